@@ -1,0 +1,47 @@
+# Every target sets up what it needs: uv into .tools/, all packages into .venv/, missing system libraries into
+# .venv/syslibs/. Nothing outside this folder is changed, and nothing needs root. `make help` lists the targets.
+
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+
+PYTHON ?= python3
+READY := .venv/.ready
+
+# Both cores busy with spinning OpenMP threads make torch operations next to Open3D 10 to 250 times slower.
+export OMP_WAIT_POLICY ?= passive
+
+.PHONY: help setup demo test check bench format lock clean
+
+help:  ## list the targets
+	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
+
+setup: $(READY)  ## make .venv as uv.lock says, with everything that Open3D needs
+
+$(READY): pyproject.toml uv.lock scripts/setup.sh scripts/system_libs.py
+	PYTHON=$(PYTHON) scripts/setup.sh
+	@touch $@
+
+demo: $(READY)  ## map an embedded scene; results in runs/demo
+	.venv/bin/semantic-mapper demo --out runs/demo
+
+test: $(READY)  ## run all tests
+	OMP_NUM_THREADS=1 .venv/bin/python -m pytest tests
+
+check: $(READY)  ## formatting, lint, types, import contracts
+	.venv/bin/ruff format --check .
+	.venv/bin/ruff check .
+	.venv/bin/pyright
+	.venv/bin/lint-imports --no-logo
+
+bench: $(READY)  ## measure speed
+	.venv/bin/semantic-mapper bench
+
+format: $(READY)  ## format and mend what can be mended automatically
+	.venv/bin/ruff format .
+	.venv/bin/ruff check --fix .
+
+lock: $(READY)  ## write uv.lock anew after a change of dependencies
+	.tools/bin/uv lock
+
+clean:  ## remove everything that the targets made, except runs/
+	rm -rf .venv .tools build dist *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache

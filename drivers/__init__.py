@@ -1,0 +1,1 @@
+"""Cameras and pose sources behind one protocol."""

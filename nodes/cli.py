@@ -1,0 +1,65 @@
+"""The command ``semantic-mapper``. Each verb lives in a file of its own and imports what is heavy when it runs."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from typing import Annotated
+
+import typer
+
+from nodes import cli_demo, cli_doctor, cli_eval, cli_finetune, cli_log, cli_replay, cli_up
+from nodes.verb import Settings
+from semantic_mapper import __version__
+
+app = typer.Typer(
+    name="semantic-mapper",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+)
+
+for _function in (
+    cli_demo.demo,
+    cli_replay.replay,
+    cli_up.up,
+    cli_log.import_,
+    cli_log.info,
+    cli_log.recover,
+    cli_finetune.finetune,
+    cli_eval.evaluate,
+    cli_doctor.doctor,
+):
+    app.command(_function.__name__.rstrip("_").replace("evaluate", "eval"))(_function)
+
+for _name in ("train", "bench"):  # measuring and training are no part of a robot's installation
+    if importlib.util.find_spec(f"nodes.cli_{_name}") is not None:
+        app.command(_name)(getattr(importlib.import_module(f"nodes.cli_{_name}"), _name))
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"semantic-mapper {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell more, and show where an error arose.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Posed camera frames in, live semantic 3D map out.
+
+    Start with `semantic-mapper demo`. Each verb explains itself: `semantic-mapper replay --help`. Results go to
+    stdout, messages to stderr. Exit codes: 0 done (`up`: also after Ctrl-C), 1 failed, 2 wrong usage, 130 Ctrl-C.
+    """
+    Settings.verbose = verbose
+
+
+def main() -> None:
+    """Entry point of the command."""
+    app()

@@ -1,0 +1,40 @@
+"""``semantic-mapper doctor``: what is missing on this machine, and how to mend it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+
+from nodes.console import Output
+from nodes.verb import EXIT_FAILED, verb
+
+_MARKS = {"ok": "[green]ok[/green]", "note": "[yellow]note[/yellow]", "bad": "[bold red]bad[/bold red]"}
+
+
+@verb
+def doctor(
+    json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
+) -> int:
+    """Look for what this machine lacks, with a mend for each thing; exit code 1 where something needed is missing.
+
+    Example: semantic-mapper doctor
+    """
+    output = Output.guarded()
+    from rich.markup import escape
+    from rich.table import Table
+
+    from nodes.doctor import examine
+
+    checks = examine()
+    if json:
+        output.json([asdict(c) for c in checks])
+    else:
+        table = Table(title="doctor", title_justify="left")
+        for title in ("", "what", "found", "mend"):
+            table.add_column(title, overflow="fold")
+        for check in checks:
+            table.add_row(_MARKS[check.state], check.name, escape(check.found), escape(check.mend))
+        output.print(table)
+    return EXIT_FAILED if any(c.state == "bad" for c in checks) else 0

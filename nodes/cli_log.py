@@ -1,0 +1,112 @@
+"""Verbs about logs: ``import``, ``info``, ``recover``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from nodes.console import Output, frame_progress
+from nodes.verb import EXIT_FAILED, verb
+
+LISTED = 10  # skipped files and damages that are shown one by one
+
+LogArgument = Annotated[Path, typer.Argument(help="Recorded log (.mcap).")]
+
+
+@verb
+def import_(
+    source: Annotated[Path, typer.Argument(metavar="SRC", help="Folder of the recording.")],
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log to write (.mcap).")],
+    format: Annotated[  # noqa: A002 - the name of the option
+        Literal["folder", "tum", "scannet"] | None, typer.Option(help="Found out when not given.")
+    ] = None,
+    max_frames: Annotated[int, typer.Option(min=0, help="Stop after so many; 0 = all.")] = 0,
+) -> None:
+    """Make a log of a recording: sequence folder, TUM RGB-D, or exported ScanNet.
+
+    Frames that cannot be used are left out, each with its file and the reason.
+
+    Example: semantic-mapper import path/to/redkitchen kitchen.mcap
+    """
+    output = Output.guarded()
+    from replay.importers import ImportOptions, import_recording
+
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with frame_progress("import", None) as bar:
+
+        def on_progress(done: int, total: int) -> None:
+            if done == 1:
+                bar.start(total)
+            bar.set(done)
+
+        report = import_recording(
+            source, log, format, on_progress, options=ImportOptions(max_frames=max_frames or None)
+        )
+    labels = "no labels" if not report.labelled else f"{report.labelled} of them labelled"
+    output.print(f"{log}: {report.frames} frames ({labels}), {report.bytes / 1e6:.1f} MB, from a '{report.format}'")
+    for notice in report.notices:
+        output.print(f"  note: {notice}")
+    for skipped in report.skipped[:LISTED]:
+        what = "label left out" if skipped.label_only else "frame left out"
+        output.print(f"  {what}: frame {skipped.frame}: {skipped.file}: {skipped.reason}")
+    if len(report.skipped) > LISTED:
+        output.print(f"  and {len(report.skipped) - LISTED} more")
+
+
+@verb
+def info(
+    log: LogArgument,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
+) -> int:
+    """Say what a log holds: topics, frames, cameras, classes, duration, size, damage.
+
+    Reads every message, so that damage anywhere is found; exit code 1 where there is any.
+
+    Example: semantic-mapper info kitchen.mcap
+    """
+    output = Output.guarded()
+    from nodes.log_info import describe_log, info_table
+
+    with frame_progress("read", None, unit="messages") as bar:
+        found = describe_log(log, bar.advance)
+    if json:
+        output.json(found)
+    else:
+        output.print(info_table(found))
+        _print_damage(output, log, found)
+    return EXIT_FAILED if found["damage"] else 0
+
+
+def _print_damage(output: Output, log: Path, found: dict[str, Any]) -> None:
+    for notice in found["notices"]:
+        output.print(f"note: {notice}")
+    for damage in found["damage"][:LISTED]:
+        output.print(f"damaged: {damage}")
+    if len(found["damage"]) > LISTED:
+        output.print(f"and {len(found['damage']) - LISTED} more")
+    if found["damage"] or not found["finished"]:
+        output.print(
+            f"`semantic-mapper recover {log} {log.with_stem(log.stem + '-recovered')}` makes a clean log of it"
+        )
+
+
+@verb
+def recover(
+    source: Annotated[Path, typer.Argument(metavar="SRC", help="Damaged or unfinished log; is not changed.")],
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="New log to write.")],
+) -> None:
+    """Make a clean log of a damaged or unfinished one: every intact message is kept.
+
+    Example: semantic-mapper recover cut-off.mcap clean.mcap
+    """
+    output = Output.guarded()
+    from replay.recover import recover as recover_log
+
+    report = recover_log(source, log)
+    output.print(f"{log}: {report.frames} frames, {report.messages} messages; {len(report.lost)} could not be saved")
+    if not report.finished:
+        output.print("  the old log had not been closed by its writer")
+    for error in report.lost[:LISTED]:
+        output.print(f"  lost: {error}")

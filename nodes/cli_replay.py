@@ -1,0 +1,67 @@
+"""``semantic-mapper replay``: a log becomes a map, in this process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nodes.console import Output, frame_progress, stderr_console
+from nodes.process import StopRequest
+from nodes.verb import verb
+
+OutOption = Annotated[Path, typer.Option("--out", help="Folder for the results; made if missing.")]
+WeightsOption = Annotated[
+    Path | None, typer.Option("--weights", help="Weights file; without it the small one in the package.")
+]
+VoxelSizeOption = Annotated[
+    float | None, typer.Option("--voxel-size", min=0.002, max=1.0, help="Edge of a voxel in metres.  [default: 0.02]")
+]
+MaxFramesOption = Annotated[int, typer.Option("--max-frames", min=0, help="Stop after so many; 0 = all.")]
+ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with settings of the mapper.")]
+
+
+@verb
+def replay(
+    log: Annotated[Path, typer.Argument(help="Recorded log (.mcap); `import` makes one.")],
+    out: OutOption,
+    weights: WeightsOption = None,
+    voxel_size: VoxelSizeOption = None,
+    max_frames: MaxFramesOption = 0,
+    eval_exclude: Annotated[
+        Path | None,
+        typer.Option(help="Leave frames that these weights were finetuned on out of the scores, too."),
+    ] = None,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print the summary as JSON, and nothing else, on stdout.")
+    ] = False,
+    rerun: Annotated[Path | None, typer.Option(help="Also write a Rerun recording (.rrd).")] = None,
+    config: ConfigOption = None,
+    seed: Annotated[int | None, typer.Option(help="Of everything that is drawn at random.")] = None,
+) -> int:
+    """Map a recorded log: writes summary.json, map.ply, map.npz and overview.png.
+
+    Frames that the weights were finetuned on are mapped, but never scored. Damaged or impossible frames are refused
+    with the reason; the rest is mapped. Ctrl-C still writes the map of the frames so far (exit code 130).
+
+    Example: semantic-mapper replay kitchen.mcap --out runs/kitchen --weights kitchen.safetensors
+    """
+    output = Output.guarded()
+    from nodes.run_replay import ReplayRequest, mapper_config, replay_log
+    from nodes.summary_table import notes, result_lines, summary_table
+
+    settings = mapper_config(config, voxel_size, seed)
+    request = ReplayRequest(log, out, weights, settings, max_frames, eval_exclude, rerun)
+    with StopRequest() as stop:
+        with frame_progress("replay", None) as bar:
+            summary = replay_log(request, stop, bar.start, bar.set)
+        if json:
+            output.json(summary)
+        else:
+            output.print(summary_table({out.name: summary}))
+            for line in (*notes(summary), *result_lines(out)):
+                output.print(line)
+        if stop:
+            stderr_console().print(f"stopped by {stop.name}; the map so far is in {out}", style="yellow")
+        return stop.exit_code

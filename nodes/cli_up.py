@@ -1,0 +1,43 @@
+"""``semantic-mapper up``: the nodes of a launch file as processes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nodes.console import Output
+from nodes.process import StopRequest
+from nodes.verb import verb
+
+
+@verb
+def up(
+    launch: Annotated[Path, typer.Argument(metavar="LAUNCH.toml", help="Launch file; see launch/.")],
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Replace a value of the file's [set] table; may be repeated."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the results; the same as --set out=DIR.")
+    ] = None,
+) -> None:
+    """Start the nodes of a launch file as processes and watch over them until they end.
+
+    Ctrl-C ends all nodes in order, the map so far is written, and the exit code is 0; a second Ctrl-C kills them. When
+    a node fails, the others are ended in order too, the error says which one it was and why, and the exit code is 1.
+
+    Example: semantic-mapper up launch/replay.toml --set log=kitchen.mcap --out runs/up
+    """
+    output = Output.guarded()
+    from nodes.launch_config import load_launch
+    from nodes.launcher import Launcher
+    from nodes.options import MapperOptions
+    from nodes.results import print_results
+
+    checked = load_launch(launch, settings or (), out)
+    with StopRequest() as stop, Launcher(checked) as launcher:
+        launcher.run(stop)
+    folders = [Path(o.out) for o in checked.options.values() if isinstance(o, MapperOptions)]
+    print_results(output, [f for f in folders if (f / "summary.json").exists()])

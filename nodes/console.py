@@ -1,0 +1,124 @@
+"""What people and programs see of the command line: results on stdout, everything else on stderr."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, TextIO
+
+import structlog
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+_log = structlog.get_logger(__name__)
+
+LOG_PERIOD_S = 15.0  # how often progress is told where there is no terminal to draw a bar on
+
+
+class Output:
+    """Where results go. ``guarded`` keeps stray prints (Open3D prints memory statistics at exit) off stdout."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.console = Console(file=stream, highlight=False)
+        self._stream = stream
+
+    @classmethod
+    def guarded(cls) -> Output:
+        """Keep the real stdout for results; from now on anything else that is written to it lands on stderr."""
+        sys.stdout.flush()
+        stream = os.fdopen(os.dup(1), "w", encoding="utf-8")
+        os.dup2(2, 1)  # C and C++ code
+        sys.stdout = sys.stderr  # Python code
+        return cls(stream)
+
+    def print(self, *things: Any) -> None:
+        """Show something to people."""
+        self.console.print(*things, soft_wrap=True)
+        self._stream.flush()
+
+    def json(self, data: Any) -> None:
+        """Write one JSON document."""
+        self._stream.write(json.dumps(data, indent=1, allow_nan=False) + "\n")
+        self._stream.flush()
+
+
+def stderr_console() -> Console:
+    """For messages and progress."""
+    return Console(stderr=True, highlight=False)
+
+
+class FrameProgress:
+    """A bar with frames a second and time left; events in the log where stderr is no terminal."""
+
+    def __init__(self, progress: Progress, task: Any, what: str, total: int | None, unit: str) -> None:
+        self._progress = progress
+        self._task = task
+        self._what = what
+        self._total = total
+        self._unit = unit
+        self._done = 0
+        self._began = self._told = time.monotonic()
+
+    def start(self, total: int | None) -> None:
+        """Now it is known how many there are, and work begins."""
+        self._total = total
+        self._began = self._told = time.monotonic()
+        self._progress.reset(self._task, total=total, description=self._what)
+
+    def advance(self, count: int = 1) -> None:
+        """So many more are done."""
+        self.set(self._done + count)
+
+    def set(self, done: int, note: str = "") -> None:
+        """So many are done by now; ``note`` replaces the text beside the bar."""
+        self._done = done
+        changes: dict[str, Any] = {"note": note} if note else {}
+        self._progress.update(self._task, completed=done, **changes)
+        now = time.monotonic()
+        if not self._progress.console.is_terminal and now - self._told >= LOG_PERIOD_S:
+            self._told = now
+            rate = done / max(now - self._began, 1e-9)
+            more = {"note": note} if note else {}
+            _log.info(self._what, done=done, total=self._total, rate=f"{rate:.2f} {self._unit}/s", **more)
+
+
+@contextmanager
+def frame_progress(what: str, total: int | None, unit: str = "frames") -> Iterator[FrameProgress]:
+    """Show progress while inside; ``total`` None where nobody knows it."""
+    columns = (
+        TextColumn("[bold]{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        _RateColumn(unit),
+        TextColumn("eta"),
+        TimeRemainingColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    console = stderr_console()
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        yield FrameProgress(progress, progress.add_task(what, total=total, note=""), what, total, unit)
+
+
+class _RateColumn(ProgressColumn):
+    def __init__(self, unit: str) -> None:
+        super().__init__()
+        self._unit = unit
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{speed:.1f} {self._unit}/s", style="cyan")

@@ -1,0 +1,84 @@
+"""What a log holds, as plain data and as a table."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from replay.log import LogReader
+
+
+def describe_log(path: Path, on_message: Callable[[], None]) -> dict[str, Any]:
+    """Read all messages of a log and say what is in it.
+
+    Raises:
+        LogError: it cannot be opened.
+    """
+    topics: Counter[str] = Counter()
+    sizes: Counter[str] = Counter()
+    stamps: list[int] = []
+    depth = labelled = 0
+    with LogReader(path, allow_empty=True) as log:
+        for envelope, parts in log.messages():
+            topic = f"{envelope.topic}/{envelope.source}" if envelope.topic != "info" else "info"
+            topics[topic] += 1
+            sizes[topic] += sum(len(p) for p in parts)
+            if envelope.topic == "frame":
+                stamps.append(envelope.stamp_ns)
+                depth += envelope.has_depth
+                labelled += envelope.has_label
+            on_message()
+        stream = log.info
+        damage, notices, finished = [str(e) for e in log.errors], list(log.notices), log.finished
+    seconds = (max(stamps) - min(stamps)) / 1e9 if stamps else 0.0
+    return {
+        "log": str(path),
+        "source": stream.source,
+        "size_bytes": path.stat().st_size,
+        "frames": len(stamps),
+        "frames_with_depth": depth,
+        "frames_with_labels": labelled,
+        "duration_s": round(seconds, 3),
+        "frame_hz": round((len(stamps) - 1) / seconds, 2) if seconds > 0 else None,
+        "cameras": {
+            name: {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}
+            for name, k in stream.cameras.items()
+        },
+        "label_set": None
+        if stream.label_set is None
+        else {"name": stream.label_set.name, "classes": list(stream.label_set.names)},
+        "topics": {name: {"messages": count, "bytes": sizes[name]} for name, count in sorted(topics.items())},
+        "metadata": dict(stream.metadata),
+        "finished": finished,
+        "notices": notices,
+        "damage": damage,
+    }
+
+
+def info_table(found: dict[str, Any]) -> Table:
+    """What ``describe_log`` found, for people."""
+    table = Table(title=found["log"], title_justify="left", show_header=False)
+    table.add_row("source", found["source"])
+    table.add_row("size", f"{found['size_bytes'] / 1e6:.1f} MB")
+    depth, labels = found["frames_with_depth"], found["frames_with_labels"]
+    table.add_row("frames", f"{found['frames']} ({depth} with depth, {labels} with labels)")
+    rate = f", {found['frame_hz']:g} Hz" if found["frame_hz"] else ""
+    table.add_row("duration", f"{found['duration_s']:g} s{rate}")
+    for name, k in found["cameras"].items():
+        table.add_row(f"camera {name}", f"{k['width']}x{k['height']}, fx {k['fx']:.1f} fy {k['fy']:.1f}")
+    label_set = found["label_set"]
+    text = "none" if label_set is None else f"{label_set['name']}: {', '.join(label_set['classes'])}"
+    table.add_row("classes", text)
+    for key, value in found["metadata"].items():
+        table.add_row(key, value)
+    table.add_section()
+    for name, topic in found["topics"].items():
+        table.add_row(f"topic {name}", f"{topic['messages']} messages, {topic['bytes'] / 1e6:.1f} MB")
+    table.add_section()
+    count = len(found["damage"])
+    table.add_row("damage", f"{count} places" if count else "none")
+    return table

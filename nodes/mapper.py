@@ -1,0 +1,165 @@
+"""The mapper node: frames in, map updates out; at the end of the stream it writes the map."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import structlog
+
+from nodes.node import NodeContext, run_node
+from nodes.options import MapperOptions
+
+if TYPE_CHECKING:
+    from replay.session import MapSession, PipelineBundle
+    from semantic_mapper.transport.messages import EndOfStream, NodeState, StreamInfo
+    from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
+    from semantic_mapper.types import PosedFrame
+
+POLL_S = 0.1
+STATUS_PERIOD_S = 1.0
+
+_log = structlog.get_logger(__name__)
+
+
+def run_mapper(context: NodeContext, options: MapperOptions) -> None:
+    """Map until the stream ends or somebody asks to stop, then write the results.
+
+    Raises:
+        WeightsError, ConfigError: it cannot start.
+        MapError: the map is full, or cannot be written.
+        TransportError: the endpoint is taken.
+    """
+    from nodes.run_replay import mapper_config, prepare_folder
+    from replay.session import load_pipeline
+    from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
+
+    prepare_folder(Path(options.out))
+    config = mapper_config(Path(options.config) if options.config else None, options.voxel_size_m or None)
+    bundle = load_pipeline(Path(options.weights) if options.weights else None, config)
+    subscribe = LosslessSubscriber if options.delivery == "all" else NewestSubscriber
+    with (
+        Publisher(context.endpoint(context.name)) as publisher,
+        subscribe(context.endpoint(options.input), ("info", "frame", "end")) as frames,
+    ):
+        _log.info("ready", weights=bundle.weights_path.name, input=options.input, delivery=options.delivery)
+        mapper = _Mapper(context, options, bundle, publisher, frames)
+        try:
+            mapper.run()
+        finally:
+            frames.close()  # the camera waits until all have left
+            mapper.finish()
+
+
+class _Mapper:
+    """State between two messages."""
+
+    def __init__(
+        self,
+        context: NodeContext,
+        options: MapperOptions,
+        bundle: PipelineBundle,
+        publisher: Publisher,
+        frames: LosslessSubscriber | NewestSubscriber,
+    ) -> None:
+        self._context = context
+        self._options = options
+        self._bundle = bundle
+        self._publisher = publisher
+        self._frames = frames
+        self._session: MapSession | None = None
+        self._ended_by = "error"
+        self._early = 0
+        self._last_status = 0.0
+
+    def run(self) -> None:
+        """Handle messages until the end of the stream or a stop request."""
+        from semantic_mapper.transport.messages import EndOfStream, StreamInfo
+        from semantic_mapper.types import PosedFrame
+
+        while not self._context.stop:
+            message = self._frames.receive(POLL_S)
+            match message:
+                case StreamInfo():
+                    self._begin(message)
+                case PosedFrame():
+                    self._map(message)
+                case EndOfStream():
+                    self._end(message)
+                    return
+                case _:
+                    pass
+            self._tell_status("running")
+        self._ended_by = self._context.stop.name
+
+    def finish(self) -> None:
+        """Write what there is."""
+        from nodes.finishing import finish_session
+
+        if self._session is None:
+            _log.warning("nothing_to_write", reason="no stream has begun")
+            return
+        self._tell_status("stopping", now=True)
+        out = Path(self._options.out)
+        summary = finish_session(self._session, out, self._ended_by)
+        _log.info("map_written", out=str(out), **summary["frames"])
+        self._tell_status("ended", now=True)
+
+    def _begin(self, info: StreamInfo) -> None:
+        from replay.session import MapSession
+        from semantic_mapper.fields.checkpoint import load_checkpoint
+
+        if self._session is not None:  # the same stream, told again to a newcomer
+            return
+        exclude = self._options.eval_exclude
+        self._session = MapSession(
+            self._bundle,
+            stream_labels=info.label_set,
+            exclude_stamps=load_checkpoint(Path(exclude)).train_stamps_ns if exclude else frozenset(),
+            source=info.source,
+            rerun=Path(self._options.rerun) if self._options.rerun else None,
+        )
+        _log.info("stream_begins", source=info.source, frames=info.frame_count)
+
+    def _map(self, frame: PosedFrame) -> None:
+        from semantic_mapper.transport.codec import encode_map_update, encode_refused
+        from semantic_mapper.transport.messages import FrameRefused
+
+        if self._session is None:
+            self._early += 1
+            _log.warning("frame_before_stream_info", seq=frame.seq)
+            return
+        update = self._session.process(frame)
+        if update is None:
+            reason = self._session.refusals[-1].reason
+            refused = FrameRefused(frame.stamp_ns, frame.seq, frame.camera_id, reason)
+            self._publisher.publish(encode_refused(refused))
+        else:
+            self._publisher.publish(encode_map_update(update))
+
+    def _end(self, end: EndOfStream) -> None:
+        self._ended_by = "" if end.reason == "end" else f"{end.source}: {end.detail or end.reason}"
+        if self._session is not None:
+            self._session.count_dropped(max(0, end.published - self._session.published))
+        _log.info("stream_ends", reason=end.reason, published=end.published, detail=end.detail)
+
+    def _tell_status(self, state: NodeState, *, now: bool = False) -> None:
+        from semantic_mapper.transport.codec import encode_status
+        from semantic_mapper.transport.messages import Status
+
+        if not now and time.monotonic() - self._last_status < STATUS_PERIOD_S:
+            return
+        self._last_status = time.monotonic()
+        counters = {"rejected": self._frames.rejected, "early": self._early}
+        if self._session is not None:
+            s = self._session
+            counters |= {"published": s.published, "fused": s.fused, "refused": len(s.refusals), "dropped": s.dropped}
+        silent = self._frames.silent_s
+        ages = {} if silent is None else {"frame": silent}
+        status = Status(self._context.name, state, time.monotonic_ns(), counters, ages)
+        self._publisher.publish(encode_status(status))
+
+
+if __name__ == "__main__":
+    run_node(MapperOptions, run_mapper)

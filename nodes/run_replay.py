@@ -1,0 +1,148 @@
+"""Replay a log in this process: what the verbs ``replay``, ``demo`` and ``eval`` share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import structlog
+
+from nodes.finishing import finish_session
+from nodes.process import StopRequest
+from replay.log import LogReader
+from replay.session import MapSession, load_pipeline
+from semantic_mapper.config import MapperConfig, load_config
+from semantic_mapper.errors import ConfigError, LogError, MapError
+from semantic_mapper.fields.checkpoint import load_checkpoint
+from semantic_mapper.types import PosedFrame
+
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayRequest:
+    """What to replay.
+
+    Args:
+        log: The log.
+        out: Folder for the results.
+        weights: None = those that ship with the package.
+        config: Of the mapper.
+        max_frames: 0 = all.
+        exclude: Weights whose finetuning frames are left out of the scores, beside those of ``weights``.
+        rerun: Where to write a Rerun recording.
+    """
+
+    log: Path
+    out: Path
+    weights: Path | None = None
+    config: MapperConfig = field(default_factory=MapperConfig)
+    max_frames: int = 0
+    exclude: Path | None = None
+    rerun: Path | None = None
+
+
+def replay_log(
+    request: ReplayRequest, stop: StopRequest, on_start: Callable[[int], None], on_frame: Callable[[int], None]
+) -> dict[str, Any]:
+    """Map a log and write summary, map and picture; after a stop request, those of the frames so far.
+
+    Damaged frames of the log and frames that the mapper refuses are counted and told of; the rest is mapped.
+
+    Args:
+        request: What to do.
+        stop: Looked at before every frame.
+        on_start: Told how many frames there are.
+        on_frame: Told how many are done.
+
+    Returns:
+        The summary, as in ``summary.json``; ``stopped_by`` names the signal that ended it early, else null.
+
+    Raises:
+        LogError, WeightsError, ConfigError, MapError: nothing could be mapped; the message says why.
+    """
+    prepare_folder(request.out)
+    exclude = load_checkpoint(request.exclude).train_stamps_ns if request.exclude else frozenset[int]()
+    with LogReader(request.log) as log:
+        for notice in log.notices:
+            _log.warning("log_notice", notice=notice)
+        bundle = load_pipeline(request.weights, request.config)
+        session = MapSession(
+            bundle,
+            stream_labels=log.info.label_set,
+            exclude_stamps=exclude,
+            source=request.log.name,
+            rerun=request.rerun,
+        )
+        for error in log.errors:  # stretches of the file in which no frame can be made out
+            session.note_damage(str(error))
+        total = min(len(log), request.max_frames or len(log))
+        on_start(total)
+        _log.info("mapping", log=request.log.name, frames=total, weights=bundle.weights_path.name)
+        try:
+            done = _map_frames(session, log, total, stop, on_frame)
+        except MapError:  # the map is full: what is in it is worth keeping
+            finish_session(session, request.out, "error")
+            raise
+        summary = finish_session(session, request.out, stop.name)
+    if not session.fused:
+        reason = session.refusals[0].reason if session.refusals else "no frame has depth or finds a source view"
+        raise LogError(f"{request.log}: none of {done} frames could be mapped; the first: {reason}")
+    return summary
+
+
+def _map_frames(
+    session: MapSession, log: LogReader, total: int, stop: StopRequest, on_frame: Callable[[int], None]
+) -> int:
+    """Feed the session; how many frames were looked at."""
+    done = 0
+    for done, item in enumerate(_frames(log, total), 1):
+        if isinstance(item, PosedFrame):
+            session.process(item)
+        else:
+            session.refuse(done - 1, 0, str(item))
+        on_frame(done)
+        if stop:
+            _log.warning("stopped", by=stop.name, frames=done, of=total)
+            break
+    return done
+
+
+def _frames(log: LogReader, total: int) -> Iterator[PosedFrame | LogError]:
+    """Frames in order; the error in place of one that is damaged."""
+    for number in range(total):
+        try:
+            yield log.frame(number)
+        except LogError as error:
+            yield error
+
+
+def mapper_config(path: Path | None, voxel_size_m: float | None, seed: int | None = None) -> MapperConfig:
+    """The mapper's config from a TOML file (None = defaults) with what the command line says on top.
+
+    Raises:
+        ConfigError: see ``load_config``.
+    """
+    config = load_config(path, MapperConfig) if path else MapperConfig()
+    if voxel_size_m is not None:
+        voxel_map = msgspec.structs.replace(config.voxel_map, voxel_size_m=voxel_size_m)
+        config = msgspec.structs.replace(config, voxel_map=voxel_map)
+    return config if seed is None else msgspec.structs.replace(config, seed=seed)
+
+
+def prepare_folder(out: Path) -> None:
+    """Make the folder for results, before minutes are spent on them.
+
+    Raises:
+        ConfigError: it cannot be made or written to.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot hold the results ({error.strerror}); choose another folder") from error

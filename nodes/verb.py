@@ -1,0 +1,68 @@
+"""What all verbs of the command line share: process set-up, one clear line for an error, exit codes.
+
+0 done; 1 failed; 2 wrong usage; 130 after Ctrl-C, 143 after SIGTERM (what was done so far is written where a verb says
+so); 1 too where a result is negative (``doctor`` finds something missing).
+"""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Callable
+from typing import ParamSpec
+
+import structlog
+import typer
+from rich.text import Text
+
+from nodes.console import stderr_console
+from nodes.process import prepare_process
+from semantic_mapper.errors import SemanticMapperError
+
+EXIT_FAILED = 1
+EXIT_INTERRUPTED = 130
+
+_log = structlog.get_logger(__name__)
+
+ParamsT = ParamSpec("ParamsT")
+
+
+class Settings:
+    """Options that stand before the verb."""
+
+    verbose = False
+
+
+def verb(function: Callable[ParamsT, int | None]) -> Callable[ParamsT, None]:
+    """Make a command of a function that returns an exit code (None = 0) and raises ``SemanticMapperError``."""
+
+    @functools.wraps(function)
+    def command(*args: ParamsT.args, **kwargs: ParamsT.kwargs) -> None:
+        prepare_process(verbose=Settings.verbose)
+        try:
+            code = function(*args, **kwargs)
+        except SemanticMapperError as error:
+            if Settings.verbose:
+                _log.exception("failed", error=str(error))
+            show_error(str(error))
+            code = EXIT_FAILED
+        except KeyboardInterrupt:
+            show_error("interrupted")
+            code = EXIT_INTERRUPTED
+        except BrokenPipeError:  # the reader of our stdout is gone (`... | head`): nothing is left to be said
+            code = EXIT_FAILED
+        except OSError as error:  # disk full, permission denied: the operating system's own words and the file
+            if Settings.verbose:
+                _log.exception("failed")
+            show_error(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+            code = EXIT_FAILED
+        sys.stderr.flush()
+        raise typer.Exit(code or 0)
+
+    return command
+
+
+def show_error(message: str) -> None:
+    """One red line on stderr."""
+    line = Text.assemble(("error: ", "bold red"), (" ".join(message.split("\n")), "red"))
+    stderr_console().print(line, soft_wrap=True)

@@ -1,0 +1,163 @@
+"""What a session leaves behind: summary.json, map.ply, map.npz, overview.png."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from semantic_mapper import __version__
+from semantic_mapper.evaluation.metrics import confusion_of, metrics_per_image
+from semantic_mapper.evaluation.report import ViewStrip, write_overview
+from semantic_mapper.evaluation.upright import camera_up
+from semantic_mapper.mapping.export import write_ply
+from semantic_mapper.mapping.map_types import MapPoints
+
+if TYPE_CHECKING:  # session imports this module
+    from replay.rerun_log import RerunLog
+    from replay.session import MapSession
+
+ItemT = TypeVar("ItemT")
+OVERVIEW_FRAMES = 2
+MAX_LISTED_REFUSALS = 50
+PACKAGES = ("torch", "open3d", "numpy", "numba", "opencv-contrib-python-headless", "pyzmq", "msgpack", "mcap")
+
+
+def write_artifacts(session: MapSession, out: Path, rerun: RerunLog | None) -> dict[str, Any]:
+    """Write everything to ``out`` (made if missing); the summary comes last, so its presence means "complete"."""
+    out.mkdir(parents=True, exist_ok=True)
+    points = session.pipeline.voxel_map.points()
+    write_ply(out / "map.ply", points)
+    session.pipeline.voxel_map.save(out / "map.npz")
+    _draw_overview(session, points, out / "overview.png")
+    if rerun is not None:
+        rerun.finish(points)
+    summary = build_summary(session, points)
+    write_json(out / "summary.json", summary)
+    return summary
+
+
+def _draw_overview(session: MapSession, points: MapPoints, path: Path) -> None:
+    label_set = session.pipeline.label_set
+    strips: list[ViewStrip] = []
+    for frame, update in _spread(session.snapshots, OVERVIEW_FRAMES):
+        truth = None
+        if session.truth is not None and frame.label is not None:
+            truth = session.truth.to_map_ids(frame.label, f"frame seq={frame.seq}")
+        strips.append(ViewStrip(f"frame {frame.seq}", frame.rgb, update.label, truth, update.depth_m))
+    poses = [f.T_world_camera for f, _ in session.snapshots]
+    size = f"{session.pipeline.voxel_map.config.voxel_size_m * 100:g} cm voxels"
+    write_overview(
+        path,
+        strips,
+        points,
+        label_set,
+        title=f"{session.source or 'session'}: {session.fused} frames, {len(points.xyz):,} surface points, {size}",
+        subtitle=_scores_line(session),
+        up=camera_up(np.stack(poses)) if poses else None,
+    )
+
+
+def _scores_line(session: MapSession) -> str:
+    miou = session.confusion.metrics().miou
+    if miou is None:
+        return "no labels to score against"
+    return f"mIoU {100 * miou:.1f} % over {session.scored} labelled frames that the weights have not seen"
+
+
+def _spread(items: Sequence[ItemT], count: int) -> list[ItemT]:
+    """At most ``count`` items, evenly spread, first and last among them."""
+    if len(items) <= count:
+        return list(items)
+    return [items[int(i)] for i in np.linspace(0, len(items) - 1, count).round()]
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Write JSON atomically."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    part.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    os.replace(part, path)
+
+
+def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
+    """The summary of a session as plain data."""
+    pipeline, bundle = session.pipeline, session.bundle
+    voxel_map, label_set = pipeline.voxel_map, pipeline.label_set
+    return {
+        "source": session.source,
+        "frames": {
+            "published": session.published,
+            "fused": session.fused,
+            "dropped": session.dropped,
+            "refused": len(session.refusals),
+            "labels_refused": len(session.label_refusals),
+            "scored": session.scored,
+            "excluded_from_scores": session.excluded,
+        },
+        "latency_ms": percentiles(session.step_ms),
+        "stages_ms": {name: percentiles(values) for name, values in session.stage_ms.items()},
+        "map": {
+            "voxel_size_m": voxel_map.config.voxel_size_m,
+            "blocks": voxel_map.block_count,
+            "surface_points": len(points.xyz),
+            "memory_mb": round(voxel_map.memory_bytes / 1e6, 1),
+        },
+        "metrics": _metrics(session, points),
+        "metrics_per_image": asdict(metrics_per_image(session.per_image)) if session.scored else None,
+        "labels": {str(i): name for i, name in zip(label_set.ids, label_set.names, strict=True)},
+        "label_set": {
+            "name": label_set.name,
+            "ignore_id": label_set.ignore_id,
+            "colors": {str(i): list(c) for i, c in zip(label_set.ids, label_set.colors, strict=True)},
+            "scored_classes": list(session.truth.shared) if session.truth is not None else None,
+        },
+        "field": {
+            "name": "sray",
+            "renderer": type(pipeline.field).__name__,
+            "sampling": pipeline.config.sampling.mode,
+            "anchors": len(bundle.checkpoint.anchors),
+        },
+        "weights": {
+            "file": bundle.weights_path.name,
+            "recipe": bundle.checkpoint.recipe.get("kind", "unknown"),
+            "finetuned_frames": len(bundle.checkpoint.train_stamps_ns),
+        },
+        "seed": pipeline.config.seed,
+        "refusals": [
+            {"seq": r.seq, "stamp_ns": r.stamp_ns, "reason": r.reason}
+            for r in sorted(session.refusals + session.label_refusals, key=lambda r: r.seq)[:MAX_LISTED_REFUSALS]
+        ],
+        "damaged_stretches": session.damages[:MAX_LISTED_REFUSALS],
+        "versions": versions(),
+    }
+
+
+def _metrics(session: MapSession, points: MapPoints) -> dict[str, Any]:
+    scores = asdict(session.confusion.metrics())
+    if not session.scored:
+        return {**dict.fromkeys(scores), "map_miou": None}
+    truth = session.surface_truth.labels_at(points.xyz)
+    surface = confusion_of(truth, points.label, session.pipeline.label_set, "map")
+    return {**scores, "map_miou": surface.metrics().miou}
+
+
+def percentiles(values: Sequence[float]) -> dict[str, float | None]:
+    """Median and 95th percentile, null for nothing."""
+    if not values:
+        return {"p50": None, "p95": None}
+    p50, p95 = np.percentile(np.asarray(values), (50, 95))
+    return {"p50": round(float(p50), 2), "p95": round(float(p95), 2)}
+
+
+def versions() -> dict[str, str]:
+    """Versions of this project, Python and the packages that decide a result."""
+    found = {"semantic_mapper": __version__, "python": platform.python_version()}
+    return found | {name: metadata.version(name) for name in PACKAGES}

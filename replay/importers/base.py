@@ -1,0 +1,291 @@
+"""What all importers share: the shape of a recording, reading of images and numbers, and the report."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol, cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LabelError
+from semantic_mapper.geometry import check_pose
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.transport.codec import EncodedImage
+from semantic_mapper.transport.compression import depth_from_uint16
+from semantic_mapper.transport.images import decode_image_file
+from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
+
+
+@dataclass(frozen=True, slots=True)
+class ImportOptions:
+    """How to read a recording.
+
+    Args:
+        camera_id: Name that the camera gets in the log.
+        frame_hz: Rate from which stamps are made where the recording has none; None = what the format has (folder 6,
+            scannet 30).
+        max_frames: Stop after this many frames; None = all.
+        match_s: TUM: largest time between a colour image, its depth image and its pose.
+    """
+
+    camera_id: str = "camera"
+    frame_hz: float | None = None
+    max_frames: int | None = None
+    match_s: float = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Skipped:
+    """Something that was left out.
+
+    Args:
+        file: The file that is at fault.
+        reason: What is wrong with it, and how to mend it.
+        frame: Number of the frame in the recording.
+        label_only: The frame is in the log, but without its label image.
+    """
+
+    file: Path
+    reason: str
+    frame: int
+    label_only: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ImportReport:
+    """What an import did.
+
+    Args:
+        frames: In the log.
+        labelled: Of these, with a label image.
+        skipped: Frames and label images that were left out.
+        notices: Sentences on what had to be assumed of the whole recording.
+        format: Of the recording.
+        info: What stands in the log's head.
+        bytes: Size of the log.
+    """
+
+    frames: int
+    labelled: int
+    skipped: tuple[Skipped, ...]
+    notices: tuple[str, ...]
+    format: str
+    info: StreamInfo
+    bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedFrame:
+    """One frame of a recording.
+
+    Args:
+        frame: Ready for the log.
+        encoded_rgb: Its colour image as the file holds it; None where it had to be changed.
+        label_error: Why it has no label image although there is a file; None where all is well.
+    """
+
+    frame: PosedFrame
+    encoded_rgb: EncodedImage | None
+    label_error: Skipped | None = None
+
+
+class Recording(Protocol):
+    """A foreign recording, opened. ``load`` may be called in any order."""
+
+    info: StreamInfo
+    depth_scale: float  # units a metre of its depth images
+    notices: list[str]
+
+    def __len__(self) -> int:
+        """Frames, good and bad."""
+        ...
+
+    def load(self, number: int) -> LoadedFrame:
+        """Read one frame.
+
+        Raises:
+            BadFrameError: it cannot be used.
+        """
+        ...
+
+
+class BadFrameError(ImportSourceError):
+    """One frame of a recording cannot be imported."""
+
+    def __init__(self, file: Path, reason: str) -> None:
+        super().__init__(f"{file}: {reason}")
+        self.file = file
+        self.reason = reason
+
+
+def read_rgb(file: Path) -> tuple[UInt8, EncodedImage]:
+    """Colour image (H, W, 3) and the file's bytes, which the log keeps as they are.
+
+    Raises:
+        BadFrameError: missing, damaged, cut off, or neither PNG nor JPEG.
+    """
+    try:
+        data = file.read_bytes()
+        rgb, encoding = decode_image_file(data)
+    except OSError as error:
+        raise BadFrameError(file, f"cannot be read ({error.strerror or error})") from error
+    except CodecError as error:
+        raise BadFrameError(file, f"{error}; export the image anew") from error
+    return rgb, EncodedImage(encoding, data)
+
+
+def read_depth(file: Path, scale: float, size: tuple[int, int]) -> Float32:
+    """Depth image (H, W) in metres.
+
+    Args:
+        file: 16-bit PNG.
+        scale: Units a metre.
+        size: (height, width) that it must have.
+
+    Raises:
+        BadFrameError: missing, damaged, not 16-bit, or of another size.
+    """
+    return depth_from_uint16(read_plane(file, "uint16", size, "depth").astype(np.uint16, copy=False), scale)
+
+
+def read_plane(
+    file: Path, kind: Literal["uint8", "uint16", "any"], size: tuple[int, int] | None, what: str
+) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Single-channel PNG as it is: (H, W) uint8 or uint16.
+
+    Args:
+        file: To read.
+        kind: "uint8", "uint16", or "any" of the two.
+        size: (height, width) that it must have; None = any.
+        what: It shows, for errors.
+
+    Raises:
+        BadFrameError: missing, damaged, of another type or size.
+    """
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise BadFrameError(file, f"the {what} image cannot be read ({error.strerror or error})") from error
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    except cv2.error as error:
+        raise BadFrameError(file, f"the {what} image is damaged: {error}") from error
+    if image is None:
+        raise BadFrameError(file, f"the {what} image is damaged or no image at all; export it anew")
+    wanted = "uint8 or uint16" if kind == "any" else kind
+    if image.ndim != 2 or image.dtype.name not in wanted.split(" or "):
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        raise BadFrameError(
+            file, f"a {what} image has one {wanted} channel, this one has {channels} of {image.dtype.name}"
+        )
+    if size is not None and image.shape != size:
+        raise BadFrameError(
+            file,
+            f"the {what} image is {image.shape[1]}x{image.shape[0]}, the colour image {size[1]}x{size[0]}; "
+            "register it to the colour image",
+        )
+    return cast("NDArray[np.uint8] | NDArray[np.uint16]", image)
+
+
+def read_label(file: Path, labels: LabelSet, size: tuple[int, int]) -> UInt8:
+    """Label image (H, W) of class ids that are all in ``labels``.
+
+    Raises:
+        BadFrameError: missing, damaged, of another type or size, or an id that is not in the set.
+    """
+    image = read_plane(file, "uint8", size, "label").astype(np.uint8, copy=False)
+    try:
+        labels.to_channels(image, "label image")
+    except LabelError as error:
+        raise BadFrameError(file, str(error)) from error
+    return image
+
+
+def check_frame_pose(T_world_camera: Float64, file: Path, line: int | None = None) -> Float64:
+    """Refuse a pose that is no rigid transform.
+
+    Raises:
+        BadFrameError: with the reason and the line of the file.
+    """
+    try:
+        check_pose(T_world_camera, f"line {line}" if line is not None else "pose")
+    except FrameError as error:
+        raise BadFrameError(file, str(error)) from error
+    return T_world_camera
+
+
+def read_matrix(file: Path) -> Float64:
+    """A 4x4 (or 3x3, then padded) matrix as text.
+
+    Raises:
+        ImportSourceError: missing, or not such a matrix.
+    """
+    try:
+        numbers = [float(word) for word in file.read_text(encoding="utf-8").split()]
+    except OSError as error:
+        raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
+    except ValueError as error:
+        raise ImportSourceError(f"{file}: holds something that is no number: {error}") from error
+    if len(numbers) not in (9, 16):
+        raise ImportSourceError(f"{file}: expected the 16 numbers of a 4x4 matrix, got {len(numbers)}")
+    side = 3 if len(numbers) == 9 else 4
+    matrix = np.eye(4)
+    matrix[:side, :side] = np.array(numbers, np.float64).reshape(side, side)
+    return matrix
+
+
+def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
+    """Files named by a number ("000017.jpg", "17.png", "frame-000017.color.jpg") by that number, in its order."""
+    found: dict[int, Path] = {}
+    if folder.is_dir():
+        for file in folder.iterdir():
+            number = re.search(r"\d+", file.name)
+            if number is not None and file.suffix.lower() in suffixes:
+                found[int(number[0])] = file
+    return dict(sorted(found.items()))
+
+
+def read_lines(file: Path) -> list[tuple[int, str]]:
+    """Lines of a text file that are not empty and no comment, with their numbers from 1.
+
+    Raises:
+        ImportSourceError: missing, or not text.
+    """
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
+    except UnicodeDecodeError as error:
+        raise ImportSourceError(f"{file}: is not a text file: {error}") from error
+    return [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
+
+
+def image_size_must_be(rgb: UInt8, intrinsics: CameraIntrinsics, file: Path) -> None:
+    """Refuse an image of another size than its camera makes.
+
+    Raises:
+        BadFrameError: naming both sizes.
+    """
+    if rgb.shape[:2] != (intrinsics.height, intrinsics.width):
+        raise BadFrameError(
+            file,
+            f"the image is {rgb.shape[1]}x{rgb.shape[0]}, the camera's intrinsics say "
+            f"{intrinsics.width}x{intrinsics.height}; resize it or mend the intrinsics",
+        )
+
+
+def seconds_to_ns(text: str) -> int:
+    """Seconds as decimal text -> nanoseconds, exactly (a float would lose them).
+
+    Raises:
+        ValueError: no number.
+    """
+    match = re.fullmatch(r"\s*(\d+)(?:\.(\d*))?\s*", text)
+    if match is None:
+        raise ValueError(f"'{text[:40]}' is not a time in seconds")
+    return int(match[1]) * 1_000_000_000 + int((match[2] or "0")[:9].ljust(9, "0"))

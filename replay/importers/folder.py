@@ -1,0 +1,204 @@
+"""The sequence-folder layout.
+
+``color/NNNNNN.jpg|png``, ``depth/NNNNNN.png`` (uint16), ``label/NNNNNN.png`` (uint8) with ``labels.json``,
+``poses.txt`` (a row of 16 numbers a frame, row-major ``T_world_camera``), ``intrinsics.json`` (width height fx fy cx cy
+depth_scale), and, if there is one, ``timestamps.txt`` (a row a frame: int nanoseconds, or seconds with a point).
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from replay.importers.base import (
+    BadFrameError,
+    ImportOptions,
+    LoadedFrame,
+    Skipped,
+    check_frame_pose,
+    image_size_must_be,
+    numbered_files,
+    read_depth,
+    read_label,
+    read_lines,
+    read_rgb,
+    seconds_to_ns,
+)
+from semantic_mapper.errors import FrameError, ImportSourceError, LabelError
+from semantic_mapper.labels import PROVIDED, LabelSet, make_label_set
+from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
+
+DEFAULT_HZ = 6.0  # of a recording without timestamps.txt
+_COLOR = (".jpg", ".jpeg", ".png")
+
+
+class _Intrinsics(msgspec.Struct):
+    width: Annotated[int, Meta(ge=1, le=1 << 14)]
+    height: Annotated[int, Meta(ge=1, le=1 << 14)]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    depth_scale: Annotated[float, Meta(gt=0, le=1e6)] = 1000.0
+
+
+class _Labels(msgspec.Struct):
+    classes: dict[str, str]
+    id_space: str = ""
+    ignore: Annotated[int, Meta(ge=0, le=255)] = 0
+
+
+class FolderRecording:
+    """A sequence folder, opened.
+
+    Args:
+        folder: Of the recording.
+        options: See ``ImportOptions``.
+
+    Raises:
+        ImportSourceError: a file that concerns all frames is missing or cannot be understood.
+    """
+
+    def __init__(self, folder: Path, options: ImportOptions) -> None:
+        self.notices: list[str] = []
+        self._folder = folder
+        self._camera_id = options.camera_id
+        self._intrinsics, self.depth_scale = read_intrinsics(folder / "intrinsics.json")
+        self._color = numbered_files(folder / "color", _COLOR)
+        self._rows = read_lines(folder / "poses.txt")
+        if not self._color:
+            raise ImportSourceError(f"{folder / 'color'}: no images named by number (000000.jpg or .png)")
+        if not self._rows:
+            raise ImportSourceError(f"{folder / 'poses.txt'}: holds no pose")
+        hz = options.frame_hz or DEFAULT_HZ
+        self._stamps = self._read_stamps(hz)
+        self._count = max(len(self._rows), max(self._color) + 1)
+        if max(self._color) >= len(self._rows) + len(self._color):
+            raise ImportSourceError(
+                f"{folder}: images are numbered up to {max(self._color)}, poses.txt has {len(self._rows)} rows; row i "
+                "belongs to image i, counted from 0"
+            )
+        self._has_depth = (folder / "depth").is_dir()
+        labels = self._read_label_set()
+        self._has_label = labels is not None and (folder / "label").is_dir()
+        self.info = StreamInfo(
+            source=f"folder {folder.resolve().name}",
+            cameras={options.camera_id: self._intrinsics},
+            label_set=labels,
+            frame_count=self._count,
+            frame_hz=hz,
+        )
+
+    def __len__(self) -> int:
+        return self._count
+
+    def load(self, number: int) -> LoadedFrame:
+        """Read one frame.
+
+        Raises:
+            BadFrameError: it cannot be used.
+        """
+        file = self._color.get(number, self._folder / "color" / f"{number:06d}.jpg")
+        pose = self._pose(number)
+        rgb, encoded = read_rgb(file)
+        image_size_must_be(rgb, self._intrinsics, file)
+        size = (self._intrinsics.height, self._intrinsics.width)
+        depth = read_depth(self._beside(file, "depth"), self.depth_scale, size) if self._has_depth else None
+        label, label_error = None, None
+        if self._has_label and self.info.label_set is not None:
+            try:
+                label = read_label(self._beside(file, "label"), self.info.label_set, size)
+            except BadFrameError as error:
+                label_error = Skipped(error.file, error.reason, number, label_only=True)
+        frame = PosedFrame(
+            stamp_ns=self._stamps[number],
+            seq=number,
+            camera_id=self._camera_id,
+            rgb=rgb,
+            depth_m=depth,
+            label=label,
+            intrinsics=self._intrinsics,
+            T_world_camera=pose,
+        )
+        return LoadedFrame(frame, encoded, label_error)
+
+    def _beside(self, color: Path, kind: str) -> Path:
+        return self._folder / kind / f"{color.stem}.png"
+
+    def _pose(self, number: int) -> Float64:
+        file = self._folder / "poses.txt"
+        if number >= len(self._rows):
+            raise BadFrameError(file, f"has {len(self._rows)} rows and so no pose for image {number}")
+        line, text = self._rows[number]
+        try:
+            values = np.array([float(word) for word in text.split()], np.float64)
+        except ValueError as error:
+            raise BadFrameError(file, f"line {line}: {error}") from error
+        if values.size != 16:
+            raise BadFrameError(file, f"line {line}: expected 16 numbers (4x4, row by row), got {values.size}")
+        return check_frame_pose(values.reshape(4, 4), file, line)
+
+    def _read_stamps(self, frame_hz: float) -> list[int]:
+        file = self._folder / "timestamps.txt"
+        count = max(len(self._rows), max(self._color) + 1)
+        if not file.exists():
+            self.notices.append(f"no timestamps.txt: stamps are made up at {frame_hz:g} frames a second")
+            return [round(i * 1e9 / frame_hz) for i in range(count)]
+        try:
+            stamps = [seconds_to_ns(t) if "." in t else int(t) for _, t in read_lines(file)]
+        except ValueError as error:
+            raise ImportSourceError(f"{file}: {error}") from error
+        if len(stamps) < count or any(b <= a for a, b in pairwise(stamps)) or min(stamps) < 0:
+            raise ImportSourceError(f"{file}: needs a rising stamp for each of {count} frames, has {len(stamps)} rows")
+        return stamps
+
+    def _read_label_set(self) -> LabelSet | None:
+        file = self._folder / "labels.json"
+        if not file.exists():
+            if (self._folder / "label").is_dir():
+                self.notices.append("label/ is left out: labels.json, which names its classes, is missing")
+            return None
+        try:
+            return label_set_from(msgspec.json.decode(file.read_bytes(), type=_Labels), self._folder.resolve().name)
+        except (msgspec.DecodeError, OSError, LabelError, ValueError) as error:
+            raise ImportSourceError(f"{file}: {error}") from error
+
+
+def read_intrinsics(file: Path) -> tuple[CameraIntrinsics, float]:
+    """``intrinsics.json`` -> intrinsics and depth units a metre.
+
+    Raises:
+        ImportSourceError: missing, or a value that cannot be.
+    """
+    try:
+        i = msgspec.json.decode(file.read_bytes(), type=_Intrinsics)
+        return CameraIntrinsics(i.fx, i.fy, i.cx, i.cy, i.width, i.height), i.depth_scale
+    except OSError as error:
+        raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
+    except (msgspec.DecodeError, FrameError) as error:
+        raise ImportSourceError(f"{file}: {error}") from error
+
+
+def label_set_from(labels: _Labels, folder_name: str) -> LabelSet:
+    """Label set of a recording: its own ids and names; the colours of a known set where it draws its ids from one.
+
+    Raises:
+        LabelError, ValueError: ids that are no numbers of 0 to 255, or a class twice.
+    """
+    classes = {int(key): name for key, name in labels.classes.items()}
+    classes.pop(labels.ignore, None)
+    ids = sorted(classes)
+    name = labels.id_space.lower() or folder_name
+    own = make_label_set(name, [classes[i] for i in ids], ids=ids, ignore_id=labels.ignore)
+    known = PROVIDED.get(name)
+    if known is None:
+        return own
+    known_colors = dict(zip(known.ids, known.colors, strict=True))
+    colors = tuple(known_colors.get(i, color) for i, color in zip(ids, own.colors, strict=True))
+    return LabelSet(own.name, own.ids, own.names, colors, own.ignore_id)

@@ -1,0 +1,129 @@
+"""Any foreign recording -> log: choose the importer, write what is good, report what is not."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from replay.importers.base import BadFrameError, ImportOptions, ImportReport, Recording, Skipped
+from replay.importers.folder import FolderRecording
+from replay.importers.scannet import ScanNetRecording
+from replay.importers.tum import TumRecording
+from replay.log import LogWriter
+from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LogError
+from semantic_mapper.transport.codec import CodecOptions
+
+FORMATS: dict[str, Callable[[Path, ImportOptions], Recording]] = {
+    "folder": FolderRecording,
+    "tum": TumRecording,
+    "scannet": ScanNetRecording,
+}
+
+# What a folder of each format has, and no other.
+_MARKS = {
+    "folder": ("color", "poses.txt", "intrinsics.json"),
+    "tum": ("rgb.txt", "depth.txt", "groundtruth.txt"),
+    "scannet": ("color", "depth", "pose"),
+}
+
+_DEFAULTS = ImportOptions()
+
+
+def detect_format(src: Path) -> str:
+    """Format of a recording by the files in its folder.
+
+    Raises:
+        ImportSourceError: no such folder, or none of the formats.
+    """
+    if not src.exists():
+        raise ImportSourceError(f"{src}: no such folder")
+    if src.is_file():
+        is_log = src.suffix == ".mcap"
+        hint = "is a log already; replay it as it is" if is_log else "is a file, not the folder of a recording"
+        raise ImportSourceError(f"{src}: {hint}")
+    missing: list[str] = []
+    for name, marks in _MARKS.items():
+        lacks = [mark for mark in marks if not (src / mark).exists()]
+        if not lacks:
+            return name
+        missing.append(f"{name} (lacks {', '.join(lacks)})")
+    raise ImportSourceError(f"{src}: is no recording of a known format: {'; '.join(missing)}")
+
+
+def import_recording(
+    src: Path,
+    dst: Path,
+    format_name: str | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
+    *,
+    options: ImportOptions = _DEFAULTS,
+    codec: CodecOptions | None = None,
+) -> ImportReport:
+    """Write the recording in folder ``src`` to the log ``dst``, which is replaced only by a complete import.
+
+    A frame that cannot be used is left out and reported; a bad label image costs the frame its label only.
+
+    Args:
+        src: Folder of the recording.
+        dst: Log to write.
+        format_name: "folder", "tum" or "scannet"; None = found out.
+        on_progress: Called with (frames looked at, frames in all).
+        options: How to read.
+        codec: How to pack; lossless by default, images that are JPEG or PNG files stay what they are.
+
+    Raises:
+        ImportSourceError: not such a recording, or not one good frame in it.
+        LogError: ``dst`` cannot be written.
+    """
+    name = format_name or detect_format(src)
+    if name not in FORMATS:
+        raise ImportSourceError(f"no format '{name}'; there are {', '.join(FORMATS)}")
+    if not src.is_dir():
+        raise ImportSourceError(f"{src}: no such folder")
+    recording = FORMATS[name](src, options)
+    total = len(recording) if options.max_frames is None else min(len(recording), options.max_frames)
+    info = dataclasses.replace(recording.info, frame_count=None)  # what the log holds counts, not what the folder did
+    packing = codec or CodecOptions(depth_scale=recording.depth_scale)
+    unfinished = dst.with_name(f".{dst.name}.importing")
+    try:
+        with LogWriter(unfinished, info, options=packing, overwrite=True) as writer:
+            labelled, skipped = _copy(recording, writer, total, on_progress, keep_files=codec is None)
+            frames = writer.frames
+        if frames == 0:
+            reasons = "; ".join(f"{s.file}: {s.reason}" for s in skipped[:3])
+            raise ImportSourceError(f"{src}: none of its {total} frames can be used: {reasons}")
+        os.replace(unfinished, dst)
+    except OSError as error:
+        raise LogError(f"{dst}: cannot be written: {error}") from error
+    finally:
+        unfinished.unlink(missing_ok=True)
+    return ImportReport(frames, labelled, tuple(skipped), tuple(recording.notices), name, info, dst.stat().st_size)
+
+
+def _copy(
+    recording: Recording,
+    writer: LogWriter,
+    total: int,
+    on_progress: Callable[[int, int], None] | None,
+    *,
+    keep_files: bool,
+) -> tuple[int, list[Skipped]]:
+    skipped: list[Skipped] = []
+    labelled = 0
+    for number in range(total):
+        try:
+            loaded = recording.load(number)
+            writer.write_frame(loaded.frame, encoded_rgb=loaded.encoded_rgb if keep_files else None)
+        except BadFrameError as error:
+            skipped.append(Skipped(error.file, error.reason, number))
+        except (FrameError, CodecError) as error:
+            skipped.append(Skipped(Path(f"frame {number}"), str(error), number))
+        else:
+            labelled += loaded.frame.label is not None
+            if loaded.label_error is not None:
+                skipped.append(loaded.label_error)
+        if on_progress is not None:
+            on_progress(number + 1, total)
+    return labelled, skipped

@@ -1,0 +1,225 @@
+"""TUM RGB-D sequences: ``rgb.txt``, ``depth.txt`` (stamp, file), ``groundtruth.txt`` (stamp tx ty tz qx qy qz qw).
+
+Each colour image gets the depth image nearest in time (each depth image once) and the pose interpolated between its two
+neighbours; a frame that has no depth within 20 ms or no pose is left out. Depth is 5000 units a metre, registered to
+colour. Intrinsics come from ``intrinsics.json`` where the folder has one (same layout as in a sequence folder), else
+from the calibration published for freiburg1, 2 or 3, by the folder's name, else the default of the sensor's ROS driver.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from replay.importers.base import (
+    BadFrameError,
+    ImportOptions,
+    LoadedFrame,
+    check_frame_pose,
+    image_size_must_be,
+    read_depth,
+    read_lines,
+    read_rgb,
+    seconds_to_ns,
+)
+from replay.importers.folder import read_intrinsics
+from semantic_mapper.errors import ImportSourceError
+from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
+
+DEPTH_SCALE = 5000.0
+_POSE_GAP_NS = 200_000_000  # poses come at 100 Hz; over a longer gap nothing is interpolated
+
+_CALIBRATIONS = {
+    "freiburg1": CameraIntrinsics(517.3, 516.5, 318.6, 255.3, 640, 480),
+    "freiburg2": CameraIntrinsics(520.9, 521.0, 325.1, 249.7, 640, 480),
+    "freiburg3": CameraIntrinsics(535.4, 539.2, 320.1, 247.6, 640, 480),
+}
+_DEFAULT = CameraIntrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
+
+
+class TumRecording:
+    """A TUM sequence, opened; one frame for each line of ``rgb.txt``.
+
+    Args:
+        folder: Of the sequence.
+        options: See ``ImportOptions``.
+
+    Raises:
+        ImportSourceError: a list is missing or holds nothing that can be used.
+    """
+
+    def __init__(self, folder: Path, options: ImportOptions) -> None:
+        self.notices: list[str] = []
+        self.depth_scale = DEPTH_SCALE
+        self._folder = folder
+        self._options = options
+        self._intrinsics = self._read_intrinsics()
+        self._color = self._read_list(folder / "rgb.txt")
+        depth = self._read_list(folder / "depth.txt")
+        self._pose_stamps, self._poses = self._read_poses(folder / "groundtruth.txt")
+        self._depth_of = match_nearest(
+            np.array([stamp for stamp, _ in self._color], np.int64),
+            np.array([stamp for stamp, _ in depth], np.int64),
+            round(options.match_s * 1e9),
+        )
+        self._depth_files = [file for _, file in depth]
+        self.info = StreamInfo(
+            source=f"tum {folder.resolve().name}",
+            cameras={options.camera_id: self._intrinsics},
+            frame_count=len(self._color),
+            frame_hz=30.0,
+        )
+
+    def __len__(self) -> int:
+        return len(self._color)
+
+    def load(self, number: int) -> LoadedFrame:
+        """Read one frame.
+
+        Raises:
+            BadFrameError: it cannot be used.
+        """
+        stamp, file = self._color[number]
+        if self._depth_of[number] < 0:
+            raise BadFrameError(file, f"no depth image within {self._options.match_s * 1e3:g} ms of it in depth.txt")
+        pose = interpolate_pose(stamp, self._pose_stamps, self._poses, round(self._options.match_s * 1e9))
+        if pose is None:
+            raise BadFrameError(file, f"groundtruth.txt has no pose near its time {stamp / 1e9:.6f}")
+        rgb, encoded = read_rgb(file)
+        image_size_must_be(rgb, self._intrinsics, file)
+        size = (self._intrinsics.height, self._intrinsics.width)
+        depth = read_depth(self._depth_files[self._depth_of[number]], self.depth_scale, size)
+        frame = PosedFrame(
+            stamp_ns=stamp,
+            seq=number,
+            camera_id=self._options.camera_id,
+            rgb=rgb,
+            depth_m=depth,
+            label=None,
+            intrinsics=self._intrinsics,
+            T_world_camera=check_frame_pose(pose, self._folder / "groundtruth.txt"),
+        )
+        return LoadedFrame(frame, encoded)
+
+    def _read_intrinsics(self) -> CameraIntrinsics:
+        file = self._folder / "intrinsics.json"
+        if file.exists():
+            intrinsics, self.depth_scale = read_intrinsics(file)
+            return intrinsics
+        name = self._folder.resolve().name
+        for key, calibration in _CALIBRATIONS.items():
+            if key in name:
+                if key != "freiburg3":
+                    self.notices.append(
+                        f"the lens distortion of {key} is not undone; rectify the images for best results"
+                    )
+                return calibration
+        self.notices.append("no intrinsics.json and no freiburg1, 2 or 3 in the name: the ROS default f = 525 is used")
+        return _DEFAULT
+
+    def _read_list(self, file: Path) -> list[tuple[int, Path]]:
+        entries: list[tuple[int, Path]] = []
+        for line, text in read_lines(file):
+            words = text.split(maxsplit=1)
+            try:
+                entries.append((seconds_to_ns(words[0]), self._inside(words[1].strip())))
+            except (ValueError, IndexError) as error:
+                self.notices.append(f"{file}, line {line} is passed over: expected 'stamp file' ({error})")
+        if not entries:
+            raise ImportSourceError(f"{file}: holds no line 'stamp file'")
+        return sorted(entries, key=lambda entry: entry[0])
+
+    def _inside(self, name: str) -> Path:
+        path = self._folder / name
+        if not path.resolve().is_relative_to(self._folder.resolve()):
+            raise ValueError(f"'{name}' lies outside the recording")
+        return path
+
+    def _read_poses(self, file: Path) -> tuple[NDArray[np.int64], Float64]:
+        stamps: list[int] = []
+        rows: list[list[float]] = []
+        for line, text in read_lines(file):
+            words = text.split()
+            try:
+                stamp, row = seconds_to_ns(words[0]), [float(word) for word in words[1:]]
+                if len(row) != 7 or not np.isfinite(row).all() or np.linalg.norm(row[3:]) < 0.5:
+                    raise ValueError("not 3 numbers of a position and 4 of a unit quaternion")
+            except (ValueError, IndexError) as error:
+                self.notices.append(f"{file}, line {line} is passed over: {error}")
+                continue
+            stamps.append(stamp)
+            rows.append(row)
+        if not rows:
+            raise ImportSourceError(f"{file}: holds no pose 'stamp tx ty tz qx qy qz qw'")
+        order = np.argsort(stamps, kind="stable")
+        return np.array(stamps, np.int64)[order], np.array(rows, np.float64)[order]
+
+
+def match_nearest(a_ns: NDArray[np.int64], b_ns: NDArray[np.int64], within_ns: int) -> list[int]:
+    """For each stamp of ``a`` the index of the nearest of ``b``, -1 = none; each of ``b`` goes to its nearest once.
+
+    Args:
+        a_ns, b_ns: (N,), (M,) rising.
+        within_ns: Largest difference.
+    """
+    right = np.clip(np.searchsorted(b_ns, a_ns), 1, max(len(b_ns) - 1, 1))
+    right = np.minimum(right, len(b_ns) - 1)
+    left = np.maximum(right - 1, 0)
+    nearest = np.where(np.abs(b_ns[left] - a_ns) <= np.abs(b_ns[right] - a_ns), left, right)
+    distance = np.abs(b_ns[nearest] - a_ns)
+    result = [-1] * len(a_ns)
+    taken: set[int] = set()
+    for i in np.argsort(distance, kind="stable"):
+        index = int(nearest[i])
+        if distance[i] <= within_ns and index not in taken:
+            taken.add(index)
+            result[int(i)] = index
+    return result
+
+
+def interpolate_pose(stamp_ns: int, stamps_ns: NDArray[np.int64], rows: Float64, within_ns: int) -> Float64 | None:
+    """Pose (4, 4) at a time: position linear, rotation spherical; None where there are no poses round that time.
+
+    Args:
+        stamp_ns: When.
+        stamps_ns: (N,) rising.
+        rows: (N, 7) tx ty tz qx qy qz qw.
+        within_ns: How far from a single pose (before the first, after the last, at a gap) it still counts.
+    """
+    after = int(np.searchsorted(stamps_ns, stamp_ns))
+    before = after - 1
+    if before >= 0 and after < len(rows) and stamps_ns[after] - stamps_ns[before] <= _POSE_GAP_NS:
+        share = float(stamp_ns - stamps_ns[before]) / float(stamps_ns[after] - stamps_ns[before])
+        position = (1 - share) * rows[before, :3] + share * rows[after, :3]
+        return _matrix(position, _slerp(rows[before, 3:], rows[after, 3:], share))
+    near = [i for i in (before, after) if 0 <= i < len(rows) and abs(int(stamps_ns[i]) - stamp_ns) <= within_ns]
+    if not near:
+        return None
+    best = min(near, key=lambda i: abs(int(stamps_ns[i]) - stamp_ns))
+    return _matrix(rows[best, :3], rows[best, 3:])
+
+
+def _slerp(a: Float64, b: Float64, share: float) -> Float64:
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    cosine = float(a @ b)
+    if cosine < 0:  # the same rotation, the short way round
+        b, cosine = -b, -cosine
+    if cosine > 0.9999:
+        return a + share * (b - a)
+    angle = np.arccos(cosine)
+    return (np.sin((1 - share) * angle) * a + np.sin(share * angle) * b) / np.sin(angle)
+
+
+def _matrix(position: Float64, quaternion: Float64) -> Float64:
+    x, y, z, w = quaternion / np.linalg.norm(quaternion)
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    T_world_camera[:3, 3] = position
+    return T_world_camera

@@ -1,0 +1,198 @@
+"""A mapping session: the pipeline plus the bookkeeping that every replay and every mapper node shares.
+
+``MapSession.process`` is the only way a frame reaches ``MappingPipeline.step``, whether it comes from a socket or from
+a log, so that both write the same map and the same summary.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import structlog
+
+from replay.artifacts import write_artifacts
+from replay.truth import SurfaceTruth, TruthMapper
+from semantic_mapper.config import MapperConfig, convert_config, to_plain
+from semantic_mapper.errors import FrameError, LabelError
+from semantic_mapper.evaluation.metrics import ConfusionMatrix, confusion_of
+from semantic_mapper.fields.base import SemanticField
+from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint
+from semantic_mapper.fields.sray import SRay
+from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.pipeline import MappingPipeline
+from semantic_mapper.types import MapUpdate, PosedFrame
+
+if TYPE_CHECKING:
+    from replay.rerun_log import RerunLog
+
+_log = structlog.get_logger(__name__)
+
+SNAPSHOTS = 8  # frames kept for the overview picture
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PipelineBundle:
+    """A pipeline with the weights it runs on."""
+
+    pipeline: MappingPipeline
+    checkpoint: Checkpoint
+    weights_path: Path
+
+
+def load_pipeline(weights: Path | None, config: MapperConfig) -> PipelineBundle:
+    """Load weights (None = those that ship with the package) and build the pipeline round them.
+
+    The map's classes are those of the weights. With ``sampling.mode = "streaming"`` and a model that the compiled
+    renderer covers, that renderer is used; the eager reference otherwise.
+
+    Raises:
+        WeightsError: missing, damaged or foreign weights.
+    """
+    path = weights or default_checkpoint_path()
+    checkpoint = load_checkpoint(path)
+    if config.render.encode_width == 0:
+        plain = to_plain(config)
+        plain["render"]["encode_width"] = checkpoint.width
+        config = convert_config(plain, MapperConfig, "mapper config")
+    pipeline = MappingPipeline(
+        config, make_field(checkpoint.model, config), checkpoint.label_set, anchors=checkpoint.anchors
+    )
+    return PipelineBundle(pipeline, checkpoint, path)
+
+
+def make_field(model: SRay, config: MapperConfig) -> SemanticField:
+    """The renderer that a config asks for, over given weights."""
+    compiled = config.sampling.mode == "streaming" and model.config.parity == "paper"
+    if compiled and not model.config.positional_encoding:
+        return StreamingSRay(model, config.sampling)
+    model.sampling = config.sampling
+    return model
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A frame that could not be used."""
+
+    seq: int
+    stamp_ns: int
+    reason: str
+
+
+class MapSession:
+    """Feeds frames to the pipeline, keeps count, and scores against labels where the stream has them.
+
+    Args:
+        bundle: From ``load_pipeline``.
+        stream_labels: Label set of the frames' label images; None where they have none.
+        exclude_stamps: Frames to leave out of the scores, beside those that the weights were finetuned on.
+        source: Name of the log or stream, for the summary.
+        rerun: Where to write a Rerun recording; None for none.
+    """
+
+    def __init__(
+        self,
+        bundle: PipelineBundle,
+        *,
+        stream_labels: LabelSet | None,
+        exclude_stamps: frozenset[int] = frozenset(),
+        source: str = "",
+        rerun: Path | None = None,
+    ) -> None:
+        self.bundle = bundle
+        self.pipeline = bundle.pipeline
+        self.source = source
+        self.exclude_stamps = exclude_stamps | bundle.checkpoint.train_stamps_ns
+        self.published = 0
+        self.fused = 0
+        self.dropped = 0
+        self.scored = 0
+        self.excluded = 0
+        self.refusals: list[Refusal] = []  # frames that were not mapped
+        self.label_refusals: list[Refusal] = []  # frames that were mapped, but whose label image cannot be used
+        self.damages: list[str] = []  # stretches of a log in which no frame can be made out
+        self.step_ms: list[float] = []
+        self.stage_ms: dict[str, list[float]] = {}
+        self.confusion = ConfusionMatrix(self.pipeline.label_set)
+        self.per_image: list[ConfusionMatrix] = []
+        self.truth = None if stream_labels is None else TruthMapper(stream_labels, self.pipeline.label_set)
+        self.surface_truth = SurfaceTruth(self.pipeline.label_set)
+        self.snapshots: list[tuple[PosedFrame, MapUpdate]] = []
+        self._snapshot_stride = 1
+        self._rerun = None if rerun is None else _open_rerun(rerun, self.pipeline.label_set)
+
+    def process(self, frame: PosedFrame) -> MapUpdate | None:
+        """Map one frame; None where it was refused (counted and logged, the map unchanged)."""
+        self.published += 1
+        began = time.perf_counter()
+        try:
+            update = self.pipeline.step(frame)
+        except FrameError as error:
+            self.refusals.append(Refusal(frame.seq, frame.stamp_ns, str(error)))
+            _log.error("frame_refused", seq=frame.seq, camera=frame.camera_id, reason=str(error))
+            return None
+        self.step_ms.append((time.perf_counter() - began) * 1e3)
+        for name, value in update.stage_ms.items():
+            self.stage_ms.setdefault(name, []).append(value)
+        self.fused += int(update.fused)
+        self._keep_snapshot(self._score(frame, update), update)
+        if self._rerun is not None:
+            self._rerun.log_step(frame, update)
+        return update
+
+    def refuse(self, seq: int, stamp_ns: int, reason: str) -> None:
+        """Count a frame that was damaged before it could be processed."""
+        self.published += 1
+        self.refusals.append(Refusal(seq, stamp_ns, reason))
+        _log.error("frame_refused", seq=seq, reason=reason)
+
+    def note_damage(self, reason: str) -> None:
+        """Keep word of a damaged stretch of a log; nobody knows how many frames it held."""
+        self.damages.append(reason)
+        _log.error("log_damaged", reason=reason)
+
+    def count_dropped(self, count: int) -> None:
+        """Count frames that were published but never reached this session."""
+        self.published += count
+        self.dropped += count
+
+    def finish(self, out: Path) -> dict[str, Any]:
+        """Write ``summary.json``, ``map.ply``, ``map.npz`` and ``overview.png`` to ``out``; returns the summary."""
+        return write_artifacts(self, out, self._rerun)
+
+    def _score(self, frame: PosedFrame, update: MapUpdate) -> PosedFrame:
+        """Score a frame against its label; returns it without a label that cannot be read."""
+        if self.truth is None or frame.label is None:
+            return replace(frame, label=None)
+        try:
+            truth = self.truth.to_map_ids(frame.label, f"frame seq={frame.seq}")
+        except LabelError as error:
+            _log.error("label_refused", seq=frame.seq, reason=str(error))
+            self.label_refusals.append(Refusal(frame.seq, frame.stamp_ns, f"mapped, but not scored: {error}"))
+            return replace(frame, label=None)
+        if frame.stamp_ns in self.exclude_stamps:
+            self.excluded += 1
+            return frame
+        self.scored += 1
+        image = confusion_of(truth, update.label, self.pipeline.label_set, f"frame seq={frame.seq}")
+        self.confusion += image
+        self.per_image.append(image)
+        self.surface_truth.add(replace(frame, label=truth))
+        return frame
+
+    def _keep_snapshot(self, frame: PosedFrame, update: MapUpdate) -> None:
+        """A bounded, evenly spread sample of the session, whatever its length."""
+        if self.fused % self._snapshot_stride == 0:
+            self.snapshots.append((frame, update))
+        if len(self.snapshots) > SNAPSHOTS:
+            self.snapshots = self.snapshots[::2]
+            self._snapshot_stride *= 2
+
+
+def _open_rerun(path: Path, label_set: LabelSet) -> RerunLog:
+    from replay.rerun_log import RerunLog  # loads for over a second, and few sessions need it
+
+    return RerunLog(path, label_set)

@@ -1,0 +1,72 @@
+"""Compare a replay's map with a reference mesh: how far the surface is off, how much of it is there, and its labels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+
+from semantic_mapper.errors import MapError
+from semantic_mapper.evaluation.metrics import map_miou
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.open3d_loader import load_open3d
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.types import Float32
+
+NEAR_M = 0.05  # a mesh vertex with a map point this near counts as mapped
+
+
+def compare_with_mesh(folder: Path, mesh: Path) -> dict[str, Any]:
+    """Figures of the map in a replay's folder against a mesh in the same world frame.
+
+    Args:
+        folder: Holds ``map.npz``.
+        mesh: .npz with ``vertices`` (V, 3) metres, ``faces`` (F, 3) and, if there are any, ``label`` (V,) uint8 ids of
+            the replay's label set (0 and other ids are not counted).
+
+    Returns:
+        ``median_m``, ``p95_m``: distance of map points to the mesh; ``on_mesh``: share of map points within 5 cm of it
+        (a map may hold more than the mesh); ``complete``: share of vertices with a map point within 5 cm;
+        ``mesh_miou``: labels at the vertices, null without labels.
+
+    Raises:
+        MapError: a file is missing or does not hold what it should.
+    """
+    try:
+        with np.load(mesh) as data:
+            vertices, faces = data["vertices"].astype(np.float32), data["faces"].astype(np.int32)
+            label = data.get("label")
+    except (OSError, KeyError, ValueError) as error:
+        raise MapError(f"{mesh}: needs arrays 'vertices' (V, 3) and 'faces' (F, 3) in an .npz: {error}") from error
+    voxel_map = VoxelMap.load(folder / "map.npz")
+    points = voxel_map.points()
+    if not len(points.xyz):
+        raise MapError(f"{folder / 'map.npz'}: the map is empty")
+    distance = _distance_to_mesh(points.xyz, vertices, faces)
+    nearest, _ = cKDTree(points.xyz).query(vertices, workers=-1)
+    found: dict[str, Any] = {
+        "median_m": round(float(np.median(distance)), 5),
+        "p95_m": round(float(np.percentile(distance, 95)), 4),
+        "on_mesh": round(float((distance < NEAR_M).mean()), 4),
+        "complete": round(float((nearest < NEAR_M).mean()), 4),
+        "mesh_miou": None,
+    }
+    if label is not None:
+        found["mesh_miou"] = _label_score(vertices, label, points, voxel_map.label_set)
+    return found
+
+
+def _distance_to_mesh(xyz: Float32, vertices: Float32, faces: Any) -> Float32:
+    o3d = load_open3d()
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces.astype(np.uint32)))
+    return scene.compute_distance(o3d.core.Tensor(np.ascontiguousarray(xyz))).numpy()
+
+
+def _label_score(vertices: Float32, label: Any, points: MapPoints, label_set: LabelSet) -> float | None:
+    known = np.isin(label, label_set.ids)
+    truth = np.where(known, label, label_set.ignore_id).astype(np.uint8)
+    return map_miou(vertices, truth, points.xyz, points.label, label_set, max_distance_m=NEAR_M)

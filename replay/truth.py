@@ -1,0 +1,79 @@
+"""Ground truth in the classes of the map: per frame by class name, and per surface point by majority of the frames."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.geometry import invert_pose, transform
+from semantic_mapper.imaging import resize_depth, resize_label, working_intrinsics
+from semantic_mapper.labels import IGNORE_CHANNEL, LabelSet
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
+
+TRUTH_WIDTH = 320
+MAX_FRAMES = 400  # frames whose truth is kept; beyond that every second one goes
+AGREEMENT_M = 0.04  # a frame votes on a surface point only where its depth is this near to it
+
+
+class TruthMapper:
+    """Translates label ids of a stream to those of the map by class name; classes that the map lacks are ignored."""
+
+    def __init__(self, stream: LabelSet, target: LabelSet) -> None:
+        self._stream = stream
+        self._table = target.to_ids(target.channel_map_from(stream))
+        self.shared = tuple(n for n in stream.names if n in target.names)
+
+    def to_map_ids(self, label: UInt8, where: str) -> UInt8:
+        """Label image in ids of the map.
+
+        Raises:
+            LabelError: an id that the stream's own label set does not know.
+        """
+        self._stream.to_channels(label, where)
+        return self._table[label]
+
+
+class SurfaceTruth:
+    """Truth labels of map points: each labelled frame that sees a point votes, the majority wins."""
+
+    def __init__(self, label_set: LabelSet) -> None:
+        self._label_set = label_set
+        self._frames: list[tuple[Float64, CameraIntrinsics, Float32, UInt8]] = []
+        self._stride = 1
+        self._seen = 0
+
+    def add(self, frame: PosedFrame) -> None:
+        """Remember what a labelled frame (ids of the map's label set) says, at reduced size."""
+        if frame.label is None or frame.depth_m is None:
+            return
+        if self._seen % self._stride == 0:
+            k = working_intrinsics(frame.intrinsics, TRUTH_WIDTH)
+            self._frames.append((frame.T_world_camera, k, resize_depth(frame, k), resize_label(frame.label, k)))
+        self._seen += 1
+        if len(self._frames) > MAX_FRAMES:
+            self._frames = self._frames[::2]
+            self._stride *= 2
+
+    def labels_at(self, xyz: Float32) -> UInt8:
+        """Truth ids (N,) of world points (N, 3); the ignore id where no labelled frame saw the point."""
+        votes = np.zeros((len(xyz), len(self._label_set)), np.uint16)
+        points = xyz.astype(np.float64)
+        for T_world_camera, k, depth, label in self._frames:
+            row, column, visible = _look_up(points, T_world_camera, k, depth)
+            channel = self._label_set.to_channels(label)[row, column]
+            index = np.flatnonzero(visible & (channel != IGNORE_CHANNEL))
+            votes[index, channel[index]] += 1
+        channel = np.where(votes.any(axis=1), votes.argmax(axis=1), IGNORE_CHANNEL)
+        return self._label_set.to_ids(channel)
+
+
+def _look_up(
+    points: Float64, T_world_camera: Float64, k: CameraIntrinsics, depth: Float32
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    p = transform(invert_pose(T_world_camera), points)
+    z = np.maximum(p[:, 2], 1e-3)
+    u, v = np.rint(k.fx * p[:, 0] / z + k.cx), np.rint(k.fy * p[:, 1] / z + k.cy)
+    inside = (p[:, 2] > 0.05) & (u >= 0) & (u < k.width) & (v >= 0) & (v < k.height)
+    row, column = np.where(inside, v, 0).astype(np.int64), np.where(inside, u, 0).astype(np.int64)
+    measured = depth[row, column]
+    return row, column, inside & (measured > 0) & (np.abs(measured - p[:, 2]) < AGREEMENT_M)

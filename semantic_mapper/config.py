@@ -1,0 +1,151 @@
+"""Typed configuration with a default for every value, read from TOML. An unknown key is an error.
+
+Every struct here is frozen; ``load_config`` fills one from a file, ``to_toml_dict`` gives it back as plain data.
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import msgspec
+
+from semantic_mapper.errors import ConfigError
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Base of all configuration structs."""
+
+
+class SRayConfig(Config, frozen=True):
+    """Shape of the S-Ray network; part of every checkpoint."""
+
+    feature_dim: int = 32  # C of the paper
+    heads: int = 4  # H; d_k = C / H
+    encoder_width: int = 32  # channels of the first encoder stage
+    encoder_blocks: tuple[int, ...] = (1, 2, 3, 3)  # residual blocks a stage
+    tau: float = 0.02  # Eq. 12: view weights lie in (tau / m, 1 / (tau m))
+    positional_encoding: bool = False  # sinusoid along the ray; the paper uses none
+    intra_view_attention: bool = True  # Eq. 6 to 9
+    cross_view_attention: bool = True  # Eq. 10
+    source_labels: bool = True  # known labels of source views (finetuning keyframes) are part of their features
+    attention_residual: bool = True  # M + f(M) instead of f(M) in Eq. 9 and 10; trains faster
+    parity: Literal["paper", "published"] = "paper"  # "published": depart from the paper where its code does
+
+
+class SamplingConfig(Config, frozen=True):
+    """Where a ray is sampled."""
+
+    mode: Literal["reference", "streaming"] = "streaming"
+    coarse: int = 64  # reference: uniform in inverse depth
+    fine: int = 64  # reference: drawn from the coarse weights
+    guided: int = 8  # streaming: round the depth prior, or uniform in inverse depth where there is none
+    free_space: int = 1  # of the guided samples: between the camera and the guided interval
+    guided_sigma: float = 0.02  # half width of the guided interval: guided_sigma * z + guided_floor_m
+    guided_floor_m: float = 0.04
+    near_m: float = 0.3
+    far_m: float = 8.0
+
+
+class KeyframeConfig(Config, frozen=True):
+    """When a frame becomes a source view, and which views a query uses."""
+
+    translation_m: float = 0.15  # new keyframe when moved this far from the nearest one, or ...
+    rotation_deg: float = 12.0  # ... turned this far
+    capacity: int = 64  # keyframes kept; the one whose loss costs least coverage goes first
+    source_views: int = 8  # m of the paper
+    use_current_view: bool = True  # the frame being mapped is itself a source view of its rendering
+
+
+class VoxelMapConfig(Config, frozen=True):
+    """The fused map."""
+
+    voxel_size_m: float = 0.02
+    truncation_voxels: float = 4.0
+    depth_max_m: float = 5.0
+    max_weight: float = 255.0  # cap of the TSDF weight, so that the map stays able to change
+    initial_blocks: int = 2000  # capacity at start; grows by half when full
+    max_blocks: int = 200_000  # refuse to grow past this, with a clear error
+    vote_discount: float = 0.5  # rho: how much a repeated view of a voxel repeats what earlier views said
+    vote_band_voxels: float = 2.0  # only voxels this near the surface take class votes
+
+
+class RenderConfig(Config, frozen=True):
+    """Resolution and chunking of the rendered view."""
+
+    scale: float = 0.25  # rendered rays a side, relative to the frame; lifted to full size along image edges
+    encode_width: int = 0  # source images are resized to this width to be encoded; 0 = what the weights were trained at
+    rays_per_chunk: int = 2048
+
+
+class MapperConfig(Config, frozen=True):
+    """Everything ``MappingPipeline`` needs."""
+
+    sampling: SamplingConfig = SamplingConfig()
+    keyframes: KeyframeConfig = KeyframeConfig()
+    voxel_map: VoxelMapConfig = VoxelMapConfig()
+    render: RenderConfig = RenderConfig()
+    seed: int = 0
+
+
+ConfigT = TypeVar("ConfigT", bound=msgspec.Struct)
+
+
+def load_config(path: Path, kind: type[ConfigT]) -> ConfigT:
+    """Read a TOML file onto ``kind``.
+
+    Raises:
+        ConfigError: file missing, not TOML, unknown key (with the nearest valid one), or a value of the wrong type.
+    """
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path}: no such file") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+    return convert_config(data, kind, str(path))
+
+
+def convert_config(data: Any, kind: type[ConfigT], where: str) -> ConfigT:
+    """Check plain data against ``kind``; see ``load_config``."""
+    try:
+        return msgspec.convert(data, kind)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{where}: {error}{_nearest_key(str(error), kind)}") from error
+
+
+def to_plain(config: msgspec.Struct) -> dict[str, Any]:
+    """Config -> nested dicts and lists of plain values."""
+    return msgspec.to_builtins(config)
+
+
+def _nearest_key(message: str, kind: type[msgspec.Struct]) -> str:
+    if "unknown field" not in message:
+        return ""
+    wrong = message.split("unknown field")[1].split("`")[1]
+    keys = sorted(_keys_at(message, kind) - {wrong})
+    near = difflib.get_close_matches(wrong, keys, n=1, cutoff=0.5)
+    return f"; did you mean `{near[0]}`?" if near else f"; valid keys are {', '.join(keys)}"
+
+
+def _keys_at(message: str, kind: type[msgspec.Struct]) -> set[str]:
+    """Keys of the section that msgspec names ("... - at `$.voxel_map`"), else of all sections."""
+    path = message.rpartition(" - at `$.")[2].rstrip("`").split(".") if " - at `$." in message else []
+    section = kind
+    for name in path:
+        inner = next((item.type for item in msgspec.structs.fields(section) if item.name == name), None)
+        if not (isinstance(inner, type) and issubclass(inner, msgspec.Struct)):
+            return _all_keys(kind)
+        section = inner
+    return {item.name for item in msgspec.structs.fields(section)}
+
+
+def _all_keys(kind: type[msgspec.Struct]) -> set[str]:
+    keys: set[str] = set()
+    for item in msgspec.structs.fields(kind):
+        keys.add(item.name)
+        if isinstance(item.type, type) and issubclass(item.type, msgspec.Struct):
+            keys |= _all_keys(item.type)
+    return keys

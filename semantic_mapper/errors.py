@@ -1,0 +1,59 @@
+"""The one error tree. Every message says what is wrong, where, and how to mend it."""
+
+from __future__ import annotations
+
+
+class SemanticMapperError(Exception):
+    """Base of every error this project raises on purpose."""
+
+
+class ShapeError(SemanticMapperError, ValueError):
+    """An array has another shape or dtype than the call asks for."""
+
+
+class FrameError(SemanticMapperError, ValueError):
+    """One frame cannot be used; the frames around it can."""
+
+
+class PoseError(FrameError):
+    """A pose is not a rigid transform (NaN, not a rotation, wrong last row)."""
+
+
+class LabelError(SemanticMapperError, ValueError):
+    """A class id or name is not in the label set at hand."""
+
+
+class ConfigError(SemanticMapperError, ValueError):
+    """A configuration file or value cannot be used."""
+
+
+class CodecError(SemanticMapperError, ValueError):
+    """Bytes from a socket or a log are not a message of ours."""
+
+
+class TransportError(SemanticMapperError, OSError):
+    """A socket cannot be opened, or the other side is missing or does not keep up."""
+
+
+class LogError(SemanticMapperError):
+    """A recorded log cannot be opened or read."""
+
+
+class ImportSourceError(SemanticMapperError):
+    """A foreign recording cannot be imported."""
+
+
+class WeightsError(SemanticMapperError):
+    """A weights file is missing, damaged, or does not fit the model or label set."""
+
+
+class MapError(SemanticMapperError):
+    """The voxel map, or a saved one, cannot be used as asked."""
+
+
+class DependencyError(SemanticMapperError, ImportError):
+    """A package or system library that a feature needs cannot be loaded."""
+
+
+class NodeError(SemanticMapperError, RuntimeError):
+    """A node process could not start, or ended when it should not have."""

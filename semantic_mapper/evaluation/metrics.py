@@ -1,0 +1,273 @@
+"""Segmentation accuracy of images and maps, and whether confidences can be believed.
+
+One implementation for everything the project reports. Rules, the same everywhere:
+
+- Pixels whose truth is the ignore id do not count.
+- A prediction of "unknown" (the ignore id) where the truth is known counts as wrong: it lowers the accuracy and the
+  IoU of the true class, and raises no other class's union. A method gains nothing by staying silent.
+- Means over classes run over the classes that occur in the truth. A class that is only predicted lowers the others
+  by the pixels it took from them and adds no term of its own.
+- Figures of a data set come from one confusion matrix over all its pixels; ``metrics_per_image`` are another number
+  and are always named so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from semantic_mapper.errors import ShapeError
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.types import Float32, Float64, UInt8
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentationMetrics:
+    """Figures in 0..1; ``None`` where no pixel had a truth.
+
+    Args:
+        miou: Mean intersection over union of the classes that occur in the truth.
+        total_accuracy: Share of the pixels that are right.
+        average_accuracy: Mean over the classes in the truth of the share of their pixels that is right.
+        coverage: Share of the pixels with any prediction but "unknown".
+        per_class: IoU by class name, for the classes that occur in the truth, in the label set's order.
+        pixels: How many pixels were counted.
+    """
+
+    miou: float | None
+    total_accuracy: float | None
+    average_accuracy: float | None
+    coverage: float | None
+    per_class: dict[str, float] = field(default_factory=dict[str, float])
+    pixels: int = 0
+
+
+class ConfusionMatrix:
+    """Counts of (true class, predicted class) pixels of a label set; adds up over images, frames and processes.
+
+    Attributes:
+        label_set: Whose classes the rows and columns are, in channel order.
+        counts: (L, L + 1) int64; row = truth, column = prediction, the last column = predicted "unknown".
+    """
+
+    def __init__(self, label_set: LabelSet) -> None:
+        self.label_set = label_set
+        self.counts: NDArray[np.int64] = np.zeros((len(label_set), len(label_set) + 1), np.int64)
+
+    def update(self, truth: UInt8, predicted: UInt8, where: str = "label image") -> None:
+        """Count one image, map or batch.
+
+        Args:
+            truth: (...) uint8 class ids of the label set; the ignore id is not counted.
+            predicted: (...) uint8 class ids, the same shape; the ignore id means "unknown" and counts as wrong.
+            where: Names the image in errors.
+
+        Raises:
+            ShapeError: the shapes differ.
+            LabelError: an id is not in the label set.
+        """
+        if truth.shape != predicted.shape:
+            raise ShapeError(
+                f"{where}: truth has shape {truth.shape} and the prediction {predicted.shape}; resize one of them"
+            )
+        true_channel = self.label_set.to_channels(truth, f"{where}: truth").ravel()
+        channel = self.label_set.to_channels(predicted, f"{where}: prediction").ravel()
+        counted = true_channel >= 0
+        columns = self.counts.shape[1]
+        channel = np.where(channel >= 0, channel, columns - 1)
+        cells = true_channel[counted] * columns + channel[counted]
+        self.counts += np.bincount(cells, minlength=self.counts.size).reshape(self.counts.shape)
+
+    def __add__(self, other: ConfusionMatrix) -> ConfusionMatrix:
+        if other.label_set.names != self.label_set.names:
+            raise ShapeError(
+                f"confusion matrices of different label sets ('{self.label_set.name}' and '{other.label_set.name}') "
+                "cannot be added; map the labels with LabelSet.channel_map_from first"
+            )
+        total = ConfusionMatrix(self.label_set)
+        total.counts = self.counts + other.counts
+        return total
+
+    def iou(self) -> Float64:
+        """(L,) intersection over union; NaN for a class that does not occur in the truth."""
+        hits, occurring = self._hits(), self.counts.sum(axis=1)
+        union = occurring + self.counts[:, :-1].sum(axis=0) - hits
+        return np.divide(hits, union, out=np.full(len(hits), np.nan), where=occurring > 0)
+
+    def class_accuracy(self) -> Float64:
+        """(L,) share of each class's pixels that is right; NaN for a class that does not occur in the truth."""
+        hits, occurring = self._hits(), self.counts.sum(axis=1)
+        return np.divide(hits, occurring, out=np.full(len(hits), np.nan), where=occurring > 0)
+
+    def metrics(self) -> SegmentationMetrics:
+        """All figures; ``None`` where nothing was counted."""
+        pixels = int(self.counts.sum())
+        if pixels == 0:
+            return SegmentationMetrics(None, None, None, None)
+        iou = self.iou()
+        named = zip(self.label_set.names, iou, strict=True)
+        return SegmentationMetrics(
+            miou=float(np.nanmean(iou)),
+            total_accuracy=float(self._hits().sum() / pixels),
+            average_accuracy=float(np.nanmean(self.class_accuracy())),
+            coverage=1.0 - float(self.counts[:, -1].sum() / pixels),
+            per_class={name: float(value) for name, value in named if np.isfinite(value)},
+            pixels=pixels,
+        )
+
+    def _hits(self) -> Float64:
+        return np.diagonal(self.counts).astype(np.float64)
+
+
+def confusion_of(truth: UInt8, predicted: UInt8, label_set: LabelSet, where: str = "label image") -> ConfusionMatrix:
+    """Confusion matrix of one image; see ``ConfusionMatrix.update``."""
+    matrix = ConfusionMatrix(label_set)
+    matrix.update(truth, predicted, where)
+    return matrix
+
+
+def metrics_per_image(images: Iterable[ConfusionMatrix]) -> SegmentationMetrics:
+    """Mean over images of each image's own figures.
+
+    Images without a labelled pixel are left out; a class's figure is the mean over the images that show it.
+    """
+    each = [m for m in (image.metrics() for image in images) if m.pixels > 0]
+    names = dict.fromkeys(name for m in each for name in m.per_class)
+    return SegmentationMetrics(
+        miou=_mean([m.miou for m in each]),
+        total_accuracy=_mean([m.total_accuracy for m in each]),
+        average_accuracy=_mean([m.average_accuracy for m in each]),
+        coverage=_mean([m.coverage for m in each]),
+        per_class={name: float(np.mean([m.per_class[name] for m in each if name in m.per_class])) for name in names},
+        pixels=sum(m.pixels for m in each),
+    )
+
+
+def nearest_labels(
+    at_xyz: Float32 | Float64,
+    from_xyz: Float32 | Float64,
+    from_label: UInt8,
+    label_set: LabelSet,
+    *,
+    max_distance_m: float = 0.05,
+) -> UInt8:
+    """Carry labels from one set of points to another: each point takes the label of the nearest one.
+
+    Args:
+        at_xyz: (N, 3) metres, the points that ask.
+        from_xyz: (M, 3) metres, in the same frame; M may be 0.
+        from_label: (M,) uint8 class ids.
+        label_set: Gives the ignore id.
+        max_distance_m: Farther than this there is no answer.
+
+    Returns:
+        (N,) uint8 class ids; the ignore id where no point is near enough.
+
+    Raises:
+        ShapeError: not (N, 3), or as many labels as points.
+    """
+    for name, xyz in (("at_xyz", at_xyz), ("from_xyz", from_xyz)):
+        if xyz.ndim != 2 or xyz.shape[1] != 3:
+            raise ShapeError(f"{name}: expected shape (N, 3), got {xyz.shape}")
+    if from_label.shape != (len(from_xyz),):
+        raise ShapeError(
+            f"from_label: expected shape ({len(from_xyz)},) as from_xyz has points, got {from_label.shape}"
+        )
+    if not len(from_xyz) or not len(at_xyz):
+        return np.full(len(at_xyz), label_set.ignore_id, np.uint8)
+    _, nearest = KDTree(from_xyz).query(at_xyz, distance_upper_bound=max_distance_m, workers=-1)
+    return np.append(from_label, np.uint8(label_set.ignore_id))[nearest]  # no neighbour: index M
+
+
+def map_confusion(
+    truth_xyz: Float32 | Float64,
+    truth_label: UInt8,
+    map_xyz: Float32 | Float64,
+    map_label: UInt8,
+    label_set: LabelSet,
+    *,
+    max_distance_m: float = 0.05,
+) -> ConfusionMatrix:
+    """Confusion matrix of a map against a labelled mesh: each vertex of the truth asks the nearest map point.
+
+    A vertex that the map does not reach within ``max_distance_m`` counts as "unknown", that is wrong, so holes in the
+    map cost as much as wrong labels, and maps of different density are judged at the same places.
+
+    Args:
+        truth_xyz, truth_label: (V, 3) vertices in metres and their (V,) uint8 ids; the ignore id is not counted.
+        map_xyz, map_label: (N, 3) map points in the same frame and their (N,) uint8 ids.
+        label_set: Of both.
+        max_distance_m: How far a map point may be from a vertex to speak for it.
+
+    Raises:
+        ShapeError, LabelError: as ``nearest_labels`` and ``ConfusionMatrix.update``.
+    """
+    found = nearest_labels(truth_xyz, map_xyz, map_label, label_set, max_distance_m=max_distance_m)
+    return confusion_of(truth_label, found, label_set, "map")
+
+
+def map_miou(
+    truth_xyz: Float32 | Float64,
+    truth_label: UInt8,
+    map_xyz: Float32 | Float64,
+    map_label: UInt8,
+    label_set: LabelSet,
+    *,
+    max_distance_m: float = 0.05,
+) -> float | None:
+    """mIoU of ``map_confusion``; ``None`` where no vertex has a truth."""
+    matrix = map_confusion(truth_xyz, truth_label, map_xyz, map_label, label_set, max_distance_m=max_distance_m)
+    return matrix.metrics().miou
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """How confidence and accuracy agree, in bins of equal width.
+
+    Args:
+        ece: Expected calibration error: mean over the samples of |accuracy - confidence| of their bin.
+        confidence: (B,) mean confidence of each bin, NaN where it is empty.
+        accuracy: (B,) share of each bin that is right, NaN where it is empty.
+        count: (B,) int64 samples of each bin.
+    """
+
+    ece: float | None
+    confidence: Float64
+    accuracy: Float64
+    count: NDArray[np.int64]
+
+
+def calibration(confidence: Float32 | Float64, correct: NDArray[np.bool_], *, bins: int = 15) -> Calibration:
+    """Measure whether predictions of confidence p are right in a share p of the cases.
+
+    Args:
+        confidence: (...) in [0, 1], of the predicted class; only samples that have a truth.
+        correct: (...) bool, the same shape.
+        bins: How many bins of equal width; a sample on an edge belongs to the lower one.
+
+    Raises:
+        ShapeError: the shapes differ, or a confidence is outside [0, 1] or NaN.
+    """
+    if confidence.shape != correct.shape:
+        raise ShapeError(f"confidence has shape {confidence.shape}, correct {correct.shape}; give one per sample")
+    p = confidence.astype(np.float64).ravel()
+    if not np.all((p >= 0) & (p <= 1)):
+        raise ShapeError("confidence must lie in [0, 1] and hold no NaN; give probabilities, not logits")
+    index = np.clip(np.ceil(p * bins).astype(np.int64) - 1, 0, bins - 1)
+    count = np.bincount(index, minlength=bins)
+    filled = count > 0
+    empty = np.full(bins, np.nan)
+    mean_p = np.divide(np.bincount(index, weights=p, minlength=bins), count, out=empty.copy(), where=filled)
+    right = np.bincount(index, weights=correct.ravel().astype(np.float64), minlength=bins)
+    accuracy = np.divide(right, count, out=empty.copy(), where=filled)
+    ece = float((count[filled] * np.abs(accuracy - mean_p)[filled]).sum() / p.size) if p.size else None
+    return Calibration(ece, mean_p, accuracy, count)
+
+
+def _mean(values: list[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return float(np.mean(known)) if known else None

@@ -1,0 +1,1 @@
+"""Neural semantic fields: torch only."""

@@ -1,0 +1,80 @@
+"""The seam that all semantic fields share: encode source views once, render any number of rays from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+
+from semantic_mapper.errors import ShapeError
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.types import FieldRender, RayBatch, SourceViews
+
+MAX_SOURCE_VIEWS = 16
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EncodedViews:
+    """Per-view maps of m source views, each independent of the others, so that a keyframe is encoded once.
+
+    Args:
+        feature: (m, C, h, w) image features, the F_j of S-Ray Eq. 5.
+        rgb: (m, 3, h, w) in [0, 1], at feature resolution.
+        geometry: (m, 5, h, w) mixture of logistics along each view ray; see ``fields.geometry_net``.
+        K: (m, 3, 3) in pixels of (h, w).
+        T_camera_world: (m, 4, 4).
+    """
+
+    feature: torch.Tensor
+    rgb: torch.Tensor
+    geometry: torch.Tensor
+    K: torch.Tensor
+    T_camera_world: torch.Tensor
+
+    def __len__(self) -> int:
+        return int(self.feature.shape[0])
+
+    def select(self, index: torch.Tensor) -> EncodedViews:
+        """The views at ``index`` (k,) int64."""
+        return EncodedViews(
+            self.feature[index], self.rgb[index], self.geometry[index], self.K[index], self.T_camera_world[index]
+        )
+
+
+def stack_views(views: Sequence[EncodedViews]) -> EncodedViews:
+    """Join encoded views of equal resolution.
+
+    Raises:
+        ShapeError: none or too many views, or different resolutions.
+    """
+    if not 1 <= sum(len(v) for v in views) <= MAX_SOURCE_VIEWS:
+        raise ShapeError(f"a render takes 1 to {MAX_SOURCE_VIEWS} source views, got {sum(len(v) for v in views)}")
+    sizes = {tuple(v.feature.shape[1:]) for v in views}
+    if len(sizes) != 1:
+        raise ShapeError(f"source views must share one feature resolution, got {sorted(sizes)}")
+    return EncodedViews(
+        torch.cat([v.feature for v in views]),
+        torch.cat([v.rgb for v in views]),
+        torch.cat([v.geometry for v in views]),
+        torch.cat([v.K for v in views]),
+        torch.cat([v.T_camera_world for v in views]),
+    )
+
+
+class SemanticField(Protocol):
+    """What training, finetuning, evaluation and streaming ask of a field."""
+
+    @property
+    def label_set(self) -> LabelSet:
+        """Classes of the rendered logits, in channel order."""
+        ...
+
+    def encode(self, views: SourceViews) -> EncodedViews:
+        """Encode source views, each by itself; the result may be cached."""
+        ...
+
+    def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
+        """Render rays from encoded source views; differentiable in training."""
+        ...

@@ -1,0 +1,243 @@
+"""Weights files: safetensors with everything needed to use them (model config, label set, recipe, anchors).
+
+A finetuned checkpoint carries its *anchors*: the labelled keyframes it was finetuned on, as images at working
+resolution with depth, labels and pose. They are source views of every later render in the same scene.
+"""
+
+from __future__ import annotations
+
+# torch and safetensors leave parts of their interface untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from semantic_mapper.config import SRayConfig, convert_config, to_plain
+from semantic_mapper.errors import ConfigError, LabelError, WeightsError
+from semantic_mapper.fields.sray import SRay
+from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, working_intrinsics
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.types import CameraIntrinsics, PosedFrame
+
+FORMAT = "semantic-mapper-weights"
+VERSION = 1
+LABEL_LOGIT = 6.0
+NEW_ROW_SPREAD = 0.2
+DEFAULT_WIDTH = 320  # of weights whose recipe does not say
+DEPTH_UNITS_PER_M = 4000.0  # anchors' depth as uint16: a quarter of a millimetre, up to 16 m
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Checkpoint:
+    """A field with its provenance.
+
+    Args:
+        model: In evaluation mode.
+        anchors: Frames the field was finetuned on, at working resolution.
+        recipe: How it was trained: plain data (seed, steps, seconds, figures, git revision, ``train_stamps_ns``, ...).
+    """
+
+    model: SRay
+    anchors: tuple[PosedFrame, ...] = ()
+    recipe: dict[str, Any] = field(default_factory=dict[str, Any])
+
+    @property
+    def label_set(self) -> LabelSet:
+        """Classes of the field."""
+        return self.model.label_set
+
+    @property
+    def width(self) -> int:
+        """Image width that the field was trained at, in pixels."""
+        return int(self.recipe.get("width", DEFAULT_WIDTH))
+
+    @property
+    def train_stamps_ns(self) -> frozenset[int]:
+        """Stamps of the frames whose labels the field has seen; evaluation leaves them out."""
+        return frozenset(int(s) for s in self.recipe.get("train_stamps_ns", ()))
+
+
+def default_checkpoint_path() -> Path:
+    """The small checkpoint that ships with the package."""
+    return Path(str(resources.files("semantic_mapper"))) / "weights" / "rooms.safetensors"
+
+
+def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -> None:
+    """Write atomically; ``half`` stores weights as float16 (half the size, for shipping)."""
+    tensors = {f"model.{name}": _stored(t, half) for name, t in checkpoint.model.state_dict().items()}
+    metadata = {
+        "format": FORMAT,
+        "version": str(VERSION),
+        "model_config": json.dumps(to_plain(checkpoint.model.config)),
+        "label_set": json.dumps(_label_set_to_plain(checkpoint.label_set)),
+        "recipe": json.dumps(checkpoint.recipe),
+    }
+    if checkpoint.anchors:
+        anchor_tensors, metadata["anchors"] = _pack_anchors(checkpoint.anchors)
+        tensors |= anchor_tensors
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    save_file(tensors, part, metadata)
+    os.replace(part, path)
+
+
+def load_checkpoint(path: Path) -> Checkpoint:
+    """Read a weights file.
+
+    Raises:
+        WeightsError: missing, damaged, of another format or version, or weights that do not fit their own config.
+    """
+    if not path.is_file():
+        raise WeightsError(f"{path}: no such weights file; make one with `semantic-mapper finetune` or check the path")
+    try:
+        with safe_open(path, framework="pt") as stored:
+            metadata = dict(stored.metadata() or {})
+            tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118 - not a dict
+    except (SafetensorError, OSError) as error:
+        raise WeightsError(f"{path}: not a readable safetensors file ({error}); fetch or train it again") from error
+    if metadata.get("format") != FORMAT:
+        raise WeightsError(
+            f"{path}: a safetensors file, but not weights of this project (no '{FORMAT}' in its metadata)"
+        )
+    if metadata.get("version") != str(VERSION):
+        raise WeightsError(f"{path}: weights format {metadata.get('version')}, this version reads {VERSION}")
+    try:
+        config = convert_config(json.loads(metadata["model_config"]), SRayConfig, str(path))
+        label_set = _label_set_from_plain(json.loads(metadata["label_set"]))
+        recipe = json.loads(metadata["recipe"])
+        anchors = _unpack_anchors(tensors, json.loads(metadata["anchors"])) if "anchors" in metadata else ()
+        model = SRay(config, label_set)
+    except (KeyError, TypeError, ValueError, ConfigError, LabelError) as error:
+        raise WeightsError(f"{path}: its metadata is damaged: {error}") from error
+    weights = {n.removeprefix("model."): t.float() for n, t in tensors.items() if n.startswith("model.")}
+    try:
+        model.load_state_dict(weights)
+    except RuntimeError as error:
+        raise WeightsError(f"{path}: weights do not fit their model config: {error}") from error
+    if not all(bool(torch.isfinite(t).all()) for t in weights.values()):
+        raise WeightsError(f"{path}: weights hold NaN or infinity; training diverged, train again")
+    return Checkpoint(model.eval(), anchors, recipe)
+
+
+def adapt_model(model: SRay, label_set: LabelSet) -> SRay:
+    """A copy of a field for another label set: all weights kept, classifier rows carried over by class name.
+
+    Rows of classes that the old set does not know start round the mean row, without a preference for any old class.
+    The codes of known labels start so that a label raises the logit of its own class by ``LABEL_LOGIT`` and that of no
+    other: before any training, views with labels already carry them over to what they see. Draws from torch's
+    generator.
+    """
+    adapted = SRay(model.config, label_set, model.sampling)
+    state = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    for name in ("classifier.weight", "classifier.bias"):
+        old = state[name]
+        spread = NEW_ROW_SPREAD if name.endswith("weight") else 0.0
+        rows = [
+            old[model.label_set.names.index(c)]
+            if c in model.label_set.names
+            else old.mean(0) + spread * torch.randn_like(old[0])
+            for c in label_set.names
+        ]
+        state[name] = torch.stack(rows)
+    if label_set != model.label_set or not bool(state["label_code.weight"].any()):  # trained codes stay
+        state["label_code.weight"] = LABEL_LOGIT * torch.linalg.pinv(state["classifier.weight"]).T.contiguous()
+    adapted.load_state_dict(state)
+    return adapted.to(next(model.parameters()).device)
+
+
+def anchor_from_frame(frame: PosedFrame, width: int) -> PosedFrame:
+    """A frame at working width, with depth rounded as the file stores it."""
+    intrinsics = working_intrinsics(frame.intrinsics, width)
+    depth = None
+    if frame.depth_m is not None:
+        depth = _depth_from_units(_depth_to_units(resize_depth(frame, intrinsics)))
+    return PosedFrame(
+        stamp_ns=frame.stamp_ns,
+        seq=frame.seq,
+        camera_id=frame.camera_id,
+        rgb=resize_rgb(frame, intrinsics),
+        depth_m=depth,
+        label=None if frame.label is None else resize_label(frame.label, intrinsics),
+        intrinsics=intrinsics,
+        T_world_camera=frame.T_world_camera,
+        pose_source=frame.pose_source,
+        pose_sigma=frame.pose_sigma,
+    )
+
+
+def _stored(tensor: torch.Tensor, half: bool) -> torch.Tensor:
+    tensor = tensor.detach().cpu().contiguous()
+    return tensor.half() if half and tensor.is_floating_point() else tensor
+
+
+def _depth_to_units(depth_m: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    return np.rint(np.clip(depth_m, 0, 65535 / DEPTH_UNITS_PER_M) * DEPTH_UNITS_PER_M).astype(np.uint16)
+
+
+def _depth_from_units(units: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    return units.astype(np.float32) / np.float32(DEPTH_UNITS_PER_M)
+
+
+def _pack_anchors(anchors: Sequence[PosedFrame]) -> tuple[dict[str, torch.Tensor], str]:
+    tensors: dict[str, torch.Tensor] = {}
+    described: list[dict[str, Any]] = []
+    for i, a in enumerate(anchors):
+        tensors[f"anchor.{i}.rgb"] = torch.from_numpy(np.ascontiguousarray(a.rgb))
+        if a.depth_m is not None:
+            tensors[f"anchor.{i}.depth"] = torch.from_numpy(_depth_to_units(a.depth_m))
+        if a.label is not None:
+            tensors[f"anchor.{i}.label"] = torch.from_numpy(np.ascontiguousarray(a.label))
+        k = a.intrinsics
+        described.append(
+            {
+                "stamp_ns": a.stamp_ns,
+                "seq": a.seq,
+                "camera_id": a.camera_id,
+                "intrinsics": [k.fx, k.fy, k.cx, k.cy, k.width, k.height],
+                "T_world_camera": a.T_world_camera.tolist(),
+            }
+        )
+    return tensors, json.dumps(described)
+
+
+def _unpack_anchors(tensors: dict[str, torch.Tensor], described: list[dict[str, Any]]) -> tuple[PosedFrame, ...]:
+    anchors: list[PosedFrame] = []
+    for i, d in enumerate(described):
+        depth, label = tensors.get(f"anchor.{i}.depth"), tensors.get(f"anchor.{i}.label")
+        anchors.append(
+            PosedFrame(
+                stamp_ns=int(d["stamp_ns"]),
+                seq=int(d["seq"]),
+                camera_id=str(d["camera_id"]),
+                rgb=tensors[f"anchor.{i}.rgb"].numpy(),
+                depth_m=None if depth is None else _depth_from_units(depth.numpy()),
+                label=None if label is None else label.numpy(),
+                intrinsics=CameraIntrinsics(*d["intrinsics"]),
+                T_world_camera=np.array(d["T_world_camera"], np.float64),
+            )
+        )
+    return tuple(anchors)
+
+
+def _label_set_to_plain(label_set: LabelSet) -> dict[str, Any]:
+    return {
+        "name": label_set.name,
+        "ids": list(label_set.ids),
+        "names": list(label_set.names),
+        "colors": [list(c) for c in label_set.colors],
+        "ignore_id": label_set.ignore_id,
+    }
+
+
+def _label_set_from_plain(data: dict[str, Any]) -> LabelSet:
+    colors = tuple((int(r), int(g), int(b)) for r, g, b in data["colors"])
+    return LabelSet(str(data["name"]), tuple(data["ids"]), tuple(data["names"]), colors, int(data["ignore_id"]))

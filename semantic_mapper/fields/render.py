@@ -1,0 +1,86 @@
+"""Render whole views from a semantic field, chunk by chunk."""
+
+from __future__ import annotations
+
+# torch and safetensors leave parts of their interface untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from semantic_mapper.config import SamplingConfig
+from semantic_mapper.fields.base import EncodedViews, SemanticField
+from semantic_mapper.geometry import pixel_grid, pixel_rays
+from semantic_mapper.types import CameraIntrinsics, FieldRender, Float32, Float64
+
+
+def render_image(
+    field: SemanticField,
+    sources: EncodedViews,
+    intrinsics: CameraIntrinsics,
+    T_world_camera: Float64,
+    prior_depth_m: Float32,
+    sampling: SamplingConfig,
+    rays_per_chunk: int,
+    on_chunk: Callable[[int], None] | None = None,
+) -> FieldRender:
+    """Render every pixel of a view without gradients, row by row.
+
+    Args:
+        intrinsics: Of the view to render, (H, W).
+        T_world_camera: (4, 4).
+        prior_depth_m: (H, W), 0 = no prior.
+        sampling: Near and far bounds.
+        on_chunk: Told the number of rays done after each chunk.
+
+    Returns:
+        ``FieldRender`` of H * W rays.
+    """
+    device = sources.feature.device
+    pixels = pixel_grid(intrinsics.width, intrinsics.height, device)
+    prior = torch.from_numpy(np.ascontiguousarray(prior_depth_m)).to(device).flatten()
+    pose = torch.from_numpy(T_world_camera).to(device=device, dtype=torch.float32)
+    parts: list[FieldRender] = []
+    with torch.inference_mode():
+        for start in range(0, len(pixels), rays_per_chunk):
+            rays = pixel_rays(
+                pixels[start : start + rays_per_chunk],
+                intrinsics,
+                pose,
+                near_m=sampling.near_m,
+                far_m=sampling.far_m,
+                prior_depth_m=prior[start : start + rays_per_chunk],
+            )
+            parts.append(field.render(rays, sources))
+            if on_chunk is not None:
+                on_chunk(min(start + rays_per_chunk, len(pixels)))
+    return FieldRender(
+        logits=torch.cat([p.logits for p in parts]),
+        depth_m=torch.cat([p.depth_m for p in parts]),
+        opacity=torch.cat([p.opacity for p in parts]),
+        rgb=torch.cat([p.rgb for p in parts]),
+        entropy=torch.cat([p.entropy for p in parts]),
+        known=torch.cat([p.known for p in parts]),
+    )
+
+
+def render_view(
+    field: SemanticField,
+    sources: EncodedViews,
+    intrinsics: CameraIntrinsics,
+    T_world_camera: Float64,
+    prior_depth_m: Float32,
+    sampling: SamplingConfig,
+    rays_per_chunk: int,
+) -> tuple[Float32, NDArray[np.bool_], Float32]:
+    """``render_image`` as arrays: class probabilities (H, W, L), known (H, W), depth (H, W) in metres."""
+    render = render_image(field, sources, intrinsics, T_world_camera, prior_depth_m, sampling, rays_per_chunk)
+    shape = (intrinsics.height, intrinsics.width)
+    probabilities = torch.softmax(render.logits, dim=-1).view(*shape, -1)
+    return (
+        probabilities.cpu().numpy(),
+        render.known.view(shape).cpu().numpy(),
+        (render.depth_m * render.known).view(shape).cpu().numpy(),
+    )

@@ -1,0 +1,216 @@
+"""Semantic Ray (S-Ray, CVPR 2023): semantics of a query ray from its reprojections into posed source views.
+
+Read top to bottom beside section 3 of the paper: ``encode`` gives the F_j, ``contextual_space`` is Eq. 3 to 5,
+``attend`` Eq. 6 to 10, ``blend_views`` Eq. 11 and 12, ``render_samples`` Eq. 13.
+"""
+
+from __future__ import annotations
+
+# torch and safetensors leave parts of their interface untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from semantic_mapper.config import SamplingConfig, SRayConfig
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.attention import (
+    MultiHeadAttention,
+    cross_view_attention,
+    positional_encoding,
+    radial_attention,
+)
+from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.encoder import GROUPS, ImageEncoder
+from semantic_mapper.fields.geometry_net import DensityNet, GeometryInit, hit_and_visibility
+from semantic_mapper.fields.projection import Reprojection, gather, reproject
+from semantic_mapper.fields.sampling import merge_samples, sample_from_weights, sample_guided, sample_inverse_depth
+from semantic_mapper.fields.view_weights import ViewWeightNet, constrained_weights, softmax_weights
+from semantic_mapper.fields.volume import composite, composite_depth, compositing_weights, interval_lengths
+from semantic_mapper.geometry import expect_shape, invert_pose_torch
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.types import FieldRender, RayBatch, SourceViews
+
+CUES = 4  # hit, visibility, view cosine, valid depth interval: what a view knows of a sample beside its feature
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ContextualSpace:
+    """The space M of Eq. 5 with what goes with it, view-first.
+
+    Args:
+        feature: (m, R, N, C).
+        rgb: (m, R, N, 3).
+        cues: (m, R, N, 4).
+        hit, visibility: (m, R, N) in [0, 1].
+        valid: (m, R, N) bool.
+        delta: (R, N) interval lengths, metres.
+    """
+
+    feature: torch.Tensor
+    rgb: torch.Tensor
+    cues: torch.Tensor
+    hit: torch.Tensor
+    visibility: torch.Tensor
+    valid: torch.Tensor
+    delta: torch.Tensor
+
+
+class SRay(nn.Module):
+    """The S-Ray field. Satisfies ``SemanticField``.
+
+    Args:
+        config: Shape of the network.
+        label_set: Classes of the logits.
+        sampling: Where rays are sampled; may be exchanged at any time, no weights depend on it.
+    """
+
+    def __init__(self, config: SRayConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
+        super().__init__()
+        _check(config)
+        dim = config.feature_dim
+        published = config.parity == "published"
+        self.config = config
+        self.sampling = sampling or SamplingConfig()
+        self._label_set = label_set
+        self.encoder = ImageEncoder(config.encoder_width, config.encoder_blocks, dim)
+        self.geometry_init = GeometryInit(dim)
+        self.density = DensityNet(dim)
+        self.cue_token = nn.Linear(CUES, dim)
+        self.radial = MultiHeadAttention(dim, config.heads, published=published)
+        self.cross = MultiHeadAttention(dim, config.heads, published=published)
+        self.weights = ViewWeightNet(dim, CUES)
+        self.semantic = nn.Sequential(nn.Linear(dim, 2 * dim), nn.ReLU(), nn.Linear(2 * dim, dim))
+        self.classifier = nn.Linear(dim, len(label_set))
+        self.label_code = nn.Embedding(len(label_set), dim)
+
+    @property
+    def label_set(self) -> LabelSet:
+        """Classes of the rendered logits, in channel order."""
+        return self._label_set
+
+    def encode(self, views: SourceViews) -> EncodedViews:
+        """Encode each view by itself: features F_j and the depth distribution of every pixel.
+
+        Raises:
+            ShapeError: tensors that do not fit together.
+        """
+        sizes = expect_shape(views.rgb, "M 3 H W", "source rgb")
+        expect_shape(views.depth_m, f"{sizes['M']} {sizes['H']} {sizes['W']}", "source depth_m")
+        expect_shape(views.K, f"{sizes['M']} 3 3", "source K")
+        feature = self.encoder(views.rgb)
+        height, width = feature.shape[-2:]
+        # Nearest, not averaged: a mean of two depths across an edge lies on no surface.
+        depth = functional.interpolate(views.depth_m[:, None], size=(height, width), mode="nearest-exact")[:, 0]
+        rgb = functional.interpolate(views.rgb, size=(height, width), mode="area")
+        scale = views.K.new_tensor((width / sizes["W"], height / sizes["H"]))
+        K = views.K.clone()
+        K[:, :2, :2] = views.K[:, :2, :2] * scale[None, :, None]
+        K[:, :2, 2] = (views.K[:, :2, 2] + 0.5) * scale - 0.5
+        geometry = self.geometry_init(feature, depth)
+        if views.channel is not None and self.config.source_labels:
+            feature = feature + self.label_features(views.channel, (height, width))
+        return EncodedViews(feature, rgb, geometry, K, invert_pose_torch(views.T_world_camera))
+
+    def label_features(self, channel: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+        """What known labels (m, H, W) of source views add to their features: (m, C, h, w), 0 where none is known.
+
+        Not in the paper: labels are to a source view what depth is, an input that it may have. The keyframes that a
+        scene was finetuned on have them, and what they show need not be recognised a second time.
+        """
+        small = functional.interpolate(channel[:, None].float(), size=size, mode="nearest-exact")[:, 0].long()
+        known = (small >= 0)[..., None]
+        return (self.label_code(small.clamp_min(0)) * known).permute(0, 3, 1, 2)
+
+    def classify_features(self, feature: torch.Tensor) -> torch.Tensor:
+        """Logits (m, L, h, w) of image features (m, C, h, w) by themselves, for a dense loss on labelled views."""
+        s = feature.permute(0, 2, 3, 1)
+        return self.classifier(s + self.semantic(s)).permute(0, 3, 1, 2)
+
+    def contextual_space(self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews) -> ContextualSpace:
+        """Reproject whole rays and gather M (Eq. 3 to 5)."""
+        where: Reprojection = reproject(rays, z, sources)
+        found = gather(sources, where)
+        delta = interval_lengths(z, rays.direction.norm(dim=-1))
+        hit, visibility = hit_and_visibility(found.geometry, where.z, 0.5 * delta)
+        hit, visibility = hit * where.valid, visibility * where.valid
+        cues = torch.stack((hit, visibility, where.view_cosine, torch.log(found.geometry[..., 1])), dim=-1)
+        return ContextualSpace(found.feature, found.rgb, cues, hit, visibility, where.valid, delta)
+
+    def attend(self, space: ContextualSpace) -> torch.Tensor:
+        """Cross-reprojection attention: M -> M'' (m, R, N, C) (Eq. 6 to 10)."""
+        x = (space.feature + self.cue_token(space.cues)).transpose(0, 1)  # (R, m, N, C)
+        valid = space.valid.transpose(0, 1)
+        if self.config.positional_encoding or self.config.parity == "published":
+            x = x + positional_encoding(x.shape[2], x.shape[3], x)
+        keep = 1.0 if self.config.attention_residual else 0.0
+        if self.config.intra_view_attention:
+            x = keep * x + radial_attention(x, valid, self.radial)
+        if self.config.cross_view_attention:
+            x = keep * x + cross_view_attention(x, valid, self.cross)
+        return x.transpose(0, 1)
+
+    def blend_views(self, refined: torch.Tensor, space: ContextualSpace) -> tuple[torch.Tensor, torch.Tensor]:
+        """Semantic ray s (Eq. 11, 12) and colour of each sample: (R, N, C), (R, N, 3)."""
+        semantic_score, colour_score = self.weights(refined, space.cues)
+        colour_weight = softmax_weights(colour_score, space.valid)
+        if self.config.parity == "published":
+            semantic_weight = colour_weight
+        else:
+            semantic_weight = constrained_weights(semantic_score, space.valid, self.config.tau)
+        s = torch.einsum("mrn,mrnc->rnc", semantic_weight, refined)
+        return s, torch.einsum("mrn,mrnc->rnc", colour_weight, space.rgb)
+
+    def render_samples(
+        self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews
+    ) -> tuple[FieldRender, torch.Tensor]:
+        """Render rays at given sample depths z (R, N) (Eq. 13); also returns the compositing weights (R, N)."""
+        space = self.contextual_space(rays, z, sources)
+        s, colour = self.blend_views(self.attend(space), space)
+        sigma = self.density(space.feature, space.hit, space.visibility, space.valid, space.delta)
+        interval = torch.ones_like(space.delta) if self.config.parity == "published" else space.delta
+        weights = compositing_weights(sigma, interval)
+        opacity = weights.sum(dim=1)
+        known = space.valid.flatten(2).any(2).any(0)
+        # The classifier is linear, so logits of blended features equal blended logits: classify once a ray.
+        rendered = composite(weights, s + self.semantic(s))
+        logits = functional.linear(rendered, self.classifier.weight) + opacity[:, None] * self.classifier.bias
+        logits = logits * known[:, None]
+        log_p = torch.log_softmax(logits, dim=-1)
+        render = FieldRender(
+            logits=logits,
+            depth_m=composite_depth(weights, z),
+            opacity=opacity,
+            rgb=composite(weights, colour),
+            entropy=-(log_p.exp() * log_p).sum(-1),
+            known=known,
+        )
+        return render, weights
+
+    def sample(self, rays: RayBatch, sources: EncodedViews, generator: torch.Generator | None = None) -> torch.Tensor:
+        """Sample depths (R, N): coarse + fine, or guided by the depth prior, as ``sampling.mode`` says."""
+        if self.sampling.mode == "streaming":
+            return sample_guided(rays, self.sampling)
+        coarse = sample_inverse_depth(rays.near_m, rays.far_m, self.sampling.coarse, generator)
+        with torch.no_grad():
+            _, weights = self.render_samples(rays, coarse, sources)
+        fine = sample_from_weights(coarse, weights, self.sampling.fine, generator)
+        return merge_samples(coarse, fine)
+
+    def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
+        """Render rays from encoded source views; differentiable."""
+        render, _ = self.render_samples(rays, self.sample(rays, sources), sources)
+        return render
+
+
+def _check(config: SRayConfig) -> None:
+    if config.feature_dim <= 0 or config.feature_dim % 4 or config.feature_dim % config.heads:
+        raise ConfigError(
+            f"feature_dim must be a multiple of 4 and of heads ({config.heads}), got {config.feature_dim}"
+        )
+    if config.encoder_width <= 0 or config.encoder_width % GROUPS or not config.encoder_blocks:
+        raise ConfigError(f"encoder_width must be a multiple of {GROUPS}, got {config.encoder_width}")
+    if not 0 < config.tau < 1:
+        raise ConfigError(f"tau must lie between 0 and 1 (Eq. 12), got {config.tau}")

@@ -1,0 +1,182 @@
+"""Cameras, poses and rays: pure functions. ``p_a = T_a_b @ p_b``; pixel centres are integers; depth is z."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from semantic_mapper.errors import PoseError, ShapeError
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, RayBatch
+
+ROTATION_TOLERANCE = 1e-3  # |R^T R - I|: logs store 6 to 9 digits; a real mistake (scale, mirror) is far larger
+
+
+def expect_shape(x: torch.Tensor | NDArray[np.generic], pattern: str, name: str = "array") -> dict[str, int]:
+    """Check ``x`` against a pattern such as ``"M 3 H W"`` and return the sizes of its named dimensions.
+
+    A letter stands for any size, the same letter for the same size, a number for itself.
+
+    Raises:
+        ShapeError: with the expected and the actual shape.
+    """
+    parts = pattern.split()
+    shape = tuple(int(n) for n in x.shape)
+    sizes: dict[str, int] = {}
+    fits = len(parts) == len(shape)
+    for part, size in zip(parts, shape, strict=False):
+        fits = fits and size == (int(part) if part.isdigit() else sizes.setdefault(part, size))
+    if not fits:
+        raise ShapeError(f"{name}: expected shape ({', '.join(parts)}), got {shape}")
+    return sizes
+
+
+def check_pose(T_world_camera: Float64, where: str) -> None:
+    """Refuse what is not a rigid transform.
+
+    Args:
+        T_world_camera: (4, 4).
+        where: Names the frame or file in the error.
+
+    Raises:
+        PoseError: NaN or infinite numbers, wrong last row, or a 3x3 part that is not a rotation.
+    """
+    expect_shape(T_world_camera, "4 4", f"{where}: T_world_camera")
+    if not np.isfinite(T_world_camera).all():
+        raise PoseError(f"{where}: the pose holds NaN or infinity; drop the frame or give it a tracked pose")
+    if not np.allclose(T_world_camera[3], (0, 0, 0, 1), atol=1e-9):
+        raise PoseError(f"{where}: the last row of the pose must be 0 0 0 1, got {T_world_camera[3]}")
+    R = T_world_camera[:3, :3]
+    error = float(np.abs(R.T @ R - np.eye(3)).max())
+    det = float(np.linalg.det(R))
+    if error > ROTATION_TOLERANCE or det < 0:
+        raise PoseError(
+            f"{where}: the pose is not a rotation (|R^T R - I| = {error:.2g}, det = {det:.3f}); "
+            "give T_world_camera as a row-major rigid 4x4 without scale or mirror"
+        )
+
+
+def invert_pose(T_a_b: Float64) -> Float64:
+    """Return ``T_b_a`` of a rigid transform (..., 4, 4)."""
+    R_b_a = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
+    T_b_a = np.zeros_like(T_a_b)
+    T_b_a[..., :3, :3] = R_b_a
+    T_b_a[..., :3, 3] = -(R_b_a @ T_a_b[..., :3, 3:])[..., 0]
+    T_b_a[..., 3, 3] = 1
+    return T_b_a
+
+
+def invert_pose_torch(T_a_b: torch.Tensor) -> torch.Tensor:
+    """Return ``T_b_a`` of a rigid transform (..., 4, 4), differentiable."""
+    R_b_a = T_a_b[..., :3, :3].transpose(-1, -2)
+    t_b_a = -(R_b_a @ T_a_b[..., :3, 3:])
+    return torch.cat((torch.cat((R_b_a, t_b_a), -1), T_a_b[..., 3:, :]), -2)
+
+
+def look_at(eye: Float64, target: Float64, up: Float64) -> Float64:
+    """Pose (4, 4) of a camera at ``eye`` that looks at ``target``, with image-up along ``up`` (world).
+
+    Raises:
+        PoseError: ``eye`` is ``target``, or the view is along ``up``, so that the roll is not defined.
+    """
+    forward = target - eye
+    right = np.cross(forward, up)
+    if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(up):
+        raise PoseError(f"look_at: no view from {eye} to {target} with up {up}; the view must not be along up")
+    forward = forward / np.linalg.norm(forward)
+    right = right / np.linalg.norm(right)
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = np.stack((right, np.cross(forward, right), forward), axis=1)
+    T_world_camera[:3, 3] = eye
+    return T_world_camera
+
+
+def camera_matrix(intrinsics: CameraIntrinsics) -> Float64:
+    """Return K, (3, 3) in pixels."""
+    return np.array([[intrinsics.fx, 0, intrinsics.cx], [0, intrinsics.fy, intrinsics.cy], [0, 0, 1]], np.float64)
+
+
+def scale_intrinsics(intrinsics: CameraIntrinsics, width: int, height: int) -> CameraIntrinsics:
+    """Intrinsics of the same view resized to ``width`` x ``height``; pixel centres stay integers."""
+    sx, sy = width / intrinsics.width, height / intrinsics.height
+    return CameraIntrinsics(
+        fx=intrinsics.fx * sx,
+        fy=intrinsics.fy * sy,
+        cx=(intrinsics.cx + 0.5) * sx - 0.5,
+        cy=(intrinsics.cy + 0.5) * sy - 0.5,
+        width=width,
+        height=height,
+        distortion=intrinsics.distortion,
+    )
+
+
+def project(p_camera: Float64, intrinsics: CameraIntrinsics) -> Float64:
+    """Project points (N, 3) in front of the camera to pixels (N, 2) as (u, v)."""
+    u = intrinsics.fx * p_camera[:, 0] / p_camera[:, 2] + intrinsics.cx
+    v = intrinsics.fy * p_camera[:, 1] / p_camera[:, 2] + intrinsics.cy
+    return np.stack((u, v), axis=1)
+
+
+def unproject(depth_m: Float32, intrinsics: CameraIntrinsics) -> Float64:
+    """Lift a depth image (H, W) to camera points (H, W, 3) in metres; z = 0 where there is no depth.
+
+    Raises:
+        ShapeError: the depth image is not of the camera's size.
+    """
+    expect_shape(depth_m, f"{intrinsics.height} {intrinsics.width}", "depth_m")
+    z = depth_m.astype(np.float64)
+    u = np.arange(intrinsics.width)[None, :]
+    v = np.arange(intrinsics.height)[:, None]
+    x = (u - intrinsics.cx) / intrinsics.fx * z
+    y = (v - intrinsics.cy) / intrinsics.fy * z
+    return np.stack((x, y, z), axis=-1)
+
+
+def transform(T_a_b: Float64, p_b: Float64) -> Float64:
+    """Map points (..., 3) of frame b to frame a."""
+    return p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def pixel_rays(
+    pixels: torch.Tensor,
+    intrinsics: CameraIntrinsics,
+    T_world_camera: torch.Tensor,
+    *,
+    near_m: float,
+    far_m: float,
+    prior_depth_m: torch.Tensor | None = None,
+) -> RayBatch:
+    """Rays through pixels, in world coordinates (S-Ray Eq. 3 with z as the parameter).
+
+    Args:
+        pixels: (R, 2) float32 as (u, v).
+        intrinsics: Of the query view.
+        T_world_camera: (4, 4) float32.
+        near_m, far_m: z bounds for every ray.
+        prior_depth_m: (R,) z, 0 = none.
+    """
+    count = expect_shape(pixels, "R 2", "pixels")["R"]
+    x = (pixels[:, 0] - intrinsics.cx) / intrinsics.fx
+    y = (pixels[:, 1] - intrinsics.cy) / intrinsics.fy
+    d_camera = torch.stack((x, y, torch.ones_like(x)), dim=-1)  # (R, 3), z = 1
+    direction = d_camera @ T_world_camera[:3, :3].T
+    origin = T_world_camera[:3, 3].expand(count, 3)
+    if prior_depth_m is None:
+        prior_depth_m = torch.zeros_like(x)
+    return RayBatch(
+        origin=origin,
+        direction=direction,
+        near_m=torch.full_like(x, near_m),
+        far_m=torch.full_like(x, far_m),
+        prior_depth_m=prior_depth_m,
+    )
+
+
+def pixel_grid(width: int, height: int, device: torch.device | str = "cpu") -> torch.Tensor:
+    """All pixels of an image, row by row: (H * W, 2) float32 as (u, v)."""
+    v, u = torch.meshgrid(
+        torch.arange(height, dtype=torch.float32, device=device),
+        torch.arange(width, dtype=torch.float32, device=device),
+        indexing="ij",
+    )
+    return torch.stack((u, v), dim=-1).reshape(-1, 2)

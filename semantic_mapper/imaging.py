@@ -1,0 +1,55 @@
+"""Resizing of frames to a working size: colours by area, depth by nearest pixel, holes filled where asked."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from semantic_mapper.geometry import scale_intrinsics
+from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame, UInt8
+
+
+def working_intrinsics(intrinsics: CameraIntrinsics, width: int) -> CameraIntrinsics:
+    """Intrinsics at a working width (never larger than the image), height in proportion, a multiple of 4."""
+    width = min(width, intrinsics.width)
+    height = max(4, round(intrinsics.height * width / intrinsics.width / 4) * 4)
+    return scale_intrinsics(intrinsics, width, height)
+
+
+def resize_rgb(frame: PosedFrame, intrinsics: CameraIntrinsics) -> UInt8:
+    """Colour image (H, W, 3) of a frame at the size of ``intrinsics``."""
+    size = (intrinsics.width, intrinsics.height)
+    if size == (frame.intrinsics.width, frame.intrinsics.height):
+        return np.ascontiguousarray(frame.rgb)
+    return np.asarray(cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def resize_depth(frame: PosedFrame, intrinsics: CameraIntrinsics) -> Float32:
+    """Depth (H, W) of a frame at the size of ``intrinsics``, 0 where nothing (finite, positive) was measured.
+
+    Nearest pixel, not averaged: a mean of two depths across an edge lies on no surface.
+    """
+    if frame.depth_m is None:
+        return np.zeros((intrinsics.height, intrinsics.width), np.float32)
+    depth = frame.depth_m
+    if depth.shape != (intrinsics.height, intrinsics.width):
+        depth = cv2.resize(depth, (intrinsics.width, intrinsics.height), interpolation=cv2.INTER_NEAREST_EXACT)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+
+
+def resize_label(label: UInt8, intrinsics: CameraIntrinsics) -> UInt8:
+    """Label image at the size of ``intrinsics`` by nearest pixel."""
+    size = (intrinsics.width, intrinsics.height)
+    return np.asarray(cv2.resize(label, size, interpolation=cv2.INTER_NEAREST_EXACT), np.uint8)
+
+
+def fill_holes(depth_m: Float32) -> Float32:
+    """Give pixels without depth that of the nearest pixel with one; all 0 stays all 0."""
+    holes = (depth_m <= 0).astype(np.uint8)
+    if not holes.any() or holes.all():
+        return depth_m
+    _, nearest = cv2.distanceTransformWithLabels(holes, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    nearest = np.asarray(nearest, np.int32)
+    values = np.zeros(int(nearest.max()) + 1, np.float32)
+    values[nearest[holes == 0]] = depth_m[holes == 0]
+    return values[nearest]

@@ -1,0 +1,1 @@
+"""Keyframes, fusion and the pipeline."""

@@ -1,0 +1,142 @@
+"""Surface points at the zero crossings of the TSDF, and the triangle mesh."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid, GridBuffers, make_open3d_grid
+from semantic_mapper.mapping.block_index import BlockIndex, find_block, find_blocks, pack_key, pack_keys, unpack_keys
+from semantic_mapper.mapping.open3d_loader import load_open3d
+from semantic_mapper.types import Float32, Float64
+
+MESH_TILE_BLOCKS = 16_384  # Open3D fails past 262,100 blocks of 8^3 (int32), and needs 8 KiB a block to mesh
+_LARGEST_STEP = 0.95  # two neighbours that differ by more straddle a depth edge, not a surface
+
+
+def surface_voxels(keys: NDArray[np.int32], blocks: NDArray[np.int32], grid: BlockGrid, min_weight: float) -> Float64:
+    """Zero crossings along voxel edges, (N, 3) float64 in units of voxels, in the order of the blocks.
+
+    Args:
+        keys, blocks: (B, 3) coordinates and (B,) buffer indices of the blocks to look at.
+        grid: The map's storage.
+        min_weight: Both ends of an edge need this TSDF weight.
+    """
+    buffers = grid.buffers()
+    counts = _count_crossings(keys, blocks, grid.index, buffers, min_weight)
+    starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
+    points = np.empty((int(starts[-1]), 3), np.float64)
+    _write_crossings(keys, blocks, grid.index, buffers, min_weight, starts, points)
+    return points
+
+
+@njit(nogil=True, cache=True)
+def _neighbours(key, block, index, found):
+    """Buffer indices of the blocks at +x, +y, +z of ``key``."""
+    x, y, z = key[0], key[1], key[2]
+    found[0] = find_block(index, pack_key(x + 1, y, z))
+    found[1] = find_block(index, pack_key(x, y + 1, z))
+    found[2] = find_block(index, pack_key(x, y, z + 1))
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _crossing(buffers, block, voxel, axis, neighbours, min_weight):
+    """Where along the edge from ``voxel`` to the next along ``axis`` the TSDF is zero, in [0, 1); -1 = nowhere."""
+    step = 1 << (3 * axis)
+    position = (voxel >> (3 * axis)) & 7
+    other_block, other = (block, voxel + step) if position < 7 else (neighbours[axis], voxel - 7 * step)
+    if other_block < 0 or buffers.weight[other_block, other] < min_weight:
+        return -1.0
+    a, b = buffers.tsdf[block, voxel], buffers.tsdf[other_block, other]
+    if (a > 0) == (b > 0) or abs(a - b) > _LARGEST_STEP:
+        return -1.0
+    return np.float64(a) / (np.float64(a) - np.float64(b))
+
+
+@njit(nogil=True, cache=True, parallel=True)
+def _count_crossings(keys, blocks, index, buffers, min_weight):
+    counts = np.zeros(len(blocks), np.int64)
+    for n in prange(len(blocks)):
+        counts[n] = _block_crossings(keys[n], blocks[n], index, buffers, min_weight, np.empty((0, 3), np.float64))
+    return counts
+
+
+@njit(nogil=True, cache=True, parallel=True)
+def _write_crossings(keys, blocks, index, buffers, min_weight, starts, points):
+    for n in prange(len(blocks)):
+        _block_crossings(keys[n], blocks[n], index, buffers, min_weight, points[starts[n] : starts[n + 1]])
+
+
+@njit(nogil=True, cache=True)
+def _block_crossings(key, block, index, buffers, min_weight, points):
+    """Number of crossings of one block; writes as many of them as ``points`` has room for."""
+    neighbours = np.empty(3, np.int64)
+    _neighbours(key, block, index, neighbours)
+    count = 0
+    for voxel in range(512):
+        if buffers.weight[block, voxel] < min_weight or abs(buffers.tsdf[block, voxel]) > _LARGEST_STEP:
+            continue
+        for axis in range(3):
+            along = _crossing(buffers, block, voxel, axis, neighbours, min_weight)
+            if along < 0:
+                continue
+            if count < len(points):
+                points[count, 0] = key[0] * BLOCK_SIDE + (voxel & 7) + (along if axis == 0 else 0.0)
+                points[count, 1] = key[1] * BLOCK_SIDE + ((voxel >> 3) & 7) + (along if axis == 1 else 0.0)
+                points[count, 2] = key[2] * BLOCK_SIDE + (voxel >> 6) + (along if axis == 2 else 0.0)
+            count += 1
+    return count
+
+
+def triangle_mesh(
+    keys: NDArray[np.int32], blocks: NDArray[np.int32], grid: BlockGrid, voxel_size_m: float, min_weight: float
+) -> tuple[Float32, NDArray[np.int32]]:
+    """Marching cubes over sorted blocks, tile by tile: vertices (V, 3) in metres, faces (F, 3), in a fixed order."""
+    corners = []
+    for start in range(0, len(blocks), MESH_TILE_BLOCKS):
+        tile = keys[start : start + MESH_TILE_BLOCKS]
+        corners.append(_tile_triangles(tile, grid.index, grid.buffers(), voxel_size_m, min_weight))
+    triangles = np.concatenate(corners) if corners else np.empty((0, 3, 3), np.float32)
+    return _weld(triangles)
+
+
+def _tile_triangles(
+    tile: NDArray[np.int32], index: BlockIndex, buffers: GridBuffers, voxel_size_m: float, min_weight: float
+) -> Float32:
+    """Triangles (T, 3, 3) of the cells of the tile's blocks; cells reach into the next blocks, so those are copied."""
+    offsets = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
+    wanted = np.unique(pack_keys((tile[:, None] + offsets).reshape(-1, 3)))
+    found = find_blocks(index, wanted)
+    keys, source = unpack_keys(wanted[found >= 0]), found[found >= 0]
+    o3d = load_open3d()
+    copy = make_open3d_grid(voxel_size_m, (1, 1, 3), len(keys))
+    target, _ = copy.hashmap().activate(o3d.core.Tensor.from_numpy(np.ascontiguousarray(keys)))
+    for i, view in enumerate((buffers.tsdf, buffers.weight, buffers.color)):
+        values = copy.hashmap().value_tensor(i).numpy()
+        values.reshape(len(values), *view.shape[1:])[target.numpy()] = view[source]
+    # Open3D keeps what is strictly above its threshold.
+    mesh = copy.extract_triangle_mesh(float(np.nextafter(np.float32(min_weight), np.float32(0))))
+    triangles = _triangles_of(mesh)
+    cell = np.floor(triangles.mean(axis=1) / voxel_size_m)
+    own = np.isin(pack_keys((cell // BLOCK_SIDE).astype(np.int32)), pack_keys(tile))
+    return triangles[own]
+
+
+def _triangles_of(mesh: Any) -> Float32:
+    if mesh.is_empty() or "indices" not in mesh.triangle:
+        return np.empty((0, 3, 3), np.float32)
+    return mesh.vertex.positions.numpy()[mesh.triangle.indices.numpy()]
+
+
+def _weld(triangles: Float32) -> tuple[Float32, NDArray[np.int32]]:
+    """Join equal corners and put vertices and faces in an order that does not depend on threads."""
+    vertices, inverse = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+    faces = inverse.reshape(-1, 3)
+    first = faces.argmin(axis=1)[:, None]  # start each face at its least vertex: same winding, one spelling
+    faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
+    faces = faces[np.lexsort(faces.T[::-1])]
+    proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])
+    return vertices.astype(np.float32), faces[proper].astype(np.int32)

@@ -1,0 +1,153 @@
+"""Which frames become source views, and which source views a query looks at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.config import KeyframeConfig
+from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.geometry import invert_pose, transform, unproject
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64
+
+COVERAGE_GRID = (12, 16)  # rows, columns of query points whose visibility decides the choice of views
+BLIND_DEPTHS_M = (0.7, 1.5, 3.0)  # where query points are put when the query has no depth
+VISIBLE_TOLERANCE = 0.05  # share of z by which a keyframe's depth may disagree and still see the point
+REPEAT_VALUE = 0.5  # a second view of the same point is worth half of the first, a third a quarter
+LABELLED_VALUE = 2.0  # a view that the field was finetuned on counts this many times
+NEARNESS_VALUE = 0.05  # breaks ties towards near views
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keyframe:
+    """A frame that later frames are rendered from.
+
+    Args:
+        seq, stamp_ns: Of the frame.
+        T_world_camera: (4, 4) float64.
+        intrinsics: Of ``depth_m``.
+        depth_m: (h, w) float32, small, 0 = none.
+        encoded: One view.
+        labelled: The field was finetuned on this view; such keyframes are never dropped.
+    """
+
+    seq: int
+    stamp_ns: int
+    T_world_camera: Float64
+    intrinsics: CameraIntrinsics
+    depth_m: Float32
+    encoded: EncodedViews
+    labelled: bool = False
+
+
+class KeyframeStore:
+    """A bounded set of keyframes."""
+
+    def __init__(self, config: KeyframeConfig) -> None:
+        self._config = config
+        self._keyframes: list[Keyframe] = []
+
+    def __len__(self) -> int:
+        return len(self._keyframes)
+
+    @property
+    def keyframes(self) -> tuple[Keyframe, ...]:
+        """All keyframes, oldest first."""
+        return tuple(self._keyframes)
+
+    def wants(self, T_world_camera: Float64) -> bool:
+        """Whether a frame at this pose has moved or turned enough, from every keyframe, to become one."""
+        for keyframe in self._keyframes:
+            moved, turned = pose_distance(keyframe.T_world_camera, T_world_camera)
+            if moved < self._config.translation_m and turned < self._config.rotation_deg:
+                return False
+        return True
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Keep a keyframe; past capacity the most redundant unlabelled one goes."""
+        self._keyframes.append(keyframe)
+        if len(self._keyframes) > self._config.capacity:
+            self._drop_most_redundant()
+
+    def choose(
+        self, T_world_camera: Float64, intrinsics: CameraIntrinsics, depth_m: Float32, count: int
+    ) -> list[Keyframe]:
+        """Up to ``count`` keyframes that together cover the query frustum; none that see nothing of it.
+
+        Greedy: each pick adds most not yet covered points of the query's own surface (its depth, or points at a few
+        depths where it has none). Visibility is tested against the keyframes' depth.
+
+        Args:
+            T_world_camera: (4, 4) pose of the query.
+            intrinsics: Of ``depth_m``.
+            depth_m: (H, W) float32, 0 = none.
+        """
+        if not self._keyframes or count <= 0:
+            return []
+        points = _query_points(T_world_camera, intrinsics, depth_m)
+        seen = np.stack([_sees(k, points) for k in self._keyframes]).astype(np.float64)  # (K, P)
+        value = np.array([LABELLED_VALUE if k.labelled else 1.0 for k in self._keyframes])
+        nearness = np.array([_nearness(k.T_world_camera, T_world_camera) for k in self._keyframes])
+        worth = np.ones(len(points))
+        chosen: list[int] = []
+        while len(chosen) < min(count, len(self._keyframes)):
+            gain = value * (seen @ worth) / len(points) + NEARNESS_VALUE * nearness * seen.any(axis=1)
+            gain[chosen] = 0
+            best = int(gain.argmax())
+            if gain[best] <= 0:
+                break
+            chosen.append(best)
+            worth = np.where(seen[best] > 0, worth * REPEAT_VALUE, worth)
+        return [self._keyframes[i] for i in chosen]
+
+    def _drop_most_redundant(self) -> None:
+        poses = [k.T_world_camera for k in self._keyframes]
+        spacing = np.full(len(poses), np.inf)
+        for i, pose in enumerate(poses[:-1]):  # the newest stays
+            if not self._keyframes[i].labelled:
+                spacing[i] = min(_separation(pose, p) for j, p in enumerate(poses) if j != i)
+        if np.isfinite(spacing).any():
+            del self._keyframes[int(spacing.argmin())]
+
+
+def pose_distance(T_world_a: Float64, T_world_b: Float64) -> tuple[float, float]:
+    """Distance (metres) and angle (degrees) between two poses."""
+    moved = float(np.linalg.norm(T_world_a[:3, 3] - T_world_b[:3, 3]))
+    cosine = (np.trace(T_world_a[:3, :3].T @ T_world_b[:3, :3]) - 1) / 2
+    return moved, float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def _separation(T_world_a: Float64, T_world_b: Float64) -> float:
+    moved, turned = pose_distance(T_world_a, T_world_b)
+    return moved + turned / 60.0  # a metre counts like 60 degrees
+
+
+def _nearness(T_world_a: Float64, T_world_b: Float64) -> float:
+    return float(np.exp(-_separation(T_world_a, T_world_b)))
+
+
+def _query_points(T_world_camera: Float64, intrinsics: CameraIntrinsics, depth_m: Float32) -> Float64:
+    """World points (P, 3) on a grid of the query image."""
+    rows = np.linspace(0, intrinsics.height - 1, COVERAGE_GRID[0]).round().astype(int)
+    columns = np.linspace(0, intrinsics.width - 1, COVERAGE_GRID[1]).round().astype(int)
+    unit = unproject(np.ones_like(depth_m), intrinsics)[np.ix_(rows, columns)].reshape(-1, 3)
+    depth = depth_m[np.ix_(rows, columns)].reshape(-1).astype(np.float64)
+    measured = unit[depth > 0] * depth[depth > 0, None]
+    blind = unit[depth <= 0]
+    guesses = [blind * z for z in BLIND_DEPTHS_M]
+    return transform(T_world_camera, np.concatenate((measured, *guesses)))
+
+
+def _sees(keyframe: Keyframe, points: Float64) -> NDArray[np.bool_]:
+    """Which world points (P, 3) the keyframe sees: inside its image and not behind its measured depth."""
+    p = transform(invert_pose(keyframe.T_world_camera), points)
+    k = keyframe.intrinsics
+    z = np.maximum(p[:, 2], 1e-3)
+    u = np.rint(k.fx * p[:, 0] / z + k.cx).astype(np.int64)
+    v = np.rint(k.fy * p[:, 1] / z + k.cy).astype(np.int64)
+    inside = (p[:, 2] > 0.05) & (u >= 0) & (u < k.width) & (v >= 0) & (v < k.height)
+    measured = keyframe.depth_m[np.clip(v, 0, k.height - 1), np.clip(u, 0, k.width - 1)]
+    free = (measured <= 0) | (p[:, 2] < measured * (1 + VISIBLE_TOLERANCE))
+    return inside & free

@@ -1,0 +1,85 @@
+"""The one file that imports Open3D, after it has made sure that the system libraries the wheel links can be found.
+
+The wheel links ``libusb-1.0``, ``libGL``, ``libEGL``, ``libX11`` and others without shipping them. Libraries loaded
+here with RTLD_GLOBAL satisfy it, so nothing has to be installed system-wide.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import importlib
+import sys
+from pathlib import Path
+from typing import Any
+
+import structlog
+
+from semantic_mapper.errors import DependencyError
+
+_log = structlog.get_logger(__name__)
+
+
+@functools.cache
+def load_open3d() -> Any:
+    """Import Open3D once and return the module, quiet (errors only).
+
+    Raises:
+        DependencyError: naming the library that is missing and how to get it.
+    """
+    notes = _preload_libusb() + preload_folder(Path(sys.prefix) / "syslibs")
+    try:
+        open3d = importlib.import_module("open3d")
+    except (ImportError, OSError) as error:
+        raise DependencyError(
+            f"Open3D cannot be loaded: {error}. Run `make setup`, which puts missing system libraries into "
+            f"{Path(sys.prefix) / 'syslibs'}, or install them yourself (Debian/Ubuntu: `apt-get install libusb-1.0-0 "
+            f"libgl1 libegl1 libx11-6 libgomp1`; glibc 2.35 or newer is needed)." + "".join(f" [{n}]" for n in notes)
+        ) from error
+    _probe_tbb_last()
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
+    _log.debug("open3d_loaded", version=open3d.__version__, preload_failures=notes)
+    return open3d
+
+
+def _probe_tbb_last() -> None:
+    """Open3D brings a TBB older than numba accepts; numba, asking for it first, would warn before going on."""
+    settings: Any = importlib.import_module("numba.core.config")
+    settings.THREADING_LAYER_PRIORITY = sorted(settings.THREADING_LAYER_PRIORITY, key=lambda name: name == "tbb")
+
+
+def preload_folder(folder: Path) -> list[str]:
+    """Load every shared library below ``folder`` into the process, in whatever order their links ask for.
+
+    Returns:
+        One line for each library that could not be loaded; empty where all could, or there is no such folder.
+    """
+    waiting = sorted(p for p in folder.rglob("*.so*") if p.is_file()) if folder.is_dir() else []
+    failures: dict[Path, str] = {}
+    while waiting:
+        failures = {path: reason for path in waiting if (reason := _load_global(path))}
+        if len(failures) == len(waiting):  # no progress in a whole round: what is left cannot be loaded
+            break
+        waiting = list(failures)
+    return [f"{path.name}: {reason}" for path, reason in failures.items()]
+
+
+def _load_global(path: Path) -> str:
+    """Empty where loaded, else the reason why not."""
+    try:
+        ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+    except OSError as error:
+        return str(error)
+    return ""
+
+
+def _preload_libusb() -> list[str]:
+    try:
+        libusb_package = importlib.import_module("libusb_package")
+    except ImportError as error:
+        return [f"package libusb-package: {error}"]
+    path = libusb_package.get_library_path()
+    if path is None:
+        return ["package libusb-package carries no library for this platform"]
+    reason = _load_global(Path(path))
+    return [f"libusb: {reason}"] if reason else []

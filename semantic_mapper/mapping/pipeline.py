@@ -1,0 +1,225 @@
+"""The whole main job in one class: a posed frame in, a better map out.
+
+Replay and the mapper node call this very ``step``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import cv2
+import numpy as np
+import structlog
+import torch
+from numpy.typing import NDArray
+
+from semantic_mapper.config import MapperConfig
+from semantic_mapper.errors import FrameError, WeightsError
+from semantic_mapper.fields.base import EncodedViews, SemanticField, stack_views
+from semantic_mapper.fields.render import render_view
+from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
+from semantic_mapper.imaging import fill_holes, resize_depth, resize_label, resize_rgb, working_intrinsics
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore
+from semantic_mapper.mapping.lifting import lift
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.types import CameraIntrinsics, Float32, MapUpdate, PosedFrame, SourceViews
+
+_log = structlog.get_logger(__name__)
+
+ODD_FRAMES = 2  # frames of another size that are refused before the new size is believed
+COVERAGE_WIDTH = 80  # width of the depth image that a keyframe keeps for the choice of source views
+
+
+class MappingPipeline:
+    """Keyframes, view choice, rendering and fusion behind one ``step``.
+
+    Deterministic: same frames, config, field and thread count give the same map, bit for bit.
+
+    Args:
+        config: All settings.
+        field: Renders semantics; its classes must be those of ``label_set``.
+        label_set: Classes of the map.
+        anchors: Labelled keyframes that the field was finetuned on; they are source views from the first frame on.
+
+    Raises:
+        WeightsError: the field renders other classes than the map holds.
+    """
+
+    def __init__(
+        self,
+        config: MapperConfig,
+        field: SemanticField,
+        label_set: LabelSet,
+        *,
+        anchors: Sequence[PosedFrame] = (),
+    ) -> None:
+        if field.label_set != label_set:
+            raise WeightsError(
+                f"the field renders label set '{field.label_set.name}' ({len(field.label_set)} classes), "
+                f"the map holds '{label_set.name}' ({len(label_set)}); use weights made for this label set"
+            )
+        self.config = config
+        self.field = field
+        self.label_set = label_set
+        self.voxel_map = VoxelMap(config.voxel_map, label_set)
+        self.keyframes = KeyframeStore(config.keyframes)
+        self._intrinsics: dict[str, CameraIntrinsics] = {}
+        self._odd_sizes: dict[str, tuple[tuple[int, int], int]] = {}
+        self._stage_ms: dict[str, float] = {}
+        for anchor in anchors:
+            self.keyframes.add(
+                self._make_keyframe(anchor, self._encode(anchor, self._known_channel(anchor)), labelled=True)
+            )
+
+    def step(self, frame: PosedFrame) -> MapUpdate:
+        """Render the semantics of one frame, fuse it, and maybe keep it as a source view.
+
+        Raises:
+            FrameError, PoseError: the frame cannot be used. The map is unchanged and the next frame is welcome.
+        """
+        self._check(frame)
+        self._stage_ms = {}
+        with self._stage("encode"):
+            current = self._encode(frame)
+        with self._stage("choose"):
+            sources = self._choose_sources(frame, current)
+        with self._stage("render"):
+            probabilities, known, rendered_depth = self._render(frame, sources, current)
+        with self._stage("lift"):
+            depth, full, full_known = self._lift(frame, probabilities, known, rendered_depth)
+        with self._stage("fuse"):
+            touched = self.voxel_map.integrate(frame, depth, full, full_known)
+        with self._stage("keyframe"):
+            is_keyframe = self.keyframes.wants(frame.T_world_camera)
+            if is_keyframe:
+                self.keyframes.add(self._make_keyframe(frame, current))
+        self._intrinsics[frame.camera_id] = frame.intrinsics
+        self._odd_sizes.pop(frame.camera_id, None)
+        channel = np.where(full_known, full.argmax(axis=2), -1)
+        return MapUpdate(
+            stamp_ns=frame.stamp_ns,
+            seq=frame.seq,
+            camera_id=frame.camera_id,
+            fused=touched > 0,
+            is_keyframe=is_keyframe,
+            source_seqs=tuple(k.seq for k in sources),
+            label=self.label_set.to_ids(channel),
+            confidence=full.max(axis=2),
+            depth_m=depth,
+            blocks=self.voxel_map.block_count,
+            blocks_touched=touched,
+            stage_ms=self._stage_ms,
+        )
+
+    def _check(self, frame: PosedFrame) -> None:
+        where = f"frame seq={frame.seq} of camera '{frame.camera_id}'"
+        check_pose(frame.T_world_camera, where)
+        expected = self._intrinsics.get(frame.camera_id, frame.intrinsics)
+        if (expected.width, expected.height) != (frame.intrinsics.width, frame.intrinsics.height):
+            if self._is_new_size(frame):
+                _log.warning("camera_size_changed", camera=frame.camera_id, width=frame.intrinsics.width)
+                return
+            raise FrameError(
+                f"{where}: {frame.intrinsics.width}x{frame.intrinsics.height}, but this camera has sent "
+                f"{expected.width}x{expected.height} before; give another camera_id to another stream"
+            )
+
+    def _is_new_size(self, frame: PosedFrame) -> bool:
+        """Whether enough frames in a row had this other size to believe that the odd one out came before them."""
+        size = (frame.intrinsics.width, frame.intrinsics.height)
+        last, count = self._odd_sizes.get(frame.camera_id, (size, 0))
+        count = count + 1 if last == size else 1
+        self._odd_sizes[frame.camera_id] = (size, count)
+        return count > ODD_FRAMES
+
+    @contextmanager
+    def _stage(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self._stage_ms[name] = (time.perf_counter() - start) * 1e3
+
+    def _known_channel(self, anchor: PosedFrame) -> torch.Tensor | None:
+        """Labels of a keyframe that the field was finetuned on, as the input of ``encode``; never of other frames."""
+        if anchor.label is None:
+            return None
+        width = self.config.render.encode_width or anchor.intrinsics.width
+        label = resize_label(anchor.label, working_intrinsics(anchor.intrinsics, width))
+        return torch.from_numpy(self.label_set.to_channels(label, f"anchor seq={anchor.seq}"))[None]
+
+    def _encode(self, frame: PosedFrame, channel: torch.Tensor | None = None) -> EncodedViews:
+        """Encode one frame at working width, where that is not larger than the frame."""
+        intrinsics = working_intrinsics(frame.intrinsics, self.config.render.encode_width or frame.intrinsics.width)
+        rgb, depth = resize_rgb(frame, intrinsics), resize_depth(frame, intrinsics)
+        views = SourceViews(
+            rgb=torch.from_numpy(rgb).permute(2, 0, 1).float().div(255)[None],
+            depth_m=torch.from_numpy(depth)[None],
+            K=torch.from_numpy(camera_matrix(intrinsics)).float()[None],
+            T_world_camera=torch.from_numpy(frame.T_world_camera).float()[None],
+            channel=channel,
+        )
+        with torch.inference_mode():
+            return self.field.encode(views)
+
+    def _choose_sources(self, frame: PosedFrame, current: EncodedViews) -> list[Keyframe]:
+        config = self.config.keyframes
+        intrinsics = working_intrinsics(frame.intrinsics, COVERAGE_WIDTH)
+        depth = resize_depth(frame, intrinsics)
+        count = config.source_views - (1 if config.use_current_view else 0)
+        chosen = self.keyframes.choose(frame.T_world_camera, intrinsics, depth, count)
+        # Cameras of another shape have feature maps of another size; one render takes views of one size.
+        return [k for k in chosen if k.encoded.feature.shape == current.feature.shape]
+
+    def _render(
+        self, frame: PosedFrame, sources: list[Keyframe], current: EncodedViews
+    ) -> tuple[Float32, NDArray[np.bool_], Float32]:
+        """Coarse class probabilities (h, w, L), known (h, w) and rendered depth (h, w)."""
+        views = [k.encoded for k in sources]
+        if self.config.keyframes.use_current_view:
+            views.append(current)
+        scale = self.config.render.scale
+        width, height = round(frame.intrinsics.width * scale), round(frame.intrinsics.height * scale)
+        if not views:
+            empty = np.zeros((height, width), np.float32)
+            return np.zeros((height, width, len(self.label_set)), np.float32), empty > 0, empty
+        intrinsics = scale_intrinsics(frame.intrinsics, width, height)
+        prior = self._depth_prior(frame, intrinsics)
+        return render_view(
+            self.field,
+            stack_views(views),
+            intrinsics,
+            frame.T_world_camera,
+            prior,
+            self.config.sampling,
+            self.config.render.rays_per_chunk,
+        )
+
+    def _depth_prior(self, frame: PosedFrame, intrinsics: CameraIntrinsics) -> Float32:
+        """Where the surface is expected: the sensor's depth with its holes filled, else the map's own ray cast."""
+        depth = resize_depth(frame, intrinsics)
+        if frame.depth_m is None:
+            if self.voxel_map.block_count == 0:
+                return depth
+            depth = self.voxel_map.ray_cast(frame.T_world_camera, intrinsics).depth_m
+        return fill_holes(depth)
+
+    def _lift(
+        self, frame: PosedFrame, probabilities: Float32, known: NDArray[np.bool_], rendered_depth: Float32
+    ) -> tuple[Float32, Float32, NDArray[np.bool_]]:
+        """Full-size depth to fuse, class probabilities and where they are known."""
+        size = (frame.intrinsics.width, frame.intrinsics.height)
+        low = scale_intrinsics(frame.intrinsics, known.shape[1], known.shape[0])
+        rgb_low, depth_low = resize_rgb(frame, low), resize_depth(frame, low)
+        if frame.depth_m is None:
+            depth = np.asarray(cv2.resize(rendered_depth, size, interpolation=cv2.INTER_LINEAR), np.float32)
+        else:
+            depth = resize_depth(frame, frame.intrinsics)
+        full, full_known = lift(probabilities, known, rgb_low, depth_low, frame.rgb, depth)
+        return depth, full, full_known
+
+    def _make_keyframe(self, frame: PosedFrame, encoded: EncodedViews, *, labelled: bool = False) -> Keyframe:
+        intrinsics = working_intrinsics(frame.intrinsics, COVERAGE_WIDTH)
+        depth = resize_depth(frame, intrinsics)
+        return Keyframe(frame.seq, frame.stamp_ns, frame.T_world_camera, intrinsics, depth, encoded, labelled)

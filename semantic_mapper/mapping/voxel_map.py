@@ -1,0 +1,288 @@
+"""The fused map: sparse voxel blocks with TSDF, colour and class evidence."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import structlog
+from numpy.typing import NDArray
+
+from semantic_mapper.config import VoxelMapConfig
+from semantic_mapper.errors import ConfigError, FrameError, MapError, ShapeError
+from semantic_mapper.geometry import check_pose, expect_shape
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.allocation import Camera, blocks_in_band, make_camera
+from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
+from semantic_mapper.mapping.block_index import pack_keys
+from semantic_mapper.mapping.extract import surface_voxels, triangle_mesh
+from semantic_mapper.mapping.fusion import FusionLimits, fuse_blocks, no_votes, vote_weights
+from semantic_mapper.mapping.map_file import read_map, write_map
+from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapState, MapView
+from semantic_mapper.mapping.ray_casting import cast_rays
+from semantic_mapper.mapping.readout import read_points
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
+
+_log = structlog.get_logger(__name__)
+
+# One lock for all maps of a process: growth moves the memory that readers look at, and numba's fallback threading
+# layer ends the process when two threads enter parallel kernels at once.
+_KERNEL_LOCK = threading.RLock()
+
+BoolImage = NDArray[np.bool_]
+
+
+class VoxelMap:
+    """Posed depth, colour and class probabilities in; surface points, mesh, views and files out.
+
+    Deterministic: the same frames in the same order give the same ``block_state``, bit for bit. Safe to call from
+    several threads: calls wait for each other, and the long ones leave the GIL to others.
+
+    Args:
+        config: Voxel size, truncation, caps and limits.
+        label_set: Classes; L = len(label_set) evidence channels in its channel order.
+
+    Raises:
+        ConfigError: a value of ``config`` that no map can be built with.
+        DependencyError: Open3D cannot be loaded.
+    """
+
+    def __init__(self, config: VoxelMapConfig, label_set: LabelSet) -> None:
+        _check_config(config)
+        self.config = config
+        self.label_set = label_set
+        self.frames = 0
+        self.last_stamp_ns = 0
+        self._grid = BlockGrid(config.voxel_size_m, len(label_set), config.initial_blocks, config.max_blocks)
+        self._truncation_m = config.truncation_voxels * config.voxel_size_m
+        self._limits = FusionLimits(
+            voxel_size=config.voxel_size_m,
+            truncation=self._truncation_m,
+            depth_max=config.depth_max_m,
+            vote_band=config.vote_band_voxels * config.voxel_size_m,
+            max_weight=config.max_weight,
+        )
+
+    @property
+    def block_count(self) -> int:
+        """Blocks of 8^3 voxels in the map."""
+        return self._grid.block_count
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes held for voxels and tables."""
+        return self._grid.memory_bytes
+
+    def integrate(
+        self, frame: PosedFrame, depth_m: Float32, probabilities: Float32 | None, known: BoolImage | None
+    ) -> int:
+        """Fuse one frame.
+
+        Args:
+            frame: Gives rgb, intrinsics (rectified) and pose; its own depth is not looked at.
+            depth_m: (H, W) float32 z in metres; 0, negative, NaN or beyond ``depth_max_m`` = no measurement.
+            probabilities: (H, W, L) float32, each known pixel summing to 1; None = geometry and colour alone.
+            known: (H, W) bool, where ``probabilities`` mean something; None = everywhere.
+
+        Returns:
+            Blocks touched, 0 where the depth image holds no measurement.
+
+        Raises:
+            PoseError, FrameError, ShapeError: the frame cannot be used.
+            MapError: the map would grow past ``max_blocks``.
+            In every case the map is as it was, and the next frame is welcome.
+        """
+        where = f"frame seq={frame.seq} of camera '{frame.camera_id}'"
+        check_pose(frame.T_world_camera, where)
+        if any(frame.intrinsics.distortion):
+            raise FrameError(f"{where}: the image is not rectified (distortion {frame.intrinsics.distortion})")
+        depth, known_image, probs = self._check_images(frame.intrinsics, depth_m, probabilities, known, where)
+        camera = make_camera(frame.intrinsics, frame.T_world_camera)
+        with _KERNEL_LOCK:
+            weights, probs = self._weigh(depth, probs, known_image, camera, where)
+            packed = blocks_in_band(
+                depth, camera, self.config.voxel_size_m, self._truncation_m, self.config.depth_max_m
+            )
+            blocks = self._grid.activate(packed)
+            rgb = np.ascontiguousarray(frame.rgb)
+            fuse_blocks(blocks, self._grid.buffers(), camera, self._limits, depth, rgb, weights, probs)
+            self.frames += 1
+            self.last_stamp_ns = frame.stamp_ns
+        return len(blocks)
+
+    def points(self, min_weight: float = 1.0) -> MapPoints:
+        """Points of the surface, at most three a voxel, in a fixed order.
+
+        Args:
+            min_weight: Voxels with fewer depth measurements are left out; > 0.
+        """
+        _check_min_weight(min_weight)
+        with _KERNEL_LOCK:
+            keys, blocks = self._grid.sorted_blocks()
+            voxels = surface_voxels(keys, blocks, self._grid, min_weight)
+            rgb, label, confidence = self._read(voxels)
+        return MapPoints((voxels * self.config.voxel_size_m).astype(np.float32), rgb, label, confidence)
+
+    def mesh(self, min_weight: float = 1.0) -> MapMesh:
+        """Triangle mesh of the surface by marching cubes, in a fixed order; see ``points``."""
+        _check_min_weight(min_weight)
+        with _KERNEL_LOCK:
+            keys, blocks = self._grid.sorted_blocks()
+            vertices, faces = triangle_mesh(keys, blocks, self._grid, self.config.voxel_size_m, min_weight)
+            rgb, label, confidence = self._read(vertices.astype(np.float64) / self.config.voxel_size_m)
+        return MapMesh(vertices, faces, rgb, label, confidence)
+
+    def ray_cast(self, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> MapView:
+        """The map as a camera would see it, up to ``depth_max_m`` away.
+
+        Args:
+            T_world_camera: (4, 4) float64.
+            intrinsics: Of the view wanted; pixel centres are integers.
+
+        Raises:
+            PoseError: the pose is not a rigid transform.
+        """
+        check_pose(T_world_camera, "ray_cast")
+        camera = make_camera(intrinsics, T_world_camera)
+        with _KERNEL_LOCK:
+            depth_m, rgb, channel, confidence = cast_rays(
+                camera,
+                intrinsics.height,
+                intrinsics.width,
+                self.config.voxel_size_m,
+                self.config.truncation_voxels,
+                self.config.depth_max_m,
+                self._grid.index,
+                self._grid.buffers(),
+                self.config.vote_discount,
+            )
+        return MapView(depth_m, rgb, self.label_set.to_ids(channel), confidence)
+
+    def block_state(self) -> dict[str, NDArray[np.generic]]:
+        """A copy of everything, for comparisons bit by bit.
+
+        Returns:
+            keys (B, 3) int32 in lexicographic order; tsdf, weight, votes (B, 8, 8, 8), color (B, 8, 8, 8, 3) and
+            evidence (B, 8, 8, 8, L) float32, voxels in the order [z][y][x].
+        """
+        state = self._state()
+        cube = (len(state.keys), BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
+        return {
+            "keys": state.keys,
+            "tsdf": state.tsdf.reshape(cube),
+            "weight": state.weight.reshape(cube),
+            "color": state.color.reshape(*cube, 3),
+            "evidence": state.evidence.reshape(*cube, len(self.label_set)),
+            "votes": state.votes.reshape(cube),
+        }
+
+    def save(self, path: Path) -> None:
+        """Write the map to one file (``map.npz``), whole or not at all.
+
+        Raises:
+            MapError: the file cannot be written.
+        """
+        state = self._state()
+        write_map(path, state)
+        _log.info("map_saved", path=str(path), blocks=len(state.keys), bytes=path.stat().st_size)
+
+    @classmethod
+    def load(cls, path: Path) -> VoxelMap:
+        """Read a saved map; it is the saved one bit for bit and can go on integrating.
+
+        Raises:
+            MapError: no such file, not a map, of another format version, or damaged (and what is).
+        """
+        state = read_map(path)
+        try:
+            loaded = cls(state.config, state.label_set)
+        except ConfigError as error:
+            raise MapError(f"{path}: the saved configuration cannot be used: {error}") from error
+        with _KERNEL_LOCK:
+            blocks = loaded._grid.activate(pack_keys(state.keys))
+            if loaded._grid.block_count != len(blocks):
+                raise MapError(f"{path}: block coordinates are not unique")
+            buffers = loaded._grid.buffers()
+            for name in ("tsdf", "weight", "color", "evidence", "votes"):
+                getattr(buffers, name)[blocks] = getattr(state, name)
+        loaded.frames, loaded.last_stamp_ns = state.frames, state.last_stamp_ns
+        return loaded
+
+    def _state(self) -> MapState:
+        with _KERNEL_LOCK:
+            keys, blocks = self._grid.sorted_blocks()
+            b = self._grid.buffers()
+            return MapState(
+                config=self.config,
+                label_set=self.label_set,
+                frames=self.frames,
+                last_stamp_ns=self.last_stamp_ns,
+                keys=keys,
+                tsdf=b.tsdf[blocks],
+                weight=b.weight[blocks],
+                color=b.color[blocks],
+                evidence=b.evidence[blocks],
+                votes=b.votes[blocks],
+            )
+
+    def _read(self, voxels: Float64) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Float32]:
+        grid = self._grid
+        return read_points(voxels, grid.index, grid.buffers(), self.label_set, self.config.vote_discount)
+
+    def _check_images(
+        self,
+        intrinsics: CameraIntrinsics,
+        depth_m: Float32,
+        probabilities: Float32 | None,
+        known: BoolImage | None,
+        where: str,
+    ) -> tuple[Float32, BoolImage, Float32 | None]:
+        size = f"{intrinsics.height} {intrinsics.width}"
+        expect_shape(depth_m, size, f"{where}: depth_m")
+        _expect_dtype(depth_m, np.float32, f"{where}: depth_m")
+        if known is not None:
+            expect_shape(known, size, f"{where}: known")
+            _expect_dtype(known, np.bool_, f"{where}: known")
+        else:
+            known = np.ones(depth_m.shape, np.bool_)
+        if probabilities is not None:
+            expect_shape(probabilities, f"{size} {len(self.label_set)}", f"{where}: probabilities")
+            _expect_dtype(probabilities, np.float32, f"{where}: probabilities")
+            probabilities = np.ascontiguousarray(probabilities)
+        return np.ascontiguousarray(depth_m), np.ascontiguousarray(known), probabilities
+
+    def _weigh(
+        self, depth: Float32, probabilities: Float32 | None, known: BoolImage, camera: Camera, where: str
+    ) -> tuple[Float32, Float32]:
+        if probabilities is None:
+            return no_votes(depth.shape[0], depth.shape[1], len(self.label_set))
+        weights, bad = vote_weights(depth, known, probabilities, camera, self.config.depth_max_m)
+        if bad:
+            raise FrameError(
+                f"{where}: {bad} known pixels hold class probabilities that are NaN, negative or do not sum to 1; "
+                "give a softmax, or mark the pixels as not known"
+            )
+        return weights, probabilities
+
+
+def _expect_dtype(array: NDArray[np.generic], dtype: type[np.generic], name: str) -> None:
+    if array.dtype != dtype:
+        raise ShapeError(f"{name}: expected dtype {np.dtype(dtype).name}, got {array.dtype.name}")
+
+
+def _check_min_weight(min_weight: float) -> None:
+    if not min_weight > 0:
+        raise MapError(f"min_weight must be above 0 (voxels without a measurement have no surface), got {min_weight}")
+
+
+def _check_config(config: VoxelMapConfig) -> None:
+    positive = ("voxel_size_m", "truncation_voxels", "depth_max_m", "initial_blocks", "max_blocks")
+    for name in positive:
+        value = getattr(config, name)
+        if not (np.isfinite(value) and value > 0):
+            raise ConfigError(f"voxel_map.{name} must be above 0, got {value}")
+    if not config.max_weight >= 1:
+        raise ConfigError(f"voxel_map.max_weight must be at least 1, got {config.max_weight}")
+    if not (config.vote_discount >= 0 and config.vote_band_voxels >= 0):
+        raise ConfigError("voxel_map.vote_discount and vote_band_voxels must not be negative")

@@ -1,0 +1,32 @@
+"""Procedural benchmark scenes: seeded furnished rooms with exact depth, labels and poses."""
+
+from semantic_mapper.scenes.camera import camera_path
+from semantic_mapper.scenes.config import (
+    SUITE_VERSION,
+    TEST_SEEDS,
+    TRAIN_SEEDS,
+    VALIDATION_SEEDS,
+    CameraPathConfig,
+    NoiseConfig,
+    RoomConfig,
+)
+from semantic_mapper.scenes.render import RenderedView, render_view
+from semantic_mapper.scenes.room import make_room
+from semantic_mapper.scenes.scene import Scene
+from semantic_mapper.scenes.sequence import room_frames
+
+__all__ = [
+    "SUITE_VERSION",
+    "TEST_SEEDS",
+    "TRAIN_SEEDS",
+    "VALIDATION_SEEDS",
+    "CameraPathConfig",
+    "NoiseConfig",
+    "RenderedView",
+    "RoomConfig",
+    "Scene",
+    "camera_path",
+    "make_room",
+    "render_view",
+    "room_frames",
+]

@@ -1,0 +1,87 @@
+"""Tables and desks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semantic_mapper.scenes.furniture.registry import furniture
+from semantic_mapper.scenes.materials import Palette
+from semantic_mapper.scenes.primitives import Assembly, Top
+
+
+def _legs(a: Assembly, material: int, w: float, d: float, height: float, thick: float) -> None:
+    for x in (-1, 1):
+        for y in (thick, d - thick):
+            a.box(material, (x * (w / 2 - thick), y, height / 2), (thick, thick, height))
+
+
+@furniture("table", "centre", keep_free_m=0.0)
+def dining_table(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A rectangular table with four legs."""
+    w, d, h = rng.uniform(1.1, 1.8), rng.uniform(0.75, 0.95), rng.uniform(0.72, 0.77)
+    wood = palette.pick(rng, "wood", "wood", "paint")
+    a.box(wood, (0, d / 2, h), (w, d, 0.04))
+    _legs(a, palette.pick(rng, "wood", "metal") if rng.uniform() < 0.3 else wood, w, d, h - 0.02, 0.06)
+    a.box(wood, (0, d / 2, h - 0.06), (w - 0.16, d - 0.16, 0.07))
+    a.tops.append(Top(-w / 2, w / 2, 0, d, h + 0.02))
+
+
+@furniture("table", "centre")
+def round_table(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A round top on a column."""
+    r, h = rng.uniform(0.8, 1.2), rng.uniform(0.72, 0.77)
+    wood, foot = palette.pick(rng, "wood", "paint"), palette.pick(rng, "wood", "metal")
+    a.cylinder(wood, (0, r / 2, h), (r, r, 0.04))
+    a.cylinder(foot, (0, r / 2, h / 2), (0.1, 0.1, h - 0.04))
+    a.cylinder(foot, (0, r / 2, 0.02), (r * 0.5, r * 0.5, 0.04))
+    a.tops.append(Top(-r * 0.35, r * 0.35, r * 0.15, r * 0.85, h + 0.02))
+
+
+@furniture("table", "centre")
+def coffee_table(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A low table, sometimes with a shelf."""
+    w, d, h = rng.uniform(0.8, 1.2), rng.uniform(0.5, 0.7), rng.uniform(0.36, 0.46)
+    wood = palette.pick(rng, "wood", "dark")
+    a.box(wood, (0, d / 2, h), (w, d, 0.05))
+    _legs(a, palette.pick(rng, "wood", "metal"), w, d, h - 0.02, 0.05)
+    if rng.uniform() < 0.5:
+        a.box(wood, (0, d / 2, 0.14), (w - 0.1, d - 0.1, 0.025))
+    a.tops.append(Top(-w / 2, w / 2, 0, d, h + 0.025))
+
+
+@furniture("desk", "wall", keep_free_m=0.75)
+def desk(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A writing desk with a drawer pedestal, screen and keyboard."""
+    w, d, h = rng.uniform(1.1, 1.6), rng.uniform(0.6, 0.75), rng.uniform(0.7, 0.76)
+    wood, dark = palette.pick(rng, "wood", "wood", "paint"), palette.pick(rng, "dark", "metal")
+    side = 1 if rng.uniform() < 0.5 else -1
+    a.box(wood, (0, d / 2, h), (w, d, 0.035))
+    a.box(wood, (-side * (w / 2 - 0.03), d / 2, (h - 0.02) / 2), (0.035, d - 0.04, h - 0.02))
+    a.box(wood, (0, 0.05, h * 0.65), (w - 0.1, 0.02, h * 0.5))
+    a.box(wood, (side * (w / 2 - 0.22), d / 2, (h - 0.02) / 2), (0.4, d - 0.06, h - 0.02))
+    for z in (0.18, 0.4, 0.6):
+        a.box(wood, (side * (w / 2 - 0.22), d - 0.02, z * h / 0.74), (0.37, 0.02, 0.17))
+        a.box(dark, (side * (w / 2 - 0.22), d, z * h / 0.74), (0.12, 0.025, 0.015))
+    x = -side * w * 0.12
+    screen = palette.pick(rng, "dark", "print")
+    a.box(dark, (x, 0.2, h + 0.03), (0.2, 0.16, 0.02), label="otherprop", item=1)
+    a.box(dark, (x, 0.17, h + 0.14), (0.05, 0.03, 0.22), label="otherprop", item=1)
+    a.box(dark, (x, 0.19, h + 0.33), (0.56, 0.03, 0.34), label="otherprop", item=1)
+    a.box(screen, (x, 0.206, h + 0.33), (0.53, 0.006, 0.31), label="otherprop", item=1)
+    a.box(dark, (x, 0.45, h + 0.027), (0.42, 0.14, 0.015), label="otherprop", item=2)
+    edge = side * w / 2
+    a.tops.append(Top(min(edge, edge - side * 0.42), max(edge, edge - side * 0.42), 0, d, h + 0.018))
+
+
+@furniture("otherfurniture", "wall")
+def nightstand(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A small chest beside a bed."""
+    w, d, h = rng.uniform(0.38, 0.5), rng.uniform(0.35, 0.42), rng.uniform(0.42, 0.6)
+    wood, knob = palette.pick(rng, "wood", "paint"), palette.pick(rng, "metal")
+    a.box(wood, (0, d / 2, h / 2 + 0.03), (w, d, h - 0.06))
+    a.box(wood, (0, d / 2 - 0.01, 0.03), (w - 0.06, d - 0.06, 0.06))
+    a.box(wood, (0, d / 2, h + 0.01), (w + 0.03, d + 0.02, 0.025))
+    for z in (0.3, 0.7):
+        a.box(wood, (0, d + 0.008, h * z + 0.02), (w - 0.05, 0.016, h * 0.36))
+        a.ellipsoid(knob, (0, d + 0.025, h * z + 0.02), (0.03, 0.03, 0.03))
+    a.tops.append(Top(-w / 2, w / 2, 0, d, h + 0.0225))

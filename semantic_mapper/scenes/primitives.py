@@ -1,0 +1,216 @@
+"""Analytic primitives, assemblies of them, and the arrays that the ray casters read.
+
+A primitive is a unit shape (box [-1, 1]^3, cylinder about z, sphere) scaled by its half extents, turned and moved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.types import Float64, UInt8
+
+Vector = tuple[float, float, float]
+
+_LABEL_ID = dict(zip(ROOMS.names, ROOMS.ids, strict=True))
+
+
+class Shape(IntEnum):
+    """Unit shapes."""
+
+    BOX = 0
+    CYLINDER = 1
+    ELLIPSOID = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """One primitive in the frame of its assembly.
+
+    Args:
+        shape: Unit shape.
+        center: (3,) metres.
+        half: (3,) half extents along its own axes.
+        rotation: (3, 3) own axes -> assembly axes.
+        label: Class name of ``labels.ROOMS``.
+        material: Number in the palette.
+        item: Separate objects of one assembly (a cushion on a sofa) have numbers of their own.
+        casts_shadow: False for what light comes from or through.
+    """
+
+    shape: Shape
+    center: Float64
+    half: Float64
+    rotation: Float64
+    label: str
+    material: int
+    item: int = 0
+    casts_shadow: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Top:
+    """A horizontal surface of an assembly on which small things may stand: [x0, x1] x [y0, y1] at height z."""
+
+    x0: float
+    x1: float
+    y0: float
+    y1: float
+    z: float
+
+
+@dataclass(slots=True)
+class Assembly:
+    """A piece of furniture under construction.
+
+    Axes: x along the wall it stands at, y away from the wall into the room, z up. The origin is on the floor, in the
+    middle of the back.
+    """
+
+    label: str
+    parts: list[Part] = field(default_factory=list[Part])
+    tops: list[Top] = field(default_factory=list[Top])
+    lamps: list[Vector] = field(default_factory=list[Vector])  # where light comes from
+    keep_free_m: float = 0.0  # space to leave in front, in y
+
+    def add(
+        self,
+        shape: Shape,
+        material: int,
+        center: Vector,
+        size: Vector,
+        *,
+        label: str | None = None,
+        yaw: float = 0.0,
+        tilt: float = 0.0,
+        item: int = 0,
+        casts_shadow: bool = True,
+    ) -> None:
+        """Add a primitive of full extents ``size``, leaning back by ``tilt`` about x, then turned by ``yaw`` about z
+        (radians)."""
+        self.parts.append(
+            Part(
+                shape,
+                np.array(center, np.float64),
+                np.array(size, np.float64) / 2,
+                rotation_z(yaw) @ rotation_x(tilt),
+                label or self.label,
+                material,
+                item,
+                casts_shadow,
+            )
+        )
+
+    def box(self, material: int, center: Vector, size: Vector, **options: object) -> None:
+        """``add`` a box."""
+        self.add(Shape.BOX, material, center, size, **options)  # type: ignore[arg-type]
+
+    def cylinder(self, material: int, center: Vector, size: Vector, **options: object) -> None:
+        """``add`` an upright cylinder."""
+        self.add(Shape.CYLINDER, material, center, size, **options)  # type: ignore[arg-type]
+
+    def ellipsoid(self, material: int, center: Vector, size: Vector, **options: object) -> None:
+        """``add`` an ellipsoid."""
+        self.add(Shape.ELLIPSOID, material, center, size, **options)  # type: ignore[arg-type]
+
+    def bounds(self) -> tuple[Float64, Float64]:
+        """Lower and upper corner (3,) of all parts, in the assembly's frame."""
+        lows, highs = zip(*(part_bounds(part) for part in self.parts), strict=True)
+        return np.min(lows, axis=0), np.max(highs, axis=0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Primitives:
+    """P primitives in world coordinates, as arrays.
+
+    Args:
+        shape: (P,) int64 of ``Shape``.
+        center, half: (P, 3) float64 metres.
+        rotation: (P, 3, 3) float64, own axes -> world.
+        label: (P,) uint8 ids of ``labels.ROOMS``.
+        instance: (P,) uint16, from 1.
+        group: (P,) int64, which piece of furniture it belongs to; 0 to 5 are floor, ceiling and walls.
+        material: (P,) int64.
+        casts_shadow: (P,) bool.
+    """
+
+    shape: np.ndarray
+    center: Float64
+    half: Float64
+    rotation: Float64
+    label: UInt8
+    instance: np.ndarray
+    group: np.ndarray
+    material: np.ndarray
+    casts_shadow: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.shape)
+
+    def bounds(self) -> tuple[Float64, Float64]:
+        """Axis-aligned bounds (P, 3), (P, 3) in world coordinates."""
+        reach = np.einsum("pij,pj->pi", np.abs(self.rotation), self.half)
+        return self.center - reach, self.center + reach
+
+
+def rotation_z(angle: float) -> Float64:
+    """(3, 3) right-handed rotation about z."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def rotation_x(angle: float) -> Float64:
+    """(3, 3) right-handed rotation about x."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def part_bounds(part: Part) -> tuple[Float64, Float64]:
+    """Axis-aligned bounds of a part in its assembly's frame."""
+    reach = np.abs(part.rotation) @ part.half
+    return part.center - reach, part.center + reach
+
+
+def place_parts(assembly: Assembly, yaw: float, position: Float64) -> list[Part]:
+    """The parts of ``assembly``, turned by ``yaw`` about z and moved to ``position`` (3,)."""
+    turn = rotation_z(yaw)
+    return [
+        Part(
+            p.shape,
+            turn @ p.center + position,
+            p.half,
+            turn @ p.rotation,
+            p.label,
+            p.material,
+            p.item,
+            p.casts_shadow,
+        )
+        for p in assembly.parts
+    ]
+
+
+def pack(groups: list[list[Part]]) -> Primitives:
+    """Parts in world coordinates -> arrays; each (group, item) becomes one instance, numbered from 1."""
+    instances: dict[tuple[int, int], int] = {}
+    flat: list[Part] = []
+    numbers: list[int] = []
+    owners: list[int] = []
+    for index, group in enumerate(groups):
+        for part in group:
+            flat.append(part)
+            owners.append(index)
+            numbers.append(instances.setdefault((index, part.item), len(instances) + 1))
+    return Primitives(
+        shape=np.array([int(p.shape) for p in flat], np.int64),
+        center=np.array([p.center for p in flat], np.float64),
+        half=np.array([p.half for p in flat], np.float64),
+        rotation=np.array([p.rotation for p in flat], np.float64),
+        label=np.array([_LABEL_ID[p.label] for p in flat], np.uint8),
+        instance=np.array(numbers, np.uint16),
+        group=np.array(owners, np.int64),
+        material=np.array([p.material for p in flat], np.int64),
+        casts_shadow=np.array([p.casts_shadow for p in flat], np.bool_),
+    )

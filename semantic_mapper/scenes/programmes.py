@@ -1,0 +1,195 @@
+"""What stands in which kind of room, and the little scenes that furniture forms (chairs at a table)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from semantic_mapper.scenes.furniture import FURNITURE
+from semantic_mapper.scenes.layout import Layout
+from semantic_mapper.scenes.primitives import Assembly, rotation_z
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """``most`` tries of a piece or set, each with ``chance``."""
+
+    name: str
+    chance: float = 1.0
+    most: int = 1
+
+
+_WINDOW = Entry("window", 0.9)
+_WALLS = (Entry("window", 0.5), Entry("radiator", 0.4), Entry("picture", 0.7, 3), Entry("wall_shelf", 0.4))
+_LOOSE = (Entry("plant", 0.4), Entry("floor_lamp", 0.35), Entry("waste_bin", 0.3), Entry("carton", 0.3, 2))
+
+PROGRAMMES: dict[str, tuple[Entry, ...]] = {
+    "bedroom": (
+        Entry("door"), Entry("bed_set"), _WINDOW,
+        Entry("wardrobe", 0.8), Entry("dresser", 0.6), Entry("desk_set", 0.4),
+        Entry("bookshelf", 0.3), Entry("armchair", 0.3), *_WALLS, *_LOOSE,
+    ),
+    "living": (
+        Entry("door"), Entry("sofa_set"), _WINDOW,
+        Entry("sideboard", 0.8), Entry("bookshelf", 0.7), Entry("armchair", 0.6),
+        Entry("dining_set", 0.4), Entry("dresser", 0.4), *_WALLS, *_LOOSE,
+    ),
+    "office": (
+        Entry("door"), Entry("desk_set"), _WINDOW,
+        Entry("desk_set", 0.5), Entry("bookshelf", 0.9), Entry("bookshelf", 0.4),
+        Entry("dresser", 0.5), Entry("wardrobe", 0.3), Entry("dining_set", 0.3), Entry("open_rack", 0.5),
+        *_WALLS, *_LOOSE,
+    ),
+    "kitchen": (
+        Entry("door"), Entry("counter"), _WINDOW,
+        Entry("refrigerator", 0.95), Entry("stove", 0.7), Entry("dining_set", 0.85),
+        Entry("dresser", 0.3), Entry("open_rack", 0.3), *_WALLS, *_LOOSE,
+    ),
+    "bathroom": (
+        Entry("door"), Entry("bathtub", 0.9), Entry("toilet"), Entry("wash_basin", 0.95), Entry("dresser", 0.3),
+        Entry("stool", 0.4), _WINDOW, Entry("towel_rail", 0.8), Entry("open_rack", 0.3),
+        Entry("picture", 0.4), Entry("radiator", 0.5), Entry("waste_bin", 0.5),
+    ),
+    "studio": (
+        Entry("door"), Entry("bed_set"), _WINDOW,
+        Entry("counter", 0.8), Entry("refrigerator", 0.8), Entry("sofa_set", 0.6),
+        Entry("dining_set", 0.5), Entry("bookshelf", 0.5), Entry("wardrobe", 0.5), *_WALLS, *_LOOSE,
+    ),
+}  # fmt: skip
+
+SHARES = {"bedroom": 0.16, "living": 0.18, "office": 0.12, "kitchen": 0.2, "bathroom": 0.22, "studio": 0.12}
+
+CLUTTER = ("table_lamp", "cup", "cup", "bottle", "bowl", "book_pile", "vase", "small_box")
+
+
+def furnish(layout: Layout, programme: str, clutter: float) -> None:
+    """Fill ``layout`` after ``PROGRAMMES[programme]``."""
+    for entry in PROGRAMMES[programme]:
+        for _ in range(entry.most):
+            if layout.rng.uniform() < entry.chance:
+                _place(layout, entry.name)
+    ceiling_lamp = FURNITURE["ceiling_lamp"].make(layout.rng, layout.palette)
+    w, d, h = layout.size_m
+    layout.put(ceiling_lamp, 0.0, np.array([w / 2, d / 2, h - 0.001]))
+    if clutter > 0:
+        layout.clutter(clutter, CLUTTER)
+
+
+def _place(layout: Layout, name: str) -> None:
+    if name in _SETS:
+        _SETS[name](layout)
+        return
+    kind = FURNITURE[name]
+    assembly = kind.make(layout.rng, layout.palette)
+    if kind.place == "centre":
+        layout.in_centre(assembly)
+    else:
+        layout.at_wall(assembly, corner=kind.place == "corner", flush=kind.place == "hang")
+
+
+def _main_piece(layout: Layout, name: str) -> tuple[Assembly, float, np.ndarray] | None:
+    """Stand a piece at a wall, trying specimens of several sizes; the piece with its yaw and position, or None."""
+    for _ in range(4):
+        piece = FURNITURE[name].make(layout.rng, layout.palette)
+        pose = layout.at_wall(piece, corner=False, flush=False, tries=40)
+        if pose is not None:
+            return piece, *pose
+    return None
+
+
+def _bed_set(layout: Layout) -> None:
+    """A bed, nightstands at its head, often a rug."""
+    rng = layout.rng
+    found = _main_piece(layout, "bed")
+    if found is None:
+        return
+    bed, yaw, position = found
+    low, high = bed.bounds()
+    for side in (-1, 1):
+        stand = FURNITURE["nightstand"].make(rng, layout.palette)
+        own_low, own_high = stand.bounds()
+        reach = high[0] + 0.06 - own_low[0] if side > 0 else low[0] - 0.06 - own_high[0]
+        if rng.uniform() < 0.75:
+            layout.put(stand, yaw, position + rotation_z(yaw) @ np.array([reach, 0.0, 0.0]))
+    if rng.uniform() < 0.5:
+        rug = FURNITURE["rug"].make(rng, layout.palette)
+        layout.on_floor_unchecked(rug, yaw, position + rotation_z(yaw) @ np.array([0.0, 1.2, 0.0]))
+
+
+def _sofa_set(layout: Layout) -> None:
+    """A sofa with a low table before it, often on a rug."""
+    rng = layout.rng
+    found = _main_piece(layout, "sofa")
+    if found is None:
+        return
+    sofa, yaw, position = found
+    front = float(sofa.bounds()[1][1])
+    if rng.uniform() < 0.6:
+        rug = FURNITURE["rug"].make(rng, layout.palette)
+        layout.on_floor_unchecked(rug, yaw, position + rotation_z(yaw) @ np.array([0.0, front - 0.2, 0.0]))
+    if rng.uniform() < 0.85:
+        table = FURNITURE["coffee_table"].make(rng, layout.palette)
+        own = np.array([rng.uniform(-0.1, 0.1), front + rng.uniform(0.3, 0.45), 0.0])
+        layout.put(table, yaw, position + rotation_z(yaw) @ own, in_keep_free=True)
+
+
+def _desk_set(layout: Layout) -> None:
+    """A desk and a chair drawn up to it."""
+    rng = layout.rng
+    found = _main_piece(layout, "desk")
+    if found is None:
+        return
+    desk, yaw, position = found
+    chair = FURNITURE[("office_chair", "office_chair", "chair")[int(rng.integers(3))]].make(rng, layout.palette)
+    depth = float(desk.bounds()[1][1])
+    own = np.array([rng.uniform(-0.12, 0.12), depth + rng.uniform(0.5, 0.75), 0.0])
+    turn = yaw + np.pi + rng.uniform(-0.35, 0.35)
+    layout.put(chair, turn, position + rotation_z(yaw) @ own, in_keep_free=True)
+
+
+def _dining_set(layout: Layout) -> None:
+    """A table with chairs of one kind round it."""
+    rng = layout.rng
+    round_top = rng.uniform() < 0.35
+    table = FURNITURE["round_table" if round_top else "dining_table"].make(rng, layout.palette)
+    pose = layout.in_centre(table, tries=60, margin_m=0.55)
+    if pose is None:
+        return
+    yaw, position = pose
+    low, high = table.bounds()
+    kind = ("chair", "chair", "stool")[int(rng.integers(3))]
+    seats: list[tuple[float, float, float]] = []  # x, y of the table's edge, and the way the chair faces
+    middle_y = float(low[1] + high[1]) / 2
+    for x in (-0.25, 0.25) if not round_top else (0.0,):
+        across = x * float(high[0] - low[0])
+        seats += [(across, float(high[1]), np.pi), (across, float(low[1]), 0.0)]
+    seats += [(float(high[0]), middle_y, np.pi / 2), (float(low[0]), middle_y, -np.pi / 2)]
+    look = rng.integers(1 << 30)
+    for x, y, facing in seats:
+        if rng.uniform() < 0.7:
+            # One generator seed for all: the chairs of a set are alike.
+            chair = FURNITURE[kind].make(np.random.default_rng(look), layout.palette)
+            _draw_up(layout, chair, yaw, position, x, y, facing)
+
+
+def _draw_up(
+    layout: Layout, chair: Assembly, yaw: float, position: np.ndarray, x: float, y: float, facing: float
+) -> None:
+    """Put ``chair`` at the table's edge (x, y): its seat a little under the top, or further out."""
+    for out in (layout.rng.uniform(0.3, 0.4), layout.rng.uniform(0.5, 0.65)):
+        # A chair's own y runs from its back to its front; the front points at the table.
+        forward = rotation_z(facing) @ np.array([0.0, 1.0, 0.0])
+        own = np.array([x, y, 0.0]) - forward * out
+        turn = yaw + facing + layout.rng.uniform(-0.15, 0.15)
+        if layout.put(chair, turn, position + rotation_z(yaw) @ own, in_keep_free=True):
+            return
+
+
+_SETS: dict[str, Callable[[Layout], None]] = {
+    "bed_set": _bed_set,
+    "sofa_set": _sofa_set,
+    "desk_set": _desk_set,
+    "dining_set": _dining_set,
+}

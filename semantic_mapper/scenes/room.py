@@ -1,0 +1,80 @@
+"""``make_room``: one furnished room from a seed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.scenes.config import SUITE_VERSION, RoomConfig
+from semantic_mapper.scenes.layout import Layout
+from semantic_mapper.scenes.materials import Palette
+from semantic_mapper.scenes.primitives import Primitives, pack
+from semantic_mapper.scenes.programmes import PROGRAMMES, SHARES, furnish
+from semantic_mapper.scenes.scene import Lights, Scene, shadow_cubes
+from semantic_mapper.types import Float64
+
+_ROOM_STREAM = 0  # number of the random stream; camera paths use others
+
+
+def make_room(seed: int, config: RoomConfig = RoomConfig()) -> Scene:
+    """Build the room of ``seed``; the same (suite version, seed, config) always gives the same room.
+
+    Raises:
+        ConfigError: negative seed, or bounds of ``config`` that leave nothing to choose.
+    """
+    _check(seed, config)
+    rng = np.random.default_rng((SUITE_VERSION, seed, _ROOM_STREAM))
+    drawn = str(rng.choice(list(SHARES), p=list(SHARES.values())))
+    programme = config.programme or drawn
+    size = _room_size(rng, programme, config)
+    palette = Palette(rng)
+    layout = Layout(size, rng, palette)
+    furnish(layout, programme, config.clutter)
+    primitives = pack(layout.groups)
+    lights = _make_lights(rng, primitives, layout.lamps, size, config.shadow_resolution)
+    return Scene(seed, programme, size, primitives, palette.table(), lights)
+
+
+def _check(seed: int, config: RoomConfig) -> None:
+    if seed < 0:
+        raise ConfigError(f"room seed {seed} is negative; seeds count from 0")
+    if not 2.4 <= config.min_side_m <= config.max_side_m:
+        raise ConfigError(
+            f"RoomConfig: need 2.4 <= min_side_m <= max_side_m, got {config.min_side_m} and {config.max_side_m}"
+        )
+    if not 2.2 <= config.min_height_m <= config.max_height_m:
+        raise ConfigError(
+            f"RoomConfig: need 2.2 <= min_height_m <= max_height_m, got {config.min_height_m} and {config.max_height_m}"
+        )
+    if config.programme is not None and config.programme not in PROGRAMMES:
+        raise ConfigError(f"RoomConfig: no programme '{config.programme}'; there are {', '.join(PROGRAMMES)}")
+    if config.clutter < 0 or config.shadow_resolution < 8:
+        raise ConfigError("RoomConfig: clutter must not be negative, shadow_resolution must be at least 8")
+
+
+def _room_size(rng: np.random.Generator, programme: str, config: RoomConfig) -> tuple[float, float, float]:
+    largest = min(config.max_side_m, config.min_side_m + 0.8) if programme == "bathroom" else config.max_side_m
+    w, d = rng.uniform(config.min_side_m, largest, 2)
+    return float(w), float(d), float(rng.uniform(config.min_height_m, config.max_height_m))
+
+
+def _make_lights(
+    rng: np.random.Generator,
+    primitives: Primitives,
+    lamps: list[Float64],
+    size: tuple[float, float, float],
+    shadow_resolution: int,
+) -> Lights:
+    """One to three of the room's lamps and windows are lit; strengths add up to an evenly exposed picture."""
+    order = rng.permutation(len(lamps)) if lamps else np.zeros(0, int)
+    chosen = [lamps[i] for i in order[: int(rng.integers(1, 4))]]
+    if not chosen:
+        chosen = [np.array([size[0] / 2, size[1] / 2, size[2] - 0.3])]
+    shares = rng.uniform(0.5, 1.5, len(chosen))
+    strength = rng.uniform(3.0, 4.5) * (size[0] * size[1] / 16.0) ** 0.5
+    warm = rng.uniform(-1.0, 1.0, (len(chosen), 1))
+    tint = 1.0 + warm * np.array([[0.15, 0.0, -0.2]])
+    position = np.array(chosen)
+    cubes = shadow_cubes(primitives, position, shadow_resolution)
+    color = tint * (strength * shares / shares.sum())[:, None]
+    return Lights(position, color, cubes, rng.uniform(0.3, 0.5) * (1.0 + rng.uniform(-0.06, 0.06, 3)))

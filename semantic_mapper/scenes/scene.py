@@ -1,0 +1,81 @@
+"""A finished scene: primitives, materials, lights; plain data that both ray casters read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.scenes.fast_cast import cast_pixels
+from semantic_mapper.scenes.materials import MaterialTable
+from semantic_mapper.scenes.primitives import Primitives
+from semantic_mapper.types import Float32, Float64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lights:
+    """N point lights and what they cannot see.
+
+    Args:
+        position: (N, 3) float64 metres.
+        color: (N, 3) float64 linear RGB times strength.
+        shadow: (N, 6, S, S) float32: per face of a cube round the light, the depth of the first surface. Face
+            ``2 * axis + (direction is negative)``; its columns run along axis + 1, its rows along axis + 2 (mod 3).
+        ambient: (3,) float64 linear RGB that reaches every surface.
+    """
+
+    position: Float64
+    color: Float64
+    shadow: Float32
+    ambient: Float64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """One room.
+
+    Args:
+        seed: That it was made from.
+        programme: Kind of room ("kitchen", ...).
+        size_m: (width, depth, height); the room fills [0, width] x [0, depth] x [0, height], z up.
+        primitives: Everything that can be seen, walls included.
+        materials: Rows are what ``primitives.material`` counts.
+        lights: Point lights and ambient light.
+    """
+
+    seed: int
+    programme: str
+    size_m: tuple[float, float, float]
+    primitives: Primitives
+    materials: MaterialTable
+    lights: Lights
+
+    @property
+    def label_set(self) -> LabelSet:
+        """Of the label images."""
+        return ROOMS
+
+
+def shadow_cubes(primitives: Primitives, position: Float64, resolution: int) -> Float32:
+    """Depth (N, 6, S, S) round each light; see ``Lights.shadow``. Misses are inf."""
+    keep = primitives.casts_shadow
+    shape, center, half, rotation = (
+        primitives.shape[keep],
+        primitives.center[keep],
+        primitives.half[keep],
+        primitives.rotation[keep],
+    )
+    cubes = np.empty((len(position), 6, resolution, resolution), np.float32)
+    focal, middle = resolution / 2.0, resolution / 2.0 - 0.5
+    for light, origin in enumerate(position):
+        for face in range(6):
+            axis, sign = face // 2, 1.0 - 2.0 * (face % 2)
+            axes = np.zeros((3, 3))
+            axes[(axis + 1) % 3, 0] = axes[(axis + 2) % 3, 1] = 1.0
+            axes[axis, 2] = sign
+            depth, _ = cast_pixels(
+                shape, center, half, rotation, origin, axes, focal, focal, middle, middle, resolution, resolution
+            )
+            cubes[light, face] = depth
+    return cubes

@@ -1,0 +1,140 @@
+"""What S-Ray has to beat with the same labelled keyframes: a per-image U-Net, and labels carried over by depth."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+from torch.nn import functional
+
+from semantic_mapper.config import Config, SRayConfig
+from semantic_mapper.errors import FrameError
+from semantic_mapper.fields.encoder import ImageEncoder
+from semantic_mapper.geometry import invert_pose, transform, unproject
+from semantic_mapper.imaging import fill_holes, resize_depth
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.training.losses import IGNORE
+from semantic_mapper.training.views import jitter_colours, stack_sources, view_from_frame
+from semantic_mapper.types import PosedFrame, UInt8
+
+WARP_TOLERANCE = 0.04  # share of z by which a keyframe's depth may disagree and still show the same surface
+
+
+class UNetConfig(Config, frozen=True):
+    """Budget and optimiser of the per-image U-Net."""
+
+    seconds: float = 300.0
+    width: int = 320
+    batch: int = 4
+    learning_rate: float = 1e-3
+    final_learning_rate: float = 5e-5
+    colour_jitter: float = 0.2
+    seed: int = 0
+
+
+class UNetBaseline:
+    """A per-image U-Net: S-Ray's own image encoder with a classifier on top, and nothing that looks across views."""
+
+    def __init__(self, label_set: LabelSet, config: UNetConfig) -> None:
+        torch.manual_seed(config.seed)
+        shape = SRayConfig()
+        self.label_set = label_set
+        self.config = config
+        self.net = nn.Sequential(
+            ImageEncoder(shape.encoder_width, shape.encoder_blocks, shape.feature_dim),
+            nn.ReLU(),
+            nn.Conv2d(shape.feature_dim, len(label_set), 1),
+        )
+
+    def fit(self, frames: Sequence[PosedFrame], on_progress: Callable[[float], None] | None = None) -> int:
+        """Train on labelled frames for the budget, with colour jitter and mirrored images; returns the steps done."""
+        if not frames:
+            raise FrameError("the U-Net baseline needs labelled frames, got none")
+        views = [view_from_frame(f, self.label_set, self.config.width) for f in frames]
+        generator = torch.Generator().manual_seed(self.config.seed)
+        optimiser = torch.optim.AdamW(self.net.parameters(), self.config.learning_rate, weight_decay=1e-4)
+        began, steps = time.monotonic(), 0
+        while (fraction := (time.monotonic() - began) / self.config.seconds) < 1:
+            span = self.config.learning_rate - self.config.final_learning_rate
+            for group in optimiser.param_groups:
+                group["lr"] = self.config.final_learning_rate + span * 0.5 * (1 + float(np.cos(np.pi * fraction)))
+            order = torch.randperm(len(views), generator=generator).tolist()[: self.config.batch]
+            batch = [views[i] for i in order]
+            rgb = jitter_colours(stack_sources(batch), self.config.colour_jitter, generator).rgb
+            channel = torch.stack([v.channel for v in batch])
+            if float(torch.rand(1, generator=generator)) < 0.5:
+                rgb, channel = rgb.flip(-1), channel.flip(-1)
+            loss = functional.cross_entropy(self._logits(rgb, channel.shape[-2:]), channel, ignore_index=IGNORE)
+            optimiser.zero_grad()
+            loss.backward()  # pyright: ignore[reportUnknownMemberType]
+            optimiser.step()
+            steps += 1
+            if on_progress is not None:
+                on_progress(min(fraction, 1.0))
+        self.net.eval()
+        return steps
+
+    def predict(self, frame: PosedFrame) -> UInt8:
+        """Class ids (H, W) of one image at full size."""
+        view = view_from_frame(
+            PosedFrame(
+                stamp_ns=frame.stamp_ns,
+                seq=frame.seq,
+                camera_id=frame.camera_id,
+                rgb=frame.rgb,
+                depth_m=None,
+                label=None,
+                intrinsics=frame.intrinsics,
+                T_world_camera=frame.T_world_camera,
+            ),
+            self.label_set,
+            self.config.width,
+        )
+        with torch.inference_mode():
+            channel = self._logits(view.rgb[None], frame.rgb.shape[:2])[0].argmax(0)
+        return self.label_set.to_ids(channel.numpy())
+
+    def _logits(self, rgb: torch.Tensor, size: Sequence[int]) -> torch.Tensor:
+        return functional.interpolate(self.net(rgb), size=tuple(size), mode="bilinear", align_corners=False)
+
+
+class WarpBaseline:
+    """Labels of the keyframes carried over by depth: no learning, nothing where no keyframe looked."""
+
+    def __init__(self, label_set: LabelSet, frames: Sequence[PosedFrame]) -> None:
+        self.label_set = label_set
+        self._frames = [f for f in frames if f.label is not None and f.depth_m is not None]
+        if not self._frames:
+            raise FrameError("carrying labels over needs labelled keyframes with depth, got none")
+
+    def predict(self, frame: PosedFrame) -> UInt8:
+        """Class ids (H, W): each pixel takes the label of the keyframe that agrees best with its depth, else ignore."""
+        if frame.depth_m is None:
+            raise FrameError(f"frame seq={frame.seq} has no depth to carry labels over with")
+        depth = fill_holes(resize_depth(frame, frame.intrinsics))
+        points = transform(frame.T_world_camera, unproject(depth, frame.intrinsics).reshape(-1, 3))
+        best = np.full(len(points), WARP_TOLERANCE)
+        label = np.full(len(points), self.label_set.ignore_id, np.uint8)
+        for keyframe in self._frames:
+            error, found = self._look_up(keyframe, points)
+            better = (error < best) & (found != self.label_set.ignore_id)
+            best[better], label[better] = error[better], found[better]
+        self.label_set.to_channels(label, f"frame seq={frame.seq}")
+        return label.reshape(frame.depth_m.shape)
+
+    def _look_up(self, keyframe: PosedFrame, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], UInt8]:
+        assert keyframe.label is not None
+        k = keyframe.intrinsics
+        p = transform(invert_pose(keyframe.T_world_camera), points)
+        z = np.maximum(p[:, 2], 1e-3)
+        u = np.rint(k.fx * p[:, 0] / z + k.cx)
+        v = np.rint(k.fy * p[:, 1] / z + k.cy)
+        inside = (p[:, 2] > 0.05) & (u >= 0) & (u < k.width) & (v >= 0) & (v < k.height)
+        row, column = np.where(inside, v, 0).astype(int), np.where(inside, u, 0).astype(int)
+        measured = resize_depth(keyframe, k)[row, column]
+        error = np.where(inside & (measured > 0), np.abs(measured - p[:, 2]) / z, np.inf)
+        return error, keyframe.label[row, column]

@@ -1,0 +1,192 @@
+"""Few-step finetuning on labelled keyframes of one scene (S-Ray section 4.2).
+
+Held-out rays decide which weights are kept.
+"""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from semantic_mapper.config import Config, SRayConfig, to_plain
+from semantic_mapper.errors import FrameError
+from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, anchor_from_frame
+from semantic_mapper.fields.sampling import sample_guided
+from semantic_mapper.fields.sray import SRay
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.training.losses import IGNORE, semantic_loss
+from semantic_mapper.training.schedule import budget_fraction, cosine_rate
+from semantic_mapper.training.step import StepConfig, pick_views, training_loss
+from semantic_mapper.training.views import LabelledView, draw_pixels, query_rays, stack_sources, view_from_frame
+from semantic_mapper.types import PosedFrame
+
+HELD_OUT_BLOCK = 16  # pixels a side: single held-out pixels would be known from their neighbours
+
+
+class FinetuneConfig(Config, frozen=True):
+    """Budget and optimiser of a finetuning."""
+
+    seconds: float = 300.0  # wall-clock budget; 0 = only steps count (then a run repeats bit for bit)
+    steps: int = 0  # step budget; 0 = only seconds count
+    width: int = 320  # working width of the images
+    learning_rate: float = 1e-3
+    final_learning_rate: float = 5e-5
+    weight_decay: float = 1e-4
+    gradient_clip: float = 10.0
+    held_out_share: float = 0.1  # of each keyframe's pixels, in blocks, never trained on
+    held_out_rays: int = 512  # a keyframe
+    evaluations: int = 10  # over the whole budget
+    patience: int = 4  # evaluations without a better loss before it stops early
+    seed: int = 0
+    step: StepConfig = StepConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class FinetuneProgress:
+    """State after a step: ``fraction`` of the budget, last training loss, held-out loss and accuracy (NaN at first)."""
+
+    step: int
+    fraction: float
+    loss: float
+    held_out_loss: float
+    held_out_accuracy: float
+    best: bool
+
+
+@dataclass(slots=True)
+class _Best:
+    loss: float
+    accuracy: float
+    step: int
+    state: dict[str, torch.Tensor]
+
+
+def finetune(
+    frames: Sequence[PosedFrame],
+    label_set: LabelSet,
+    start: SRay | None,
+    config: FinetuneConfig,
+    on_progress: Callable[[FinetuneProgress], None] | None = None,
+) -> Checkpoint:
+    """Fit a field to the labelled keyframes ``frames``; never worse on held-out rays than where it started.
+
+    Args:
+        frames: Labelled keyframes with poses; at least 2.
+        label_set: Classes of their labels, and of the result.
+        start: Weights to start from, adapted to ``label_set`` by class name; None = random.
+        config: At least one of ``seconds`` and ``steps`` set.
+        on_progress: Called after every step.
+
+    Raises:
+        FrameError: fewer than two frames, or none with labels.
+    """
+    if len(frames) < 2 or all(f.label is None for f in frames):
+        raise FrameError(f"finetuning needs at least 2 labelled keyframes, got {len(frames)}; raise --keyframes")
+    torch.manual_seed(config.seed)
+    generator = torch.Generator().manual_seed(config.seed)
+    model = SRay(SRayConfig(), label_set) if start is None else adapt_model(start, label_set)
+    views = [view_from_frame(f, label_set, config.width) for f in frames]
+    train, held_out = zip(*(_split(v, config.held_out_share, generator) for v in views), strict=True)
+    began = time.monotonic()
+    best, steps = _run(model, train, held_out, config, generator, on_progress)
+    model.load_state_dict(best.state)
+    recipe: dict[str, Any] = {
+        "kind": "finetune",
+        "width": config.width,
+        "config": to_plain(config),
+        "steps": steps,
+        "best_step": best.step,
+        "seconds": round(time.monotonic() - began, 1),
+        "held_out_loss": best.loss,
+        "held_out_accuracy": best.accuracy,
+        "train_stamps_ns": [int(f.stamp_ns) for f in frames],
+    }
+    anchors = tuple(anchor_from_frame(f, config.width) for f in frames)
+    return Checkpoint(model.eval(), anchors, recipe)
+
+
+def _run(
+    model: SRay,
+    train: Sequence[LabelledView],
+    held_out: Sequence[LabelledView],
+    config: FinetuneConfig,
+    generator: torch.Generator,
+    on_progress: Callable[[FinetuneProgress], None] | None,
+) -> tuple[_Best, int]:
+    optimiser = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
+    best = _Best(*_evaluate(model, train, held_out, config), 0, copy.deepcopy(model.state_dict()))
+    latest = (best.loss, best.accuracy)
+    began, step, evaluated, stale = time.monotonic(), 0, 0, 0
+    while (
+        fraction := budget_fraction(step, time.monotonic() - began, steps=config.steps, seconds=config.seconds)
+    ) < 1 and stale < config.patience:
+        rate = cosine_rate(fraction, config.learning_rate, config.final_learning_rate)
+        for group in optimiser.param_groups:
+            group["lr"] = rate
+        query, sources = pick_views(len(train), config.step, generator)
+        loss = training_loss(model, train, query, sources, config.step, generator)
+        step += 1
+        if loss is None:
+            continue
+        optimiser.zero_grad()
+        loss.total.backward()  # pyright: ignore[reportUnknownMemberType]
+        torch.nn.utils.clip_grad_norm_(model.parameters(), config.gradient_clip)
+        optimiser.step()
+        fraction = budget_fraction(step, time.monotonic() - began, steps=config.steps, seconds=config.seconds)
+        improved = False
+        if fraction * config.evaluations >= evaluated + 1 or fraction >= 1:
+            evaluated = int(fraction * config.evaluations)
+            latest = _evaluate(model, train, held_out, config)
+            improved = latest[0] < best.loss
+            stale = 0 if improved else stale + 1
+            if improved:
+                best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
+        if on_progress is not None:
+            on_progress(FinetuneProgress(step, min(fraction, 1.0), float(loss.total.detach()), *latest, improved))
+    return best, step
+
+
+def _split(view: LabelledView, share: float, generator: torch.Generator) -> tuple[LabelledView, LabelledView]:
+    """The view for training (held-out blocks ignored) and for evaluation (all but held-out blocks ignored)."""
+    height, width = view.channel.shape
+    rows, columns = -(-height // HELD_OUT_BLOCK), -(-width // HELD_OUT_BLOCK)
+    blocks = torch.rand(rows, columns, generator=generator) < share
+    mask = blocks.repeat_interleave(HELD_OUT_BLOCK, 0).repeat_interleave(HELD_OUT_BLOCK, 1)[:height, :width]
+    ignored = torch.full_like(view.channel, IGNORE)
+    fields = (view.rgb, view.depth_m)
+    return (
+        LabelledView(*fields, torch.where(mask, ignored, view.channel), view.intrinsics, view.T_world_camera),
+        LabelledView(*fields, torch.where(mask, view.channel, ignored), view.intrinsics, view.T_world_camera),
+    )
+
+
+def _evaluate(
+    model: SRay, train: Sequence[LabelledView], held_out: Sequence[LabelledView], config: FinetuneConfig
+) -> tuple[float, float]:
+    """Class loss and accuracy of held-out rays, each view rendered from all others and their training labels."""
+    generator = torch.Generator().manual_seed(config.seed)
+    sampling = config.step.sampling
+    losses: list[float] = []
+    right, counted = 0, 0
+    model.eval()
+    with torch.inference_mode():
+        encoded = model.encode(stack_sources(train, with_labels=True))
+        for i, view in enumerate(held_out):
+            flat = draw_pixels(view.channel, config.held_out_rays, 0.5, generator, len(model.label_set))
+            if len(flat) == 0:
+                continue
+            prior = view.depth_m.flatten()[flat]
+            rays, targets = query_rays(view, flat, near_m=sampling.near_m, far_m=sampling.far_m, prior=prior)
+            others = torch.tensor([j for j in range(len(held_out)) if j != i][:16])
+            render, _ = model.render_samples(rays, sample_guided(rays, sampling), encoded.select(others))
+            losses.append(float(semantic_loss(render.logits, targets.channel)))
+            right += int((render.logits.argmax(1) == targets.channel).sum())
+            counted += len(flat)
+    model.train()
+    return float(np.mean(losses)) if losses else float("inf"), right / max(counted, 1)

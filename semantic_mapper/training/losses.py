@@ -1,0 +1,56 @@
+"""What a rendered ray is compared with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch.nn import functional
+
+from semantic_mapper.config import Config
+from semantic_mapper.training.views import RayTargets
+from semantic_mapper.types import FieldRender
+
+IGNORE = -1
+
+
+class LossConfig(Config, frozen=True):
+    """Weights of the parts of the loss."""
+
+    semantic: float = 0.25
+    colour: float = 0.75
+    depth: float = 0.1
+    source: float = 0.25  # per-pixel class loss on labelled source views: teaches the shared encoder densely
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Loss:
+    """The total and its parts, each a scalar tensor."""
+
+    total: torch.Tensor
+    semantic: torch.Tensor
+    colour: torch.Tensor
+    depth: torch.Tensor
+
+
+def semantic_loss(logits: torch.Tensor, channel: torch.Tensor) -> torch.Tensor:
+    """Cross-entropy over the rays (S-Ray Eq. 14), ignored rays masked; 0 where all are ignored."""
+    counted = (channel != IGNORE).sum().clamp_min(1)
+    return functional.cross_entropy(logits, channel, ignore_index=IGNORE, reduction="sum") / counted
+
+
+def ray_loss(render: FieldRender, targets: RayTargets, config: LossConfig) -> Loss:
+    """Weighted sum of the semantic, colour and depth losses over rays that some view sees.
+
+    Depth is compared in inverse metres where it is measured, so that near and far errors count by what a camera sees.
+    """
+    known = render.known
+    channel = torch.where(known, targets.channel, torch.full_like(targets.channel, IGNORE))
+    semantic = semantic_loss(render.logits, channel)
+    count = known.sum().clamp_min(1)
+    colour = (((render.rgb - targets.rgb) ** 2).mean(-1) * known).sum() / count
+    measured = known & (targets.depth_m > 0) & (render.opacity > 0.1)
+    inverse = (1 / render.depth_m.clamp_min(0.1) - 1 / targets.depth_m.clamp_min(0.1)).abs()
+    depth = (inverse * measured).sum() / measured.sum().clamp_min(1)
+    total = config.semantic * semantic + config.colour * colour + config.depth * depth
+    return Loss(total, semantic, colour, depth)

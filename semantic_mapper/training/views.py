@@ -1,0 +1,145 @@
+"""Labelled views as tensors, and the draws that training makes from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from semantic_mapper.geometry import camera_matrix, pixel_rays
+from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, working_intrinsics
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.types import CameraIntrinsics, PosedFrame, RayBatch, SourceViews
+
+BatchT = TypeVar("BatchT", SourceViews, RayBatch, "RayTargets")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelledView:
+    """One posed image at training resolution.
+
+    Args:
+        rgb: (3, H, W) float32 in [0, 1].
+        depth_m: (H, W) float32, 0 = none.
+        channel: (H, W) int64 class channels, -1 = ignore.
+        intrinsics: Of (H, W).
+        T_world_camera: (4, 4) float32.
+    """
+
+    rgb: torch.Tensor
+    depth_m: torch.Tensor
+    channel: torch.Tensor
+    intrinsics: CameraIntrinsics
+    T_world_camera: torch.Tensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RayTargets:
+    """What R query rays should render to: channel (R,) int64, rgb (R, 3), depth_m (R,) with 0 = none."""
+
+    channel: torch.Tensor
+    rgb: torch.Tensor
+    depth_m: torch.Tensor
+
+
+def view_from_frame(frame: PosedFrame, label_set: LabelSet, width: int) -> LabelledView:
+    """Resize a frame to the working width; colours by area, depth and labels by nearest pixel."""
+    intrinsics = working_intrinsics(frame.intrinsics, width)
+    if frame.label is None:
+        channel = np.full((intrinsics.height, intrinsics.width), -1, np.int64)
+    else:
+        channel = label_set.to_channels(resize_label(frame.label, intrinsics), f"frame seq={frame.seq}")
+    return LabelledView(
+        torch.from_numpy(resize_rgb(frame, intrinsics)).permute(2, 0, 1).float().div_(255).contiguous(),
+        torch.from_numpy(resize_depth(frame, intrinsics)),
+        torch.from_numpy(channel),
+        intrinsics,
+        torch.from_numpy(frame.T_world_camera).float(),
+    )
+
+
+def to_device(batch: BatchT, device: torch.device) -> BatchT:
+    """A copy of a dataclass of tensors (``SourceViews``, ``RayBatch``, ``RayTargets``) on another device."""
+    values = {f.name: getattr(batch, f.name) for f in fields(batch)}
+    return replace(batch, **{name: value if value is None else value.to(device) for name, value in values.items()})
+
+
+def stack_sources(views: Sequence[LabelledView], *, with_labels: bool = False) -> SourceViews:
+    """Views of one resolution as the input of ``SemanticField.encode``, with what is known of their labels if asked."""
+    return SourceViews(
+        torch.stack([v.rgb for v in views]),
+        torch.stack([v.depth_m for v in views]),
+        torch.stack([torch.from_numpy(camera_matrix(v.intrinsics)).float() for v in views]),
+        torch.stack([v.T_world_camera for v in views]),
+        torch.stack([v.channel for v in views]) if with_labels else None,
+    )
+
+
+def withhold_labels(sources: SourceViews, share: float, generator: torch.Generator) -> SourceViews:
+    """Set the known labels of a random share of the views to "none": most source views of a robot have none."""
+    if sources.channel is None:
+        return sources
+    keep = torch.rand(len(sources.rgb), generator=generator) >= share
+    return replace(sources, channel=torch.where(keep[:, None, None], sources.channel, -1))
+
+
+def withhold_depth(sources: SourceViews, share: float, generator: torch.Generator) -> SourceViews:
+    """Set the depth of a random share of the views to "none", so that the field learns to work without."""
+    keep = torch.rand(len(sources.depth_m), generator=generator) >= share
+    return replace(sources, depth_m=sources.depth_m * keep.to(sources.depth_m.device)[:, None, None])
+
+
+def jitter_colours(sources: SourceViews, strength: float, generator: torch.Generator) -> SourceViews:
+    """Random gain a view and channel, and gamma a view: exposure and white balance drift."""
+    count = len(sources.rgb)
+    gain = 1 + strength * (2 * torch.rand(count, 1, 1, 1, generator=generator) - 1)
+    tint = 1 + 0.5 * strength * (2 * torch.rand(count, 3, 1, 1, generator=generator) - 1)
+    gamma = 1 + strength * (2 * torch.rand(count, 1, 1, 1, generator=generator) - 1)
+    device = sources.rgb.device
+    rgb = (sources.rgb.clamp_min(1e-3) ** gamma.to(device)) * (gain * tint).to(device)
+    return replace(sources, rgb=rgb.clamp(0, 1))
+
+
+def draw_pixels(
+    channel: torch.Tensor, count: int, balanced_share: float, generator: torch.Generator, classes: int
+) -> torch.Tensor:
+    """Flat indices of labelled pixels (count,): partly uniform, partly with every class present equally likely.
+
+    Args:
+        channel: (H, W) int64, -1 = not to be drawn.
+        classes: L.
+    """
+    flat = channel.flatten()
+    labelled = (flat >= 0).nonzero()[:, 0]
+    if len(labelled) == 0:
+        return labelled
+    uniform = labelled[torch.randint(len(labelled), (count - int(count * balanced_share),), generator=generator)]
+    histogram = torch.bincount(flat[labelled], minlength=classes).float()
+    weight = torch.where(histogram > 0, 1 / histogram.clamp_min(1), torch.zeros_like(histogram))[flat[labelled]]
+    cumulative = torch.cumsum(weight.double(), 0)
+    u = torch.rand(int(count * balanced_share), generator=generator, dtype=torch.float64) * cumulative[-1]
+    balanced = labelled[torch.searchsorted(cumulative, u).clamp_max(len(labelled) - 1)]
+    return torch.cat((uniform, balanced))
+
+
+def query_rays(
+    view: LabelledView, flat_index: torch.Tensor, *, near_m: float, far_m: float, prior: torch.Tensor | None
+) -> tuple[RayBatch, RayTargets]:
+    """Rays through chosen pixels of a view, with what they should render to.
+
+    Args:
+        flat_index: (R,) row-major pixel indices.
+        prior: (R,) depth priors in metres, 0 = none; None for none at all.
+    """
+    width = view.intrinsics.width
+    pixels = torch.stack((flat_index % width, flat_index // width), dim=-1).float()
+    rays = pixel_rays(pixels, view.intrinsics, view.T_world_camera, near_m=near_m, far_m=far_m, prior_depth_m=prior)
+    targets = RayTargets(
+        view.channel.flatten()[flat_index],
+        view.rgb.flatten(1)[:, flat_index].T.contiguous(),
+        view.depth_m.flatten()[flat_index],
+    )
+    return rays, targets

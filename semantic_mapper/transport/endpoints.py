@@ -1,0 +1,117 @@
+"""Where sockets listen: ``ipc://`` in a folder of the user by default; what other machines could reach is refused."""
+
+from __future__ import annotations
+
+import fcntl
+import ipaddress
+import os
+import re
+import tempfile
+from pathlib import Path
+from types import TracebackType
+from typing import IO
+
+from semantic_mapper.errors import TransportError
+
+_MAX_IPC_PATH = 100  # the kernel takes 107 bytes, lock suffix aside
+
+
+def default_endpoint(name: str, namespace: str = "default") -> str:
+    """``ipc://`` endpoint of a node, the same for all processes of one user.
+
+    Args:
+        name: Of the node ("camera", "mapper").
+        namespace: Keeps two systems on one machine apart.
+
+    Raises:
+        TransportError: a name that is no plain word, or no folder can be made for the sockets.
+    """
+    for word in (name, namespace):
+        if not re.fullmatch(r"[A-Za-z0-9_.-]{1,48}", word) or word.startswith("."):
+            raise TransportError(f"'{word}' cannot name an endpoint: use letters, digits and any of _ . -")
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    if runtime and os.access(runtime, os.W_OK):
+        folder = Path(runtime) / "semantic-mapper" / namespace
+    else:
+        folder = Path(tempfile.gettempdir()) / f"semantic-mapper-{os.getuid()}" / namespace
+    try:
+        folder.parent.mkdir(mode=0o700, exist_ok=True)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        owner = folder.parent.stat().st_uid
+    except OSError as error:
+        raise TransportError(f"cannot make the folder {folder} for sockets: {error}; set XDG_RUNTIME_DIR") from error
+    if owner != os.getuid():  # in a shared temporary folder somebody else may have been first
+        raise TransportError(f"{folder.parent} belongs to user {owner}; remove it or set XDG_RUNTIME_DIR")
+    return f"ipc://{folder}/{name}"
+
+
+def check_bind(endpoint: str) -> None:
+    """Refuse to listen where other machines could connect: messages are neither encrypted nor authenticated yet.
+
+    Raises:
+        TransportError: an address beyond this machine, or a transport other than ipc, inproc and tcp.
+    """
+    transport, _, address = endpoint.partition("://")
+    if transport == "ipc":
+        if address.startswith("@") or len(os.fsencode(address)) > _MAX_IPC_PATH or not address:
+            raise TransportError(f"{endpoint}: an ipc address is a path of 1 to {_MAX_IPC_PATH} bytes")
+    elif transport == "tcp":
+        host = address.rpartition(":")[0].strip("[]")
+        if not _is_loopback(host):
+            raise TransportError(
+                f"{endpoint}: only loopback addresses (tcp://127.0.0.1:PORT) can be bound, as messages are not "
+                "encrypted yet; tunnel it (ssh -L) to reach another machine"
+            )
+    elif transport != "inproc":
+        raise TransportError(f"{endpoint}: use ipc://PATH or tcp://127.0.0.1:PORT")
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:  # a wildcard or the name of an interface or host
+        return False
+
+
+class EndpointLock:
+    """Holds an ``ipc://`` path: ZeroMQ would silently take a living publisher's path over from it.
+
+    The kernel releases the lock when the process ends, however it ends. Other transports need none.
+
+    Raises:
+        TransportError: somebody else holds it, or its folder does not exist.
+    """
+
+    def __init__(self, endpoint: str) -> None:
+        self._file: IO[str] | None = None
+        if not endpoint.startswith("ipc://"):
+            return
+        path = Path(endpoint.removeprefix("ipc://") + ".lock")
+        try:
+            file = path.open("a")
+        except OSError as error:
+            raise TransportError(f"{endpoint}: cannot be bound: {error}") from error
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            file.close()
+            raise TransportError(
+                f"{endpoint}: another process listens there already; stop it or choose another endpoint"
+            ) from error
+        self._file = file
+
+    def release(self) -> None:
+        """Let others have it. The lock file stays: unlinking it would let two hold "the" lock."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def __enter__(self) -> EndpointLock:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.release()

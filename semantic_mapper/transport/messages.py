@@ -1,0 +1,85 @@
+"""What travels besides ``PosedFrame`` and ``MapUpdate``. Plain data; ``codec`` turns it into bytes and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
+
+NodeState = Literal["starting", "running", "degraded", "stopping", "ended"]
+EndReason = Literal["end", "stopped", "error"]
+
+
+@dataclass(frozen=True, slots=True)
+class StreamInfo:
+    """What a stream of frames is; sent before its first frame and kept in every log.
+
+    Args:
+        source: Where the frames come from, for people ("folder redkitchen", "OAK-D 18443010").
+        cameras: Intrinsics of each camera by its id.
+        label_set: Classes of the frames' label images; None for a stream without labels.
+        frame_count: Frames that the source will send; None where nobody knows (a live camera).
+        frame_hz: Nominal rate; 0 = not known.
+        metadata: Anything else worth keeping, as text.
+    """
+
+    source: str
+    cameras: Mapping[str, CameraIntrinsics] = field(default_factory=dict[str, CameraIntrinsics])
+    label_set: LabelSet | None = None
+    frame_count: int | None = None
+    frame_hz: float = 0.0
+    metadata: Mapping[str, str] = field(default_factory=dict[str, str])
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What a node says about itself, about once a second.
+
+    Args:
+        node: Name of the node.
+        state: Where it is in its life.
+        stamp_ns: When it said so, on the robot's monotonic clock.
+        counters: Totals since its start ("fused", "dropped", "rejected", ...).
+        ages_s: Seconds since something last happened ("frame", ...).
+        degraded: One sentence for each thing that does not work as it should; empty when all is well.
+    """
+
+    node: str
+    state: NodeState
+    stamp_ns: int
+    counters: Mapping[str, int] = field(default_factory=dict[str, int])
+    ages_s: Mapping[str, float] = field(default_factory=dict[str, float])
+    degraded: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRefused:
+    """The mapper's answer to a frame that it could not use, in place of a ``MapUpdate``."""
+
+    stamp_ns: int
+    seq: int
+    camera_id: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class EndOfStream:
+    """The last message of a stream of frames.
+
+    Args:
+        source: Who ends ("player", a camera id, ...).
+        reason: "end" of the recording, "stopped" by a person, or an "error".
+        published: Frames that were sent.
+        detail: The error, for people.
+    """
+
+    source: str
+    reason: EndReason
+    published: int
+    detail: str = ""
+
+
+Message = PosedFrame | MapUpdate | FrameRefused | Status | StreamInfo | EndOfStream

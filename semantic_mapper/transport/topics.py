@@ -1,0 +1,81 @@
+"""The one table of topics. A topic on the wire is ``name/source/``, so that a subscription matches whole words only."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+from semantic_mapper.errors import CodecError
+from semantic_mapper.transport.messages import EndOfStream, FrameRefused, Message, Status, StreamInfo
+from semantic_mapper.types import MapUpdate, PosedFrame
+
+SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # camera ids and node names, as they stand in topics
+MAX_TOPIC_BYTES = 96
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One kind of message.
+
+    Args:
+        name: First word of the topic on the wire.
+        message: Type of the decoded message.
+        logged: Whether the recorder keeps it.
+        nominal_hz: Usual rate, 0 = now and then.
+        queue: "newest": an unread message gives way to a newer one of the same source; "all": nothing is dropped.
+        latched: The last one is sent again to every new subscriber.
+    """
+
+    name: str
+    message: type[Message]
+    logged: bool
+    nominal_hz: float
+    queue: Literal["newest", "all"]
+    latched: bool = False
+
+
+TOPICS = {
+    topic.name: topic
+    for topic in (
+        Topic("info", StreamInfo, logged=True, nominal_hz=0, queue="all", latched=True),
+        Topic("frame", PosedFrame, logged=True, nominal_hz=15, queue="newest"),
+        Topic("end", EndOfStream, logged=False, nominal_hz=0, queue="all"),
+        Topic("map", MapUpdate, logged=False, nominal_hz=5, queue="newest"),
+        Topic("refused", FrameRefused, logged=True, nominal_hz=0, queue="all"),
+        Topic("status", Status, logged=True, nominal_hz=1, queue="newest", latched=True),
+    )
+}
+
+
+def topic_bytes(name: str, source: str) -> bytes:
+    """Topic as it stands on the wire, ``name/source/``.
+
+    Raises:
+        CodecError: the source has characters that a topic cannot hold.
+    """
+    if not re.match(SOURCE_PATTERN, source):
+        raise CodecError(
+            f"'{source}' cannot be the name of a camera or node: use 1 to 64 letters, digits and any of _ . : -"
+        )
+    return f"{name}/{source}/".encode()
+
+
+def subscription(name: str, source: str | None = None) -> bytes:
+    """Prefix that matches all messages of a topic, or those of one source."""
+    return f"{name}/".encode() if source is None else topic_bytes(name, source)
+
+
+def parse_topic(topic: bytes) -> tuple[Topic, str]:
+    """Topic on the wire -> its row of the table and the source.
+
+    Raises:
+        CodecError: not one of ours.
+    """
+    if len(topic) <= MAX_TOPIC_BYTES:
+        words = topic.decode("ascii", errors="replace").split("/")
+        if len(words) == 3 and words[0] in TOPICS and re.match(SOURCE_PATTERN, words[1]) and not words[2]:
+            return TOPICS[words[0]], words[1]
+    raise CodecError(
+        f"topic {topic[:40]!r} is none of ours; they read '<name>/<source>/' with a name of {', '.join(TOPICS)}"
+    )

@@ -1,0 +1,182 @@
+"""Plain data that travels through the system. Frozen, slotted, no behaviour beyond checks of form.
+
+Frames: ``T_a_b`` maps points of frame b to frame a. Camera axes follow OpenCV (x right, y down, z forward).
+Depth is z in metres, 0 = no measurement. Pixel centres have integer coordinates. Stamps are int64 nanoseconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from semantic_mapper.errors import FrameError
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraIntrinsics:
+    """Pinhole model in pixels; ``distortion`` holds OpenCV coefficients, empty for a rectified image."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if not all(np.isfinite(v) for v in values):
+            raise FrameError(f"intrinsics must be finite numbers, got {values}")
+        if self.fx <= 0 or self.fy <= 0 or self.width <= 0 or self.height <= 0:
+            raise FrameError(
+                f"focal lengths and image size must be positive, got fx={self.fx} fy={self.fy} "
+                f"width={self.width} height={self.height}"
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedFrame:
+    """One camera image with its pose, as a driver or a log gives it.
+
+    Args:
+        stamp_ns: Capture time, int64 nanoseconds on the robot's monotonic clock.
+        seq: Counter of the source, from 0; gaps mean lost frames.
+        camera_id: Name of the camera.
+        rgb: (H, W, 3) uint8.
+        depth_m: (H, W) float32 z-depth in metres, 0 = no measurement; None without a depth sensor.
+        label: (H, W) uint8 class ids of the stream's label set; None where there are none.
+        intrinsics: Of the rectified image.
+        T_world_camera: (4, 4) float64.
+        pose_source: Where the pose comes from ("log", "odometry", ...).
+        pose_sigma: One-sigma position uncertainty in metres; 0 = not known.
+
+    Raises:
+        FrameError: where a shape or dtype is off. The pose is checked by ``geometry.check_pose``.
+    """
+
+    stamp_ns: int
+    seq: int
+    camera_id: str
+    rgb: UInt8
+    depth_m: Float32 | None
+    label: UInt8 | None
+    intrinsics: CameraIntrinsics
+    T_world_camera: Float64
+    pose_source: str = "log"
+    pose_sigma: float = 0.0
+
+    def __post_init__(self) -> None:
+        size = (self.intrinsics.height, self.intrinsics.width)
+        _expect(self, "rgb", self.rgb, (*size, 3), np.uint8)
+        _expect(self, "T_world_camera", self.T_world_camera, (4, 4), np.float64)
+        if self.depth_m is not None:
+            _expect(self, "depth_m", self.depth_m, size, np.float32)
+        if self.label is not None:
+            _expect(self, "label", self.label, size, np.uint8)
+
+
+def _expect(
+    frame: PosedFrame, name: str, array: NDArray[np.generic], shape: tuple[int, ...], dtype: type[np.generic]
+) -> None:
+    if array.shape != shape or array.dtype != dtype:
+        raise FrameError(
+            f"frame seq={frame.seq} of camera '{frame.camera_id}': {name} must be {np.dtype(dtype).name} {shape} "
+            f"(the intrinsics say {frame.intrinsics.width}x{frame.intrinsics.height}), "
+            f"got {array.dtype.name} {array.shape}"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SourceViews:
+    """The m images that a semantic field looks at, in one resolution.
+
+    Args:
+        rgb: (m, 3, H, W) float32 in [0, 1].
+        depth_m: (m, H, W) float32, 0 = no measurement; all 0 for a view without depth.
+        K: (m, 3, 3) float32 pinhole matrices in pixels of (H, W).
+        T_world_camera: (m, 4, 4) float32.
+        channel: (m, H, W) int64 class channels that are known of the views, -1 = none; None for views without labels.
+    """
+
+    rgb: torch.Tensor
+    depth_m: torch.Tensor
+    K: torch.Tensor
+    T_world_camera: torch.Tensor
+    channel: torch.Tensor | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RayBatch:
+    """R query rays in world coordinates.
+
+    Args:
+        origin: (R, 3) float32 metres.
+        direction: (R, 3) float32, scaled so that ``origin + z * direction`` has camera depth z (not unit length).
+        near_m, far_m: (R,) float32 z bounds of the search.
+        prior_depth_m: (R,) float32 z from a sensor or a map, 0 = none.
+    """
+
+    origin: torch.Tensor
+    direction: torch.Tensor
+    near_m: torch.Tensor
+    far_m: torch.Tensor
+    prior_depth_m: torch.Tensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldRender:
+    """What a semantic field renders for R rays.
+
+    Args:
+        logits: (R, L) rendered class logits (S-Ray Eq. 13); zeros where ``known`` is False.
+        depth_m: (R,) expected z depth.
+        opacity: (R,) in [0, 1].
+        rgb: (R, 3) in [0, 1].
+        entropy: (R,) of the class distribution, nats; ln L where nothing is known.
+        known: (R,) bool, False where no source view sees the ray: an explicit "unknown", not a guess.
+    """
+
+    logits: torch.Tensor
+    depth_m: torch.Tensor
+    opacity: torch.Tensor
+    rgb: torch.Tensor
+    entropy: torch.Tensor
+    known: torch.Tensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapUpdate:
+    """What one ``MappingPipeline.step`` did.
+
+    Args:
+        stamp_ns, seq, camera_id: Of the frame.
+        fused: False where the frame was looked at but not fused.
+        is_keyframe: Whether the frame became a source view for later ones.
+        source_seqs: Sequence numbers of the source views that were rendered from.
+        label: (H, W) uint8 rendered class ids, the label set's ignore id where unknown.
+        confidence: (H, W) float32 probability of ``label``.
+        depth_m: (H, W) float32 depth that was fused.
+        blocks: Blocks in the map; ``blocks_touched``: visited by this frame.
+        stage_ms: Wall time of each stage.
+    """
+
+    stamp_ns: int
+    seq: int
+    camera_id: str
+    fused: bool
+    is_keyframe: bool
+    source_seqs: tuple[int, ...]
+    label: UInt8
+    confidence: Float32
+    depth_m: Float32
+    blocks: int
+    blocks_touched: int
+    stage_ms: dict[str, float] = field(default_factory=dict[str, float])

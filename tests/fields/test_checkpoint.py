@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from semantic_mapper.errors import WeightsError
+from semantic_mapper.fields.checkpoint import (
+    LABEL_LOGIT,
+    Checkpoint,
+    adapt_model,
+    anchor_from_frame,
+    default_checkpoint_path,
+    load_checkpoint,
+    save_checkpoint,
+)
+from semantic_mapper.labels import ROOMS, make_label_set
+from tests.small import tiny_field, tiny_frames
+
+
+def test_round_trip_keeps_weights_labels_recipe_and_anchors(tmp_path):
+    anchors = tuple(anchor_from_frame(f, 64) for f in tiny_frames(2))
+    saved = Checkpoint(tiny_field(), anchors, {"train_stamps_ns": [5, 7], "width": 64})
+    save_checkpoint(saved, tmp_path / "w.safetensors")
+    loaded = load_checkpoint(tmp_path / "w.safetensors")
+    for name, tensor in saved.model.state_dict().items():
+        assert torch.equal(loaded.model.state_dict()[name], tensor)
+    assert loaded.label_set == ROOMS and loaded.model.config == saved.model.config
+    assert loaded.train_stamps_ns == {5, 7} and loaded.width == 64
+    for a, b in zip(loaded.anchors, anchors, strict=True):
+        assert np.array_equal(a.rgb, b.rgb) and np.array_equal(a.depth_m, b.depth_m)
+        assert np.array_equal(a.T_world_camera, b.T_world_camera) and a.intrinsics == b.intrinsics
+        assert np.array_equal(a.label, b.label) and a.label.shape == (48, 64)
+
+
+def test_half_precision_file_is_half_as_large_and_nearly_equal(tmp_path):
+    saved = Checkpoint(tiny_field())
+    save_checkpoint(saved, tmp_path / "full.safetensors")
+    save_checkpoint(saved, tmp_path / "half.safetensors", half=True)
+    full, half = (tmp_path / "full.safetensors").stat().st_size, (tmp_path / "half.safetensors").stat().st_size
+    assert half < 0.75 * full
+    loaded = load_checkpoint(tmp_path / "half.safetensors").model.state_dict()
+    for name, tensor in saved.model.state_dict().items():
+        torch.testing.assert_close(loaded[name], tensor, atol=1e-3, rtol=1e-3)
+
+
+def test_missing_file_is_named(tmp_path):
+    with pytest.raises(WeightsError, match="no such weights file"):
+        load_checkpoint(tmp_path / "none.safetensors")
+
+
+@pytest.mark.parametrize("keep", [0, 7, 100, 5000])
+def test_truncated_file_is_refused(tmp_path, keep):
+    path = tmp_path / "w.safetensors"
+    save_checkpoint(Checkpoint(tiny_field()), path)
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(WeightsError, match=r"w\.safetensors"):
+        load_checkpoint(path)
+
+
+def test_foreign_safetensors_are_refused(tmp_path):
+    save_file({"x": torch.zeros(3)}, tmp_path / "other.safetensors")
+    with pytest.raises(WeightsError, match="not weights of this project"):
+        load_checkpoint(tmp_path / "other.safetensors")
+
+
+def test_weights_with_nan_are_refused(tmp_path):
+    model = tiny_field()
+    model.classifier.weight.data[0, 0] = float("nan")
+    save_checkpoint(Checkpoint(model), tmp_path / "w.safetensors")
+    with pytest.raises(WeightsError, match="NaN"):
+        load_checkpoint(tmp_path / "w.safetensors")
+
+
+def test_weights_that_do_not_fit_their_config_are_refused(tmp_path):
+    path = tmp_path / "w.safetensors"
+    save_checkpoint(Checkpoint(tiny_field()), path)
+    path.write_bytes(path.read_bytes().replace(b'encoder_width\\": 8', b'encoder_width\\": 9'))
+    with pytest.raises(WeightsError):
+        load_checkpoint(path)
+
+
+def test_adapted_model_carries_classifier_rows_over_by_name():
+    model = tiny_field()
+    other = make_label_set("other", ["spaceship", "chair", "wall"], ids=[4, 9, 2])
+    adapted = adapt_model(model, other)
+    weight, old = adapted.classifier.weight, model.classifier.weight
+    assert torch.equal(weight[1], old[ROOMS.names.index("chair")])
+    assert torch.equal(weight[2], old[ROOMS.names.index("wall")])
+    assert (weight[0] - old.mean(0)).abs().mean() < 0.5
+    logits = adapted.label_code.weight @ weight.T  # of codes alone: each raises its own class and no other
+    torch.testing.assert_close(logits, LABEL_LOGIT * torch.eye(3), atol=1e-3, rtol=1e-3)
+    assert torch.equal(adapted.encoder.head.weight, model.encoder.head.weight)
+
+
+def test_the_shipped_checkpoint_is_small_and_says_where_it_comes_from():
+    path = default_checkpoint_path()
+    assert path.stat().st_size <= 4_000_000
+    checkpoint = load_checkpoint(path)
+    assert checkpoint.label_set == ROOMS and not checkpoint.anchors
+    assert {"kind", "config", "steps", "rooms", "validation_miou", "history", "width"} <= set(checkpoint.recipe)

@@ -1,0 +1,264 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from semantic_mapper.config import SamplingConfig, SRayConfig
+from semantic_mapper.errors import ConfigError, ShapeError
+from semantic_mapper.fields.base import EncodedViews, stack_views
+from semantic_mapper.fields.geometry_net import hit_and_visibility
+from semantic_mapper.fields.projection import gather, reproject
+from semantic_mapper.fields.sampling import sample_guided, sample_inverse_depth
+from semantic_mapper.fields.sray import SRay
+from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.labels import make_label_set
+from semantic_mapper.types import RayBatch, SourceViews
+from tests.fields.scene import WALL_M, pose_at, wall_rays, wall_sources
+
+LABELS = make_label_set("test", ["a", "b", "c"])
+SMALL = SRayConfig(feature_dim=16, heads=2, encoder_width=8, encoder_blocks=(1, 1))
+POSES = [pose_at(-0.3), pose_at(-0.1, 0.1), pose_at(0.1), pose_at(0.3, -0.15)]
+
+
+def small_field(seed: int = 0, **changes: object) -> SRay:
+    torch.manual_seed(seed)
+    return SRay(SRayConfig(**{**{f: getattr(SMALL, f) for f in SMALL.__struct_fields__}, **changes}), LABELS).eval()
+
+
+def test_reprojection_finds_the_same_wall_point_in_every_view():
+    field = small_field()
+    encoded = field.encode(wall_sources(POSES))
+    rays = wall_rays(pose_at(0.05, 0.02), step=7)
+    z = torch.full((len(rays.origin), 2), 0.0)
+    true_z = (WALL_M - rays.origin[:, 2]) / rays.direction[:, 2]
+    z[:, 0], z[:, 1] = true_z, true_z + 0.5
+    where = reproject(rays, z, encoded)
+    found = gather(encoded, where)
+    seen = where.valid[..., 0] & (where.uv[..., 0, 0] > 0) & (where.uv[..., 0, 0] < 23) & (where.uv[..., 0, 1] > 0)
+    seen &= where.uv[..., 0, 1] < 15
+    points = rays.origin + true_z[:, None] * rays.direction
+    from tests.fields.scene import wall_colour
+
+    expected = wall_colour(points[:, 0], points[:, 1]).expand(len(POSES), -1, -1)
+    error = (found.rgb[:, :, 0] - expected).abs().amax(-1)[seen]
+    assert seen.float().mean() > 0.5
+    assert error.max() < 0.05  # half-resolution colours of a smooth texture
+    wrong = (found.rgb[:, :, 1] - expected).abs().amax(-1)[seen]
+    assert wrong.mean() > 3 * error.mean()
+
+
+def test_samples_behind_a_camera_or_outside_its_image_are_invalid():
+    encoded = small_field().encode(wall_sources([pose_at(0.0), pose_at(0.0, 3.14159)]))
+    where = reproject(wall_rays(pose_at(0.0), step=50), torch.full((31, 1), 2.0), encoded)
+    assert where.valid[0].all()
+    assert not where.valid[1].any()
+
+
+def test_measured_depth_makes_the_wall_hit_and_what_is_behind_it_invisible():
+    field = small_field()
+    encoded = field.encode(wall_sources([pose_at(0.0)]))
+    rays = wall_rays(pose_at(0.0), step=97)
+    z = torch.tensor([[1.5, WALL_M, 2.5]]).expand(len(rays.origin), 3)
+    found = gather(encoded, reproject(rays, z, encoded))
+    hit, visibility = hit_and_visibility(found.geometry, z[None], torch.tensor(0.05))
+    assert (hit[..., 1] > 0.5).all() and (hit[..., 0] < 0.05).all()
+    assert (visibility[..., 0] > 0.9).all() and (visibility[..., 2] < 0.1).all()
+
+
+def test_untrained_field_already_renders_measured_depth():
+    field = small_field()
+    encoded = field.encode(wall_sources(POSES))
+    rays = wall_rays(pose_at(0.0), step=31, prior=WALL_M)
+    render = field.render(rays, encoded)
+    seen = render.opacity > 0.5
+    assert seen.float().mean() > 0.8
+    assert (render.depth_m[seen] - WALL_M).abs().median() < 0.03
+
+
+@pytest.mark.parametrize("views", [1, 2, 7, 16])
+@pytest.mark.parametrize("mode", ["streaming", "reference"])
+def test_any_number_of_views_from_1_to_16_renders(views: int, mode: str):
+    field = small_field()
+    field.sampling = SamplingConfig(mode=mode, coarse=8, fine=8)  # type: ignore[arg-type]
+    encoded = field.encode(wall_sources([pose_at(0.02 * i) for i in range(views)]))
+    render = field.render(wall_rays(pose_at(0.0), step=101), encoded)
+    assert render.logits.shape == (16, 3)
+    assert all(torch.isfinite(t).all() for t in (render.logits, render.depth_m, render.rgb, render.entropy))
+    assert render.known.all()
+
+
+def test_more_than_16_views_are_refused():
+    field = small_field()
+    one = field.encode(wall_sources([pose_at(0.0)]))
+    with pytest.raises(ShapeError, match="1 to 16"):
+        stack_views([one] * 17)
+
+
+def test_a_ray_that_no_view_sees_is_unknown():
+    field = small_field()
+    encoded = field.encode(wall_sources(POSES))
+    away = field.render(wall_rays(pose_at(0.0, 3.14159), step=53), encoded)
+    assert not away.known.any()
+    assert away.logits.abs().max() == 0 and away.opacity.max() == 0
+    torch.testing.assert_close(away.entropy, torch.full_like(away.entropy, torch.log(torch.tensor(3.0)).item()))
+
+
+def test_a_blind_view_changes_nothing():
+    field = small_field()
+    seeing = field.encode(wall_sources(POSES))
+    with_blind = field.encode(wall_sources([*POSES, pose_at(0.0, 3.14159)]))
+    rays = wall_rays(pose_at(0.0), step=31)
+    torch.testing.assert_close(field.render(rays, seeing).logits, field.render(rays, with_blind).logits)
+
+
+def test_order_of_views_does_not_matter():
+    field = small_field()
+    encoded = field.encode(wall_sources(POSES))
+    rays = wall_rays(pose_at(0.0), step=31)
+    shuffled = encoded.select(torch.tensor([2, 0, 3, 1]))
+    torch.testing.assert_close(
+        field.render(rays, encoded).logits, field.render(rays, shuffled).logits, atol=1e-5, rtol=1e-4
+    )
+
+
+def test_world_frame_does_not_matter():
+    field = small_field()
+    views = wall_sources(POSES)
+    rays = wall_rays(pose_at(0.0), step=31)
+    T = torch.from_numpy(pose_at(1.7, 0.8)).float()
+    T[1, 3] = -0.4
+    moved_views = SourceViews(views.rgb, views.depth_m, views.K, T @ views.T_world_camera)
+    moved_rays = RayBatch(
+        rays.origin @ T[:3, :3].T + T[:3, 3], rays.direction @ T[:3, :3].T, rays.near_m, rays.far_m, rays.prior_depth_m
+    )
+    a = field.render(rays, field.encode(views)).logits
+    b = field.render(moved_rays, field.encode(moved_views)).logits
+    torch.testing.assert_close(a, b, atol=2e-3, rtol=2e-3)
+
+
+def test_views_without_depth_render_too():
+    field = small_field()
+    encoded = field.encode(wall_sources(POSES, with_depth=False))
+    render = field.render(wall_rays(pose_at(0.0), step=31, prior=0.0), encoded)
+    assert torch.isfinite(render.logits).all() and render.known.all()
+
+
+def test_each_view_is_encoded_by_itself():
+    field = small_field()
+    views = wall_sources(POSES)
+    together = field.encode(views)
+    one = field.encode(SourceViews(views.rgb[2:3], views.depth_m[2:3], views.K[2:3], views.T_world_camera[2:3]))
+    torch.testing.assert_close(together.feature[2:3], one.feature, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(together.geometry[2:3], one.geometry, atol=1e-4, rtol=1e-4)
+
+
+def test_mismatched_sources_give_a_shape_error():
+    views = wall_sources(POSES)
+    with pytest.raises(ShapeError, match="source depth_m"):
+        small_field().encode(SourceViews(views.rgb, views.depth_m[:2], views.K, views.T_world_camera))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"intra_view_attention": False},
+        {"cross_view_attention": False},
+        {"attention_residual": False},
+        {"intra_view_attention": False, "cross_view_attention": False},
+    ],
+)
+@pytest.mark.parametrize("guided", [True, False])
+def test_streaming_renderer_equals_the_reference_at_the_same_samples(changes: dict[str, bool], guided: bool):
+    field = small_field(3, **changes)
+    for p in field.parameters():
+        p.data += 0.05 * torch.randn_like(p)
+    streaming = StreamingSRay(field)
+    encoded = streaming.encode(wall_sources([*POSES, pose_at(1.5), pose_at(0.0, 3.0)]))
+    rays = wall_rays(pose_at(0.2, 0.3), step=3)
+    z = sample_guided(rays, SamplingConfig()) if guided else sample_inverse_depth(rays.near_m, rays.far_m, 24)
+    with torch.inference_mode():
+        reference, _ = field.render_samples(rays, z, encoded)
+    fast = streaming.render_samples(rays, z, encoded)
+    assert torch.equal(fast.known, reference.known)
+    for name in ("logits", "depth_m", "opacity", "rgb", "entropy"):
+        torch.testing.assert_close(getattr(fast, name), getattr(reference, name), atol=1e-4, rtol=1e-4)
+
+
+def test_streaming_renderer_refuses_variants_it_does_not_cover():
+    with pytest.raises(ConfigError, match="parity"):
+        StreamingSRay(small_field(parity="published"))
+
+
+def test_published_parity_runs_and_differs_from_the_paper():
+    published = small_field(parity="published")
+    paper = small_field()
+    assert published.cross.head_dim == 4 and paper.cross.head_dim == 8
+    encoded = published.encode(wall_sources(POSES))
+    rays = wall_rays(pose_at(0.0), step=31)
+    thin, _ = published.render_samples(rays, torch.tensor([[1.9, 2.0, 2.1]]).expand(len(rays.origin), 3), encoded)
+    assert torch.isfinite(thin.logits).all()
+
+
+def test_published_parity_leaves_the_interval_length_out_of_alpha():
+    field = small_field(parity="published")
+    encoded = field.encode(wall_sources(POSES))
+    rays = wall_rays(pose_at(0.0), step=31)
+    z = torch.tensor([[1.98, 2.0, 2.02]]).expand(len(rays.origin), 3)
+    with torch.no_grad():
+        space = field.contextual_space(rays, z, encoded)
+        sigma = field.density(space.feature, space.hit, space.visibility, space.valid, space.delta)
+        render, _ = field.render_samples(rays, z, encoded)
+    torch.testing.assert_close(render.opacity, 1 - torch.exp(-sigma.sum(1)))
+
+
+def test_reference_sampling_concentrates_fine_samples_on_the_wall():
+    field = small_field()
+    field.sampling = SamplingConfig(mode="reference", coarse=64, fine=64)
+    encoded = field.encode(wall_sources(POSES))
+    rays = wall_rays(pose_at(0.0), step=101, prior=0.0)
+    z = field.sample(rays, encoded)
+    assert z.shape[1] == 128
+    assert ((z - WALL_M).abs() < 0.2).float().mean() > 0.4
+
+
+def test_the_whole_field_passes_gradcheck():
+    torch.manual_seed(1)
+    field = SRay(SRayConfig(feature_dim=8, heads=2, encoder_width=8, encoder_blocks=(1,)), LABELS).double().eval()
+    rays = wall_rays(pose_at(0.0), step=500)
+    rays = RayBatch(*(t.double() for t in (rays.origin, rays.direction, rays.near_m, rays.far_m, rays.prior_depth_m)))
+    z = sample_guided(rays, SamplingConfig(guided=3, free_space=0))
+    views = wall_sources(POSES[:2])
+    views = SourceViews(*(t.double() for t in (views.rgb, views.depth_m, views.K, views.T_world_camera)))
+    encoded = field.encode(views)
+    flat = encoded.feature.detach()[:, :, 4:12, 8:16].contiguous().requires_grad_()
+    geometry = encoded.geometry.detach()[:, :, 4:12, 8:16].contiguous()
+    K = encoded.K.clone()
+    K[:, 0, 2] -= 8
+    K[:, 1, 2] -= 4
+
+    def render(feature: torch.Tensor) -> torch.Tensor:
+        sources = EncodedViews(feature, encoded.rgb[:, :, 4:12, 8:16].detach(), geometry, K, encoded.T_camera_world)
+        return field.render_samples(rays, z, sources)[0].logits
+
+    assert torch.autograd.gradcheck(render, (flat,), atol=1e-4)
+
+
+def test_known_labels_of_a_source_view_move_its_features_and_no_others():
+    field = small_field()
+    views = wall_sources(POSES[:2])
+    channel = torch.full((2, 32, 48), -1)
+    channel[1, :, 24:] = 2
+    plain, labelled = field.encode(views), field.encode(replace(views, channel=channel))
+    moved = (labelled.feature - plain.feature).abs().amax(1) > 1e-6
+    assert not moved[0].any() and not moved[1, :, :12].any() and moved[1, :, 12:].all()
+    torch.testing.assert_close(labelled.geometry, plain.geometry)
+    off = small_field(source_labels=False)
+    assert torch.equal(off.encode(replace(views, channel=channel)).feature, off.encode(views).feature)
+
+
+def test_unknown_labels_are_the_same_as_none():
+    field = small_field()
+    views = wall_sources(POSES[:2])
+    unknown = replace(views, channel=torch.full((2, 32, 48), -1))
+    torch.testing.assert_close(field.encode(unknown).feature, field.encode(views).feature)

@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from semantic_mapper.geometry import look_at, unproject
+from semantic_mapper.mapping.allocation import blocks_in_band, make_camera
+from semantic_mapper.mapping.block_index import pack_keys
+from semantic_mapper.types import CameraIntrinsics
+from tests.mapping.views import INTRINSICS, frame, plane_depth, small_map
+
+POSE = look_at(np.array([0.4, -0.3, -1.1]), np.array([0.1, 0.1, 0.4]), np.array([0.1, -1.0, 0.0]))
+
+
+def sampled_blocks(depth: np.ndarray, truncation: float, block: float) -> np.ndarray:
+    """The same by brute force: 65 points on every pixel's ray."""
+    directions = unproject(np.ones_like(depth), INTRINSICS)[depth > 0] @ POSE[:3, :3].T
+    z = depth[depth > 0].astype(np.float64)
+    found = [
+        np.floor(((z + s)[:, None] * directions + POSE[:3, 3]) / block).astype(np.int32)
+        for s in np.linspace(-truncation, truncation, 65)
+    ]
+    return np.unique(pack_keys(np.concatenate(found)))
+
+
+@pytest.mark.parametrize("scene", ["plane", "noise"])
+def test_every_block_that_a_ray_crosses_in_the_band_is_found(scene: str, rng: np.random.Generator) -> None:
+    depth = plane_depth(POSE, (0.2, 0.1, 1.0), 0.45)
+    if scene == "noise":
+        depth = (depth + rng.uniform(-0.5, 0.5, depth.shape)).astype(np.float32)
+        depth[rng.random(depth.shape) < 0.3] = 0
+    found = blocks_in_band(depth, make_camera(INTRINSICS, POSE), 0.02, 0.08, 5.0)
+    expected = sampled_blocks(depth, 0.08, 0.16)
+    assert (np.diff(found) > 0).all()
+    missed = np.setdiff1d(expected, found)
+    # A smooth tile may pass over the very tip of a block between two rays, less than a voxel of it.
+    assert len(missed) <= (0.01 * len(expected) if scene == "plane" else 0)
+    assert len(found) < 1.1 * len(expected)
+
+
+@pytest.mark.parametrize("column", [80, 81, 82, 83])
+def test_a_pole_one_pixel_wide_is_not_missed(column: int) -> None:
+    depth = np.zeros((120, 160), np.float32)
+    depth[:, column] = 1.0
+    voxel_map = small_map(voxel_size_m=0.005)
+    assert voxel_map.integrate(frame(), depth, None, None) >= 24
+    xyz = voxel_map.points().xyz
+    assert xyz[:, 1].max() - xyz[:, 1].min() > 0.85
+    assert np.abs(xyz[:, 2] - 1.0).max() < 0.001
+
+
+def test_no_measurement_no_blocks() -> None:
+    assert len(blocks_in_band(np.zeros((120, 160), np.float32), make_camera(INTRINSICS, POSE), 0.02, 0.08, 5.0)) == 0
+
+
+def test_more_blocks_than_the_first_guess_has_room_for(rng: np.random.Generator) -> None:
+    depth = rng.uniform(0.5, 5.0, (120, 160)).astype(np.float32)
+    found = blocks_in_band(depth, make_camera(INTRINSICS, POSE), 0.004, 0.3, 5.0)
+    assert len(found) > 8 * (1 << 13)
+
+
+def test_an_image_of_one_pixel_is_enough() -> None:
+    camera = make_camera(CameraIntrinsics(100, 100, 0, 0, 1, 1), np.eye(4))
+    assert len(blocks_in_band(np.full((1, 1), 1.0, np.float32), camera, 0.02, 0.08, 5.0)) == 2

@@ -1,0 +1,84 @@
+import numpy as np
+import torch
+
+from semantic_mapper.config import KeyframeConfig
+from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore, pose_distance
+from semantic_mapper.types import CameraIntrinsics
+
+INTRINSICS = CameraIntrinsics(40.0, 40.0, 39.5, 29.5, 80, 60)
+WALL = np.full((60, 80), 2.0, np.float32)
+NOTHING = EncodedViews(*(torch.zeros(1, n, 1, 1) for n in (1, 3, 5)), torch.zeros(1, 3, 3), torch.zeros(1, 4, 4))
+
+
+def pose(x: float = 0.0, yaw_deg: float = 0.0) -> np.ndarray:
+    a = np.radians(yaw_deg)
+    T = np.eye(4)
+    T[:3, :3] = [[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]]
+    T[0, 3] = x
+    return T
+
+
+def keyframe(seq: int, T: np.ndarray, labelled: bool = False, depth: np.ndarray = WALL) -> Keyframe:
+    return Keyframe(seq, seq, T, INTRINSICS, depth, NOTHING, labelled)
+
+
+def test_pose_distance_is_in_metres_and_degrees():
+    moved, turned = pose_distance(pose(0.0, 10), pose(0.3, 40))
+    assert np.isclose(moved, 0.3) and np.isclose(turned, 30)
+
+
+def test_a_frame_becomes_a_keyframe_after_moving_or_turning_enough():
+    store = KeyframeStore(KeyframeConfig(translation_m=0.2, rotation_deg=15))
+    assert store.wants(pose())
+    store.add(keyframe(0, pose()))
+    assert not store.wants(pose(0.1, 5))
+    assert store.wants(pose(0.25))
+    assert store.wants(pose(0.0, 20))
+
+
+def test_capacity_drops_the_most_redundant_and_never_a_labelled_keyframe():
+    store = KeyframeStore(KeyframeConfig(capacity=3))
+    store.add(keyframe(0, pose(0.0), labelled=True))
+    store.add(keyframe(1, pose(0.01)))
+    store.add(keyframe(2, pose(5.0)))
+    store.add(keyframe(3, pose(10.0)))
+    assert [k.seq for k in store.keyframes] == [0, 2, 3]
+
+
+def test_views_that_see_nothing_of_the_query_are_not_chosen():
+    store = KeyframeStore(KeyframeConfig())
+    store.add(keyframe(0, pose(0.0, 180)))
+    store.add(keyframe(1, pose(0.2)))
+    assert [k.seq for k in store.choose(pose(), INTRINSICS, WALL, 8)] == [1]
+
+
+def test_choice_covers_the_frustum_rather_than_taking_the_nearest_centres():
+    store = KeyframeStore(KeyframeConfig())
+    store.add(keyframe(0, pose(0.02, 35)))  # near, but looks right: half of the query's view
+    store.add(keyframe(1, pose(0.03, 36)))
+    store.add(keyframe(2, pose(0.04, 37)))
+    store.add(keyframe(3, pose(0.8, -15)))  # farther away, sees the left half
+    chosen = [k.seq for k in store.choose(pose(), INTRINSICS, WALL, 2)]
+    assert 3 in chosen and len(chosen) == 2
+
+
+def test_occluded_views_are_not_chosen():
+    store = KeyframeStore(KeyframeConfig())
+    near_wall = np.full((60, 80), 0.5, np.float32)  # something stands right before this camera
+    store.add(keyframe(0, pose(0.0), depth=near_wall))
+    store.add(keyframe(1, pose(0.5)))
+    assert [k.seq for k in store.choose(pose(), INTRINSICS, WALL, 1)] == [1]
+
+
+def test_query_without_depth_still_finds_views():
+    store = KeyframeStore(KeyframeConfig())
+    store.add(keyframe(0, pose(0.3)))
+    assert len(store.choose(pose(), INTRINSICS, np.zeros_like(WALL), 4)) == 1
+
+
+def test_no_keyframes_or_no_room_gives_no_views():
+    store = KeyframeStore(KeyframeConfig())
+    assert store.choose(pose(), INTRINSICS, WALL, 4) == []
+    store.add(keyframe(0, pose()))
+    assert store.choose(pose(), INTRINSICS, WALL, 0) == []

@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from semantic_mapper.mapping.open3d_loader import load_open3d, preload_folder
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+def run_python(code: str, *path: Path) -> subprocess.CompletedProcess[str]:
+    prelude = f"import sys; sys.path[:0] = {[str(p) for p in (*path, REPOSITORY)]!r}\n"
+    return subprocess.run([sys.executable, "-I", "-c", prelude + code], capture_output=True, text=True, timeout=100)
+
+
+def test_open3d_loads_and_has_the_tensor_voxel_grid() -> None:
+    assert load_open3d().t.geometry.VoxelBlockGrid is not None
+    assert load_open3d() is load_open3d()
+
+
+def test_importing_the_library_does_not_import_open3d() -> None:
+    done = run_python("import semantic_mapper.mapping.voxel_map, sys; assert 'open3d' not in sys.modules")
+    assert done.returncode == 0, done.stderr
+
+
+def test_nothing_is_printed_when_kernels_start() -> None:
+    """Numba would warn of Open3D's old TBB."""
+    code = (
+        "import structlog; structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(40))\n"
+        "from tests.mapping.views import *\nimport numpy as np\n"
+        "small_map().integrate(frame(), np.ones((120, 160), np.float32), None, None)"
+    )
+    done = run_python(code)
+    assert done.returncode == 0 and done.stdout == "" and "Warning" not in done.stderr, done.stderr
+
+
+def test_missing_system_library_is_named_with_the_mend(tmp_path: Path) -> None:
+    package = tmp_path / "open3d"
+    package.mkdir()
+    message = "libGL.so.1: cannot open shared object file: No such file or directory"
+    (package / "__init__.py").write_text(f"raise ImportError({message!r})\n")
+    code = (
+        "from semantic_mapper.errors import DependencyError\n"
+        "from semantic_mapper.mapping.open3d_loader import load_open3d\n"
+        "try:\n    load_open3d()\nexcept DependencyError as error:\n    print(error)"
+    )
+    done = run_python(code, tmp_path)
+    assert "libGL.so.1" in done.stdout and "make setup" in done.stdout and "apt-get install" in done.stdout, done.stderr
+
+
+def test_what_cannot_be_preloaded_is_reported_and_does_not_stop_the_rest(tmp_path: Path) -> None:
+    assert preload_folder(tmp_path / "none") == []
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "libbroken.so.1").write_bytes(b"not a library")
+    failures = preload_folder(tmp_path)
+    assert len(failures) == 1 and failures[0].startswith("libbroken.so.1: ")

@@ -1,0 +1,311 @@
+from __future__ import annotations
+
+import threading
+
+import numba
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from semantic_mapper.config import VoxelMapConfig
+from semantic_mapper.errors import ConfigError, FrameError, MapError, PoseError, ShapeError
+from semantic_mapper.geometry import look_at
+from semantic_mapper.mapping.open3d_loader import load_open3d
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.types import CameraIntrinsics
+from tests.mapping.views import INTRINSICS, LABELS, around, frame, plane_depth, small_map, sphere_depth, sure
+
+State = dict[str, NDArray[np.generic]]
+CENTER = np.array([0.3, -0.2, 0.5])
+OBLIQUE = look_at(np.array([0.4, -0.3, -1.1]), np.array([0.1, 0.1, 0.4]), np.array([0.1, -1.0, 0.0]))
+
+
+def same(a: State, b: State) -> bool:
+    return a.keys() == b.keys() and all(a[k].shape == b[k].shape and (a[k] == b[k]).all() for k in a)
+
+
+def fuse_sphere(voxel_map: VoxelMap, count: int = 6) -> None:
+    for seq, pose in enumerate(around(CENTER, 1.2, count)):
+        depth = sphere_depth(pose, CENTER, 0.4)
+        voxel_map.integrate(frame(pose, seq=seq), depth, sure(seq % 3, 0.6), depth > 0)
+
+
+def open3d_state(voxel_map: VoxelMap, depth: NDArray[np.float32], rgb: NDArray[np.uint8], pose: NDArray[np.float64]):
+    """What Open3D's own integrate makes of one frame in the same blocks: tsdf, weight, colour in the same layout."""
+    o3d = load_open3d()
+    core, config = o3d.core, voxel_map.config
+    grid = o3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight", "color"),
+        (core.float32,) * 3,
+        ((1,), (1,), (3,)),
+        config.voxel_size_m,
+        8,
+        1000,
+        core.Device("CPU:0"),
+    )
+    i = INTRINSICS
+    K = core.Tensor(np.array([[i.fx, 0, i.cx + 0.5], [0, i.fy, i.cy + 0.5], [0, 0, 1]]))
+    images = [o3d.t.geometry.Image(core.Tensor(a)) for a in (depth, rgb.astype(np.float32) / 255)]
+    keys = core.Tensor(np.ascontiguousarray(voxel_map.block_state()["keys"]))
+    grid.integrate(
+        keys, *images, K, K, core.Tensor(np.linalg.inv(pose)), 1.0, config.depth_max_m, config.truncation_voxels
+    )
+    found, _ = grid.hashmap().find(keys)
+    return [grid.attribute(name).numpy()[found.numpy()] for name in ("tsdf", "weight", "color")]
+
+
+@pytest.mark.parametrize("shape", ["plane", "sphere"])
+def test_tsdf_and_colour_equal_open3ds_own_integrate(shape: str) -> None:
+    voxel_map = small_map()
+    pose = OBLIQUE if shape == "plane" else around(CENTER, 1.2, 5)[1]
+    depth = plane_depth(pose, (0.2, 0.1, 1.0), 0.45) if shape == "plane" else sphere_depth(pose, CENTER, 0.4)
+    posed = frame(pose, rgb=None if shape == "plane" else 77)
+    voxel_map.integrate(posed, depth, None, None)
+    tsdf, weight, color = open3d_state(voxel_map, depth, posed.rgb, pose)
+    mine = voxel_map.block_state()
+    both = (mine["weight"] > 0) & (weight[..., 0] > 0)
+    # Open3D leaves out the outer half of the border pixels, and single voxels fall to the other pixel by rounding.
+    assert both.sum() > 0.95 * (mine["weight"] > 0).sum() and both.sum() > 0.999 * (weight > 0).sum()
+    difference = np.abs(mine["tsdf"] - tsdf[..., 0])[both]
+    assert (difference > 1e-3).mean() < 1e-4 and np.quantile(difference, 0.999) < 1e-5
+    if shape == "plane":  # on the sphere's rim a neighbouring pixel is another surface
+        assert difference.max() < 0.05 and np.quantile(np.abs(mine["color"] - color)[both], 0.999) < 0.01
+
+
+def test_surface_points_lie_on_the_plane_they_were_fused_from() -> None:
+    voxel_map = small_map()
+    normal = np.array([0.2, 0.1, 1.0]) / np.linalg.norm([0.2, 0.1, 1.0])
+    assert voxel_map.integrate(frame(OBLIQUE), plane_depth(OBLIQUE, (0.2, 0.1, 1.0), 0.45), None, None) > 50
+    points = voxel_map.points()
+    assert points.xyz.dtype == np.float32 and len(points.xyz) > 2000
+    distance = np.abs(points.xyz @ normal - 0.45)
+    assert np.median(distance) < 0.001 and np.quantile(distance, 0.99) < 0.004
+
+
+def test_sphere_from_all_sides_is_a_sphere_with_its_colour() -> None:
+    voxel_map = small_map()
+    for seq, pose in enumerate(around(CENTER, 1.2, 12)):
+        voxel_map.integrate(frame(pose, seq=seq, rgb=140), sphere_depth(pose, CENTER, 0.4), None, None)
+    points = voxel_map.points()
+    off = np.abs(np.linalg.norm(points.xyz - CENTER, axis=1) - 0.4)
+    assert np.median(off) < 0.003
+    assert (points.rgb[off < 0.02] == 140).all()
+
+
+def test_one_vote_a_voxel_a_frame_near_the_surface_where_known() -> None:
+    voxel_map = small_map()
+    known = np.zeros((120, 160), bool)
+    known[:, :80] = True
+    depth = np.full((120, 160), 1.2, np.float32)
+    for seq in range(3):
+        voxel_map.integrate(frame(seq=seq), depth, sure(1), known)
+    state = voxel_map.block_state()
+    assert 2.9 < state["votes"].max() <= 3
+    k, _, i = np.indices((8, 8, 8))
+    z = (state["keys"][:, 2, None, None, None] * 8 + k) * 0.02
+    x = (state["keys"][:, 0, None, None, None] * 8 + i) * 0.02
+    voted = state["votes"] > 0
+    assert np.abs(z[voted] - 1.2).max() <= 2 * 0.02 + 1e-6
+    assert x[voted].max() <= 0.005  # columns 0..79 look left of the optical axis
+    points = voxel_map.points()
+    assert (points.label[points.xyz[:, 0] < -0.05] == 9).all()
+    right = points.xyz[:, 0] > 0.05
+    assert (points.label[right] == 0).all() and (points.confidence[right] == 0).all()
+
+
+def test_confidence_of_one_frontal_vote_is_the_fields_own_probability() -> None:
+    voxel_map = small_map()
+    voxel_map.integrate(frame(), np.full((120, 160), 1.0, np.float32), sure(2, 0.7), None)
+    points = voxel_map.points()
+    middle = np.abs(points.xyz[:, :2]).max(axis=1) < 0.15
+    assert (points.label[middle] == 2).all()
+    np.testing.assert_allclose(points.confidence[middle], 0.7, atol=0.01)
+
+
+def test_repeated_views_are_discounted() -> None:
+    voxel_map = small_map(vote_discount=0.5)
+    for seq in range(20):
+        voxel_map.integrate(frame(seq=seq), np.full((120, 160), 1.0, np.float32), sure(0, 0.7), None)
+    points = voxel_map.points()
+    middle = np.abs(points.xyz[:, :2]).max(axis=1) < 0.05
+    n_eff = 20 / (1 + 0.5 * 19)
+    expected = 1 / (1 + 2 * (0.15 / 0.7) ** n_eff)
+    np.testing.assert_allclose(points.confidence[middle], expected, atol=0.005)
+
+
+def test_far_and_grazing_looks_count_less() -> None:
+    near, far = small_map(), small_map()
+    near.integrate(frame(), np.full((120, 160), 1.0, np.float32), sure(0), None)
+    far.integrate(frame(), np.full((120, 160), 4.0, np.float32), sure(0), None)
+    grazing = small_map()
+    # A floor 0.3 m below a camera that looks along it (world y points down).
+    grazing.integrate(frame(), plane_depth(np.eye(4), (0.0, 1.0, 0.0), 0.3), sure(0), None)
+    assert near.block_state()["votes"].max() > 0.99
+    assert 0.2 < far.block_state()["votes"].max() <= 0.25 + 1e-6
+    assert 0.05 < grazing.block_state()["votes"].max() < 0.6
+
+
+def test_zero_probability_does_not_silence_a_class_for_ever() -> None:
+    voxel_map = small_map()
+    depth = np.full((120, 160), 1.0, np.float32)
+    voxel_map.integrate(frame(), depth, sure(0, 1.0), None)
+    assert np.isfinite(voxel_map.block_state()["evidence"]).all()
+    for seq in range(12):
+        voxel_map.integrate(frame(seq=seq), depth, sure(1, 0.6), None)
+    middle = np.abs(voxel_map.points().xyz[:, :2]).max(axis=1) < 0.05
+    assert (voxel_map.points().label[middle] == 9).all()
+
+
+def test_weights_and_votes_are_capped_and_the_map_can_still_change() -> None:
+    voxel_map = small_map(max_weight=4.0)
+    for seq in range(8):
+        voxel_map.integrate(frame(seq=seq), np.full((120, 160), 1.0, np.float32), sure(0), None)
+    state = voxel_map.block_state()
+    assert state["weight"].max() == 4 and state["votes"].max() <= 4
+    for seq in range(12):
+        voxel_map.integrate(frame(seq=seq), np.full((120, 160), 1.0, np.float32), sure(1), None)
+    assert np.bincount(voxel_map.points().label).argmax() == 9
+
+
+def test_empty_depth_touches_nothing_and_an_empty_map_can_be_read() -> None:
+    voxel_map = small_map()
+    assert voxel_map.integrate(frame(), np.zeros((120, 160), np.float32), sure(0), None) == 0
+    assert voxel_map.block_count == 0
+    assert voxel_map.points().xyz.shape == (0, 3) and voxel_map.mesh().faces.shape == (0, 3)
+    assert not voxel_map.ray_cast(np.eye(4), INTRINSICS).depth_m.any()
+    assert voxel_map.block_state()["evidence"].shape == (0, 8, 8, 8, 3)
+
+
+def test_invalid_depth_is_no_depth() -> None:
+    depth = plane_depth(OBLIQUE, (0.2, 0.1, 1.0), 0.45)
+    holes, zeros = depth.copy(), depth.copy()
+    holes[10:20], holes[30:40], holes[50:55], holes[60:62] = np.nan, -1.0, 5.01, np.inf
+    zeros[10:20] = zeros[30:40] = zeros[50:55] = zeros[60:62] = 0
+    a, b = small_map(), small_map()
+    a.integrate(frame(OBLIQUE), holes, sure(0), None)
+    b.integrate(frame(OBLIQUE), zeros, sure(0), None)
+    a_state, b_state = a.block_state(), b.block_state()
+    assert (a_state["keys"] == b_state["keys"]).all() and (a_state["tsdf"] == b_state["tsdf"]).all()
+
+
+def bad_poses() -> dict[str, NDArray[np.float64]]:
+    nan, scaled, mirrored = np.eye(4), np.eye(4), np.diag([-1.0, 1.0, 1.0, 1.0])
+    nan[0, 3] = np.nan
+    scaled[:3, :3] *= 1.1
+    return {"nan": nan, "scaled": scaled, "mirrored": mirrored}
+
+
+@pytest.mark.parametrize("kind", ["nan", "scaled", "mirrored"])
+def test_bad_pose_is_refused_and_changes_nothing(kind: str) -> None:
+    voxel_map = small_map()
+    fuse_sphere(voxel_map, 2)
+    before = voxel_map.block_state()
+    with pytest.raises(PoseError, match="seq=7"):
+        voxel_map.integrate(frame(bad_poses()[kind], seq=7), np.ones((120, 160), np.float32), None, None)
+    with pytest.raises(PoseError):
+        voxel_map.ray_cast(bad_poses()[kind], INTRINSICS)
+    assert same(before, voxel_map.block_state())
+
+
+def test_images_that_do_not_fit_are_refused_by_name() -> None:
+    voxel_map, depth = small_map(), np.ones((120, 160), np.float32)
+    with pytest.raises(ShapeError, match="depth_m"):
+        voxel_map.integrate(frame(), depth[:60], None, None)
+    with pytest.raises(ShapeError, match=r"depth_m.*float32"):
+        voxel_map.integrate(frame(), depth.astype(np.float64), None, None)  # type: ignore[arg-type]
+    with pytest.raises(ShapeError, match="probabilities"):
+        voxel_map.integrate(frame(), depth, sure(0)[..., :2], None)
+    with pytest.raises(ShapeError, match="known"):
+        voxel_map.integrate(frame(), depth, sure(0), np.ones((120, 160), np.uint8))  # type: ignore[arg-type]
+    assert voxel_map.block_count == 0
+
+
+@pytest.mark.parametrize("wrong", [np.nan, -0.5, 3.0])
+def test_what_is_no_probability_is_refused_and_changes_nothing(wrong: float) -> None:
+    voxel_map = small_map()
+    probabilities = sure(0)
+    probabilities[60, 80, 1] = wrong
+    depth = np.ones((120, 160), np.float32)
+    with pytest.raises(FrameError, match="1 known pixels"):
+        voxel_map.integrate(frame(), depth, probabilities, None)
+    assert voxel_map.block_count == 0
+    known = np.ones((120, 160), bool)
+    known[60, 80] = False
+    assert voxel_map.integrate(frame(), depth, probabilities, known) > 0
+
+
+def test_unrectified_and_far_away_frames_are_refused() -> None:
+    depth = np.ones((120, 160), np.float32)
+    distorted = CameraIntrinsics(130, 130, 80, 60, 160, 120, (0.1, 0.0))
+    with pytest.raises(FrameError, match="rectified"):
+        small_map().integrate(frame(intrinsics=distorted), depth, None, None)
+    far = np.eye(4)
+    far[0, 3] = 1e7
+    with pytest.raises(FrameError, match="origin"):
+        small_map().integrate(frame(far), depth, None, None)
+
+
+def test_a_full_map_refuses_and_stays_usable() -> None:
+    voxel_map = small_map(max_blocks=150)
+    voxel_map.integrate(frame(), plane_depth(np.eye(4), (0, 0, 1), 0.8), sure(0), None)
+    before, count = voxel_map.block_state(), voxel_map.block_count
+    with pytest.raises(MapError, match=r"max_blocks"):
+        voxel_map.integrate(frame(seq=1), np.full((120, 160), 3.0, np.float32), sure(0), None)
+    assert voxel_map.block_count == count and same(before, voxel_map.block_state())
+    assert voxel_map.integrate(frame(seq=2), plane_depth(np.eye(4), (0, 0, 1), 0.8), sure(0), None) == count
+    assert len(voxel_map.points().xyz) > 1000 and voxel_map.frames == 2
+
+
+def test_growth_from_one_block_gives_the_map_that_had_room_at_once() -> None:
+    small, roomy = small_map(initial_blocks=1), small_map(initial_blocks=4000)
+    fuse_sphere(small)
+    fuse_sphere(roomy)
+    assert same(small.block_state(), roomy.block_state())
+    assert small.memory_bytes < roomy.memory_bytes
+
+
+def test_same_frames_give_the_same_bits_on_one_thread_and_on_two() -> None:
+    maps = [small_map(), small_map(), small_map()]
+    fuse_sphere(maps[0])
+    fuse_sphere(maps[1])
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        fuse_sphere(maps[2])
+    finally:
+        numba.set_num_threads(threads)
+    states = [m.block_state() for m in maps]
+    assert same(states[0], states[1]) and same(states[0], states[2])
+    assert (maps[0].points().xyz == maps[2].points().xyz).all()
+
+
+def test_readers_in_other_threads_meet_no_half_grown_map() -> None:
+    voxel_map = small_map(initial_blocks=1)
+    done, failures = threading.Event(), []
+
+    def read() -> None:
+        while not done.is_set():
+            try:
+                view = voxel_map.ray_cast(np.eye(4), CameraIntrinsics(20, 20, 12, 9, 24, 18))
+                if not np.isfinite(view.depth_m).all():
+                    failures.append("depth")
+            except Exception as error:  # noqa: BLE001  (whatever it is, the test has to fail in its own thread)
+                failures.append(repr(error))
+
+    readers = [threading.Thread(target=read) for _ in range(2)]
+    for reader in readers:
+        reader.start()
+    for seq in range(12):
+        voxel_map.integrate(frame(seq=seq), np.full((120, 160), 0.6 + 0.3 * seq, np.float32), sure(0), None)
+    done.set()
+    for reader in readers:
+        reader.join()
+    assert not failures
+
+
+def test_impossible_configurations_are_refused_by_name() -> None:
+    for change in ({"voxel_size_m": 0.0}, {"truncation_voxels": -1.0}, {"max_weight": 0.0}, {"depth_max_m": np.nan}):
+        with pytest.raises(ConfigError, match=next(iter(change))):
+            VoxelMap(VoxelMapConfig(**change), LABELS)
+    with pytest.raises(MapError, match="min_weight"):
+        small_map().points(0)

@@ -1,0 +1,161 @@
+"""Real processes for tests: tiny logs and weights, the installed command, and what it leaves running."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from replay.log import LogWriter
+from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.types import PosedFrame
+from tests.small import INTRINSICS, tiny_field, tiny_frames
+
+COMMAND = Path(sys.executable).parent / "semantic-mapper"
+REPLAY_LAUNCH = Path(__file__).resolve().parents[2] / "launch" / "replay.toml"
+TIMEOUT_S = 100.0
+CONFIG = """
+[render]
+encode_width = 96
+scale = 0.25
+[keyframes]
+source_views = 3
+[sampling]
+guided = 4
+[voxel_map]
+voxel_size_m = 0.05
+initial_blocks = 200
+"""
+
+
+def write_log(path: Path, frames: Sequence[PosedFrame]) -> Path:
+    info = StreamInfo(source="test room", cameras={"rooms": INTRINSICS}, label_set=ROOMS, frame_count=len(frames))
+    with LogWriter(path, info) as log:
+        for frame in frames:
+            log.write_frame(frame)
+    return path
+
+
+def repeated_frames(count: int) -> list[PosedFrame]:
+    """Many frames at the price of a few: the same ones again, with new numbers and stamps."""
+    few = tiny_frames(4)
+    return [dataclasses.replace(few[i % 4], seq=i, stamp_ns=(i + 1) * 66_666_667) for i in range(count)]
+
+
+def write_weights(path: Path, train_stamps_ns: Sequence[int] = ()) -> Path:
+    recipe = {"kind": "test", "width": 96, "train_stamps_ns": list(train_stamps_ns)}
+    save_checkpoint(Checkpoint(tiny_field(), (), recipe), path)
+    return path
+
+
+def write_config(path: Path) -> Path:
+    path.write_text(CONFIG, encoding="utf-8")
+    return path
+
+
+def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """The command, to its end."""
+    return subprocess.run(
+        [str(COMMAND), *map(str, arguments)], capture_output=True, text=True, timeout=TIMEOUT_S, check=False, cwd=cwd
+    )
+
+
+class Running:
+    """The command in the background; its stderr is read line by line."""
+
+    def __init__(self, *arguments: str | Path) -> None:
+        self.process = subprocess.Popen(
+            [str(COMMAND), *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        self.lines: list[str] = []
+        self._ended = False
+        self._grown = threading.Condition()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def __enter__(self) -> Running:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        for pid in self.node_pids():
+            if is_alive(pid):
+                os.kill(pid, signal.SIGKILL)
+        self.process.wait()
+
+    @property
+    def text(self) -> str:
+        return "\n".join(self.lines)
+
+    def wait_for_line(self, pattern: str) -> str:
+        """The first line of stderr that matches."""
+
+        def found() -> str | None:
+            return next((line for line in self.lines if re.search(pattern, line)), None)
+
+        with self._grown:
+            line = self._grown.wait_for(lambda: found() or self._ended, TIMEOUT_S) and found()
+        assert line, f"no line matches {pattern!r} in:\n{self.text}"
+        return str(line)
+
+    def wait(self) -> int:
+        code = self.process.wait(TIMEOUT_S)
+        self._reader.join(10)
+        return code
+
+    def node_pids(self) -> list[int]:
+        return [int(n) for line in self.lines for n in re.findall(r"node_started.*pid=(\d+)", line)]
+
+    def node_pid(self, name: str) -> int:
+        line = self.wait_for_line(rf"node_started.*node={name}\b")
+        return int(re.findall(r"pid=(\d+)", line)[0])
+
+    def _read(self) -> None:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            with self._grown:
+                self.lines.append(line.rstrip("\n"))
+                self._grown.notify_all()
+        with self._grown:
+            self._ended = True
+            self._grown.notify_all()
+
+
+def is_alive(pid: int) -> bool:
+    """Runs still, and is no zombie that nobody has waited for yet."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def eventually(holds: Callable[[], bool], timeout_s: float = TIMEOUT_S) -> bool:
+    """Whether it comes to hold."""
+    deadline = time.monotonic() + timeout_s
+    while not holds():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.05)
+    return True
+
+
+def error_line(stderr: str) -> str:
+    """The one line that says what went wrong."""
+    assert "Traceback" not in stderr, stderr
+    lines = [line for line in stderr.splitlines() if line.startswith("error: ")]
+    assert len(lines) == 1, stderr
+    return lines[0]

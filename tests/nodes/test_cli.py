@@ -1,0 +1,56 @@
+"""The command as such: help, usage errors, versions."""
+
+from __future__ import annotations
+
+import pytest
+
+from semantic_mapper import __version__
+from tests.nodes.support import run
+
+VERBS = ("demo", "replay", "up", "import", "info", "recover", "finetune", "eval", "doctor", "train", "bench")
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_explains_itself_with_an_example(verb: str) -> None:
+    done = run(verb, "--help")
+    assert done.returncode == 0, done.stderr
+    assert f"Example: semantic-mapper {verb}" in done.stdout
+    assert done.stderr == ""
+
+
+def test_help_lists_all_verbs() -> None:
+    done = run("--help")
+    assert done.returncode == 0
+    assert all(f"  {verb} " in done.stdout for verb in VERBS)
+
+
+def test_version_is_that_of_the_package() -> None:
+    assert run("--version").stdout == f"semantic-mapper {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("replai",),
+        ("replay", "room.mcap"),
+        ("replay", "room.mcap", "--out", "x", "--voxel-size", "-1"),
+        ("import", "src", "dst", "--format", "rosbag"),
+        ("finetune", "room.mcap", "--keyframes", "1", "--out", "w"),
+        ("finetune", "room.mcap", "--keyframes", "4", "--out", "w", "--seconds", "0"),
+        ("eval",),
+    ],
+)
+def test_wrong_usage_exits_with_2_and_says_so_on_stderr(arguments: tuple[str, ...]) -> None:
+    done = run(*arguments)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert "Usage: semantic-mapper" in done.stderr
+
+
+def test_no_heavy_package_is_loaded_for_help() -> None:
+    import subprocess
+    import sys
+
+    code = "import sys, nodes.cli; print([m for m in ('torch', 'numpy', 'open3d', 'numba', 'cv2') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

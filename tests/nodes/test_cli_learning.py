@@ -1,0 +1,75 @@
+"""``finetune`` and ``eval``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from replay.log import LogWriter
+from semantic_mapper.fields.checkpoint import load_checkpoint
+from semantic_mapper.transport.messages import StreamInfo
+from tests.nodes.support import error_line, run
+from tests.small import INTRINSICS, tiny_frames
+
+
+@pytest.fixture(scope="module")
+def tuned(folder: Path, log: Path, weights: Path) -> Path:
+    out = folder / "made" / "tuned.safetensors"
+    arguments = ("--keyframes", "3", "--seconds", "0", "--steps", "2", "--weights", weights)
+    done = run("finetune", log, *arguments, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "finetuned on frames" in done.stdout
+    return out
+
+
+def test_finetuned_weights_remember_their_keyframes(tuned: Path) -> None:
+    checkpoint = load_checkpoint(tuned)
+    assert len(checkpoint.train_stamps_ns) == len(checkpoint.anchors) == 3
+    assert checkpoint.train_stamps_ns <= {f.stamp_ns for f in tiny_frames(6)}
+    assert checkpoint.recipe["source"] == "room.mcap"
+    assert checkpoint.recipe["steps"] == 2
+
+
+def test_more_keyframes_than_labelled_frames_are_refused(log: Path, weights: Path, tmp_path: Path) -> None:
+    done = run("finetune", log, "--keyframes", "7", "--weights", weights, "--out", tmp_path / "w.safetensors")
+    assert done.returncode == 1
+    assert "--keyframes 7" in error_line(done.stderr)
+
+
+def test_log_without_labels_is_refused(weights: Path, tmp_path: Path) -> None:
+    log = tmp_path / "plain.mcap"
+    with LogWriter(log, StreamInfo(source="test", cameras={"rooms": INTRINSICS})) as writer:
+        writer.write_frame(tiny_frames(1)[0])
+    for verb in (("finetune", log, "--keyframes", "2", "--out", tmp_path / "w.safetensors"), ("eval", log)):
+        done = run(*verb, "--weights", weights)
+        assert done.returncode == 1
+        assert "plain.mcap: has no label images" in error_line(done.stderr)
+
+
+def test_eval_shows_replays_side_by_side_and_writes_json(replayed: Path, tmp_path: Path) -> None:
+    file = tmp_path / "figures" / "eval.json"
+    done = run("eval", replayed, "--json", file)
+    assert done.returncode == 0, done.stderr
+    assert "mIoU" in done.stdout and "replayed" in done.stdout
+    written = json.loads(file.read_text())
+    assert written["replays"]["replayed"] == json.loads((replayed / "summary.json").read_text())
+
+
+def test_eval_of_a_log_compares_with_baselines_on_frames_that_nobody_was_fitted_to(
+    log: Path, tuned: Path, config: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "eval.json"
+    done = run("eval", log, "--weights", tuned, "--baselines", "--seconds", "1", "--config", config, "--json", file)
+    assert done.returncode == 0, done.stderr
+    scores = json.loads(file.read_text())["logs"][str(log)]
+    assert scores["scored"] == 3 and scores["excluded"] == 3
+    assert {"sray", "per-image U-Net", "labels carried by depth"} <= set(scores["methods"])
+    assert "per-image U-Net" in done.stdout
+
+
+def test_eval_of_a_folder_without_a_replay_says_so(tmp_path: Path) -> None:
+    done = run("eval", tmp_path)
+    assert done.returncode == 1
+    assert "no summary.json" in error_line(done.stderr)

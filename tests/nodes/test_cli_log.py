@@ -1,0 +1,90 @@
+"""``import``, ``info`` and ``recover``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from semantic_mapper.types import PosedFrame
+from tests.nodes.support import error_line, run
+from tests.small import INTRINSICS, tiny_frames
+
+
+def _write_sequence(folder: Path, frames: tuple[PosedFrame, ...]) -> Path:
+    """A sequence folder, the way a recording comes."""
+    for name in ("color", "depth", "label"):
+        (folder / name).mkdir(parents=True)
+    rows = []
+    for i, frame in enumerate(frames):
+        assert frame.depth_m is not None and frame.label is not None
+        cv2.imwrite(str(folder / f"color/{i:06d}.png"), frame.rgb[..., ::-1])
+        cv2.imwrite(str(folder / f"depth/{i:06d}.png"), (frame.depth_m * 1000).round().astype(np.uint16))
+        cv2.imwrite(str(folder / f"label/{i:06d}.png"), frame.label)
+        rows.append(" ".join(map(str, frame.T_world_camera.ravel())))
+    (folder / "poses.txt").write_text("\n".join(rows))
+    k = INTRINSICS
+    intrinsics = {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}
+    (folder / "intrinsics.json").write_text(json.dumps({**intrinsics, "depth_scale": 1000}))
+    labels = sorted({int(i) for f in frames for i in np.unique(f.label) if i})
+    (folder / "labels.json").write_text(json.dumps({"classes": {str(i): f"class{i}" for i in labels}}))
+    return folder
+
+
+def test_recording_with_a_broken_pose_is_imported_but_for_that_frame(tmp_path: Path) -> None:
+    source = _write_sequence(tmp_path / "sequence", tiny_frames(4))
+    poses = (source / "poses.txt").read_text().splitlines()
+    poses[2] = " ".join(["nan"] * 16)
+    (source / "poses.txt").write_text("\n".join(poses))
+    log = tmp_path / "sequence.mcap"
+    done = run("import", source, log)
+    assert done.returncode == 0, done.stderr
+    assert "3 frames (3 of them labelled)" in done.stdout
+    assert "frame 2" in done.stdout and "poses.txt" in done.stdout
+    found = json.loads(run("info", log, "--json").stdout)
+    assert found["frames"] == found["frames_with_depth"] == found["frames_with_labels"] == 3
+    assert found["cameras"]["camera"]["width"] == 96
+    assert found["damage"] == []
+
+
+def test_what_is_no_recording_is_refused_by_name(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    done = run("import", tmp_path / "empty", tmp_path / "out.mcap")
+    assert done.returncode == 1
+    assert "empty" in error_line(done.stderr)
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_info_shows_topics_frames_and_classes(log: Path) -> None:
+    done = run("info", log)
+    assert done.returncode == 0, done.stderr
+    for text in ("6 (6 with depth, 6 with labels)", "96x72", "topic frame/rooms", "rooms: wall, floor", "none"):
+        assert text in done.stdout
+
+
+def test_damaged_log_is_reported_and_recovered(log: Path, tmp_path: Path) -> None:
+    content = bytearray(log.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(content[: len(content) * 9 // 10])
+    told = run("info", damaged)
+    assert told.returncode == 1
+    assert "damaged:" in told.stdout and "semantic-mapper recover" in told.stdout
+    clean = tmp_path / "clean.mcap"
+    done = run("recover", damaged, clean)
+    assert done.returncode == 0, done.stderr
+    assert "lost:" in done.stdout
+    found = json.loads(run("info", clean, "--json").stdout)
+    assert 3 <= found["frames"] <= 5
+    assert found["damage"] == [] and found["finished"]
+
+
+def test_recover_never_writes_over_a_log(log: Path, tmp_path: Path) -> None:
+    taken = tmp_path / "taken.mcap"
+    taken.write_text("mine")
+    done = run("recover", log, taken)
+    assert done.returncode == 1
+    assert "taken.mcap: exists already" in error_line(done.stderr)
+    assert taken.read_text() == "mine"

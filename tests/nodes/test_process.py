@@ -1,0 +1,101 @@
+"""Process entry: thread counts, stop requests, stdout that holds results only."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from nodes.process import StopRequest
+
+
+def _python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    inherited = {k: v for k, v in os.environ.items() if not k.startswith(("OMP_", "NUMBA_"))}
+    return subprocess.run(
+        [sys.executable, "-I", "-c", code], capture_output=True, text=True, check=False, env=inherited | environment
+    )
+
+
+def test_first_signal_is_noted_and_the_second_interrupts() -> None:
+    with StopRequest() as stop:
+        assert not stop
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop and stop.name == "SIGINT" and stop.exit_code == 130
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_patient_request_keeps_the_first_signal() -> None:
+    with StopRequest(patient=True) as stop:
+        for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGTERM):
+            os.kill(os.getpid(), signum)
+        assert stop.name == "SIGTERM" and stop.exit_code == 143
+
+
+def test_handlers_are_given_back() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with StopRequest():
+        assert signal.getsignal(signal.SIGINT) != before
+    assert signal.getsignal(signal.SIGINT) == before
+
+
+def test_threads_are_set_before_anything_heavy_is_loaded_and_the_users_choice_is_kept() -> None:
+    code = """
+import json, os, sys
+from nodes.process import prepare_process
+prepare_process()
+names = ("OMP_WAIT_POLICY", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS")
+print(json.dumps([*(os.environ[n] for n in names), "torch" in sys.modules]))
+"""
+    policy, omp, numba, heavy = json.loads(_python(code).stdout)
+    assert policy == "passive" and int(omp) >= 1 and numba == omp and not heavy
+    assert json.loads(_python(code, OMP_NUM_THREADS="3").stdout)[1:3] == ["3", "3"]
+
+
+def test_stray_prints_never_reach_stdout() -> None:
+    code = """
+import atexit, ctypes, os
+from nodes.console import Output
+output = Output.guarded()
+print("python print")
+os.write(1, b"raw write\\n")
+ctypes.CDLL(None).puts(b"c print")
+atexit.register(os.write, 1, b"at exit\\n")
+output.json({"a": 1})
+"""
+    done = _python(code)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == {"a": 1}
+    for text in ("python print", "raw write", "c print", "at exit"):
+        assert text in done.stderr
+
+
+def test_one_event_is_one_line_even_when_a_message_has_several() -> None:
+    code = """
+import structlog
+from nodes.process import prepare_process
+prepare_process()
+structlog.get_logger("x").error("broken", reason="first\\nsecond")
+"""
+    done = _python(code)
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1 and "first | second" in done.stderr
+
+
+def test_log_events_survive_a_closed_stderr() -> None:
+    code = """
+import os, structlog
+from nodes.process import prepare_process
+prepare_process()
+read, write = os.pipe()
+os.dup2(write, 2); os.close(write); os.close(read)
+structlog.get_logger("x").error("nobody hears this")
+os.write(1, b"alive")
+os._exit(0)
+"""
+    done = _python(code)
+    assert done.stdout == "alive" and done.returncode == 0

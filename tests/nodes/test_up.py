@@ -1,0 +1,162 @@
+"""``up``: real processes and sockets: the map of one process, orderly ends, clear errors, nothing left behind."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from replay.log import LogReader
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from tests.nodes.support import (
+    REPLAY_LAUNCH,
+    Running,
+    error_line,
+    eventually,
+    is_alive,
+    repeated_frames,
+    run,
+    write_log,
+)
+from tests.small import tiny_frames
+
+RECORD_LAUNCH = REPLAY_LAUNCH.with_name("record.toml")
+
+
+def _settings(log: Path, weights: Path, config: Path) -> tuple[str, ...]:
+    return ("--set", f"log={log}", "--set", f"weights={weights}", "--set", f"config={config}")
+
+
+@pytest.fixture(scope="module")
+def long_log(folder: Path) -> Path:
+    """More frames than any test waits for."""
+    return write_log(folder / "long.mcap", repeated_frames(600))
+
+
+@pytest.fixture(scope="module")
+def recorded(folder: Path, log: Path, weights: Path, config: Path) -> Path:
+    """Results of all three nodes in lockstep."""
+    out = folder / "up"
+    done = run("up", RECORD_LAUNCH, *_settings(log, weights, config), "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "frames fused" in done.stdout
+    return out
+
+
+def test_lockstep_map_equals_the_in_process_map_bit_for_bit(recorded: Path, replayed: Path) -> None:
+    ours = VoxelMap.load(recorded / "map.npz").block_state()
+    theirs = VoxelMap.load(replayed / "map.npz").block_state()
+    assert len(ours["keys"]) > 0
+    for name, values in theirs.items():
+        np.testing.assert_array_equal(ours[name], values, err_msg=name)
+    mine, other = (json.loads((p / "summary.json").read_text()) for p in (recorded, replayed))
+    assert mine["frames"] == other["frames"]
+    assert mine["metrics"] == other["metrics"]
+
+
+def test_recorder_keeps_every_frame_byte_for_byte(recorded: Path, log: Path) -> None:
+    with LogReader(log) as before, LogReader(recorded / "recorded.mcap") as after:
+        assert [p for _, p in after.frame_parts()] == [p for _, p in before.frame_parts()]
+        assert after.info.label_set == before.info.label_set
+        assert after.finished and not after.errors
+        assert "status" in {envelope.topic for envelope, _ in after.messages()}
+
+
+def test_ctrl_c_writes_the_map_so_far_and_leaves_no_process(
+    long_log: Path, weights: Path, config: Path, tmp_path: Path
+) -> None:
+    with Running("up", RECORD_LAUNCH, *_settings(long_log, weights, config), "--out", tmp_path / "up") as running:
+        running.wait_for_line("stream_begins")
+        sockets = Path(running.wait_for_line(r"sockets=").split("sockets=")[1].split()[0])
+        assert sockets.stat().st_mode & 0o777 == 0o700
+        running.process.send_signal(signal.SIGINT)
+        assert running.wait() == 0, running.text
+        assert not any(is_alive(pid) for pid in running.node_pids())
+        assert len(running.node_pids()) == 3
+        assert not sockets.exists()
+    summary = json.loads((tmp_path / "up" / "summary.json").read_text())
+    assert summary["frames"]["fused"] < 600
+    assert "stopped" in summary["stopped_by"] or summary["stopped_by"] == "SIGTERM"
+    with LogReader(tmp_path / "up" / "recorded.mcap") as recorded:
+        assert recorded.finished and len(recorded) < 600
+
+
+def test_killed_mapper_is_named_and_nothing_is_left(
+    long_log: Path, weights: Path, config: Path, tmp_path: Path
+) -> None:
+    with Running("up", REPLAY_LAUNCH, *_settings(long_log, weights, config), "--out", tmp_path / "up") as running:
+        running.wait_for_line("stream_begins")
+        os.kill(running.node_pid("mapper"), signal.SIGKILL)
+        assert running.wait() == 1, running.text
+        assert not any(is_alive(pid) for pid in running.node_pids())
+        assert error_line(running.text).startswith("error: node 'mapper' (mapper) ended: killed by SIGKILL")
+
+
+def test_mapper_that_cannot_start_is_named_with_its_reason(log: Path, config: Path, tmp_path: Path) -> None:
+    missing = tmp_path / "none.safetensors"
+    done = run("up", REPLAY_LAUNCH, *_settings(log, missing, config), "--out", tmp_path / "up")
+    assert done.returncode == 1
+    line = error_line(done.stderr)
+    assert "node 'mapper' (mapper) ended: exit code 1" in line
+    assert "none.safetensors: no such weights file" in line
+    assert "camera" not in line  # it was waiting for the mapper, and ended when asked to
+
+
+def test_nodes_of_a_killed_launcher_write_their_results_and_end(
+    long_log: Path, weights: Path, config: Path, tmp_path: Path
+) -> None:
+    with Running("up", REPLAY_LAUNCH, *_settings(long_log, weights, config), "--out", tmp_path / "up") as running:
+        running.wait_for_line("stream_begins")
+        pids = running.node_pids()
+        running.process.kill()
+        assert eventually(lambda: not any(is_alive(pid) for pid in pids))
+    summary = json.loads((tmp_path / "up" / "summary.json").read_text())
+    assert summary["stopped_by"]
+
+
+def test_frozen_node_is_found_out_and_killed(log: Path, weights: Path, config: Path, tmp_path: Path) -> None:
+    launch = tmp_path / "impatient.toml"
+    launch.write_text("heartbeat_s = 6.0\n" + REPLAY_LAUNCH.read_text())
+    with Running("up", launch, *_settings(log, weights, config), "--out", tmp_path / "up") as running:
+        os.kill(running.node_pid("camera"), signal.SIGSTOP)
+        assert running.wait() == 1, running.text
+        line = error_line(running.text)
+        assert "node 'camera'" in line and "no sign of life for 6 s" in line
+        assert not any(is_alive(pid) for pid in running.node_pids())
+
+
+@pytest.mark.parametrize(("mode", "delivery"), [("fast", "all"), ("realtime", "newest")])
+def test_without_lockstep_every_frame_is_fused_or_counted_as_dropped(
+    mode: str, delivery: str, weights: Path, config: Path, tmp_path: Path
+) -> None:
+    log = write_log(tmp_path / "forty.mcap", repeated_frames(40))
+    launch = tmp_path / "live.toml"
+    launch.write_text(REPLAY_LAUNCH.read_text().replace('delivery = "all"', f'delivery = "{delivery}"'))
+    settings = (*_settings(log, weights, config), "--set", f"mode={mode}")
+    done = run("up", launch, *settings, "--out", tmp_path / "up")
+    assert done.returncode == 0, done.stderr
+    frames = json.loads((tmp_path / "up" / "summary.json").read_text())["frames"]
+    assert frames["published"] == 40
+    assert frames["fused"] >= 1 and frames["fused"] + frames["dropped"] == 40
+    assert delivery == "newest" or frames["dropped"] == 0
+
+
+def test_refused_frame_does_not_stop_the_lockstep(weights: Path, config: Path, tmp_path: Path) -> None:
+    frames = list(tiny_frames(4))
+    skewed = frames[1].T_world_camera.copy()
+    skewed[:3, :3] *= 2
+    frames[1] = dataclasses.replace(frames[1], T_world_camera=skewed)
+    log = write_log(tmp_path / "skewed.mcap", frames)
+    done = run("up", RECORD_LAUNCH, *_settings(log, weights, config), "--out", tmp_path / "up")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "up" / "summary.json").read_text())
+    assert summary["frames"]["published"] == 4 and summary["frames"]["fused"] == 3
+    assert "frame seq=1" in summary["refusals"][0]["reason"]
+    assert "1 frames refused" in done.stdout
+    with LogReader(tmp_path / "up" / "recorded.mcap") as recorded:
+        assert "refused" in {envelope.topic for envelope, _ in recorded.messages()}

@@ -1,0 +1,202 @@
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from replay.evaluate import baseline_predictors, evaluate_frames, sray_predictors
+from replay.session import SNAPSHOTS, MapSession, load_pipeline, make_field
+from replay.truth import SurfaceTruth, TruthMapper
+from semantic_mapper.errors import LabelError, WeightsError
+from semantic_mapper.fields.checkpoint import Checkpoint, anchor_from_frame, save_checkpoint
+from semantic_mapper.fields.sray import SRay
+from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.labels import NYU40, ROOMS, make_label_set
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from tests.small import tiny_config, tiny_field, tiny_frames
+
+
+@pytest.fixture
+def weights(tmp_path):
+    """Untrained weights that claim to be finetuned on frame 1."""
+    frames = tiny_frames()
+    recipe = {"kind": "finetune", "width": 96, "train_stamps_ns": [frames[1].stamp_ns]}
+    save_checkpoint(Checkpoint(tiny_field(), (anchor_from_frame(frames[1], 96),), recipe), tmp_path / "w.safetensors")
+    return tmp_path / "w.safetensors"
+
+
+def run(weights, frames, **options):
+    session = MapSession(load_pipeline(weights, tiny_config()), stream_labels=ROOMS, source="test", **options)
+    for frame in frames:
+        session.process(frame)
+    return session
+
+
+def test_a_session_leaves_summary_map_points_and_picture(tmp_path, weights):
+    session = run(weights, tiny_frames(), rerun=tmp_path / "run.rrd")
+    summary = session.finish(tmp_path / "out")
+    on_disk = json.loads((tmp_path / "out/summary.json").read_text())
+    assert on_disk == summary
+    assert summary["frames"]["published"] == summary["frames"]["fused"] == 6
+    assert summary["frames"]["dropped"] == 0
+    assert set(summary["latency_ms"]) == {"p50", "p95"} and set(summary["stages_ms"]) >= {"render", "fuse"}
+    assert set(summary["map"]) >= {"voxel_size_m", "blocks", "surface_points", "memory_mb"}
+    assert set(summary["metrics"]) >= {"miou", "total_accuracy", "average_accuracy", "per_class", "map_miou"}
+    assert summary["labels"]["1"] == "wall" and summary["weights"]["file"] == "w.safetensors"
+    points = VoxelMap.load(tmp_path / "out/map.npz").points()
+    assert len(points.xyz) == summary["map"]["surface_points"]
+    ply = (tmp_path / "out/map.ply").read_bytes()
+    assert b"property uchar label" in ply[:400] and b"property float confidence" in ply[:400]
+    assert cv2.imread(str(tmp_path / "out/overview.png")).std() > 10
+    assert (tmp_path / "run.rrd").read_bytes()[:4] in (b"RRF2", b"RRIO", b"RRF3") and (
+        tmp_path / "run.rrd"
+    ).stat().st_size > 10_000
+
+
+def test_frames_that_the_weights_have_seen_are_not_scored(weights):
+    frames = tiny_frames()
+    session = run(weights, frames, exclude_stamps=frozenset({frames[4].stamp_ns}))
+    assert session.excluded == 2 and session.scored == 4
+
+
+def test_scores_are_those_of_the_rendered_labels(weights):
+    frames = tiny_frames()
+    session = MapSession(load_pipeline(weights, tiny_config()), stream_labels=ROOMS)
+    right = counted = 0
+    for frame in frames:
+        update = session.process(frame)
+        if frame.stamp_ns != frames[1].stamp_ns:
+            labelled = frame.label != ROOMS.ignore_id
+            right += int((update.label == frame.label)[labelled].sum())
+            counted += int(labelled.sum())
+    assert np.isclose(session.confusion.metrics().total_accuracy, right / counted)
+
+
+def test_refused_frames_are_counted_with_their_reason_and_the_rest_is_mapped(tmp_path, weights):
+    frames = list(tiny_frames())
+    broken = frames[2].T_world_camera.copy()
+    broken[1, 1] = np.inf
+    frames[2] = replace(frames[2], T_world_camera=broken)
+    session = run(weights, frames)
+    session.refuse(9, 0, "message 9: checksum is wrong")
+    session.count_dropped(3)
+    summary = session.finish(tmp_path / "out")
+    assert summary["frames"] | {} == summary["frames"]
+    assert (summary["frames"]["published"], summary["frames"]["fused"]) == (10, 5)
+    assert (summary["frames"]["refused"], summary["frames"]["dropped"]) == (2, 3)
+    assert "seq=2" in summary["refusals"][0]["reason"] and "NaN or infinity" in summary["refusals"][0]["reason"]
+
+
+@pytest.mark.parametrize("bad", [0, 1, 2])  # 1 is a frame that the weights were finetuned on
+def test_an_unknown_label_id_costs_the_score_but_neither_map_nor_results(tmp_path, weights, bad):
+    frames = list(tiny_frames(3))
+    label = frames[bad].label.copy()
+    label[0, 0] = 77
+    frames[bad] = replace(frames[bad], label=label)
+    session = run(weights, frames)
+    assert session.fused == 3 and session.scored == (2 if bad == 1 else 1)
+    summary = session.finish(tmp_path / "out")
+    assert summary["frames"]["labels_refused"] == 1 and summary["frames"]["refused"] == 0
+    assert "77" in summary["refusals"][0]["reason"] and f"seq={bad}" in summary["refusals"][0]["reason"]
+    assert (tmp_path / "out/overview.png").exists()
+
+
+def test_without_labels_metrics_are_null(tmp_path, weights):
+    session = MapSession(load_pipeline(weights, tiny_config()), stream_labels=None)
+    session.process(replace(tiny_frames()[0], label=None))
+    summary = session.finish(tmp_path)
+    assert all(v is None for v in summary["metrics"].values()) and summary["metrics_per_image"] is None
+
+
+def test_an_empty_session_still_writes_everything(tmp_path, weights):
+    session = MapSession(load_pipeline(weights, tiny_config()), stream_labels=ROOMS)
+    summary = session.finish(tmp_path)
+    assert summary["frames"]["fused"] == 0 and summary["latency_ms"]["p50"] is None
+    assert (tmp_path / "overview.png").exists() and (tmp_path / "map.npz").exists()
+
+
+def test_snapshots_stay_few_and_spread(weights):
+    session = MapSession(load_pipeline(weights, tiny_config()), stream_labels=ROOMS)
+    for _ in range(3):
+        for frame in tiny_frames():
+            session.process(frame)
+    assert 2 <= len(session.snapshots) <= SNAPSHOTS
+
+
+def test_missing_weights_are_an_error_before_any_frame(tmp_path):
+    with pytest.raises(WeightsError, match="no such weights file"):
+        load_pipeline(tmp_path / "none.safetensors", tiny_config())
+
+
+def test_working_width_comes_from_the_weights_unless_set(weights):
+    unset = tiny_config(render={"scale": 0.5})
+    assert load_pipeline(weights, unset).pipeline.config.render.encode_width == 96
+    assert load_pipeline(weights, tiny_config(render={"encode_width": 48})).pipeline.config.render.encode_width == 48
+
+
+def test_the_compiled_renderer_is_used_where_it_covers_the_model():
+    assert isinstance(make_field(tiny_field(), tiny_config()), StreamingSRay)
+    assert isinstance(make_field(tiny_field(), tiny_config(sampling={"mode": "reference"})), SRay)
+
+
+def test_truth_is_translated_by_class_name():
+    mapper = TruthMapper(NYU40, ROOMS)
+    label = np.array([[1, 5, 37]], np.uint8)  # wall, chair, bag
+    translated = mapper.to_map_ids(label, "frame")
+    assert translated.tolist() == [[ROOMS.ids[0], ROOMS.ids[ROOMS.names.index("chair")], ROOMS.ignore_id]]
+    with pytest.raises(LabelError, match="99"):
+        mapper.to_map_ids(np.array([[99]], np.uint8), "frame")
+
+
+def test_surface_truth_is_the_majority_of_the_frames_that_see_the_point():
+    frame = tiny_frames()[0]
+    truth = SurfaceTruth(ROOMS)
+    wall, floor = np.full_like(frame.label, ROOMS.ids[0]), np.full_like(frame.label, ROOMS.ids[1])
+    for label in (wall, floor, wall):
+        truth.add(replace(frame, label=label))
+    k, z = frame.intrinsics, frame.depth_m[36, 48]
+    seen = np.array([(48 - k.cx) / k.fx * z, (36 - k.cy) / k.fy * z, z, 1]) @ frame.T_world_camera.T
+    behind = frame.T_world_camera[:3, 3] - frame.T_world_camera[:3, 2]
+    labels = truth.labels_at(np.stack((seen[:3], behind)).astype(np.float32))
+    assert labels.tolist() == [ROOMS.ids[0], ROOMS.ignore_id]
+
+
+def test_methods_are_scored_on_the_same_frames_and_keyframes_never_count(weights):
+    frames = list(tiny_frames())
+    bundle = load_pipeline(weights, tiny_config())
+    keyframes = [frames[1], frames[4]]
+    predictors = sray_predictors(bundle) | baseline_predictors(keyframes, ROOMS, seconds=1.0, seed=0)
+    excluded = frozenset(f.stamp_ns for f in keyframes)
+    result = evaluate_frames(frames, predictors, ROOMS, ROOMS, excluded)
+    assert set(result.methods) == {"sray", "sray, novel view", "per-image U-Net", "labels carried by depth"}
+    assert (result.scored, result.excluded, result.refused) == (4, 2, 0)
+    assert len({m["pixels"] for m in result.methods.values()}) == 1
+    assert result.methods["labels carried by depth"]["total_accuracy"] > 0.5
+
+
+def test_an_unknown_label_costs_one_frame_of_an_evaluation_and_progress_still_ends():
+    frames = list(tiny_frames(3))
+    label = frames[1].label.copy()
+    label[0, 0] = 77
+    frames[1] = replace(frames[1], label=label)
+    seen: list[int] = []
+    result = evaluate_frames(frames, {"truth": lambda f: f.label}, ROOMS, ROOMS, frozenset(), seen.append)
+    assert (result.scored, result.refused) == (2, 1) and seen == [1, 2, 3]
+    assert result.methods["truth"]["miou"] == 1.0
+
+
+def test_carried_labels_reproduce_the_keyframe_itself():
+    frame = tiny_frames()[0]
+    predictors = baseline_predictors([frame], ROOMS, seconds=0.5, seed=0)
+    same = predictors["labels carried by depth"](frame) == frame.label
+    assert same[frame.depth_m > 0].mean() > 0.98
+
+
+def test_other_label_sets_are_scored_on_shared_classes_only(weights):
+    stream = make_label_set("mine", ["wall", "spaceship"], ids=[1, 9])
+    frame = tiny_frames()[0]
+    label = np.where(frame.label == ROOMS.ids[0], 1, 9).astype(np.uint8)
+    session = MapSession(load_pipeline(weights, tiny_config()), stream_labels=stream)
+    session.process(replace(frame, label=label))
+    assert set(session.confusion.metrics().per_class) == {"wall"}

@@ -1,0 +1,111 @@
+"""Rooms: determinism, placement, class coverage, refusals."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.scenes import TEST_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, RoomConfig, Scene, make_room
+from semantic_mapper.scenes.programmes import PROGRAMMES
+
+SEEDS = range(20)
+
+
+@pytest.fixture(scope="module")
+def rooms() -> list[Scene]:
+    return [make_room(seed, RoomConfig(shadow_resolution=8)) for seed in SEEDS]
+
+
+def test_a_seed_gives_the_same_room_twice() -> None:
+    a, b = make_room(7), make_room(7)
+    assert (a.programme, a.size_m) == (b.programme, b.size_m)
+    for part in ("primitives", "materials", "lights"):
+        first, second = getattr(a, part), getattr(b, part)
+        for name in first.__slots__:
+            np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+def test_another_seed_gives_another_room() -> None:
+    assert make_room(7).size_m != make_room(8).size_m
+
+
+def test_splits_share_no_seed_and_stay_below_the_reserved_ones() -> None:
+    splits = [set(TRAIN_SEEDS), set(VALIDATION_SEEDS), set(TEST_SEEDS)]
+    assert sum(map(len, splits)) == len(set.union(*splits))
+    assert max(set.union(*splits)) < 300_000
+
+
+def test_twenty_rooms_show_every_class(rooms: list[Scene]) -> None:
+    seen = np.unique(np.concatenate([room.primitives.label for room in rooms]))
+    missing = [name for i, name in zip(ROOMS.ids, ROOMS.names, strict=True) if i not in seen]
+    assert missing == []
+
+
+def test_rooms_have_as_many_primitives_as_planned(rooms: list[Scene]) -> None:
+    counts = [len(room.primitives) for room in rooms]
+    assert min(counts) >= 30
+    assert np.median(counts) >= 60
+
+
+def test_everything_stays_inside_the_room(rooms: list[Scene]) -> None:
+    for room in rooms:
+        low, high = room.primitives.bounds()
+        shell = np.isin(room.primitives.label, [ROOMS.ids[ROOMS.names.index(n)] for n in ("wall", "floor", "ceiling")])
+        assert low[~shell].min() >= -1e-6
+        assert (high[~shell] <= np.array(room.size_m) + 1e-6).all()
+
+
+def test_furniture_does_not_interpenetrate(rooms: list[Scene]) -> None:
+    """Boxes round parts of different pieces are apart; parts of one piece (neighbours in instance number) may touch."""
+    for room in rooms:
+        groups = room.primitives.group
+        low, high = room.primitives.bounds()
+        # Walls and what lies flat (rugs) are met by furniture on purpose; bounds of turned parts are loose by nature.
+        solid = (high[:, 2] > 0.02) & (groups >= 6)
+        low, high, groups = low[solid], high[solid], groups[solid]
+        overlap = np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None])
+        deep = (overlap.min(-1) > 1e-3) & (groups[:, None] != groups[None])
+        assert not deep.any()
+
+
+@pytest.mark.parametrize("programme", sorted(PROGRAMMES))
+def test_a_programme_can_be_asked_for(programme: str) -> None:
+    config = RoomConfig(programme=programme, shadow_resolution=8)  # type: ignore[arg-type]
+    assert make_room(3, config).programme == programme
+
+
+def test_main_furniture_is_nearly_always_there() -> None:
+    wanted = {"bedroom": "bed", "living": "sofa", "office": "desk", "kitchen": "counter", "bathroom": "toilet"}
+    for programme, label in wanted.items():
+        config = RoomConfig(programme=programme, shadow_resolution=8)  # type: ignore[arg-type]
+        rooms = [make_room(seed, config) for seed in range(10)]
+        there = sum(ROOMS.ids[ROOMS.names.index(label)] in room.primitives.label for room in rooms)
+        assert there >= 8, (programme, there)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        RoomConfig(min_side_m=5.0, max_side_m=4.0),
+        RoomConfig(min_side_m=1.0),
+        RoomConfig(max_height_m=2.0),
+        RoomConfig(clutter=-1.0),
+        RoomConfig(programme="castle"),  # type: ignore[arg-type]
+    ],
+)
+def test_impossible_settings_are_refused(config: RoomConfig) -> None:
+    with pytest.raises(ConfigError):
+        make_room(0, config)
+
+
+def test_a_negative_seed_is_refused() -> None:
+    with pytest.raises(ConfigError, match="negative"):
+        make_room(-1)
+
+
+def test_settings_are_plain_data() -> None:
+    config = RoomConfig(programme="kitchen", clutter=0.5)
+    assert msgspec.convert(msgspec.to_builtins(config), RoomConfig) == config

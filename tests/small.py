@@ -1,0 +1,34 @@
+"""Small real things shared by tests: a tiny S-Ray and frames of a procedural room."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+
+from semantic_mapper.config import MapperConfig, SRayConfig, convert_config
+from semantic_mapper.fields.sray import SRay
+from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
+from semantic_mapper.types import CameraIntrinsics, PosedFrame
+
+INTRINSICS = CameraIntrinsics(66.0, 66.0, 47.5, 35.5, 96, 72)
+SMALL_MODEL = SRayConfig(feature_dim=16, heads=2, encoder_width=8, encoder_blocks=(1, 1))
+
+
+def tiny_field(label_set: LabelSet = ROOMS, seed: int = 0) -> SRay:
+    """Random weights, evaluation mode."""
+    torch.manual_seed(seed)
+    return SRay(SMALL_MODEL, label_set).eval()
+
+
+@cache
+def tiny_frames(count: int = 6, seed: int = 7) -> tuple[PosedFrame, ...]:
+    """Labelled 96x72 frames of one room."""
+    return tuple(room_frames(TRAIN_SEEDS[seed], count, INTRINSICS))
+
+
+def tiny_config(**changes: object) -> MapperConfig:
+    """A config for 96x72 frames; ``changes`` are whole sections as dicts."""
+    base = {"render": {"encode_width": 96, "scale": 0.5}, "voxel_map": {"voxel_size_m": 0.05, "initial_blocks": 200}}
+    return convert_config({**base, **changes}, MapperConfig, "test config")

@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from semantic_mapper.config import (
+    Config,
+    MapperConfig,
+    SRayConfig,
+    VoxelMapConfig,
+    convert_config,
+    load_config,
+    to_plain,
+)
+from semantic_mapper.errors import ConfigError
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "mapper.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_an_empty_file_gives_the_defaults(tmp_path: Path) -> None:
+    assert load_config(write(tmp_path, ""), MapperConfig) == MapperConfig()
+
+
+def test_a_file_changes_what_it_names_and_nothing_else(tmp_path: Path) -> None:
+    config = load_config(write(tmp_path, "seed = 3\n[voxel_map]\nvoxel_size_m = 0.05\n"), MapperConfig)
+    assert config.seed == 3
+    assert config.voxel_map == VoxelMapConfig(voxel_size_m=0.05)
+    assert config.sampling == MapperConfig().sampling
+
+
+@pytest.mark.parametrize(
+    ("text", "nearest"),
+    [
+        ("sede = 1", "seed"),
+        ("[voxelmap]", "voxel_map"),
+        ("[voxel_map]\nvoxel_size = 0.05", "voxel_size_m"),
+        ("[keyframes]\nsource_view = 4", "source_views"),
+    ],
+)
+def test_an_unknown_key_is_refused_with_the_nearest_valid_one(tmp_path: Path, text: str, nearest: str) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(ConfigError) as caught:
+        load_config(path, MapperConfig)
+    assert str(path) in str(caught.value)
+    assert f"did you mean `{nearest}`?" in str(caught.value)
+
+
+def test_an_unknown_key_like_no_other_is_answered_with_the_valid_ones(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"valid keys are .*seed"):
+        load_config(write(tmp_path, "qqqq = 1"), MapperConfig)
+
+
+def test_the_nearest_key_is_one_of_the_section_that_holds_the_mistake() -> None:
+    with pytest.raises(ConfigError) as caught:
+        convert_config({"keyframes": {"voxel_size_m": 0.05}}, MapperConfig, "mapper.toml")
+    assert "`voxel_size_m`?" not in str(caught.value)  # it is refused here: offering it again helps nobody
+
+
+@pytest.mark.parametrize(
+    ("data", "names"),
+    [
+        ({"seed": "one"}, "seed"),
+        ({"sampling": {"mode": "fast"}}, "sampling.mode"),
+        ({"voxel_map": {"voxel_size_m": "2cm"}}, "voxel_map.voxel_size_m"),
+        ({"voxel_map": 3}, "voxel_map"),
+    ],
+)
+def test_a_value_of_another_type_is_refused_by_its_path(data: dict[str, object], names: str) -> None:
+    with pytest.raises(ConfigError, match=names):
+        convert_config(data, MapperConfig, "mapper.toml")
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"absent\.toml: no such file"):
+        load_config(tmp_path / "absent.toml", MapperConfig)
+
+
+@pytest.mark.parametrize("content", [b"seed = ", b"\xff\xfe", b"[a]\n[a]\n"])
+def test_a_file_that_is_not_toml_is_named(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "mapper.toml"
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match=r"mapper\.toml: not valid TOML"):
+        load_config(path, MapperConfig)
+
+
+@pytest.mark.parametrize("config", [MapperConfig(seed=5), SRayConfig(tau=0.1, encoder_blocks=(1, 2))])
+def test_plain_data_converts_back_to_the_same_config(config: Config) -> None:
+    assert convert_config(to_plain(config), type(config), "plain") == config
+
+
+def test_configs_cannot_be_changed() -> None:
+    with pytest.raises(AttributeError):
+        MapperConfig().seed = 1  # type: ignore[misc]
+    assert msgspec.structs.replace(MapperConfig(), seed=1).seed == 1

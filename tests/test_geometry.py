@@ -1,0 +1,259 @@
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from semantic_mapper.errors import PoseError, ShapeError
+from semantic_mapper.geometry import (
+    camera_matrix,
+    check_pose,
+    expect_shape,
+    invert_pose,
+    invert_pose_torch,
+    look_at,
+    pixel_grid,
+    pixel_rays,
+    project,
+    scale_intrinsics,
+    transform,
+    unproject,
+)
+from semantic_mapper.types import CameraIntrinsics
+
+CAMERA = CameraIntrinsics(fx=100, fy=200, cx=10, cy=20, width=32, height=24)
+
+finite = st.floats(-50, 50, allow_nan=False)
+vectors = hnp.arrays(np.float64, 3, elements=finite)
+
+
+@st.composite
+def poses(draw: st.DrawFn) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(draw(hnp.arrays(np.float64, 3, elements=st.floats(-4, 4))))[0]
+    T[:3, 3] = draw(vectors)
+    return T
+
+
+@st.composite
+def cameras(draw: st.DrawFn) -> CameraIntrinsics:
+    width, height = draw(st.integers(2, 40)), draw(st.integers(2, 40))
+    focal = st.floats(5, 500)
+    return CameraIntrinsics(
+        fx=draw(focal),
+        fy=draw(focal),
+        cx=draw(st.floats(0, 1)) * (width - 1),
+        cy=draw(st.floats(0, 1)) * (height - 1),
+        width=width,
+        height=height,
+    )
+
+
+# Shapes
+
+
+def test_expect_shape_returns_the_named_sizes() -> None:
+    assert expect_shape(torch.zeros(2, 3, 4, 5), "M 3 H W") == {"M": 2, "H": 4, "W": 5}
+    assert expect_shape(np.zeros((4, 4)), "N N") == {"N": 4}
+
+
+@pytest.mark.parametrize(
+    ("shape", "pattern"), [((2, 4), "M 3"), ((2, 3), "M 3 H"), ((2, 3, 4), "M 3"), ((3, 4), "N N")]
+)
+def test_expect_shape_shows_expected_and_actual(shape: tuple[int, ...], pattern: str) -> None:
+    with pytest.raises(ShapeError) as caught:
+        expect_shape(torch.zeros(shape), pattern, "rays")
+    assert str(caught.value) == f"rays: expected shape ({', '.join(pattern.split())}), got {shape}"
+
+
+# Poses
+
+
+def test_a_rotation_by_a_quarter_turn_is_inverted_by_hand() -> None:
+    T_a_b = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], np.float64)
+    T_b_a = np.array([[0, 1, 0, -2], [-1, 0, 0, 1], [0, 0, 1, -3], [0, 0, 0, 1]], np.float64)
+    np.testing.assert_allclose(invert_pose(T_a_b), T_b_a)
+    np.testing.assert_allclose(transform(T_a_b, np.array([1.0, 0, 0])), [1, 3, 3])
+
+
+@given(T_a_b=poses(), p_b=hnp.arrays(np.float64, (5, 3), elements=finite))
+def test_a_pose_and_its_inverse_cancel(T_a_b: np.ndarray, p_b: np.ndarray) -> None:
+    np.testing.assert_allclose(T_a_b @ invert_pose(T_a_b), np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(transform(invert_pose(T_a_b), transform(T_a_b, p_b)), p_b, atol=1e-9)
+    np.testing.assert_allclose(invert_pose_torch(torch.from_numpy(T_a_b)).numpy(), invert_pose(T_a_b), atol=1e-12)
+
+
+@given(T_a_b=poses(), T_b_c=poses(), p_c=vectors)
+def test_indices_of_chained_poses_cancel(T_a_b: np.ndarray, T_b_c: np.ndarray, p_c: np.ndarray) -> None:
+    np.testing.assert_allclose(transform(T_a_b @ T_b_c, p_c), transform(T_a_b, transform(T_b_c, p_c)), atol=1e-9)
+
+
+def test_inverses_work_on_batches_and_keep_the_dtype() -> None:
+    T = np.tile(np.eye(4, dtype=np.float32), (2, 3, 1, 1))
+    T[..., 0, 3] = np.arange(6).reshape(2, 3)
+    assert invert_pose(T).dtype == np.float32
+    np.testing.assert_array_equal(invert_pose(T)[..., 0, 3], -T[..., 0, 3])
+    torch.testing.assert_close(invert_pose_torch(torch.from_numpy(T)), torch.from_numpy(invert_pose(T)))
+
+
+def test_the_inverse_of_a_pose_can_be_differentiated() -> None:
+    T = torch.from_numpy(look_at(np.array([1.0, 2, 3]), np.zeros(3), np.array([0.0, 0, 1]))).requires_grad_()
+    assert torch.autograd.gradcheck(invert_pose_torch, (T,))
+
+
+@given(T=poses())
+def test_every_rigid_pose_passes(T: np.ndarray) -> None:
+    assert check_pose(T, "frame 1") is None
+    assert check_pose(np.round(T, 6), "frame 1") is None  # as a text log stores it
+
+
+@pytest.mark.parametrize(
+    ("mistake", "says"),
+    [
+        (lambda T: T * np.nan, "NaN"),
+        (lambda T: T + np.diag([0, 0, 0, np.inf]), "NaN or infinity"),
+        (lambda T: T @ np.diag([1, 1, -1, 1]), "mirror"),
+        (lambda T: T @ np.diag([1.01, 1.01, 1.01, 1]), "not a rotation"),
+        (lambda T: T.T, "last row"),
+        (lambda T: T * 0, "last row"),
+        (lambda T: np.vstack((T[:3] * 0, T[3])), "not a rotation"),
+    ],
+)
+def test_what_is_not_a_rigid_pose_is_refused_by_name(mistake, says: str) -> None:  # type: ignore[no-untyped-def]
+    T = look_at(np.array([1.0, 2, 3]), np.zeros(3), np.array([0.0, 0, 1]))
+    with pytest.raises(PoseError, match=says) as caught:
+        check_pose(mistake(T), "frame 12 of log.mcap")
+    assert "frame 12 of log.mcap" in str(caught.value)
+
+
+def test_a_pose_of_another_shape_is_a_shape_error() -> None:
+    with pytest.raises(ShapeError, match="frame 3"):
+        check_pose(np.eye(3), "frame 3")
+
+
+@given(eye=vectors, target=vectors)
+def test_look_at_puts_the_target_in_the_middle_and_up_on_top(eye: np.ndarray, target: np.ndarray) -> None:
+    up = np.array([0.0, 0, 1])
+    assume(np.linalg.norm(np.cross(target - eye, up)) > 1e-3)
+    T_world_camera = look_at(eye, target, up)
+    check_pose(T_world_camera, "look_at")
+    p_camera = transform(invert_pose(T_world_camera), target)
+    np.testing.assert_allclose(p_camera, [0, 0, np.linalg.norm(target - eye)], atol=1e-6)
+    assert T_world_camera[:3, 1] @ up < 0  # y points down
+
+
+# Cameras
+
+
+def test_projection_by_hand() -> None:
+    p = np.array([[0, 0, 1], [0.1, 0.2, 2], [-1, -0.5, 4]], np.float64)
+    np.testing.assert_allclose(project(p, CAMERA), [[10, 20], [15, 40], [-15, -5]])
+
+
+@given(camera=cameras(), p=hnp.arrays(np.float64, (4, 3), elements=st.floats(0.1, 20)))
+def test_projection_agrees_with_the_camera_matrix(camera: CameraIntrinsics, p: np.ndarray) -> None:
+    homogeneous = p @ camera_matrix(camera).T
+    np.testing.assert_allclose(project(p, camera), homogeneous[:, :2] / homogeneous[:, 2:], rtol=1e-9)
+
+
+@given(camera=cameras(), seed=st.integers(0, 1000))
+def test_unprojected_pixels_project_onto_themselves(camera: CameraIntrinsics, seed: int) -> None:
+    depth = np.random.default_rng(seed).uniform(0.2, 10, (camera.height, camera.width)).astype(np.float32)
+    points = unproject(depth, camera)
+    assert points.shape == (camera.height, camera.width, 3)
+    np.testing.assert_array_equal(points[..., 2], depth)
+    pixels = project(points.reshape(-1, 3), camera)
+    np.testing.assert_allclose(pixels, pixel_grid(camera.width, camera.height).numpy(), atol=1e-6)
+
+
+def test_pixels_without_depth_unproject_to_the_origin() -> None:
+    np.testing.assert_array_equal(unproject(np.zeros((24, 32), np.float32), CAMERA), 0)
+
+
+def test_the_pixel_grid_goes_row_by_row() -> None:
+    expected = [[0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1]]
+    np.testing.assert_array_equal(pixel_grid(3, 2).numpy(), expected)
+
+
+def test_half_size_by_hand() -> None:
+    small = scale_intrinsics(CameraIntrinsics(100, 100, 31.5, 23.5, 64, 48), 32, 24)
+    assert (small.fx, small.fy, small.cx, small.cy) == (50, 50, 15.5, 11.5)  # the centre stays the centre
+
+
+@given(camera=cameras(), width=st.integers(1, 80), height=st.integers(1, 80))
+def test_scaled_intrinsics_see_the_same_corners_and_scale_back(
+    camera: CameraIntrinsics, width: int, height: int
+) -> None:
+    scaled = scale_intrinsics(camera, width, height)
+    # Outer edges of the image, half a pixel beyond the outermost centres, stay where they were in the scene.
+    for old, new in (
+        ((-0.5, -0.5), (-0.5, -0.5)),
+        ((camera.width - 0.5, camera.height - 0.5), (width - 0.5, height - 0.5)),
+    ):
+        assert (new[0] - scaled.cx) / scaled.fx == pytest.approx((old[0] - camera.cx) / camera.fx, abs=1e-9)
+        assert (new[1] - scaled.cy) / scaled.fy == pytest.approx((old[1] - camera.cy) / camera.fy, abs=1e-9)
+    back = scale_intrinsics(scaled, camera.width, camera.height)
+    assert dataclasses.astuple(back)[:6] == pytest.approx(dataclasses.astuple(camera)[:6], abs=1e-9)
+
+
+# Rays
+
+
+def test_rays_by_hand() -> None:
+    T = torch.eye(4)
+    T[:3, 3] = torch.tensor([1.0, 2, 3])
+    rays = pixel_rays(torch.tensor([[10.0, 20], [110, 20], [10, 220]]), CAMERA, T, near_m=0.1, far_m=5)
+    torch.testing.assert_close(rays.direction, torch.tensor([[0.0, 0, 1], [1, 0, 1], [0, 1, 1]]))
+    torch.testing.assert_close(rays.origin, torch.tensor([[1.0, 2, 3]]).expand(3, 3))
+    assert rays.near_m.tolist() == pytest.approx([0.1] * 3) and rays.far_m.tolist() == [5] * 3
+    assert rays.prior_depth_m.tolist() == [0] * 3
+
+
+@given(camera=cameras(), T_world_camera=poses(), seed=st.integers(0, 1000))
+def test_every_point_of_a_ray_projects_to_its_pixel_at_its_depth(
+    camera: CameraIntrinsics, T_world_camera: np.ndarray, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    pixels = rng.uniform((0, 0), (camera.width, camera.height), (6, 2))
+    z = rng.uniform(0.3, 8, 6)
+    rays = pixel_rays(torch.from_numpy(pixels), camera, torch.from_numpy(T_world_camera), near_m=0.1, far_m=9)
+    p_world = (rays.origin + torch.from_numpy(z)[:, None] * rays.direction).numpy()
+    p_camera = transform(invert_pose(T_world_camera), p_world)
+    np.testing.assert_allclose(p_camera[:, 2], z, rtol=1e-9)
+    np.testing.assert_allclose(project(p_camera, camera), pixels, atol=1e-6)
+
+
+def test_rays_at_sensor_depth_meet_the_unprojected_points() -> None:
+    T = look_at(np.array([1.0, 2, 1.5]), np.array([0.0, 0, 1]), np.array([0.0, 0, 1]))
+    depth = np.random.default_rng(0).uniform(1, 4, (24, 32)).astype(np.float32)
+    rays = pixel_rays(
+        pixel_grid(32, 24).double(),
+        CAMERA,
+        torch.from_numpy(T),
+        near_m=0.1,
+        far_m=9,
+        prior_depth_m=torch.from_numpy(depth).ravel(),
+    )
+    along = rays.origin + rays.prior_depth_m[:, None] * rays.direction
+    np.testing.assert_allclose(along.numpy(), transform(T, unproject(depth, CAMERA)).reshape(-1, 3), atol=1e-9)
+
+
+def test_pixels_of_another_shape_are_refused() -> None:
+    with pytest.raises(ShapeError, match="pixels"):
+        pixel_rays(torch.zeros(4, 3), CAMERA, torch.eye(4), near_m=0.1, far_m=5)
+
+
+def test_depth_of_another_size_than_the_camera_is_refused() -> None:
+    with pytest.raises(ShapeError, match="depth_m"):
+        unproject(np.ones((12, 16), np.float32), CAMERA)
+
+
+def test_looking_straight_along_up_is_refused() -> None:
+    with pytest.raises(PoseError, match="up"):
+        look_at(np.array([0.0, 0, 2]), np.zeros(3), np.array([0.0, 0, 1]))

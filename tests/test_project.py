@@ -1,0 +1,134 @@
+"""The project as a whole: its version, its layers, its house rules."""
+
+from __future__ import annotations
+
+import ast
+import importlib.metadata
+import pkgutil
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import semantic_mapper
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("semantic_mapper", "drivers", "replay", "nodes")
+MAX_FILE_LINES = 400
+MAX_FUNCTION_LINES = 60
+
+
+def sources() -> list[Path]:
+    return [path for package in (*PACKAGES, "scripts", "tests") for path in sorted((ROOT / package).rglob("*.py"))]
+
+
+def pyproject() -> dict:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    declared = pyproject()["project"]["version"]
+    assert semantic_mapper.__version__ == declared
+    assert importlib.metadata.version("semantic-mapper") == declared
+    assert f"## {declared}" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+def test_every_module_can_be_imported_and_none_loads_a_vendor_library() -> None:
+    names = list(PACKAGES)
+    for package in PACKAGES:
+        names += [m.name for m in pkgutil.walk_packages([str(ROOT / package)], f"{package}.")]
+    names = [name for name in names if not name.endswith("__main__")]
+    program = (
+        "import importlib, sys\n"
+        f"for name in {names!r}: importlib.import_module(name)\n"
+        "print(sorted({'open3d', 'depthai'} & set(sys.modules)))\n"
+    )
+    done = subprocess.run([sys.executable, "-I", "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "[]"  # they load when a device or a map is opened
+
+
+def test_the_command_line_starts_without_heavy_packages() -> None:
+    program = (
+        "import sys, nodes.cli\n"
+        "print(sorted({'torch', 'open3d', 'rerun', 'numba', 'scipy', 'cv2', 'zmq'} & set(sys.modules)))\n"
+    )
+    done = subprocess.run([sys.executable, "-I", "-c", program], capture_output=True, text=True, check=False)
+    assert (done.stdout.strip(), done.returncode) == ("[]", 0), done.stderr
+
+
+def test_the_layers_are_under_contract() -> None:
+    contracts = {c["id"]: c for c in pyproject()["tool"]["importlinter"]["contracts"]}
+    assert contracts["folders"]["layers"] == ["nodes", "replay", "drivers", "semantic_mapper"]
+    assert contracts["library"]["exhaustive"]
+    assert contracts["torch-only"]["forbidden_modules"] == [
+        "open3d",
+        "depthai",
+        "zmq",
+        "semantic_mapper.mapping.open3d_loader",
+    ]
+    assert contracts["one-open3d"]["forbidden_modules"] == ["open3d"]
+
+
+def test_one_file_loads_open3d() -> None:
+    loading = re.compile(r"^\s*(import|from) open3d|import_module\(\s*[\"']open3d", re.MULTILINE)
+    files = [p.relative_to(ROOT).as_posix() for p in sources() if loading.search(p.read_text(encoding="utf-8"))]
+    assert files == ["semantic_mapper/mapping/open3d_loader.py"]
+
+
+def test_files_and_functions_stay_short() -> None:
+    too_long: list[str] = []
+    for path in sources():
+        text = path.read_text(encoding="utf-8")
+        if text.count("\n") > MAX_FILE_LINES:
+            too_long.append(f"{path.relative_to(ROOT)}: {text.count(chr(10))} lines")
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.end_lineno is not None:
+                lines = node.end_lineno - node.lineno + 1
+                if lines > MAX_FUNCTION_LINES:
+                    too_long.append(f"{path.relative_to(ROOT)}: {node.name}: {lines} lines")
+    assert not too_long
+
+
+def test_no_file_names_a_machine_or_a_package_index() -> None:
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if listed.returncode != 0:
+        pytest.skip("not a git checkout")
+    foreign = re.compile(
+        "|".join(("/" + "root/", "/" + "work/", "/" + r"home/\w", "pypi" + r"\.org", "python" + "hosted"))
+    )
+    named: list[str] = []
+    for name in listed.stdout.splitlines():
+        path = ROOT / name
+        if name == "uv.lock" or path.suffix in {".png", ".jpg", ".safetensors", ".mcap"} or not path.is_file():
+            continue
+        found = foreign.search(path.read_text(encoding="utf-8"))
+        named += [f"{name}: {found.group()}"] if found else []
+    assert not named
+
+
+def test_continuous_integration_runs_the_tests_and_then_the_checks() -> None:
+    lines = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
+    assert "set -euo pipefail" in lines
+    assert lines[-2:] == ["make test", "make check"]
+
+
+@pytest.mark.parametrize("target", ["setup", "demo", "test", "check", "bench"])
+def test_every_target_sets_up_what_it_needs(target: str) -> None:
+    planned = subprocess.run(
+        ["make", "--dry-run", "--always-make", target], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert planned.returncode == 0, planned.stderr
+    assert "scripts/setup.sh" in planned.stdout
+
+
+def test_every_relative_link_of_the_documentation_leads_somewhere() -> None:
+    broken = []
+    for page in (*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")):
+        for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
+            if "://" not in target and not (page.parent / target).exists():
+                broken.append(f"{page.relative_to(ROOT)}: {target}")
+    assert not broken

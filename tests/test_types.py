@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import FrameError, SemanticMapperError
+from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
+
+CAMERA = CameraIntrinsics(fx=50, fy=50, cx=3.5, cy=2.5, width=8, height=6)
+
+
+def frame(**changed: object) -> PosedFrame:
+    parts: dict[str, object] = {
+        "stamp_ns": 1,
+        "seq": 7,
+        "camera_id": "front",
+        "rgb": np.zeros((6, 8, 3), np.uint8),
+        "depth_m": np.ones((6, 8), np.float32),
+        "label": np.ones((6, 8), np.uint8),
+        "intrinsics": CAMERA,
+        "T_world_camera": np.eye(4),
+    }
+    return PosedFrame(**(parts | changed))  # type: ignore[arg-type]
+
+
+def test_a_whole_frame_and_one_without_depth_and_labels_are_accepted() -> None:
+    assert frame().seq == 7
+    assert frame(depth_m=None, label=None).depth_m is None
+
+
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [
+        ("rgb", np.zeros((8, 6, 3), np.uint8)),  # width and height swapped
+        ("rgb", np.zeros((6, 8), np.uint8)),
+        ("rgb", np.zeros((6, 8, 3), np.float32)),
+        ("depth_m", np.ones((6, 8), np.uint16)),  # millimetres as the sensor gives them
+        ("depth_m", np.ones((6, 8), np.float64)),
+        ("depth_m", np.ones((3, 4), np.float32)),
+        ("label", np.ones((6, 8), np.int64)),
+        ("label", np.ones((6, 9), np.uint8)),
+        ("T_world_camera", np.eye(4, dtype=np.float32)),
+        ("T_world_camera", np.eye(3)),
+    ],
+)
+def test_a_part_of_another_shape_or_dtype_is_refused_by_name(part: str, value: np.ndarray) -> None:
+    with pytest.raises(FrameError) as caught:
+        frame(**{part: value})
+    message = str(caught.value)
+    assert "seq=7" in message and "'front'" in message and part in message
+    assert str(value.shape) in message and value.dtype.name in message
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])
+@pytest.mark.parametrize("name", ["fx", "fy", "cx", "cy"])
+def test_intrinsics_that_are_not_finite_are_refused(name: str, bad: float) -> None:
+    with pytest.raises(FrameError, match="finite"):
+        dataclasses.replace(CAMERA, **{name: bad})
+
+
+@pytest.mark.parametrize("change", [{"fx": 0.0}, {"fy": -1.0}, {"width": 0}, {"height": -6}])
+def test_intrinsics_that_are_not_positive_are_refused(change: dict[str, float]) -> None:
+    with pytest.raises(FrameError, match="positive"):
+        dataclasses.replace(CAMERA, **change)
+
+
+def test_distortion_has_to_be_finite() -> None:
+    with pytest.raises(FrameError, match="finite"):
+        dataclasses.replace(CAMERA, distortion=(0.1, float("nan")))
+
+
+def test_data_types_cannot_be_changed() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        CAMERA.fx = 1.0  # type: ignore[misc]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        frame().seq = 8  # type: ignore[misc]
+
+
+def test_updates_do_not_share_their_timings() -> None:
+    empty = np.zeros((6, 8), np.uint8)
+    parts = (1, 7, "front", True, False, (), empty, empty.astype(np.float32), empty.astype(np.float32), 0, 0)
+    first, second = MapUpdate(*parts), MapUpdate(*parts)
+    first.stage_ms["encode"] = 1.0
+    assert second.stage_ms == {}
+
+
+def test_frame_errors_belong_to_the_one_tree() -> None:
+    assert issubclass(FrameError, SemanticMapperError) and issubclass(FrameError, ValueError)

@@ -1,0 +1,84 @@
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from semantic_mapper.config import convert_config
+from semantic_mapper.errors import FrameError
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.training.finetune import FinetuneConfig, finetune
+from semantic_mapper.training.select import Candidate, candidate_from_frame, choose_keyframes
+from tests.small import tiny_field, tiny_frames
+
+
+def config(**changes: object) -> FinetuneConfig:
+    base = {"seconds": 0, "steps": 6, "width": 96, "held_out_rays": 64, "evaluations": 3, "step": {"rays": 128}}
+    return convert_config({**base, **changes}, FinetuneConfig, "test config")
+
+
+def test_finetuning_improves_held_out_rays_and_says_what_it_did():
+    seen: list[float] = []
+    result = finetune(tiny_frames(4), ROOMS, tiny_field(), config(steps=40), lambda p: seen.append(p.held_out_loss))
+    assert result.recipe["held_out_loss"] < seen[0]
+    assert result.recipe["held_out_loss"] == min(seen)
+    assert result.train_stamps_ns == {f.stamp_ns for f in tiny_frames(4)}
+    assert len(result.anchors) == 4 and all(a.label is not None for a in result.anchors)
+
+
+def test_weights_are_never_worse_than_the_start_on_held_out_rays():
+    ruined = config(steps=12, learning_rate=30.0, final_learning_rate=30.0, gradient_clip=1e9)
+    start = tiny_field()
+    result = finetune(tiny_frames(3), ROOMS, start, ruined)
+    if result.recipe["best_step"] == 0:
+        for name, tensor in start.state_dict().items():
+            assert torch.equal(result.model.state_dict()[name], tensor)
+    assert math.isfinite(result.recipe["held_out_loss"])
+
+
+def test_same_seed_and_steps_give_the_same_weights():
+    a = finetune(tiny_frames(3), ROOMS, tiny_field(), config())
+    b = finetune(tiny_frames(3), ROOMS, tiny_field(), config())
+    c = finetune(tiny_frames(3), ROOMS, tiny_field(), config(seed=1))
+    assert all(
+        torch.equal(x, y) for x, y in zip(a.model.state_dict().values(), b.model.state_dict().values(), strict=True)
+    )
+    assert any(
+        not torch.equal(x, y) for x, y in zip(a.model.state_dict().values(), c.model.state_dict().values(), strict=True)
+    )
+
+
+def test_too_few_or_unlabelled_keyframes_are_refused():
+    with pytest.raises(FrameError, match="at least 2 labelled keyframes"):
+        finetune(tiny_frames(4)[:1], ROOMS, None, config())
+    blind = [dataclasses.replace(f, label=None) for f in tiny_frames(3)]
+    with pytest.raises(FrameError, match="at least 2 labelled keyframes"):
+        finetune(blind, ROOMS, None, config())
+
+
+def test_time_budget_ends_the_run():
+    result = finetune(tiny_frames(3), ROOMS, tiny_field(), config(seconds=1.0, steps=0))
+    assert result.recipe["steps"] >= 1
+
+
+def test_chosen_keyframes_cover_different_places():
+    def cells(start: int) -> np.ndarray:
+        return np.stack([np.arange(start, start + 50), np.zeros(50, int), np.zeros(50, int)], axis=1)
+
+    candidates = [Candidate(i, cells(start)) for i, start in enumerate([0, 1, 2, 100, 101, 200])]
+    chosen = choose_keyframes(candidates, 3, seed=0)
+    assert len(set(chosen) & {0, 1, 2}) == 1 and len(set(chosen) & {3, 4}) == 1 and 5 in chosen
+
+
+def test_choice_is_decided_by_the_seed_and_gives_as_many_as_asked():
+    candidates = [candidate_from_frame(f) for f in tiny_frames(6)]
+    assert choose_keyframes(candidates, 4, 3) == choose_keyframes(candidates, 4, 3)
+    assert len(choose_keyframes(candidates, 4, 3)) == 4
+    assert choose_keyframes(candidates, 99, 0) == list(range(6))
+
+
+def test_frames_without_depth_are_spread_over_time():
+    blind = [Candidate(i, np.zeros((0, 3), np.int64)) for i in range(100)]
+    chosen = choose_keyframes(blind, 4, 0)
+    assert len(chosen) == 4 and min(np.diff(chosen)) >= 15

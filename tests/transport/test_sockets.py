@@ -1,0 +1,348 @@
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import zmq
+
+from semantic_mapper.errors import TransportError
+from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info, encode_status
+from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
+from semantic_mapper.transport.sockets import Heartbeat, LosslessSubscriber, NewestSubscriber, Publisher
+from semantic_mapper.types import PosedFrame
+
+from . import samples
+
+WAIT_S = 20.0
+
+
+def eventually(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < deadline, "did not come true"
+        time.sleep(0.005)
+
+
+def test_the_first_message_after_the_handshake_arrives(endpoint: str) -> None:
+    with Publisher(endpoint) as publisher, LosslessSubscriber(endpoint, ["frame"]) as subscriber:
+        subscriber.wait_until_heard(WAIT_S)
+        publisher.publish(encode_frame(samples.make_frame(7)))
+        frame = subscriber.receive(WAIT_S)
+    assert isinstance(frame, PosedFrame) and frame.seq == 7
+    assert np.array_equal(frame.rgb, samples.make_frame(7).rgb)
+
+
+def test_the_publisher_can_wait_for_its_subscribers(endpoint: str) -> None:
+    with Publisher(endpoint) as publisher:
+        with pytest.raises(TransportError, match="0 of 1 subscribers of 'frame'"):
+            publisher.wait_for_subscribers("frame", timeout_s=0.05)
+        with LosslessSubscriber(endpoint, ["frame"]), NewestSubscriber(endpoint, ["frame/front"]):
+            publisher.wait_for_subscribers("frame", 1, WAIT_S)
+            eventually(lambda: publisher.subscribers("frame", "front") == 2)
+            assert publisher.subscribers("frame", "frontal") == 1
+            assert publisher.subscribers("map") == 0
+        eventually(lambda: publisher.subscribers("frame", "front") == 0)
+
+
+def test_waiting_for_a_publisher_that_is_not_there_fails_clearly(endpoint: str) -> None:
+    with LosslessSubscriber(endpoint, ["frame"]) as lossless, NewestSubscriber(endpoint, ["frame"]) as newest:
+        for subscriber in (lossless, newest):
+            with pytest.raises(TransportError, match="0 of 1 publishers"):
+                subscriber.wait_until_heard(0.1)
+            assert subscriber.receive(0.01) is None
+
+
+def test_nothing_is_lost_between_a_blocking_publisher_and_a_slow_lossless_subscriber(endpoint: str) -> None:
+    count = 150
+    with (
+        Publisher(endpoint, policy="block", hwm=2) as publisher,
+        LosslessSubscriber(endpoint, ["frame", "end"], hwm=2) as subscriber,
+    ):
+        subscriber.wait_until_heard(WAIT_S)
+
+        def send() -> None:
+            for seq in range(count):
+                publisher.publish(encode_frame(samples.make_frame(seq)), WAIT_S)
+            publisher.publish(encode_end(EndOfStream("front", "end", count)), WAIT_S)
+
+        sender = threading.Thread(target=send)
+        sender.start()
+        seqs: list[int] = []
+        while isinstance(message := subscriber.receive(WAIT_S), PosedFrame):
+            seqs.append(message.seq)
+            if len(seqs) % 40 == 0:
+                time.sleep(0.1)
+        sender.join()
+    assert isinstance(message, EndOfStream)
+    assert seqs == list(range(count))
+
+
+def test_a_blocking_publisher_names_a_subscriber_that_hangs(endpoint: str) -> None:
+    big = [*encode_end(EndOfStream("front", "end", 0)), bytes(2**20)]  # fills the kernel's buffers soon
+    with (
+        Publisher(endpoint, policy="block", hwm=1, linger_ms=0) as publisher,
+        LosslessSubscriber(endpoint, ["end"], hwm=1) as subscriber,
+    ):
+        subscriber.wait_until_heard(WAIT_S)
+
+        def publish_many() -> None:
+            for _ in range(100):
+                publisher.publish(big, timeout_s=0.3)
+
+        with pytest.raises(TransportError, match="has taken nothing for"):
+            publish_many()
+
+
+def test_the_newest_frame_wins_and_the_end_does_not_overtake_it(endpoint: str) -> None:
+    with Publisher(endpoint, policy="block") as publisher, NewestSubscriber(endpoint, ["frame", "end"]) as subscriber:
+        subscriber.wait_until_heard(WAIT_S)
+        for seq in range(20):
+            publisher.publish(encode_frame(samples.make_frame(seq)))
+            publisher.publish(encode_frame(samples.make_frame(seq, camera_id="back")))
+        publisher.publish(encode_end(EndOfStream("player", "end", 20)))
+        eventually(lambda: subscriber.overwritten == 38)
+        messages = [subscriber.receive(WAIT_S) for _ in range(3)]
+        assert subscriber.receive(0.01) is None
+    front, back, end = messages
+    assert isinstance(front, PosedFrame) and isinstance(back, PosedFrame)
+    assert (front.camera_id, front.seq, back.camera_id, back.seq) == ("front", 19, "back", 19)
+    assert end == EndOfStream("player", "end", 20)
+
+
+def test_messages_marked_all_never_give_way(endpoint: str) -> None:
+    with Publisher(endpoint) as publisher, NewestSubscriber(endpoint, ["end"]) as subscriber:
+        subscriber.wait_until_heard(WAIT_S)
+        for number in range(5):
+            publisher.publish(encode_end(EndOfStream("front", "end", number)))
+        ends = [subscriber.receive(WAIT_S) for _ in range(5)]
+    assert [end.published for end in ends if isinstance(end, EndOfStream)] == list(range(5))
+
+
+def test_a_late_subscriber_gets_the_stream_info_and_the_last_status(endpoint: str) -> None:
+    with Publisher(endpoint) as publisher:
+        publisher.publish(encode_info(samples.make_info()))
+        for stamp in range(3):
+            publisher.publish(encode_status(Status("camera", "running", stamp)))
+        with LosslessSubscriber(endpoint, ["info", "status"]) as subscriber:
+            received = [subscriber.receive(WAIT_S), subscriber.receive(WAIT_S)]
+    assert received == [samples.make_info(), Status("camera", "running", 2)]
+
+
+def test_a_subscriber_may_listen_to_several_publishers(endpoint: str) -> None:
+    other = endpoint + "2"
+    with (
+        Publisher(endpoint) as one,
+        Publisher(other) as two,
+        LosslessSubscriber([endpoint, other], ["info"]) as subscriber,
+    ):
+        subscriber.wait_until_heard(WAIT_S)
+        assert subscriber.connections() == 2
+        one.publish(encode_info(StreamInfo("one")))
+        two.publish(encode_info(StreamInfo("two"), sender="b"))
+        received = {info.source for info in (subscriber.receive(WAIT_S), subscriber.receive(WAIT_S)) if info}  # type: ignore[union-attr]
+    assert received == {"one", "two"}
+
+
+def test_a_publisher_that_comes_back_is_heard_again(endpoint: str) -> None:
+    def publish_once_each() -> None:
+        for seq in range(3):
+            with Publisher(endpoint) as publisher:
+                publisher.wait_for_subscribers("frame", 2, WAIT_S)
+                publisher.publish(encode_frame(samples.make_frame(seq)))
+
+    with LosslessSubscriber(endpoint, ["frame"]) as lossless, NewestSubscriber(endpoint, ["frame"]) as newest:
+        thread = threading.Thread(target=publish_once_each)
+        thread.start()
+        for seq in range(3):
+            frame = lossless.receive(WAIT_S)
+            assert isinstance(frame, PosedFrame) and frame.seq == seq
+        thread.join()
+        eventually(lambda: lossless.connections() == 0)
+        seq = -1
+        while seq < 2:  # it may have read an older one in between
+            frame = newest.receive(WAIT_S)
+            assert isinstance(frame, PosedFrame) and frame.seq > seq
+            seq = frame.seq
+
+
+@pytest.mark.parametrize("kind", [NewestSubscriber, LosslessSubscriber])
+def test_ten_thousand_bad_messages_do_not_harm_a_living_subscriber(endpoint: str, kind) -> None:
+    rng = random.Random(1)
+    good = [parts for name, parts in samples.all_messages().items() if name in ("frame", "map")]
+    stranger = zmq.Context.instance().socket(zmq.XPUB)
+    stranger.setsockopt(zmq.SNDHWM, 0)
+    stranger.bind(endpoint)
+    with stranger, kind(endpoint, ["frame", "map", "end"]) as subscriber:
+        for _ in range(4):  # three topics and the handshake, which a stranger does not answer
+            assert stranger.poll(WAIT_S * 1e3)
+            stranger.recv()
+        sent = 0
+        while sent < 10_000:
+            if rng.random() < 0.2:
+                parts = [b"frame/front/", *(rng.randbytes(rng.randrange(200)) for _ in range(rng.randrange(6)))]
+            else:
+                parts = samples.mutate(rng.choice(good), rng)
+            if not parts or not parts[0].startswith((b"frame/", b"map/")):
+                continue  # zmq itself filters what was not subscribed to
+            stranger.send_multipart(parts)
+            sent += 1
+        stranger.send_multipart(encode_frame(samples.make_frame(4242)))
+        stranger.send_multipart(encode_end(EndOfStream("player", "end", sent)))
+        last_frame = None
+        while not isinstance(message := subscriber.receive(WAIT_S), EndOfStream):
+            assert message is not None, "the good messages did not arrive"
+            last_frame = message if isinstance(message, PosedFrame) else last_frame
+        assert last_frame is not None and last_frame.seq == 4242
+        assert subscriber.rejected > 5_000 and subscriber.last_error is not None
+
+
+def test_a_part_of_absurd_size_costs_the_stranger_the_connection_only(endpoint: str) -> None:
+    with (
+        zmq.Context.instance().socket(zmq.XPUB) as stranger,
+        LosslessSubscriber([endpoint, endpoint + "2"], ["frame"]) as subscriber,
+        Publisher(endpoint + "2") as publisher,
+    ):
+        stranger.setsockopt(zmq.LINGER, 0)
+        stranger.bind(endpoint)
+        assert stranger.poll(WAIT_S * 1e3)
+        publisher.wait_for_subscribers("frame", timeout_s=WAIT_S)
+        stranger.send_multipart([b"frame/front/", bytes(2**28)], copy=False)
+        publisher.publish(encode_frame(samples.make_frame(5)))
+        frame = subscriber.receive(WAIT_S)
+    assert isinstance(frame, PosedFrame) and frame.seq == 5
+
+
+def test_noise_from_a_subscriber_does_not_harm_the_publisher(endpoint: str) -> None:
+    rng = random.Random(2)
+    with Publisher(endpoint) as publisher, LosslessSubscriber(endpoint, ["frame"]) as subscriber:
+        subscriber.wait_until_heard(WAIT_S)
+        with zmq.Context.instance().socket(zmq.XSUB) as stranger:
+            stranger.connect(endpoint)
+            for _ in range(2000):
+                stranger.send(rng.choice((b"\x00", b"\x01", b"\x02", b"")) + rng.randbytes(rng.randrange(300)))
+            stranger.send(b"\x01" + bytes(5000))
+            publisher.publish(encode_frame(samples.make_frame(1)))
+            assert subscriber.receive(WAIT_S) is not None
+
+
+def test_two_publishers_cannot_share_an_endpoint(endpoint: str) -> None:
+    with Publisher(endpoint), pytest.raises(TransportError, match="another process listens there"):
+        Publisher(endpoint)
+    with Publisher(endpoint):  # free again
+        pass
+
+
+def test_the_endpoint_of_a_killed_publisher_is_free_again(endpoint: str) -> None:
+    code = (
+        "import sys, time; from semantic_mapper.transport.sockets import Publisher\n"
+        f"p = Publisher({endpoint!r}); print('bound', flush=True); time.sleep(600)"
+    )
+    child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert child.stdout is not None and child.stdout.readline() == "bound\n"
+    with pytest.raises(TransportError):
+        Publisher(endpoint)
+    child.kill()
+    child.wait()
+    child.stdout.close()
+    with Publisher(endpoint) as publisher, LosslessSubscriber(endpoint, ["end"]) as subscriber:
+        subscriber.wait_until_heard(WAIT_S)
+        publisher.publish(encode_end(EndOfStream("a", "end", 1)))
+        assert subscriber.receive(WAIT_S) == EndOfStream("a", "end", 1)
+
+
+@pytest.mark.parametrize(
+    "address", ["tcp://*:5555", "tcp://0.0.0.0:5555", "tcp://[::]:5555", "tcp://192.168.1.5:5555", "tcp://eth0:5555"]
+)
+def test_an_address_that_other_machines_could_reach_is_refused(address: str) -> None:
+    with pytest.raises(TransportError, match="only loopback"):
+        Publisher(address)
+
+
+@pytest.mark.parametrize(
+    "address", ["udp://127.0.0.1:1", "ipc://", "ipc://" + "a" * 200, "ipc:///no/such/folder/s", "x"]
+)
+def test_an_address_that_is_none_is_refused(address: str) -> None:
+    with pytest.raises(TransportError):
+        Publisher(address)
+
+
+def test_a_subscription_to_an_unknown_topic_or_address_is_refused(endpoint: str) -> None:
+    for topics, address in ((["frames"], endpoint), (["frame"], "nonsense"), (["frame/a b"], endpoint)):
+        with pytest.raises(TransportError):
+            LosslessSubscriber(address, topics)
+        with pytest.raises(TransportError):
+            NewestSubscriber(address, topics)
+
+
+def test_loopback_tcp_works_with_any_free_port() -> None:
+    with (
+        Publisher("tcp://127.0.0.1:*") as publisher,
+        LosslessSubscriber(publisher.endpoint, ["end"], heartbeat=Heartbeat()) as subscriber,
+    ):
+        subscriber.wait_until_heard(WAIT_S)
+        publisher.publish(encode_end(EndOfStream("a", "end", 1)))
+        assert subscriber.receive(WAIT_S) == EndOfStream("a", "end", 1)
+
+
+def test_the_last_message_before_close_is_delivered(endpoint: str) -> None:
+    with LosslessSubscriber(endpoint, ["end"]) as subscriber:
+        with Publisher(endpoint) as publisher:
+            subscriber.wait_until_heard(WAIT_S)
+            publisher.publish(encode_end(EndOfStream("a", "stopped", 1)))
+        assert subscriber.receive(WAIT_S) == EndOfStream("a", "stopped", 1)
+
+
+def test_many_threads_may_publish_at_once(endpoint: str) -> None:
+    with Publisher(endpoint, policy="block") as publisher, LosslessSubscriber(endpoint, ["frame"]) as subscriber:
+        subscriber.wait_until_heard(WAIT_S)
+
+        def send(camera_id: str) -> None:
+            for seq in range(25):
+                publisher.publish(encode_frame(samples.make_frame(seq, camera_id=camera_id)))
+
+        threads = [threading.Thread(target=send, args=(f"camera{i}",)) for i in range(4)]
+        for thread in threads:
+            thread.start()
+        seen: dict[str, list[int]] = {}
+        for _ in range(100):
+            frame = subscriber.receive(WAIT_S)
+            assert isinstance(frame, PosedFrame)
+            seen.setdefault(frame.camera_id, []).append(frame.seq)
+        for thread in threads:
+            thread.join()
+    assert seen == {f"camera{i}": list(range(25)) for i in range(4)}
+    assert subscriber.rejected == 0
+
+
+def test_closed_sockets_say_so(endpoint: str) -> None:
+    publisher = Publisher(endpoint)
+    lossless, newest = LosslessSubscriber(endpoint, ["end"]), NewestSubscriber(endpoint, ["end"])
+    for socket in (publisher, lossless, newest):
+        socket.close()
+        socket.close()
+    for use in (lambda: publisher.publish(samples.all_messages()["end"]), lossless.receive, newest.receive):
+        with pytest.raises(TransportError, match="closed"):
+            use()
+
+
+def test_closing_wakes_a_receiver_that_waits(endpoint: str) -> None:
+    subscriber = NewestSubscriber(endpoint, ["end"])
+    errors: list[TransportError] = []
+
+    def wait() -> None:
+        try:
+            subscriber.receive()
+        except TransportError as error:
+            errors.append(error)
+
+    waiter = threading.Thread(target=wait)
+    waiter.start()
+    subscriber.close()
+    waiter.join(WAIT_S)
+    assert len(errors) == 1
