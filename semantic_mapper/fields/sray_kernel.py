@@ -17,6 +17,7 @@ import numpy as np
 from semantic_mapper.fields.geometry_net import OWN_DENSITY_OFFSET
 from semantic_mapper.fields.kernel_math import attend, fast_exp, linear, relu, sigmoid, softplus, tanh
 from semantic_mapper.fields.projection import MIN_DEPTH_M
+from semantic_mapper.threads import parallel_kernel
 
 CUES = 4
 _ZERO = np.float32(0.0)
@@ -341,7 +342,7 @@ def _render_ray(r, rays, sources, settings, weights, scratch, out):
     opacity[r], depth[r] = _composite(refined, blended, sigma, delta, z[r], rendered[r], colour[r])
 
 
-@numba.njit(parallel=True, fastmath=True, nogil=True, cache=True)
+@parallel_kernel(fastmath=True)
 def render_rays(rays, sources, settings, weights, tasks, out):
     """Render all rays; see ``SRay.render_samples``.
 

@@ -43,8 +43,7 @@ class StreamingSRay:
         self.model = model
         self.sampling = sampling or SamplingConfig()
         self._weights = pack_weights(model)
-        # Both share OpenMP's pool: if numba's first kernel widened it, torch would split (and round) its convolutions
-        # differently from then on, and the first frame of a process would not repeat bit for bit.
+        # Torch's count may have been changed since the threads were started.
         numba.set_num_threads(min(torch.get_num_threads(), numba.get_num_threads()))
 
     @property

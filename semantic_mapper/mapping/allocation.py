@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from semantic_mapper.errors import FrameError
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE
 from semantic_mapper.mapping.block_index import KEY_LIMIT, first_slot, pack_key
+from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 
 _BANDS = 8  # image bands with a key set of their own: enough to share among cores, few enough to merge at no cost
@@ -157,7 +158,7 @@ def _is_smooth(depth, v0, v1, u0, u1, camera, voxel, depth_max):
     return least, most
 
 
-@njit(nogil=True, cache=True, parallel=True)
+@parallel_kernel()
 def _collect_bands(depth, camera, voxel, truncation, depth_max, slots, keys, counts):
     height, width = depth.shape
     bands, rows = len(counts), (height + _TILE - 1) // _TILE

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid, GridBuffers, make_open3d_grid
 from semantic_mapper.mapping.block_index import BlockIndex, find_block, find_blocks, pack_key, pack_keys, unpack_keys
 from semantic_mapper.mapping.open3d_loader import load_open3d
+from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import Float32, Float64
 
 MESH_TILE_BLOCKS = 16_384  # Open3D fails past 262,100 blocks of 8^3 (int32), and needs 8 KiB a block to mesh
@@ -56,7 +57,7 @@ def _crossing(buffers, block, voxel, axis, neighbours, min_weight):
     return np.float64(a) / (np.float64(a) - np.float64(b))
 
 
-@njit(nogil=True, cache=True, parallel=True)
+@parallel_kernel()
 def _count_crossings(keys, blocks, index, buffers, min_weight):
     counts = np.zeros(len(blocks), np.int64)
     for n in prange(len(blocks)):
@@ -64,7 +65,7 @@ def _count_crossings(keys, blocks, index, buffers, min_weight):
     return counts
 
 
-@njit(nogil=True, cache=True, parallel=True)
+@parallel_kernel()
 def _write_crossings(keys, blocks, index, buffers, min_weight, starts, points):
     for n in prange(len(blocks)):
         _block_crossings(keys[n], blocks[n], index, buffers, min_weight, points[starts[n] : starts[n + 1]])

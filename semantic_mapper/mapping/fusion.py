@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit, prange
 
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE
+from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import Float32
 
 PROBABILITY_FLOOR = 1e-4  # one confident mistake must not outweigh many modest looks: a vote moves at most ln 1e4
@@ -59,7 +60,7 @@ def _cosine(depth, v, u, camera):
     return max(abs(dot) / norm, LEAST_COSINE)
 
 
-@njit(nogil=True, cache=True, parallel=True)
+@parallel_kernel()
 def vote_weights(depth, known, probabilities, camera, depth_max):
     """Weight of each pixel's vote, (H, W) float32: ``max(cos, 0.2) * min(1, (2 m / z)^2)``, 0 where none is due.
 
@@ -101,7 +102,7 @@ def _add_vote(evidence, votes, voxel, probabilities, weight, cap):
         evidence[voxel, c] = evidence[voxel, c] * keep + weight * np.log(p)
 
 
-@njit(nogil=True, cache=True, parallel=True)
+@parallel_kernel()
 def fuse_blocks(indices, buffers, camera, limits, depth, rgb, weights, probabilities):
     """Fuse one frame into the blocks with buffer ``indices`` (B,), in place.
 

@@ -8,6 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import Float32, UInt8
 
 COLOUR_SIGMA = 20.0  # 8-bit steps
@@ -34,7 +35,7 @@ def lift(
     return out, out_known
 
 
-@numba.njit(parallel=True, nogil=True, cache=True, fastmath=True)
+@parallel_kernel(fastmath=True)
 def _lift(  # pragma: no cover - compiled
     probabilities: Float32,
     known: NDArray[np.bool_],

@@ -36,16 +36,9 @@ def load_open3d() -> Any:
             f"{Path(sys.prefix) / 'syslibs'}, or install them yourself (Debian/Ubuntu: `apt-get install libusb-1.0-0 "
             f"libgl1 libegl1 libx11-6 libgomp1`; glibc 2.35 or newer is needed)." + "".join(f" [{n}]" for n in notes)
         ) from error
-    _probe_tbb_last()
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     _log.debug("open3d_loaded", version=open3d.__version__, preload_failures=notes)
     return open3d
-
-
-def _probe_tbb_last() -> None:
-    """Open3D brings a TBB older than numba accepts; numba, asking for it first, would warn before going on."""
-    settings: Any = importlib.import_module("numba.core.config")
-    settings.THREADING_LAYER_PRIORITY = sorted(settings.THREADING_LAYER_PRIORITY, key=lambda name: name == "tbb")
 
 
 def preload_folder(folder: Path) -> list[str]:

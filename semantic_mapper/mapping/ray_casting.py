@@ -11,6 +11,7 @@ from numba import njit, prange
 
 from semantic_mapper.mapping.block_index import find_block, pack_key
 from semantic_mapper.mapping.readout import read_point, sample_tsdf
+from semantic_mapper.threads import parallel_kernel
 
 _STEP_SHARE = 0.7  # of the TSDF's distance: it is measured along other rays, so it may be too long for this one
 _REFINEMENTS = 5
@@ -106,7 +107,7 @@ def _march(origin, d, truncation_voxels, z_max, index, buffers, p):
     return 0.0
 
 
-@njit(nogil=True, cache=True, parallel=True)
+@parallel_kernel()
 def cast_rays(camera, height, width, voxel_size, truncation_voxels, z_max, index, buffers, vote_discount):
     """See the map through a camera.
 

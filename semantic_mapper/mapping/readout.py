@@ -13,6 +13,7 @@ from numba import njit, prange
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_grid import GridBuffers
 from semantic_mapper.mapping.block_index import BlockIndex, find_block, pack_key
+from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import Float32, Float64, UInt8
 
 _LEAST_SHARE = 1e-3  # corners with less are rounding dust of a point that lies on a voxel edge
@@ -121,7 +122,7 @@ def read_point(p, index, buffers, vote_discount, rgb, color, evidence):
     return decide(evidence, votes, vote_discount)
 
 
-@njit(nogil=True, cache=True, parallel=True)
+@parallel_kernel()
 def _read_points(voxels, index, buffers, vote_discount):
     count, classes = len(voxels), buffers.evidence.shape[2]
     rgb = np.zeros((count, 3), np.uint8)

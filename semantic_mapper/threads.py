@@ -1,0 +1,38 @@
+"""One thread pool for torch and the compiled kernels, which share OpenMP's."""
+
+from __future__ import annotations
+
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numba
+import torch
+from numba.core import config as numba_config
+
+FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
+
+
+@functools.cache
+def share_threads() -> int:
+    """Start numba's threads and give torch its own number of threads back; returns what a kernel will use.
+
+    Starting them sets OpenMP's thread count to numba's for the whole process. Torch, which still believes in its own
+    (``OMP_NUM_THREADS``, say), then splits and rounds its convolutions differently, and oneDNN's backward pass, planned
+    for one count and run with the other, can crash.
+    """
+    # Open3D brings a TBB older than numba accepts; numba, asking for it first, would warn before going on.
+    priority: Any = numba_config
+    priority.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
+    threads = torch.get_num_threads()
+    numba.set_num_threads(min(threads, numba.get_num_threads()))  # starts them
+    torch.set_num_threads(threads)
+    return numba.get_num_threads()
+
+
+def parallel_kernel(*, fastmath: bool = False) -> Callable[[FunctionT], FunctionT]:
+    """``numba.njit`` for a kernel with ``prange`` loops: cached on disk, without the GIL, on the shared threads."""
+    share_threads()
+    decorate: Any = numba.njit(parallel=True, nogil=True, cache=True, fastmath=fastmath)
+    return decorate

@@ -1,0 +1,48 @@
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from numba import prange
+
+from semantic_mapper.threads import parallel_kernel, share_threads
+
+COUNT = re.compile(r"omp_get_max_threads\(\) : (\d+)")
+CODE = """
+import numpy as np, torch
+from tests.mapping.views import small_map, frame
+small_map().integrate(frame(), np.ones((120, 160), np.float32), None, None)  # Open3D and several kernels
+print(torch.__config__.parallel_info())
+"""
+
+
+@pytest.mark.parametrize("asked", [1, 2])
+def test_kernels_leave_torch_the_threads_that_it_believes_in(asked: int) -> None:
+    """OneDNN plans for one count and would run, and sometimes crash, with the other."""
+    environment = os.environ | {"OMP_NUM_THREADS": str(asked)}
+    done = subprocess.run(
+        [sys.executable, "-c", CODE], capture_output=True, text=True, timeout=200, env=environment, check=True
+    )
+    found = COUNT.search(done.stdout)
+    assert found and int(found[1]) == asked, done.stdout
+
+
+def test_kernels_use_as_many_threads_as_torch_at_most() -> None:
+    assert 1 <= share_threads() <= torch.get_num_threads()
+
+
+@parallel_kernel()
+def _double(x: np.ndarray) -> None:
+    for i in prange(len(x)):
+        x[i] *= 2
+
+
+def test_a_parallel_kernel_runs() -> None:
+    x = np.arange(1000.0)
+    _double(x)
+    assert (x == 2 * np.arange(1000.0)).all()
