@@ -25,6 +25,7 @@ class EncodedViews:
         geometry: (m, 5, h, w) mixture of logistics along each view ray; see ``fields.geometry_net``.
         K: (m, 3, 3) in pixels of (h, w).
         T_camera_world: (m, 4, 4).
+        channel: (m, H, W) int16 known labels at the resolution of the images that were encoded, -1 = none.
     """
 
     feature: torch.Tensor
@@ -32,6 +33,7 @@ class EncodedViews:
     geometry: torch.Tensor
     K: torch.Tensor
     T_camera_world: torch.Tensor
+    channel: torch.Tensor
 
     def __len__(self) -> int:
         return int(self.feature.shape[0])
@@ -39,7 +41,12 @@ class EncodedViews:
     def select(self, index: torch.Tensor) -> EncodedViews:
         """The views at ``index`` (k,) int64."""
         return EncodedViews(
-            self.feature[index], self.rgb[index], self.geometry[index], self.K[index], self.T_camera_world[index]
+            self.feature[index],
+            self.rgb[index],
+            self.geometry[index],
+            self.K[index],
+            self.T_camera_world[index],
+            self.channel[index],
         )
 
 
@@ -51,15 +58,16 @@ def stack_views(views: Sequence[EncodedViews]) -> EncodedViews:
     """
     if not 1 <= sum(len(v) for v in views) <= MAX_SOURCE_VIEWS:
         raise ShapeError(f"a render takes 1 to {MAX_SOURCE_VIEWS} source views, got {sum(len(v) for v in views)}")
-    sizes = {tuple(v.feature.shape[1:]) for v in views}
+    sizes = {(tuple(v.feature.shape[1:]), tuple(v.channel.shape[1:])) for v in views}
     if len(sizes) != 1:
-        raise ShapeError(f"source views must share one feature resolution, got {sorted(sizes)}")
+        raise ShapeError(f"source views must share one resolution, got {sorted(sizes)}")
     return EncodedViews(
         torch.cat([v.feature for v in views]),
         torch.cat([v.rgb for v in views]),
         torch.cat([v.geometry for v in views]),
         torch.cat([v.K for v in views]),
         torch.cat([v.T_camera_world for v in views]),
+        torch.cat([v.channel for v in views]),
     )
 
 

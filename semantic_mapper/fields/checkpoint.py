@@ -30,7 +30,6 @@ from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
 FORMAT = "semantic-mapper-weights"
 VERSION = 1
-LABEL_LOGIT = 6.0
 NEW_ROW_SPREAD = 0.2
 DEFAULT_WIDTH = 320  # of weights whose recipe does not say
 DEPTH_UNITS_PER_M = 4000.0  # anchors' depth as uint16: a quarter of a millimetre, up to 16 m
@@ -132,9 +131,7 @@ def adapt_model(model: SRay, label_set: LabelSet) -> SRay:
     """A copy of a field for another label set: all weights kept, classifier rows carried over by class name.
 
     Rows of classes that the old set does not know start round the mean row, without a preference for any old class.
-    The codes of known labels start so that a label raises the logit of its own class by ``LABEL_LOGIT`` and that of no
-    other: before any training, views with labels already carry them over to what they see. Draws from torch's
-    generator.
+    Draws from torch's generator.
     """
     adapted = SRay(model.config, label_set, model.sampling)
     state = {name: tensor.clone() for name, tensor in model.state_dict().items()}
@@ -148,8 +145,6 @@ def adapt_model(model: SRay, label_set: LabelSet) -> SRay:
             for c in label_set.names
         ]
         state[name] = torch.stack(rows)
-    if label_set != model.label_set or not bool(state["label_code.weight"].any()):  # trained codes stay
-        state["label_code.weight"] = LABEL_LOGIT * torch.linalg.pinv(state["classifier.weight"]).T.contiguous()
     adapted.load_state_dict(state)
     return adapted.to(next(model.parameters()).device)
 

@@ -38,11 +38,13 @@ class Gathered:
         feature: (m, R, N, C).
         rgb: (m, R, N, 3).
         geometry: (m, R, N, G).
+        channel: (m, R, N) int64 known label at the sample, -1 = none.
     """
 
     feature: torch.Tensor
     rgb: torch.Tensor
     geometry: torch.Tensor
+    channel: torch.Tensor
 
 
 def reproject(rays: RayBatch, z: torch.Tensor, sources: EncodedViews) -> Reprojection:
@@ -64,7 +66,7 @@ def reproject(rays: RayBatch, z: torch.Tensor, sources: EncodedViews) -> Reproje
 
 
 def gather(sources: EncodedViews, where: Reprojection) -> Gathered:
-    """Features and colours bilinearly, geometry from the nearest pixel (depth must not be mixed across edges)."""
+    """Features and colours bilinearly; geometry and labels from the nearest pixel: neither mixes across edges."""
     views, rays, samples = where.z.shape
     height, width = sources.feature.shape[-2:]
     size = where.uv.new_tensor((width, height))
@@ -76,6 +78,16 @@ def gather(sources: EncodedViews, where: Reprojection) -> Gathered:
     flat = sources.geometry.flatten(2)  # (m, G, h w)
     index = (row * width + column).view(views, 1, -1).expand(-1, flat.shape[1], -1)
     geometry = flat.gather(2, index).view(views, -1, rays, samples)
+    channel = _nearest_channel(sources.channel, where.uv.detach(), height, width)
     channels = sources.feature.shape[1]
     picked = picked.permute(0, 2, 3, 1)  # (m, R, N, C + 3)
-    return Gathered(picked[..., :channels], picked[..., channels:], geometry.permute(0, 2, 3, 1))
+    return Gathered(picked[..., :channels], picked[..., channels:], geometry.permute(0, 2, 3, 1), channel)
+
+
+def _nearest_channel(channel: torch.Tensor, uv: torch.Tensor, height: int, width: int) -> torch.Tensor:
+    """Labels (m, H, W) at pixels uv (m, R, N, 2) of feature maps of (height, width): (m, R, N) int64."""
+    rows, columns = channel.shape[1:]
+    column = ((uv[..., 0] + 0.5) * (columns / width) - 0.5).round().clamp(0, columns - 1).long()
+    row = ((uv[..., 1] + 0.5) * (rows / height) - 0.5).round().clamp(0, rows - 1).long()
+    index = (row * columns + column).flatten(1)
+    return channel.flatten(1).gather(1, index).view(uv.shape[:-1]).long()

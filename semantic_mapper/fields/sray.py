@@ -33,6 +33,8 @@ from semantic_mapper.geometry import expect_shape, invert_pose_torch
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
+LABEL_LOGIT = 8.0  # what full agreement of the labelled views on a class adds to its logit before any training
+DOUBT = 0.05  # hit probability at which a label that a view carries over counts by half
 CUES = 4  # hit, visibility, view cosine, valid depth interval: what a view knows of a sample beside its feature
 
 
@@ -47,6 +49,7 @@ class ContextualSpace:
         hit, visibility: (m, R, N) in [0, 1].
         valid: (m, R, N) bool.
         delta: (R, N) interval lengths, metres.
+        channel: (m, R, N) int64 known label at the sample, -1 = none.
     """
 
     feature: torch.Tensor
@@ -56,6 +59,7 @@ class ContextualSpace:
     visibility: torch.Tensor
     valid: torch.Tensor
     delta: torch.Tensor
+    channel: torch.Tensor
 
 
 class SRay(nn.Module):
@@ -84,7 +88,7 @@ class SRay(nn.Module):
         self.weights = ViewWeightNet(dim, CUES)
         self.semantic = nn.Sequential(nn.Linear(dim, 2 * dim), nn.ReLU(), nn.Linear(2 * dim, dim))
         self.classifier = nn.Linear(dim, len(label_set))
-        self.label_code = nn.Embedding(len(label_set), dim)
+        self.label_logit = nn.Parameter(torch.tensor(LABEL_LOGIT))
 
     @property
     def label_set(self) -> LabelSet:
@@ -110,19 +114,23 @@ class SRay(nn.Module):
         K[:, :2, :2] = views.K[:, :2, :2] * scale[None, :, None]
         K[:, :2, 2] = (views.K[:, :2, 2] + 0.5) * scale - 0.5
         geometry = self.geometry_init(feature, depth)
+        channel = torch.full_like(views.depth_m, -1, dtype=torch.int16)
         if views.channel is not None and self.config.source_labels:
-            feature = feature + self.label_features(views.channel, (height, width))
-        return EncodedViews(feature, rgb, geometry, K, invert_pose_torch(views.T_world_camera))
+            expect_shape(views.channel, f"{sizes['M']} {sizes['H']} {sizes['W']}", "source channel")
+            channel = views.channel.to(torch.int16)
+        return EncodedViews(feature, rgb, geometry, K, invert_pose_torch(views.T_world_camera), channel)
 
-    def label_features(self, channel: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
-        """What known labels (m, H, W) of source views add to their features: (m, C, h, w), 0 where none is known.
+    def carried_labels(self, space: ContextualSpace) -> torch.Tensor:
+        """What views with known labels say of each sample: (R, N, L), each entry and their sum in [0, 1].
 
-        Not in the paper: labels are to a source view what depth is, an input that it may have. The keyframes that a
-        scene was finetuned on have them, and what they show need not be recognised a second time.
+        Not in the paper: labels are to a source view what depth is, an input that it may have. A view's label counts
+        by the probability that its ray ends in the sample, so what is hidden from it takes no label from it.
         """
-        small = functional.interpolate(channel[:, None].float(), size=size, mode="nearest-exact")[:, 0].long()
-        known = (small >= 0)[..., None]
-        return (self.label_code(small.clamp_min(0)) * known).permute(0, 3, 1, 2)
+        weight = space.hit * (space.channel >= 0)
+        votes = weight.new_zeros(*weight.shape[1:], len(self.label_set))
+        index = space.channel.clamp_min(0).permute(1, 2, 0)
+        votes = votes.scatter_add(2, index, weight.permute(1, 2, 0))
+        return votes / (weight.sum(0) + DOUBT)[..., None]
 
     def classify_features(self, feature: torch.Tensor) -> torch.Tensor:
         """Logits (m, L, h, w) of image features (m, C, h, w) by themselves, for a dense loss on labelled views."""
@@ -137,7 +145,7 @@ class SRay(nn.Module):
         hit, visibility = hit_and_visibility(found.geometry, where.z, 0.5 * delta)
         hit, visibility = hit * where.valid, visibility * where.valid
         cues = torch.stack((hit, visibility, where.view_cosine, torch.log(found.geometry[..., 1])), dim=-1)
-        return ContextualSpace(found.feature, found.rgb, cues, hit, visibility, where.valid, delta)
+        return ContextualSpace(found.feature, found.rgb, cues, hit, visibility, where.valid, delta, found.channel)
 
     def attend(self, space: ContextualSpace) -> torch.Tensor:
         """Cross-reprojection attention: M -> M'' (m, R, N, C) (Eq. 6 to 10)."""
@@ -177,6 +185,8 @@ class SRay(nn.Module):
         # The classifier is linear, so logits of blended features equal blended logits: classify once a ray.
         rendered = composite(weights, s + self.semantic(s))
         logits = functional.linear(rendered, self.classifier.weight) + opacity[:, None] * self.classifier.bias
+        if self.config.source_labels:
+            logits = logits + self.label_logit * composite(weights, self.carried_labels(space))
         logits = logits * known[:, None]
         log_p = torch.log_softmax(logits, dim=-1)
         render = FieldRender(

@@ -17,6 +17,7 @@ import numpy as np
 from semantic_mapper.fields.geometry_net import OWN_DENSITY_OFFSET
 from semantic_mapper.fields.kernel_math import attend, fast_exp, linear, relu, sigmoid, softplus, tanh
 from semantic_mapper.fields.projection import MIN_DEPTH_M
+from semantic_mapper.fields.sray import DOUBT
 from semantic_mapper.threads import parallel_kernel
 
 CUES = 4
@@ -58,12 +59,14 @@ def _cdf(mixture, z):
 
 @numba.njit(fastmath=True, nogil=True, cache=True)
 def _fill_tokens(
-    origin, direction, z, delta, maps, geometry, K, T, token_view, token_sample, feature, rgb, cues, mixture
+    origin, direction, z, delta, sources, token_view, token_sample, token_label, feature, rgb, cues, mixture
 ):
     """Reproject the samples of one ray into all views (Eq. 4, 5); return the number of tokens that some view sees."""
+    maps, geometry, K, T, labels = sources
     count = 0
+    height, width = maps.shape[1], maps.shape[2]
+    rows, columns = labels.shape[1], labels.shape[2]
     for j in range(maps.shape[0]):
-        height, width = maps.shape[1], maps.shape[2]
         dx = T[j, 0, 0] * direction[0] + T[j, 0, 1] * direction[1] + T[j, 0, 2] * direction[2]
         dy = T[j, 1, 0] * direction[0] + T[j, 1, 1] * direction[1] + T[j, 1, 2] * direction[2]
         dz = T[j, 2, 0] * direction[0] + T[j, 2, 1] * direction[1] + T[j, 2, 2] * direction[2]
@@ -87,6 +90,9 @@ def _fill_tokens(
             cues[count, 1] = 1 - cdf_near
             cues[count, 2] = (px * dx + py * dy + pz * dz) / (norm * length)
             cues[count, 3] = math.log(mixture[1])
+            row = int(np.rint((v + np.float32(0.5)) * np.float32(rows / height) - np.float32(0.5)))
+            column = int(np.rint((u + np.float32(0.5)) * np.float32(columns / width) - np.float32(0.5)))
+            token_label[count] = labels[j, min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)]
             token_view[count] = j
             token_sample[count] = k
             count += 1
@@ -151,6 +157,22 @@ def _blend(x, cues, rgb, by_sample, sizes, weights, log_ratio, scratch, s, colou
 
 
 @numba.njit(fastmath=True, nogil=True, cache=True)
+def _carry_labels(token_label, cues, by_sample, sizes, out):
+    """Known labels that the views carry over to each sample, (N, L); see ``SRay.carried_labels``."""
+    for k in range(by_sample.shape[0]):
+        for c in range(out.shape[1]):
+            out[k, c] = 0
+        total = np.float32(DOUBT)
+        for i in range(sizes[k]):
+            t = by_sample[k, i]
+            if token_label[t] >= 0:
+                total += cues[t, 0]
+                out[k, token_label[t]] += cues[t, 0]
+        for c in range(out.shape[1]):
+            out[k, c] /= total
+
+
+@numba.njit(fastmath=True, nogil=True, cache=True)
 def _density(feature, cues, by_sample, sizes, delta, weights, scratch, sigma):
     """Density of each sample of one ray from what all views say about it; see ``DensityNet``."""
     w1, b1, w2, b2, wqkv, v1, c1, v2, c2 = weights
@@ -207,13 +229,15 @@ def _density(feature, cues, by_sample, sizes, delta, weights, scratch, sigma):
 
 
 @numba.njit(fastmath=True, nogil=True, cache=True)
-def _composite(s, colour, sigma, delta, z, out, rendered_colour):
-    """Eq. 13 over one ray: fills out (C,) and rendered_colour (3,), returns opacity and expected depth."""
+def _composite(s, colour, labels, sigma, delta, z, out, rendered_colour, carried):
+    """Eq. 13 over one ray: fills out (C,), rendered_colour (3,), carried (L,); returns opacity and expected depth."""
     optical, opacity, depth = _ZERO, _ZERO, _ZERO
     for c in range(out.shape[0]):
         out[c] = 0
     for c in range(3):
         rendered_colour[c] = 0
+    for c in range(carried.shape[0]):
+        carried[c] = 0
     for k in range(z.shape[0]):
         step = sigma[k] * delta[k]
         w = np.float32(math.exp(-optical)) * np.float32(-math.expm1(-step))
@@ -224,6 +248,8 @@ def _composite(s, colour, sigma, delta, z, out, rendered_colour):
             out[c] += w * s[k, c]
         for c in range(3):
             rendered_colour[c] += w * colour[k, c]
+        for c in range(carried.shape[0]):
+            carried[c] += w * labels[k, c]
     return opacity, (depth / max(opacity, np.float32(1e-6)) if opacity > 1e-3 else _ZERO)
 
 
@@ -241,12 +267,12 @@ def _group_tokens(token_view, token_sample, count, by_view, view_size, by_sample
 
 
 @numba.njit(fastmath=True, nogil=True, cache=True)
-def _make_scratch(views, samples, channels):
+def _make_scratch(views, samples, channels, classes):
     """Buffers of one thread: tokens, their groups, attention, samples, density."""
     tokens = views * samples
     score = np.empty(max(views, samples) ** 2, np.float32)
     return (
-        (np.empty(tokens, np.int64), np.empty(tokens, np.int64)),  # view and sample of each token
+        (np.empty(tokens, np.int64), np.empty(tokens, np.int64), np.empty(tokens, np.int64)),  # view, sample, label
         (
             np.empty((tokens, channels), np.float32),  # feature
             np.empty((tokens, 3), np.float32),  # colour
@@ -270,6 +296,7 @@ def _make_scratch(views, samples, channels):
             np.empty((4, max(channels + CUES, 2 * channels, views)), np.float32),  # one token's way through the weights
             np.empty((samples, channels), np.float32),  # s
             np.empty((samples, 3), np.float32),
+            np.empty((samples, classes), np.float32),  # carried labels
             np.empty((samples, 2 * channels), np.float32),
             np.empty((samples, channels), np.float32),
             np.empty(samples, np.float32),  # sigma
@@ -293,29 +320,26 @@ def _render_ray(r, rays, sources, settings, weights, scratch, out):
     origin, direction, z = rays
     heads, keep, log_ratio = settings
     cue_w, cue_b, radial, cross, blend, density, semantic = weights
-    (token_view, token_sample), token_data, groups, attention, blending, density_scratch = scratch
+    (token_view, token_sample, token_label), token_data, groups, attention, blending, density_scratch = scratch
     feature, rgb, cues, mixture = token_data
     by_view, view_size, by_sample, sample_size = groups
     x, zero, qkv, mixed, score = attention
-    one, s, blended, wide, refined, sigma, delta = blending
-    rendered, colour, depth, opacity, known = out
+    one, s, blended, labels, wide, refined, sigma, delta = blending
+    rendered, colour, depth, opacity, known, carried = out
     samples, channels = s.shape
     norm = math.sqrt(direction[r, 0] ** 2 + direction[r, 1] ** 2 + direction[r, 2] ** 2)
     for k in range(samples - 1):
         delta[k] = (z[r, k + 1] - z[r, k]) * norm
     delta[samples - 1] = delta[samples - 2]
-    maps, geometry, K, T = sources
     count = _fill_tokens(
         origin[r],
         direction[r],
         z[r],
         delta,
-        maps,
-        geometry,
-        K,
-        T,
+        sources,
         token_view,
         token_sample,
+        token_label,
         feature,
         rgb,
         cues,
@@ -332,6 +356,7 @@ def _render_ray(r, rays, sources, settings, weights, scratch, out):
     if cross[0].shape[0] > 0:
         _attention_layer(x, by_sample, sample_size, count, cross[0], cross[1], zero, heads, keep, qkv, mixed, score)
     _blend(x, cues, rgb, by_sample, sample_size, blend, log_ratio, one, s, blended)
+    _carry_labels(token_label, cues, by_sample, sample_size, labels)
     _density(feature, cues, by_sample, sample_size, delta, density, density_scratch, sigma)
     linear(s, samples, semantic[0], semantic[1], wide)
     relu(wide, samples, 2 * channels)
@@ -339,7 +364,7 @@ def _render_ray(r, rays, sources, settings, weights, scratch, out):
     for k in range(samples):
         for c in range(channels):
             refined[k, c] += s[k, c]
-    opacity[r], depth[r] = _composite(refined, blended, sigma, delta, z[r], rendered[r], colour[r])
+    opacity[r], depth[r] = _composite(refined, blended, labels, sigma, delta, z[r], rendered[r], colour[r], carried[r])
 
 
 @parallel_kernel(fastmath=True)
@@ -348,11 +373,12 @@ def render_rays(rays, sources, settings, weights, tasks, out):
 
     Args:
         rays: origin (R, 3), direction (R, 3), z (R, N) ascending.
-        sources: maps (m, h, w, C + 3) features and colour, geometry (m, h, w, 5), K (m, 4) fx fy cx cy, T (m, 3, 4).
+        sources: maps (m, h, w, C + 3) features and colour, geometry (m, h, w, 5), K (m, 4) fx fy cx cy, T (m, 3, 4),
+            known labels (m, H, W).
         settings: heads, weight of the residual, ln(1 / tau).
         weights: See ``sray_streaming.pack_weights``.
         tasks: Number of blocks the rays are split into; each has its own scratch.
-        out: rendered (R, C), colour (R, 3), depth (R,), opacity (R,), known (R,).
+        out: rendered (R, C), colour (R, 3), depth (R,), opacity (R,), known (R,), carried labels (R, L).
     """
     count, samples = rays[2].shape
     views, channels = sources[0].shape[0], sources[0].shape[3] - 3
@@ -360,6 +386,6 @@ def render_rays(rays, sources, settings, weights, tasks, out):
     cue_w, cue_b, radial, cross, blend, density, semantic = weights  # a parallel loop takes no nested tuple
     for task in numba.prange(tasks):
         packed = (cue_w, cue_b, radial, cross, blend, density, semantic)
-        scratch = _make_scratch(views, samples, channels)
+        scratch = _make_scratch(views, samples, channels, out[5].shape[1])
         for r in range(task * block, min((task + 1) * block, count)):
             _render_ray(r, rays, sources, settings, packed, scratch, out)

@@ -61,6 +61,7 @@ class StreamingSRay:
                 encoded.geometry.contiguous(memory_format=torch.channels_last),
                 encoded.K,
                 encoded.T_camera_world,
+                encoded.channel,
             )
 
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
@@ -73,19 +74,26 @@ class StreamingSRay:
         # Torch's buffers are aligned alike every time; the matrix product of _classify rounds differently otherwise.
         rendered, colour = torch.empty(count, channels), torch.empty(count, 3)
         depth, opacity, known = torch.empty(count), torch.empty(count), torch.empty(count, dtype=torch.bool)
+        carried = torch.empty(count, len(self.label_set))
         keep = 1.0 if self.model.config.attention_residual else 0.0
         poses = sources.T_camera_world[:, :3, :]
         maps = torch.cat((sources.feature, sources.rgb), dim=1).permute(0, 2, 3, 1)
         K = torch.stack((sources.K[:, 0, 0], sources.K[:, 1, 1], sources.K[:, 0, 2], sources.K[:, 1, 2]), dim=1)
         render_rays(
             (_array(rays.origin), _array(rays.direction), _array(z)),
-            (_array(maps), _array(sources.geometry.permute(0, 2, 3, 1)), _array(K), _array(poses)),
+            (
+                _array(maps),
+                _array(sources.geometry.permute(0, 2, 3, 1)),
+                _array(K),
+                _array(poses),
+                sources.channel.numpy(),
+            ),
             (self.model.config.heads, np.float32(keep), np.float32(math.log(1 / self.model.config.tau))),
             self._weights,
             TASKS_PER_THREAD * numba.get_num_threads(),
-            tuple(t.numpy() for t in (rendered, colour, depth, opacity, known)),
+            tuple(t.numpy() for t in (rendered, colour, depth, opacity, known, carried)),
         )
-        return self._classify(rendered, colour, depth, opacity, known)
+        return self._classify(rendered, colour, depth, opacity, known, carried)
 
     def _classify(
         self,
@@ -94,10 +102,13 @@ class StreamingSRay:
         depth: torch.Tensor,
         opacity: torch.Tensor,
         known: torch.Tensor,
+        carried: torch.Tensor,
     ) -> FieldRender:
         with torch.inference_mode():
             classifier = self.model.classifier
             logits = rendered @ classifier.weight.T + opacity[:, None] * classifier.bias
+            if self.model.config.source_labels:
+                logits = logits + self.model.label_logit * carried
             logits = logits * known[:, None]
             log_p = torch.log_softmax(logits, dim=-1)
             entropy = -(log_p.exp() * log_p).sum(-1)

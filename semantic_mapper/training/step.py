@@ -81,7 +81,7 @@ def training_loss(
     render, _ = model.render_samples(rays, z, encoded)
     loss = ray_loss(render, targets, config.loss)
     if config.loss.source > 0:
-        total = loss.total + config.loss.source * _source_loss(model, encoded, stacked, [views[i] for i in sources])
+        total = loss.total + config.loss.source * _source_loss(model, encoded, [views[i] for i in sources])
         loss = replace(loss, total=total)
     return loss
 
@@ -112,15 +112,10 @@ def _draw_samples(
     return rays, targets, z
 
 
-def _source_loss(
-    model: SRay, encoded: EncodedViews, stacked: SourceViews, sources: Sequence[LabelledView]
-) -> torch.Tensor:
-    """Class loss of the image features alone: with the known labels in them there would be nothing to learn."""
+def _source_loss(model: SRay, encoded: EncodedViews, sources: Sequence[LabelledView]) -> torch.Tensor:
+    """Class loss of the image features by themselves."""
     device, size = encoded.feature.device, encoded.feature.shape[-2:]
-    feature = encoded.feature
-    if stacked.channel is not None and model.config.source_labels:
-        feature = feature - model.label_features(stacked.channel.to(device), (size[0], size[1]))
-    logits = model.classify_features(feature)
+    logits = model.classify_features(encoded.feature)
     channel = torch.stack([v.channel for v in sources]).to(device)
     small = functional.interpolate(channel[:, None].float(), size=size, mode="nearest-exact")[:, 0].long()
     counted = (small != IGNORE).sum().clamp_min(1)

@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -174,7 +175,9 @@ def test_streaming_renderer_equals_the_reference_at_the_same_samples(changes: di
     for p in field.parameters():
         p.data += 0.05 * torch.randn_like(p)
     streaming = StreamingSRay(field)
-    encoded = streaming.encode(wall_sources([*POSES, pose_at(1.5), pose_at(0.0, 3.0)]))
+    views = wall_sources([*POSES, pose_at(1.5), pose_at(0.0, 3.0)])
+    channel = torch.randint(-1, 3, views.depth_m.shape)
+    encoded = streaming.encode(replace(views, channel=channel))
     rays = wall_rays(pose_at(0.2, 0.3), step=3)
     z = sample_guided(rays, SamplingConfig()) if guided else sample_inverse_depth(rays.near_m, rays.far_m, 24)
     with torch.inference_mode():
@@ -236,29 +239,57 @@ def test_the_whole_field_passes_gradcheck():
     K = encoded.K.clone()
     K[:, 0, 2] -= 8
     K[:, 1, 2] -= 4
+    channel = torch.randint(-1, 3, (2, 16, 16)).to(torch.int16)
 
     def render(feature: torch.Tensor) -> torch.Tensor:
-        sources = EncodedViews(feature, encoded.rgb[:, :, 4:12, 8:16].detach(), geometry, K, encoded.T_camera_world)
+        sources = EncodedViews(
+            feature, encoded.rgb[:, :, 4:12, 8:16].detach(), geometry, K, encoded.T_camera_world, channel
+        )
         return field.render_samples(rays, z, sources)[0].logits
 
     assert torch.autograd.gradcheck(render, (flat,), atol=1e-4)
 
 
-def test_known_labels_of_a_source_view_move_its_features_and_no_others():
-    field = small_field()
-    views = wall_sources(POSES[:2])
-    channel = torch.full((2, 32, 48), -1)
-    channel[1, :, 24:] = 2
-    plain, labelled = field.encode(views), field.encode(replace(views, channel=channel))
-    moved = (labelled.feature - plain.feature).abs().amax(1) > 1e-6
-    assert not moved[0].any() and not moved[1, :, :12].any() and moved[1, :, 12:].all()
-    torch.testing.assert_close(labelled.geometry, plain.geometry)
-    off = small_field(source_labels=False)
-    assert torch.equal(off.encode(replace(views, channel=channel)).feature, off.encode(views).feature)
+def labelled_wall(field: SRay, channel: torch.Tensor, *poses: np.ndarray) -> EncodedViews:
+    return field.encode(replace(wall_sources(list(poses)), channel=channel))
 
 
-def test_unknown_labels_are_the_same_as_none():
+def test_labels_of_a_source_view_are_carried_to_where_they_belong():
+    """The right half of a view's wall is of class 2: from any pose, and from class 2 alone, the ray's x tells."""
     field = small_field()
-    views = wall_sources(POSES[:2])
-    unknown = replace(views, channel=torch.full((2, 32, 48), -1))
-    torch.testing.assert_close(field.encode(unknown).feature, field.encode(views).feature)
+    channel = torch.full((1, 32, 48), 1)
+    channel[:, :, 24:] = 2
+    encoded = labelled_wall(field, channel, pose_at(0.0))
+    for pose in (pose_at(0.0), pose_at(0.3, 0.1)):
+        rays = wall_rays(pose)
+        render = field.render(rays, encoded)
+        x = (rays.origin + (WALL_M / rays.direction[:, 2:]) * rays.direction)[:, 0]
+        clear = render.known & (x.abs() > 0.08)  # but for the pixels that the border runs through
+        assert (render.logits.argmax(1)[clear] == torch.where(x > 0, 2, 1)[clear]).all() and clear.sum() > 500
+
+
+def test_a_view_carries_no_label_to_what_is_hidden_from_it():
+    """Seen from (3, 0) the wall stands at 2 m; a surface 0.5 m behind it takes nothing over."""
+    field = small_field()
+    encoded = labelled_wall(field, torch.full((1, 32, 48), 2), pose_at(0.0))
+    rays = wall_rays(pose_at(0.0), step=7)
+
+    def carried(z: float) -> torch.Tensor:
+        ladder = (z + torch.tensor([-0.02, 0.0, 0.02])).expand(len(rays.origin), 3)
+        return field.carried_labels(field.contextual_space(rays, ladder, encoded))[:, 1, 2]
+
+    assert carried(WALL_M).min() > 0.6 and carried(WALL_M + 0.5).max() < 0.15 and carried(WALL_M - 0.5).max() < 0.15
+
+
+def test_unknown_labels_are_the_same_as_none_and_the_switch_turns_labels_off():
+    for field, label in ((small_field(), -1), (small_field(source_labels=False), 2)):
+        views, rays = wall_sources(POSES[:2]), wall_rays(pose_at(0.1), step=5)
+        with_labels = field.encode(replace(views, channel=torch.full((2, 32, 48), label)))
+        torch.testing.assert_close(
+            field.render(rays, with_labels).logits, field.render(rays, field.encode(views)).logits
+        )
+
+
+def test_labels_of_another_size_than_their_images_are_refused():
+    with pytest.raises(ShapeError, match="source channel"):
+        labelled_wall(small_field(), torch.zeros(1, 16, 24, dtype=torch.int64), pose_at(0.0))

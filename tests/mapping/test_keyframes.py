@@ -8,7 +8,9 @@ from semantic_mapper.types import CameraIntrinsics
 
 INTRINSICS = CameraIntrinsics(40.0, 40.0, 39.5, 29.5, 80, 60)
 WALL = np.full((60, 80), 2.0, np.float32)
-NOTHING = EncodedViews(*(torch.zeros(1, n, 1, 1) for n in (1, 3, 5)), torch.zeros(1, 3, 3), torch.zeros(1, 4, 4))
+NOTHING = EncodedViews(
+    *(torch.zeros(1, n, 1, 1) for n in (1, 3, 5)), torch.zeros(1, 3, 3), torch.zeros(1, 4, 4), torch.zeros(1, 1, 1)
+)
 
 
 def pose(x: float = 0.0, yaw_deg: float = 0.0) -> np.ndarray:
