@@ -19,7 +19,11 @@ def evaluate(
     ],
     json_file: Annotated[
         Path | None,
-        typer.Option("--json", metavar="FILE", help="Where to write; else eval.json in the first DIR, or here."),
+        typer.Option(
+            "--json",
+            metavar="FILE",
+            help="Where to write; else eval.json in the first DIR, or LOG.eval.json beside the first log.",
+        ),
     ] = None,
     weights: WeightsOption = None,
     baselines: Annotated[
@@ -64,7 +68,7 @@ def evaluate(
         request = ScoreRequest(log, weights, baselines, seconds, max_frames, config, seed)
         found["logs"][str(log)] = scores = score_log(request)
         output.print(score_table(log.name, scores))
-    path = json_file or (folders[0] if folders else Path()) / "eval.json"
+    path = json_file or (folders[0] / "eval.json" if folders else targets[0].with_suffix(".eval.json"))
     write_json(path, found)
     output.print(f"written to {path}")
 

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from nodes.console import Output, frame_progress
+from nodes.console import Output, frame_progress, stderr_console
+from nodes.process import StopRequest
 from nodes.verb import verb
 
 
@@ -23,11 +24,12 @@ def finetune(
         Path | None, typer.Option(help="Weights to start from; without it the small ones in the package.")
     ] = None,
     from_scratch: Annotated[bool, typer.Option("--from-scratch", help="Start from random weights.")] = False,
-) -> None:
+) -> int:
     """Fit the field to a few labelled keyframes of a log.
 
     The keyframes are those that together show most of what the log shows; no other label is trained on. The weights
-    remember them, so that `replay` and `eval` never score on them. Ctrl-C writes nothing.
+    remember them, so that `replay` and `eval` never score on them. Ctrl-C writes the
+    best weights so far (exit code 130).
 
     Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors
     """
@@ -39,11 +41,14 @@ def finetune(
     from nodes.finetuning import FinetuneRequest, finetune_log
 
     request = FinetuneRequest(log, keyframes, out, seconds, steps, seed, weights, from_scratch)
-    with frame_progress("finetune", None, unit="%") as bar:
-        checkpoint, chosen = finetune_log(request, bar)
+    with StopRequest() as stop, frame_progress("finetune", None, unit="%") as bar:
+        checkpoint, chosen = finetune_log(request, stop, bar)
     recipe = checkpoint.recipe
     output.print(f"{out}: finetuned on frames {', '.join(map(str, chosen))} of {log.name}")
     output.print(
         f"  {recipe['steps']} steps in {recipe['seconds']} s, best at step {recipe['best_step']}: held-out loss "
         f"{recipe['held_out_loss']:.3f}, accuracy {recipe['held_out_accuracy'] * 100:.1f} %"
     )
+    if stop:
+        stderr_console().print(f"stopped by {stop.name}; the best weights so far are in {out}", style="yellow")
+    return stop.exit_code

@@ -8,6 +8,7 @@ from pathlib import Path
 import structlog
 
 from nodes.console import FrameProgress
+from nodes.process import StopRequest
 from replay.log import LogReader
 from semantic_mapper.errors import ConfigError, FrameError, LabelError, LogError
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint, save_checkpoint
@@ -34,8 +35,8 @@ class FinetuneRequest:
     from_scratch: bool
 
 
-def finetune_log(request: FinetuneRequest, bar: FrameProgress) -> tuple[Checkpoint, list[int]]:
-    """Finetune on keyframes of a log and write the weights.
+def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress) -> tuple[Checkpoint, list[int]]:
+    """Finetune on keyframes of a log and write the weights: after a stop request, the best so far.
 
     Returns:
         The weights, and the sequence numbers of the frames they were fitted to.
@@ -62,7 +63,7 @@ def finetune_log(request: FinetuneRequest, bar: FrameProgress) -> tuple[Checkpoi
         note = f"step {progress.step} held-out loss {progress.held_out_loss:.3f}"
         bar.set(int(progress.fraction * 100), f"{note} accuracy {progress.held_out_accuracy * 100:.1f} %")
 
-    checkpoint = finetune(frames, label_set, None if start is None else start.model, config, on_progress)
+    checkpoint = finetune(frames, label_set, None if start is None else start.model, config, on_progress, lambda: stop)
     checkpoint.recipe["source"] = request.log.name
     save_checkpoint(checkpoint, request.out)
     return checkpoint, [f.seq for f in frames]

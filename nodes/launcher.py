@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 import tempfile
@@ -20,6 +21,7 @@ from nodes.process import StopRequest
 from semantic_mapper.errors import NodeError
 
 POLL_S = 0.05
+FOLDER_PREFIX = "semantic-mapper-"
 KILL_S = 5.0  # between SIGTERM and SIGKILL for a node that has overstayed its time
 STOP_ORDER = ("camera", "recorder", "mapper")  # sources first, so that the others get the end of the stream
 
@@ -42,7 +44,8 @@ class Launcher:
         self._failures: list[str] = []
 
     def __enter__(self) -> Self:
-        self._folder = Path(tempfile.mkdtemp(prefix="semantic-mapper-"))  # mode 0700
+        _sweep()
+        self._folder = Path(tempfile.mkdtemp(prefix=f"{FOLDER_PREFIX}{os.getpid()}-"))  # mode 0700
         try:
             self._start()
         except BaseException:
@@ -131,6 +134,14 @@ class Launcher:
             child.close()
         self._children.clear()
         shutil.rmtree(self._folder, onerror=_tell_left_over)
+
+
+def _sweep() -> None:
+    """Remove the socket folders of launchers that were killed: theirs is the only name that a dead process leaves."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{FOLDER_PREFIX}*-*"):
+        pid = folder.name.removeprefix(FOLDER_PREFIX).partition("-")[0]
+        if pid.isdigit() and not Path("/proc", pid).exists() and folder.stat().st_uid == os.getuid():
+            shutil.rmtree(folder, onerror=_tell_left_over)
 
 
 def _tell_left_over(function: object, path: str, error: object) -> None:

@@ -10,6 +10,7 @@ import structlog
 
 from nodes.node import NodeContext, run_node
 from nodes.options import MapperOptions
+from semantic_mapper.errors import SemanticMapperError
 
 if TYPE_CHECKING:
     from replay.session import MapSession, PipelineBundle
@@ -33,23 +34,28 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
     """
     from nodes.run_replay import mapper_config, prepare_folder
     from replay.session import load_pipeline
+    from semantic_mapper.fields.checkpoint import load_checkpoint
     from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
 
     prepare_folder(Path(options.out))
     config = mapper_config(Path(options.config) if options.config else None, options.voxel_size_m or None)
     bundle = load_pipeline(Path(options.weights) if options.weights else None, config)
+    exclude = load_checkpoint(Path(options.eval_exclude)).train_stamps_ns if options.eval_exclude else frozenset[int]()
     subscribe = LosslessSubscriber if options.delivery == "all" else NewestSubscriber
     with (
         Publisher(context.endpoint(context.name)) as publisher,
         subscribe(context.endpoint(options.input), ("info", "frame", "end")) as frames,
     ):
         _log.info("ready", weights=bundle.weights_path.name, input=options.input, delivery=options.delivery)
-        mapper = _Mapper(context, options, bundle, publisher, frames)
+        mapper = _Mapper(context, options, bundle, exclude, publisher, frames)
         try:
             mapper.run()
-        finally:
-            frames.close()  # the camera waits until all have left
-            mapper.finish()
+        except BaseException as error:
+            frames.close()
+            mapper.finish_after(error)
+            raise
+        frames.close()  # the camera waits until all have left
+        mapper.finish()
 
 
 class _Mapper:
@@ -60,12 +66,14 @@ class _Mapper:
         context: NodeContext,
         options: MapperOptions,
         bundle: PipelineBundle,
+        exclude: frozenset[int],
         publisher: Publisher,
         frames: LosslessSubscriber | NewestSubscriber,
     ) -> None:
         self._context = context
         self._options = options
         self._bundle = bundle
+        self._exclude = exclude
         self._publisher = publisher
         self._frames = frames
         self._session: MapSession | None = None
@@ -106,17 +114,22 @@ class _Mapper:
         _log.info("map_written", out=str(out), **summary["frames"])
         self._tell_status("ended", now=True)
 
+    def finish_after(self, error: BaseException) -> None:
+        """Write what there is, and let no second failure hide the first."""
+        try:
+            self.finish()
+        except (SemanticMapperError, OSError) as second:
+            _log.error("results_not_written", reason=str(second), after=str(error))
+
     def _begin(self, info: StreamInfo) -> None:
         from replay.session import MapSession
-        from semantic_mapper.fields.checkpoint import load_checkpoint
 
         if self._session is not None:  # the same stream, told again to a newcomer
             return
-        exclude = self._options.eval_exclude
         self._session = MapSession(
             self._bundle,
             stream_labels=info.label_set,
-            exclude_stamps=load_checkpoint(Path(exclude)).train_stamps_ns if exclude else frozenset(),
+            exclude_stamps=self._exclude,
             source=info.source,
             rerun=Path(self._options.rerun) if self._options.rerun else None,
         )
@@ -142,6 +155,8 @@ class _Mapper:
         self._ended_by = "" if end.reason == "end" else f"{end.source}: {end.detail or end.reason}"
         if self._session is not None:
             self._session.count_dropped(max(0, end.published - self._session.published))
+            for damage in end.damages:
+                self._session.note_damage(damage)
         _log.info("stream_ends", reason=end.reason, published=end.published, detail=end.detail)
 
     def _tell_status(self, state: NodeState, *, now: bool = False) -> None:

@@ -74,7 +74,7 @@ def replay_log(
             bundle,
             stream_labels=log.info.label_set,
             exclude_stamps=exclude,
-            source=request.log.name,
+            source=log.info.source,
             rerun=request.rerun,
         )
         for error in log.errors:  # stretches of the file in which no frame can be made out

@@ -100,10 +100,11 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "refused": len(session.refusals),
             "labels_refused": len(session.label_refusals),
             "scored": session.scored,
+            "without_depth": session.without_depth,
             "excluded_from_scores": session.excluded,
         },
-        "latency_ms": percentiles(session.step_ms),
-        "stages_ms": {name: percentiles(values) for name, values in session.stage_ms.items()},
+        "latency_ms": {**percentiles(session.step_ms[1:] or session.step_ms), "first": _first(session.step_ms)},
+        "stages_ms": {name: percentiles(values[1:] or values) for name, values in session.stage_ms.items()},
         "map": {
             "voxel_size_m": voxel_map.config.voxel_size_m,
             "blocks": voxel_map.block_count,
@@ -147,6 +148,11 @@ def _metrics(session: MapSession, points: MapPoints) -> dict[str, Any]:
     truth = session.surface_truth.labels_at(points.xyz)
     surface = confusion_of(truth, points.label, session.pipeline.label_set, "map")
     return {**scores, "map_miou": surface.metrics().miou}
+
+
+def _first(values: Sequence[float]) -> float | None:
+    """The first frame stands by itself: it may compile kernels, once on a machine."""
+    return round(values[0], 2) if values else None
 
 
 def percentiles(values: Sequence[float]) -> dict[str, float | None]:

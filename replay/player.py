@@ -156,7 +156,7 @@ def play(
         raise
     finally:
         patience = STOP_TIMEOUT_S if stop.is_set() else END_TIMEOUT_S
-        _say_end(publisher, EndOfStream(options.source, reason, run.published, detail), patience)
+        _say_end(publisher, EndOfStream(options.source, reason, run.published, detail, run.damages), patience)
     return PlayReport(run.published, run.fused, tuple(run.refused), tuple(log.errors + run.errors), stop.is_set())
 
 
@@ -209,6 +209,11 @@ class _Run:
             self._count(ack)
             if self.on_frame is not None:
                 self.on_frame(envelope, ack)
+
+    @property
+    def damages(self) -> tuple[str, ...]:
+        """What could not be read so far."""
+        return tuple(str(error) for error in (*self.log.errors, *self.errors))
 
     def _can_be_decoded(self, parts: Parts, envelope: Envelope) -> bool:
         """A subscriber would drop it without a word, and lockstep would wait for its answer for ever."""

@@ -111,6 +111,7 @@ class MapSession:
         self.dropped = 0
         self.scored = 0
         self.excluded = 0
+        self.without_depth = 0  # their geometry was rendered, not measured
         self.refusals: list[Refusal] = []  # frames that were not mapped
         self.label_refusals: list[Refusal] = []  # frames that were mapped, but whose label image cannot be used
         self.damages: list[str] = []  # stretches of a log in which no frame can be made out
@@ -138,10 +139,17 @@ class MapSession:
         for name, value in update.stage_ms.items():
             self.stage_ms.setdefault(name, []).append(value)
         self.fused += int(update.fused)
+        self._note_depth(frame)
         self._keep_snapshot(self._score(frame, update), update)
         if self._rerun is not None:
             self._rerun.log_step(frame, update)
         return update
+
+    def _note_depth(self, frame: PosedFrame) -> None:
+        if frame.depth_m is None:
+            if not self.without_depth:
+                _log.warning("geometry_is_rendered", seq=frame.seq, reason="the frame has no depth")
+            self.without_depth += 1
 
     def refuse(self, seq: int, stamp_ns: int, reason: str) -> None:
         """Count a frame that was damaged before it could be processed."""

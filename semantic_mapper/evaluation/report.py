@@ -264,6 +264,8 @@ def _draw_scale_bar(picture: UInt8, scale: float) -> None:
     while metres * scale < 24:
         metres *= 10
     length, y = round(metres * scale), picture.shape[0] - 18
+    corner = picture[y - 28 : y + 11, 8 : max(length, 40) + 26]  # points may lie here
+    corner[:] = (corner * 0.25 + np.array(PANEL) * 0.75).astype(np.uint8)
     cv2.rectangle(picture, (16, y), (16 + length, y + 3), TEXT, -1)
     draw_text(picture, f"{metres:g} m", (16, y - 20), 14, TEXT)
 

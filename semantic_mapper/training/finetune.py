@@ -73,6 +73,7 @@ def finetune(
     start: SRay | None,
     config: FinetuneConfig,
     on_progress: Callable[[FinetuneProgress], None] | None = None,
+    stopped: Callable[[], object] = bool,
 ) -> Checkpoint:
     """Fit a field to the labelled keyframes ``frames``; never worse on held-out rays than where it started.
 
@@ -82,6 +83,7 @@ def finetune(
         start: Weights to start from, adapted to ``label_set`` by class name; None = random.
         config: At least one of ``seconds`` and ``steps`` set.
         on_progress: Called after every step.
+        stopped: Asked before every step; once it says so (anything true), the best weights so far are the result.
 
     Raises:
         FrameError: fewer than two frames, or none with labels.
@@ -94,7 +96,7 @@ def finetune(
     views = [view_from_frame(f, label_set, config.width) for f in frames]
     train, held_out = zip(*(_split(v, config.held_out_share, generator) for v in views), strict=True)
     began = time.monotonic()
-    best, steps = _run(model, train, held_out, config, generator, on_progress)
+    best, steps = _run(model, train, held_out, config, generator, on_progress, stopped)
     model.load_state_dict(best.state)
     recipe: dict[str, Any] = {
         "kind": "finetune",
@@ -118,14 +120,17 @@ def _run(
     config: FinetuneConfig,
     generator: torch.Generator,
     on_progress: Callable[[FinetuneProgress], None] | None,
+    stopped: Callable[[], object],
 ) -> tuple[_Best, int]:
     optimiser = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
     best = _Best(*_evaluate(model, train, held_out, config), 0, copy.deepcopy(model.state_dict()))
     latest = (best.loss, best.accuracy)
     began, step, evaluated, stale = time.monotonic(), 0, 0, 0
     while (
-        fraction := budget_fraction(step, time.monotonic() - began, steps=config.steps, seconds=config.seconds)
-    ) < 1 and stale < config.patience:
+        (fraction := budget_fraction(step, time.monotonic() - began, steps=config.steps, seconds=config.seconds)) < 1
+        and stale < config.patience
+        and not stopped()
+    ):
         rate = cosine_rate(fraction, config.learning_rate, config.final_learning_rate)
         for group in optimiser.param_groups:
             group["lr"] = rate
@@ -149,6 +154,10 @@ def _run(
                 best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
         if on_progress is not None:
             on_progress(FinetuneProgress(step, min(fraction, 1.0), float(loss.total.detach()), *latest, improved))
+    if stopped() and step > 0:  # what was learned since the last look
+        latest = _evaluate(model, train, held_out, config)
+        if latest[0] < best.loss:
+            best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
     return best, step
 
 

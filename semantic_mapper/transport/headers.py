@@ -15,6 +15,7 @@ from semantic_mapper.transport.images import ImageEncoding
 from semantic_mapper.transport.messages import EndReason, NodeState
 from semantic_mapper.transport.topics import SOURCE_PATTERN
 
+MAX_DAMAGES = 50  # damaged places of a recording that its end tells of
 PROTOCOL_VERSION = 1  # raise it when a header changes its meaning; readers refuse what they do not know
 MAX_HEADER_BYTES = 1 << 18
 
@@ -172,6 +173,7 @@ class EndOfStreamHeader(Header, frozen=True, kw_only=True):
     reason: EndReason
     published: Count
     detail: Sentence
+    damages: Annotated[tuple[Sentence, ...], Meta(max_length=MAX_DAMAGES)] = ()
 
 
 HeaderT = TypeVar("HeaderT", bound=Header)

@@ -74,12 +74,14 @@ class EndOfStream:
         reason: "end" of the recording, "stopped" by a person, or an "error".
         published: Frames that were sent.
         detail: The error, for people.
+        damages: What could not be read of a recording, in words; the first few.
     """
 
     source: str
     reason: EndReason
     published: int
     detail: str = ""
+    damages: tuple[str, ...] = ()
 
 
 Message = PosedFrame | MapUpdate | FrameRefused | Status | StreamInfo | EndOfStream

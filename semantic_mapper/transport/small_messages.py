@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from semantic_mapper.transport import headers
-from semantic_mapper.transport.headers import pack_header
+from semantic_mapper.transport.headers import MAX_DAMAGES, pack_header
 from semantic_mapper.transport.messages import EndOfStream, FrameRefused, Status, StreamInfo
 from semantic_mapper.transport.opening import Parts, check_source, message_name, open_plain
 from semantic_mapper.transport.plain import intrinsics_header, label_set_header, to_intrinsics, to_label_set
@@ -108,7 +108,11 @@ def encode_end(end: EndOfStream) -> list[bytes]:
         CodecError: a value that cannot be sent.
     """
     header = headers.EndOfStreamHeader(
-        source=end.source, reason=end.reason, published=int(end.published), detail=end.detail[:4096]
+        source=end.source,
+        reason=end.reason,
+        published=int(end.published),
+        detail=end.detail[:4096],
+        damages=tuple(text[:1024] for text in end.damages[:MAX_DAMAGES]),
     )
     return [topic_bytes("end", end.source), pack_header(header, f"end of '{end.source}'")]
 
@@ -121,4 +125,4 @@ def decode_end(parts: Parts) -> EndOfStream:
     """
     h = open_plain(parts, "end", headers.EndOfStreamHeader)
     check_source(parts, h.source)
-    return EndOfStream(h.source, h.reason, h.published, h.detail)
+    return EndOfStream(h.source, h.reason, h.published, h.detail, h.damages)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import signal
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,7 @@ import pytest
 from replay.log import LogWriter
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.transport.messages import StreamInfo
-from tests.nodes.support import error_line, run
+from tests.nodes.support import Running, error_line, run
 from tests.small import INTRINSICS, tiny_frames
 
 
@@ -73,3 +75,22 @@ def test_eval_of_a_folder_without_a_replay_says_so(tmp_path: Path) -> None:
     done = run("eval", tmp_path)
     assert done.returncode == 1
     assert "no summary.json" in error_line(done.stderr)
+
+
+def test_ctrl_c_keeps_the_best_weights_so_far(log: Path, weights: Path, tmp_path: Path) -> None:
+    out = tmp_path / "early.safetensors"
+    arguments = ("--keyframes", "3", "--seconds", "600", "--weights", weights, "--out", out)
+    with Running("finetune", log, *arguments) as running:
+        running.wait_for_line("step [1-9]")
+        running.process.send_signal(signal.SIGINT)
+        assert running.wait() == 130, running.text
+    checkpoint = load_checkpoint(out)
+    assert len(checkpoint.anchors) == 3 and checkpoint.recipe["seconds"] < 500
+    assert "the best weights so far" in running.text
+
+
+def test_eval_of_a_log_writes_beside_it(log: Path, weights: Path, config: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copy(log, tmp_path / "copy.mcap"))
+    done = run("eval", copy, "--weights", weights, "--config", config, "--max-frames", "2")
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "copy.eval.json").read_text())["logs"][str(copy)]["scored"] == 2

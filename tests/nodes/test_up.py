@@ -57,6 +57,7 @@ def test_lockstep_map_equals_the_in_process_map_bit_for_bit(recorded: Path, repl
     mine, other = (json.loads((p / "summary.json").read_text()) for p in (recorded, replayed))
     assert mine["frames"] == other["frames"]
     assert mine["metrics"] == other["metrics"]
+    assert mine["source"] == other["source"] == "test room"
 
 
 def test_recorder_keeps_every_frame_byte_for_byte(recorded: Path, log: Path) -> None:
@@ -113,8 +114,12 @@ def test_nodes_of_a_killed_launcher_write_their_results_and_end(
     with Running("up", REPLAY_LAUNCH, *_settings(long_log, weights, config), "--out", tmp_path / "up") as running:
         running.wait_for_line("stream_begins")
         pids = running.node_pids()
+        sockets = Path(running.wait_for_line(r"sockets=").split("sockets=")[1].split()[0])
         running.process.kill()
         assert eventually(lambda: not any(is_alive(pid) for pid in pids))
+    assert sockets.exists()  # who could have removed it?
+    again = run("up", REPLAY_LAUNCH, *_settings(tmp_path / "none.mcap", weights, config), "--out", tmp_path / "again")
+    assert again.returncode == 1 and not sockets.exists()  # the next launch
     summary = json.loads((tmp_path / "up" / "summary.json").read_text())
     assert summary["stopped_by"]
 
@@ -160,3 +165,14 @@ def test_refused_frame_does_not_stop_the_lockstep(weights: Path, config: Path, t
     assert "1 frames refused" in done.stdout
     with LogReader(tmp_path / "up" / "recorded.mcap") as recorded:
         assert "refused" in {envelope.topic for envelope, _ in recorded.messages()}
+
+
+def test_damage_of_a_played_log_stands_in_the_summary(weights: Path, config: Path, tmp_path: Path) -> None:
+    log = write_log(tmp_path / "hurt.mcap", repeated_frames(6))
+    data = bytearray(log.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    log.write_bytes(data)
+    done = run("up", REPLAY_LAUNCH, *_settings(log, weights, config), "--out", tmp_path / "up")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "up" / "summary.json").read_text())
+    assert summary["frames"]["fused"] == 5 and "hurt.mcap" in summary["damaged_stretches"][0]

@@ -40,7 +40,7 @@ def test_a_session_leaves_summary_map_points_and_picture(tmp_path, weights):
     assert on_disk == summary
     assert summary["frames"]["published"] == summary["frames"]["fused"] == 6
     assert summary["frames"]["dropped"] == 0
-    assert set(summary["latency_ms"]) == {"p50", "p95"} and set(summary["stages_ms"]) >= {"render", "fuse"}
+    assert set(summary["latency_ms"]) == {"p50", "p95", "first"} and set(summary["stages_ms"]) >= {"render", "fuse"}
     assert set(summary["map"]) >= {"voxel_size_m", "blocks", "surface_points", "memory_mb"}
     assert set(summary["metrics"]) >= {"miou", "total_accuracy", "average_accuracy", "per_class", "map_miou"}
     assert summary["labels"]["1"] == "wall" and summary["weights"]["file"] == "w.safetensors"
@@ -52,6 +52,19 @@ def test_a_session_leaves_summary_map_points_and_picture(tmp_path, weights):
     assert (tmp_path / "run.rrd").read_bytes()[:4] in (b"RRF2", b"RRIO", b"RRF3") and (
         tmp_path / "run.rrd"
     ).stat().st_size > 10_000
+
+
+def test_the_first_frame_which_may_compile_kernels_does_not_count_in_the_percentiles(tmp_path, weights):
+    session = run(weights, tiny_frames())
+    session.step_ms[:] = [9000.0, *[10.0] * 5]
+    latency = session.finish(tmp_path / "out")["latency_ms"]
+    assert latency == {"p50": 10.0, "p95": 10.0, "first": 9000.0}
+
+
+def test_frames_without_depth_are_counted_because_their_geometry_is_rendered(tmp_path, weights):
+    frames = tiny_frames()
+    session = run(weights, [*frames[:3], *(replace(f, depth_m=None) for f in frames[3:])])
+    assert session.finish(tmp_path / "out")["frames"]["without_depth"] == 3
 
 
 def test_frames_that_the_weights_have_seen_are_not_scored(weights):

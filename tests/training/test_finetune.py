@@ -37,6 +37,15 @@ def test_weights_are_never_worse_than_the_start_on_held_out_rays():
     assert math.isfinite(result.recipe["held_out_loss"])
 
 
+def test_a_stop_request_ends_it_with_the_best_weights_so_far():
+    steps: list[int] = []
+    result = finetune(
+        tiny_frames(3), ROOMS, tiny_field(), config(steps=500), lambda p: steps.append(p.step), lambda: len(steps) >= 5
+    )
+    assert steps == [1, 2, 3, 4, 5] and result.recipe["steps"] == 5
+    assert result.recipe["best_step"] in (0, 5)
+
+
 def test_same_seed_and_steps_give_the_same_weights():
     a = finetune(tiny_frames(3), ROOMS, tiny_field(), config())
     b = finetune(tiny_frames(3), ROOMS, tiny_field(), config())

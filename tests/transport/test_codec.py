@@ -147,7 +147,7 @@ def test_small_messages_survive() -> None:
     assert decode_status(encode_status(Status("m", "running", 0))) == Status("m", "running", 0)
     refused = FrameRefused(1, 2, "front", "pose holds NaN")
     assert decode_refused(encode_refused(refused)) == refused
-    end = EndOfStream("player", "error", 3, "the mapper has gone")
+    end = EndOfStream("player", "error", 3, "the mapper has gone", ("frame seq=2: CRC",))
     assert decode_end(encode_end(end)) == end
 
 
