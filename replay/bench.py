@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from semantic_mapper.config import SamplingConfig
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.metrics import confusion_of
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.checkpoint import Checkpoint
@@ -54,7 +55,14 @@ def bench_render(
 
     Returns:
         Plain data; ``speedup`` is wall time of the reference over that of streaming, for the same rays.
+
+    Raises:
+        ConfigError: weights of another field than S-Ray.
     """
+    if not isinstance(checkpoint.model, SRay):
+        raise ConfigError(
+            f"the render bench compares S-Ray's renderers; these weights are of '{checkpoint.model.kind}'"
+        )
     frames = list(room_frames(TEST_SEEDS[0], SOURCE_VIEWS + 1, view, path=CameraPathConfig(step_m=0.15)))
     query = frames.pop(SOURCE_VIEWS // 2)
     reference = SRay(checkpoint.model.config, checkpoint.label_set, SamplingConfig(mode="reference"))

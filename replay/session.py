@@ -20,8 +20,9 @@ from semantic_mapper.errors import FrameError, LabelError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, confusion_of
 from semantic_mapper.fields.base import SemanticField
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint
+from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.fields.sray_streaming import StreamingSRay, compiled_covers
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.types import MapUpdate, PosedFrame
@@ -64,10 +65,9 @@ def load_pipeline(weights: Path | None, config: MapperConfig) -> PipelineBundle:
     return PipelineBundle(pipeline, checkpoint, path)
 
 
-def make_field(model: SRay, config: MapperConfig) -> SemanticField:
+def make_field(model: LearnedField, config: MapperConfig) -> SemanticField:
     """The renderer that a config asks for, over given weights."""
-    compiled = config.sampling.mode == "streaming" and model.config.parity == "paper"
-    if compiled and not model.config.positional_encoding:
+    if isinstance(model, SRay) and config.sampling.mode == "streaming" and compiled_covers(model):
         return StreamingSRay(model, config.sampling)
     model.sampling = config.sampling
     return model

@@ -21,8 +21,10 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from semantic_mapper.config import SRayConfig, convert_config, to_plain
+from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError, LabelError, WeightsError
+from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.registry import build_field
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, working_intrinsics
 from semantic_mapper.labels import LabelSet
@@ -45,7 +47,7 @@ class Checkpoint:
         recipe: How it was trained: plain data (seed, steps, seconds, figures, git revision, ``train_stamps_ns``, ...).
     """
 
-    model: SRay
+    model: LearnedField
     anchors: tuple[PosedFrame, ...] = ()
     recipe: dict[str, Any] = field(default_factory=dict[str, Any])
 
@@ -76,6 +78,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -
     metadata = {
         "format": FORMAT,
         "version": str(VERSION),
+        "field": checkpoint.model.kind,
         "model_config": json.dumps(to_plain(checkpoint.model.config)),
         "label_set": json.dumps(_label_set_to_plain(checkpoint.label_set)),
         "recipe": json.dumps(checkpoint.recipe),
@@ -110,11 +113,10 @@ def load_checkpoint(path: Path) -> Checkpoint:
     if metadata.get("version") != str(VERSION):
         raise WeightsError(f"{path}: weights format {metadata.get('version')}, this version reads {VERSION}")
     try:
-        config = convert_config(json.loads(metadata["model_config"]), SRayConfig, str(path))
         label_set = _label_set_from_plain(json.loads(metadata["label_set"]))
         recipe = json.loads(metadata["recipe"])
         anchors = _unpack_anchors(tensors, json.loads(metadata["anchors"])) if "anchors" in metadata else ()
-        model = SRay(config, label_set)
+        model = build_field(metadata.get("field", SRay.kind), json.loads(metadata["model_config"]), label_set)
     except (KeyError, TypeError, ValueError, ConfigError, LabelError) as error:
         raise WeightsError(f"{path}: its metadata is damaged: {error}") from error
     weights = {n.removeprefix("model."): t.float() for n, t in tensors.items() if n.startswith("model.")}
@@ -127,17 +129,17 @@ def load_checkpoint(path: Path) -> Checkpoint:
     return Checkpoint(model.eval(), anchors, recipe)
 
 
-def adapt_model(model: SRay, label_set: LabelSet) -> SRay:
+def adapt_model(model: LearnedField, label_set: LabelSet) -> LearnedField:
     """A copy of a field for another label set: all weights kept, classifier rows carried over by class name.
 
     Rows of classes that the old set does not know start round the mean row, without a preference for any old class.
     Draws from torch's generator.
     """
-    adapted = SRay(model.config, label_set, model.sampling)
+    adapted = build_field(model.kind, model.config, label_set, model.sampling)
     state = {name: tensor.clone() for name, tensor in model.state_dict().items()}
-    for name in ("classifier.weight", "classifier.bias"):
+    for name in model.class_rows:
         old = state[name]
-        spread = NEW_ROW_SPREAD if name.endswith("weight") else 0.0
+        spread = NEW_ROW_SPREAD if old.ndim > 1 else 0.0
         rows = [
             old[model.label_set.names.index(c)]
             if c in model.label_set.names

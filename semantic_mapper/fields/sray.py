@@ -25,8 +25,8 @@ from semantic_mapper.fields.attention import (
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.encoder import GROUPS, ImageEncoder
 from semantic_mapper.fields.geometry_net import DensityNet, GeometryInit, hit_and_visibility
+from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.projection import Reprojection, gather, reproject
-from semantic_mapper.fields.sampling import merge_samples, sample_from_weights, sample_guided, sample_inverse_depth
 from semantic_mapper.fields.view_weights import ViewWeightNet, constrained_weights, softmax_weights
 from semantic_mapper.fields.volume import composite, composite_depth, compositing_weights, interval_lengths
 from semantic_mapper.geometry import expect_shape, invert_pose_torch
@@ -62,8 +62,8 @@ class ContextualSpace:
     channel: torch.Tensor
 
 
-class SRay(nn.Module):
-    """The S-Ray field. Satisfies ``SemanticField``.
+class SRay(LearnedField):
+    """The S-Ray field.
 
     Args:
         config: Shape of the network.
@@ -71,14 +71,15 @@ class SRay(nn.Module):
         sampling: Where rays are sampled; may be exchanged at any time, no weights depend on it.
     """
 
+    kind = "sray"
+    class_rows = ("classifier.weight", "classifier.bias")
+
     def __init__(self, config: SRayConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
-        super().__init__()
+        super().__init__(config, label_set, sampling)
         _check(config)
         dim = config.feature_dim
         published = config.parity == "published"
-        self.config = config
-        self.sampling = sampling or SamplingConfig()
-        self._label_set = label_set
+        self.config: SRayConfig = config
         self.encoder = ImageEncoder(config.encoder_width, config.encoder_blocks, dim)
         self.geometry_init = GeometryInit(dim)
         self.density = DensityNet(dim)
@@ -89,11 +90,6 @@ class SRay(nn.Module):
         self.semantic = nn.Sequential(nn.Linear(dim, 2 * dim), nn.ReLU(), nn.Linear(2 * dim, dim))
         self.classifier = nn.Linear(dim, len(label_set))
         self.label_logit = nn.Parameter(torch.tensor(LABEL_LOGIT))
-
-    @property
-    def label_set(self) -> LabelSet:
-        """Classes of the rendered logits, in channel order."""
-        return self._label_set
 
     def encode(self, views: SourceViews) -> EncodedViews:
         """Encode each view by itself: features F_j and the depth distribution of every pixel.
@@ -132,9 +128,9 @@ class SRay(nn.Module):
         votes = votes.scatter_add(2, index, weight.permute(1, 2, 0))
         return votes / (weight.sum(0) + DOUBT)[..., None]
 
-    def classify_features(self, feature: torch.Tensor) -> torch.Tensor:
-        """Logits (m, L, h, w) of image features (m, C, h, w) by themselves, for a dense loss on labelled views."""
-        s = feature.permute(0, 2, 3, 1)
+    def source_logits(self, sources: EncodedViews) -> torch.Tensor:
+        """Logits (m, L, h, w) of the image features by themselves."""
+        s = sources.feature.permute(0, 2, 3, 1)
         return self.classifier(s + self.semantic(s)).permute(0, 3, 1, 2)
 
     def contextual_space(self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews) -> ContextualSpace:
@@ -198,21 +194,6 @@ class SRay(nn.Module):
             known=known,
         )
         return render, weights
-
-    def sample(self, rays: RayBatch, sources: EncodedViews, generator: torch.Generator | None = None) -> torch.Tensor:
-        """Sample depths (R, N): coarse + fine, or guided by the depth prior, as ``sampling.mode`` says."""
-        if self.sampling.mode == "streaming":
-            return sample_guided(rays, self.sampling)
-        coarse = sample_inverse_depth(rays.near_m, rays.far_m, self.sampling.coarse, generator)
-        with torch.no_grad():
-            _, weights = self.render_samples(rays, coarse, sources)
-        fine = sample_from_weights(coarse, weights, self.sampling.fine, generator)
-        return merge_samples(coarse, fine)
-
-    def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
-        """Render rays from encoded source views; differentiable."""
-        render, _ = self.render_samples(rays, self.sample(rays, sources), sources)
-        return render
 
 
 def _check(config: SRayConfig) -> None:

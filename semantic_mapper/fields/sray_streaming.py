@@ -24,6 +24,11 @@ from semantic_mapper.types import FieldRender, Float32, RayBatch, SourceViews
 TASKS_PER_THREAD = 4  # rays differ in cost (views that see nothing), so give the threads something to balance
 
 
+def compiled_covers(model: SRay) -> bool:
+    """Whether the compiled renderer knows this variant of the model."""
+    return model.config.parity == "paper" and not model.config.positional_encoding
+
+
 class StreamingSRay:
     """Inference-only S-Ray on the CPU. Satisfies ``SemanticField``.
 
@@ -36,7 +41,7 @@ class StreamingSRay:
     """
 
     def __init__(self, model: SRay, sampling: SamplingConfig | None = None) -> None:
-        if model.config.parity != "paper" or model.config.positional_encoding:
+        if not compiled_covers(model):
             raise ConfigError(
                 "the streaming renderer covers parity='paper' without positional encoding; use SRay itself"
             )

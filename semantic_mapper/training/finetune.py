@@ -17,6 +17,7 @@ import torch
 from semantic_mapper.config import Config, SRayConfig, to_plain
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, anchor_from_frame
+from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import LabelSet
@@ -70,7 +71,7 @@ class _Best:
 def finetune(
     frames: Sequence[PosedFrame],
     label_set: LabelSet,
-    start: SRay | None,
+    start: LearnedField | None,
     config: FinetuneConfig,
     on_progress: Callable[[FinetuneProgress], None] | None = None,
     stopped: Callable[[], object] = bool,
@@ -114,7 +115,7 @@ def finetune(
 
 
 def _run(
-    model: SRay,
+    model: LearnedField,
     train: Sequence[LabelledView],
     held_out: Sequence[LabelledView],
     config: FinetuneConfig,
@@ -176,7 +177,7 @@ def _split(view: LabelledView, share: float, generator: torch.Generator) -> tupl
 
 
 def _evaluate(
-    model: SRay, train: Sequence[LabelledView], held_out: Sequence[LabelledView], config: FinetuneConfig
+    model: LearnedField, train: Sequence[LabelledView], held_out: Sequence[LabelledView], config: FinetuneConfig
 ) -> tuple[float, float]:
     """Class loss and accuracy of held-out rays, each view rendered from all others and their training labels."""
     generator = torch.Generator().manual_seed(config.seed)

@@ -11,8 +11,8 @@ from torch.nn import functional
 
 from semantic_mapper.config import Config, SamplingConfig
 from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided, sample_inverse_depth
-from semantic_mapper.fields.sray import SRay
 from semantic_mapper.training.losses import IGNORE, Loss, LossConfig, ray_loss
 from semantic_mapper.training.views import (
     LabelledView,
@@ -57,7 +57,7 @@ def pick_views(count: int, config: StepConfig, generator: torch.Generator) -> tu
 
 
 def training_loss(
-    model: SRay,
+    model: LearnedField,
     views: Sequence[LabelledView],
     query: int,
     sources: Sequence[int],
@@ -112,10 +112,12 @@ def _draw_samples(
     return rays, targets, z
 
 
-def _source_loss(model: SRay, encoded: EncodedViews, sources: Sequence[LabelledView]) -> torch.Tensor:
+def _source_loss(model: LearnedField, encoded: EncodedViews, sources: Sequence[LabelledView]) -> torch.Tensor:
     """Class loss of the image features by themselves."""
-    device, size = encoded.feature.device, encoded.feature.shape[-2:]
-    logits = model.classify_features(encoded.feature)
+    logits = model.source_logits(encoded)
+    if logits is None:
+        return encoded.feature.new_zeros(())
+    device, size = logits.device, logits.shape[-2:]
     channel = torch.stack([v.channel for v in sources]).to(device)
     small = functional.interpolate(channel[:, None].float(), size=size, mode="nearest-exact")[:, 0].long()
     counted = (small != IGNORE).sum().clamp_min(1)

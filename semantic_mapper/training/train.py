@@ -12,6 +12,7 @@ import torch
 
 from semantic_mapper.config import Config, SRayConfig, to_plain
 from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS
@@ -109,7 +110,7 @@ def learning_rate(fraction: float, config: TrainConfig) -> float:
     return cosine * min(1.0, fraction / 0.01 + 0.1)
 
 
-def validate(model: SRay, rooms: Sequence[RoomViews], config: TrainConfig) -> tuple[float, float]:
+def validate(model: LearnedField, rooms: Sequence[RoomViews], config: TrainConfig) -> tuple[float, float]:
     """mIoU (over the classes present) and accuracy: in each room one view rendered from the others, with depth."""
     device = next(model.parameters()).device
     generator = torch.Generator().manual_seed(1)

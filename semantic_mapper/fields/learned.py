@@ -1,0 +1,73 @@
+"""What training, checkpoints and evaluation ask of a field that has weights, whatever its kind."""
+
+from __future__ import annotations
+
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+import torch
+from torch import nn
+
+from semantic_mapper.config import Config, SamplingConfig
+from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.sampling import merge_samples, sample_from_weights, sample_guided, sample_inverse_depth
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.types import FieldRender, RayBatch, SourceViews
+
+
+class LearnedField(nn.Module, ABC):
+    """Base of all fields with weights. Satisfies ``SemanticField``.
+
+    A kind of field implements ``encode`` and ``render_samples``; sampling is shared, so that kinds differ in what they
+    make of the samples and in nothing else.
+
+    Args:
+        config: Shape of the network; part of every checkpoint.
+        label_set: Classes of the logits.
+        sampling: Where rays are sampled; may be exchanged at any time, no weights depend on it.
+    """
+
+    kind: ClassVar[str]
+    class_rows: ClassVar[tuple[str, ...]] = ()  # names of the parameters with one row a class, in channel order
+
+    def __init__(self, config: Config, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
+        super().__init__()
+        self.config: Any = config
+        self.sampling = sampling or SamplingConfig()
+        self._label_set = label_set
+
+    @property
+    def label_set(self) -> LabelSet:
+        """Classes of the rendered logits, in channel order."""
+        return self._label_set
+
+    @abstractmethod
+    def encode(self, views: SourceViews) -> EncodedViews:
+        """Encode source views."""
+
+    @abstractmethod
+    def render_samples(
+        self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews
+    ) -> tuple[FieldRender, torch.Tensor]:
+        """Render rays at given sample depths z (R, N), ascending, metres; also the compositing weights (R, N)."""
+
+    def source_logits(self, sources: EncodedViews) -> torch.Tensor | None:
+        """Logits (m, L, h, w) of the source images by themselves, for a dense loss; None where a kind has none."""
+        return None
+
+    def sample(self, rays: RayBatch, sources: EncodedViews, generator: torch.Generator | None = None) -> torch.Tensor:
+        """Sample depths (R, N): coarse + fine, or guided by the depth prior, as ``sampling.mode`` says."""
+        if self.sampling.mode == "streaming":
+            return sample_guided(rays, self.sampling)
+        coarse = sample_inverse_depth(rays.near_m, rays.far_m, self.sampling.coarse, generator)
+        with torch.no_grad():
+            _, weights = self.render_samples(rays, coarse, sources)
+        fine = sample_from_weights(coarse, weights, self.sampling.fine, generator)
+        return merge_samples(coarse, fine)
+
+    def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
+        """Render rays from encoded source views; differentiable."""
+        render, _ = self.render_samples(rays, self.sample(rays, sources), sources)
+        return render
