@@ -38,6 +38,11 @@ class EncodedViews:
     def __len__(self) -> int:
         return int(self.feature.shape[0])
 
+    @property
+    def size(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Of the feature and the label maps; views of one size can be rendered from together."""
+        return tuple(self.feature.shape[1:]), tuple(self.channel.shape[1:])
+
     def select(self, index: torch.Tensor) -> EncodedViews:
         """The views at ``index`` (k,) int64."""
         return EncodedViews(
@@ -58,7 +63,7 @@ def stack_views(views: Sequence[EncodedViews]) -> EncodedViews:
     """
     if not 1 <= sum(len(v) for v in views) <= MAX_SOURCE_VIEWS:
         raise ShapeError(f"a render takes 1 to {MAX_SOURCE_VIEWS} source views, got {sum(len(v) for v in views)}")
-    sizes = {(tuple(v.feature.shape[1:]), tuple(v.channel.shape[1:])) for v in views}
+    sizes = {v.size for v in views}
     if len(sizes) != 1:
         raise ShapeError(f"source views must share one resolution, got {sorted(sizes)}")
     return EncodedViews(

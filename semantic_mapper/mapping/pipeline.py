@@ -170,7 +170,7 @@ class MappingPipeline:
         count = config.source_views - (1 if config.use_current_view else 0)
         chosen = self.keyframes.choose(frame.T_world_camera, intrinsics, depth, count)
         # Cameras of another shape have feature maps of another size; one render takes views of one size.
-        return [k for k in chosen if k.encoded.feature.shape == current.feature.shape]
+        return [k for k in chosen if k.encoded.size == current.size]
 
     def _render(
         self, frame: PosedFrame, sources: list[Keyframe], current: EncodedViews

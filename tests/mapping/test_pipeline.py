@@ -80,6 +80,17 @@ def test_bad_frames_are_refused_and_leave_the_map_as_it_was():
     assert same_map(a, b)
 
 
+def test_a_camera_one_pixel_narrower_has_features_of_the_same_size_and_is_still_mapped():
+    """Its label maps differ in size, and one render takes views of one size."""
+    pipeline = make_pipeline(keyframes={"translation_m": 0.02})
+    frames = tiny_frames()
+    pipeline.step(frames[0])
+    k = frames[1].intrinsics
+    cut = {n: None if (v := getattr(frames[1], n)) is None else v[:, :-1] for n in ("rgb", "depth_m", "label")}
+    narrow = replace(frames[1], camera_id="narrow", intrinsics=replace(k, width=k.width - 1), **cut)
+    assert pipeline.step(narrow).fused
+
+
 def test_an_odd_sized_first_frame_does_not_shut_out_the_rest():
     pipeline = make_pipeline()
     frames = tiny_frames()
