@@ -32,7 +32,7 @@ from semantic_mapper.fields.cost_volume import (
 )
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.nerf_math import density_from, encode_frequencies, encoded_size
+from semantic_mapper.fields.nerf_math import density_from, encode_frequencies, encoded_size, relu_layers
 from semantic_mapper.fields.projection import Reprojection, gather, reproject
 from semantic_mapper.fields.ray_render import composite_render
 from semantic_mapper.fields.source_maps import check_encoder, check_views, encoded_views
@@ -75,13 +75,10 @@ class MVSNeRF(LearnedField):
         self.encoder = ImageEncoder(config.encoder_width, config.encoder_blocks, config.feature_dim)
         self.volume_net = EncodingVolumeNet(config.feature_dim + colours, config.volume_channels)
         c_in = encoded_size(3, config.position_frequencies) + config.volume_channels + colours
-        layers: list[nn.Module] = []
-        for i in range(config.depth):
-            layers += [nn.Linear(c_in if i == 0 else width, width), nn.ReLU()]
-        self.trunk = nn.Sequential(*layers)
+        self.trunk = relu_layers(c_in, width, config.depth)
         self.sigma = nn.Linear(width, 1)
-        self.radiance = nn.Sequential(nn.Linear(width + 3, width // 2), nn.ReLU(), nn.Linear(width // 2, 3))
-        self.semantic = nn.Sequential(nn.Linear(width, width), nn.ReLU())
+        self.radiance = nn.Sequential(relu_layers(width + 3, width // 2, 1), nn.Linear(width // 2, 3))
+        self.semantic = relu_layers(width, width, 1)
         self.classifier = nn.Linear(width, len(label_set))
         self._kept: _KeptVolume | None = None
 

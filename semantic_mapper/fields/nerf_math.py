@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 import math
 
 import torch
+from torch import nn
 
 DENSITY_START = 2.0  # log density of an untrained network: 7 / m, a third of the light gone after 5 cm
 DENSITY_LIMIT = 8.0  # 3,000 / m: opaque within 1 mm, and no overflow
@@ -29,3 +31,17 @@ def density_from(raw: torch.Tensor) -> torch.Tensor:
     densities from 0.1 / m to 1,000 / m have to be in reach of one learning rate.
     """
     return torch.exp((raw + DENSITY_START).clamp(max=DENSITY_LIMIT))
+
+
+def relu_layers(c_in: int, width: int, count: int) -> nn.Sequential:
+    """``count`` linear layers, each with a ReLU: (..., c_in) -> (..., width).
+
+    He's initialisation, as NeRF's successors have it: with torch's own, a plain MLP learns far slower.
+    """
+    layers: list[nn.Module] = []
+    for i in range(count):
+        layer = nn.Linear(c_in if i == 0 else width, width)
+        nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+        nn.init.zeros_(layer.bias)
+        layers += [layer, nn.ReLU()]
+    return nn.Sequential(*layers)

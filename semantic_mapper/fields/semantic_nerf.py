@@ -19,7 +19,7 @@ from semantic_mapper.config import SamplingConfig, SemanticNeRFConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.nerf_math import density_from, encode_frequencies, encoded_size
+from semantic_mapper.fields.nerf_math import density_from, encode_frequencies, encoded_size, relu_layers
 from semantic_mapper.fields.ray_render import composite_render
 from semantic_mapper.fields.source_maps import check_views, encoded_views
 from semantic_mapper.fields.volume import composite, compositing_weights, interval_lengths
@@ -54,11 +54,11 @@ class SemanticNeRF(LearnedField):
         position = encoded_size(3, config.position_frequencies)
         direction = encoded_size(3, config.direction_frequencies)
         below = config.depth // 2
-        self.lower = _layers(position, width, below)
-        self.upper = _layers(width + position, width, config.depth - below)
+        self.lower = relu_layers(position, width, below)
+        self.upper = relu_layers(width + position, width, config.depth - below)
         self.sigma = nn.Linear(width, 1)
-        self.radiance = nn.Sequential(nn.Linear(width + direction, width // 2), nn.ReLU(), nn.Linear(width // 2, 3))
-        self.semantic = nn.Sequential(nn.Linear(width, width // 2), nn.ReLU())
+        self.radiance = nn.Sequential(relu_layers(width + direction, width // 2, 1), nn.Linear(width // 2, 3))
+        self.semantic = relu_layers(width, width // 2, 1)
         self.classifier = nn.Linear(width // 2, len(label_set))
         self.register_buffer("fitted_steps", torch.zeros((), dtype=torch.int64))
 
@@ -120,13 +120,6 @@ def config_for_scene(
     return msgspec.structs.replace(
         config or SemanticNeRFConfig(), centre_m=(centre[0], centre[1], centre[2]), half_extent_m=half
     )
-
-
-def _layers(c_in: int, width: int, count: int) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for i in range(count):
-        layers += [nn.Linear(c_in if i == 0 else width, width), nn.ReLU()]
-    return nn.Sequential(*layers)
 
 
 def _check(config: SemanticNeRFConfig) -> None:
