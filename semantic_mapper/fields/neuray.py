@@ -4,9 +4,10 @@ Read beside sections 3.2 to 3.4 of the NeuRay paper. Each view predicts along ea
 which gives the visibility v_j of a sample and the probability h_j that the view's ray ends in it (``geometry_net``).
 Local features are aggregated over the views with these visibilities, the way of IBRNet: mean and variance, a small
 network a view that sees both, mean and variance again. A ray transformer turns the aggregates into density
-(``DensityNet``: as in S-Ray's published code, its geometry-aware network is NeuRay's, and both share it here), colours are blended from
-the views, and a head with one hidden layer, as Semantic-NeRF adds it to NeRF, turns each sample's aggregate into class
-logits. Nothing relates the samples of a view or the views to each other by attention: that is S-Ray's addition.
+(``DensityNet``: as in S-Ray's published code, its geometry-aware network is NeuRay's, and both share it here), colours
+are blended from the views, and a head with one hidden layer, as Semantic-NeRF adds it to NeRF, turns each sample's
+aggregate into class logits. Nothing relates the samples of a view, or the views, to each other by attention: that is
+S-Ray's addition.
 """
 
 from __future__ import annotations
