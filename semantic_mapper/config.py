@@ -35,6 +35,49 @@ class SRayConfig(Config, frozen=True):
     parity: Literal["paper", "published"] = "paper"  # "published": depart from the paper where its code does
 
 
+class UNetFieldConfig(Config, frozen=True):
+    """Shape of the per-image U-Net; the encoder is S-Ray's."""
+
+    feature_dim: int = 32  # channels that the classifier reads
+    encoder_width: int = 32
+    encoder_blocks: tuple[int, ...] = (1, 2, 3, 3)
+
+
+class NeuRayConfig(Config, frozen=True):
+    """Shape of NeuRay with a semantic head; the encoder is S-Ray's."""
+
+    feature_dim: int = 32  # C
+    encoder_width: int = 32
+    encoder_blocks: tuple[int, ...] = (1, 2, 3, 3)
+
+
+class MVSNeRFConfig(Config, frozen=True):
+    """Shape of MVSNeRF with a semantic head; the encoder is S-Ray's."""
+
+    feature_dim: int = 32  # channels whose variance the cost volume holds
+    encoder_width: int = 32
+    encoder_blocks: tuple[int, ...] = (1, 2, 3, 3)
+    views: int = 3  # source views used: those nearest to the query; the first of them is the reference
+    planes: int = 64  # of the sweep, uniform in inverse depth
+    plane_near_m: float = 0.3
+    plane_far_m: float = 8.0
+    volume_channels: int = 8  # of the neural encoding volume
+    width: int = 64  # of the MLP
+    depth: int = 4  # layers of the MLP
+    position_frequencies: int = 6
+
+
+class SemanticNeRFConfig(Config, frozen=True):
+    """Shape of Semantic-NeRF, and the box that it can describe: one scene."""
+
+    width: int = 128
+    depth: int = 4  # layers before the heads; the encoded position enters the middle one again
+    position_frequencies: int = 10
+    direction_frequencies: int = 4
+    centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the box, world
+    half_extent_m: float = 8.0  # half the side of the box
+
+
 class SamplingConfig(Config, frozen=True):
     """Where a ray is sampled."""
 

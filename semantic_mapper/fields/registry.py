@@ -4,32 +4,82 @@ from __future__ import annotations
 
 from typing import Any
 
-from semantic_mapper.config import Config, SamplingConfig, SRayConfig, convert_config
+import msgspec
+
+from semantic_mapper.config import (
+    Config,
+    MVSNeRFConfig,
+    NeuRayConfig,
+    SamplingConfig,
+    SemanticNeRFConfig,
+    SRayConfig,
+    UNetFieldConfig,
+    convert_config,
+)
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.mvsnerf import MVSNeRF
+from semantic_mapper.fields.neuray import NeuRay
+from semantic_mapper.fields.semantic_nerf import SemanticNeRF
 from semantic_mapper.fields.sray import SRay
+from semantic_mapper.fields.unet_field import UNetField
 from semantic_mapper.labels import LabelSet
 
-KINDS: dict[str, tuple[type[Config], type[LearnedField]]] = {SRay.kind: (SRayConfig, SRay)}
+KINDS: dict[str, tuple[type[Config], type[LearnedField]]] = {
+    SRay.kind: (SRayConfig, SRay),
+    UNetField.kind: (UNetFieldConfig, UNetField),
+    NeuRay.kind: (NeuRayConfig, NeuRay),
+    MVSNeRF.kind: (MVSNeRFConfig, MVSNeRF),
+    SemanticNeRF.kind: (SemanticNeRFConfig, SemanticNeRF),
+}
+
+# A name for some switches of a kind. The field built is of that kind, and so is its checkpoint: the switches are part
+# of the config that is saved, so nothing but a choice of names depends on this table.
+PRESETS: dict[str, tuple[str, dict[str, bool]]] = {
+    "sray-none": (SRay.kind, {"intra_view_attention": False, "cross_view_attention": False}),
+    "sray-intra": (SRay.kind, {"intra_view_attention": True, "cross_view_attention": False}),
+    "sray-cross": (SRay.kind, {"intra_view_attention": False, "cross_view_attention": True}),
+}
 
 
-def build_field(
-    kind: str, config: dict[str, Any] | Config, label_set: LabelSet, sampling: SamplingConfig | None = None
-) -> LearnedField:
-    """A field of a kind with random weights.
+def field_names() -> tuple[str, ...]:
+    """Every name that ``build_field`` takes: kinds, then presets."""
+    return (*KINDS, *PRESETS)
+
+
+def field_config(name: str, config: dict[str, Any] | Config) -> Config:
+    """The full config that a field of this name is built with: defaults filled in, a preset's switches set.
 
     Args:
-        kind: A key of ``KINDS``.
+        name: A kind or a preset. The switches of a preset win over those of ``config``.
         config: Of that kind, or plain data for it.
 
     Raises:
-        ConfigError: no such kind, or a config that does not fit it.
+        ConfigError: no such name, or a config that does not fit it.
     """
+    kind, switches = PRESETS.get(name, (name, {}))
     if kind not in KINDS:
-        raise ConfigError(f"no field of kind '{kind}'; there are {', '.join(sorted(KINDS))}")
-    config_type, field_type = KINDS[kind]
+        raise ConfigError(f"no field of kind '{name}'; there are {', '.join(sorted(field_names()))}")
+    config_type, _ = KINDS[kind]
     if isinstance(config, dict):
-        config = convert_config(config, config_type, f"config of field '{kind}'")
+        config = convert_config(config, config_type, f"config of field '{name}'")
     if not isinstance(config, config_type):
-        raise ConfigError(f"field '{kind}' takes a {config_type.__name__}, got a {type(config).__name__}")
-    return field_type(config, label_set, sampling)
+        raise ConfigError(f"field '{name}' takes a {config_type.__name__}, got a {type(config).__name__}")
+    return msgspec.structs.replace(config, **switches)
+
+
+def build_field(
+    name: str, config: dict[str, Any] | Config, label_set: LabelSet, sampling: SamplingConfig | None = None
+) -> LearnedField:
+    """A field with random weights.
+
+    Args:
+        name: A key of ``KINDS`` or ``PRESETS``; the ``kind`` of the field is that of the preset's base.
+        config: Of that kind, or plain data for it.
+
+    Raises:
+        ConfigError: no such name, or a config that does not fit it.
+    """
+    full = field_config(name, config)
+    _, field_type = KINDS[PRESETS[name][0] if name in PRESETS else name]
+    return field_type(full, label_set, sampling)

@@ -1,0 +1,33 @@
+"""What the source views know of the samples of a ray, for fields that take S-Ray's geometry-aware network as it is."""
+
+from __future__ import annotations
+
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+import torch
+
+from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.geometry_net import hit_and_visibility
+from semantic_mapper.fields.projection import gather, reproject
+from semantic_mapper.fields.sray import ContextualSpace
+from semantic_mapper.fields.volume import interval_lengths
+from semantic_mapper.types import RayBatch
+
+
+def contextual_space(rays: RayBatch, z: torch.Tensor, sources: EncodedViews) -> ContextualSpace:
+    """Reproject samples z (R, N) of whole rays into all views; gather features, colours and hit probabilities."""
+    where = reproject(rays, z, sources)
+    found = gather(sources, where)
+    delta = interval_lengths(z, rays.direction.norm(dim=-1))
+    hit, visibility = hit_and_visibility(found.geometry, where.z, 0.5 * delta)
+    hit, visibility = hit * where.valid, visibility * where.valid
+    cues = torch.stack((hit, visibility, where.view_cosine, torch.log(found.geometry[..., 1])), dim=-1)
+    return ContextualSpace(found.feature, found.rgb, cues, hit, visibility, where.valid, delta, found.channel)
+
+
+def visibility_share(visibility: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """Weights of the views at each sample, in proportion to their visibility: (m, R, N), sum 1 over valid views.
+
+    A sample that is hidden from every view that it projects into takes all of them alike.
+    """
+    weight = (visibility + 1e-4) * valid
+    return weight / weight.sum(0).clamp_min(1e-6)

@@ -1,0 +1,71 @@
+"""What every kind of field keeps of its source views besides features: colours and cameras at feature resolution."""
+
+from __future__ import annotations
+
+import torch
+from torch.nn import functional
+
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.encoder import GROUPS
+from semantic_mapper.fields.geometry_net import GEOMETRY_CHANNELS
+from semantic_mapper.geometry import expect_shape, invert_pose_torch
+from semantic_mapper.types import SourceViews
+
+
+def check_views(views: SourceViews) -> None:
+    """Refuse source views whose tensors do not fit together.
+
+    Raises:
+        ShapeError: naming the tensor, with expected and actual shape.
+    """
+    sizes = expect_shape(views.rgb, "M 3 H W", "source rgb")
+    count, height, width = sizes["M"], sizes["H"], sizes["W"]
+    expect_shape(views.depth_m, f"{count} {height} {width}", "source depth_m")
+    expect_shape(views.K, f"{count} 3 3", "source K")
+    expect_shape(views.T_world_camera, f"{count} 4 4", "source T_world_camera")
+
+
+def check_encoder(width: int, blocks: tuple[int, ...], feature_dim: int) -> None:
+    """Refuse an encoder that cannot be built.
+
+    Raises:
+        ConfigError: naming the value that is off.
+    """
+    if width <= 0 or width % GROUPS or not blocks:
+        raise ConfigError(f"encoder_width must be a multiple of {GROUPS} and encoder_blocks not empty, got {width}")
+    if feature_dim <= 0:
+        raise ConfigError(f"feature_dim must be positive, got {feature_dim}")
+
+
+def scaled_camera(K: torch.Tensor, scale_x: float, scale_y: float) -> torch.Tensor:
+    """Pinhole matrices (m, 3, 3) of images resized by these factors; pixel centres stay integers."""
+    scale = K.new_tensor((scale_x, scale_y))
+    scaled = K.clone()
+    scaled[:, :2, :2] = K[:, :2, :2] * scale[None, :, None]
+    scaled[:, :2, 2] = (K[:, :2, 2] + 0.5) * scale - 0.5
+    return scaled
+
+
+def depth_at(views: SourceViews, height: int, width: int) -> torch.Tensor:
+    """Measured depth (m, height, width). Nearest, not averaged: a mean of depths across an edge lies on no surface."""
+    return functional.interpolate(views.depth_m[:, None], size=(height, width), mode="nearest-exact")[:, 0]
+
+
+def encoded_views(views: SourceViews, feature: torch.Tensor, geometry: torch.Tensor | None = None) -> EncodedViews:
+    """Features (m, C, h, w) with the colours and cameras that belong to them, and no known labels.
+
+    Args:
+        geometry: (m, 5, h, w) mixture of logistics; None for fields that have none, which then hold zeros.
+    """
+    height, width = feature.shape[-2:]
+    if geometry is None:
+        geometry = feature.new_zeros(len(feature), GEOMETRY_CHANNELS, height, width)
+    return EncodedViews(
+        feature=feature,
+        rgb=functional.interpolate(views.rgb, size=(height, width), mode="area"),
+        geometry=geometry,
+        K=scaled_camera(views.K, width / views.rgb.shape[-1], height / views.rgb.shape[-2]),
+        T_camera_world=invert_pose_torch(views.T_world_camera),
+        channel=torch.full_like(views.depth_m, -1, dtype=torch.int16),
+    )

@@ -1,0 +1,103 @@
+"""The per-image U-Net as a field: S-Ray's image encoder with a classifier, and nothing that looks across views.
+
+What multi-view fields have to beat. A query ray is answered from the query's own image and from no other: ``encode``
+classifies each source view, and ``render_samples`` reads the logits of the one source view whose camera is the query
+camera. A query whose own image is not among the sources, as in novel view synthesis, is *unknown* all over: an image
+classifier has no answer for a view that nobody took. So an evaluation has to put the query's own image among the
+sources, or to ask ``predict_image`` (the same logits without rays). In training the dense loss on the source views
+(``source_logits``) teaches the network in every step, the rays only in steps whose sources hold the query view.
+"""
+
+from __future__ import annotations
+
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+import torch
+from torch import nn
+from torch.nn import functional
+
+from semantic_mapper.config import SamplingConfig, UNetFieldConfig
+from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.encoder import ImageEncoder
+from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.projection import gather, reproject
+from semantic_mapper.fields.ray_render import field_render
+from semantic_mapper.fields.source_maps import check_encoder, check_views, encoded_views
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.types import FieldRender, RayBatch, SourceViews
+
+SAME_CAMERA = 1e-3  # metres between the centres plus the error of a unit depth: float32 poses agree far better
+
+
+class UNetField(LearnedField):
+    """Per-image classification behind the ray interface. Depth, measured or prior, plays no part.
+
+    Args:
+        config: Shape of the network.
+        label_set: Classes of the logits.
+        sampling: Not used: the answer does not depend on where a ray is sampled.
+    """
+
+    kind = "unet"
+    class_rows = ("classifier.weight", "classifier.bias")
+
+    def __init__(self, config: UNetFieldConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
+        super().__init__(config, label_set, sampling)
+        check_encoder(config.encoder_width, config.encoder_blocks, config.feature_dim)
+        self.config: UNetFieldConfig = config
+        self.encoder = ImageEncoder(config.encoder_width, config.encoder_blocks, config.feature_dim)
+        self.classifier = nn.Conv2d(config.feature_dim, len(label_set), 1)
+
+    def encode(self, views: SourceViews) -> EncodedViews:
+        """Classify each view by itself; ``feature`` of the result holds the logits (m, L, h, w).
+
+        Raises:
+            ShapeError: tensors that do not fit together.
+        """
+        check_views(views)
+        return encoded_views(views, self._logits(views.rgb))
+
+    def source_logits(self, sources: EncodedViews) -> torch.Tensor:
+        """Logits (m, L, h, w) of the source images: what ``encode`` made of them."""
+        return sources.feature
+
+    def predict_image(self, rgb: torch.Tensor) -> torch.Tensor:
+        """Logits (m, L, H, W) of images (m, 3, H, W) in [0, 1]; what rays through their own pixels render to."""
+        return functional.interpolate(self._logits(rgb), size=rgb.shape[-2:], mode="bilinear", align_corners=False)
+
+    def render_samples(
+        self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews
+    ) -> tuple[FieldRender, torch.Tensor]:
+        """Logits and colour of each ray's own pixel. Depth, opacity and weights are 0: the network says nothing of
+        where the surface is."""
+        index, same = own_view(rays, sources)
+        where = reproject(rays, torch.ones_like(z[:, :1]), sources)  # any depth: the ray is one pixel of its own view
+        found = gather(sources, where)
+        row = torch.arange(len(index), device=index.device)
+        known = same & where.valid[index, row, 0]
+        render = field_render(
+            logits=found.feature[index, row, 0],
+            depth_m=torch.zeros_like(z[:, 0]),
+            opacity=torch.zeros_like(z[:, 0]),
+            rgb=found.rgb[index, row, 0] * known[:, None],
+            known=known,
+        )
+        return render, torch.zeros_like(z)
+
+    def _logits(self, rgb: torch.Tensor) -> torch.Tensor:
+        return self.classifier(functional.relu(self.encoder(rgb)))
+
+
+def own_view(rays: RayBatch, sources: EncodedViews) -> tuple[torch.Tensor, torch.Tensor]:
+    """The source view that each ray was taken from, if any.
+
+    A ray starts at the centre of its camera, and its direction has depth 1 in its camera, so a view that turned on the
+    spot is told apart too.
+
+    Returns:
+        index (R,) int64 of the best view, same (R,) bool: whether that view's camera is the ray's.
+    """
+    R_camera_world, t_camera_world = sources.T_camera_world[:, :3, :3], sources.T_camera_world[:, :3, 3]
+    start = torch.einsum("mij,rj->mri", R_camera_world, rays.origin) + t_camera_world[:, None]  # (m, R, 3)
+    unit_depth = torch.einsum("mj,rj->mr", R_camera_world[:, 2], rays.direction)
+    mismatch, index = (start.norm(dim=-1) + (unit_depth - 1).abs()).min(dim=0)
+    return index, mismatch < SAME_CAMERA

@@ -1,0 +1,83 @@
+"""Tiny fields of every kind, and what tests of several kinds share."""
+
+from __future__ import annotations
+
+import torch
+
+from semantic_mapper.config import (
+    Config,
+    MVSNeRFConfig,
+    NeuRayConfig,
+    SamplingConfig,
+    SemanticNeRFConfig,
+    SRayConfig,
+    UNetFieldConfig,
+)
+from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.sampling import sample_guided
+from semantic_mapper.labels import LabelSet, make_label_set
+from semantic_mapper.types import FieldRender, RayBatch, SourceViews
+from tests.fields.scene import pose_at, wall_rays, wall_sources
+
+LABELS = make_label_set("test", ["a", "b", "c"])
+POSES = [pose_at(-0.3), pose_at(-0.1, 0.1), pose_at(0.1), pose_at(0.3, -0.15)]
+AWAY = pose_at(0.0, 3.14159)
+
+TINY: dict[str, Config] = {
+    "sray": SRayConfig(feature_dim=16, heads=2, encoder_width=8, encoder_blocks=(1, 1)),
+    "unet": UNetFieldConfig(feature_dim=16, encoder_width=8, encoder_blocks=(1, 1)),
+    "neuray": NeuRayConfig(feature_dim=16, encoder_width=8, encoder_blocks=(1, 1)),
+    "mvsnerf": MVSNeRFConfig(
+        feature_dim=8, encoder_width=8, encoder_blocks=(1, 1), planes=8, volume_channels=4, width=16
+    ),
+    "semantic_nerf": SemanticNeRFConfig(width=16, position_frequencies=4, half_extent_m=4.0),
+    "sray-none": SRayConfig(feature_dim=16, heads=2, encoder_width=8, encoder_blocks=(1, 1)),
+    "sray-intra": SRayConfig(feature_dim=16, heads=2, encoder_width=8, encoder_blocks=(1, 1)),
+    "sray-cross": SRayConfig(feature_dim=16, heads=2, encoder_width=8, encoder_blocks=(1, 1)),
+}
+
+
+def tiny(name: str, seed: int = 0, label_set: LabelSet = LABELS) -> LearnedField:
+    """Random weights, evaluation mode."""
+    torch.manual_seed(seed)
+    return build_field(name, TINY[name], label_set).eval()
+
+
+def assert_unknown(render: FieldRender) -> None:
+    """Nothing known: zero logits, no opacity, full entropy."""
+    assert not render.known.any()
+    assert render.logits.abs().max() == 0 and render.opacity.abs().max() == 0
+    assert render.rgb.abs().max() == 0 and render.depth_m.abs().max() == 0
+    full = torch.log(torch.tensor(float(render.logits.shape[1])))
+    torch.testing.assert_close(render.entropy, full.expand_as(render.entropy))
+
+
+def assert_gradients_are_right(field: LearnedField) -> None:
+    """All parameters through encoding and rendering, every output, in double precision, against finite differences."""
+    field = field.double().train()
+    views = wall_sources(POSES[:2])
+    views = SourceViews(*(t.double() for t in (views.rgb, views.depth_m, views.K, views.T_world_camera)))
+    views = SourceViews(
+        views.rgb[..., ::2, ::2].contiguous(), views.depth_m[:, ::2, ::2], _halved(views.K), views.T_world_camera
+    )
+    rays = wall_rays(POSES[1], step=500)
+    rays = RayBatch(*(t.double() for t in (rays.origin, rays.direction, rays.near_m, rays.far_m, rays.prior_depth_m)))
+    z = sample_guided(rays, SamplingConfig(guided=3, free_space=0))
+
+    def outputs(*_: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        encoded = field.encode(views)
+        render, _ = field.render_samples(rays, z, encoded)
+        assert render.known.all()
+        own = field.source_logits(encoded)
+        rendered = (render.logits, render.rgb, render.depth_m, render.entropy)
+        return rendered if own is None else (*rendered, own)
+
+    parameters = tuple(field.parameters())
+    assert torch.autograd.gradcheck(outputs, parameters, fast_mode=True, atol=1e-8, rtol=1e-3)
+
+
+def _halved(K: torch.Tensor) -> torch.Tensor:
+    half = K.clone()
+    half[:, :2] = K[:, :2] / 2
+    return half

@@ -1,0 +1,107 @@
+import pytest
+import torch
+
+from semantic_mapper.config import NeuRayConfig, SRayConfig
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.registry import KINDS, PRESETS, build_field, field_config, field_names
+from semantic_mapper.labels import ROOMS, make_label_set
+from semantic_mapper.training.losses import LossConfig
+from semantic_mapper.training.step import StepConfig, training_loss
+from semantic_mapper.training.views import view_from_frame
+from tests.fields.peers import LABELS, POSES, TINY, tiny
+from tests.fields.scene import wall_rays, wall_sources
+from tests.small import tiny_frames
+
+STEP = StepConfig(rays=32, views_min=2, views_max=2, blind_samples=4)
+
+
+def test_every_name_is_tested_here():
+    assert set(TINY) == set(field_names()) == set(KINDS) | set(PRESETS)
+
+
+@pytest.mark.parametrize("name", field_names())
+def test_every_kind_is_built_from_its_defaults_and_from_plain_data(name: str):
+    field = build_field(name, {}, LABELS)
+    assert field.config == field_config(name, {}) and field.label_set == LABELS
+    assert field.kind == (PRESETS[name][0] if name in PRESETS else name)
+    rows = dict(field.named_parameters())
+    assert field.class_rows and all(rows[r].shape[0] == len(LABELS) for r in field.class_rows)
+
+
+def test_an_unknown_name_is_refused_with_those_there_are():
+    with pytest.raises(ConfigError, match=r"no field of kind 'nerf'; there are .*mvsnerf.*sray-none"):
+        build_field("nerf", {}, LABELS)
+
+
+def test_a_config_of_another_kind_is_refused():
+    with pytest.raises(ConfigError, match="'neuray' takes a NeuRayConfig, got a SRayConfig"):
+        build_field("neuray", SRayConfig(), LABELS)
+    with pytest.raises(ConfigError, match="feature_dim"):
+        build_field("neuray", {"feature_dims": 3}, LABELS)
+    assert build_field("neuray", {"feature_dim": 8, "encoder_width": 8}, LABELS).config == NeuRayConfig(
+        feature_dim=8, encoder_width=8
+    )
+
+
+@pytest.mark.parametrize("name", field_names())
+def test_every_kind_goes_through_a_checkpoint(name: str, tmp_path):
+    field = tiny(name)
+    save_checkpoint(Checkpoint(field), tmp_path / "w.safetensors")
+    loaded = load_checkpoint(tmp_path / "w.safetensors").model
+    assert type(loaded) is type(field) and loaded.config == field.config
+    for key, tensor in field.state_dict().items():
+        assert torch.equal(loaded.state_dict()[key], tensor)
+
+
+@pytest.mark.parametrize("name", field_names())
+def test_every_kind_is_adapted_to_another_label_set_by_class_name(name: str):
+    field = tiny(name)
+    adapted = adapt_model(field, make_label_set("other", ["c", "new", "a"]))
+    for key in field.class_rows:
+        old, new = field.state_dict()[key], adapted.state_dict()[key]
+        assert torch.equal(new[0], old[2]) and torch.equal(new[2], old[0]) and new.shape[0] == 3
+    rays = wall_rays(POSES[0], step=101)
+    assert adapted.render(rays, adapted.encode(wall_sources(POSES))).logits.shape == (len(rays.origin), 3)
+
+
+@pytest.mark.parametrize("name", field_names())
+@pytest.mark.parametrize("own_view", [True, False])
+def test_every_kind_takes_a_training_step(name: str, own_view: bool):
+    """Also the U-Net where the query's own image is not among its sources: its dense loss goes on."""
+    views = [view_from_frame(f, ROOMS, 48) for f in tiny_frames()]
+    field = tiny(name, label_set=ROOMS).train()
+    optimiser = torch.optim.Adam(field.parameters(), 1e-3)
+    before = {n: p.detach().clone() for n, p in field.named_parameters()}
+    loss = training_loss(field, views, 2, [1, 2] if own_view else [1, 3], STEP, torch.Generator().manual_seed(0))
+    assert loss is not None and torch.isfinite(loss.total)
+    loss.total.backward()
+    optimiser.step()
+    moved = [n for n, p in field.named_parameters() if not torch.equal(p, before[n])]
+    assert {"classifier.weight", "classifier.bias"} <= set(moved)
+    assert all(torch.isfinite(p).all() for p in field.parameters())
+
+
+@pytest.mark.parametrize("name", field_names())
+def test_every_kind_trains_without_the_dense_loss(name: str):
+    views = [view_from_frame(f, ROOMS, 48) for f in tiny_frames()]
+    step = StepConfig(rays=16, depth_withheld=1.0, blind_samples=4, loss=LossConfig(source=0.0))
+    field = tiny(name, label_set=ROOMS).train()
+    loss = training_loss(field, views, 2, [1, 3], step, torch.Generator().manual_seed(0))
+    assert loss is not None
+    loss.total.backward()
+
+
+@pytest.mark.parametrize("name", field_names())
+def test_no_kind_depends_on_how_rays_are_split_into_chunks(name: str):
+    field = tiny(name)
+    rays = wall_rays(POSES[1], step=3)
+    with torch.no_grad():
+        encoded = field.encode(wall_sources(POSES))
+        whole = field.render(rays, encoded)
+        names = ("origin", "direction", "near_m", "far_m", "prior_depth_m")
+        parts = [
+            field.render(type(rays)(*(getattr(rays, n)[i : i + 128] for n in names)), encoded).logits
+            for i in range(0, len(rays.origin), 128)
+        ]
+    torch.testing.assert_close(torch.cat(parts), whole.logits, atol=1e-5, rtol=1e-4)
