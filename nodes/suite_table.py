@@ -45,6 +45,8 @@ def _add_curve(table: Table, entries: Sequence[Mapping[str, Any]]) -> None:
     if not shares:
         return
     table.add_section()
+    values = [entry["figures"]["seconds_to_95_percent"] for entry in entries]
+    table.add_row("time to 95 % of the last mIoU", *("-" if v is None else f"{v:.0f} s" for v in values))
     for share in shares:
         cells = [_curve_cell(curve.get(share)) for curve in curves]
         table.add_row(f"mIoU after {percent(share)} of the budget" if share else "mIoU before fitting", *cells)

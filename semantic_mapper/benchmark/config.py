@@ -36,7 +36,7 @@ TIERS: dict[Tier, TierConfig] = {
         width=320,
         rays_per_chunk=8192,
         guided=SamplingConfig(guided=16, free_space=2),
-        blind=SamplingConfig(mode="reference", coarse=64, fine=64),
+        blind=SamplingConfig(mode="reference", coarse=64, fine=64, guided=64, free_space=0),  # 64 while fitting
     ),
 }
 
@@ -53,12 +53,13 @@ class SequenceConfig(Config, frozen=True):
 class SpacingConfig(Config, frozen=True):
     """How far source views are from the query and from each other, in metres between camera centres."""
 
-    from_query_m: float
-    apart_m: float
+    from_query_m: float = 0.0
+    to_query_m: float = float("inf")
+    apart_m: float = 0.0
 
 
 SPACINGS: dict[Baseline, SpacingConfig] = {
-    "narrow": SpacingConfig(from_query_m=0.08, apart_m=0.08),
+    "narrow": SpacingConfig(from_query_m=0.05, to_query_m=0.5, apart_m=0.05),
     "wide": SpacingConfig(from_query_m=0.5, apart_m=0.2),
 }
 
@@ -117,5 +118,8 @@ def settings_digest(suite: SuiteConfig, part: Literal["views", "map"]) -> str:
         del plain["map_frames"], plain["mapper"]
         if suite.protocol == "generalize":
             del plain["scene"]
+            plain["spacing"] = repr(SPACINGS[suite.baseline])
+        else:
+            del plain["baseline"]
     plain |= {"part": part, "suite_version": SUITE_VERSION, "record_version": RECORD_VERSION}
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]

@@ -41,6 +41,7 @@ def view_figures(records: Sequence[RoomRecord]) -> dict[str, Any]:
         "seen": _mean([i.seen for i in images]),
         "per_room_miou": {str(r.room): c.metrics().miou for r, c in zip(records, confusions, strict=True)},
         "curve": _curve(records),
+        "seconds_to_95_percent": _seconds_to_most(_curve(records)),
     }
 
 
@@ -98,6 +99,14 @@ def _curve(records: Sequence[RoomRecord]) -> list[dict[str, Any]]:
         }
         for share, at in zip(shares, points, strict=True)
     ]
+
+
+def _seconds_to_most(curve: Sequence[dict[str, Any]], most: float = 0.95) -> float | None:
+    """Seconds of the first point of the curve that reaches this share of its last mIoU; None without a curve."""
+    final = curve[-1]["miou"] if curve else None
+    if final is None:
+        return None
+    return next(p["seconds"] for p in curve if p["miou"] is not None and p["miou"] >= most * final)
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

@@ -28,8 +28,9 @@ from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, finetune
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
+from semantic_mapper.training.step import StepConfig
 
-ANYWHERE = SpacingConfig(from_query_m=0.0, apart_m=0.0)
+ANYWHERE = SpacingConfig()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,11 +136,12 @@ def _fit_and_score(
     field = _start(contestant.field, suite)
     answers = answer_from_keyframes(room, field.eval(), suite, keyframes)
     curve = [_curve_point(0.0, 0.0, 0, room_confusion(room, answers))]
+    device = next(field.parameters()).device
     spent, whole = 0.0, sum(suite.scene.shares)
     for share in sorted(suite.scene.shares):
         start = _start(contestant.field, suite)
         fitted = finetune(frames, ROOMS, start, _fit_config(suite, share), _progress(on_fit, spent, share, whole))
-        answers = answer_from_keyframes(room, fitted.model, suite, keyframes)
+        answers = answer_from_keyframes(room, fitted.model.to(device).eval(), suite, keyframes)
         recipe = fitted.recipe
         curve.append(_curve_point(share, float(recipe["seconds"]), int(recipe["steps"]), room_confusion(room, answers)))
         spent += share
@@ -167,6 +169,7 @@ def _fit_config(suite: SuiteConfig, share: float) -> FinetuneConfig:
         seconds=scene.seconds * share,
         steps=max(1, round(scene.steps * share)) if scene.steps else 0,
         width=suite.tier.width,
+        step=StepConfig(sampling=suite.tier.guided if suite.depth else suite.tier.blind),
         seed=suite.seed,
     )
 

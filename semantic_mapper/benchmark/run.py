@@ -91,7 +91,7 @@ def sheet_rows(
     for at in np.linspace(0, len(seeds) - 1, min(SHEET_ROWS, len(seeds))).round():
         seed = seeds[int(at)]
         labels, notes = {}, {}
-        rgb = truth = None
+        name, rgb, truth = "", None, None
         for contestant in contestants:
             record = store.find(RoomRecord, settings, contestant.digest, seed)
             path = _picture_path(pictures, settings, contestant.digest, seed)
@@ -99,9 +99,10 @@ def sheet_rows(
                 continue
             with np.load(path) as data:
                 rgb, truth, labels[contestant.name] = data["rgb"], data["truth"], data["label"]
+            name = f"room {seed} ({record.programme}), frame {record.images[0].frame}"
             notes[contestant.name] = image_note(record.images[0])
         if rgb is not None and truth is not None:
-            rows.append(SheetRow(f"room {seed}", rgb, truth, labels, notes))
+            rows.append(SheetRow(name, rgb, truth, labels, notes))
     return rows
 
 

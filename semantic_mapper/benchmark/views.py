@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,8 +51,8 @@ def choose_sources(
 ) -> Sources:
     """The ``count`` frames that see most of what the query sees, among those that keep the distances of ``spacing``.
 
-    Where too few do, the distance to each other is given up first, then the one to the query. The choice looks at
-    exact depth and poses alone, so that every field and every setting of depth gets the same views.
+    Where too few do, the distance to each other is given up first, then those to the query. The choice looks at depth
+    and poses alone, whatever the field is given, so that every field and every setting of depth gets the same views.
 
     Args:
         query_pose: (4, 4) T_world_camera.
@@ -71,10 +72,11 @@ def choose_sources(
     away = np.linalg.norm(centre - query_pose[:3, 3], axis=1)
     order = [int(i) for i in np.lexsort((np.arange(len(share)), away, -share))]
     chosen: list[int] = []
-    for from_query_m, apart_m in ((spacing.from_query_m, spacing.apart_m), (spacing.from_query_m, 0.0), (0.0, 0.0)):
+    for rule in (spacing, msgspec.structs.replace(spacing, apart_m=0.0), SpacingConfig()):
         for i in order:
-            near = any(float(np.linalg.norm(centre[i] - centre[j])) < apart_m for j in chosen)
-            if len(chosen) < count and i not in chosen and away[i] >= from_query_m and not near:
+            fits = rule.from_query_m <= away[i] <= rule.to_query_m
+            crowded = any(float(np.linalg.norm(centre[i] - centre[j])) < rule.apart_m for j in chosen)
+            if len(chosen) < count and i not in chosen and fits and not crowded:
                 chosen.append(i)
     together = np.any([seen[i] for i in chosen], axis=0) if len(points) else np.zeros(1)
     return Sources(tuple(chosen), float(away[chosen].mean()), float(together.mean()))

@@ -30,6 +30,15 @@ def choose(candidates: list[PosedFrame], count: int, from_query_m: float, apart_
     return choose_sources(np.eye(4), WALL, candidates, count, SpacingConfig(from_query_m=from_query_m, apart_m=apart_m))
 
 
+def test_narrow_views_are_near_even_where_farther_ones_see_more() -> None:
+    back = frame(0.3)
+    back.T_world_camera[2, 3] = -2.0  # sees the whole wall from 4 m
+    far = dataclasses.replace(back, depth_m=np.full_like(WALL, 4.0))
+    assert choose([far, frame(0.4)], 1, 0.0, 0.0).numbers == (0,)
+    bounded = choose_sources(np.eye(4), WALL, [far, frame(0.4)], 1, SpacingConfig(to_query_m=0.5))
+    assert bounded.numbers == (1,)
+
+
 def test_near_views_are_those_that_see_most() -> None:
     candidates = [frame(1.0), frame(0.1), frame(0.0, turned=True), frame(0.3)]
     found = choose(candidates, 2, 0.0, 0.0)
