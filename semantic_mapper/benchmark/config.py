@@ -69,6 +69,7 @@ class SceneBudget(Config, frozen=True):
 
     keyframes: int = 12  # labelled
     guard: int = 3  # frames on either side of a query that are no keyframes
+    labelled_sources: bool = True  # queries: give the keyframes' labels to fields that take labels of source views
     seconds: float = 120.0  # wall clock; 0 = only steps count
     steps: int = 0  # 0 = only seconds count
     shares: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0)  # of the budget; each is a run of its own, a point of the curve

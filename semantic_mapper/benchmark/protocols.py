@@ -79,8 +79,9 @@ def answer_queries(room: BenchmarkRoom, field: LearnedField, suite: SuiteConfig)
 def answer_from_keyframes(
     room: BenchmarkRoom, field: LearnedField, suite: SuiteConfig, keyframes: Sequence[int]
 ) -> dict[int, Answer]:
-    """Render all query views from labelled keyframes, whatever their distance: they are all that there is."""
-    return {q: _answer(room, field, suite, q, keyframes, ANYWHERE, labelled=True) for q in room.queries}
+    """Render all query views from the keyframes, whatever their distance: they are all that there is."""
+    labelled = suite.scene.labelled_sources
+    return {q: _answer(room, field, suite, q, keyframes, ANYWHERE, labelled=labelled) for q in room.queries}
 
 
 def choose_labelled(room: BenchmarkRoom, suite: SuiteConfig) -> list[int]:

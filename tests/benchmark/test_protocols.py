@@ -6,7 +6,7 @@ import torch
 
 from semantic_mapper.benchmark.figures import view_figures
 from semantic_mapper.benchmark.predict import predict_view
-from semantic_mapper.benchmark.protocols import Contestant, choose_labelled, run_room
+from semantic_mapper.benchmark.protocols import Contestant, answer_from_keyframes, choose_labelled, run_room
 from semantic_mapper.benchmark.rooms import as_given
 from semantic_mapper.benchmark.scoring import from_rows
 from semantic_mapper.errors import ConfigError
@@ -108,6 +108,14 @@ def test_fitting_gives_a_curve_and_renders_from_the_labelled_keyframes() -> None
     assert told == sorted(told) and told[-1] == pytest.approx(1)
     figures = view_figures([record])
     assert [p["steps"] for p in figures["curve"]] == [0, 1, 2]
+
+
+def test_labels_of_the_keyframes_can_be_kept_from_the_queries() -> None:
+    field = watched()
+    for given in (True, False):
+        suite = tiny_suite(scene={"labelled_sources": given})
+        answer_from_keyframes(tiny_room(), field, suite, [0, 2, 12])
+        assert (field.seen.channel is not None) == given
 
 
 def test_scratch_starts_from_random_weights_whatever_the_file_holds() -> None:
