@@ -24,8 +24,8 @@ class ImageRecord(Config, frozen=True):
     total_accuracy: float | None
     average_accuracy: float | None
     coverage: float | None
-    psnr_db: float
-    ssim: float
+    psnr_db: float | None  # None where the field was shown this very image
+    ssim: float | None
     depth: DepthRecord
 
 

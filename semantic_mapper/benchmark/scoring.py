@@ -33,7 +33,8 @@ def image_record(frame: int, answer: Answer, truth: RenderedView) -> ImageRecord
     """All figures of one view."""
     prediction = answer.prediction
     scores = confusion_of(truth.label, prediction.label, ROOMS, f"query view {frame}").metrics()
-    depth = depth_errors(truth.depth_m, prediction.depth_m, prediction.known)
+    depth = depth_errors(truth.depth_m, prediction.depth_m, prediction.known & (prediction.depth_m > 0))
+    was_shown = frame in answer.source_frames
     colour = np.divide(truth.rgb, 255, dtype=np.float32)
     return ImageRecord(
         frame=frame,
@@ -44,8 +45,8 @@ def image_record(frame: int, answer: Answer, truth: RenderedView) -> ImageRecord
         total_accuracy=scores.total_accuracy,
         average_accuracy=scores.average_accuracy,
         coverage=scores.coverage,
-        psnr_db=psnr(colour, prediction.rgb),
-        ssim=ssim(colour, prediction.rgb),
+        psnr_db=None if was_shown else psnr(colour, prediction.rgb),
+        ssim=None if was_shown else ssim(colour, prediction.rgb),
         depth=DepthRecord(relative_sum=depth.relative_sum, square_sum=depth.square_sum, count=depth.count),
     )
 

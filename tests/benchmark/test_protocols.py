@@ -53,6 +53,8 @@ def test_generalizing_scores_whole_views_from_sources_that_are_not_the_query() -
 def test_the_query_is_a_source_only_of_a_kind_that_needs_it() -> None:
     record = run_room(tiny_room(), Contestant("own", "own", watched(OwnView)), tiny_suite()).record
     assert all(len(i.sources) == 3 and i.sources[-1] == i.frame for i in record.images)
+    figures = view_figures([record])
+    assert figures["psnr_db"] is None and figures["ssim"] is None  # it could just repeat the image
 
 
 def test_without_depth_nothing_of_it_reaches_the_field() -> None:
