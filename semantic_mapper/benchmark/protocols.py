@@ -51,12 +51,17 @@ class Contestant:
 
 
 def run_room(
-    room: BenchmarkRoom, contestant: Contestant, suite: SuiteConfig, on_fit: Callable[[float], None] | None = None
-) -> RoomResult:
-    """One room by one field, as ``suite.protocol`` says.
+    room: BenchmarkRoom,
+    contestant: Contestant,
+    suite: SuiteConfig,
+    on_fit: Callable[[float], None] | None = None,
+    stopped: Callable[[], object] = bool,
+) -> RoomResult | None:
+    """One room by one field, as ``suite.protocol`` says; None where it was stopped while it fitted.
 
     Args:
         on_fit: Told the share of the fitting that is done.
+        stopped: Asked before every step of the fitting; once it says so (anything true), the room is given up.
 
     Raises:
         ConfigError: a budget of nothing, or a room with too few frames.
@@ -64,7 +69,7 @@ def run_room(
     if suite.protocol == "generalize":
         field = contestant.field.eval()
         return _scored(room, answer_queries(room, field, suite), contestant, suite)
-    return _fit_and_score(room, contestant, suite, on_fit)
+    return _fit_and_score(room, contestant, suite, on_fit, stopped)
 
 
 def answer_queries(room: BenchmarkRoom, field: LearnedField, suite: SuiteConfig) -> dict[int, Answer]:
@@ -127,8 +132,12 @@ def _answer(
 
 
 def _fit_and_score(
-    room: BenchmarkRoom, contestant: Contestant, suite: SuiteConfig, on_fit: Callable[[float], None] | None
-) -> RoomResult:
+    room: BenchmarkRoom,
+    contestant: Contestant,
+    suite: SuiteConfig,
+    on_fit: Callable[[float], None] | None,
+    stopped: Callable[[], object],
+) -> RoomResult | None:
     """Fit to the keyframes with growing shares of the budget; the whole budget gives the room's figures."""
     if suite.scene.seconds <= 0 and suite.scene.steps <= 0:
         raise ConfigError(f"protocol {suite.protocol} needs a budget: set seconds, steps, or both")
@@ -141,7 +150,10 @@ def _fit_and_score(
     spent, whole = 0.0, sum(suite.scene.shares)
     for share in sorted(suite.scene.shares):
         start = _start(contestant.field, suite)
-        fitted = finetune(frames, ROOMS, start, _fit_config(suite, share), _progress(on_fit, spent, share, whole))
+        progress = _progress(on_fit, spent, share, whole)
+        fitted = finetune(frames, ROOMS, start, _fit_config(suite, share), progress, stopped)
+        if stopped():
+            return None
         answers = answer_from_keyframes(room, fitted.model.to(device).eval(), suite, keyframes)
         recipe = fitted.recipe
         curve.append(_curve_point(share, float(recipe["seconds"]), int(recipe["steps"]), room_confusion(room, answers)))

@@ -47,7 +47,8 @@ def run_suite(
         store: Records that are there are kept and not made again.
         pictures: Folder for the label images of ``sheet_rows``.
         on_progress: Told of every step.
-        stopped: Asked before each room and contestant; once it says so (anything true), the run ends.
+        stopped: Asked before each room, contestant and step of a fitting; once it says so (anything true), the run
+            ends. A room that is not done by then leaves no record.
     """
     settings, seeds = settings_digest(suite, "views"), suite_seeds(suite)
     total, done = len(seeds) * len(contestants), 0
@@ -65,7 +66,10 @@ def run_suite(
                 contestant,
                 suite,
                 lambda share, at=done, name=name: on_progress(Progress(at + share, total, f"fit {name}")),
+                stopped,
             )
+            if result is None:
+                return
             _keep_picture(pictures, room, result)
             store.add(result.record)
             done += 1

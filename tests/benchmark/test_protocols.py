@@ -1,12 +1,21 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
 
+from semantic_mapper.benchmark.config import SuiteConfig
 from semantic_mapper.benchmark.figures import view_figures
 from semantic_mapper.benchmark.predict import predict_view
-from semantic_mapper.benchmark.protocols import Contestant, answer_from_keyframes, choose_labelled, run_room
+from semantic_mapper.benchmark.protocols import (
+    Contestant,
+    RoomResult,
+    answer_from_keyframes,
+    choose_labelled,
+    run_room,
+)
 from semantic_mapper.benchmark.rooms import as_given
 from semantic_mapper.benchmark.scoring import from_rows
 from semantic_mapper.errors import ConfigError
@@ -38,9 +47,15 @@ def watched(kind: type[Watched] = Watched) -> Watched:
     return copy
 
 
+def score(contestant: Contestant, suite: SuiteConfig, on_fit: Callable[[float], None] | None = None) -> RoomResult:
+    result = run_room(tiny_room(), contestant, suite, on_fit)
+    assert result is not None
+    return result
+
+
 def test_generalizing_scores_whole_views_from_sources_that_are_not_the_query() -> None:
     room = tiny_room()
-    record = run_room(room, tiny_contestant(), tiny_suite()).record
+    record = score(tiny_contestant(), tiny_suite()).record
     assert [i.frame for i in record.images] == [6, 8]
     assert all(len(i.sources) == 3 and i.frame not in i.sources for i in record.images)
     labelled = sum(int((t.label != ROOMS.ignore_id).sum()) for t in room.truth.values())
@@ -51,7 +66,7 @@ def test_generalizing_scores_whole_views_from_sources_that_are_not_the_query() -
 
 
 def test_the_query_is_a_source_only_of_a_kind_that_needs_it() -> None:
-    record = run_room(tiny_room(), Contestant("own", "own", watched(OwnView)), tiny_suite()).record
+    record = score(Contestant("own", "own", watched(OwnView)), tiny_suite()).record
     assert all(len(i.sources) == 3 and i.sources[-1] == i.frame for i in record.images)
     figures = view_figures([record])
     assert figures["psnr_db"] is None and figures["ssim"] is None  # it could just repeat the image
@@ -59,16 +74,23 @@ def test_the_query_is_a_source_only_of_a_kind_that_needs_it() -> None:
 
 def test_without_depth_nothing_of_it_reaches_the_field() -> None:
     field = watched()
-    run_room(tiny_room(), Contestant("blind", "blind", field), tiny_suite(depth=False))
+    score(Contestant("blind", "blind", field), tiny_suite(depth=False))
     assert not field.seen.depth_m.any() and field.seen.channel is None
     assert field.sampling == tiny_suite().tier.blind
-    run_room(tiny_room(), Contestant("seeing", "seeing", field), tiny_suite())
+    score(Contestant("seeing", "seeing", field), tiny_suite())
     assert field.seen.depth_m.any() and field.sampling == tiny_suite().tier.guided
 
 
+def test_without_depth_coarse_samples_may_guide_fine_ones() -> None:
+    tier = {"width": 48, "blind": {"mode": "reference", "coarse": 6, "fine": 4}}
+    record = score(tiny_contestant(), tiny_suite(depth=False, tier=tier)).record
+    uniform = score(tiny_contestant(), tiny_suite(depth=False)).record
+    assert record.images[0].depth.count > 0 and record.settings != uniform.settings
+    assert record.images[0].depth != uniform.images[0].depth
+
+
 def test_the_compiled_renderer_gives_the_figures_of_the_field_itself() -> None:
-    suite, room = tiny_suite(), tiny_room()
-    fast, plain = (run_room(room, Contestant("x", "x", f), suite) for f in (tiny_field(), watched()))
+    fast, plain = (score(Contestant("x", "x", f), tiny_suite()) for f in (tiny_field(), watched()))
     for query, answer in fast.answers.items():
         other = plain.answers[query].prediction
         np.testing.assert_allclose(answer.prediction.confidence, other.confidence, atol=1e-4)
@@ -102,7 +124,7 @@ def test_keyframes_are_no_queries_and_not_next_to_one() -> None:
 def test_fitting_gives_a_curve_and_renders_from_the_labelled_keyframes() -> None:
     suite = tiny_suite(protocol="finetune")
     told: list[float] = []
-    record = run_room(tiny_room(), tiny_contestant(), suite, told.append).record
+    record = score(tiny_contestant(), suite, told.append).record
     assert [p.share for p in record.curve] == [0, 0.5, 1.0]
     assert [p.steps for p in record.curve] == [0, 1, 2]
     assert record.curve[-1].confusion == record.confusion
@@ -122,12 +144,19 @@ def test_labels_of_the_keyframes_can_be_kept_from_the_queries() -> None:
 
 def test_scratch_starts_from_random_weights_whatever_the_file_holds() -> None:
     suite = tiny_suite(protocol="scratch")
-    first, second = (run_room(tiny_room(), tiny_contestant(seed), suite).record for seed in (0, 1))
+    first, second = (score(tiny_contestant(seed), suite).record for seed in (0, 1))
     assert first.confusion == second.confusion
-    tuned = [run_room(tiny_room(), tiny_contestant(s), tiny_suite(protocol="finetune")).record for s in (0, 1)]
+    tuned = [score(tiny_contestant(s), tiny_suite(protocol="finetune")).record for s in (0, 1)]
     assert tuned[0].curve[0].confusion != tuned[1].curve[0].confusion
+
+
+def test_a_fitting_that_is_stopped_gives_no_figures() -> None:
+    steps: list[float] = []
+    suite = tiny_suite(protocol="finetune", scene={"keyframes": 3, "guard": 1, "seconds": 0, "steps": 50})
+    assert run_room(tiny_room(), tiny_contestant(), suite, steps.append, lambda: len(steps) >= 2) is None
+    assert len(steps) == 2
 
 
 def test_a_budget_of_nothing_is_refused() -> None:
     with pytest.raises(ConfigError, match="needs a budget"):
-        run_room(tiny_room(), tiny_contestant(), tiny_suite(protocol="scratch", scene={"seconds": 0, "steps": 0}))
+        score(tiny_contestant(), tiny_suite(protocol="scratch", scene={"seconds": 0, "steps": 0}))
