@@ -11,7 +11,7 @@ from semantic_mapper.benchmark.predict import Prediction
 from semantic_mapper.benchmark.records import CalibrationRecord, DepthRecord, ImageRecord
 from semantic_mapper.benchmark.rooms import BenchmarkRoom
 from semantic_mapper.benchmark.views import Sources
-from semantic_mapper.evaluation.colour import psnr, ssim
+from semantic_mapper.evaluation.colour import match_colours, psnr, ssim
 from semantic_mapper.evaluation.consistency import Agreement, label_agreement, matching_pixels
 from semantic_mapper.evaluation.depth_error import depth_errors
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration, confusion_of
@@ -36,6 +36,7 @@ def image_record(frame: int, answer: Answer, truth: RenderedView) -> ImageRecord
     depth = depth_errors(truth.depth_m, prediction.depth_m, prediction.known & (prediction.depth_m > 0))
     was_shown = frame in answer.source_frames
     colour = np.divide(truth.rgb, 255, dtype=np.float32)
+    rendered = match_colours(colour, prediction.rgb)
     return ImageRecord(
         frame=frame,
         sources=answer.source_frames,
@@ -45,8 +46,8 @@ def image_record(frame: int, answer: Answer, truth: RenderedView) -> ImageRecord
         total_accuracy=scores.total_accuracy,
         average_accuracy=scores.average_accuracy,
         coverage=scores.coverage,
-        psnr_db=None if was_shown else psnr(colour, prediction.rgb),
-        ssim=None if was_shown else ssim(colour, prediction.rgb),
+        psnr_db=None if was_shown else psnr(colour, rendered),
+        ssim=None if was_shown else ssim(colour, rendered),
         depth=DepthRecord(relative_sum=depth.relative_sum, square_sum=depth.square_sum, count=depth.count),
     )
 

@@ -1,4 +1,4 @@
-"""How near a rendered picture comes to the true one: PSNR and SSIM."""
+"""How near a rendered picture comes to the true one: PSNR and SSIM, whatever the exposure."""
 
 from __future__ import annotations
 
@@ -12,6 +12,31 @@ MAX_PSNR_DB = 100.0
 SSIM_WINDOW = 11  # pixels a side of the Gaussian window
 SSIM_SIGMA = 1.5
 _C1, _C2 = 0.01**2, 0.03**2  # for values in [0, 1]
+
+
+def match_colours(truth: Float32, rendered: Float32) -> Float32:
+    """The rendered picture with the gain and offset of each channel that bring it nearest to the true one.
+
+    Exposure and white balance of the source images are not those of the truth, and nobody can render what no image
+    shows; a picture that is off by them alone is right.
+
+    Args:
+        truth, rendered: (H, W, 3) float32 in [0, 1].
+
+    Returns:
+        (H, W, 3) float32 in [0, 1].
+
+    Raises:
+        ShapeError: the shapes differ.
+    """
+    _check(truth, rendered)
+    matched = np.empty_like(rendered)
+    for channel in range(3):
+        x, y = rendered[..., channel].astype(np.float64), truth[..., channel].astype(np.float64)
+        spread = float(((x - x.mean()) ** 2).mean())
+        gain = float(((x - x.mean()) * (y - y.mean())).mean()) / spread if spread > 0 else 0.0
+        matched[..., channel] = np.clip(y.mean() + gain * (x - x.mean()), 0, 1)
+    return matched
 
 
 def psnr(truth: Float32, rendered: Float32) -> float:

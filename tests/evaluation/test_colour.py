@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import ShapeError
-from semantic_mapper.evaluation.colour import MAX_PSNR_DB, psnr, ssim
+from semantic_mapper.evaluation.colour import MAX_PSNR_DB, match_colours, psnr, ssim
 
 
 def pictures(rng: np.random.Generator, noise: float) -> tuple[np.ndarray, np.ndarray]:
@@ -26,6 +26,22 @@ def test_psnr_by_hand() -> None:
 def test_psnr_agrees_with_opencv(rng: np.random.Generator) -> None:
     truth, noisy = pictures(rng, 0.05)
     assert psnr(truth, noisy) == pytest.approx(cv2.PSNR(truth, noisy, 1.0), abs=1e-6)
+
+
+def test_exposure_and_white_balance_are_taken_out(rng: np.random.Generator) -> None:
+    truth, _ = pictures(rng, 0)
+    darker = (0.1 + truth * np.array([0.4, 0.6, 0.5], np.float32)).astype(np.float32)
+    assert psnr(truth, darker) < 15
+    assert psnr(truth, match_colours(truth, darker)) > 80
+    flat = np.full_like(truth, 0.2)
+    np.testing.assert_allclose(match_colours(truth, flat), np.broadcast_to(truth.mean((0, 1)), truth.shape), atol=1e-5)
+
+
+def test_matching_by_hand() -> None:
+    truth, rendered = np.zeros((1, 4, 3), np.float32), np.zeros((1, 4, 3), np.float32)
+    truth[0, :, 0], rendered[0, :, 0] = (0.2, 0.4, 0.2, 0.4), (0.1, 0.3, 0.3, 0.5)
+    # Means 0.3 and 0.3; covariance 0.01, variance 0.02: gain 0.5.
+    np.testing.assert_allclose(match_colours(truth, rendered)[0, :, 0], (0.2, 0.3, 0.3, 0.4), atol=1e-6)
 
 
 def test_ssim_by_hand_where_nothing_varies() -> None:
@@ -52,6 +68,6 @@ def test_pictures_that_cannot_be_compared_are_refused() -> None:
     small = np.zeros((10, 30, 3), np.float32)
     with pytest.raises(ShapeError, match="at least 11 pixels"):
         ssim(small, small)
-    for compare in (psnr, ssim):
+    for compare in (psnr, ssim, match_colours):
         with pytest.raises(ShapeError, match="one shape"):
             compare(np.zeros((12, 12, 3), np.float32), np.zeros((12, 13, 3), np.float32))
