@@ -1,4 +1,4 @@
-"""``semantic-mapper eval``: figures of replays side by side, or of a log by several methods."""
+"""``semantic-mapper eval``: figures of replays side by side, of a log by several methods, or of a benchmark."""
 
 from __future__ import annotations
 
@@ -7,47 +7,105 @@ from typing import Annotated, Any
 
 import typer
 
-from nodes.cli_replay import ConfigOption, MaxFramesOption, WeightsOption
+from nodes import suite_options as suites
+from nodes.cli_replay import MaxFramesOption
 from nodes.console import Output
 from nodes.verb import verb
+
+BASELINE_SECONDS = 300.0
+
+TargetsArgument = Annotated[
+    list[Path] | None, typer.Argument(metavar="DIR_OR_LOG...", help="Folders that `replay` has written, and logs.")
+]
+JsonOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--json",
+        metavar="FILE",
+        help="Where to write; else eval.json in the first DIR, LOG.eval.json by the first log, or runs/rooms-*.json.",
+    ),
+]
+WeightsOption = Annotated[
+    list[Path] | None,
+    typer.Option("--weights", help="Weights file; the one in the package without it. Suite: give several to compare."),
+]
+BaselinesOption = Annotated[
+    bool, typer.Option("--baselines", help="LOG: also fit the baselines to the keyframes of the weights.")
+]
+MeshOption = Annotated[
+    Path | None, typer.Option(metavar="NPZ", help="DIR: also compare its map with this reference mesh.")
+]
+SeedOption = Annotated[int | None, typer.Option(help="Of everything that is drawn at random.  [default: 0]")]
 
 
 @verb
 def evaluate(
-    targets: Annotated[
-        list[Path], typer.Argument(metavar="DIR_OR_LOG...", help="Folders that `replay` has written, and logs.")
-    ],
-    json_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--json",
-            metavar="FILE",
-            help="Where to write; else eval.json in the first DIR, or LOG.eval.json beside the first log.",
-        ),
-    ] = None,
+    targets: TargetsArgument = None,
+    json_file: JsonOption = None,
     weights: WeightsOption = None,
-    baselines: Annotated[
-        bool, typer.Option("--baselines", help="LOG: also fit the baselines to the keyframes of the weights.")
-    ] = False,
-    seconds: Annotated[float, typer.Option(min=1, help="Training time of the U-Net baseline.")] = 300.0,
-    mesh: Annotated[
-        Path | None, typer.Option(metavar="NPZ", help="DIR: also compare its map with this reference mesh.")
-    ] = None,
+    baselines: BaselinesOption = False,
+    seconds: suites.SecondsOption = None,
+    mesh: MeshOption = None,
     max_frames: MaxFramesOption = 0,
-    config: ConfigOption = None,
-    seed: Annotated[int, typer.Option(help="Of everything that is drawn at random.")] = 0,
-) -> None:
+    config: suites.EvalConfigOption = None,
+    seed: SeedOption = None,
+    suite: suites.SuiteOption = None,
+    split: suites.SplitOption = None,
+    rooms: suites.RoomsOption = None,
+    protocol: suites.ProtocolOption = None,
+    views: suites.ViewsOption = None,
+    baseline: suites.BaselineOption = None,
+    depth: suites.DepthOption = None,
+    tier: suites.TierOption = None,
+    keyframes: suites.KeyframesOption = None,
+    steps: suites.StepsOption = None,
+    maps: suites.MapOption = False,
+) -> int:
     """Print a table of figures and write them as JSON.
 
     A DIR gives the figures of its replay. A LOG is mapped and scored: with --weights that were finetuned on it, the
     keyframes they were fitted to never count, and --baselines adds a per-image U-Net and labels carried over by depth,
-    both made from those same keyframes.
+    both made from those same keyframes. --mesh takes an .npz with vertices, faces and (if there are any) labels.
 
-    --mesh takes an .npz with vertices, faces and (if there are any) labels of the vertices, in the frame of the log.
+    --suite rooms renders query views of rooms that nothing was trained on, one column a weights file, and draws a
+    contact sheet. A run that was ended goes on where it was; docs/protocols.md says what each figure means.
 
     Example: semantic-mapper eval runs/a runs/b
     Example: semantic-mapper eval kitchen.mcap --weights kitchen.safetensors --baselines
+    Example: semantic-mapper eval --suite rooms --weights a.safetensors --weights b.safetensors --json runs/ab.json
     """
+    given = {"split": split, "rooms": rooms, "protocol": protocol, "views": views, "baseline": baseline, "depth": depth}
+    given |= {"keyframes": keyframes, "steps": steps}
+    if suite is None:
+        if maps or tier or any(value is not None for value in given.values()):
+            raise typer.BadParameter("is what this option needs", param_hint="--suite rooms")
+        options = _single(weights), baselines, seconds or BASELINE_SECONDS, max_frames, config, seed or 0
+        return _evaluate_targets(targets or [], options, mesh, json_file)
+    if targets or baselines or mesh or max_frames:
+        raise typer.BadParameter("takes no DIR_OR_LOG, --baselines, --mesh or --max-frames", param_hint="--suite")
+    if maps and protocol in ("finetune", "scratch"):
+        raise typer.BadParameter("goes with --protocol generalize only", param_hint="--map")
+    from nodes.suite import run_suite_verb
+
+    settings = suites.suite_config(config, tier, {**given, "seconds": seconds, "seed": seed})
+    return run_suite_verb(settings, weights or [], maps, json_file)
+
+
+def _single(weights: list[Path] | None) -> Path | None:
+    if weights is not None and len(weights) > 1:
+        raise typer.BadParameter("several are compared with --suite only", param_hint="--weights")
+    return weights[0] if weights else None
+
+
+def _evaluate_targets(
+    targets: list[Path],
+    options: tuple[Path | None, bool, float, int, Path | None, int],
+    mesh: Path | None,
+    json_file: Path | None,
+) -> int:
+    """Figures of folders and logs; ``options`` are those of ``nodes.scoring.ScoreRequest`` after the log."""
+    if not targets:
+        raise typer.BadParameter("give folders or logs, or --suite", param_hint="DIR_OR_LOG")
     output = Output.guarded()
     from nodes.results import print_results
     from replay.artifacts import write_json
@@ -65,12 +123,12 @@ def evaluate(
     for log in (t for t in targets if not t.is_dir()):
         from nodes.scoring import ScoreRequest, score_log, score_table
 
-        request = ScoreRequest(log, weights, baselines, seconds, max_frames, config, seed)
-        found["logs"][str(log)] = scores = score_log(request)
+        found["logs"][str(log)] = scores = score_log(ScoreRequest(log, *options))
         output.print(score_table(log.name, scores))
     path = json_file or (folders[0] / "eval.json" if folders else targets[0].with_suffix(".eval.json"))
     write_json(path, found)
     output.print(f"written to {path}")
+    return 0
 
 
 def surface_line(figures: dict[str, Any]) -> str:

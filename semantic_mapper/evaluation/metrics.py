@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from semantic_mapper.errors import ShapeError
 from semantic_mapper.labels import LabelSet
@@ -179,6 +178,8 @@ def nearest_labels(
         )
     if not len(from_xyz) or not len(at_xyz):
         return np.full(len(at_xyz), label_set.ignore_id, np.uint8)
+    from scipy.spatial import KDTree  # a machine that only trains and renders has no SciPy
+
     _, nearest = KDTree(from_xyz).query(at_xyz, distance_upper_bound=max_distance_m, workers=-1)
     return np.append(from_label, np.uint8(label_set.ignore_id))[nearest]  # no neighbour: index M
 
@@ -259,12 +260,25 @@ def calibration(confidence: Float32 | Float64, correct: NDArray[np.bool_], *, bi
         raise ShapeError("confidence must lie in [0, 1] and hold no NaN; give probabilities, not logits")
     index = np.clip(np.ceil(p * bins).astype(np.int64) - 1, 0, bins - 1)
     count = np.bincount(index, minlength=bins)
+    confidence_sum = np.bincount(index, weights=p, minlength=bins).astype(np.float64)
+    right = np.bincount(index, weights=correct.ravel(), minlength=bins).astype(np.float64)
+    return calibration_of_bins(count, confidence_sum, right)
+
+
+def calibration_of_bins(count: NDArray[np.int64], confidence_sum: Float64, right: Float64) -> Calibration:
+    """Calibration from sums a bin, which add up over images and data sets.
+
+    Args:
+        count: (B,) samples of each bin.
+        confidence_sum: (B,) sum of their confidences.
+        right: (B,) how many of them are right.
+    """
     filled = count > 0
-    empty = np.full(bins, np.nan)
-    mean_p = np.divide(np.bincount(index, weights=p, minlength=bins), count, out=empty.copy(), where=filled)
-    right = np.bincount(index, weights=correct.ravel().astype(np.float64), minlength=bins)
+    empty = np.full(len(count), np.nan)
+    mean_p = np.divide(confidence_sum, count, out=empty.copy(), where=filled)
     accuracy = np.divide(right, count, out=empty.copy(), where=filled)
-    ece = float((count[filled] * np.abs(accuracy - mean_p)[filled]).sum() / p.size) if p.size else None
+    total = int(count.sum())
+    ece = float((count[filled] * np.abs(accuracy - mean_p)[filled]).sum() / total) if total else None
     return Calibration(ece, mean_p, accuracy, count)
 
 

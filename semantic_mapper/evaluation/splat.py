@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from semantic_mapper.types import Float32, Float64, UInt8
 
@@ -135,6 +134,8 @@ def _spacing(xyz: Float64) -> float:
     """Typical distance of a point to its fourth neighbour, metres: the pitch of a surface sampled on a grid."""
     if len(xyz) < 5:
         return 0.05
+    from scipy.spatial import KDTree  # a machine that only trains and renders has no SciPy
+
     asking = xyz[:: max(1, len(xyz) // 500)]
     distances, _ = KDTree(xyz).query(asking, k=5)
     return float(np.percentile(distances[:, 4], 75))

@@ -1,0 +1,73 @@
+"""Options of ``semantic-mapper eval --suite``, and the settings that come of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+if TYPE_CHECKING:
+    from semantic_mapper.benchmark.config import SuiteConfig
+
+SuiteOption = Annotated[Literal["rooms"] | None, typer.Option(help="Run this benchmark; takes no DIR_OR_LOG.")]
+SplitOption = Annotated[Literal["test", "val"] | None, typer.Option(help="Suite: which rooms.  [default: test]")]
+RoomsOption = Annotated[
+    int | None, typer.Option(min=0, help="Suite: the first so many rooms of the split; 0 = all.  [default: 0]")
+]
+ProtocolOption = Annotated[
+    Literal["generalize", "finetune", "scratch"] | None,
+    typer.Option(help="Suite: weights as they are, fitted to each room, or random ones fitted.  [default: generalize]"),
+]
+ViewsOption = Annotated[int | None, typer.Option(min=1, max=16, help="Suite: source views of a query.  [default: 8]")]
+BaselineOption = Annotated[
+    Literal["wide", "narrow"] | None,
+    typer.Option(help="Suite, generalize: source views far from the query, or near it.  [default: narrow]"),
+]
+DepthOption = Annotated[
+    Literal["on", "off"] | None, typer.Option(help="Suite: whether the frames have sensor depth.  [default: on]")
+]
+TierOption = Annotated[
+    Literal["cpu", "gpu"] | None,
+    typer.Option(help="Suite: 160x120 and few samples, or 320x240 and many.  [default: cpu]"),
+]
+KeyframesOption = Annotated[
+    int | None, typer.Option(min=2, help="Suite, finetune and scratch: labelled keyframes a room.  [default: 12]")
+]
+StepsOption = Annotated[
+    int | None, typer.Option(min=0, help="Suite, finetune and scratch: steps a room instead of --seconds.")
+]
+SecondsOption = Annotated[
+    float | None,
+    typer.Option(min=0, help="Training time: of the U-Net baseline [300], of finetune and scratch a room [120]."),
+]
+MapOption = Annotated[bool, typer.Option("--map", help="Suite, generalize: also fuse each room and score the map.")]
+EvalConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="TOML file with settings of the mapper; with --suite, a SuiteConfig.")
+]
+
+
+def suite_config(path: Path | None, tier: Literal["cpu", "gpu"] | None, given: dict[str, Any]) -> SuiteConfig:
+    """Settings from a TOML file (None = defaults), with what the command line says on top.
+
+    Args:
+        path: Holds a ``SuiteConfig``.
+        tier: Replaces the file's.
+        given: Values of options by name, None = not given; ``keyframes``, ``seconds`` and ``steps`` go to ``scene``.
+
+    Raises:
+        ConfigError: a file or value that cannot be used.
+    """
+    from semantic_mapper.benchmark.config import TIERS, SuiteConfig
+    from semantic_mapper.config import convert_config, load_config, to_plain
+
+    plain = to_plain(load_config(path, SuiteConfig) if path else SuiteConfig())
+    if tier is not None:
+        plain["tier"] = to_plain(TIERS[tier])
+    given = {name: value for name, value in given.items() if value is not None}
+    if given.get("steps") and "seconds" not in given:
+        given["seconds"] = 0.0
+    for name, value in given.items():
+        section = plain["scene"] if name in ("keyframes", "seconds", "steps") else plain
+        section[name] = value == "on" if name == "depth" else value
+    return convert_config(plain, SuiteConfig, "command line")

@@ -1,0 +1,115 @@
+"""The map of a procedural room against the room itself: frames through the real pipeline, then labels at surfaces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from replay.session import load_pipeline
+from semantic_mapper.benchmark.config import MAP_WIDTH, SuiteConfig, camera_of_width, settings_digest
+from semantic_mapper.benchmark.records import MapRecord
+from semantic_mapper.benchmark.rooms import as_given
+from semantic_mapper.benchmark.scoring import as_rows
+from semantic_mapper.errors import MapError
+from semantic_mapper.evaluation.metrics import (
+    ConfusionMatrix,
+    confusion_of,
+    map_confusion,
+    metrics_per_image,
+    nearest_labels,
+)
+from semantic_mapper.geometry import transform, unproject
+from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, Scene, make_room, render_view, room_frames
+from semantic_mapper.types import Float32, Float64, UInt8
+
+NEAR_M = 0.05  # a map point this near to the true surface speaks for it
+TRUTH_VOXEL_M = 0.01  # the true surface is sampled this densely, where the camera saw it that densely
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueSurface:
+    """Points of a room's true surface that its camera has seen: xyz (N, 3) float32 metres, ids (N,) of ``ROOMS``."""
+
+    xyz: Float32
+    label: UInt8
+
+
+def map_room(seed: int, weights: Path, digest: str, suite: SuiteConfig) -> MapRecord:
+    """Fuse a room's sequence and compare the map's labels with those of the nearest true surface.
+
+    Args:
+        seed: Of the room.
+        weights: File that the pipeline runs on.
+        digest: Of the weights, for the record.
+        suite: Gives the number of frames, their spacing, whether they have depth, and the settings of the mapper.
+
+    Raises:
+        WeightsError: see ``load_pipeline``.
+        MapError: the map came out empty.
+    """
+    pipeline = load_pipeline(weights, suite.mapper).pipeline
+    camera = camera_of_width(MAP_WIDTH)
+    path = CameraPathConfig(step_m=suite.sequence.step_m)
+    scene = make_room(seed)
+    views: list[ConfusionMatrix] = []
+    poses: list[Float64] = []
+    for frame in room_frames(seed, suite.map_frames, camera, path=path, noise=NoiseConfig()):
+        label = in_rooms(pipeline.step(as_given(frame, depth=suite.depth)).label, pipeline.label_set)
+        assert frame.label is not None
+        views.append(confusion_of(frame.label, label, ROOMS, f"room {seed}, frame {frame.seq}"))
+        poses.append(frame.T_world_camera)
+    points = pipeline.voxel_map.points()
+    if not len(points.xyz):
+        raise MapError(f"room {seed}: none of its {suite.map_frames} frames could be fused; the map is empty")
+    return _compare(scene, points, pipeline.label_set, true_surface(scene, poses), views, digest, suite)
+
+
+def in_rooms(label: UInt8, label_set: LabelSet) -> UInt8:
+    """Ids of another label set as those of ``ROOMS`` with the same name; its ignore id where there is none."""
+    return ROOMS.to_ids(ROOMS.channel_map_from(label_set)[label])
+
+
+def true_surface(scene: Scene, poses: list[Float64]) -> TrueSurface:
+    """What a perfect camera at ``poses`` (each (4, 4)) sees of a room, one point a cubic centimetre."""
+    camera = camera_of_width(MAP_WIDTH)
+    xyz: list[Float32] = []
+    label: list[UInt8] = []
+    for T_world_camera in poses:
+        view = render_view(scene, camera, T_world_camera)
+        hit = view.depth_m > 0
+        xyz.append(transform(T_world_camera, unproject(view.depth_m, camera)[hit]).astype(np.float32))
+        label.append(view.label[hit])
+    points, labels = np.concatenate(xyz), np.concatenate(label)
+    cell = np.floor(points / TRUTH_VOXEL_M).astype(np.int64)
+    _, first = np.unique(cell @ np.array([1, 1 << 20, 1 << 40]), return_index=True)
+    return TrueSurface(points[first], labels[first])
+
+
+def _compare(
+    scene: Scene,
+    points: MapPoints,
+    label_set: LabelSet,
+    surface: TrueSurface,
+    views: list[ConfusionMatrix],
+    digest: str,
+    suite: SuiteConfig,
+) -> MapRecord:
+    label = in_rooms(points.label, label_set)
+    truth = nearest_labels(points.xyz, surface.xyz, surface.label, ROOMS, max_distance_m=NEAR_M)
+    at_surface = map_confusion(surface.xyz, surface.label, points.xyz, label, ROOMS, max_distance_m=NEAR_M)
+    return MapRecord(
+        settings=settings_digest(suite, "map"),
+        weights=digest,
+        room=scene.seed,
+        programme=scene.programme,
+        points=len(points.xyz),
+        on_surface=float((truth != ROOMS.ignore_id).mean()),
+        confusion=as_rows(confusion_of(truth, label, ROOMS, "map")),
+        surface_confusion=as_rows(at_surface),
+        view_confusion=as_rows(sum(views, ConfusionMatrix(ROOMS))),
+        view_miou=metrics_per_image(views).miou,
+    )

@@ -1,0 +1,126 @@
+"""Settings of a benchmark run. ``docs/protocols.md`` says what each protocol does."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Literal
+
+from semantic_mapper.config import Config, MapperConfig, SamplingConfig, to_plain
+from semantic_mapper.scenes import SUITE_VERSION, TEST_SEEDS, VALIDATION_SEEDS
+from semantic_mapper.types import CameraIntrinsics
+
+RECORD_VERSION = 1  # a change of what a record means raises it, so that older ones are made anew
+
+FOCAL_PER_WIDTH = 882.5 / 1280  # an OAK-D at 1280 pixels
+MAP_WIDTH = 320
+
+Split = Literal["test", "val"]
+Protocol = Literal["generalize", "finetune", "scratch"]
+Baseline = Literal["wide", "narrow"]
+Tier = Literal["cpu", "gpu"]
+
+
+class TierConfig(Config, frozen=True):
+    """Resolution and samples; ``cpu`` runs everywhere, ``gpu`` is the full size."""
+
+    width: int = 160  # pixels; height is three quarters of it
+    rays_per_chunk: int = 2048
+    guided: SamplingConfig = SamplingConfig()  # where depth is given
+    blind: SamplingConfig = SamplingConfig(guided=32, free_space=0)  # without: uniform in inverse depth
+
+
+TIERS: dict[Tier, TierConfig] = {
+    "cpu": TierConfig(),
+    "gpu": TierConfig(
+        width=320,
+        rays_per_chunk=8192,
+        guided=SamplingConfig(guided=16, free_space=2),
+        blind=SamplingConfig(mode="reference", coarse=64, fine=64, guided=64, free_space=0),  # 64 while fitting
+    ),
+}
+
+
+class SequenceConfig(Config, frozen=True):
+    """The walk through each room, and which of its frames are queries."""
+
+    frames: int = 80
+    step_m: float = 0.08  # way (a turn of 1 rad counts as 0.35 m) between frames
+    query_pairs: int = 2  # spread evenly over the sequence
+    pair_gap: int = 4  # the second view of a pair is so many frames on
+
+
+class SpacingConfig(Config, frozen=True):
+    """How far source views are from the query and from each other, in metres between camera centres."""
+
+    from_query_m: float = 0.0
+    to_query_m: float = float("inf")
+    apart_m: float = 0.0
+
+
+SPACINGS: dict[Baseline, SpacingConfig] = {
+    "narrow": SpacingConfig(from_query_m=0.05, to_query_m=0.5, apart_m=0.05),
+    "wide": SpacingConfig(from_query_m=0.5, apart_m=0.2),
+}
+
+
+class SceneBudget(Config, frozen=True):
+    """How a field is fitted to one room, for ``finetune`` and ``scratch``."""
+
+    keyframes: int = 12  # labelled
+    guard: int = 3  # frames on either side of a query that are no keyframes
+    labelled_sources: bool = True  # queries: give the keyframes' labels to fields that take labels of source views
+    seconds: float = 120.0  # wall clock; 0 = only steps count
+    steps: int = 0  # 0 = only seconds count
+    shares: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0)  # of the budget; each is a run of its own, a point of the curve
+
+
+class SuiteConfig(Config, frozen=True):
+    """A run of the benchmark."""
+
+    split: Split = "test"
+    rooms: int = 0  # the first so many of the split; 0 = all
+    protocol: Protocol = "generalize"
+    views: int = 8  # source views of a query
+    baseline: Baseline = "narrow"
+    depth: bool = True  # whether fields are given sensor depth
+    tier: TierConfig = TierConfig()
+    sequence: SequenceConfig = SequenceConfig()
+    scene: SceneBudget = SceneBudget()
+    map_frames: int = 40  # of a room that are mapped for the map-level figures
+    mapper: MapperConfig = MapperConfig()  # that they are mapped with
+    seed: int = 0
+
+
+def suite_seeds(suite: SuiteConfig) -> list[int]:
+    """Seeds of the rooms, in order."""
+    seeds = TEST_SEEDS if suite.split == "test" else VALIDATION_SEEDS
+    return list(seeds[: suite.rooms] if suite.rooms else seeds)
+
+
+def camera_of_width(width: int) -> CameraIntrinsics:
+    """The benchmark's camera: an OAK-D's field of view, 4:3."""
+    height = width * 3 // 4
+    focal = FOCAL_PER_WIDTH * width
+    return CameraIntrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
+
+
+def settings_digest(suite: SuiteConfig, part: Literal["views", "map"]) -> str:
+    """What tells records apart that were made in another way: 16 hex digits.
+
+    Which rooms are asked for plays no part, nor do settings that this part of the run does not look at.
+    """
+    plain = to_plain(suite)
+    for key in ("split", "rooms"):
+        del plain[key]
+    if part == "map":
+        plain = {key: plain[key] for key in ("depth", "map_frames", "mapper")} | {"step_m": suite.sequence.step_m}
+    else:
+        del plain["map_frames"], plain["mapper"]
+        if suite.protocol == "generalize":
+            del plain["scene"]
+            plain["spacing"] = repr(SPACINGS[suite.baseline])
+        else:
+            del plain["baseline"]
+    plain |= {"part": part, "suite_version": SUITE_VERSION, "record_version": RECORD_VERSION}
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]

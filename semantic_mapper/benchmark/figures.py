@@ -1,0 +1,119 @@
+"""Figures of a run from its records: one weights file alone, and two of them compared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from semantic_mapper.benchmark.records import CurvePoint, ImageRecord, MapRecord, RoomRecord
+from semantic_mapper.benchmark.scoring import from_rows
+from semantic_mapper.evaluation.bootstrap import paired_bootstrap
+from semantic_mapper.evaluation.consistency import Agreement
+from semantic_mapper.evaluation.depth_error import DepthErrors
+from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration_of_bins
+from semantic_mapper.labels import ROOMS
+
+
+def view_figures(records: Sequence[RoomRecord]) -> dict[str, Any]:
+    """All figures of one weights file over its rooms, as plain data; None where nothing could be measured."""
+    confusions = [from_rows(r.confusion) for r in records]
+    images = [image for r in records for image in r.images]
+    agreement = sum((Agreement(r.agreeing, r.compared) for r in records), Agreement())
+    depth = sum((DepthErrors(i.depth.relative_sum, i.depth.square_sum, i.depth.count) for i in images), DepthErrors())
+    return {
+        "rooms": len(records),
+        "images": len(images),
+        "data_set": asdict(_summed(confusions).metrics()),
+        "per_image": {
+            name: _mean([getattr(i, name) for i in images])
+            for name in ("miou", "total_accuracy", "average_accuracy", "coverage")
+        },
+        "psnr_db": _mean([i.psnr_db for i in images]),
+        "ssim": _mean([i.ssim for i in images]),
+        "depth_abs_rel": depth.abs_rel,
+        "depth_rmse_m": depth.rmse_m,
+        "ece": _ece(records),
+        "consistency": agreement.share,
+        "baseline_m": _mean([i.baseline_m for i in images]),
+        "seen": _mean([i.seen for i in images]),
+        "per_room_miou": {str(r.room): c.metrics().miou for r, c in zip(records, confusions, strict=True)},
+        "curve": _curve(records),
+        "seconds_to_95_percent": _seconds_to_most(_curve(records)),
+    }
+
+
+def map_figures(records: Sequence[MapRecord]) -> dict[str, Any]:
+    """Figures of the fused maps of one weights file over its rooms."""
+    at_points = [from_rows(r.confusion) for r in records]
+    return {
+        "rooms": len(records),
+        "map_miou": _summed(at_points).metrics().miou,
+        "surface_miou": _summed([from_rows(r.surface_confusion) for r in records]).metrics().miou,
+        "views_miou": _summed([from_rows(r.view_confusion) for r in records]).metrics().miou,
+        "map_miou_mean_of_rooms": _mean([c.metrics().miou for c in at_points]),
+        "view_miou_mean_of_rooms": _mean([r.view_miou for r in records]),
+        "on_surface": _mean([r.on_surface for r in records]),
+        "per_room": {
+            str(r.room): {"map_miou": c.metrics().miou, "view_miou": r.view_miou}
+            for r, c in zip(records, at_points, strict=True)
+        },
+    }
+
+
+def compare(first: Sequence[RoomRecord], second: Sequence[RoomRecord], *, seed: int = 0) -> dict[str, Any] | None:
+    """Difference in data-set mIoU, ``first`` minus ``second``, over the rooms of both; None for fewer than 2 rooms."""
+    others = {r.room: r for r in second}
+    both = [(r, others[r.room]) for r in first if r.room in others]
+    if len(both) < 2:
+        return None
+    a, b = ([from_rows(r.confusion) for r in side] for side in zip(*both, strict=True))
+    return asdict(paired_bootstrap(a, b, seed=seed))
+
+
+def _summed(confusions: Sequence[ConfusionMatrix]) -> ConfusionMatrix:
+    return sum(confusions, ConfusionMatrix(ROOMS))
+
+
+def _ece(records: Sequence[RoomRecord]) -> float | None:
+    if not records:
+        return None
+    count = np.array([r.calibration.count for r in records], np.int64)
+    confidence = np.array([r.calibration.confidence for r in records], np.float64)
+    right = np.array([r.calibration.right for r in records], np.float64)
+    return calibration_of_bins(count.sum(axis=0), confidence.sum(axis=0), right.sum(axis=0)).ece
+
+
+def _curve(records: Sequence[RoomRecord]) -> list[dict[str, Any]]:
+    """mIoU over all rooms against the mean seconds and steps that the fitting of a room took."""
+    shares = sorted({point.share for r in records for point in r.curve})
+    points: list[list[CurvePoint]] = [[p for r in records for p in r.curve if p.share == share] for share in shares]
+    return [
+        {
+            "share": share,
+            "seconds": round(float(np.mean([p.seconds for p in at])), 1),
+            "steps": round(float(np.mean([p.steps for p in at])), 1),
+            "miou": _summed([from_rows(p.confusion) for p in at]).metrics().miou,
+        }
+        for share, at in zip(shares, points, strict=True)
+    ]
+
+
+def _seconds_to_most(curve: Sequence[dict[str, Any]], most: float = 0.95) -> float | None:
+    """Seconds of the first point of the curve that reaches this share of its last mIoU; None without a curve."""
+    final = curve[-1]["miou"] if curve else None
+    if final is None:
+        return None
+    return next(p["seconds"] for p in curve if p["miou"] is not None and p["miou"] >= most * final)
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return float(np.mean(known)) if known else None
+
+
+def image_note(image: ImageRecord) -> str:
+    """What is said of one view in a picture."""
+    return "no truth" if image.miou is None else f"mIoU {100 * image.miou:.0f} %"

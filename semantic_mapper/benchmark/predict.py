@@ -1,0 +1,88 @@
+"""Whole query views rendered by any learned field."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from semantic_mapper.benchmark.config import TierConfig
+from semantic_mapper.config import SamplingConfig
+from semantic_mapper.fields.base import SemanticField
+from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.render import render_image
+from semantic_mapper.fields.sray import SRay
+from semantic_mapper.fields.sray_streaming import StreamingSRay, compiled_covers
+from semantic_mapper.imaging import fill_holes, resize_depth
+from semantic_mapper.labels import IGNORE_CHANNEL, ROOMS, LabelSet
+from semantic_mapper.training.views import stack_sources, to_device, view_from_frame
+from semantic_mapper.types import FieldRender, Float32, PosedFrame, UInt8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """A rendered query view.
+
+    Args:
+        label: (H, W) uint8 ids of ``labels.ROOMS``, its ignore id where unknown or where the field's class is none of
+            these.
+        confidence: (H, W) float32 probability of the field's most likely class.
+        rgb: (H, W, 3) float32 in [0, 1].
+        depth_m: (H, W) float32.
+        known: (H, W) bool.
+    """
+
+    label: UInt8
+    confidence: Float32
+    rgb: Float32
+    depth_m: Float32
+    known: NDArray[np.bool_]
+
+
+def predict_view(field: LearnedField, sources: Sequence[PosedFrame], query: PosedFrame, tier: TierConfig) -> Prediction:
+    """Render every pixel of the query view.
+
+    Args:
+        field: In evaluation mode, on the device to render on. Its ``sampling`` is set as the tier says.
+        sources: What the field may see: depth and labels (ids of the field's label set) only where they are given.
+        query: Gives pose, camera and, as the prior of guided sampling, its sensor depth with holes filled; a query
+            without depth is rendered with the tier's blind samples.
+        tier: Samples and chunk size.
+    """
+    device = next(field.parameters()).device
+    sampling = tier.blind if query.depth_m is None else tier.guided
+    views = [view_from_frame(frame, field.label_set, query.intrinsics.width) for frame in sources]
+    labelled = any(frame.label is not None for frame in sources)
+    renderer = _renderer(field, sampling, device)
+    with torch.inference_mode():
+        encoded = renderer.encode(to_device(stack_sources(views, with_labels=labelled), device))
+    prior = fill_holes(resize_depth(query, query.intrinsics))
+    chunk = tier.rays_per_chunk
+    render = render_image(renderer, encoded, query.intrinsics, query.T_world_camera, prior, sampling, chunk)
+    return _as_prediction(render, field.label_set, (query.intrinsics.height, query.intrinsics.width))
+
+
+def _renderer(field: LearnedField, sampling: SamplingConfig, device: torch.device) -> SemanticField:
+    """The compiled renderer for S-Ray where it covers the case (it gives the same answer), else the field itself."""
+    field.sampling = sampling
+    # Exactly this class: a kind derived from it renders in its own way.
+    if type(field) is SRay and device.type == "cpu" and sampling.mode == "streaming" and compiled_covers(field):
+        return StreamingSRay(field, sampling)
+    return field
+
+
+def _as_prediction(render: FieldRender, label_set: LabelSet, size: tuple[int, int]) -> Prediction:
+    confidence, channel = torch.softmax(render.logits.float(), dim=-1).max(dim=-1)
+    known = render.known.cpu().numpy()
+    own_ids = label_set.to_ids(np.where(known, channel.cpu().numpy(), IGNORE_CHANNEL))
+    label = ROOMS.to_ids(ROOMS.channel_map_from(label_set)[own_ids])
+    return Prediction(
+        label.reshape(size),
+        confidence.cpu().numpy().reshape(size),
+        render.rgb.float().clamp(0, 1).cpu().numpy().reshape(*size, 3),
+        render.depth_m.float().cpu().numpy().reshape(size),
+        known.reshape(size),
+    )

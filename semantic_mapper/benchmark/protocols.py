@@ -1,0 +1,216 @@
+"""One room by one field, under each protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from semantic_mapper.benchmark.config import SPACINGS, SpacingConfig, SuiteConfig, settings_digest
+from semantic_mapper.benchmark.predict import predict_view
+from semantic_mapper.benchmark.records import CurvePoint, RoomRecord
+from semantic_mapper.benchmark.rooms import BenchmarkRoom, as_given
+from semantic_mapper.benchmark.scoring import (
+    Answer,
+    as_rows,
+    image_record,
+    room_agreement,
+    room_calibration,
+    room_confusion,
+)
+from semantic_mapper.benchmark.views import choose_sources, needs_own_view
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.evaluation.metrics import ConfusionMatrix
+from semantic_mapper.fields.checkpoint import adapt_model
+from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.registry import build_field
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, finetune
+from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
+from semantic_mapper.training.step import StepConfig
+
+ANYWHERE = SpacingConfig()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoomResult:
+    """A room's record, and the query views behind it."""
+
+    record: RoomRecord
+    answers: dict[int, Answer]
+
+
+@dataclass(frozen=True, slots=True)
+class Contestant:
+    """A weights file under test: ``name`` heads its column, ``digest`` tells its bytes from others'."""
+
+    name: str
+    digest: str
+    field: LearnedField
+
+
+def run_room(
+    room: BenchmarkRoom,
+    contestant: Contestant,
+    suite: SuiteConfig,
+    on_fit: Callable[[float], None] | None = None,
+    stopped: Callable[[], object] = bool,
+) -> RoomResult | None:
+    """One room by one field, as ``suite.protocol`` says; None where it was stopped while it fitted.
+
+    Args:
+        on_fit: Told the share of the fitting that is done.
+        stopped: Asked before every step of the fitting; once it says so (anything true), the room is given up.
+
+    Raises:
+        ConfigError: a budget of nothing, or a room with too few frames.
+    """
+    if suite.protocol == "generalize":
+        field = contestant.field.eval()
+        return _scored(room, answer_queries(room, field, suite), contestant, suite)
+    return _fit_and_score(room, contestant, suite, on_fit, stopped)
+
+
+def answer_queries(room: BenchmarkRoom, field: LearnedField, suite: SuiteConfig) -> dict[int, Answer]:
+    """Render all query views from source views without labels, chosen by the baseline of the run."""
+    numbers = range(len(room.frames))
+    return {
+        q: _answer(room, field, suite, q, [n for n in numbers if n != q], SPACINGS[suite.baseline], labelled=False)
+        for q in room.queries
+    }
+
+
+def answer_from_keyframes(
+    room: BenchmarkRoom, field: LearnedField, suite: SuiteConfig, keyframes: Sequence[int]
+) -> dict[int, Answer]:
+    """Render all query views from the keyframes, whatever their distance: they are all that there is."""
+    labelled = suite.scene.labelled_sources
+    return {q: _answer(room, field, suite, q, keyframes, ANYWHERE, labelled=labelled) for q in room.queries}
+
+
+def choose_labelled(room: BenchmarkRoom, suite: SuiteConfig) -> list[int]:
+    """Frame numbers of the keyframes that are labelled: what shows most of the room, none of it near a query view.
+
+    Raises:
+        ConfigError: too few frames are left.
+    """
+    guard = suite.scene.guard
+    free = [n for n in range(len(room.frames)) if all(abs(n - q) > guard for q in room.queries)]
+    if len(free) < max(2, suite.scene.keyframes):
+        raise ConfigError(
+            f"{suite.scene.keyframes} keyframes are asked for; {len(free)} frames of the room are no query view and "
+            f"not within {guard} frames of one, and 2 are the least"
+        )
+    candidates = [candidate_from_frame(room.frames[n]) for n in free]
+    return [free[i] for i in choose_keyframes(candidates, suite.scene.keyframes, suite.seed)]
+
+
+def _answer(
+    room: BenchmarkRoom,
+    field: LearnedField,
+    suite: SuiteConfig,
+    query: int,
+    pool: Sequence[int],
+    spacing: SpacingConfig,
+    *,
+    labelled: bool,
+) -> Answer:
+    frames = room.frames
+    own = needs_own_view(field)
+    count = min(suite.views, len(pool)) - (1 if own else 0)
+    truth = room.truth[query]
+    sources = choose_sources(
+        frames[query].T_world_camera, truth.depth_m, [frames[n] for n in pool], max(1, count), spacing
+    )
+    chosen = [pool[i] for i in sources.numbers][:count]
+    given = [as_given(frames[n], depth=suite.depth, label=labelled) for n in chosen]
+    asked = as_given(frames[query], depth=suite.depth)
+    if own:  # last, where the mapping pipeline has the current view, too
+        given, chosen = [*given, asked], [*chosen, query]
+    return Answer(predict_view(field, given, asked, suite.tier), sources, tuple(chosen))
+
+
+def _fit_and_score(
+    room: BenchmarkRoom,
+    contestant: Contestant,
+    suite: SuiteConfig,
+    on_fit: Callable[[float], None] | None,
+    stopped: Callable[[], object],
+) -> RoomResult | None:
+    """Fit to the keyframes with growing shares of the budget; the whole budget gives the room's figures."""
+    if suite.scene.seconds <= 0 and suite.scene.steps <= 0:
+        raise ConfigError(f"protocol {suite.protocol} needs a budget: set seconds, steps, or both")
+    keyframes = choose_labelled(room, suite)
+    frames = [as_given(room.frames[n], depth=suite.depth, label=True) for n in keyframes]
+    field = _start(contestant.field, suite)
+    answers = answer_from_keyframes(room, field.eval(), suite, keyframes)
+    curve = [_curve_point(0.0, 0.0, 0, room_confusion(room, answers))]
+    device = next(field.parameters()).device
+    spent, whole = 0.0, sum(suite.scene.shares)
+    for share in sorted(suite.scene.shares):
+        start = _start(contestant.field, suite)
+        progress = _progress(on_fit, spent, share, whole)
+        fitted = finetune(frames, ROOMS, start, _fit_config(suite, share), progress, stopped)
+        if stopped():
+            return None
+        answers = answer_from_keyframes(room, fitted.model.to(device).eval(), suite, keyframes)
+        recipe = fitted.recipe
+        curve.append(_curve_point(share, float(recipe["seconds"]), int(recipe["steps"]), room_confusion(room, answers)))
+        spent += share
+    return _scored(room, answers, contestant, suite, tuple(keyframes), tuple(curve))
+
+
+def _progress(
+    on_fit: Callable[[float], None] | None, spent: float, share: float, whole: float
+) -> Callable[[FinetuneProgress], None] | None:
+    """What one of the runs of the curve tells of itself, as a share of all of them."""
+    return None if on_fit is None else lambda p: on_fit((spent + p.fraction * share) / whole)
+
+
+def _start(field: LearnedField, suite: SuiteConfig) -> LearnedField:
+    """A copy to start from: the field's own weights in the classes of the rooms, or random ones of its shape."""
+    torch.manual_seed(suite.seed)
+    if suite.protocol == "finetune":
+        return adapt_model(field, ROOMS)
+    return build_field(field.kind, field.config, ROOMS, field.sampling).to(next(field.parameters()).device)
+
+
+def _fit_config(suite: SuiteConfig, share: float) -> FinetuneConfig:
+    scene = suite.scene
+    return FinetuneConfig(
+        seconds=scene.seconds * share,
+        steps=max(1, round(scene.steps * share)) if scene.steps else 0,
+        width=suite.tier.width,
+        step=StepConfig(sampling=suite.tier.guided if suite.depth else suite.tier.blind),
+        seed=suite.seed,
+    )
+
+
+def _curve_point(share: float, seconds: float, steps: int, confusion: ConfusionMatrix) -> CurvePoint:
+    return CurvePoint(share=share, seconds=seconds, steps=steps, confusion=as_rows(confusion))
+
+
+def _scored(
+    room: BenchmarkRoom,
+    answers: dict[int, Answer],
+    contestant: Contestant,
+    suite: SuiteConfig,
+    keyframes: tuple[int, ...] = (),
+    curve: tuple[CurvePoint, ...] = (),
+) -> RoomResult:
+    agreement = room_agreement(room, answers)
+    record = RoomRecord(
+        settings=settings_digest(suite, "views"),
+        weights=contestant.digest,
+        room=room.seed,
+        programme=room.programme,
+        confusion=as_rows(room_confusion(room, answers)),
+        images=tuple(image_record(q, answer, room.truth[q]) for q, answer in answers.items()),
+        calibration=room_calibration(room, answers),
+        agreeing=agreement.agreeing,
+        compared=agreement.compared,
+        keyframes=keyframes,
+        curve=curve,
+    )
+    return RoomResult(record, answers)

@@ -1,0 +1,80 @@
+"""What is kept of a room, as plain data: everything that the figures of a whole run are computed from."""
+
+from __future__ import annotations
+
+from semantic_mapper.config import Config
+
+
+class DepthRecord(Config, frozen=True):
+    """``evaluation.depth_error.DepthErrors`` as data."""
+
+    relative_sum: float
+    square_sum: float
+    count: int
+
+
+class ImageRecord(Config, frozen=True):
+    """One query view. Figures in 0..1, None where nothing could be compared."""
+
+    frame: int
+    sources: tuple[int, ...]  # frame numbers
+    baseline_m: float  # mean distance of the source cameras
+    seen: float  # share of the query's surface that some source view sees
+    miou: float | None
+    total_accuracy: float | None
+    average_accuracy: float | None
+    coverage: float | None
+    psnr_db: float | None  # None where the field was shown this very image
+    ssim: float | None
+    depth: DepthRecord
+
+
+class CalibrationRecord(Config, frozen=True):
+    """Sums by bin of confidence, over the pixels with truth and prediction."""
+
+    count: tuple[int, ...]
+    confidence: tuple[float, ...]
+    right: tuple[float, ...]
+
+
+class CurvePoint(Config, frozen=True):
+    """Where a share of the budget leads. Share 0 is the start."""
+
+    share: float
+    seconds: float
+    steps: int
+    confusion: tuple[tuple[int, ...], ...]
+
+
+class RoomRecord(Config, frozen=True, tag_field="record", tag="views"):
+    """The query views of one room by one weights file. Confusions are (L, L + 1) of ``labels.ROOMS``."""
+
+    settings: str  # digest
+    weights: str  # digest
+    room: int
+    programme: str
+    confusion: tuple[tuple[int, ...], ...]
+    images: tuple[ImageRecord, ...]
+    calibration: CalibrationRecord
+    agreeing: int  # of the pixels of one query view that are found again in its neighbour
+    compared: int
+    keyframes: tuple[int, ...] = ()  # that the field was fitted to
+    curve: tuple[CurvePoint, ...] = ()
+
+
+class MapRecord(Config, frozen=True, tag_field="record", tag="map"):
+    """The fused map of one room by one weights file. Confusions are (L, L + 1) of ``labels.ROOMS``."""
+
+    settings: str
+    weights: str
+    room: int
+    programme: str
+    points: int  # of the map's surface
+    on_surface: float  # share of them near the true surface
+    confusion: tuple[tuple[int, ...], ...]  # at the map's own points
+    surface_confusion: tuple[tuple[int, ...], ...]  # at points of the true surface; holes count as wrong
+    view_confusion: tuple[tuple[int, ...], ...]  # of the frames' rendered labels
+    view_miou: float | None  # mean of the frames' own mIoU
+
+
+Record = RoomRecord | MapRecord

@@ -1,0 +1,126 @@
+"""A run of the benchmark: room by room, every contestant, each result on disk before the next begins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import structlog
+
+from semantic_mapper.benchmark.config import SuiteConfig, settings_digest, suite_seeds
+from semantic_mapper.benchmark.figures import image_note
+from semantic_mapper.benchmark.protocols import Contestant, RoomResult, run_room
+from semantic_mapper.benchmark.records import RoomRecord
+from semantic_mapper.benchmark.rooms import BenchmarkRoom, make_benchmark_room
+from semantic_mapper.benchmark.store import RecordStore
+from semantic_mapper.evaluation.sheet import SheetRow
+
+_log = structlog.get_logger(__name__)
+
+SHEET_ROWS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """``done`` of ``total`` pairs of room and contestant; ``note`` says what is being done."""
+
+    done: float
+    total: int
+    note: str
+
+
+def run_suite(
+    suite: SuiteConfig,
+    contestants: Sequence[Contestant],
+    store: RecordStore,
+    pictures: Path,
+    on_progress: Callable[[Progress], None],
+    stopped: Callable[[], object] = bool,
+) -> None:
+    """Make the records that are missing in ``store``, and beside them a picture of each room's first query view.
+
+    Args:
+        suite: What to run.
+        contestants: Which fields.
+        store: Records that are there are kept and not made again.
+        pictures: Folder for the label images of ``sheet_rows``.
+        on_progress: Told of every step.
+        stopped: Asked before each room, contestant and step of a fitting; once it says so (anything true), the run
+            ends. A room that is not done by then leaves no record.
+    """
+    settings, seeds = settings_digest(suite, "views"), suite_seeds(suite)
+    total, done = len(seeds) * len(contestants), 0
+    for seed in seeds:
+        missing = [c for c in contestants if store.find(RoomRecord, settings, c.digest, seed) is None]
+        done += len(contestants) - len(missing)
+        on_progress(Progress(done, total, f"room {seed}"))
+        room = make_benchmark_room(seed, suite) if missing and not stopped() else None
+        for contestant in missing:
+            if room is None or stopped():
+                return
+            name = contestant.name
+            result = run_room(
+                room,
+                contestant,
+                suite,
+                lambda share, at=done, name=name: on_progress(Progress(at + share, total, f"fit {name}")),
+                stopped,
+            )
+            if result is None:
+                return
+            _keep_picture(pictures, room, result)
+            store.add(result.record)
+            done += 1
+            miou = np.mean([i.miou for i in result.record.images if i.miou is not None] or [np.nan])
+            _log.debug("room_scored", room=seed, weights=name, miou=round(float(miou), 3))
+            on_progress(Progress(done, total, f"room {seed}, {name}"))
+
+
+def room_records(suite: SuiteConfig, contestant: Contestant, store: RecordStore) -> list[RoomRecord]:
+    """The records of a contestant that are there, in the order of the split."""
+    settings = settings_digest(suite, "views")
+    found = (store.find(RoomRecord, settings, contestant.digest, seed) for seed in suite_seeds(suite))
+    return [record for record in found if record is not None]
+
+
+def sheet_rows(
+    suite: SuiteConfig, contestants: Sequence[Contestant], store: RecordStore, pictures: Path
+) -> list[SheetRow]:
+    """Up to six rooms of the run for the contact sheet, evenly spread; those whose pictures are gone are left out."""
+    settings = settings_digest(suite, "views")
+    rows: list[SheetRow] = []
+    seeds = suite_seeds(suite)
+    for at in np.linspace(0, len(seeds) - 1, min(SHEET_ROWS, len(seeds))).round():
+        seed = seeds[int(at)]
+        labels, notes = {}, {}
+        name, rgb, truth = "", None, None
+        for contestant in contestants:
+            record = store.find(RoomRecord, settings, contestant.digest, seed)
+            path = _picture_path(pictures, settings, contestant.digest, seed)
+            if record is None or not path.exists():
+                continue
+            with np.load(path) as data:
+                rgb, truth, labels[contestant.name] = data["rgb"], data["truth"], data["label"]
+            name = f"room {seed} ({record.programme}), frame {record.images[0].frame}"
+            notes[contestant.name] = image_note(record.images[0])
+        if rgb is not None and truth is not None:
+            rows.append(SheetRow(name, rgb, truth, labels, notes))
+    return rows
+
+
+def _keep_picture(pictures: Path, room: BenchmarkRoom, result: RoomResult) -> None:
+    pictures.mkdir(parents=True, exist_ok=True)
+    query, answer = next(iter(result.answers.items()))
+    record = result.record
+    np.savez_compressed(
+        _picture_path(pictures, record.settings, record.weights, room.seed),
+        rgb=room.frames[query].rgb,
+        truth=room.truth[query].label,
+        label=answer.prediction.label,
+    )
+
+
+def _picture_path(pictures: Path, settings: str, weights: str, room: int) -> Path:
+    return pictures / f"{room}-{settings}-{weights}.npz"

@@ -1,0 +1,103 @@
+"""Which frames a query view is rendered from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.benchmark.config import SpacingConfig
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.geometry import invert_pose, transform, unproject
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
+
+PROBE_WIDTH = 40  # pixels a row of the query that are asked what another view sees of them
+SAME_SURFACE = 0.05  # share of z; sensor noise and rounding to pixels come together
+
+
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """The chosen source views of a query.
+
+    Args:
+        numbers: Positions among the candidates, the most useful first.
+        distance_m: Mean distance between their camera centres and the query's.
+        seen: Share of the query's surface that at least one of them sees.
+    """
+
+    numbers: tuple[int, ...]
+    distance_m: float
+    seen: float
+
+
+def needs_own_view(field: LearnedField) -> bool:
+    """Whether a kind of field cannot answer without the image of the very view it renders (a per-image network).
+
+    Such a kind sets a class attribute ``needs_own_view = True``; for all others the query is never a source view.
+    """
+    return bool(getattr(field, "needs_own_view", False))
+
+
+def choose_sources(
+    query_pose: Float64,
+    query_depth_m: Float32,
+    candidates: Sequence[PosedFrame],
+    count: int,
+    spacing: SpacingConfig,
+) -> Sources:
+    """The ``count`` frames that see most of what the query sees, among those that keep the distances of ``spacing``.
+
+    Where too few do, the distance to each other is given up first, then those to the query. The choice looks at depth
+    and poses alone, whatever the field is given, so that every field and every setting of depth gets the same views.
+
+    Args:
+        query_pose: (4, 4) T_world_camera.
+        query_depth_m: (H, W) exact z of the query view.
+        candidates: Frames of one size, the query not among them; each with its sensor depth.
+        count: How many to choose.
+
+    Raises:
+        ConfigError: fewer candidates than ``count``.
+    """
+    if len(candidates) < count:
+        raise ConfigError(f"{count} source views are asked for, the room has {len(candidates)} frames to choose from")
+    points = _surface_points(query_pose, query_depth_m, candidates[0].intrinsics)
+    seen = [_sees(frame, points) for frame in candidates]
+    share = np.array([s.mean() if len(s) else 0.0 for s in seen])
+    centre = np.stack([frame.T_world_camera[:3, 3] for frame in candidates])
+    away = np.linalg.norm(centre - query_pose[:3, 3], axis=1)
+    order = [int(i) for i in np.lexsort((np.arange(len(share)), away, -share))]
+    chosen: list[int] = []
+    for rule in (spacing, msgspec.structs.replace(spacing, apart_m=0.0), SpacingConfig()):
+        for i in order:
+            fits = rule.from_query_m <= away[i] <= rule.to_query_m
+            crowded = any(float(np.linalg.norm(centre[i] - centre[j])) < rule.apart_m for j in chosen)
+            if len(chosen) < count and i not in chosen and fits and not crowded:
+                chosen.append(i)
+    together = np.any([seen[i] for i in chosen], axis=0) if len(points) else np.zeros(1)
+    return Sources(tuple(chosen), float(away[chosen].mean()), float(together.mean()))
+
+
+def _surface_points(pose: Float64, depth_m: Float32, intrinsics: CameraIntrinsics) -> Float64:
+    """World points (N, 3) of a thinned-out depth image."""
+    step = max(1, intrinsics.width // PROBE_WIDTH)
+    points = unproject(depth_m, intrinsics)[step // 2 :: step, step // 2 :: step].reshape(-1, 3)
+    return transform(pose, points[points[:, 2] > 0])
+
+
+def _sees(frame: PosedFrame, points: Float64) -> NDArray[np.bool_]:
+    """(N,): the point lies in the image, and its depth is what the sensor measured there."""
+    assert frame.depth_m is not None
+    k = frame.intrinsics
+    p = transform(invert_pose(frame.T_world_camera), points)
+    z = np.maximum(p[:, 2], 1e-3)
+    u, v = np.rint(k.fx * p[:, 0] / z + k.cx), np.rint(k.fy * p[:, 1] / z + k.cy)
+    inside = (p[:, 2] > 0.05) & (u >= 0) & (u < k.width) & (v >= 0) & (v < k.height)
+    row, column = np.where(inside, v, 0).astype(np.int64), np.where(inside, u, 0).astype(np.int64)
+    measured = frame.depth_m[row, column]
+    # A hole of the sensor hides nothing from the colour image.
+    return inside & ((measured <= 0) | (np.abs(measured - p[:, 2]) < SAME_SURFACE * z))

@@ -1,0 +1,162 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from semantic_mapper.benchmark.config import SuiteConfig
+from semantic_mapper.benchmark.figures import view_figures
+from semantic_mapper.benchmark.predict import predict_view
+from semantic_mapper.benchmark.protocols import (
+    Contestant,
+    RoomResult,
+    answer_from_keyframes,
+    choose_labelled,
+    run_room,
+)
+from semantic_mapper.benchmark.rooms import as_given
+from semantic_mapper.benchmark.scoring import from_rows
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.sray import SRay
+from semantic_mapper.labels import ROOMS, make_label_set
+from semantic_mapper.types import SourceViews
+from tests.benchmark.tiny import tiny_contestant, tiny_room, tiny_suite
+from tests.small import tiny_field
+
+
+class Watched(SRay):
+    """Remembers what it was given."""
+
+    kind = "sray"
+
+    def encode(self, views: SourceViews):
+        self.seen = views
+        return super().encode(views)
+
+
+class OwnView(Watched):
+    needs_own_view = True
+
+
+def watched(kind: type[Watched] = Watched) -> Watched:
+    field = tiny_field()
+    copy = kind(field.config, ROOMS).eval()
+    copy.load_state_dict(field.state_dict())
+    return copy
+
+
+def score(contestant: Contestant, suite: SuiteConfig, on_fit: Callable[[float], None] | None = None) -> RoomResult:
+    result = run_room(tiny_room(), contestant, suite, on_fit)
+    assert result is not None
+    return result
+
+
+def test_generalizing_scores_whole_views_from_sources_that_are_not_the_query() -> None:
+    room = tiny_room()
+    record = score(tiny_contestant(), tiny_suite()).record
+    assert [i.frame for i in record.images] == [6, 8]
+    assert all(len(i.sources) == 3 and i.frame not in i.sources for i in record.images)
+    labelled = sum(int((t.label != ROOMS.ignore_id).sum()) for t in room.truth.values())
+    assert from_rows(record.confusion).metrics().pixels == labelled
+    assert record.compared > 100 and 0 <= record.agreeing <= record.compared
+    assert sum(record.calibration.count) <= labelled
+    assert not record.curve and not record.keyframes
+
+
+def test_the_query_is_a_source_only_of_a_kind_that_needs_it() -> None:
+    record = score(Contestant("own", "own", watched(OwnView)), tiny_suite()).record
+    assert all(len(i.sources) == 3 and i.sources[-1] == i.frame for i in record.images)
+    figures = view_figures([record])
+    assert figures["psnr_db"] is None and figures["ssim"] is None  # it could just repeat the image
+
+
+def test_without_depth_nothing_of_it_reaches_the_field() -> None:
+    field = watched()
+    score(Contestant("blind", "blind", field), tiny_suite(depth=False))
+    assert not field.seen.depth_m.any() and field.seen.channel is None
+    assert field.sampling == tiny_suite().tier.blind
+    score(Contestant("seeing", "seeing", field), tiny_suite())
+    assert field.seen.depth_m.any() and field.sampling == tiny_suite().tier.guided
+
+
+def test_without_depth_coarse_samples_may_guide_fine_ones() -> None:
+    tier = {"width": 48, "blind": {"mode": "reference", "coarse": 6, "fine": 4}}
+    record = score(tiny_contestant(), tiny_suite(depth=False, tier=tier)).record
+    uniform = score(tiny_contestant(), tiny_suite(depth=False)).record
+    assert record.images[0].depth.count > 0 and record.settings != uniform.settings
+    assert record.images[0].depth != uniform.images[0].depth
+
+
+def test_the_compiled_renderer_gives_the_figures_of_the_field_itself() -> None:
+    fast, plain = (score(Contestant("x", "x", f), tiny_suite()) for f in (tiny_field(), watched()))
+    for query, answer in fast.answers.items():
+        other = plain.answers[query].prediction
+        np.testing.assert_allclose(answer.prediction.confidence, other.confidence, atol=1e-4)
+        assert (answer.prediction.label == other.label).mean() > 0.999
+
+
+def test_labels_of_another_set_are_compared_by_name() -> None:
+    two = make_label_set("two", ["curb", "wall"], ids=[7, 9], ignore_id=255)
+    field = tiny_field(two)
+    with torch.no_grad():
+        field.classifier.weight.zero_()
+        field.classifier.bias.copy_(torch.tensor([-9.0, 9.0]))
+    room = tiny_room()
+    frames = [as_given(room.frames[n], depth=True) for n in (5, 7)]
+    query = as_given(room.frames[6], depth=True)
+    wall = ROOMS.ids[ROOMS.names.index("wall")]
+    found = predict_view(field, frames, query, tiny_suite().tier)
+    assert set(np.unique(found.label[found.known])) == {wall}
+    with torch.no_grad():
+        field.classifier.bias.copy_(torch.tensor([9.0, -9.0]))
+    assert set(np.unique(predict_view(field, frames, query, tiny_suite().tier).label)) == {ROOMS.ignore_id}
+
+
+def test_keyframes_are_no_queries_and_not_next_to_one() -> None:
+    chosen = choose_labelled(tiny_room(), tiny_suite())
+    assert len(chosen) == 3 and not set(chosen) & {5, 6, 7, 8, 9}
+    with pytest.raises(ConfigError, match="9 keyframes are asked for"):
+        choose_labelled(tiny_room(), tiny_suite(scene={"keyframes": 9, "guard": 2}))
+
+
+def test_fitting_gives_a_curve_and_renders_from_the_labelled_keyframes() -> None:
+    suite = tiny_suite(protocol="finetune")
+    told: list[float] = []
+    record = score(tiny_contestant(), suite, told.append).record
+    assert [p.share for p in record.curve] == [0, 0.5, 1.0]
+    assert [p.steps for p in record.curve] == [0, 1, 2]
+    assert record.curve[-1].confusion == record.confusion
+    assert all(set(i.sources) <= set(record.keyframes) for i in record.images)
+    assert told == sorted(told) and told[-1] == pytest.approx(1)
+    figures = view_figures([record])
+    assert [p["steps"] for p in figures["curve"]] == [0, 1, 2]
+
+
+def test_labels_of_the_keyframes_can_be_kept_from_the_queries() -> None:
+    field = watched()
+    for given in (True, False):
+        suite = tiny_suite(scene={"labelled_sources": given})
+        answer_from_keyframes(tiny_room(), field, suite, [0, 2, 12])
+        assert (field.seen.channel is not None) == given
+
+
+def test_scratch_starts_from_random_weights_whatever_the_file_holds() -> None:
+    suite = tiny_suite(protocol="scratch")
+    first, second = (score(tiny_contestant(seed), suite).record for seed in (0, 1))
+    assert first.confusion == second.confusion
+    tuned = [score(tiny_contestant(s), tiny_suite(protocol="finetune")).record for s in (0, 1)]
+    assert tuned[0].curve[0].confusion != tuned[1].curve[0].confusion
+
+
+def test_a_fitting_that_is_stopped_gives_no_figures() -> None:
+    steps: list[float] = []
+    suite = tiny_suite(protocol="finetune", scene={"keyframes": 3, "guard": 1, "seconds": 0, "steps": 50})
+    assert run_room(tiny_room(), tiny_contestant(), suite, steps.append, lambda: len(steps) >= 2) is None
+    assert len(steps) == 2
+
+
+def test_a_budget_of_nothing_is_refused() -> None:
+    with pytest.raises(ConfigError, match="needs a budget"):
+        score(tiny_contestant(), tiny_suite(protocol="scratch", scene={"seconds": 0, "steps": 0}))

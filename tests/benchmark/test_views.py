@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from semantic_mapper.benchmark.config import SpacingConfig
+from semantic_mapper.benchmark.views import choose_sources, needs_own_view
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.sray import SRay
+from semantic_mapper.types import CameraIntrinsics, PosedFrame
+from tests.small import tiny_field
+
+CAMERA = CameraIntrinsics(40.0, 40.0, 23.5, 15.5, 48, 32)
+WALL = np.full((32, 48), 2.0, np.float32)  # 2 m ahead, 2.4 m wide
+
+
+def frame(x: float, *, turned: bool = False) -> PosedFrame:
+    """A camera ``x`` metres to the right that looks at the wall, or away from it."""
+    T = np.eye(4)
+    if turned:
+        T[0, 0] = T[2, 2] = -1
+    T[0, 3] = x
+    rgb = np.zeros((32, 48, 3), np.uint8)
+    return PosedFrame(0, 0, "test", rgb, WALL, None, CAMERA, T)
+
+
+def choose(candidates: list[PosedFrame], count: int, from_query_m: float, apart_m: float):
+    return choose_sources(np.eye(4), WALL, candidates, count, SpacingConfig(from_query_m=from_query_m, apart_m=apart_m))
+
+
+def test_narrow_views_are_near_even_where_farther_ones_see_more() -> None:
+    back = frame(0.3)
+    back.T_world_camera[2, 3] = -2.0  # sees the whole wall from 4 m
+    far = dataclasses.replace(back, depth_m=np.full_like(WALL, 4.0))
+    assert choose([far, frame(0.4)], 1, 0.0, 0.0).numbers == (0,)
+    bounded = choose_sources(np.eye(4), WALL, [far, frame(0.4)], 1, SpacingConfig(to_query_m=0.5))
+    assert bounded.numbers == (1,)
+
+
+def test_near_views_are_those_that_see_most() -> None:
+    candidates = [frame(1.0), frame(0.1), frame(0.0, turned=True), frame(0.3)]
+    found = choose(candidates, 2, 0.0, 0.0)
+    assert found.numbers == (1, 3)
+    assert found.distance_m == pytest.approx(0.2)
+    assert 0.8 < found.seen <= 1
+
+
+def test_wide_views_keep_their_distance_from_the_query_and_from_each_other() -> None:
+    candidates = [frame(x) for x in (0.1, 0.2, 0.5, 0.55, 0.75, -0.6)]
+    found = choose(candidates, 3, 0.5, 0.2)
+    assert set(found.numbers) == {2, 5, 4}
+
+
+def test_distances_are_given_up_where_too_few_views_keep_them() -> None:
+    candidates = [frame(x) for x in (0.1, 0.5, 0.55)]
+    assert choose(candidates, 2, 0.5, 0.2).numbers == (1, 2)
+    assert choose(candidates, 3, 0.5, 0.2).numbers == (1, 2, 0)
+
+
+def test_sensor_holes_hide_nothing() -> None:
+    blind = dataclasses.replace(frame(0.1), depth_m=np.zeros_like(WALL))
+    assert choose([blind, frame(0.3)], 1, 0.0, 0.0).numbers == (0,)
+
+
+def test_more_views_than_frames_are_refused() -> None:
+    with pytest.raises(ConfigError, match="3 source views"):
+        choose([frame(0.1)], 3, 0.0, 0.0)
+
+
+def test_only_a_kind_that_says_so_gets_its_own_view() -> None:
+    class OwnView(SRay):
+        needs_own_view = True
+
+    field = tiny_field()
+    assert not needs_own_view(field)
+    assert needs_own_view(OwnView(field.config, field.label_set))

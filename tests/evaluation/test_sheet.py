@@ -1,0 +1,50 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import SemanticMapperError
+from semantic_mapper.evaluation.canvas import UNKNOWN
+from semantic_mapper.evaluation.sheet import SheetRow, draw_sheet, write_picture
+from semantic_mapper.labels import ROOMS
+
+WALL, BED = (ROOMS.ids[ROOMS.names.index(n)] for n in ("wall", "bed"))
+
+
+def row(**labels: np.ndarray) -> SheetRow:
+    truth = np.full((24, 32), WALL, np.uint8)
+    return SheetRow("room 1", np.full((24, 32, 3), 90, np.uint8), truth, labels, dict.fromkeys(labels, "mIoU 50 %"))
+
+
+def shows(picture: np.ndarray, color: tuple[int, int, int]) -> float:
+    return float((np.abs(picture.astype(int) - color).max(axis=-1) < 3).mean())
+
+
+def test_each_method_has_a_column_and_a_missing_one_stays_empty() -> None:
+    bed = np.full((24, 32), BED, np.uint8)
+    sheet = draw_sheet([row(a=bed), row(a=bed, b=bed)], ["a", "b"], ROOMS, title="sheet")
+    one = draw_sheet([row(a=bed)], ["a"], ROOMS, title="sheet")
+    assert sheet.shape[1] > one.shape[1] and sheet.shape[0] > one.shape[0]
+    tile = 320 * 240
+    assert shows(sheet, ROOMS.colors[ROOMS.names.index("bed")]) * sheet[..., 0].size >= 3 * tile
+    assert shows(sheet, ROOMS.colors[ROOMS.names.index("wall")]) * sheet[..., 0].size >= 2 * tile
+    assert shows(sheet, UNKNOWN) * sheet[..., 0].size < 200
+
+
+def test_unknown_is_grey_and_in_the_legend() -> None:
+    unknown = np.full((24, 32), ROOMS.ignore_id, np.uint8)
+    sheet = draw_sheet([row(a=unknown)], ["a"], ROOMS, title="sheet")
+    assert shows(sheet, UNKNOWN) * sheet[..., 0].size > 320 * 240
+
+
+def test_the_picture_is_written_or_says_why_not(tmp_path: Path) -> None:
+    sheet = draw_sheet([row()], [], ROOMS, title="sheet")
+    path = tmp_path / "new" / "sheet.png"
+    write_picture(path, sheet)
+    np.testing.assert_array_equal(cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB), sheet)
+    (tmp_path / "file").touch()
+    with pytest.raises(SemanticMapperError, match="cannot be written"):
+        write_picture(tmp_path / "file" / "sheet.png", sheet)

@@ -1,0 +1,104 @@
+"""``eval --suite``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
+from tests.nodes.support import error_line, run
+from tests.small import tiny_field
+
+CONFIG = """
+split = "val"
+views = 3
+map_frames = 2
+[tier]
+width = 48
+guided = { guided = 4, free_space = 0 }
+[sequence]
+frames = 14
+query_pairs = 1
+pair_gap = 2
+[scene]
+keyframes = 3
+guard = 1
+shares = [1.0]
+[mapper]
+render = { encode_width = 48, scale = 0.125 }
+voxel_map = { voxel_size_m = 0.05, initial_blocks = 400 }
+"""
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("suite") / "suite.toml"
+    path.write_text(CONFIG, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("two")
+    paths = folder / "first.safetensors", folder / "second.safetensors"
+    for seed, path in enumerate(paths):
+        save_checkpoint(Checkpoint(tiny_field(seed=seed), (), {"width": 48}), path)
+    return paths
+
+
+def test_weights_side_by_side_with_maps_and_a_second_call_that_continues(
+    suite: Path, two: tuple[Path, Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "runs" / "ab.json"
+    common = ("eval", "--suite", "rooms", "--config", suite, "--json", out)
+    first = run(*common, "--weights", two[0], "--rooms", "1", "--map")
+    assert first.returncode == 0, first.stderr
+    records = out.with_suffix(".jsonl").read_text().splitlines()
+    assert len(records) == 2 and "map: mIoU of its points" in first.stdout
+    both = run(*common, "--weights", two[0], "--weights", two[1], "--rooms", "2")
+    assert both.returncode == 0, both.stderr
+    lines = out.with_suffix(".jsonl").read_text().splitlines()
+    assert lines[:2] == records and len(lines) == 5
+    assert "first minus second" in both.stdout and "95 % interval" in both.stdout
+    found = json.loads(out.read_text())
+    assert found["complete"] and list(found["weights"]) == ["first", "second"]
+    assert found["weights"]["first"]["figures"]["rooms"] == 2 and found["weights"]["first"]["map"] is None
+    assert found["differences"][0]["scenes"] == 2
+    assert out.with_suffix(".png").stat().st_size > 1000
+
+
+def test_fitting_shows_its_curve(suite: Path, two: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "fit.json"
+    options = ("--protocol", "scratch", "--steps", "2", "--rooms", "1", "--depth", "off", "--baseline", "wide")
+    done = run("eval", "--suite", "rooms", "--config", suite, "--weights", two[0], *options, "--json", out)
+    assert done.returncode == 0, done.stderr
+    assert "mIoU before fitting" in done.stdout and "2 steps" in done.stdout
+    written = json.loads(out.read_text())
+    assert written["suite"]["scene"]["seconds"] == 0 and not written["suite"]["depth"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("log.mcap", "--suite", "rooms"),
+        ("log.mcap", "--rooms", "2"),
+        ("log.mcap", "--weights", "a", "--weights", "b"),
+        ("--suite", "klevr"),
+        ("--suite", "rooms", "--protocol", "finetune", "--map"),
+        ("--suite", "rooms", "--views", "17"),
+    ],
+)
+def test_options_that_do_not_go_together_are_wrong_usage(arguments: tuple[str, ...]) -> None:
+    done = run("eval", *arguments)
+    assert done.returncode == 2, done.stderr
+    assert "Usage: semantic-mapper" in done.stderr
+
+
+def test_an_unknown_setting_names_the_nearest_one(tmp_path: Path) -> None:
+    path = tmp_path / "suite.toml"
+    path.write_text("veiws = 3\n", encoding="utf-8")
+    done = run("eval", "--suite", "rooms", "--config", path)
+    assert done.returncode == 1
+    assert "did you mean `views`" in error_line(done.stderr)
