@@ -23,13 +23,16 @@ _TURN_WEIGHT_M = 0.35  # a turn of one radian counts as this much way
 _LEG_M = 0.7  # mean way between two way-points
 _SMALL_M3 = 2e-4  # eighth of the volume of a part that is worth being looked at
 _LOOK_BELOW_M = 1.8  # lamps under the ceiling are no targets
-_LOOK_UP_SHARE = 0.15  # of the way-points; without it ceilings are hardly seen
+_LOOK_UP_SHARE = 0.2  # of the way-points; without it ceilings are hardly seen
 _FINE = 24  # points of the path between two way-points
 _PROBE = CameraIntrinsics(fx=27.6, fy=27.6, cx=19.5, cy=14.5, width=40, height=30)
 _FLAT: dict[str, float] = dict.fromkeys(
     ("window", "curtain", "door", "picture"), 0.25
 )  # little to learn from where it fills the view
-_RARE = dict.fromkeys(("toilet", "sink", "bathtub", "refrigerator", "counter", "sofa", "bed", "desk"), 1.7)
+_RARE: dict[str, float] = {
+    **dict.fromkeys(("refrigerator", "counter", "desk"), 3.0),
+    **dict.fromkeys(("toilet", "sink", "bookshelf", "table"), 2.0),
+}  # few pixels in most rooms
 _WORTH = np.zeros(256)  # of one pixel of each class id
 for _id, _name in zip(ROOMS.ids, ROOMS.names, strict=True):
     _WORTH[_id] = 0.0 if _name in ("wall", "floor", "ceiling") else {**_FLAT, **_RARE}.get(_name, 1.0)
@@ -101,7 +104,7 @@ def _worst_between(scene: Scene, a: Float64, b: Float64) -> float:
 
 
 def _targets(scene: Scene) -> Float64:
-    """(N >= 1, 3) one point to look at for each object, two for furniture that is rare in pictures; those of little
+    """(N >= 1, 3) one point to look at for each object, more for furniture that is rare in pictures; those of little
     worth, and small things, only where there is nothing else."""
     worth, volume = _WORTH[scene.primitives.label], scene.primitives.half.prod(1)
     low = scene.primitives.center[:, 2] < _LOOK_BELOW_M
@@ -109,8 +112,7 @@ def _targets(scene: Scene) -> Float64:
         things = np.flatnonzero((worth >= least) & low & (volume >= size))
         if len(things):
             first = things[np.unique(scene.primitives.instance[things], return_index=True)[1]]
-            twice = first[worth[first] > 1.0]
-            return scene.primitives.center[np.concatenate((first, twice))]
+            return scene.primitives.center[np.repeat(first, np.maximum(worth[first], 1.0).astype(int))]
     return np.array([scene.size_m]) / 2
 
 
@@ -153,7 +155,7 @@ def _score(scene: Scene, state: Float64) -> float:
     worth = _WORTH[label]
     classes = np.unique(label[worth > 0], return_counts=True)[1]
     near = float((depth < 0.8).mean())
-    return min(float(worth.mean()), 0.5) * 2.5 + 0.15 * float((classes > 8).sum()) - 1.5 * near
+    return min(float(np.minimum(worth, 1.7).mean()), 0.5) * 2.5 + 0.15 * float((classes > 8).sum()) - 1.5 * near
 
 
 def pose_of(position: Float64, yaw: float, pitch: float, roll: float = 0.0) -> Float64:

@@ -23,18 +23,18 @@ def shade_pixels(  # type: ignore[no-untyped-def]
 ) -> Float32:
     """Linear RGB (H, W, 3) float32 of the hits that ``fast_cast.cast_pixels`` found; misses are black.
 
-    ``prims``, ``materials`` and ``lights`` are the named tuples of ``scene.kernel_arrays``; they are unpacked once, since
+    ``prims``, ``materials`` and ``lights`` are the named tuples of ``scene.kernel_arrays``; they are unpacked once:
     an array that is taken out of a tuple for every pixel costs more than the shading.
     """
-    return _shade_all(depth, index, *prims, *materials, *lights, origin, camera_axes, fx, fy, cx, cy)
+    return _shade_all(depth, index, origin, camera_axes, fx, fy, cx, cy, *prims, *materials, *lights)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _shade_all(  # type: ignore[no-untyped-def]
-    depth, index, shape, center, half, rotation, material,
+    depth, index, origin, camera_axes, fx, fy, cx, cy,
+    shape, center, half, rotation, material,
     pattern, color_a, color_b, scale, seed, emission, gloss, mirror,
     position, light_color, shadow, softness, ambient, room, low, high,
-    origin, camera_axes, fx, fy, cx, cy,
 ):  # fmt: skip
     height, width = depth.shape
     out = np.zeros((height, width, 3), np.float32)

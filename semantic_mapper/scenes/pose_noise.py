@@ -12,7 +12,7 @@ from semantic_mapper.types import Float64
 _POSE_STREAM = 3  # number of the random stream; rooms, paths and shots use others
 
 
-def drifting_poses(poses: Float64, seed: int, config: PoseNoiseConfig = PoseNoiseConfig()) -> Float64:
+def drifting_poses(poses: Float64, seed: int, config: PoseNoiseConfig) -> Float64:
     """Exact T_world_camera (N, 4, 4) -> drifted ones, deterministic in the arguments. The first pose is exact.
 
     Each step's motion is off by ``translation_share`` and ``rotation_deg_per_m`` of its way (standard deviations);

@@ -71,8 +71,12 @@ PROGRAMMES: dict[str, tuple[Entry, ...]] = {
     ),
 }  # fmt: skip
 
-# Kitchens and bathrooms more often than homes have them: their furniture is small in the picture.
-SHARES = {"bedroom": 0.14, "living": 0.16, "office": 0.12, "kitchen": 0.22, "bathroom": 0.24, "studio": 0.12}
+# The programme of a seed is CYCLE[seed % 20], so that any 20 rooms in a row, and each split, have the same mix:
+# kitchens and bathrooms more often than homes have them, since their furniture is small in the picture.
+CYCLE = (
+    "kitchen", "bathroom", "living", "bedroom", "bathroom", "office", "kitchen", "bathroom", "studio", "living",
+    "kitchen", "bedroom", "bathroom", "kitchen", "living", "office", "bathroom", "kitchen", "bedroom", "studio",
+)  # fmt: skip
 
 _COMMON = ("cup", "bottle", "bowl", "book_pile", "vase", "small_box", "potted_plant")
 CLUTTER: dict[str, tuple[str, ...]] = {

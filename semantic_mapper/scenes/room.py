@@ -9,7 +9,7 @@ from semantic_mapper.scenes.config import SUITE_VERSION, TRAIN_SEEDS, RoomConfig
 from semantic_mapper.scenes.layout import Layout
 from semantic_mapper.scenes.materials import Palette
 from semantic_mapper.scenes.primitives import Primitives, pack
-from semantic_mapper.scenes.programmes import PROGRAMMES, SHARES, furnish
+from semantic_mapper.scenes.programmes import CYCLE, PROGRAMMES, furnish
 from semantic_mapper.scenes.scene import Lights, Scene, extremes, shadow_cubes
 
 _ROOM_STREAM = 0  # number of the random stream; camera paths use others
@@ -23,8 +23,7 @@ def make_room(seed: int, config: RoomConfig = RoomConfig()) -> Scene:
     """
     _check(seed, config)
     rng = np.random.default_rng((SUITE_VERSION, seed, _ROOM_STREAM))
-    drawn = str(rng.choice(list(SHARES), p=list(SHARES.values())))
-    programme = config.programme or drawn
+    programme = config.programme or CYCLE[seed % len(CYCLE)]
     size = _room_size(rng, programme, config)
     palette = Palette(rng, held_out=seed not in TRAIN_SEEDS)
     layout = Layout(size, rng, palette, wet=programme == "bathroom")

@@ -2,8 +2,8 @@
 
 Both sensors match pixels between two eyes, so errors arise in disparity and grow with the square of range: noise
 (independent and correlated), quantisation, a ceiling at short range, a band beside near things that one eye does not
-see, blobs without measurement on surfaces without texture (passive sensors only), and near things that grow at their
-edges by half a matching window.
+see, blobs without measurement on surfaces without texture (passive sensors) or too dark and far for the projector
+(active ones), holes along edges, and near things that grow there by half a matching window.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
 _NATIVE_WIDTH = 1280  # pixels; disparities of both sensors are counted at this width
 _IID_SHARE, _CORRELATED_SHARE = 0.6, 0.8  # of sigma; their squares add up to 1
 _CORRELATION_PX = 8
+_EDGE_RATIO, _EDGE_HOLE_SHARE = 0.06, 0.35  # a step of depth of this share is an edge; holes along it
 _FATTEN_SHARE = 0.65  # of the edge pixels take the nearer depth
 _TEXTURE_WINDOW = 9
 _TEXTURE_WIDTH = 0.5  # grey levels over which holes become likely
@@ -36,6 +37,7 @@ class StereoSensor:
         max_disparity_px: Nearer things are not measured.
         max_depth_m: Farther things are not measured.
         min_texture: Local contrast in grey levels below which matching fails; 0 for a sensor with a projector.
+        min_return: Grey levels over square metres below which the projector's pattern is lost; 0 for a passive one.
     """
 
     baseline_m: float
@@ -44,11 +46,12 @@ class StereoSensor:
     max_disparity_px: float
     max_depth_m: float
     min_texture: float
+    min_return: float
 
 
 STEREO_SENSORS: dict[str, StereoSensor] = {
-    "oak_d": StereoSensor(0.075, 0.12, 1 / 8, 95.0, 12.0, 1.1),
-    "d435": StereoSensor(0.050, 0.08, 1 / 32, 126.0, 8.0, 0.0),
+    "oak_d": StereoSensor(0.075, 0.12, 1 / 8, 95.0, 12.0, 1.1, 0.0),
+    "d435": StereoSensor(0.050, 0.08, 1 / 32, 126.0, 8.0, 0.0, 2.0),
 }
 
 
@@ -80,8 +83,11 @@ def measure_depth(
     noisy = disparity + np.float32(model.sigma_px) * noise
     noisy = np.round(noisy / np.float32(model.step_px)) * np.float32(model.step_px)
     seen = (disparity > 0) & (noisy > 0) & ~hidden & (noisy <= model.max_disparity_px)
+    seen &= ~(depth_edges(exact_m, _EDGE_RATIO) & (rng.random(shape, np.float32) < _EDGE_HOLE_SHARE))
     if model.min_texture > 0:
         seen &= _has_texture(rgb, model.min_texture, rng)
+    if model.min_return > 0:
+        seen &= _returns_light(rgb, exact_m, model.min_return, rng)
     depth = focal_base / np.where(seen, noisy, 1.0)
     return np.where(seen & (depth <= model.max_depth_m), depth, 0.0).astype(np.float32)
 
@@ -126,6 +132,13 @@ def _smooth_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Float32:
     coarse = rng.standard_normal((height // _CORRELATION_PX + 2, width // _CORRELATION_PX + 2), np.float32)
     field = np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
     return field / max(float(field.std()), 1e-6)
+
+
+def _returns_light(rgb: UInt8, exact_m: Float32, least: float, rng: np.random.Generator) -> np.ndarray:
+    """(H, W) bool: the projected pattern is bright enough; it gets weaker with the square of range."""
+    grey = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (5, 5), 1.2).astype(np.float32) + 8.0
+    threshold = least * np.exp(0.5 * _smooth_noise(grey.shape, rng))
+    return grey > threshold * exact_m * exact_m
 
 
 def _has_texture(rgb: UInt8, least: float, rng: np.random.Generator) -> np.ndarray:

@@ -138,7 +138,7 @@ def classes(
 ) -> None:
     """Measure how often each class is seen and write the shares as JSON."""
     shares = class_shares(SPLITS[split][:rooms], views)
-    plain = {name: {"pixels": round(s[0], 5), "pictures": round(s[1], 4)} for name, s in shares.items()}
+    plain = {name: {"pixels": round(float(s[0]), 5), "pictures": round(float(s[1]), 4)} for name, s in shares.items()}
     out.write_bytes(msgspec.json.format(msgspec.json.encode(plain), indent=1))
     log.info("class_shares", **{name: f"{100 * s[0]:.2f} %" for name, s in shares.items()})
 

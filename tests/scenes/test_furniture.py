@@ -8,7 +8,7 @@ import pytest
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes.furniture import FURNITURE
 from semantic_mapper.scenes.materials import CAMOUFLAGE, HELD_OUT_HUES, Draw, Palette
-from semantic_mapper.scenes.programmes import CLUTTER, PROGRAMMES, SHARES
+from semantic_mapper.scenes.programmes import CLUTTER, CYCLE, PROGRAMMES
 
 SPECIMENS = 12
 STANDING = [name for name, kind in FURNITURE.items() if kind.place in ("wall", "corner", "centre", "small")]
@@ -42,13 +42,12 @@ def test_every_specimen_can_differ() -> None:
         assert len(sizes) + len(colours) > 2, name
 
 
-def test_programmes_name_registered_furniture_and_their_shares_add_up() -> None:
+def test_programmes_name_registered_furniture() -> None:
     sets = {"bed_set", "sofa_set", "desk_set", "dining_set", "mat"}
     named = {entry.name for entries in PROGRAMMES.values() for entry in entries}
     named |= {name for names in CLUTTER.values() for name in names}
     assert named - sets <= set(FURNITURE)
-    assert set(SHARES) == set(CLUTTER) == set(PROGRAMMES)
-    assert sum(SHARES.values()) == pytest.approx(1.0)
+    assert set(CYCLE) == set(CLUTTER) == set(PROGRAMMES)
 
 
 def test_each_pool_of_materials_serves_several_classes() -> None:

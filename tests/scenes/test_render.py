@@ -17,8 +17,8 @@ from semantic_mapper.scenes.materials import MaterialTable, Pattern
 from semantic_mapper.scenes.primitives import Primitives, Shape
 from semantic_mapper.scenes.reference import render_view_torch, render_views_torch
 from semantic_mapper.scenes.render import Sensor
-from semantic_mapper.scenes.sensor_depth import depth_edges
 from semantic_mapper.scenes.scene import Lights, extremes, shadow_cubes
+from semantic_mapper.scenes.sensor_depth import depth_edges
 from semantic_mapper.types import CameraIntrinsics
 
 CAMERA = CameraIntrinsics(fx=66.0, fy=66.0, cx=47.5, cy=35.5, width=96, height=72)
