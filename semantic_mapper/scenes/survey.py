@@ -43,11 +43,16 @@ log = structlog.get_logger(__name__)
 
 
 def contact_sheet(
-    seeds: Iterable[int], views: int, *, camera: CameraIntrinsics = CAMERA, noise: NoiseConfig | None = NoiseConfig()
+    seeds: Iterable[int],
+    views: int,
+    *,
+    across: int = 1,
+    camera: CameraIntrinsics = CAMERA,
+    noise: NoiseConfig | None = NoiseConfig(),
 ) -> UInt8:
     """Rooms as rows of pictures (H, W, 3) RGB: for each view its colours, its labels and its measured depth.
 
-    The programmes take turns, so that six seeds show all of them.
+    The programmes take turns, so that six seeds show all of them. ``across`` rooms share a row.
     """
     names = sorted(PROGRAMMES)
     rows: list[UInt8] = []
@@ -59,7 +64,8 @@ def contact_sheet(
             tiles += [view.frame.rgb, ROOMS.colorize(view.rendered.label), _depth_picture(depth)]
         rows.append(np.concatenate(tiles, 1))
         cv2.putText(rows[-1], f"{seed} {room.programme}", (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 0), 1)
-    return np.concatenate(rows, 0)
+    rows += [np.zeros_like(rows[0])] * (-len(rows) % across)
+    return np.concatenate([np.concatenate(rows[k : k + across], 1) for k in range(0, len(rows), across)], 0)
 
 
 def class_shares(seeds: Iterable[int], views: int) -> dict[str, Float64]:
@@ -116,15 +122,19 @@ Views = Annotated[int, typer.Option(help="of each room")]
 
 @app.command()
 def sheet(
-    out: Annotated[Path, typer.Option(help="PNG to write")],
+    out: Annotated[Path, typer.Option(help="PNG or JPEG to write")],
     split: Split = "train",
     first: Annotated[int, typer.Option(help="how many seeds of the split to skip")] = 0,
     rooms: Rooms = 12,
     views: Views = 2,
+    across: Annotated[int, typer.Option(help="rooms side by side")] = 1,
+    scale: Annotated[float, typer.Option(help="of the picture that is written")] = 1.0,
     clean: Annotated[bool, typer.Option(help="perfect sensors")] = False,
 ) -> None:
-    """Write pictures, labels and depth of rooms of all programmes to a PNG."""
-    picture = contact_sheet(SPLITS[split][first : first + rooms], views, noise=None if clean else NoiseConfig())
+    """Write pictures, labels and depth of rooms of all programmes to a PNG or JPEG."""
+    seeds, noise = SPLITS[split][first : first + rooms], None if clean else NoiseConfig()
+    picture = contact_sheet(seeds, views, across=across, noise=noise)
+    picture = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
     cv2.imwrite(str(out), np.ascontiguousarray(picture[..., ::-1]))
     log.info("contact_sheet_written", path=str(out), size=picture.shape)
 

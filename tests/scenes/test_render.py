@@ -136,6 +136,15 @@ def test_soft_shadows_have_wider_edges_than_hard_ones() -> None:
     assert (np.abs(between[0] - between[1]).max(-1) > 2).mean() > 0.005
 
 
+def test_single_precision_as_on_a_gpu_gives_nearly_the_same_picture() -> None:
+    scene = make_room(2)
+    pose = camera_path(scene, 1, 0)[0]
+    fast, single = render_view(scene, CAMERA, pose), render_view_torch(scene, CAMERA, pose, dtype=torch.float32)
+    assert (fast.label != single.label).mean() < 0.005
+    assert np.median(np.abs(fast.depth_m - single.depth_m)) < 1e-4
+    assert (np.abs(fast.rgb.astype(int) - single.rgb.astype(int)).max(-1) > 6).mean() < 0.02
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU on this machine")
 def test_the_plain_renderer_gives_the_same_on_a_gpu() -> None:
     scene = make_room(1)

@@ -79,8 +79,8 @@ def test_hardly_any_frame_shows_nothing_but_walls() -> None:
 
 
 def test_the_survey_draws_counts_and_measures() -> None:
-    sheet = contact_sheet(TRAIN_SEEDS[:2], 1, camera=CAMERA)
-    assert sheet.shape == (2 * 72, 3 * 96, 3)
+    sheet = contact_sheet(TRAIN_SEEDS[:3], 1, across=2, camera=CAMERA)
+    assert sheet.shape == (2 * 72, 2 * 3 * 96, 3)
     assert sheet.std() > 20
     shares = class_shares(TRAIN_SEEDS[:3], 2)
     assert sum(share[0] for share in shares.values()) == pytest.approx(1.0)

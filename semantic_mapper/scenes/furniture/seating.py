@@ -82,10 +82,8 @@ def sofa(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
         a.box(throw, (rng.uniform(-0.3, 0.3) * inner, 0.12, back + 0.005), (0.5, 0.26, 0.02), label="otherprop", item=9)
     cushion = palette.pick(rng, "print", "fabric", role="cushion")
     for k in range(int(rng.integers(0, seats + 2))):
-        x = rng.uniform(-0.4, 0.4) * inner
-        a.ellipsoid(
-            cushion, (x, 0.42, seat + 0.2), (0.42, 0.18, 0.4), label="otherprop", item=1 + k, tilt=rng.uniform(0.2, 0.5)
-        )
+        x, lean = rng.uniform(-0.4, 0.4) * inner, rng.uniform(0.2, 0.5)
+        a.ellipsoid(cushion, (x, 0.42, seat + 0.19), (0.42, 0.15, 0.38), label="otherprop", item=1 + k, tilt=lean)
 
 
 @furniture("sofa", "corner", keep_free_m=0.3)
