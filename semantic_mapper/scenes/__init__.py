@@ -8,12 +8,13 @@ from semantic_mapper.scenes.config import (
     VALIDATION_SEEDS,
     CameraPathConfig,
     NoiseConfig,
+    PoseNoiseConfig,
     RoomConfig,
 )
 from semantic_mapper.scenes.render import RenderedView, render_view
 from semantic_mapper.scenes.room import make_room
 from semantic_mapper.scenes.scene import Scene
-from semantic_mapper.scenes.sequence import room_frames
+from semantic_mapper.scenes.sequence import RoomView, room_frames, room_views
 
 __all__ = [
     "SUITE_VERSION",
@@ -22,11 +23,14 @@ __all__ = [
     "VALIDATION_SEEDS",
     "CameraPathConfig",
     "NoiseConfig",
+    "PoseNoiseConfig",
     "RenderedView",
     "RoomConfig",
+    "RoomView",
     "Scene",
     "camera_path",
     "make_room",
     "render_view",
     "room_frames",
+    "room_views",
 ]

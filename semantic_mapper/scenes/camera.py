@@ -17,18 +17,25 @@ from semantic_mapper.types import CameraIntrinsics, Float64
 _CAMERA_STREAM = 1
 _DRAWS = 160  # positions drawn to find them
 _CANDIDATES = 14  # views tried at each way-point
+_FINALISTS = 4  # of them are judged by the way there, too
+_WAY_WEIGHT = 0.7
 _TURN_WEIGHT_M = 0.35  # a turn of one radian counts as this much way
 _LEG_M = 0.7  # mean way between two way-points
+_SMALL_M3 = 2e-4  # eighth of the volume of a part that is worth being looked at
 _LOOK_BELOW_M = 1.8  # lamps under the ceiling are no targets
-_LOOK_UP_SHARE = 0.15  # of the way-points; without it ceilings are hardly seen
+_LOOK_UP_SHARE = 0.2  # of the way-points; without it ceilings are hardly seen
 _FINE = 24  # points of the path between two way-points
 _PROBE = CameraIntrinsics(fx=27.6, fy=27.6, cx=19.5, cy=14.5, width=40, height=30)
 _FLAT: dict[str, float] = dict.fromkeys(
     ("window", "curtain", "door", "picture"), 0.25
 )  # little to learn from where it fills the view
+_RARE: dict[str, float] = {
+    **dict.fromkeys(("refrigerator", "counter", "desk"), 3.0),
+    **dict.fromkeys(("toilet", "sink", "bookshelf", "table"), 2.0),
+}  # few pixels in most rooms
 _WORTH = np.zeros(256)  # of one pixel of each class id
 for _id, _name in zip(ROOMS.ids, ROOMS.names, strict=True):
-    _WORTH[_id] = 0.0 if _name in ("wall", "floor", "ceiling") else _FLAT.get(_name, 1.0)
+    _WORTH[_id] = 0.0 if _name in ("wall", "floor", "ceiling") else {**_FLAT, **_RARE}.get(_name, 1.0)
 
 
 def camera_path(scene: Scene, count: int, seed: int, config: CameraPathConfig = CameraPathConfig()) -> Float64:
@@ -68,30 +75,44 @@ def clearance(scene: Scene, points: Float64) -> Float64:
 
 
 def _best_view(scene: Scene, rng: np.random.Generator, config: CameraPathConfig, last: Float64 | None) -> Float64:
-    """(5,) position, yaw, pitch of the best candidate; within reach of ``last`` in a straight line."""
-    best, best_score = None, -np.inf
+    """(5,) position, yaw, pitch of the best candidate; within reach of ``last`` in a straight line.
+
+    Of the best few, the one wins on whose way from ``last`` the picture stays worth having: no frame of bare wall.
+    """
     targets = _targets(scene)
     raised = rng.uniform(0.15, 0.4) if rng.uniform() < _LOOK_UP_SHARE else 0.0
+    states: list[Float64] = []
     for position in _free_positions(scene, rng, config, last):
         toward = targets[int(rng.integers(len(targets)))] - position
         flat = float(np.hypot(toward[0], toward[1]))
         yaw = float(np.arctan2(toward[1], toward[0])) + rng.normal(0, 0.12)
         pitch = float(np.clip(np.arctan2(toward[2], max(flat, 0.5)), -0.7, 0.1)) + raised + rng.normal(0, 0.05)
-        score = _score(scene, position, yaw, pitch)
-        if score > best_score:
-            best, best_score = np.array([*position, yaw, pitch]), score
-    assert best is not None  # _free_positions gives at least one
-    return best
+        states.append(np.array([*position, yaw, pitch]))
+    scores = np.array([_score(scene, state) for state in states])
+    order = np.argsort(-scores, kind="stable")
+    if last is None:
+        return states[int(order[0])]
+    best = max(order[:_FINALISTS], key=lambda k: scores[k] + _WAY_WEIGHT * _worst_between(scene, last, states[k]))
+    return states[int(best)]
+
+
+def _worst_between(scene: Scene, a: Float64, b: Float64) -> float:
+    """Lowest score of views on the straight way from state ``a`` to ``b``, turning the short way round."""
+    delta = b - a
+    delta[3] = (delta[3] + np.pi) % (2 * np.pi) - np.pi
+    return min(_score(scene, a + share * delta) for share in (0.33, 0.67))
 
 
 def _targets(scene: Scene) -> Float64:
-    """(N >= 1, 3) one point to look at for each object; those of little worth only where there is nothing else."""
-    worth = _WORTH[scene.primitives.label]
-    for least in (1.0, 0.1):
-        things = np.flatnonzero((worth >= least) & (scene.primitives.center[:, 2] < _LOOK_BELOW_M))
+    """(N >= 1, 3) one point to look at for each object, more for furniture that is rare in pictures; those of little
+    worth, and small things, only where there is nothing else."""
+    worth, volume = _WORTH[scene.primitives.label], scene.primitives.half.prod(1)
+    low = scene.primitives.center[:, 2] < _LOOK_BELOW_M
+    for least, size in ((1.0, _SMALL_M3), (1.0, 0.0), (0.1, 0.0)):
+        things = np.flatnonzero((worth >= least) & low & (volume >= size))
         if len(things):
-            first = np.unique(scene.primitives.instance[things], return_index=True)[1]
-            return scene.primitives.center[things[first]]
+            first = things[np.unique(scene.primitives.instance[things], return_index=True)[1]]
+            return scene.primitives.center[np.repeat(first, np.maximum(worth[first], 1.0).astype(int))]
     return np.array([scene.size_m]) / 2
 
 
@@ -127,14 +148,14 @@ def _line_is_free(scene: Scene, a: Float64, b: Float64, needed: float) -> bool:
     return bool((clearance(scene, a + share * (b - a)) >= needed - 1e-9).all())
 
 
-def _score(scene: Scene, position: Float64, yaw: float, pitch: float) -> float:
+def _score(scene: Scene, state: Float64) -> float:
     """How much furniture, and of how many classes, a view shows; very near things count against it."""
-    depth, index = cast_view(scene, _PROBE, pose_of(position, yaw, pitch))
+    depth, index = cast_view(scene, _PROBE, pose_of(state[:3], state[3], state[4]))
     label = scene.primitives.label[index]
     worth = _WORTH[label]
     classes = np.unique(label[worth > 0], return_counts=True)[1]
     near = float((depth < 0.8).mean())
-    return min(float(worth.mean()), 0.5) * 2.5 + 0.15 * float((classes > 8).sum()) - 1.5 * near
+    return min(float(np.minimum(worth, 1.7).mean()), 0.5) * 2.5 + 0.15 * float((classes > 8).sum()) - 1.5 * near
 
 
 def pose_of(position: Float64, yaw: float, pitch: float, roll: float = 0.0) -> Float64:

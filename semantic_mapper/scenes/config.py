@@ -6,25 +6,26 @@ from typing import Literal
 
 from semantic_mapper.config import Config
 
-SUITE_VERSION = 1  # part of every seed: a change that alters a room raises it
+SUITE_VERSION = 2  # part of every seed: a change that alters a room raises it
 
 TRAIN_SEEDS = range(0, 100_000)
 VALIDATION_SEEDS = range(100_000, 100_020)
 TEST_SEEDS = range(200_000, 200_020)
 
 Programme = Literal["bedroom", "living", "office", "kitchen", "bathroom", "studio"]
+DepthSensorName = Literal["oak_d", "d435", "exact", "none"]
 
 
 class RoomConfig(Config, frozen=True):
     """What a room may look like; the seed decides within these bounds."""
 
-    programme: Programme | None = None  # None: drawn from the seed
+    programme: Programme | None = None  # None: the seed decides
     min_side_m: float = 3.0
     max_side_m: float = 6.0
     min_height_m: float = 2.35
     max_height_m: float = 3.0
     clutter: float = 1.0  # scales the number of small objects, 0 = none
-    shadow_resolution: int = 128  # pixels a side of each face of a light's shadow cube
+    shadow_resolution: int = 96  # pixels a side of each face of a light's shadow cube
 
 
 class CameraPathConfig(Config, frozen=True):
@@ -39,11 +40,27 @@ class CameraPathConfig(Config, frozen=True):
 
 
 class NoiseConfig(Config, frozen=True):
-    """A simple depth and colour camera."""
+    """The camera: its depth sensor, and how far it departs from a perfect one in colour.
 
-    depth_sigma: float = 0.0015  # standard deviation of depth = depth_sigma * z^2
-    edge_hole_rate: float = 0.6  # share of pixels at depth edges that have no depth
-    edge_ratio: float = 0.06  # a step of depth larger than this share of z is an edge
-    max_depth_m: float = 8.0
-    gain_stops: float = 0.25  # standard deviation of the exposure in stops
-    rgb_sigma: float = 2.0  # read noise in grey levels
+    Values that say "up to" or "standard deviation" are drawn once a sequence or once a frame, see ``shots``.
+    """
+
+    depth: DepthSensorName = "oak_d"  # "exact": no error; "none": no depth sensor, frames carry no depth
+    exposure_stops: float = 0.25  # standard deviation of the exposure's drift, in stops
+    white_balance: float = 0.07  # standard deviation of the red and blue gains' drift, natural logarithm
+    auto_exposure: float = 0.6  # share of the way to an evenly exposed picture that the camera goes by itself
+    look: float = 1.0  # strength of random contrast and saturation; 0 = neutral
+    shot_noise: float = 0.0005  # variance of linear light per unit of it, at ISO factor 1
+    read_noise: float = 0.003  # standard deviation in linear light, at ISO factor 1
+    max_vignetting: float = 0.35  # loss of light in the corners, up to
+    max_lens_blur_px: float = 0.7  # standard deviation of the lens's blur, up to; for a width of 320
+    max_blur_way_m: float = 0.01  # way of the camera while the shutter is open, up to; one radian counts as 0.35 m
+
+
+class PoseNoiseConfig(Config, frozen=True):
+    """Odometry: a random walk, put right a little by each loop closure."""
+
+    translation_share: float = 0.0075  # drift per metre of way
+    rotation_deg_per_m: float = 0.15
+    closure_frames: int = 60  # a loop closure jumps back towards the truth after so many frames; 0 = never
+    closure_share: float = 0.7  # of the error that a loop closure takes away

@@ -41,16 +41,48 @@ def cast_pixels(shape, center, half, rotation, origin, camera_axes, fx, fy, cx, 
                 dx = turn[0, 0] * x + bx
                 dy = turn[1, 0] * x + by
                 dz = turn[2, 0] * x + bz
-                if shape[p] == 0:
-                    t = _hit_box(start[0], start[1], start[2], dx, dy, dz)
-                elif shape[p] == 1:
-                    t = _hit_cylinder(start[0], start[1], start[2], dx, dy, dz)
-                else:
-                    t = _hit_sphere(start[0], start[1], start[2], dx, dy, dz)
+                t = _hit(shape[p], start[0], start[1], start[2], dx, dy, dz)
                 if t < depth[v, u]:
                     depth[v, u] = t
                     index[v, u] = p
     return depth, index
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def first_hit(shape, center, half, rotation, origin, ray):  # type: ignore[no-untyped-def]
+    """Ray parameter (inf = miss) and number of the primitive (-1 = miss) of one ray, for the few that mirrors send."""
+    nearest, index = _INF, -1
+    square = ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2]
+    own_start, own_ray = np.empty(3), np.empty(3)
+    for p in range(shape.shape[0]):
+        cx, cy, cz = center[p, 0] - origin[0], center[p, 1] - origin[1], center[p, 2] - origin[2]
+        along = cx * ray[0] + cy * ray[1] + cz * ray[2]
+        reach = half[p, 0] * half[p, 0] + half[p, 1] * half[p, 1] + half[p, 2] * half[p, 2]
+        if cx * cx + cy * cy + cz * cz - along * along / square > reach:
+            continue
+        for i in range(3):
+            own_start[i] = -(rotation[p, 0, i] * cx + rotation[p, 1, i] * cy + rotation[p, 2, i] * cz) / half[p, i]
+            own_ray[i] = (rotation[p, 0, i] * ray[0] + rotation[p, 1, i] * ray[1] + rotation[p, 2, i] * ray[2]) / half[
+                p, i
+            ]
+        t = _hit(shape[p], own_start[0], own_start[1], own_start[2], own_ray[0], own_ray[1], own_ray[2])
+        if t < nearest:
+            nearest, index = t, p
+    return nearest, index
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _hit(shape, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Where a ray enters a unit shape (``primitives.Shape``); inf where it does not, or starts inside."""
+    if shape == 0:
+        t = _hit_box(ox, oy, oz, dx, dy, dz)
+    elif shape == 1:
+        t = _hit_cylinder(ox, oy, oz, dx, dy, dz)
+    elif shape == 2:
+        t = _hit_sphere(ox, oy, oz, dx, dy, dz)
+    else:
+        t = _hit_frustum(ox, oy, oz, dx, dy, dz)
+    return t
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -95,6 +127,31 @@ def _hit_sphere(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
         return _INF
     root = np.sqrt(under)
     return _entry((-b - root) / a, (-b + root) / a)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _hit_frustum(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Radius 0.8 - 0.2 z between z = -1 and 1: a slice of the lower half of a double cone with its tip at z = 4."""
+    radius, slope = 0.8 - 0.2 * oz, -0.2 * dz
+    a = dx * dx + dy * dy - slope * slope
+    b = ox * dx + oy * dy - radius * slope
+    c = ox * ox + oy * oy - radius * radius
+    under = b * b - a * c
+    near, far = -_INF, _INF
+    if under >= 0.0:
+        root = np.sqrt(under)
+        first, last = (-b - root) / a, (-b + root) / a
+        if a > 0.0:
+            near, far = first, last
+        elif slope < 0.0:  # going up: inside the lower half up to the earlier of the two crossings
+            far = last
+        else:
+            near = first
+    elif a > 0.0:
+        return _INF
+    iz = 1.0 / dz
+    az, bz = (-1.0 - oz) * iz, (1.0 - oz) * iz
+    return _entry(max(near, min(az, bz)), min(far, max(az, bz)))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

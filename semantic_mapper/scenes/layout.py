@@ -6,7 +6,8 @@ import numpy as np
 
 from semantic_mapper.scenes.furniture import FURNITURE
 from semantic_mapper.scenes.materials import Palette
-from semantic_mapper.scenes.primitives import Assembly, Part, Shape, Top, part_bounds, place_parts, rotation_z
+from semantic_mapper.scenes.primitives import Assembly, Part, Top, part_bounds, place_parts, rotation_z
+from semantic_mapper.scenes.shell import build_shell, wall_pose
 from semantic_mapper.types import Float64
 
 _GAP_M = 0.015  # between two pieces, and between a piece and the wall behind it
@@ -14,9 +15,18 @@ _WALLS = 4
 
 
 class Layout:
-    """A room being furnished. Pieces that find no place are left out."""
+    """A room being furnished. Pieces that find no place are left out.
 
-    def __init__(self, size_m: tuple[float, float, float], rng: np.random.Generator, palette: Palette) -> None:
+    Args:
+        size_m: Width, depth, height.
+        rng: Draws everything.
+        palette: The room's materials.
+        wet: A bathroom, with tiles.
+    """
+
+    def __init__(
+        self, size_m: tuple[float, float, float], rng: np.random.Generator, palette: Palette, *, wet: bool = False
+    ) -> None:
         self.size_m = size_m
         self.rng = rng
         self.palette = palette
@@ -25,33 +35,12 @@ class Layout:
         self._tops: list[tuple[Top, float, Float64]] = []  # with yaw and position of the piece they belong to
         self._low, self._high = np.zeros((0, 3)), np.zeros((0, 3))  # of all parts that stand
         self._free_low, self._free_high = np.zeros((0, 3)), np.zeros((0, 3))  # zones to keep free
-        self._shell()
-
-    def _shell(self) -> None:
-        """Floor, ceiling, four walls with skirting boards."""
-        w, d, h = self.size_m
-        rng, palette = self.rng, self.palette
-        floor, wall, ceiling = (
-            palette.pick(rng, "wood", "tile", "fabric"),
-            palette.pick(rng, "wallpaint", "wallpaint", "tile"),
-            palette.pick(rng, "wallpaint", "paint"),
-        )
-        accent = palette.pick(rng, "wallpaint", "paint") if rng.uniform() < 0.3 else wall
-        board = palette.pick(rng, "wood", "paint")
-        for label, material, center, size in (
-            ("floor", floor, (w / 2, d / 2, -0.05), (w + 0.2, d + 0.2, 0.1)),
-            ("ceiling", ceiling, (w / 2, d / 2, h + 0.05), (w + 0.2, d + 0.2, 0.1)),
-            ("wall", accent, (w / 2, -0.05, h / 2), (w + 0.2, 0.1, h)),
-            ("wall", wall, (w + 0.05, d / 2, h / 2), (0.1, d, h)),
-            ("wall", wall, (w / 2, d + 0.05, h / 2), (w + 0.2, 0.1, h)),
-            ("wall", wall, (-0.05, d / 2, h / 2), (0.1, d, h)),
-        ):
-            shell = Assembly(label)
-            shell.add(Shape.BOX, material, center, size)
-            if label == "wall":
-                edge = tuple(min(s, limit) for s, limit in zip(size, (w, d, 0.07), strict=True))
-                shell.add(Shape.BOX, board, (center[0], center[1], 0.035), _skirting(center, edge, self.size_m))
-            self.groups.append(shell.parts)
+        shell = build_shell(size_m, rng, palette, wet=wet)
+        self.groups.extend(shell.groups)
+        self.far_lamp = shell.lamp
+        self.has_opening = shell.free is not None
+        if shell.free is not None:
+            self._free_low, self._free_high = shell.free[0][None], shell.free[1][None]
 
     def put(self, assembly: Assembly, yaw: float, position: Float64, *, in_keep_free: bool = False) -> bool:
         """Stand ``assembly`` at ``position`` (3,) if nothing is in the way; ``in_keep_free``: it may stand where space
@@ -97,14 +86,6 @@ class Layout:
         zone_low[:, 2], zone_high[:, 2] = 0.05, 2.0
         return zone_low, zone_high
 
-    def wall_pose(self, wall: int, along: float, away: float = 0.0) -> tuple[float, Float64]:
-        """Yaw and position of a piece with its back to ``wall`` (0 = y 0, then counter-clockwise)."""
-        w, d, _ = self.size_m
-        yaw = wall * np.pi / 2
-        corner = np.array([(0.0, 0.0), (w, 0.0), (w, d), (0.0, d)][wall])
-        turn = rotation_z(yaw)[:2, :2]
-        return yaw, np.append(corner + turn @ np.array([along, away]), 0.0)
-
     def at_wall(
         self, assembly: Assembly, *, corner: bool, flush: bool, tries: int = 30
     ) -> tuple[float, Float64] | None:
@@ -121,7 +102,7 @@ class Layout:
             else:
                 along = self.rng.uniform(first, last)
             away = 0.0 if flush else self.rng.uniform(0.02, 0.05) - low[1]
-            yaw, position = self.wall_pose(wall, float(along), float(away))
+            yaw, position = wall_pose(self.size_m, wall, float(along), float(away))
             if self.put(assembly, yaw, position):
                 return yaw, position
         return None
@@ -167,14 +148,6 @@ class Layout:
         if self.put(small, yaw, position, in_keep_free=True):
             drop = np.array([0.0, 0.0, _GAP_M])
             self.groups[-1] = place_parts(small, yaw, position - drop)
-
-
-def _skirting(
-    center: tuple[float, float, float], edge: tuple[float, ...], room: tuple[float, float, float]
-) -> tuple[float, float, float]:
-    """Full extents of the board at the foot of a wall: as the wall, but 1 cm thicker into the room."""
-    along_x = center[0] == room[0] / 2
-    return (room[0], 0.12, edge[2]) if along_x else (0.12, room[1], edge[2])
 
 
 def _any_overlap(low: Float64, high: Float64, other_low: Float64, other_high: Float64) -> bool:

@@ -1,12 +1,14 @@
 """Procedural materials, and the pools of a room from which all classes draw.
 
 One small set of woods, fabrics, paints ... a room is shared by all of its furniture, so that colour alone does not
-tell the class: a door may have the cabinet's wood, a curtain the sofa's fabric.
+tell the class. On top of that, ``CAMOUFLAGE`` names pairs of classes that share one and the same material in some
+rooms: a door with exactly the cabinet's wood.
 """
 
 from __future__ import annotations
 
 import colorsys
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -16,9 +18,21 @@ from semantic_mapper.types import Float64
 
 Color = tuple[float, float, float]
 
+CAMOUFLAGE_SHARE = 0.3  # of the rooms, for each pair
+CAMOUFLAGE = (
+    ("door", "cabinet", "wood"),
+    ("desk", "table", "wood"),
+    ("curtain", "sofa", "fabric"),
+    ("picture", "cushion", "print"),
+    ("refrigerator", "cabinet", "paint"),
+    ("counter", "floor", "tile"),
+)
+# Bands of the hue circle that training rooms leave out and held-out rooms are fond of.
+HELD_OUT_HUES = ((0.28, 0.38), (0.60, 0.70), (0.86, 0.96))
+
 
 class Pattern(IntEnum):
-    """How a material varies over a surface; ``textures`` and ``fast_shade`` both draw these."""
+    """How a material varies over a surface; ``textures`` and ``fast_textures`` both draw these."""
 
     PLAIN = 0  # low-contrast clouds
     WOOD = 1  # grain along the longest side
@@ -28,6 +42,7 @@ class Pattern(IntEnum):
     WEAVE = 5  # fine threads
     PRINT = 6  # blobs in three colours
     SPINES = 7  # upright stripes of random width and hue: rows of books
+    PLANKS = 8  # boards with grain, each of its own shade
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +56,7 @@ class Material:
         seed: Of the pattern's noise.
         emission: Light given off, as a multiple of the albedo.
         gloss: Strength of the highlight.
+        mirror: Share of the light that is a mirror image.
     """
 
     pattern: Pattern
@@ -50,12 +66,13 @@ class Material:
     seed: int
     emission: float = 0.0
     gloss: float = 0.0
+    mirror: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaterialTable:
     """Materials as arrays: pattern (M,) int64, color_a and color_b (M, 3), scale_m (M,), seed (M,) int64,
-    emission (M,), gloss (M,), floats float64."""
+    emission (M,), gloss (M,), mirror (M,), floats float64."""
 
     pattern: np.ndarray
     color_a: Float64
@@ -64,41 +81,78 @@ class MaterialTable:
     seed: np.ndarray
     emission: Float64
     gloss: Float64
+    mirror: Float64
+
+
+@dataclass(frozen=True, slots=True)
+class Draw:
+    """Random numbers for materials; ``held_out`` shifts colours to where training rooms have few or none."""
+
+    rng: np.random.Generator
+    held_out: bool
+
+    def hue(self) -> float:
+        """Anywhere on the circle but in ``HELD_OUT_HUES``; held out: half of the time inside them."""
+        rng = self.rng
+        if self.held_out and rng.uniform() < 0.5:
+            return float(rng.uniform(*HELD_OUT_HUES[int(rng.integers(len(HELD_OUT_HUES)))]))
+        while True:
+            hue = float(rng.uniform())
+            if self.held_out or not any(low <= hue < high for low, high in HELD_OUT_HUES):
+                return hue
+
+    def wood(self) -> tuple[float, float, float]:
+        """Hue, saturation and value of a wood; held out: half of the time redder, yellower or greyer."""
+        rng = self.rng
+        if self.held_out and rng.uniform() < 0.5:
+            hue = rng.uniform(0.0, 0.03) if rng.uniform() < 0.5 else rng.uniform(0.11, 0.14)
+            return float(hue), float(rng.uniform(0.05, 0.8)), float(rng.uniform(0.15, 0.95))
+        return float(rng.uniform(0.03, 0.11)), float(rng.uniform(0.2, 0.7)), float(rng.uniform(0.2, 0.9))
+
+    def uniform(self, low: float, high: float) -> float:
+        """A number between ``low`` and ``high``."""
+        return float(self.rng.uniform(low, high))
+
+    def one_of(self, *patterns: Pattern) -> Pattern:
+        """One of ``patterns``."""
+        return patterns[int(self.rng.integers(len(patterns)))]
+
+    def seed(self) -> int:
+        """For a pattern's noise."""
+        return int(self.rng.integers(1 << 30))
 
 
 class Palette:
     """The materials of one room, by pool."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
+    def __init__(self, rng: np.random.Generator, *, held_out: bool = False) -> None:
         self._materials: list[Material] = []
         self._pools: dict[str, list[int]] = {}
-        for pool, count, make in (
-            ("wood", 3, _wood),
-            ("fabric", 4, _fabric),
-            ("paint", 3, _paint),
-            ("wallpaint", 2, _wall_paint),
-            ("metal", 2, _metal),
-            ("ceramic", 1, _ceramic),
-            ("tile", 2, _tile),
-            ("print", 4, _print),
-            ("books", 3, _books),
-            ("plant", 1, _plant),
-            ("daylight", 1, _daylight),
-            ("lampshade", 1, _lampshade),
-            ("dark", 1, _dark),
-            ("object", 6, _object),
-        ):
-            self._pools[pool] = [self.add(make(rng)) for _ in range(count)]
+        draw = Draw(rng, held_out)
+        for pool, count, make in _POOLS:
+            self._pools[pool] = [self.add(make(draw)) for _ in range(count)]
+        self._shared: dict[str, int] = {}
+        for first, second, pool in CAMOUFLAGE:
+            chosen, active = self.pick(rng, pool), rng.uniform() < CAMOUFLAGE_SHARE
+            if active:
+                chosen = self._shared.get(first, self._shared.get(second, chosen))
+                self._shared[first] = self._shared[second] = chosen
+
+    @property
+    def camouflage(self) -> dict[str, int]:
+        """Roles that have a material in common with another class in this room, with its number."""
+        return dict(self._shared)
 
     def add(self, material: Material) -> int:
         """Add a material; returns its number."""
         self._materials.append(material)
         return len(self._materials) - 1
 
-    def pick(self, rng: np.random.Generator, *pools: str) -> int:
-        """A random material of the given pools."""
+    def pick(self, rng: np.random.Generator, *pools: str, role: str | None = None) -> int:
+        """A random material of the given pools, or the one that this room's camouflage gives ``role``."""
         choices = [index for pool in pools for index in self._pools[pool]]
-        return int(choices[int(rng.integers(len(choices)))])
+        drawn = int(choices[int(rng.integers(len(choices)))])
+        return drawn if role is None else self._shared.get(role, drawn)
 
     def table(self) -> MaterialTable:
         """All materials as arrays."""
@@ -111,6 +165,7 @@ class Palette:
             seed=np.array([m.seed for m in items], np.int64),
             emission=np.array([m.emission for m in items], np.float64),
             gloss=np.array([m.gloss for m in items], np.float64),
+            mirror=np.array([m.mirror for m in items], np.float64),
         )
 
 
@@ -120,98 +175,133 @@ def _hsv(hue: float, saturation: float, value: float) -> Color:
     return r**2.2, g**2.2, b**2.2
 
 
-def _seed(rng: np.random.Generator) -> int:
-    return int(rng.integers(1 << 30))
-
-
-def _wood(rng: np.random.Generator) -> Material:
-    hue, saturation, value = rng.uniform(0.03, 0.11), rng.uniform(0.2, 0.7), rng.uniform(0.3, 0.9)
-    a = _hsv(hue, saturation, value)
-    b = _hsv(hue, saturation * 1.1, value * rng.uniform(0.55, 0.85))
-    return Material(Pattern.WOOD, a, b, rng.uniform(0.015, 0.05), _seed(rng), gloss=rng.uniform(0.0, 0.25))
-
-
-def _fabric(rng: np.random.Generator) -> Material:
-    hue, saturation, value = rng.uniform(), rng.uniform(0.0, 0.7), rng.uniform(0.2, 0.9)
-    a = _hsv(hue, saturation, value)
-    b = _hsv(hue + rng.normal(0, 0.08), saturation * 0.8, value * rng.uniform(0.4, 0.9))
-    pattern = Pattern(int(rng.choice([Pattern.WEAVE, Pattern.WEAVE, Pattern.STRIPES, Pattern.CHECKER, Pattern.PRINT])))
-    fine = pattern == Pattern.WEAVE
-    return Material(pattern, a, b, rng.uniform(0.008, 0.02) if fine else rng.uniform(0.04, 0.15), _seed(rng))
-
-
-def _paint(rng: np.random.Generator) -> Material:
-    white = rng.uniform() < 0.4
-    a = _hsv(rng.uniform(), rng.uniform(0, 0.08) if white else rng.uniform(0.1, 0.6), rng.uniform(0.75, 0.97))
-    b = _scaled(a, 0.85)
-    return Material(Pattern.PLAIN, a, b, rng.uniform(0.1, 0.5), _seed(rng), gloss=rng.uniform(0, 0.3))
-
-
-def _wall_paint(rng: np.random.Generator) -> Material:
-    a = _hsv(rng.uniform(), rng.uniform(0.0, 0.35), rng.uniform(0.6, 0.95))
-    pattern = Pattern(int(rng.choice([Pattern.PLAIN, Pattern.PLAIN, Pattern.PLAIN, Pattern.STRIPES, Pattern.PRINT])))
-    b = _scaled(a, 0.88 if pattern == Pattern.PLAIN else rng.uniform(0.7, 0.92))
-    return Material(pattern, a, b, rng.uniform(0.08, 0.4), _seed(rng))
-
-
-def _metal(rng: np.random.Generator) -> Material:
-    a = _hsv(rng.uniform(0.5, 0.7), rng.uniform(0, 0.1), rng.uniform(0.25, 0.85))
-    return Material(Pattern.PLAIN, a, _scaled(a, 0.8), 0.05, _seed(rng), gloss=0.6)
-
-
-def _ceramic(rng: np.random.Generator) -> Material:
-    a = _hsv(rng.uniform(), rng.choice([0.02, 0.05, 0.25]), rng.uniform(0.8, 0.97))
-    return Material(Pattern.PLAIN, a, _scaled(a, 0.93), 0.2, _seed(rng), gloss=0.5)
-
-
-def _tile(rng: np.random.Generator) -> Material:
-    a = _hsv(rng.uniform(), rng.uniform(0.0, 0.45), rng.uniform(0.45, 0.95))
-    b = _scaled(a, rng.uniform(0.4, 0.8))
-    pattern = Pattern(int(rng.choice([Pattern.TILES, Pattern.TILES, Pattern.CHECKER])))
-    return Material(pattern, a, b, rng.uniform(0.12, 0.4), _seed(rng), gloss=rng.uniform(0.1, 0.4))
-
-
-def _print(rng: np.random.Generator) -> Material:
-    a = _hsv(rng.uniform(), rng.uniform(0.1, 0.9), rng.uniform(0.2, 0.95))
-    b = _hsv(rng.uniform(), rng.uniform(0.1, 0.9), rng.uniform(0.2, 0.95))
-    pattern = Pattern(int(rng.choice([Pattern.PRINT, Pattern.PRINT, Pattern.STRIPES, Pattern.CHECKER])))
-    lit = rng.uniform(0.2, 0.6) if rng.uniform() < 0.2 else 0.0  # lit pictures: decoys for windows
-    return Material(pattern, a, b, rng.uniform(0.06, 0.25), _seed(rng), emission=lit)
-
-
-def _books(rng: np.random.Generator) -> Material:
-    a = _hsv(rng.uniform(), rng.uniform(0.2, 0.8), rng.uniform(0.3, 0.9))
-    b = _hsv(rng.uniform(), rng.uniform(0.2, 0.8), rng.uniform(0.3, 0.9))
-    return Material(Pattern.SPINES, a, b, rng.uniform(0.025, 0.05), _seed(rng))
-
-
-def _plant(rng: np.random.Generator) -> Material:
-    a = _hsv(rng.uniform(0.22, 0.4), rng.uniform(0.4, 0.8), rng.uniform(0.3, 0.7))
-    return Material(Pattern.PRINT, a, _scaled(a, 0.35), rng.uniform(0.03, 0.06), _seed(rng))
-
-
-def _daylight(rng: np.random.Generator) -> Material:
-    a = _hsv(rng.uniform(0.5, 0.65), rng.uniform(0.0, 0.4), rng.uniform(0.3, 0.95))
-    b = _hsv(rng.uniform(0.2, 0.6), rng.uniform(0.0, 0.4), rng.uniform(0.25, 0.9))
-    return Material(Pattern.PRINT, a, b, rng.uniform(0.2, 0.6), _seed(rng), emission=rng.uniform(0.1, 0.9), gloss=0.5)
-
-
-def _lampshade(rng: np.random.Generator) -> Material:
-    a = _hsv(rng.uniform(0.05, 0.17), rng.uniform(0.0, 0.4), rng.uniform(0.8, 1.0))
-    return Material(Pattern.WEAVE, a, _scaled(a, 0.9), 0.02, _seed(rng), emission=rng.uniform(0.0, 0.8))
-
-
-def _dark(rng: np.random.Generator) -> Material:
-    a = _hsv(rng.uniform(), rng.uniform(0, 0.2), rng.uniform(0.05, 0.25))
-    return Material(Pattern.PLAIN, a, _scaled(a, 0.6), 0.2, _seed(rng), gloss=0.6)
-
-
-def _object(rng: np.random.Generator) -> Material:
-    a = _hsv(rng.uniform(), rng.uniform(0.1, 0.9), rng.uniform(0.2, 0.95))
-    b = _hsv(rng.uniform(), rng.uniform(0.1, 0.9), rng.uniform(0.2, 0.95))
-    pattern = Pattern(int(rng.choice([Pattern.PLAIN, Pattern.STRIPES, Pattern.WEAVE])))
-    return Material(pattern, a, _scaled(a, 0.8) if pattern == Pattern.PLAIN else b, rng.uniform(0.02, 0.08), _seed(rng))
-
-
 def _scaled(color: Color, factor: float) -> Color:
     return color[0] * factor, color[1] * factor, color[2] * factor
+
+
+def _wood(d: Draw) -> Material:
+    hue, saturation, value = d.wood()
+    a = _hsv(hue, saturation, value)
+    b = _hsv(hue, saturation * 1.1, value * d.uniform(0.55, 0.85))
+    return Material(Pattern.WOOD, a, b, d.uniform(0.015, 0.05), d.seed(), gloss=d.uniform(0.0, 0.25))
+
+
+def _parquet(d: Draw) -> Material:
+    hue, saturation, value = d.wood()
+    a = _hsv(hue, saturation, value)
+    b = _hsv(hue, saturation * 1.1, value * d.uniform(0.5, 0.8))
+    return Material(Pattern.PLANKS, a, b, d.uniform(0.07, 0.18), d.seed(), gloss=d.uniform(0.0, 0.35))
+
+
+def _fabric(d: Draw) -> Material:
+    hue, saturation, value = d.hue(), d.uniform(0.0, 0.7), d.uniform(0.2, 0.9)
+    a = _hsv(hue, saturation, value)
+    b = _hsv(hue + float(d.rng.normal(0, 0.04)), saturation * 0.8, value * d.uniform(0.4, 0.9))
+    pattern = d.one_of(Pattern.WEAVE, Pattern.WEAVE, Pattern.STRIPES, Pattern.CHECKER, Pattern.PRINT)
+    scale = d.uniform(0.008, 0.02) if pattern == Pattern.WEAVE else d.uniform(0.04, 0.15)
+    return Material(pattern, a, b, scale, d.seed())
+
+
+def _paint(d: Draw) -> Material:
+    white = d.uniform(0, 1) < 0.4
+    a = _hsv(d.hue(), d.uniform(0, 0.08) if white else d.uniform(0.1, 0.6), d.uniform(0.55, 0.97))
+    return Material(Pattern.PLAIN, a, _scaled(a, 0.85), d.uniform(0.1, 0.5), d.seed(), gloss=d.uniform(0, 0.3))
+
+
+def _wall_paint(d: Draw) -> Material:
+    a = _hsv(d.hue(), d.uniform(0.0, 0.35), d.uniform(0.55, 0.95))
+    pattern = d.one_of(Pattern.PLAIN, Pattern.PLAIN, Pattern.PLAIN, Pattern.STRIPES, Pattern.PRINT)
+    b = _scaled(a, 0.88 if pattern == Pattern.PLAIN else d.uniform(0.7, 0.92))
+    return Material(pattern, a, b, d.uniform(0.08, 0.4), d.seed())
+
+
+def _metal(d: Draw) -> Material:
+    a = _hsv(d.uniform(0.5, 0.7), d.uniform(0, 0.1), d.uniform(0.25, 0.85))
+    return Material(Pattern.PLAIN, a, _scaled(a, 0.8), 0.05, d.seed(), gloss=0.6)
+
+
+def _ceramic(d: Draw) -> Material:
+    a = _hsv(d.hue(), float(d.rng.choice([0.02, 0.05, 0.25])), d.uniform(0.75, 0.97))
+    return Material(Pattern.PLAIN, a, _scaled(a, 0.93), 0.2, d.seed(), gloss=0.5)
+
+
+def _tile(d: Draw) -> Material:
+    a = _hsv(d.hue(), d.uniform(0.0, 0.45), d.uniform(0.4, 0.95))
+    b = _scaled(a, d.uniform(0.4, 0.8))
+    pattern = d.one_of(Pattern.TILES, Pattern.TILES, Pattern.CHECKER)
+    return Material(pattern, a, b, d.uniform(0.12, 0.4), d.seed(), gloss=d.uniform(0.1, 0.4))
+
+
+def _print(d: Draw) -> Material:
+    a = _hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
+    b = _hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
+    pattern = d.one_of(Pattern.PRINT, Pattern.PRINT, Pattern.STRIPES, Pattern.CHECKER)
+    return Material(pattern, a, b, d.uniform(0.06, 0.25), d.seed())
+
+
+def _screen(d: Draw) -> Material:
+    """A picture that gives off light: lit pictures and screens are decoys for windows."""
+    p = _daylight(d) if d.uniform(0, 1) < 0.5 else _print(d)
+    return Material(p.pattern, p.color_a, p.color_b, d.uniform(0.1, 0.4), d.seed(), d.uniform(0.3, 0.9), gloss=0.4)
+
+
+def _books(d: Draw) -> Material:
+    a = _hsv(d.hue(), d.uniform(0.2, 0.8), d.uniform(0.3, 0.9))
+    b = _hsv(d.hue(), d.uniform(0.2, 0.8), d.uniform(0.3, 0.9))
+    return Material(Pattern.SPINES, a, b, d.uniform(0.025, 0.05), d.seed())
+
+
+def _plant(d: Draw) -> Material:
+    a = _hsv(d.uniform(0.22, 0.4), d.uniform(0.4, 0.8), d.uniform(0.3, 0.7))
+    return Material(Pattern.PRINT, a, _scaled(a, 0.35), d.uniform(0.03, 0.06), d.seed())
+
+
+def _daylight(d: Draw) -> Material:
+    """What stands outside a window: bright, or dim as at dusk."""
+    a = _hsv(d.uniform(0.5, 0.65), d.uniform(0.0, 0.4), d.uniform(0.3, 0.95))
+    b = _hsv(d.uniform(0.2, 0.6), d.uniform(0.0, 0.4), d.uniform(0.25, 0.9))
+    lit = d.uniform(0.0, 0.25) if d.uniform(0, 1) < 0.45 else d.uniform(0.25, 0.9)
+    return Material(Pattern.PRINT, a, b, d.uniform(0.2, 0.6), d.seed(), emission=lit, gloss=0.5)
+
+
+def _lampshade(d: Draw) -> Material:
+    a = _hsv(d.uniform(0.05, 0.17), d.uniform(0.0, 0.4), d.uniform(0.8, 1.0))
+    return Material(Pattern.WEAVE, a, _scaled(a, 0.9), 0.02, d.seed(), emission=d.uniform(0.0, 0.8))
+
+
+def _dark(d: Draw) -> Material:
+    a = _hsv(d.hue(), d.uniform(0, 0.2), d.uniform(0.05, 0.25))
+    return Material(Pattern.PLAIN, a, _scaled(a, 0.6), 0.2, d.seed(), gloss=0.6)
+
+
+def _object(d: Draw) -> Material:
+    a = _hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
+    b = _hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
+    pattern = d.one_of(Pattern.PLAIN, Pattern.STRIPES, Pattern.WEAVE)
+    return Material(pattern, a, _scaled(a, 0.8) if pattern == Pattern.PLAIN else b, d.uniform(0.02, 0.08), d.seed())
+
+
+def _mirror(d: Draw) -> Material:
+    a = _hsv(d.uniform(0.4, 0.6), 0.05, 0.6)
+    return Material(Pattern.PLAIN, a, a, 0.5, d.seed(), gloss=0.3, mirror=d.uniform(0.75, 0.92))
+
+
+_POOLS: tuple[tuple[str, int, Callable[[Draw], Material]], ...] = (
+    ("wood", 3, _wood),
+    ("parquet", 1, _parquet),
+    ("fabric", 4, _fabric),
+    ("paint", 3, _paint),
+    ("wallpaint", 2, _wall_paint),
+    ("metal", 2, _metal),
+    ("ceramic", 1, _ceramic),
+    ("tile", 2, _tile),
+    ("print", 4, _print),
+    ("screen", 2, _screen),
+    ("books", 3, _books),
+    ("plant", 1, _plant),
+    ("daylight", 1, _daylight),
+    ("lampshade", 1, _lampshade),
+    ("dark", 1, _dark),
+    ("object", 6, _object),
+    ("mirror", 1, _mirror),
+)

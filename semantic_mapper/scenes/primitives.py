@@ -1,6 +1,7 @@
 """Analytic primitives, assemblies of them, and the arrays that the ray casters read.
 
-A primitive is a unit shape (box [-1, 1]^3, cylinder about z, sphere) scaled by its half extents, turned and moved.
+A primitive is a unit shape (box [-1, 1]^3, cylinder about z, sphere, frustum about z) scaled by its half extents,
+turned and moved.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ class Shape(IntEnum):
     BOX = 0
     CYLINDER = 1
     ELLIPSOID = 2
+    FRUSTUM = 3  # a cone cut off: radius 1 at z = -1, 0.6 at z = 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,6 +117,10 @@ class Assembly:
     def ellipsoid(self, material: int, center: Vector, size: Vector, **options: object) -> None:
         """``add`` an ellipsoid."""
         self.add(Shape.ELLIPSOID, material, center, size, **options)  # type: ignore[arg-type]
+
+    def frustum(self, material: int, center: Vector, size: Vector, **options: object) -> None:
+        """``add`` an upright frustum, wide below; ``tilt=np.pi`` turns it over."""
+        self.add(Shape.FRUSTUM, material, center, size, **options)  # type: ignore[arg-type]
 
     def bounds(self) -> tuple[Float64, Float64]:
         """Lower and upper corner (3,) of all parts, in the assembly's frame."""

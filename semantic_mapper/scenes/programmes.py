@@ -22,59 +22,95 @@ class Entry:
 
 
 _WINDOW = Entry("window", 0.9)
-_WALLS = (Entry("window", 0.5), Entry("radiator", 0.4), Entry("picture", 0.7, 3), Entry("wall_shelf", 0.4))
-_LOOSE = (Entry("plant", 0.4), Entry("floor_lamp", 0.35), Entry("waste_bin", 0.3), Entry("carton", 0.3, 2))
+_WALLS = (
+    Entry("window", 0.5), Entry("radiator", 0.4), Entry("picture", 0.75, 4), Entry("wall_shelf", 0.4),
+    Entry("wall_clock", 0.3), Entry("wall_mirror", 0.2), Entry("coat_hooks", 0.2),
+)  # fmt: skip
+_LOOSE = (
+    Entry("plant", 0.45), Entry("floor_lamp", 0.35), Entry("waste_bin", 0.35), Entry("carton", 0.3, 2),
+    Entry("bag", 0.35), Entry("shoes", 0.4, 2), Entry("basket", 0.25), Entry("ball", 0.2),
+)  # fmt: skip
 
 PROGRAMMES: dict[str, tuple[Entry, ...]] = {
     "bedroom": (
-        Entry("door"), Entry("bed_set"), _WINDOW,
-        Entry("wardrobe", 0.8), Entry("dresser", 0.6), Entry("desk_set", 0.4),
-        Entry("bookshelf", 0.3), Entry("armchair", 0.3), *_WALLS, *_LOOSE,
+        Entry("bed_set"), _WINDOW,
+        Entry("wardrobe", 0.8), Entry("dresser", 0.6), Entry("desk_set", 0.45),
+        Entry("bookshelf", 0.3), Entry("cube_shelf", 0.25), Entry("armchair", 0.35), Entry("pouf", 0.3),
+        Entry("television", 0.2), *_WALLS, *_LOOSE,
     ),
     "living": (
-        Entry("door"), Entry("sofa_set"), _WINDOW,
-        Entry("sideboard", 0.8), Entry("bookshelf", 0.7), Entry("armchair", 0.6),
-        Entry("dining_set", 0.4), Entry("dresser", 0.4), *_WALLS, *_LOOSE,
+        Entry("sofa_set"), _WINDOW,
+        Entry("sideboard", 0.8), Entry("bookshelf", 0.6), Entry("armchair", 0.7), Entry("cube_shelf", 0.35),
+        Entry("ladder_shelf", 0.3), Entry("dining_set", 0.45), Entry("dresser", 0.4), Entry("side_table", 0.5),
+        Entry("pouf", 0.35), Entry("television", 0.3), *_WALLS, *_LOOSE,
     ),
     "office": (
-        Entry("door"), Entry("desk_set"), _WINDOW,
-        Entry("desk_set", 0.5), Entry("bookshelf", 0.9), Entry("bookshelf", 0.4),
-        Entry("dresser", 0.5), Entry("wardrobe", 0.3), Entry("dining_set", 0.3), Entry("open_rack", 0.5),
-        *_WALLS, *_LOOSE,
+        Entry("desk_set"), _WINDOW,
+        Entry("desk_set", 0.6), Entry("bookshelf", 0.8), Entry("filing_cabinet", 0.7), Entry("cube_shelf", 0.4),
+        Entry("ladder_shelf", 0.2), Entry("dresser", 0.3), Entry("wardrobe", 0.3), Entry("dining_set", 0.35),
+        Entry("open_rack", 0.5), *_WALLS, *_LOOSE,
     ),
     "kitchen": (
-        Entry("door"), Entry("counter"), _WINDOW,
-        Entry("refrigerator", 0.95), Entry("stove", 0.7), Entry("dining_set", 0.85),
-        Entry("dresser", 0.3), Entry("open_rack", 0.3), *_WALLS, *_LOOSE,
+        Entry("counter"), _WINDOW,
+        Entry("refrigerator", 0.95), Entry("stove", 0.75), Entry("dining_set", 0.75), Entry("larder", 0.45),
+        Entry("counter", 0.35), Entry("kitchen_island", 0.3), Entry("dresser", 0.2), Entry("open_rack", 0.3),
+        Entry("stool", 0.2), *_WALLS, *_LOOSE,
     ),
     "bathroom": (
-        Entry("door"), Entry("bathtub", 0.9), Entry("toilet"), Entry("wash_basin", 0.95), Entry("dresser", 0.3),
-        Entry("stool", 0.4), _WINDOW, Entry("towel_rail", 0.8), Entry("open_rack", 0.3),
-        Entry("picture", 0.4), Entry("radiator", 0.5), Entry("waste_bin", 0.5),
+        Entry("bathtub", 0.75), Entry("toilet"), Entry("wash_basin", 0.95), Entry("shower", 0.5),
+        Entry("wash_basin", 0.25), Entry("dresser", 0.25), Entry("wall_cabinet", 0.45), Entry("stool", 0.4), _WINDOW,
+        Entry("towel_rail", 0.8, 2), Entry("open_rack", 0.35), Entry("toilet_roll", 0.7), Entry("basket", 0.5),
+        Entry("picture", 0.4, 2), Entry("radiator", 0.5), Entry("waste_bin", 0.5), Entry("wall_mirror", 0.2),
+        Entry("plant", 0.25), Entry("wall_shelf", 0.4), Entry("mat", 0.3),
     ),
     "studio": (
-        Entry("door"), Entry("bed_set"), _WINDOW,
-        Entry("counter", 0.8), Entry("refrigerator", 0.8), Entry("sofa_set", 0.6),
-        Entry("dining_set", 0.5), Entry("bookshelf", 0.5), Entry("wardrobe", 0.5), *_WALLS, *_LOOSE,
+        Entry("bed_set"), _WINDOW,
+        Entry("counter", 0.8), Entry("refrigerator", 0.8), Entry("sofa_set", 0.6), Entry("desk_set", 0.35),
+        Entry("dining_set", 0.5), Entry("bookshelf", 0.4), Entry("cube_shelf", 0.3), Entry("wardrobe", 0.5),
+        Entry("television", 0.25), *_WALLS, *_LOOSE,
     ),
 }  # fmt: skip
 
-SHARES = {"bedroom": 0.16, "living": 0.18, "office": 0.12, "kitchen": 0.2, "bathroom": 0.22, "studio": 0.12}
+# The programme of a seed is CYCLE[seed % 20], so that any 20 rooms in a row, and each split, have the same mix:
+# kitchens and bathrooms more often than homes have them, since their furniture is small in the picture.
+CYCLE = (
+    "kitchen", "bathroom", "living", "bedroom", "bathroom", "office", "kitchen", "bathroom", "studio", "living",
+    "kitchen", "bedroom", "bathroom", "kitchen", "living", "office", "bathroom", "kitchen", "bedroom", "studio",
+)  # fmt: skip
 
-CLUTTER = ("table_lamp", "cup", "cup", "bottle", "bowl", "book_pile", "vase", "small_box")
+_COMMON = ("cup", "bottle", "bowl", "book_pile", "vase", "small_box", "potted_plant")
+CLUTTER: dict[str, tuple[str, ...]] = {
+    "bedroom": (*_COMMON, "table_lamp", "table_lamp", "photo_frame", "photo_frame", "book_pile", "laptop"),
+    "living": (*_COMMON, "table_lamp", "photo_frame", "photo_frame", "laptop"),
+    "office": ("cup", "book_pile", "small_box", "potted_plant", "paper_pile", "paper_pile", "laptop", "table_lamp"),
+    "kitchen": (*_COMMON, "cup", "kettle", "pan", "pan", "microwave", "dish_rack", "bottle"),
+    "bathroom": ("soap_set", "soap_set", "bottle", "bottle", "cup", "small_box", "folded_towels", "potted_plant"),
+    "studio": (*_COMMON, "table_lamp", "photo_frame", "pan", "kettle", "laptop"),
+}
 
 
 def furnish(layout: Layout, programme: str, clutter: float) -> None:
     """Fill ``layout`` after ``PROGRAMMES[programme]``."""
+    if not layout.has_opening or layout.rng.uniform() < 0.4:
+        _place(layout, "door")
     for entry in PROGRAMMES[programme]:
         for _ in range(entry.most):
             if layout.rng.uniform() < entry.chance:
                 _place(layout, entry.name)
-    ceiling_lamp = FURNITURE["ceiling_lamp"].make(layout.rng, layout.palette)
-    w, d, h = layout.size_m
-    layout.put(ceiling_lamp, 0.0, np.array([w / 2, d / 2, h - 0.001]))
+    _ceiling_lamps(layout)
     if clutter > 0:
-        layout.clutter(clutter, CLUTTER)
+        layout.clutter(clutter, CLUTTER[programme])
+
+
+def _ceiling_lamps(layout: Layout) -> None:
+    """One in the middle, or two of a kind in a long room."""
+    w, d, h = layout.size_m
+    look = int(layout.rng.integers(1 << 30))
+    two = max(w, d) > 4.2 and layout.rng.uniform() < 0.5
+    for share in (0.28, 0.72) if two else (0.5,):
+        lamp = FURNITURE["ceiling_lamp"].make(np.random.default_rng(look), layout.palette)
+        x, y = (w * share, d / 2) if w >= d else (w / 2, d * share)
+        layout.put(lamp, 0.0 if w >= d else np.pi / 2, np.array([x, y, h - 0.001]))
 
 
 def _place(layout: Layout, name: str) -> None:
@@ -142,7 +178,9 @@ def _desk_set(layout: Layout) -> None:
     if found is None:
         return
     desk, yaw, position = found
-    chair = FURNITURE[("office_chair", "office_chair", "chair")[int(rng.integers(3))]].make(rng, layout.palette)
+    chair = FURNITURE[("office_chair", "office_chair", "chair", "shell_chair")[int(rng.integers(4))]].make(
+        rng, layout.palette
+    )
     depth = float(desk.bounds()[1][1])
     own = np.array([rng.uniform(-0.12, 0.12), depth + rng.uniform(0.5, 0.75), 0.0])
     turn = yaw + np.pi + rng.uniform(-0.35, 0.35)
@@ -159,7 +197,7 @@ def _dining_set(layout: Layout) -> None:
         return
     yaw, position = pose
     low, high = table.bounds()
-    kind = ("chair", "chair", "stool")[int(rng.integers(3))]
+    kind = ("chair", "chair", "shell_chair", "shell_chair", "stool")[int(rng.integers(5))]
     seats: list[tuple[float, float, float]] = []  # x, y of the table's edge, and the way the chair faces
     middle_y = float(low[1] + high[1]) / 2
     for x in (-0.25, 0.25) if not round_top else (0.0,):
@@ -187,9 +225,17 @@ def _draw_up(
             return
 
 
+def _mat(layout: Layout) -> None:
+    """A mat on the bathroom floor."""
+    rug = FURNITURE["rug"].make(layout.rng, layout.palette)
+    w, d, _ = layout.size_m
+    layout.on_floor_unchecked(rug, 0.0, np.array([w * layout.rng.uniform(0.4, 0.6), d * 0.3, 0.0]))
+
+
 _SETS: dict[str, Callable[[Layout], None]] = {
     "bed_set": _bed_set,
     "sofa_set": _sofa_set,
     "desk_set": _desk_set,
     "dining_set": _dining_set,
+    "mat": _mat,
 }

@@ -5,22 +5,28 @@ Runs in float64 on the CPU (as the compiled path does) and in float32 elsewhere 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.scenes.config import NoiseConfig
 from semantic_mapper.scenes.fast_cast import NEAR_M
-from semantic_mapper.scenes.fast_shade import LIGHT_RADIUS_SQ, SHADOW_BIAS_M
+from semantic_mapper.scenes.fast_shade import CORNER_DIM, CORNER_REACH_M, LIGHT_RADIUS_SQ, SHADOW_BIAS_M
 from semantic_mapper.scenes.primitives import Shape
-from semantic_mapper.scenes.render import RenderedView, finish_view
-from semantic_mapper.scenes.scene import Scene
+from semantic_mapper.scenes.render import RenderedView, Sensor, finish_view
+from semantic_mapper.scenes.scene import LightArrays, Scene, kernel_arrays
+from semantic_mapper.scenes.shots import Shot
 from semantic_mapper.scenes.textures import albedo
 from semantic_mapper.types import CameraIntrinsics, Float64
 
 _RAYS_A_CHUNK = 8192
+_RAYS_A_CHUNK_GPU = 1 << 18  # about 2 GiB of temporaries with 150 primitives in float32
+
+_LIGHT_ARRAYS = LightArrays._fields.index("low")  # what follows only speeds the compiled path up
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,10 +45,13 @@ class _Tensors:
     seed: torch.Tensor
     emission: torch.Tensor
     gloss: torch.Tensor
+    mirror: torch.Tensor
     light_position: torch.Tensor
     light_color: torch.Tensor
     shadow: torch.Tensor
+    softness: torch.Tensor
     ambient: torch.Tensor
+    room: torch.Tensor
 
 
 def render_view_torch(
@@ -52,6 +61,7 @@ def render_view_torch(
     *,
     noise: int | None = None,
     noise_config: NoiseConfig = NoiseConfig(),
+    shot: Shot | None = None,
     device: torch.device | str = "cpu",
     dtype: torch.dtype | None = None,
 ) -> RenderedView:
@@ -60,58 +70,93 @@ def render_view_torch(
     Raises:
         PoseError: where ``T_world_camera`` is not a rigid transform.
     """
-    check_pose(T_world_camera, "render_view_torch")
+    sensors = [None if noise is None else Sensor(noise, noise_config, shot)]
+    return render_views_torch(scene, intrinsics, T_world_camera[None], sensors, device=device, dtype=dtype)[0]
+
+
+def render_views_torch(
+    scene: Scene,
+    intrinsics: CameraIntrinsics,
+    poses: Float64,
+    sensors: Sequence[Sensor | None],
+    *,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype | None = None,
+) -> list[RenderedView]:
+    """All views of a room in one batch of rays: a GPU is kept busy, and the scene is moved there once.
+
+    Rays are cast and shaded on ``device``; the sensors (``render.finish_view``) run on the CPU.
+
+    Args:
+        poses: (V, 4, 4) float64 T_world_camera.
+        sensors: One a view; None for a perfect camera.
+
+    Raises:
+        PoseError: where a pose is not a rigid transform.
+        ConfigError: where there are not as many sensors as poses.
+    """
+    if len(sensors) != len(poses):
+        raise ConfigError(f"render_views_torch: {len(poses)} poses but {len(sensors)} sensors; give one a pose")
+    for number, pose in enumerate(poses):
+        check_pose(pose, f"render_views_torch: view {number}")
     device = torch.device(device)
     dtype = dtype or (torch.float64 if device.type == "cpu" else torch.float32)
     tensors = _to_device(scene, device, dtype)
-    height, width = intrinsics.height, intrinsics.width
+    origins, rays = _camera_rays(intrinsics, torch.as_tensor(poses, device=device, dtype=dtype))
+    depths, indices, colors = [], [], []
+    chunk = _RAYS_A_CHUNK if device.type == "cpu" else _RAYS_A_CHUNK_GPU
+    for origin, ray in zip(origins.split(chunk), rays.split(chunk), strict=True):
+        depth, index = first_hits(tensors, origin, ray)
+        depths.append(depth)
+        indices.append(index)
+        colors.append(shade_hits(tensors, origin, ray, depth, index))
+    size = (len(poses), intrinsics.height, intrinsics.width)
+    depth = torch.cat(depths).reshape(size).double().cpu().numpy()
+    index = torch.cat(indices).reshape(size).int().cpu().numpy()
+    linear = torch.cat(colors).reshape(*size, 3).float().cpu().numpy()
+    return [finish_view(scene, intrinsics, depth[k], index[k], linear[k], sensor) for k, sensor in enumerate(sensors)]
+
+
+def _camera_rays(intrinsics: CameraIntrinsics, poses: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Origins and directions (V * H * W, 3) of all pixels; depth along a ray is z."""
+    like = {"device": poses.device, "dtype": poses.dtype}
     v, u = torch.meshgrid(
-        torch.arange(height, device=device, dtype=dtype), torch.arange(width, device=device, dtype=dtype), indexing="ij"
+        torch.arange(intrinsics.height, **like), torch.arange(intrinsics.width, **like), indexing="ij"
     )
     x, y = (u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy
     camera = torch.stack((x, y, torch.ones_like(x)), -1).reshape(-1, 3)
-    pose = torch.as_tensor(T_world_camera, device=device, dtype=dtype)
-    depths, indices, colors = [], [], []
-    for rays in (camera @ pose[:3, :3].T).split(_RAYS_A_CHUNK):
-        depth, index = first_hits(tensors, pose[:3, 3], rays)
-        depths.append(depth)
-        indices.append(index)
-        colors.append(shade_hits(tensors, pose[:3, 3], rays, depth, index))
-    return finish_view(
-        scene,
-        torch.cat(depths).reshape(height, width).double().cpu().numpy(),
-        torch.cat(indices).reshape(height, width).int().cpu().numpy(),
-        torch.cat(colors).reshape(height, width, 3).float().cpu().numpy(),
-        noise,
-        noise_config,
-    )
+    rays = torch.einsum("vij,rj->vri", poses[:, :3, :3], camera)
+    origins = poses[:, None, :3, 3].expand_as(rays)
+    return origins.reshape(-1, 3), rays.reshape(-1, 3)
 
 
 def _to_device(scene: Scene, device: torch.device, dtype: torch.dtype) -> _Tensors:
     def move(array: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(array, device=device, dtype=dtype if array.dtype.kind == "f" else torch.int64)
 
-    prim, mat, light = scene.primitives, scene.materials, scene.lights
-    return _Tensors(
-        *(move(a) for a in (prim.shape, prim.center, prim.half, prim.rotation, prim.material)),
-        *(move(a) for a in (mat.pattern, mat.color_a, mat.color_b, mat.scale_m, mat.seed, mat.emission, mat.gloss)),
-        *(move(a) for a in (light.position, light.color, light.shadow, light.ambient)),
-    )
+    primitives, materials, lights = kernel_arrays(scene)
+    return _Tensors(*(move(array) for array in (*primitives, *materials, *lights[:_LIGHT_ARRAYS])))
 
 
-def first_hits(t: _Tensors, origin: torch.Tensor, rays: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Ray parameter (R,) (inf = miss) and primitive number (R,) int64 (-1 = miss) of rays (R, 3) from origin (3,)."""
-    o = torch.einsum("pji,pj->pi", t.rotation, origin - t.center) / t.half  # (P, 3) in unit shapes
+def first_hits(t: _Tensors, origins: torch.Tensor, rays: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Ray parameter (R,) (inf = miss) and primitive number (R,) int64 (-1 = miss) of rays and origins (R, 3)."""
+    o = torch.einsum("pji,rpj->rpi", t.rotation, origins[:, None] - t.center) / t.half  # (R, P, 3) in unit shapes
     d = torch.einsum("pji,rj->rpi", t.rotation, rays) / t.half  # (R, P, 3)
-    sphere = _interval_of_quadric(o.expand_as(d), d)
-    round_side = _interval_of_quadric(o[:, :2].expand_as(d[..., :2]), d[..., :2])
+    sphere = _interval_of_quadric(o, d)
+    round_side = _interval_of_quadric(o[..., :2], d[..., :2])
+    cone = _interval_of_cone(o, d)
     slab_a, slab_b = (-1 - o) / d, (1 - o) / d
     enter, leave = torch.minimum(slab_a, slab_b), torch.maximum(slab_a, slab_b)  # (R, P, 3)
-    box = enter.amax(-1), leave.amin(-1)
-    can = torch.maximum(round_side[0], enter[..., 2]), torch.minimum(round_side[1], leave[..., 2])
-    is_box, is_can = t.shape == int(Shape.BOX), t.shape == int(Shape.CYLINDER)
-    near = torch.where(is_box, box[0], torch.where(is_can, can[0], sphere[0]))
-    far = torch.where(is_box, box[1], torch.where(is_can, can[1], sphere[1]))
+    kinds = {
+        Shape.BOX: (enter.amax(-1), leave.amin(-1)),
+        Shape.CYLINDER: (torch.maximum(round_side[0], enter[..., 2]), torch.minimum(round_side[1], leave[..., 2])),
+        Shape.ELLIPSOID: sphere,
+        Shape.FRUSTUM: (torch.maximum(cone[0], enter[..., 2]), torch.minimum(cone[1], leave[..., 2])),
+    }
+    near, far = kinds[Shape.BOX]
+    for shape, (first, last) in kinds.items():
+        mine = t.shape == int(shape)
+        near, far = torch.where(mine, first, near), torch.where(mine, last, far)
     near = torch.where((near <= far) & (near > NEAR_M), near, torch.inf)
     depth, index = near.min(-1)
     return depth, torch.where(torch.isfinite(depth), index, -1)
@@ -125,25 +170,72 @@ def _interval_of_quadric(o: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor
     return torch.where(under < 0, torch.inf, (-b - root) / a), torch.where(under < 0, -torch.inf, (-b + root) / a)
 
 
+def _interval_of_cone(o: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where rays are inside the lower half of the cone of radius 0.8 - 0.2 z; see ``fast_cast._hit_frustum``."""
+    radius, slope = 0.8 - 0.2 * o[..., 2], -0.2 * d[..., 2]
+    a = (d[..., :2] ** 2).sum(-1) - slope**2
+    b = (o[..., :2] * d[..., :2]).sum(-1) - radius * slope
+    under = b * b - a * ((o[..., :2] ** 2).sum(-1) - radius**2)
+    root = under.clamp_min(0).sqrt()
+    first, last = (-b - root) / a, (-b + root) / a
+    miss, between, up = (under < 0) & (a > 0), (under >= 0) & (a > 0), (under >= 0) & (a <= 0) & (slope < 0)
+    near = torch.where(between | ((under >= 0) & ~up), first, -torch.inf)
+    far = torch.where(between | up, last, torch.inf)
+    return torch.where(miss, torch.inf, near), torch.where(miss, -torch.inf, far)
+
+
 def shade_hits(
-    t: _Tensors, origin: torch.Tensor, rays: torch.Tensor, depth: torch.Tensor, index: torch.Tensor
+    t: _Tensors, origins: torch.Tensor, rays: torch.Tensor, depth: torch.Tensor, index: torch.Tensor
 ) -> torch.Tensor:
     """Linear RGB (R, 3) of the hits; black where there is none."""
     out = torch.zeros_like(rays)
-    hit = index >= 0
-    view = -rays[hit] * depth[hit, None]
-    world, p = origin - view, index[hit]
+    hit = (index >= 0).nonzero()[:, 0]
+    view, p = -rays[hit] * depth[hit, None], index[hit]
+    world = origins[hit] - view
+    color, normal = _shade_points(t, p, world, view)
+    mirror = t.mirror[t.material[p]]
+    shows = (mirror > 0).nonzero()[:, 0]
+    if len(shows):
+        seen = _reflected(t, world[shows], view[shows], normal[shows])
+        share = mirror[shows, None]
+        color[shows] = (1 - share) * color[shows] + share * seen
+    out[hit] = color
+    return out
+
+
+def _reflected(t: _Tensors, world: torch.Tensor, view: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:
+    """Light (N, 3) that mirrors at ``world`` (N, 3) send along ``view``."""
+    toward = torch.nn.functional.normalize(view, dim=-1)
+    rays = 2 * (normal * toward).sum(-1, keepdim=True) * normal - toward
+    depth, index = first_hits(t, world, rays)
+    out = torch.zeros_like(rays)
+    hit = (index >= 0).nonzero()[:, 0]
+    step = rays[hit] * depth[hit, None]
+    out[hit] = _shade_points(t, index[hit], world[hit] + step, -step)[0]
+    return out
+
+
+def _shade_points(
+    t: _Tensors, p: torch.Tensor, world: torch.Tensor, view: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Linear RGB (N, 3) and normals (N, 3) of the points ``world`` (N, 3) of primitives p (N,), seen along -view."""
     rotation, half = t.rotation[p], t.half[p]
     local = torch.einsum("rji,rj->ri", rotation, world - t.center[p])
     own, axis = _own_normal(t.shape[p], local, half)
     normal = torch.einsum("rij,rj->ri", rotation, own)
     m = t.material[p]
     base = albedo(t.pattern[m], t.color_a[m], t.color_b[m], t.scale_m[m], t.seed[m], local, half, axis)
-    light = t.ambient * (0.75 + 0.25 * normal[:, 2:])
+    light = t.ambient * (0.75 + 0.25 * normal[:, 2:]) * _openness(t, world, normal)[:, None]
     for k in range(len(t.light_position)):
         light = light + _light(t, k, world, normal, view, t.gloss[m])
-    out[hit] = base * (light + t.emission[m, None])
-    return out
+    return base * (light + t.emission[m, None]), normal
+
+
+def _openness(t: _Tensors, world: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:
+    """Share of the ambient light that reaches points (N, 3); see ``fast_shade._openness``."""
+    low, high = world / CORNER_REACH_M, (t.room - world) / CORNER_REACH_M
+    share = (1 - CORNER_DIM / (1 + low**2)) * (1 - CORNER_DIM / (1 + high**2))
+    return torch.where(normal.abs() < 0.7, share, 1.0).prod(-1)
 
 
 def _own_normal(shape: torch.Tensor, local: torch.Tensor, half: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -152,10 +244,13 @@ def _own_normal(shape: torch.Tensor, local: torch.Tensor, half: torch.Tensor) ->
     side = torch.where(local > 0, 1.0, -1.0).to(local.dtype)
     box_axis = q.abs().argmax(-1)
     box = torch.nn.functional.one_hot(box_axis, 3) * side
-    flat = torch.ones_like(q)
-    flat[:, 2] = (shape == int(Shape.ELLIPSOID)).to(q.dtype)
-    curved = torch.nn.functional.normalize(q / half * flat, dim=-1)
-    lid = (shape == int(Shape.CYLINDER)) & (q[:, 2].abs() >= q[:, :2].norm(dim=-1))
+    radial, radius = q[:, :2].norm(dim=-1), 0.8 - 0.2 * q[:, 2]
+    gradient = q.clone()
+    gradient[:, 2] = torch.where(shape == int(Shape.ELLIPSOID), q[:, 2], 0.0)
+    gradient[:, 2] = torch.where(shape == int(Shape.FRUSTUM), 0.2 * radius, gradient[:, 2])
+    curved = torch.nn.functional.normalize(gradient / half, dim=-1)
+    lid = (shape == int(Shape.CYLINDER)) & (q[:, 2].abs() >= radial)
+    lid |= (shape == int(Shape.FRUSTUM)) & (1 - q[:, 2].abs() < (radial - radius).abs())
     top = torch.zeros_like(q)
     top[:, 2] = side[:, 2]
     own = torch.where((shape == int(Shape.BOX))[:, None], box.to(q.dtype), torch.where(lid[:, None], top, curved))
@@ -172,11 +267,11 @@ def _light(
     cosine = (normal * toward).sum(-1)
     middle = torch.nn.functional.normalize(toward + torch.nn.functional.normalize(view, dim=-1), dim=-1)
     shine = (normal * middle).sum(-1) ** 16
-    strength = _visible(t.shadow[k], -to_light) * (cosine + gloss * shine) / (square + LIGHT_RADIUS_SQ)
+    strength = _visible(t.shadow[k], t.softness[k], -to_light) * (cosine + gloss * shine) / (square + LIGHT_RADIUS_SQ)
     return torch.where(cosine > 0, strength, 0.0)[:, None] * t.light_color[k]
 
 
-def _visible(cube: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+def _visible(cube: torch.Tensor, softness: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
     """Share of the light (N,) that reaches points at ``d`` (N, 3) from it; see ``scene.Lights.shadow``."""
     axis = d.abs().argmax(-1)
     pick = torch.arange(len(d), device=d.device)
@@ -186,11 +281,13 @@ def _visible(cube: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
     n = cube.shape[-1]
     u = (d[pick, (axis + 1) % 3] / major + 1) * 0.5 * n - 0.5
     v = (d[pick, (axis + 2) % 3] / major + 1) * 0.5 * n - 0.5
-    u0, v0 = u.floor(), v.floor()
-    wu, wv = u - u0, v - v0
     z = major - SHADOW_BIAS_M * (1 + 0.5 * major)
     lit = torch.zeros_like(z)
-    for du, dv, weight in ((0, 0, (1 - wu) * (1 - wv)), (1, 0, wu * (1 - wv)), (0, 1, (1 - wu) * wv), (1, 1, wu * wv)):
-        column, row = (u0 + du).long().clamp(0, n - 1), (v0 + dv).long().clamp(0, n - 1)
-        lit = lit + torch.where(cube[face, row, column] >= z, weight, 0.0)
-    return lit
+    for x, y in ((x, y) for y in (v - softness, v + softness) for x in (u - softness, u + softness)):
+        x0, y0 = x.floor(), y.floor()
+        wx, wy = x - x0, y - y0
+        spots = ((0, 0, (1 - wx) * (1 - wy)), (1, 0, wx * (1 - wy)), (0, 1, (1 - wx) * wy), (1, 1, wx * wy))
+        for dx, dy, weight in spots:
+            column, row = (x0 + dx).long().clamp(0, n - 1), (y0 + dy).long().clamp(0, n - 1)
+            lit = lit + torch.where(cube[face, row, column] >= z, weight, 0.0)
+    return 0.25 * lit

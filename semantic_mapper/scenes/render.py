@@ -11,8 +11,10 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes.config import NoiseConfig
 from semantic_mapper.scenes.fast_cast import cast_pixels
 from semantic_mapper.scenes.fast_shade import shade_pixels
-from semantic_mapper.scenes.noise import add_noise
-from semantic_mapper.scenes.scene import Scene
+from semantic_mapper.scenes.scene import Scene, kernel_arrays
+from semantic_mapper.scenes.sensor_color import develop, expose
+from semantic_mapper.scenes.sensor_depth import measure_depth
+from semantic_mapper.scenes.shots import Shot, single_shot
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 
@@ -22,15 +24,32 @@ class RenderedView:
 
     Args:
         rgb: (H, W, 3) uint8.
-        depth_m: (H, W) float32 z-depth in metres, 0 = nothing hit, or a hole of the noise model.
+        depth_m: (H, W) float32 z-depth in metres as the sensor gives it, 0 = no measurement.
         label: (H, W) uint8 ids of ``labels.ROOMS``, its ignore id where nothing was hit.
         instance: (H, W) uint16, 0 where nothing was hit.
+        exact_depth_m: (H, W) float32 the true z-depth, 0 = nothing hit; of a mirror, that of its surface.
     """
 
     rgb: UInt8
     depth_m: Float32
     label: UInt8
     instance: np.ndarray
+    exact_depth_m: Float32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sensor:
+    """How light and depth become a ``RenderedView``.
+
+    Args:
+        seed: Of the noise.
+        config: Strength of the noise.
+        shot: Exposure and motion of this frame; None for a camera at rest, drawn from ``seed``.
+    """
+
+    seed: int
+    config: NoiseConfig
+    shot: Shot | None = None
 
 
 def render_view(
@@ -40,6 +59,7 @@ def render_view(
     *,
     noise: int | None = None,
     noise_config: NoiseConfig = NoiseConfig(),
+    shot: Shot | None = None,
 ) -> RenderedView:
     """Render one view.
 
@@ -48,22 +68,20 @@ def render_view(
         intrinsics: Pinhole; distortion coefficients are not modelled and must be empty.
         T_world_camera: (4, 4) float64, OpenCV camera axes.
         noise: Seed of the sensor noise on colour and depth; None for a perfect camera.
-        noise_config: Strength of that noise.
+        noise_config: The sensors and the strength of their noise.
+        shot: Exposure and motion of this frame of a sequence; None for a camera at rest, drawn from ``noise``.
 
     Raises:
         PoseError: where ``T_world_camera`` is not a rigid transform.
     """
     check_pose(T_world_camera, "render_view")
     depth, index = cast_view(scene, intrinsics, T_world_camera)
-    prim, mat, light = scene.primitives, scene.materials, scene.lights
     linear = shade_pixels(
-        depth, index, prim.shape, prim.center, prim.half, prim.rotation, prim.material,
-        mat.pattern, mat.color_a, mat.color_b, mat.scale_m, mat.seed, mat.emission, mat.gloss,
-        light.position, light.color, light.shadow, light.ambient,
-        T_world_camera[:3, 3].copy(), T_world_camera[:3, :3].copy(),
+        depth, index, *kernel_arrays(scene), T_world_camera[:3, 3].copy(), T_world_camera[:3, :3].copy(),
         intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy,
     )  # fmt: skip
-    return finish_view(scene, depth, index, linear, noise, noise_config)
+    sensor = None if noise is None else Sensor(noise, noise_config, shot)
+    return finish_view(scene, intrinsics, depth, index, linear, sensor)
 
 
 def cast_view(scene: Scene, intrinsics: CameraIntrinsics, T_world_camera: Float64) -> tuple[Float64, np.ndarray]:
@@ -78,38 +96,20 @@ def cast_view(scene: Scene, intrinsics: CameraIntrinsics, T_world_camera: Float6
 
 def finish_view(
     scene: Scene,
+    intrinsics: CameraIntrinsics,
     depth: Float64,
     index: np.ndarray,
     linear: Float32,
-    noise: int | None,
-    noise_config: NoiseConfig,
+    sensor: Sensor | None,
 ) -> RenderedView:
-    """Linear light and primitive numbers -> what the sensor gives."""
+    """Linear light (H, W, 3) and primitive numbers (H, W) -> what the sensors give; perfect ones where None."""
     label = np.append(scene.primitives.label, np.uint8(ROOMS.ignore_id))[index]  # index -1 is the appended entry
     instance = np.append(scene.primitives.instance, np.uint16(0))[index]
-    depth_m = np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
-    if noise is None:
-        return RenderedView(_DISPLAY.encode(linear), depth_m, label, instance)
-    linear, depth_m, grain = add_noise(linear, depth_m, noise, noise_config)
-    rgb = np.clip(_DISPLAY.encode(linear) + grain, 0, 255).astype(np.uint8)
-    return RenderedView(rgb, depth_m, label, instance)
-
-
-class _Display:
-    """Linear light -> 8-bit grey levels by table: highlights roll off, gamma 2.2."""
-
-    _SIZE = 4096
-    _TOP = 4.0  # linear light that the table ends at
-
-    def __init__(self) -> None:
-        x = np.linspace(0.0, 1.0, self._SIZE) ** 2 * self._TOP
-        rolled = x * (1.0 + x / 9.0) / (1.0 + x)  # Reinhard with white at 3
-        self._table = np.clip(rolled ** (1 / 2.2) * 255.0 + 0.5, 0, 255).astype(np.uint8)
-
-    def encode(self, linear: Float32) -> UInt8:
-        """(...) float -> (...) uint8."""
-        position = np.sqrt(np.clip(linear, 0.0, self._TOP) / self._TOP) * (self._SIZE - 1)
-        return self._table[(position + 0.5).astype(np.int32)]
-
-
-_DISPLAY = _Display()
+    exact = np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
+    if sensor is None:
+        return RenderedView(develop(linear), exact.copy(), label, instance, exact)
+    rng = np.random.default_rng(sensor.seed)
+    shot = sensor.shot or single_shot(sensor.seed, sensor.config)
+    rgb = expose(linear, exact, intrinsics, shot, sensor.config, rng)
+    depth_m = measure_depth(exact, rgb, intrinsics, sensor.config.depth, rng)
+    return RenderedView(rgb, depth_m, label, instance, exact)

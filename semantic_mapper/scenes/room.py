@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.scenes.config import SUITE_VERSION, RoomConfig
+from semantic_mapper.scenes.config import SUITE_VERSION, TRAIN_SEEDS, RoomConfig
 from semantic_mapper.scenes.layout import Layout
 from semantic_mapper.scenes.materials import Palette
 from semantic_mapper.scenes.primitives import Primitives, pack
-from semantic_mapper.scenes.programmes import PROGRAMMES, SHARES, furnish
-from semantic_mapper.scenes.scene import Lights, Scene, shadow_cubes
-from semantic_mapper.types import Float64
+from semantic_mapper.scenes.programmes import CYCLE, PROGRAMMES, furnish
+from semantic_mapper.scenes.scene import Lights, Scene, extremes, shadow_cubes
 
 _ROOM_STREAM = 0  # number of the random stream; camera paths use others
 
@@ -24,14 +23,13 @@ def make_room(seed: int, config: RoomConfig = RoomConfig()) -> Scene:
     """
     _check(seed, config)
     rng = np.random.default_rng((SUITE_VERSION, seed, _ROOM_STREAM))
-    drawn = str(rng.choice(list(SHARES), p=list(SHARES.values())))
-    programme = config.programme or drawn
+    programme = config.programme or CYCLE[seed % len(CYCLE)]
     size = _room_size(rng, programme, config)
-    palette = Palette(rng)
-    layout = Layout(size, rng, palette)
+    palette = Palette(rng, held_out=seed not in TRAIN_SEEDS)
+    layout = Layout(size, rng, palette, wet=programme == "bathroom")
     furnish(layout, programme, config.clutter)
     primitives = pack(layout.groups)
-    lights = _make_lights(rng, primitives, layout.lamps, size, config.shadow_resolution)
+    lights = _make_lights(rng, primitives, layout, config.shadow_resolution)
     return Scene(seed, programme, size, primitives, palette.table(), lights)
 
 
@@ -58,23 +56,23 @@ def _room_size(rng: np.random.Generator, programme: str, config: RoomConfig) -> 
     return float(w), float(d), float(rng.uniform(config.min_height_m, config.max_height_m))
 
 
-def _make_lights(
-    rng: np.random.Generator,
-    primitives: Primitives,
-    lamps: list[Float64],
-    size: tuple[float, float, float],
-    shadow_resolution: int,
-) -> Lights:
-    """One to three of the room's lamps and windows are lit; strengths add up to an evenly exposed picture."""
+def _make_lights(rng: np.random.Generator, primitives: Primitives, layout: Layout, shadow_resolution: int) -> Lights:
+    """Two to four of the room's lamps and windows are lit, and the next room's lamp where an opening shows it;
+    strengths add up to an evenly exposed picture."""
+    size, lamps = layout.size_m, layout.lamps
     order = rng.permutation(len(lamps)) if lamps else np.zeros(0, int)
-    chosen = [lamps[i] for i in order[: int(rng.integers(1, 4))]]
+    chosen = [lamps[i] for i in order[: int(rng.integers(2, 5))]]
     if not chosen:
         chosen = [np.array([size[0] / 2, size[1] / 2, size[2] - 0.3])]
     shares = rng.uniform(0.5, 1.5, len(chosen))
-    strength = rng.uniform(3.0, 4.5) * (size[0] * size[1] / 16.0) ** 0.5
+    strength = rng.uniform(3.0, 4.5) * (size[0] * size[1] / 16.0) ** 0.5 * shares / shares.sum()
+    if layout.far_lamp is not None:
+        chosen.append(layout.far_lamp)
+        strength = np.append(strength, rng.uniform(0.4, 1.6))
     warm = rng.uniform(-1.0, 1.0, (len(chosen), 1))
     tint = 1.0 + warm * np.array([[0.15, 0.0, -0.2]])
     position = np.array(chosen)
     cubes = shadow_cubes(primitives, position, shadow_resolution)
-    color = tint * (strength * shares / shares.sum())[:, None]
-    return Lights(position, color, cubes, rng.uniform(0.3, 0.5) * (1.0 + rng.uniform(-0.06, 0.06, 3)))
+    softness = rng.uniform(0.35, 1.0, len(chosen))
+    ambient = rng.uniform(0.3, 0.5) * (1.0 + rng.uniform(-0.06, 0.06, 3))
+    return Lights(position, tint * strength[:, None], cubes, *extremes(cubes), softness, ambient)

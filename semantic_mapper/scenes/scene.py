@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from semantic_mapper.labels import ROOMS, LabelSet
@@ -22,12 +24,17 @@ class Lights:
         color: (N, 3) float64 linear RGB times strength.
         shadow: (N, 6, S, S) float32: per face of a cube round the light, the depth of the first surface. Face
             ``2 * axis + (direction is negative)``; its columns run along axis + 1, its rows along axis + 2 (mod 3).
+        shadow_low, shadow_high: (N, 6, S, S) float32 extremes of ``shadow`` within two pixels, from ``extremes``.
+        softness: (N,) float64 half width of the shadows' edges in pixels of the cube, at most 1.
         ambient: (3,) float64 linear RGB that reaches every surface.
     """
 
     position: Float64
     color: Float64
     shadow: Float32
+    shadow_low: Float32
+    shadow_high: Float32
+    softness: Float64
     ambient: Float64
 
 
@@ -57,6 +64,61 @@ class Scene:
         return ROOMS
 
 
+class PrimitiveArrays(NamedTuple):
+    """What the compiled shading reads of ``Primitives``."""
+
+    shape: np.ndarray
+    center: Float64
+    half: Float64
+    rotation: Float64
+    material: np.ndarray
+
+
+class MaterialArrays(NamedTuple):
+    """What it reads of ``MaterialTable``."""
+
+    pattern: np.ndarray
+    color_a: Float64
+    color_b: Float64
+    scale_m: Float64
+    seed: np.ndarray
+    emission: Float64
+    gloss: Float64
+    mirror: Float64
+
+
+class LightArrays(NamedTuple):
+    """What it reads of ``Lights``, and the size (3,) of the room."""
+
+    position: Float64
+    color: Float64
+    shadow: Float32
+    softness: Float64
+    ambient: Float64
+    room: Float64
+    low: Float32
+    high: Float32
+
+
+def kernel_arrays(scene: Scene) -> tuple[PrimitiveArrays, MaterialArrays, LightArrays]:
+    """The scene as named tuples of arrays, which compiled functions take as arguments."""
+    p, m, light = scene.primitives, scene.materials, scene.lights
+    return (
+        PrimitiveArrays(p.shape, p.center, p.half, p.rotation, p.material),
+        MaterialArrays(m.pattern, m.color_a, m.color_b, m.scale_m, m.seed, m.emission, m.gloss, m.mirror),
+        LightArrays(
+            light.position,
+            light.color,
+            light.shadow,
+            light.softness,
+            light.ambient,
+            np.array(scene.size_m),
+            light.shadow_low,
+            light.shadow_high,
+        ),
+    )
+
+
 def shadow_cubes(primitives: Primitives, position: Float64, resolution: int) -> Float32:
     """Depth (N, 6, S, S) round each light; see ``Lights.shadow``. Misses are inf."""
     keep = primitives.casts_shadow
@@ -79,3 +141,13 @@ def shadow_cubes(primitives: Primitives, position: Float64, resolution: int) -> 
             )
             cubes[light, face] = depth
     return cubes
+
+
+def extremes(cubes: Float32) -> tuple[Float32, Float32]:
+    """Least and greatest depth within two pixels (5x5) of each pixel of shadow cubes (N, 6, S, S)."""
+    window = np.ones((5, 5), np.uint8)
+    low, high = np.empty_like(cubes), np.empty_like(cubes)
+    for index in np.ndindex(cubes.shape[:2]):
+        low[index] = cv2.erode(cubes[index], window, borderType=cv2.BORDER_REPLICATE)
+        high[index] = cv2.dilate(cubes[index], window, borderType=cv2.BORDER_REPLICATE)
+    return low, high

@@ -3,14 +3,78 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 from semantic_mapper.scenes.camera import camera_path
-from semantic_mapper.scenes.config import CameraPathConfig, NoiseConfig, RoomConfig
-from semantic_mapper.scenes.render import render_view
+from semantic_mapper.scenes.config import CameraPathConfig, NoiseConfig, PoseNoiseConfig, RoomConfig
+from semantic_mapper.scenes.pose_noise import drifting_poses
+from semantic_mapper.scenes.render import RenderedView, render_view
 from semantic_mapper.scenes.room import make_room
-from semantic_mapper.types import CameraIntrinsics, PosedFrame
+from semantic_mapper.scenes.scene import Scene
+from semantic_mapper.scenes.shots import sequence_shots
+from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
 FRAME_NS = 66_666_667  # 15 frames a second
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoomView:
+    """One frame with the truth that a recorded log would not have.
+
+    Args:
+        frame: What the robot gets: noisy picture, noisy depth (None without a depth sensor), its pose as it knows it.
+        rendered: The same picture with exact depth and instances.
+        T_world_camera: (4, 4) float64, where the camera truly is.
+    """
+
+    frame: PosedFrame
+    rendered: RenderedView
+    T_world_camera: Float64
+
+
+def room_views(
+    seed: int,
+    count: int,
+    intrinsics: CameraIntrinsics,
+    *,
+    room: RoomConfig = RoomConfig(),
+    path: CameraPathConfig = CameraPathConfig(),
+    noise: NoiseConfig | None = None,
+    pose_noise: PoseNoiseConfig | None = None,
+    scene: Scene | None = None,
+) -> Iterator[RoomView]:
+    """``count`` labelled views (ids of ``labels.ROOMS``) of the room of ``seed``; everything follows from the seed.
+
+    Args:
+        seed: Of the room and of the path.
+        count: Frames; they are ``path.step_m`` apart.
+        intrinsics: Of the camera.
+        room, path: What the room and the path may look like.
+        noise: Depth sensor and noise, another draw each frame; None for perfect sensors.
+        pose_noise: Drift of the frames' poses; None for exact ones.
+        scene: ``make_room(seed, room)``, where the caller has it already.
+    """
+    scene = make_room(seed, room) if scene is None else scene
+    poses = camera_path(scene, count, seed, path)
+    told = poses if pose_noise is None else drifting_poses(poses, seed, pose_noise)
+    shots = [None] * count if noise is None else sequence_shots(poses, seed, noise)
+    for index, shot in enumerate(shots):
+        noise_seed = None if noise is None else seed * 100_003 + index
+        view = render_view(
+            scene, intrinsics, poses[index], noise=noise_seed, noise_config=noise or NoiseConfig(), shot=shot
+        )
+        frame = PosedFrame(
+            stamp_ns=(index + 1) * FRAME_NS,
+            seq=index,
+            camera_id="rooms",
+            rgb=view.rgb,
+            depth_m=None if noise is not None and noise.depth == "none" else view.depth_m,
+            label=view.label,
+            intrinsics=intrinsics,
+            T_world_camera=told[index],
+            pose_source="rooms",
+        )
+        yield RoomView(frame, view, poses[index])
 
 
 def room_frames(
@@ -21,28 +85,8 @@ def room_frames(
     room: RoomConfig = RoomConfig(),
     path: CameraPathConfig = CameraPathConfig(),
     noise: NoiseConfig | None = None,
+    pose_noise: PoseNoiseConfig | None = None,
 ) -> Iterator[PosedFrame]:
-    """``count`` labelled frames (ids of ``labels.ROOMS``) of the room of ``seed``; everything follows from the seed.
-
-    Args:
-        seed: Of the room and of the path.
-        count: Frames; they are ``path.step_m`` apart.
-        intrinsics: Of the camera.
-        room, path: What the room and the path may look like.
-        noise: Sensor noise, another draw each frame; None for a perfect camera.
-    """
-    scene = make_room(seed, room)
-    for index, T_world_camera in enumerate(camera_path(scene, count, seed, path)):
-        noise_seed = None if noise is None else seed * 100_003 + index
-        view = render_view(scene, intrinsics, T_world_camera, noise=noise_seed, noise_config=noise or NoiseConfig())
-        yield PosedFrame(
-            stamp_ns=(index + 1) * FRAME_NS,
-            seq=index,
-            camera_id="rooms",
-            rgb=view.rgb,
-            depth_m=view.depth_m,
-            label=view.label,
-            intrinsics=intrinsics,
-            T_world_camera=T_world_camera,
-            pose_source="rooms",
-        )
+    """The frames of ``room_views``, without the truth."""
+    for view in room_views(seed, count, intrinsics, room=room, path=path, noise=noise, pose_noise=pose_noise):
+        yield view.frame

@@ -1,4 +1,4 @@
-"""The procedural patterns in plain torch; ``fast_shade`` holds the compiled twins."""
+"""The procedural patterns in plain torch; ``fast_textures`` holds the compiled twins."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ def albedo(
     """
     first = torch.where(axis == 0, 1, 0)
     second = torch.where(axis == 2, 1, 2)
-    swap = (pattern == int(Pattern.WOOD)) & (_take(half, first) > _take(half, second))
+    grained = (pattern == int(Pattern.WOOD)) | (pattern == int(Pattern.PLANKS))
+    swap = grained & (_take(half, first) > _take(half, second))
     first, second = torch.where(swap, second, first), torch.where(swap, first, second)
     s, t = _take(local, first) / scale_m, _take(local, second) / scale_m
     blend, third = torch.zeros_like(s), torch.zeros_like(s)
@@ -81,6 +82,14 @@ def _spines(s: torch.Tensor, t: torch.Tensor, seed: torch.Tensor) -> Weights:
     return first, 0.6 * _hash(cell, torch.full_like(seed, 2), seed).to(s.dtype)
 
 
+def _planks(s: torch.Tensor, t: torch.Tensor, seed: torch.Tensor) -> Weights:
+    row = s.floor().long()
+    along = t * 0.125 + _hash(row, torch.full_like(seed, 3), seed).to(s.dtype)
+    joint = (s - s.floor() < 0.03) | (along - along.floor() < 0.004)
+    shade = 0.55 * _hash(row, along.floor().long(), seed).to(s.dtype) + 0.3 * _noise(s * 8.0, t * 0.5, seed + 1)
+    return torch.where(joint, 1.0, shade), torch.zeros_like(s)
+
+
 _PATTERNS = {
     Pattern.PLAIN: _plain,
     Pattern.WOOD: _wood,
@@ -90,6 +99,7 @@ _PATTERNS = {
     Pattern.WEAVE: _weave,
     Pattern.PRINT: _print,
     Pattern.SPINES: _spines,
+    Pattern.PLANKS: _planks,
 }
 
 

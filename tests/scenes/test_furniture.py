@@ -7,8 +7,8 @@ import pytest
 
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes.furniture import FURNITURE
-from semantic_mapper.scenes.materials import Palette
-from semantic_mapper.scenes.programmes import CLUTTER, PROGRAMMES, SHARES
+from semantic_mapper.scenes.materials import CAMOUFLAGE, HELD_OUT_HUES, Draw, Palette
+from semantic_mapper.scenes.programmes import CLUTTER, CYCLE, PROGRAMMES
 
 SPECIMENS = 12
 STANDING = [name for name, kind in FURNITURE.items() if kind.place in ("wall", "corner", "centre", "small")]
@@ -42,12 +42,12 @@ def test_every_specimen_can_differ() -> None:
         assert len(sizes) + len(colours) > 2, name
 
 
-def test_programmes_name_registered_furniture_and_their_shares_add_up() -> None:
-    sets = {"bed_set", "sofa_set", "desk_set", "dining_set"}
-    named = {entry.name for entries in PROGRAMMES.values() for entry in entries} | set(CLUTTER)
+def test_programmes_name_registered_furniture() -> None:
+    sets = {"bed_set", "sofa_set", "desk_set", "dining_set", "mat"}
+    named = {entry.name for entries in PROGRAMMES.values() for entry in entries}
+    named |= {name for names in CLUTTER.values() for name in names}
     assert named - sets <= set(FURNITURE)
-    assert set(SHARES) == set(PROGRAMMES)
-    assert sum(SHARES.values()) == pytest.approx(1.0)
+    assert set(CYCLE) == set(CLUTTER) == set(PROGRAMMES)
 
 
 def test_each_pool_of_materials_serves_several_classes() -> None:
@@ -60,3 +60,46 @@ def test_each_pool_of_materials_serves_several_classes() -> None:
                 users.setdefault(part.material, set()).add(part.label)
     for pair in ({"door", "cabinet"}, {"desk", "table"}, {"curtain", "sofa"}, {"refrigerator", "cabinet"}):
         assert any(pair <= classes for classes in users.values()), pair
+
+
+def test_camouflaged_pairs_share_one_material_in_about_a_third_of_the_rooms() -> None:
+    palettes = [Palette(np.random.default_rng(seed)) for seed in range(200)]
+    for first, second, _ in CAMOUFLAGE:
+        shared = [p.camouflage.get(first, -1) == p.camouflage.get(second, -2) for p in palettes]
+        assert 0.2 < np.mean(shared) < 0.5, (first, second)
+
+
+@pytest.mark.parametrize(
+    ("pair", "pieces", "labels"),
+    [
+        (0, ("door", "wardrobe"), ("door", "cabinet")),
+        (1, ("desk", "dining_table"), ("desk", "table")),
+        (2, ("bathtub", "sofa"), ("curtain", "sofa")),
+        (4, ("refrigerator", "larder"), ("refrigerator", "cabinet")),
+    ],
+)
+def test_a_camouflaged_room_uses_the_shared_material_on_both(
+    pair: int, pieces: tuple[str, str], labels: tuple[str, str]
+) -> None:
+    first, second, _ = CAMOUFLAGE[pair]
+    shared = next(
+        p for p in (Palette(np.random.default_rng(s)) for s in range(99)) if {first, second} <= p.camouflage.keys()
+    )
+    for piece, label in zip(pieces, labels, strict=True):
+        used = {
+            part.material
+            for seed in range(SPECIMENS)
+            for part in FURNITURE[piece].make(np.random.default_rng(seed), shared).parts
+            if part.label == label
+        }
+        assert shared.camouflage[first] in used, piece
+
+
+def test_training_rooms_leave_out_hues_that_held_out_rooms_are_fond_of() -> None:
+    def share(held_out: bool) -> float:
+        draw = Draw(np.random.default_rng(0), held_out)
+        hues = [draw.hue() for _ in range(2000)]
+        return float(np.mean([any(low <= hue < high for low, high in HELD_OUT_HUES) for hue in hues]))
+
+    assert share(held_out=False) == 0
+    assert share(held_out=True) > 0.5

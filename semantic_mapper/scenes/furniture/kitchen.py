@@ -15,7 +15,8 @@ def counter(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     doors = int(rng.integers(3, 6))
     each, d, h = rng.uniform(0.45, 0.6), rng.uniform(0.58, 0.64), rng.uniform(0.86, 0.92)
     w = doors * each
-    front, top = palette.pick(rng, "wood", "paint"), palette.pick(rng, "tile", "wood", "dark", "paint")
+    front = palette.pick(rng, "wood", "paint", role="cabinet")
+    top = palette.pick(rng, "tile", "wood", "dark", "paint", role="counter")
     metal = palette.pick(rng, "metal", "dark")
     # The carcass ends under the bowl of the sink; end panels and doors hide the gap.
     a.box(front, (0, d / 2 - 0.02, (h - 0.12) / 2), (w - 0.05, d - 0.08, h - 0.28), label="cabinet", item=1)
@@ -47,8 +48,8 @@ def counter(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     a.box(palette.pick(rng, "tile"), (0, 0.01, h + 0.27), (w, 0.012, 0.5), label="wall", item=3)
     if rng.uniform() < 0.65:
         _wall_units(a, rng, palette, front, metal, doors, each)
-    free = (-w / 2, sx - 0.3) if left > right else (sx + 0.3, w / 2)
-    a.tops.append(Top(free[0], free[1], 0.03, d, h + 0.02))
+    for x0, x1 in ((-w / 2, sx - 0.3), (sx + 0.3, w / 2)):
+        a.tops.append(Top(x0, x1, 0.03, d, h + 0.02))
 
 
 def _bowl(a: Assembly, material: int, x: float, y: float, h: float, w: float, d: float) -> None:
@@ -73,7 +74,8 @@ def _wall_units(
 def refrigerator(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     """Body, one or two doors one above the other, bar handles."""
     w, d, h = rng.uniform(0.58, 0.8), rng.uniform(0.6, 0.7), rng.uniform(1.5, 1.95)
-    body, metal = palette.pick(rng, "paint", "metal", "ceramic"), palette.pick(rng, "metal", "dark")
+    body = palette.pick(rng, "paint", "metal", "ceramic", role="refrigerator")
+    metal = palette.pick(rng, "metal", "dark")
     split = rng.choice([0.33, 0.68]) * h
     hand = 1 if rng.uniform() < 0.5 else -1
     a.box(body, (0, d / 2, h / 2), (w, d, h))
@@ -101,3 +103,37 @@ def stove(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
             a.cylinder(dark, (x, y, h + 0.006), (0.2, 0.2, 0.014))
             a.cylinder(dark, (x, d + 0.01, h - 0.07), (0.04, 0.04, 0.04))
     a.box(body, (0, 0.03, h + 0.06), (0.6, 0.05, 0.12))
+    if rng.uniform() < 0.6:  # a hood above it
+        metal = palette.pick(rng, "metal", "paint", "dark")
+        a.frustum(metal, (0, 0.25, 1.72), (0.62, 0.48, 0.24), item=1)
+        a.box(metal, (0, 0.14, 1.98), (0.26, 0.24, 0.3), item=1)
+
+
+@furniture("counter", "centre", keep_free_m=0.4)
+def kitchen_island(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A block with doors under an overhanging top."""
+    w, d, h = rng.uniform(1.0, 1.6), rng.uniform(0.65, 0.9), rng.uniform(0.88, 0.94)
+    body = palette.pick(rng, "wood", "paint", role="cabinet")
+    top, metal = palette.pick(rng, "tile", "wood", "dark", "paint", role="counter"), palette.pick(rng, "metal", "dark")
+    a.box(body, (0, d / 2, (h - 0.02) / 2), (w - 0.12, d - 0.16, h - 0.02), label="cabinet", item=1)
+    for k in (-1, 0, 1):
+        x, each = k * (w - 0.12) / 3, (w - 0.12) / 3 - 0.015
+        a.box(body, (x, d - 0.072, h / 2), (each, 0.018, h - 0.16), label="cabinet", item=1)
+        a.box(metal, (x, d - 0.055, h - 0.13), (each * 0.5, 0.02, 0.016), label="cabinet", item=1)
+    a.box(top, (0, d / 2, h), (w, d, 0.04))
+    a.tops.append(Top(-w / 2, w / 2, 0, d, h + 0.02))
+
+
+@furniture("cabinet", "wall", keep_free_m=0.5)
+def larder(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A tall kitchen cupboard, sometimes with an oven in it."""
+    w, d, h = rng.uniform(0.55, 0.65), rng.uniform(0.56, 0.62), rng.uniform(1.9, 2.15)
+    body, metal = palette.pick(rng, "wood", "paint", role="cabinet"), palette.pick(rng, "metal", "dark")
+    a.box(body, (0, d / 2, h / 2), (w, d, h))
+    oven = rng.uniform() < 0.5
+    for z0, z1 in ((0.1, 0.78), (1.4, h - 0.02)) if oven else ((0.1, 1.1), (1.12, h - 0.02)):
+        a.box(body, (0, d + 0.01, (z0 + z1) / 2), (w - 0.012, 0.02, z1 - z0))
+        a.box(metal, (w / 2 - 0.06, d + 0.03, (z0 + z1) / 2), (0.02, 0.025, 0.18))
+    if oven:
+        a.box(palette.pick(rng, "dark"), (0, d + 0.012, 1.09), (w - 0.02, 0.024, 0.58), label="otherfurniture", item=1)
+        a.box(metal, (0, d + 0.04, 1.3), (w - 0.14, 0.03, 0.025), label="otherfurniture", item=1)

@@ -1,4 +1,4 @@
-"""Lamps, plants, rugs and clutter."""
+"""Lamps, plants, rugs, cartons, bins."""
 
 from __future__ import annotations
 
@@ -11,15 +11,24 @@ from semantic_mapper.scenes.primitives import Assembly
 
 @furniture("otherprop", "ceiling")
 def ceiling_lamp(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
-    """A shade at the ceiling, or hung from it; z = 0 is the ceiling."""
+    """A flat shade, a tube, or a shade hung from a cord; z = 0 is the ceiling."""
     shade, w = palette.pick(rng, "lampshade"), rng.uniform(0.3, 0.5)
-    if rng.uniform() < 0.5:
+    kind = int(rng.integers(4))
+    if kind == 0:
         a.cylinder(shade, (0, 0, -0.06), (w, w, 0.1), casts_shadow=False)
         a.lamps.append((0.0, 0.0, -0.25))
+    elif kind == 1:
+        length = rng.uniform(0.8, 1.3)
+        a.box(palette.pick(rng, "metal", "paint"), (0, 0, -0.02), (length, 0.14, 0.03), casts_shadow=False)
+        a.cylinder(shade, (0, 0, -0.06), (0.07, 0.07, length), yaw=np.pi / 2, tilt=np.pi / 2, casts_shadow=False)
+        a.lamps.append((0.0, 0.0, -0.25))
     else:
-        drop = rng.uniform(0.2, 0.35)
+        drop = rng.uniform(0.2, 0.45)
         a.cylinder(palette.pick(rng, "metal", "dark"), (0, 0, -drop / 2), (0.02, 0.02, drop), casts_shadow=False)
-        a.ellipsoid(shade, (0, 0, -drop - 0.08), (w, w, 0.22), casts_shadow=False)
+        if kind == 2:
+            a.ellipsoid(shade, (0, 0, -drop - 0.08), (w, w, 0.22), casts_shadow=False)
+        else:
+            a.frustum(shade, (0, 0, -drop - 0.08), (w, w, 0.2), casts_shadow=False)
         a.lamps.append((0.0, 0.0, -drop - 0.3))
 
 
@@ -30,7 +39,8 @@ def floor_lamp(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     w = rng.uniform(0.3, 0.42)
     a.cylinder(metal, (0, 0.22, 0.015), (0.28, 0.28, 0.03))
     a.cylinder(metal, (0, 0.22, h / 2), (0.03, 0.03, h))
-    a.cylinder(shade, (0, 0.22, h), (w, w, rng.uniform(0.22, 0.3)), casts_shadow=False)
+    add = a.frustum if rng.uniform() < 0.6 else a.cylinder
+    add(shade, (0, 0.22, h), (w, w, rng.uniform(0.22, 0.3)), casts_shadow=False)
     a.lamps.append((0.0, 0.22, h + 0.25))
 
 
@@ -39,14 +49,14 @@ def table_lamp(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     """A small lamp."""
     foot, h = palette.pick(rng, "metal", "ceramic", "object"), rng.uniform(0.22, 0.35)
     a.ellipsoid(foot, (0, 0, h * 0.3), (0.13, 0.13, h * 0.6))
-    a.cylinder(palette.pick(rng, "lampshade"), (0, 0, h * 0.85), (0.2, 0.2, h * 0.5), casts_shadow=False)
+    a.frustum(palette.pick(rng, "lampshade"), (0, 0, h * 0.85), (0.2, 0.2, h * 0.5), casts_shadow=False)
 
 
 @furniture("otherprop", "corner")
 def plant(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     """A pot with a crown of ellipsoids."""
     pot, leaf, h = palette.pick(rng, "object", "ceramic", "wood"), palette.pick(rng, "plant"), rng.uniform(0.6, 1.3)
-    a.cylinder(pot, (0, 0.25, 0.15), (0.3, 0.3, 0.3))
+    a.frustum(pot, (0, 0.25, 0.15), (0.32, 0.32, 0.3), tilt=np.pi)
     a.cylinder(palette.pick(rng, "wood"), (0, 0.25, 0.3 + h * 0.2), (0.04, 0.04, h * 0.5))
     for _ in range(4):
         x, y, z = rng.uniform(-0.09, 0.09), 0.25 + rng.uniform(-0.06, 0.09), rng.uniform(0.45, 0.95) * h
@@ -75,58 +85,5 @@ def carton(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
 def waste_bin(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     """A round bin."""
     w, h = rng.uniform(0.24, 0.34), rng.uniform(0.3, 0.55)
-    a.cylinder(palette.pick(rng, "metal", "object", "dark"), (0, 0.2, h / 2), (w, w, h))
+    a.frustum(palette.pick(rng, "metal", "object", "dark"), (0, 0.2, h / 2), (w, w, h), tilt=np.pi)
     a.cylinder(palette.pick(rng, "dark", "metal"), (0, 0.2, h + 0.008), (w * 0.94, w * 0.94, 0.02))
-
-
-@furniture("otherprop", "small")
-def cup(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
-    """A mug or a glass."""
-    w, h = rng.uniform(0.07, 0.1), rng.uniform(0.08, 0.13)
-    a.cylinder(palette.pick(rng, "object", "ceramic"), (0, 0, h / 2), (w, w, h))
-
-
-@furniture("otherprop", "small")
-def bottle(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
-    """Body and neck."""
-    w, h = rng.uniform(0.07, 0.1), rng.uniform(0.18, 0.26)
-    material = palette.pick(rng, "object", "dark", "plant")
-    a.cylinder(material, (0, 0, h * 0.35), (w, w, h * 0.7))
-    a.cylinder(material, (0, 0, h * 0.85), (w * 0.35, w * 0.35, h * 0.3))
-
-
-@furniture("otherprop", "small")
-def bowl(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
-    """A bowl of fruit."""
-    w = rng.uniform(0.2, 0.28)
-    a.cylinder(palette.pick(rng, "ceramic", "wood", "object"), (0, 0, 0.035), (w, w, 0.07))
-    for k in range(3):
-        angle = 2.1 * k
-        center = (0.06 * float(np.cos(angle)), 0.06 * float(np.sin(angle)), 0.085)
-        a.ellipsoid(palette.pick(rng, "object"), center, (0.085, 0.085, 0.08))
-
-
-@furniture("otherprop", "small")
-def book_pile(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
-    """Two or three books lying on each other."""
-    z = 0.0
-    for _ in range(int(rng.integers(2, 4))):
-        h = rng.uniform(0.02, 0.045)
-        size = (rng.uniform(0.18, 0.24), rng.uniform(0.14, 0.18), h)
-        a.box(palette.pick(rng, "object", "print"), (0, 0, z + h / 2), size, yaw=rng.uniform(-0.4, 0.4))
-        z += h
-
-
-@furniture("otherprop", "small")
-def vase(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
-    """A vase with a bunch."""
-    h = rng.uniform(0.16, 0.26)
-    a.ellipsoid(palette.pick(rng, "object", "ceramic"), (0, 0, h * 0.5), (0.12, 0.12, h))
-    a.ellipsoid(palette.pick(rng, "plant", "print"), (0, 0, h * 1.3), (0.2, 0.2, h * 0.8))
-
-
-@furniture("otherprop", "small")
-def small_box(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
-    """A packet, a radio, a tin."""
-    size = (rng.uniform(0.1, 0.28), rng.uniform(0.08, 0.18), rng.uniform(0.06, 0.22))
-    a.box(palette.pick(rng, "object", "dark", "print"), (0, 0, size[2] / 2), size, yaw=rng.uniform(-0.3, 0.3))

@@ -1,4 +1,4 @@
-"""Doors, windows, curtains, pictures, radiators."""
+"""Doors, windows, curtains, pictures, radiators, what hangs on walls."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 
 from semantic_mapper.scenes.furniture.registry import furniture
 from semantic_mapper.scenes.materials import Palette
-from semantic_mapper.scenes.primitives import Assembly
+from semantic_mapper.scenes.primitives import Assembly, Top
 
 
 @furniture("door", "hang", keep_free_m=0.9)
 def door(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     """Leaf with panels, frame, handle."""
     w, h = rng.uniform(0.8, 0.95), rng.uniform(1.95, 2.1)
-    leaf, frame = palette.pick(rng, "wood", "paint"), palette.pick(rng, "wood", "paint")
+    leaf, frame = palette.pick(rng, "wood", "paint", role="door"), palette.pick(rng, "wood", "paint")
     metal = palette.pick(rng, "metal", "dark")
     a.box(leaf, (0, 0.025, h / 2), (w, 0.05, h))
     for x in (-1, 1):
@@ -22,17 +22,19 @@ def door(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     hand = 1 if rng.uniform() < 0.5 else -1
     a.box(metal, (hand * (w / 2 - 0.08), 0.06, 1.02), (0.04, 0.03, 0.16))
     a.box(metal, (hand * (w / 2 - 0.13), 0.1, 1.05), (0.13, 0.025, 0.025))
-    style = int(rng.integers(3))
+    style = int(rng.integers(4))
     panels = ((0.28, 0.36), (0.74, 0.36)) if style == 1 else ((0.2, 0.26), (0.5, 0.22), (0.8, 0.26))
-    for z, tall in panels if style else ():
+    for z, tall in panels if style in (1, 2) else ():
         a.box(leaf, (0, 0.055, z * h), (w * 0.66, 0.014, tall * h))
+    if style == 3:  # a pane in the upper half
+        a.box(palette.pick(rng, "daylight", "dark", "screen"), (0, 0.05, 0.7 * h), (w * 0.5, 0.012, 0.42 * h))
 
 
 @furniture("window", "hang")
 def window(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     """Panes in a frame with bars, a sill, often curtains at its sides."""
     w, tall, low = rng.uniform(0.8, 1.7), rng.uniform(0.9, 1.35), rng.uniform(0.8, 1.0)
-    pane, frame = palette.pick(rng, "daylight", "daylight", "dark"), palette.pick(rng, "paint", "wood")
+    pane, frame = palette.pick(rng, "daylight", "daylight", "daylight", "dark"), palette.pick(rng, "paint", "wood")
     mid = low + tall / 2
     a.box(pane, (0, 0.01, mid), (w, 0.02, tall), casts_shadow=False)
     for x in (-1, 1):
@@ -45,15 +47,16 @@ def window(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     if rng.uniform() < 0.4:
         a.box(frame, (0, 0.025, low + tall * 0.65), (w, 0.044, 0.04))
     a.box(palette.pick(rng, "paint", "wood", "tile"), (0, 0.09, low - 0.07), (w + 0.2, 0.18, 0.035))
-    a.lamps.append((0.0, 0.35, mid + 0.1))
+    a.lamps.extend(((-w / 4, 0.35, mid + 0.1), (w / 4, 0.35, mid + 0.1)))
+    a.tops.append(Top(-w / 2 + 0.05, w / 2 - 0.05, 0.06, 0.18, low - 0.0525))
     if rng.uniform() < 0.7:
         _curtains(a, rng, palette, w, low + tall + 0.15)
 
 
 def _curtains(a: Assembly, rng: np.random.Generator, palette: Palette, w: float, top: float) -> None:
-    cloth, rod = palette.pick(rng, "fabric"), palette.pick(rng, "metal", "wood")
+    cloth, rod = palette.pick(rng, "fabric", role="curtain"), palette.pick(rng, "metal", "wood")
     bottom = 0.05 if rng.uniform() < 0.6 else rng.uniform(0.6, 0.75)
-    folds, width = int(rng.integers(3, 6)), rng.uniform(0.09, 0.12)
+    folds, width = int(rng.integers(3, 7)), rng.uniform(0.09, 0.12)
     # Hung clear of the sill, which sticks out 18 cm.
     for x in (-1, 1):
         for k in range(folds):
@@ -65,11 +68,50 @@ def _curtains(a: Assembly, rng: np.random.Generator, palette: Palette, w: float,
 
 @furniture("picture", "hang")
 def picture(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
-    """A framed print."""
-    w, tall = rng.uniform(0.35, 1.0), rng.uniform(0.35, 0.8)
+    """A framed print; some are lit, some have a mount."""
+    w, tall = rng.uniform(0.35, 1.1), rng.uniform(0.35, 0.9)
     z = rng.uniform(1.45, 1.65)
-    a.box(palette.pick(rng, "wood", "paint", "dark"), (0, 0.015, z), (w, 0.03, tall))
-    a.box(palette.pick(rng, "print", "print", "fabric"), (0, 0.02, z), (w - 0.08, 0.034, tall - 0.08))
+    sight = palette.pick(rng, "print", "print", "fabric", "screen", role="picture")
+    sight = palette.pick(rng, "screen") if rng.uniform() < 0.2 else sight
+    edge = rng.uniform(0.02, 0.06)
+    a.box(palette.pick(rng, "wood", "paint", "dark", "metal"), (0, 0.015, z), (w, 0.03, tall))
+    if rng.uniform() < 0.35:
+        a.box(palette.pick(rng, "paint", "wallpaint"), (0, 0.018, z), (w - 2 * edge, 0.03, tall - 2 * edge))
+        edge += 0.05
+    a.box(sight, (0, 0.02, z), (w - 2 * edge, 0.034, tall - 2 * edge))
+
+
+@furniture("otherprop", "hang")
+def wall_clock(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """Rim, face, hands."""
+    w, z = rng.uniform(0.24, 0.36), rng.uniform(1.75, 2.0)
+    rim, face, dark = palette.pick(rng, "wood", "metal", "dark"), palette.pick(rng, "paint"), palette.pick(rng, "dark")
+    a.cylinder(rim, (0, 0.02, z), (w, w, 0.04), tilt=np.pi / 2)
+    a.cylinder(face, (0, 0.024, z), (w - 0.03, w - 0.03, 0.04), tilt=np.pi / 2)
+    a.box(dark, (0, 0.046, z + w * 0.16), (0.012, 0.006, w * 0.34))
+    a.box(dark, (w * 0.1, 0.046, z), (w * 0.22, 0.006, 0.014))
+
+
+@furniture("otherprop", "hang")
+def television(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A flat screen on the wall."""
+    w, z = rng.uniform(0.9, 1.4), rng.uniform(1.2, 1.45)
+    a.box(palette.pick(rng, "dark"), (0, 0.03, z), (w, 0.06, w * 0.58))
+    a.box(palette.pick(rng, "dark", "screen", "print"), (0, 0.035, z), (w - 0.03, 0.06, w * 0.58 - 0.03))
+
+
+@furniture("otherprop", "hang")
+def coat_hooks(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A board with hooks and clothes on some of them."""
+    w, z = rng.uniform(0.5, 0.9), rng.uniform(1.6, 1.8)
+    a.box(palette.pick(rng, "wood", "paint"), (0, 0.01, z), (w, 0.02, 0.1))
+    for k in range(4):
+        x = (k - 1.5) * w / 4
+        a.box(palette.pick(rng, "metal"), (x, 0.045, z - 0.02), (0.02, 0.06, 0.02))
+        if rng.uniform() < 0.5:
+            long = rng.uniform(0.5, 0.95)
+            size = (rng.uniform(0.16, 0.24), 0.1, long)
+            a.ellipsoid(palette.pick(rng, "fabric"), (x, 0.075, z - 0.03 - long / 2), size, item=1 + k)
 
 
 @furniture("otherfurniture", "hang")

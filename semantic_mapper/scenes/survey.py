@@ -1,0 +1,166 @@
+"""Look at the suite: contact sheets, how often each class is seen, how fast rooms are rendered.
+
+``python -m semantic_mapper.scenes.survey sheet --out rooms.png`` and likewise ``classes`` and ``speed``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import msgspec
+import numpy as np
+import structlog
+import typer
+
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.scenes.camera import camera_path
+from semantic_mapper.scenes.config import (
+    TEST_SEEDS,
+    TRAIN_SEEDS,
+    VALIDATION_SEEDS,
+    CameraPathConfig,
+    DepthSensorName,
+    NoiseConfig,
+    RoomConfig,
+)
+from semantic_mapper.scenes.programmes import PROGRAMMES
+from semantic_mapper.scenes.render import render_view
+from semantic_mapper.scenes.room import make_room
+from semantic_mapper.scenes.sequence import room_views
+from semantic_mapper.scenes.shots import sequence_shots
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
+
+CAMERA = CameraIntrinsics(220.6, 220.6, 159.5, 119.5, 320, 240)  # an OAK-D's colour camera, at a quarter of its width
+SPLITS = {"train": TRAIN_SEEDS, "validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
+SPREAD = CameraPathConfig(step_m=0.6)  # views that differ
+
+app = typer.Typer(add_completion=False, help=__doc__)
+log = structlog.get_logger(__name__)
+
+
+def contact_sheet(
+    seeds: Iterable[int],
+    views: int,
+    *,
+    across: int = 1,
+    camera: CameraIntrinsics = CAMERA,
+    noise: NoiseConfig | None = NoiseConfig(),
+) -> UInt8:
+    """Rooms as rows of pictures (H, W, 3) RGB: for each view its colours, its labels and its measured depth.
+
+    The programmes take turns, so that six seeds show all of them. ``across`` rooms share a row.
+    """
+    names = sorted(PROGRAMMES)
+    rows: list[UInt8] = []
+    for number, seed in enumerate(seeds):
+        room = RoomConfig(programme=names[number % len(names)])  # type: ignore[arg-type]
+        tiles: list[UInt8] = []
+        for view in room_views(seed, views, camera, room=room, path=SPREAD, noise=noise):
+            depth = view.rendered.depth_m
+            tiles += [view.frame.rgb, ROOMS.colorize(view.rendered.label), _depth_picture(depth)]
+        rows.append(np.concatenate(tiles, 1))
+        cv2.putText(rows[-1], f"{seed} {room.programme}", (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 0), 1)
+    rows += [np.zeros_like(rows[0])] * (-len(rows) % across)
+    return np.concatenate([np.concatenate(rows[k : k + across], 1) for k in range(0, len(rows), across)], 0)
+
+
+def class_shares(seeds: Iterable[int], views: int) -> dict[str, Float64]:
+    """Of each class: share of all pixels, and share of the pictures that show it (2,)."""
+    small = CameraIntrinsics(55.15, 55.15, 39.5, 29.5, 80, 60)
+    pixels, pictures, count = np.zeros(256), np.zeros(256), 0
+    for seed in seeds:
+        scene = make_room(seed, RoomConfig(shadow_resolution=8))
+        for pose in camera_path(scene, views, seed, SPREAD):
+            histogram = np.bincount(render_view(scene, small, pose).label.ravel(), minlength=256)
+            pixels += histogram
+            pictures += histogram > 0
+            count += 1
+    return {
+        name: np.array([pixels[i] / pixels.sum(), pictures[i] / count])
+        for i, name in zip(ROOMS.ids, ROOMS.names, strict=True)
+    }
+
+
+def images_per_second(seeds: Iterable[int], views: int, depth: DepthSensorName) -> dict[str, float]:
+    """Images a CPU second, all threads counted, with full shading and sensors: of views alone, and of whole rooms."""
+    noise = NoiseConfig(depth=depth)
+    making = rendering = 0.0
+    count = primitives = rooms = 0
+    for seed in seeds:
+        started = time.process_time()
+        scene = make_room(seed)
+        poses = camera_path(scene, views, seed)
+        shots = sequence_shots(poses, seed, noise)
+        made = time.process_time()
+        for k, pose in enumerate(poses):
+            render_view(scene, CAMERA, pose, noise=k, noise_config=noise, shot=shots[k])
+        making, rendering = making + made - started, rendering + time.process_time() - made
+        count, primitives, rooms = count + views, primitives + len(scene.primitives), rooms + 1
+    return {
+        "views_per_s": count / rendering,
+        "with_room_and_path_per_s": count / (rendering + making),
+        "room_and_path_s": making / rooms,
+        "primitives": primitives / rooms,
+    }
+
+
+def _depth_picture(depth_m: Float32) -> UInt8:
+    grey = np.clip(depth_m / 6.0 * 255.0, 0, 255).astype(np.uint8)
+    picture = np.asarray(cv2.applyColorMap(255 - grey, cv2.COLORMAP_TURBO), np.uint8)[..., ::-1].copy()
+    picture[depth_m == 0] = 0
+    return picture
+
+
+Split = Annotated[str, typer.Option(help="train, validation or test")]
+Rooms = Annotated[int, typer.Option(help="how many seeds of the split")]
+Views = Annotated[int, typer.Option(help="of each room")]
+
+
+@app.command()
+def sheet(
+    out: Annotated[Path, typer.Option(help="PNG or JPEG to write")],
+    split: Split = "train",
+    first: Annotated[int, typer.Option(help="how many seeds of the split to skip")] = 0,
+    rooms: Rooms = 12,
+    views: Views = 2,
+    across: Annotated[int, typer.Option(help="rooms side by side")] = 1,
+    scale: Annotated[float, typer.Option(help="of the picture that is written")] = 1.0,
+    clean: Annotated[bool, typer.Option(help="perfect sensors")] = False,
+) -> None:
+    """Write pictures, labels and depth of rooms of all programmes to a PNG or JPEG."""
+    seeds, noise = SPLITS[split][first : first + rooms], None if clean else NoiseConfig()
+    picture = contact_sheet(seeds, views, across=across, noise=noise)
+    picture = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+    cv2.imwrite(str(out), np.ascontiguousarray(picture[..., ::-1]))
+    log.info("contact_sheet_written", path=str(out), size=picture.shape)
+
+
+@app.command()
+def classes(
+    out: Annotated[Path, typer.Option(help="JSON to write")],
+    split: Split = "train",
+    rooms: Rooms = 100,
+    views: Views = 10,
+) -> None:
+    """Measure how often each class is seen and write the shares as JSON."""
+    shares = class_shares(SPLITS[split][:rooms], views)
+    plain = {name: {"pixels": round(float(s[0]), 5), "pictures": round(float(s[1]), 4)} for name, s in shares.items()}
+    out.write_bytes(msgspec.json.format(msgspec.json.encode(plain), indent=1))
+    log.info("class_shares", **{name: f"{100 * s[0]:.2f} %" for name, s in shares.items()})
+
+
+@app.command()
+def speed(rooms: Rooms = 8, views: Views = 30, depth: Annotated[str, typer.Option()] = "oak_d") -> None:
+    """Measure images a CPU second at 320x240; the first room only warms the compiled code up."""
+    sensor = msgspec.convert(depth, DepthSensorName)
+    images_per_second(TRAIN_SEEDS[:1], 2, sensor)
+    figures = images_per_second(TRAIN_SEEDS[1 : rooms + 1], views, sensor)
+    log.info("speed", depth=sensor, **{name: round(value, 2) for name, value in figures.items()})
+
+
+if __name__ == "__main__":
+    app()
