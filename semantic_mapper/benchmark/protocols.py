@@ -19,7 +19,7 @@ from semantic_mapper.benchmark.scoring import (
     room_calibration,
     room_confusion,
 )
-from semantic_mapper.benchmark.views import choose_sources, needs_own_view
+from semantic_mapper.benchmark.views import choose_sources
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.fields.checkpoint import adapt_model
@@ -117,7 +117,7 @@ def _answer(
     labelled: bool,
 ) -> Answer:
     frames = room.frames
-    own = needs_own_view(field)
+    own = field.needs_own_view
     count = min(suite.views, len(pool)) - (1 if own else 0)
     truth = room.truth[query]
     sources = choose_sources(

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from semantic_mapper.benchmark.config import SpacingConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.geometry import invert_pose, transform, unproject
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 
@@ -32,14 +31,6 @@ class Sources:
     numbers: tuple[int, ...]
     distance_m: float
     seen: float
-
-
-def needs_own_view(field: LearnedField) -> bool:
-    """Whether a kind of field cannot answer without the image of the very view it renders (a per-image network).
-
-    Such a kind sets a class attribute ``needs_own_view = True``; for all others the query is never a source view.
-    """
-    return bool(getattr(field, "needs_own_view", False))
 
 
 def choose_sources(

@@ -3,18 +3,45 @@
 from __future__ import annotations
 
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+from dataclasses import dataclass
+
 import torch
 
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.geometry_net import hit_and_visibility
 from semantic_mapper.fields.projection import gather, reproject
-from semantic_mapper.fields.sray import ContextualSpace
 from semantic_mapper.fields.volume import interval_lengths
 from semantic_mapper.types import RayBatch
 
+CUES = 4  # hit, visibility, view cosine, spread of the depth: what a view knows of a sample beside its feature
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ContextualSpace:
+    """The space M of Eq. 5 with what goes with it, view-first.
+
+    Args:
+        feature: (m, R, N, C).
+        rgb: (m, R, N, 3).
+        cues: (m, R, N, 4).
+        hit, visibility: (m, R, N) in [0, 1].
+        valid: (m, R, N) bool.
+        delta: (R, N) interval lengths, metres.
+        channel: (m, R, N) int64 known label at the sample, -1 = none.
+    """
+
+    feature: torch.Tensor
+    rgb: torch.Tensor
+    cues: torch.Tensor
+    hit: torch.Tensor
+    visibility: torch.Tensor
+    valid: torch.Tensor
+    delta: torch.Tensor
+    channel: torch.Tensor
+
 
 def contextual_space(rays: RayBatch, z: torch.Tensor, sources: EncodedViews) -> ContextualSpace:
-    """Reproject samples z (R, N) of whole rays into all views; gather features, colours and hit probabilities."""
+    """Reproject samples z (R, N) of whole rays into all views and gather M (S-Ray Eq. 3 to 5)."""
     where = reproject(rays, z, sources)
     found = gather(sources, where)
     delta = interval_lengths(z, rays.direction.norm(dim=-1))

@@ -30,6 +30,7 @@ class LearnedField(nn.Module, ABC):
     """
 
     kind: ClassVar[str]
+    needs_own_view: ClassVar[bool] = False  # whether it can render only views whose image is among the sources
     class_rows: ClassVar[tuple[str, ...]] = ()  # names of the parameters with one row a class, in channel order
 
     def __init__(self, config: Config, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:

@@ -24,6 +24,8 @@ def check_views(views: SourceViews) -> None:
     expect_shape(views.depth_m, f"{count} {height} {width}", "source depth_m")
     expect_shape(views.K, f"{count} 3 3", "source K")
     expect_shape(views.T_world_camera, f"{count} 4 4", "source T_world_camera")
+    if views.channel is not None:
+        expect_shape(views.channel, f"{count} {height} {width}", "source channel")
 
 
 def check_encoder(width: int, blocks: tuple[int, ...], feature_dim: int) -> None:

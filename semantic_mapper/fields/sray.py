@@ -8,7 +8,7 @@ from __future__ import annotations
 
 # torch and safetensors leave parts of their interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-from dataclasses import dataclass
+from dataclasses import replace
 
 import torch
 from torch import nn
@@ -23,43 +23,18 @@ from semantic_mapper.fields.attention import (
     radial_attention,
 )
 from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.contextual import CUES, ContextualSpace, contextual_space
 from semantic_mapper.fields.encoder import GROUPS, ImageEncoder
-from semantic_mapper.fields.geometry_net import DensityNet, GeometryInit, hit_and_visibility
+from semantic_mapper.fields.geometry_net import DensityNet, GeometryInit
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.projection import Reprojection, gather, reproject
+from semantic_mapper.fields.source_maps import check_views, depth_at, encoded_views
 from semantic_mapper.fields.view_weights import ViewWeightNet, constrained_weights, softmax_weights
-from semantic_mapper.fields.volume import composite, composite_depth, compositing_weights, interval_lengths
-from semantic_mapper.geometry import expect_shape, invert_pose_torch
+from semantic_mapper.fields.volume import composite, composite_depth, compositing_weights
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
 LABEL_LOGIT = 8.0  # what full agreement of the labelled views on a class adds to its logit before any training
 DOUBT = 0.05  # hit probability at which a label that a view carries over counts by half
-CUES = 4  # hit, visibility, view cosine, valid depth interval: what a view knows of a sample beside its feature
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ContextualSpace:
-    """The space M of Eq. 5 with what goes with it, view-first.
-
-    Args:
-        feature: (m, R, N, C).
-        rgb: (m, R, N, 3).
-        cues: (m, R, N, 4).
-        hit, visibility: (m, R, N) in [0, 1].
-        valid: (m, R, N) bool.
-        delta: (R, N) interval lengths, metres.
-        channel: (m, R, N) int64 known label at the sample, -1 = none.
-    """
-
-    feature: torch.Tensor
-    rgb: torch.Tensor
-    cues: torch.Tensor
-    hit: torch.Tensor
-    visibility: torch.Tensor
-    valid: torch.Tensor
-    delta: torch.Tensor
-    channel: torch.Tensor
 
 
 class SRay(LearnedField):
@@ -97,24 +72,13 @@ class SRay(LearnedField):
         Raises:
             ShapeError: tensors that do not fit together.
         """
-        sizes = expect_shape(views.rgb, "M 3 H W", "source rgb")
-        expect_shape(views.depth_m, f"{sizes['M']} {sizes['H']} {sizes['W']}", "source depth_m")
-        expect_shape(views.K, f"{sizes['M']} 3 3", "source K")
+        check_views(views)
         feature = self.encoder(views.rgb)
-        height, width = feature.shape[-2:]
-        # Nearest, not averaged: a mean of two depths across an edge lies on no surface.
-        depth = functional.interpolate(views.depth_m[:, None], size=(height, width), mode="nearest-exact")[:, 0]
-        rgb = functional.interpolate(views.rgb, size=(height, width), mode="area")
-        scale = views.K.new_tensor((width / sizes["W"], height / sizes["H"]))
-        K = views.K.clone()
-        K[:, :2, :2] = views.K[:, :2, :2] * scale[None, :, None]
-        K[:, :2, 2] = (views.K[:, :2, 2] + 0.5) * scale - 0.5
-        geometry = self.geometry_init(feature, depth)
-        channel = torch.full_like(views.depth_m, -1, dtype=torch.int16)
-        if views.channel is not None and self.config.source_labels:
-            expect_shape(views.channel, f"{sizes['M']} {sizes['H']} {sizes['W']}", "source channel")
-            channel = views.channel.to(torch.int16)
-        return EncodedViews(feature, rgb, geometry, K, invert_pose_torch(views.T_world_camera), channel)
+        geometry = self.geometry_init(feature, depth_at(views, feature.shape[-2], feature.shape[-1]))
+        encoded = encoded_views(views, feature, geometry)
+        if views.channel is None or not self.config.source_labels:
+            return encoded
+        return replace(encoded, channel=views.channel.to(torch.int16))
 
     def carried_labels(self, space: ContextualSpace) -> torch.Tensor:
         """What views with known labels say of each sample: (R, N, L), each entry and their sum in [0, 1].
@@ -132,16 +96,6 @@ class SRay(LearnedField):
         """Logits (m, L, h, w) of the image features by themselves."""
         s = sources.feature.permute(0, 2, 3, 1)
         return self.classifier(s + self.semantic(s)).permute(0, 3, 1, 2)
-
-    def contextual_space(self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews) -> ContextualSpace:
-        """Reproject whole rays and gather M (Eq. 3 to 5)."""
-        where: Reprojection = reproject(rays, z, sources)
-        found = gather(sources, where)
-        delta = interval_lengths(z, rays.direction.norm(dim=-1))
-        hit, visibility = hit_and_visibility(found.geometry, where.z, 0.5 * delta)
-        hit, visibility = hit * where.valid, visibility * where.valid
-        cues = torch.stack((hit, visibility, where.view_cosine, torch.log(found.geometry[..., 1])), dim=-1)
-        return ContextualSpace(found.feature, found.rgb, cues, hit, visibility, where.valid, delta, found.channel)
 
     def attend(self, space: ContextualSpace) -> torch.Tensor:
         """Cross-reprojection attention: M -> M'' (m, R, N, C) (Eq. 6 to 10)."""
@@ -171,7 +125,7 @@ class SRay(LearnedField):
         self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews
     ) -> tuple[FieldRender, torch.Tensor]:
         """Render rays at given sample depths z (R, N) (Eq. 13); also returns the compositing weights (R, N)."""
-        space = self.contextual_space(rays, z, sources)
+        space = contextual_space(rays, z, sources)
         s, colour = self.blend_views(self.attend(space), space)
         sigma = self.density(space.feature, space.hit, space.visibility, space.valid, space.delta)
         interval = torch.ones_like(space.delta) if self.config.parity == "published" else space.delta

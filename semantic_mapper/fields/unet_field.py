@@ -38,6 +38,7 @@ class UNetField(LearnedField):
     """
 
     kind = "unet"
+    needs_own_view = True
     class_rows = ("classifier.weight", "classifier.bias")
 
     def __init__(self, config: UNetFieldConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from semantic_mapper.benchmark.config import SpacingConfig
-from semantic_mapper.benchmark.views import choose_sources, needs_own_view
+from semantic_mapper.benchmark.views import choose_sources
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.sray import SRay
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
-from tests.small import tiny_field
 
 CAMERA = CameraIntrinsics(40.0, 40.0, 23.5, 15.5, 48, 32)
 WALL = np.full((32, 48), 2.0, np.float32)  # 2 m ahead, 2.4 m wide
@@ -67,12 +65,3 @@ def test_sensor_holes_hide_nothing() -> None:
 def test_more_views_than_frames_are_refused() -> None:
     with pytest.raises(ConfigError, match="3 source views"):
         choose([frame(0.1)], 3, 0.0, 0.0)
-
-
-def test_only_a_kind_that_says_so_gets_its_own_view() -> None:
-    class OwnView(SRay):
-        needs_own_view = True
-
-    field = tiny_field()
-    assert not needs_own_view(field)
-    assert needs_own_view(OwnView(field.config, field.label_set))

@@ -7,6 +7,7 @@ import torch
 from semantic_mapper.config import SamplingConfig, SRayConfig
 from semantic_mapper.errors import ConfigError, ShapeError
 from semantic_mapper.fields.base import EncodedViews, stack_views
+from semantic_mapper.fields.contextual import contextual_space
 from semantic_mapper.fields.geometry_net import hit_and_visibility
 from semantic_mapper.fields.projection import gather, reproject
 from semantic_mapper.fields.sampling import sample_guided, sample_inverse_depth
@@ -209,7 +210,7 @@ def test_published_parity_leaves_the_interval_length_out_of_alpha():
     rays = wall_rays(pose_at(0.0), step=31)
     z = torch.tensor([[1.98, 2.0, 2.02]]).expand(len(rays.origin), 3)
     with torch.no_grad():
-        space = field.contextual_space(rays, z, encoded)
+        space = contextual_space(rays, z, encoded)
         sigma = field.density(space.feature, space.hit, space.visibility, space.valid, space.delta)
         render, _ = field.render_samples(rays, z, encoded)
     torch.testing.assert_close(render.opacity, 1 - torch.exp(-sigma.sum(1)))
@@ -276,7 +277,7 @@ def test_a_view_carries_no_label_to_what_is_hidden_from_it():
 
     def carried(z: float) -> torch.Tensor:
         ladder = (z + torch.tensor([-0.02, 0.0, 0.02])).expand(len(rays.origin), 3)
-        return field.carried_labels(field.contextual_space(rays, ladder, encoded))[:, 1, 2]
+        return field.carried_labels(contextual_space(rays, ladder, encoded))[:, 1, 2]
 
     assert carried(WALL_M).min() > 0.6 and carried(WALL_M + 0.5).max() < 0.15 and carried(WALL_M - 0.5).max() < 0.15
 
