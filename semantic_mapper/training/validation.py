@@ -25,7 +25,7 @@ class ValidationConfig(Config, frozen=True):
     times: int = 8  # over the whole budget
     rooms: int = 6  # the first ones of the validation seeds
     queries: int = 2  # views a room
-    rays: int = 1000  # a view
+    rays: int = 1000  # a view; without depth one in ``blind_thinning`` of them
     views: int = 8  # source views, the nearest on the path
 
 
@@ -108,8 +108,9 @@ def _count(
     classes = len(model.label_set)
     counts: list[torch.Tensor] = []
     for blind in (False, True):
-        prior = None if blind else view.depth_m.flatten()[flat]
-        rays, targets = query_rays(view, flat, near_m=near_m, far_m=far_m, prior=prior)
+        chosen = flat[:: step.blind_thinning] if blind else flat  # a ray without a prior costs more, as in training
+        prior = None if blind else view.depth_m.flatten()[chosen]
+        rays, targets = query_rays(view, chosen, near_m=near_m, far_m=far_m, prior=prior)
         rays = to_device(rays, device)
         seen = replace(sources, depth_m=torch.zeros_like(sources.depth_m)) if blind else sources
         if blind:
