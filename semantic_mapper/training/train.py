@@ -160,10 +160,6 @@ class _Run:
         torch.manual_seed(config.seed)
         self.config, self.folder, self.ranks, self.device = config, folder, ranks, device
         self.field = build_field(config.kind, config.field, ROOMS).to(device)
-        if device.type == "cuda":
-            compute_in_bfloat16(self.field, config.bfloat16, device.type)
-        elif config.bfloat16:
-            _log.info("float32_everywhere", reason="bfloat16 is slower than float32 on CPUs")
         self.loss: nn.Module = _StepLoss(self.field, config.step.loss, encode_together=config.encode_together)
         if ranks.world > 1:  # parts that a config switches off (an attention, say) get no gradient
             self.loss = DistributedDataParallel(self.loss, find_unused_parameters=True)
@@ -186,6 +182,7 @@ class _Run:
         config, progress = self.config, self.progress
         rooms = validation_rooms(config.validation, config.pool, self.ranks, self.device)
         self._check_encoding(rooms)
+        self._choose_precision()  # after that check, which rounding would disturb
         pool = RoomPool(
             config.pool,
             config.seed * ROOMS_A_SEED + self.ranks.rank,
@@ -329,6 +326,12 @@ class _Run:
                 f"encode_together: fields of kind '{self.config.kind}' encode views in the light of each other, so the "
                 "rooms of a step cannot share one call; leave it out"
             )
+
+    def _choose_precision(self) -> None:
+        if self.device.type == "cuda":
+            compute_in_bfloat16(self.field, self.config.bfloat16, self.device.type)
+        elif self.config.bfloat16 and self.ranks.first:
+            _log.info("float32_everywhere", reason="bfloat16 is slower than float32 on CPUs")
 
     def _announce(self) -> None:
         if self.ranks.first:
