@@ -6,7 +6,7 @@ import itertools
 from collections import deque
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -105,15 +105,21 @@ def pack_room(seed: int, config: RoomPoolConfig) -> PackedRoom | str:
 
 def unpack_room(packed: PackedRoom, device: torch.device) -> RoomViews:
     """Views in host memory and on the training device."""
-    rgb = torch.from_numpy(packed.rgb).float().div_(255)
-    depth, poses = torch.from_numpy(packed.depth_m), torch.from_numpy(packed.T_world_camera)
-    channel = torch.from_numpy(packed.channel).long()
-    views = tuple(
+    views = _views_on(packed, CPU)
+    resident = views if device.type == "cpu" else _views_on(packed, device)
+    labelled = np.flatnonzero((packed.channel != IGNORE).any(axis=(1, 2)))
+    return RoomViews(packed.seed, views, resident, tuple(int(i) for i in labelled))
+
+
+def _views_on(packed: PackedRoom, device: torch.device) -> tuple[LabelledView, ...]:
+    """Sent as the bytes they are and unpacked there: a quarter of the way's load."""
+    rgb = torch.from_numpy(packed.rgb).to(device).float().div_(255)
+    depth = torch.from_numpy(packed.depth_m).to(device)
+    channel = torch.from_numpy(packed.channel).to(device).long()
+    poses = torch.from_numpy(packed.T_world_camera).to(device)
+    return tuple(
         LabelledView(rgb[i], depth[i], channel[i], packed.intrinsics, poses[i]) for i in range(len(packed.rgb))
     )
-    resident = views if device.type == "cpu" else tuple(_moved(v, device) for v in views)
-    labelled = tuple(int(i) for i in (channel != IGNORE).flatten(1).any(1).nonzero()[:, 0])
-    return RoomViews(packed.seed, views, resident, labelled)
 
 
 def render_room(seed: int, config: RoomPoolConfig, device: torch.device = CPU) -> RoomViews:
@@ -126,16 +132,6 @@ def render_room(seed: int, config: RoomPoolConfig, device: torch.device = CPU) -
     if isinstance(packed, str):
         raise ConfigError(packed)
     return unpack_room(packed, device)
-
-
-def _moved(view: LabelledView, device: torch.device) -> LabelledView:
-    return replace(
-        view,
-        rgb=view.rgb.to(device),
-        depth_m=view.depth_m.to(device),
-        channel=view.channel.to(device),
-        T_world_camera=view.T_world_camera.to(device),
-    )
 
 
 class RoomPool(AbstractContextManager["RoomPool"]):

@@ -12,7 +12,7 @@ from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.train import TrainConfig
-from tests.nodes.support import Running, error_line, eventually, run
+from tests.nodes.support import Running, eventually, run
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = """
@@ -69,8 +69,6 @@ def test_ctrl_c_saves_what_resume_goes_on_with(recipe: Path, tmp_path: Path) -> 
     assert "--resume goes on" in running.text
     stopped_at = load_checkpoint(out).recipe["steps"]
     assert stopped_at >= 4
-    again = run("train", "--config", recipe, "--out", out, "--steps", "100000")
-    assert again.returncode == 1 and f"stopped here at step {stopped_at}" in error_line(again.stderr)
     done = run("train", "--config", recipe, "--out", out, "--steps", str(stopped_at + 2), "--resume")
     assert done.returncode == 0, done.stderr
     assert load_checkpoint(out).recipe["steps"] == stopped_at + 2

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -78,6 +80,15 @@ def test_known_labels_of_source_views_are_given_only_when_asked_for():
     assert batch().sources.channel is None
     given = batch(known_labels=True, labels_withheld=0.0).sources.channel
     assert given is not None and (given >= 0).any()
+
+
+def test_source_images_come_from_the_copies_on_the_device_and_targets_from_the_host():
+    bright = [replace(view, rgb=torch.ones_like(view.rgb)) for view in VIEWS]
+    step = TrainStepConfig(rays=64, colour_jitter=0.0)
+    generator = torch.Generator().manual_seed(0)
+    drawn = draw_batch(VIEWS, 1, (0, 2), step, generator, len(ROOMS), torch.device("cpu"), bright)
+    assert drawn is not None
+    assert drawn.sources.rgb.min() == 1 and drawn.targets.rgb.min() < 1
 
 
 def test_draws_follow_from_the_generator():
