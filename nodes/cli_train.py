@@ -1,56 +1,75 @@
-"""``semantic-mapper train``: train the field on procedural rooms."""
+"""``semantic-mapper train``: train a field on procedural rooms."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from nodes.console import Output, frame_progress
+from nodes.console import Output, frame_progress, stderr_console
+from nodes.process import StopRequest
 from nodes.verb import verb
 
 
 @verb
 def train(
-    out: Annotated[Path, typer.Option("--out", help="Weights file to write (.safetensors).")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for everything, or a weights file (.safetensors).")],
+    config: Annotated[Path | None, typer.Option(help="TOML file with a TrainConfig, recipes/cpu-2h.toml say.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on where the run in --out stopped.")] = False,
     seconds: Annotated[float | None, typer.Option(min=0, help="Time for training; 0 = only --steps counts.")] = None,
     steps: Annotated[int | None, typer.Option(min=0, help="Steps of training; 0 = only --seconds counts.")] = None,
     seed: Annotated[int | None, typer.Option(help="Of everything that is drawn at random.")] = None,
-    config: Annotated[Path | None, typer.Option(help="TOML file with a TrainConfig.")] = None,
+    workers: Annotated[int | None, typer.Option(min=0, help="Processes that render rooms; 0 = none beside it.")] = None,
     half: Annotated[bool, typer.Option("--half", help="Store weights as float16, for shipping.")] = False,
-) -> None:
-    """Train S-Ray from scratch on procedural rooms, which are rendered as it goes.
+) -> int:
+    """Train a field from scratch on procedural rooms, which are rendered as it goes.
 
-    Keeps the weights that were best on the validation rooms. Ctrl-C writes nothing.
+    Keeps the weights that were best on the validation rooms. Beside them it writes its state, its history
+    (history.jsonl) and its curves (curves.png). Ctrl-C saves the state and the best weights so far (exit code 130);
+    the same command with --resume goes on. Start it with torchrun to use several GPUs.
 
-    Example: semantic-mapper train --out rooms.safetensors --seconds 1800 --seed 0 --half
+    Example: semantic-mapper train --config recipes/cpu-2h.toml --out runs/rooms --half
     """
     output = Output.guarded()
     from semantic_mapper.config import convert_config, load_config, to_plain
-    from semantic_mapper.errors import ConfigError
     from semantic_mapper.fields.checkpoint import save_checkpoint
-    from semantic_mapper.training.train import TrainConfig, TrainProgress
+    from semantic_mapper.training.ranks import ranks_from_environment
+    from semantic_mapper.training.train import WEIGHTS_FILE, TrainConfig, TrainProgress
     from semantic_mapper.training.train import train as train_field
 
     plain = to_plain(load_config(config, TrainConfig) if config else TrainConfig())
-    given = {"seconds": seconds, "steps": steps, "seed": seed}
+    given = {"seconds": seconds, "steps": steps, "seed": seed, "workers": workers}
     plain |= {name: value for name, value in given.items() if value is not None}
     settings = convert_config(plain, TrainConfig, "command line")
-    if settings.seconds == 0 and settings.steps == 0:
-        raise ConfigError("training needs a budget: set seconds, steps, or both")
-    with frame_progress("training", None, unit="%") as bar:
+    is_file = out.suffix == ".safetensors"
+    folder = out.with_name(f"{out.stem}-training") if is_file else out
+    ranks = ranks_from_environment()
+    # torchrun hands on Ctrl-C and then asks once more in its own way: both mean the same.
+    with StopRequest(patient=ranks.world > 1) as stop, frame_progress("training", None, unit="%") as bar:
         bar.start(100)
 
         def on_progress(progress: TrainProgress) -> None:
-            score = "" if math.isnan(progress.validation_miou) else f" mIoU {progress.validation_miou * 100:.1f} %"
-            bar.set(int(progress.fraction * 100), f"step {progress.step} loss {progress.loss:.3f}{score}")
+            loss = "" if progress.loss is None else f" loss {progress.loss:.3f}"
+            score = "" if progress.scores is None else f" mIoU {progress.scores.miou * 100:.1f} %"
+            bar.set(int(progress.fraction * 100), f"step {progress.step}{loss}{score}")
 
-        checkpoint = train_field(settings, on_progress)
-    save_checkpoint(checkpoint, out, half=half)
-    recipe = checkpoint.recipe
-    output.print(
-        f"{out}: {recipe['steps']} steps on {recipe['rooms']} rooms in {recipe['seconds']:.0f} s, "
-        f"validation mIoU {recipe['validation_miou'] * 100:.1f} %"
-    )
+        checkpoint = train_field(settings, folder, resume=resume, on_progress=on_progress, stopped=lambda: stop)
+    if ranks.first:
+        weights = out if is_file else out / WEIGHTS_FILE
+        save_checkpoint(checkpoint, weights, half=half)
+        output.print(f"{weights}: {_told(checkpoint.recipe)}")
+        if stop:
+            kept = f"stopped by {stop.name}; the state and the best weights so far are kept, --resume goes on"
+            stderr_console().print(kept, style="yellow", soft_wrap=True)
+    return stop.exit_code
+
+
+def _told(recipe: dict[str, object]) -> str:
+    """The recipe in a line."""
+    line = f"{recipe['steps']} steps on {recipe['rooms']} rooms in {recipe['seconds']:.0f} s"
+    best = recipe["validation"]
+    if not isinstance(best, dict) or not best:
+        return f"{line}, not validated yet"
+    figures = f"{best['miou'] * 100:.1f} % with depth, {best['blind_miou'] * 100:.1f} % without"
+    return f"{line}; best at step {recipe['best_step']}: validation mIoU {figures}"

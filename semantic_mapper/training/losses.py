@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import torch
 from torch.nn import functional
@@ -54,3 +55,11 @@ def ray_loss(render: FieldRender, targets: RayTargets, config: LossConfig) -> Lo
     depth = (inverse * measured).sum() / measured.sum().clamp_min(1)
     total = config.semantic * semantic + config.colour * colour + config.depth * depth
     return Loss(total, semantic, colour, depth)
+
+
+def mean_loss(losses: Sequence[Loss]) -> Loss:
+    """Mean of at least one loss, part by part."""
+    if len(losses) == 1:
+        return losses[0]
+    parts = {f.name: torch.stack([getattr(loss, f.name) for loss in losses]).mean() for f in fields(Loss)}
+    return Loss(**parts)

@@ -2,75 +2,220 @@
 
 from __future__ import annotations
 
+import itertools
+from collections import deque
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import Self
 
+import numpy as np
+import structlog
 import torch
+from numpy.typing import NDArray
 
 from semantic_mapper.config import Config
+from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, room_frames
+from semantic_mapper.scenes import TRAIN_SEEDS, CameraPathConfig, NoiseConfig, room_frames
+from semantic_mapper.training.losses import IGNORE
+from semantic_mapper.training.room_feed import open_feed
 from semantic_mapper.training.views import LabelledView, view_from_frame
-from semantic_mapper.types import CameraIntrinsics
+from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
 
 FOCAL_SHARE = 0.69  # focal length over width: an OAK-D at 1280 pixels has 882.5
 ASPECT = 0.75
+CPU = torch.device("cpu")
+
+_log = structlog.get_logger(__name__)
 
 
 class RoomPoolConfig(Config, frozen=True):
     """How rooms are rendered and how long each is used."""
 
     width: int = 192
-    views: int = 10  # a room
+    views: int = 16  # a room, along one path
     rooms: int = 48  # kept at a time
-    steps_per_room: int = 4  # a new room replaces the oldest after this many steps
+    rooms_at_start: int = 4  # rendered before the first draw
+    draws_per_room: int = 6  # a new room replaces the oldest after this many draws
     step_m_min: float = 0.08  # way between two views of a room, drawn between these
     step_m_max: float = 0.35
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class PackedRoom:
+    """V views of one room in as few bytes as they take, as a worker process sends them.
+
+    Args:
+        seed: Of the room.
+        rgb: (V, 3, H, W) uint8.
+        depth_m: (V, H, W) float32, 0 = none.
+        channel: (V, H, W) int8 class channels, -1 = ignore.
+        intrinsics: Of (H, W).
+        T_world_camera: (V, 4, 4) float32.
+    """
+
+    seed: int
+    rgb: UInt8
+    depth_m: Float32
+    channel: NDArray[np.int8]
+    intrinsics: CameraIntrinsics
+    T_world_camera: Float32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RoomViews:
-    """Views of one room."""
+    """Views of one room.
+
+    Args:
+        seed: Of the room.
+        views: In host memory.
+        resident: The same views on the training device; the very same objects where that is the CPU.
+        labelled: Indices of the views with at least one labelled pixel.
+    """
 
     seed: int
     views: tuple[LabelledView, ...]
+    resident: tuple[LabelledView, ...]
+    labelled: tuple[int, ...]
 
 
-def render_room(seed: int, config: RoomPoolConfig) -> RoomViews:
-    """Render one room's views; everything follows from the seed."""
+def pack_room(seed: int, config: RoomPoolConfig) -> PackedRoom | str:
+    """Render one room's views; everything follows from the seed. A room that cannot be made gives the reason."""
     generator = torch.Generator().manual_seed(seed)
     u = float(torch.rand(1, generator=generator))
     path = CameraPathConfig(step_m=config.step_m_min + u * (config.step_m_max - config.step_m_min))
     height = round(config.width * ASPECT)
     focal = FOCAL_SHARE * config.width
     intrinsics = CameraIntrinsics(focal, focal, (config.width - 1) / 2, (height - 1) / 2, config.width, height)
-    frames = room_frames(seed, config.views, intrinsics, path=path, noise=NoiseConfig())
-    return RoomViews(seed, tuple(view_from_frame(f, ROOMS, config.width) for f in frames))
+    try:
+        frames = list(room_frames(seed, config.views, intrinsics, path=path, noise=NoiseConfig()))
+    except SemanticMapperError as error:
+        return f"room {seed}: {error}"
+    views = [view_from_frame(f, ROOMS, config.width) for f in frames]
+    return PackedRoom(
+        seed,
+        np.stack([(v.rgb * 255).round().to(torch.uint8).numpy() for v in views]),
+        np.stack([v.depth_m.numpy() for v in views]),
+        np.stack([v.channel.numpy().astype(np.int8) for v in views]),
+        views[0].intrinsics,
+        np.stack([v.T_world_camera.numpy() for v in views]),
+    )
 
 
-class RoomPool:
-    """A ring of rooms; ``draw`` gives one of them and now and then renders a new one.
+def unpack_room(packed: PackedRoom, device: torch.device) -> RoomViews:
+    """Views in host memory and on the training device."""
+    views = _views_on(packed, CPU)
+    resident = views if device.type == "cpu" else _views_on(packed, device)
+    labelled = np.flatnonzero((packed.channel != IGNORE).any(axis=(1, 2)))
+    return RoomViews(packed.seed, views, resident, tuple(int(i) for i in labelled))
+
+
+def _views_on(packed: PackedRoom, device: torch.device) -> tuple[LabelledView, ...]:
+    """Sent as the bytes they are and unpacked there: a quarter of the way's load."""
+    rgb = torch.from_numpy(packed.rgb).to(device).float().div_(255)
+    depth = torch.from_numpy(packed.depth_m).to(device)
+    channel = torch.from_numpy(packed.channel).to(device).long()
+    poses = torch.from_numpy(packed.T_world_camera).to(device)
+    return tuple(
+        LabelledView(rgb[i], depth[i], channel[i], packed.intrinsics, poses[i]) for i in range(len(packed.rgb))
+    )
+
+
+def render_room(seed: int, config: RoomPoolConfig, device: torch.device = CPU) -> RoomViews:
+    """One room; everything follows from the seed.
+
+    Raises:
+        ConfigError: this room cannot be made.
+    """
+    packed = pack_room(seed, config)
+    if isinstance(packed, str):
+        raise ConfigError(packed)
+    return unpack_room(packed, device)
+
+
+class RoomPool(AbstractContextManager["RoomPool"]):
+    """A ring of rooms; ``draw`` gives one of them and now and then takes in a new one.
+
+    Which rooms it holds follows from the seed range and the number of draws alone: a pool that starts at draw n is
+    the pool that has made n draws, whatever the number of workers. A room that cannot be made leaves its place empty.
 
     Args:
         config: Sizes.
-        first_seed: Seed of the first room; the following rooms count up from it.
+        first: Place in ``TRAIN_SEEDS`` of the first room.
+        stride: Places from one room to the next; ranks that share a range start at different places.
+        draws: Draws made before.
+        workers: Processes that render ahead; 0 renders inline.
+        device: Where ``RoomViews.resident`` lies.
     """
 
-    def __init__(self, config: RoomPoolConfig, first_seed: int) -> None:
+    def __init__(
+        self,
+        config: RoomPoolConfig,
+        first: int,
+        *,
+        stride: int = 1,
+        draws: int = 0,
+        workers: int = 0,
+        device: torch.device = CPU,
+    ) -> None:
+        if not 1 <= config.rooms_at_start <= config.rooms or config.draws_per_room < 1 or config.views < 2:
+            raise ConfigError("RoomPoolConfig: need 1 <= rooms_at_start <= rooms, draws_per_room >= 1 and views >= 2")
         self._config = config
-        self._next_seed = first_seed
-        self._rooms: list[RoomViews] = []
-        self._draws = 0
+        self._device = device
+        self._draws = draws
+        self._taken = max(0, self._wanted() - config.rooms)
+        self._ring: deque[RoomViews | None] = deque(maxlen=config.rooms)
+        self._feed = open_feed(_seeds(first, stride, self._taken), config, workers)
 
     @property
     def rooms_rendered(self) -> int:
         """How many different rooms training has seen."""
-        return -(-self._draws // self._config.steps_per_room)
+        return self._wanted()
+
+    @property
+    def waited_s(self) -> float:
+        """Time spent waiting for rooms."""
+        return self._feed.waited_s
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Of the rooms that the last draw chose from."""
+        return tuple(room.seed for room in self._ring if room is not None)
 
     def draw(self, generator: torch.Generator) -> RoomViews:
-        """A random room of the pool; the first draw of every ``steps_per_room`` renders a new one."""
-        if self._draws % self._config.steps_per_room == 0:
-            self._rooms.append(render_room(self._next_seed, self._config))
-            self._next_seed += 1
-            del self._rooms[: -self._config.rooms]
+        """A random room of the pool; new ones are taken in first where it is time.
+
+        Raises:
+            ConfigError: none of the pool's rooms could be made.
+        """
+        while self._taken < self._wanted():
+            self._take()
         self._draws += 1
-        return self._rooms[int(torch.randint(len(self._rooms), (1,), generator=generator))]
+        alive = [room for room in self._ring if room is not None]
+        if not alive:
+            raise ConfigError(f"none of {len(self._ring)} rooms could be made; the reasons are in the log")
+        return alive[int(torch.randint(len(alive), (1,), generator=generator))]
+
+    def __exit__(self, *exception: object) -> None:
+        self._feed.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def _wanted(self) -> int:
+        """Rooms taken in by the time of the next draw."""
+        return self._config.rooms_at_start + self._draws // self._config.draws_per_room
+
+    def _take(self) -> None:
+        packed = self._feed.next()
+        self._taken += 1
+        if isinstance(packed, str):
+            _log.warning("room_left_out", reason=packed)
+        room = None if isinstance(packed, str) else unpack_room(packed, self._device)
+        self._ring.append(room if room is not None and room.labelled else None)
+
+
+def _seeds(first: int, stride: int, start: int) -> Iterator[int]:
+    """Seeds of the places ``start``, ``start + 1``, ...; the range of training seeds is a circle."""
+    return (TRAIN_SEEDS[(first + k * stride) % len(TRAIN_SEEDS)] for k in itertools.count(start))

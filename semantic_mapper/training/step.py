@@ -1,10 +1,12 @@
-"""One gradient step's worth of loss: a query view rendered from other views of the same scene. Shared by training and
-finetuning."""
+"""One gradient step's worth of loss: query views rendered from other views of the same scene.
+
+Shared by training and finetuning. ``draw_batch`` makes all random draws, on the CPU; ``batch_loss`` computes.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch.nn import functional
@@ -13,13 +15,15 @@ from semantic_mapper.config import Config, SamplingConfig
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided, sample_inverse_depth
-from semantic_mapper.training.losses import IGNORE, Loss, LossConfig, ray_loss
+from semantic_mapper.training.losses import IGNORE, Loss, LossConfig, mean_loss, ray_loss
 from semantic_mapper.training.views import (
     LabelledView,
     RayTargets,
     draw_pixels,
     jitter_colours,
+    join_sources,
     query_rays,
+    select_sources,
     stack_sources,
     to_device,
     withhold_depth,
@@ -37,12 +41,34 @@ class StepConfig(Config, frozen=True):
     own_view_share: float = 0.3  # how often the query view is itself a source, as when the current frame is mapped
     balanced_share: float = 0.5  # share of rays drawn with all classes equally likely
     depth_withheld: float = 0.15  # share of source views, and of steps for the query's prior, without depth
+    blind: float = 0.0  # share of steps without any depth: neither source views nor prior have it
+    known_labels: bool = True  # source views other than the query bring their labels, as keyframes of a finetuning do
     labels_withheld: float = 0.3  # share of source views without known labels
     prior_noise: float = 0.01  # sigma of the depth prior's error as a share of z
     blind_samples: int = 32  # samples a ray in steps without a depth prior
+    blind_thinning: int = 1  # in steps without a depth prior, where a ray costs more, one ray in so many is rendered
     colour_jitter: float = 0.2
     loss: LossConfig = LossConfig()
     sampling: SamplingConfig = SamplingConfig()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepBatch:
+    """What one query view of one scene brings to a step, on the training device.
+
+    Args:
+        sources: The source views, with what is withheld taken away.
+        channel: (m, H, W) int64 labels of the source views, for the dense class loss; -1 = none.
+        rays: R query rays.
+        targets: What they should render to.
+        z: (R, N) sample depths, ascending, metres.
+    """
+
+    sources: SourceViews
+    channel: torch.Tensor
+    rays: RayBatch
+    targets: RayTargets
+    z: torch.Tensor
 
 
 def pick_views(count: int, config: StepConfig, generator: torch.Generator) -> tuple[int, list[int]]:
@@ -51,6 +77,26 @@ def pick_views(count: int, config: StepConfig, generator: torch.Generator) -> tu
     query, others = order[0], order[1:]
     size = int(torch.randint(config.views_min, config.views_max + 1, (1,), generator=generator))
     sources = others[: max(1, size)] or [query]
+    if float(torch.rand(1, generator=generator)) < config.own_view_share:
+        sources = [*sources[: max(0, size - 1)], query]
+    return query, sources
+
+
+def pick_views_on_path(
+    queries: Sequence[int], count: int, config: StepConfig, generator: torch.Generator
+) -> tuple[int, list[int]]:
+    """Draw a query view of ``queries`` and its source views from ``count`` >= 2 views in the order of a camera's path.
+
+    The source views are drawn from a stretch of the path round the query. Its length is drawn too, evenly on a
+    logarithmic scale: from the nearest views alone (a dense recording) to the whole path (views far apart).
+    """
+    query = queries[int(torch.randint(len(queries), (1,), generator=generator))]
+    others = sorted((i for i in range(count) if i != query), key=lambda i: abs(i - query))
+    size = int(torch.randint(config.views_min, config.views_max + 1, (1,), generator=generator))
+    size = max(1, min(size, len(others)))
+    stretch = round(size * (len(others) / size) ** float(torch.rand(1, generator=generator)))
+    order = torch.randperm(stretch, generator=generator)[:size].tolist()
+    sources = [others[i] for i in order]
     if float(torch.rand(1, generator=generator)) < config.own_view_share:
         sources = [*sources[: max(0, size - 1)], query]
     return query, sources
@@ -69,56 +115,114 @@ def training_loss(
     Gradients flow into the whole model.
     """
     device = next(model.parameters()).device
+    batch = draw_batch(views, query, sources, config, generator, len(model.label_set), device)
+    return None if batch is None else batch_loss(model, [batch], config.loss)
+
+
+def draw_batch(
+    views: Sequence[LabelledView],
+    query: int,
+    sources: Sequence[int],
+    config: StepConfig,
+    generator: torch.Generator,
+    classes: int,
+    device: torch.device,
+    resident: Sequence[LabelledView] | None = None,
+) -> StepBatch | None:
+    """Draw rays of ``views[query]`` and prepare ``views[sources]``; None where the query has no labelled pixel.
+
+    Args:
+        views: In host memory. The generator is of the CPU too, so that draws are the same whatever the device.
+        classes: L of the label set.
+        device: Of training.
+        resident: The same views on ``device`` already; without them the sources are copied there.
+    """
     target = views[query]
-    flat = draw_pixels(target.channel, config.rays, config.balanced_share, generator, len(model.label_set))
+    flat = draw_pixels(target.channel, config.rays, config.balanced_share, generator, classes)
     if len(flat) == 0:
         return None
-    stacked = withhold_depth(_sources(views, query, sources, config, generator), config.depth_withheld, generator)
-    stacked = jitter_colours(stacked, config.colour_jitter, generator)
-    encoded = model.encode(to_device(stacked, device))
-    rays, targets, z = _draw_samples(target, flat, config, generator)
-    rays, targets, z = to_device(rays, device), to_device(targets, device), z.to(device)
-    render, _ = model.render_samples(rays, z, encoded)
-    loss = ray_loss(render, targets, config.loss)
-    if config.loss.source > 0:
-        total = loss.total + config.loss.source * _source_loss(model, encoded, [views[i] for i in sources])
-        loss = replace(loss, total=total)
-    return loss
+    blind = config.blind > 0 and float(torch.rand(1, generator=generator)) < config.blind
+    stacked = _sources(resident or views, query, sources, config, generator)
+    stacked = withhold_depth(stacked, 1.0 if blind else config.depth_withheld, generator)
+    stacked = jitter_colours(to_device(stacked, device), config.colour_jitter, generator)
+    rays, targets, z = _draw_samples(target, flat, config, blind, generator)
+    channel = torch.stack([(resident or views)[i].channel for i in sources])
+    return StepBatch(stacked, channel.to(device), to_device(rays, device), to_device(targets, device), z.to(device))
+
+
+def batch_loss(
+    model: LearnedField, batches: Sequence[StepBatch], config: LossConfig, *, encode_together: bool = False
+) -> Loss:
+    """Mean loss of several batches; gradients flow into the whole model.
+
+    Args:
+        encode_together: One call of ``encode`` for the views of all batches. Right only for kinds of fields that
+            encode each view by itself; see ``encodes_views_separately``.
+    """
+    losses: list[Loss] = []
+    for batch, encoded in zip(batches, _encode(model, batches, encode_together), strict=True):
+        render, _ = model.render_samples(batch.rays, batch.z, encoded)
+        loss = ray_loss(render, batch.targets, config)
+        if config.source > 0:
+            loss = replace(loss, total=loss.total + config.source * _source_loss(model, encoded, batch.channel))
+        losses.append(loss)
+    return mean_loss(losses)
+
+
+def encodes_views_separately(model: LearnedField, sources: SourceViews) -> bool:
+    """Whether encoding ``sources`` (at least 2 views) together gives what encoding them in two calls gives."""
+    first = torch.arange(len(sources.rgb)) < len(sources.rgb) // 2
+    with torch.no_grad():
+        together = model.encode(sources)
+        for part in (first, ~first):
+            index = part.nonzero()[:, 0].to(sources.rgb.device)
+            alone = model.encode(select_sources(sources, index))
+            for a, b in ((together.feature, alone.feature), (together.geometry, alone.geometry)):
+                if float((a[index] - b).abs().max()) > 1e-2 * float(b.abs().max()):
+                    return False
+    return True
+
+
+def _encode(model: LearnedField, batches: Sequence[StepBatch], together: bool) -> list[EncodedViews]:
+    if not together or len(batches) == 1:
+        return [model.encode(batch.sources) for batch in batches]
+    encoded = model.encode(join_sources([batch.sources for batch in batches]))
+    index = torch.arange(len(encoded), device=encoded.feature.device)
+    return [encoded.select(part) for part in index.split([len(batch.sources.rgb) for batch in batches])]
 
 
 def _sources(
     views: Sequence[LabelledView], query: int, sources: Sequence[int], config: StepConfig, generator: torch.Generator
 ) -> SourceViews:
-    """The source views with their labels, but for the query's own: a robot's current frame has none."""
-    stacked = stack_sources([views[i] for i in sources], with_labels=True)
-    assert stacked.channel is not None
-    own = torch.tensor([i == query for i in sources])
+    """The source views, with their labels if asked but for the query's own: a robot's current frame has none."""
+    stacked = stack_sources([views[i] for i in sources], with_labels=config.known_labels)
+    if stacked.channel is None:
+        return stacked
+    own = torch.tensor([i == query for i in sources], device=stacked.channel.device)
     stacked = replace(stacked, channel=torch.where(own[:, None, None], IGNORE, stacked.channel))
     return withhold_labels(stacked, config.labels_withheld, generator)
 
 
 def _draw_samples(
-    target: LabelledView, flat: torch.Tensor, config: StepConfig, generator: torch.Generator
+    target: LabelledView, flat: torch.Tensor, config: StepConfig, blind: bool, generator: torch.Generator
 ) -> tuple[RayBatch, RayTargets, torch.Tensor]:
-    depth = target.depth_m.flatten()[flat]
     noise = 1 + config.prior_noise * torch.randn(len(flat), generator=generator)
-    rays, targets = query_rays(
-        target, flat, near_m=config.sampling.near_m, far_m=config.sampling.far_m, prior=depth * noise
-    )
-    if float(torch.rand(1, generator=generator)) < config.depth_withheld:
-        z = sample_inverse_depth(rays.near_m, rays.far_m, config.blind_samples, generator)
-    else:
-        z = sample_guided(rays, config.sampling)
-    return rays, targets, z
+    withheld = float(torch.rand(1, generator=generator)) < config.depth_withheld
+    near_m, far_m = config.sampling.near_m, config.sampling.far_m
+    if blind or withheld:
+        rays, targets = query_rays(target, flat[:: config.blind_thinning], near_m=near_m, far_m=far_m, prior=None)
+        return rays, targets, sample_inverse_depth(rays.near_m, rays.far_m, config.blind_samples, generator)
+    prior = target.depth_m.flatten()[flat] * noise
+    rays, targets = query_rays(target, flat, near_m=near_m, far_m=far_m, prior=prior)
+    return rays, targets, sample_guided(rays, config.sampling)
 
 
-def _source_loss(model: LearnedField, encoded: EncodedViews, sources: Sequence[LabelledView]) -> torch.Tensor:
-    """Class loss of the image features by themselves."""
+def _source_loss(model: LearnedField, encoded: EncodedViews, channel: torch.Tensor) -> torch.Tensor:
+    """Class loss of the image features by themselves; channel (m, H, W)."""
     logits = model.source_logits(encoded)
     if logits is None:
         return encoded.feature.new_zeros(())
-    device, size = logits.device, logits.shape[-2:]
-    channel = torch.stack([v.channel for v in sources]).to(device)
+    size = logits.shape[-2:]
     small = functional.interpolate(channel[:, None].float(), size=size, mode="nearest-exact")[:, 0].long()
     counted = (small != IGNORE).sum().clamp_min(1)
     return functional.cross_entropy(logits, small, ignore_index=IGNORE, reduction="sum") / counted

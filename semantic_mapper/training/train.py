@@ -1,139 +1,367 @@
-"""Train S-Ray to generalize: rooms without end, one query view rendered from others in each step."""
+"""Train a field to generalize: rooms without end, query views rendered from other views of the same room."""
 
 from __future__ import annotations
 
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
+import structlog
 import torch
+from torch import nn
+from torch.nn.parallel import DistributedDataParallel
 
-from semantic_mapper.config import Config, SRayConfig, to_plain
-from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.config import Config, to_plain
+from semantic_mapper.errors import ConfigError, WeightsError
+from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.sampling import sample_guided
-from semantic_mapper.fields.sray import SRay
+from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.scenes import SUITE_VERSION, TRAIN_SEEDS, VALIDATION_SEEDS
-from semantic_mapper.training.rooms import RoomPool, RoomPoolConfig, RoomViews, render_room
+from semantic_mapper.scenes import SUITE_VERSION, TRAIN_SEEDS
+from semantic_mapper.training.device import DeviceName, choose_device, compute_in_bfloat16
+from semantic_mapper.training.losses import LossConfig
+from semantic_mapper.training.ranks import Ranks, joined, ranks_from_environment
+from semantic_mapper.training.recipe import provenance
+from semantic_mapper.training.rooms import RoomPool, RoomPoolConfig, RoomViews
 from semantic_mapper.training.schedule import budget_fraction, cosine_rate
-from semantic_mapper.training.step import StepConfig, pick_views, training_loss
-from semantic_mapper.training.views import query_rays, stack_sources, to_device
+from semantic_mapper.training.step import (
+    StepBatch,
+    StepConfig,
+    batch_loss,
+    draw_batch,
+    encodes_views_separately,
+    pick_views_on_path,
+)
+from semantic_mapper.training.train_log import TrainLog
+from semantic_mapper.training.train_state import LOSS_PARTS, Progress, load_state, save_state, unfinished_step
+from semantic_mapper.training.validation import Scores, ValidationConfig, validate, validation_rooms
+from semantic_mapper.training.views import stack_sources
+
+STATE_FILE = "state.safetensors"
+WEIGHTS_FILE = "weights.safetensors"
+ROOMS_A_SEED = 10_000  # places between the first rooms of two training seeds
+WARM_UP = 0.01  # share of the budget
+_FREE = ("seconds", "steps", "device", "workers", "save_every_s")  # may differ when a run goes on
+
+_log = structlog.get_logger(__name__)
+
+
+class TrainStepConfig(StepConfig, frozen=True):
+    """A step of training to generalize: many densities of views, no known labels, often no depth at all."""
+
+    views_max: int = 12
+    known_labels: bool = False
+    blind: float = 0.25
+    blind_thinning: int = 4  # 32 samples a ray instead of 8
 
 
 class TrainConfig(Config, frozen=True):
     """A training run."""
 
-    seconds: float = 1500.0  # wall-clock budget; 0 = only steps count
+    kind: str = "sray"  # of field, as in ``fields.registry``
+    field: dict[str, Any] = msgspec.field(
+        default_factory=dict
+    )  # settings of that kind; what is left out keeps its default
+    seconds: float = 1500.0  # wall-clock budget; 0 = only steps count (then a run repeats bit for bit on a CPU)
     steps: int = 0  # step budget; 0 = only seconds count
+    rooms_per_step: int = 1  # a rank
+    encode_together: bool = False  # one call of the encoder a step; for kinds that encode each view by itself
+    bfloat16: tuple[str, ...] = ()  # parts of the field that compute in bfloat16 on a GPU ("encoder", ...)
     learning_rate: float = 1e-3
     final_learning_rate: float = 5e-5
     weight_decay: float = 1e-4
     gradient_clip: float = 10.0
-    validations: int = 8  # over the whole budget
-    validation_rooms: int = 6
-    validation_rays: int = 1500  # a room
-    validation_views: int = 8  # source views
     seed: int = 0
-    model: SRayConfig = SRayConfig()
+    device: DeviceName = "auto"
+    workers: int = 0  # processes that render rooms ahead, a rank; 0 = inline, right where the CPU trains
+    save_every_s: float = 120.0
+    log_steps: int = 20  # steps a line of the history
     pool: RoomPoolConfig = RoomPoolConfig()
-    step: StepConfig = StepConfig(views_min=3, views_max=5)
+    step: TrainStepConfig = TrainStepConfig()
+    validation: ValidationConfig = ValidationConfig()
 
 
 @dataclass(frozen=True, slots=True)
 class TrainProgress:
-    """State after a step: budget used, smoothed loss, last validation mIoU (NaN before the first)."""
+    """State after a step: budget used, mean loss of the last line of the history, last validation (None before)."""
 
     step: int
     fraction: float
-    loss: float
-    validation_miou: float
+    loss: float | None
+    scores: Scores | None
 
 
-def train(config: TrainConfig, on_progress: Callable[[TrainProgress], None] | None = None) -> Checkpoint:
-    """Train from scratch on the training rooms; returns the weights that were best on the validation rooms."""
-    torch.manual_seed(config.seed)
-    generator = torch.Generator().manual_seed(config.seed)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    model = SRay(config.model, ROOMS).to(device)
-    pool = RoomPool(config.pool, first_seed=config.seed * 10_000 % len(TRAIN_SEEDS))
-    validation = [render_room(seed, config.pool) for seed in VALIDATION_SEEDS[: config.validation_rooms]]
-    optimiser = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
-    began, step, smoothed, validated = time.monotonic(), 0, float("nan"), 0
-    miou, best_miou, best_state = float("nan"), -1.0, model.state_dict()
-    history: list[dict[str, float]] = []
-    while (fraction := budget_fraction(step, time.monotonic() - began, steps=config.steps, seconds=config.seconds)) < 1:
-        for group in optimiser.param_groups:
-            group["lr"] = learning_rate(fraction, config)
-        room = pool.draw(generator)
-        query, sources = pick_views(len(room.views), config.step, generator)
-        loss = training_loss(model, room.views, query, sources, config.step, generator)
-        step += 1
-        if loss is None:
-            continue
-        optimiser.zero_grad()
-        loss.total.backward()  # pyright: ignore[reportUnknownMemberType]
-        torch.nn.utils.clip_grad_norm_(model.parameters(), config.gradient_clip)
-        optimiser.step()
-        value = float(loss.total.detach())
-        smoothed = value if np.isnan(smoothed) else 0.98 * smoothed + 0.02 * value
-        fraction = budget_fraction(step, time.monotonic() - began, steps=config.steps, seconds=config.seconds)
-        if fraction * config.validations >= validated + 1 or fraction >= 1:
-            validated = int(fraction * config.validations)
-            miou, accuracy = validate(model, validation, config)
-            history.append({"step": step, "loss": smoothed, "miou": miou, "accuracy": accuracy})
-            if miou > best_miou:
-                best_miou, best_state = miou, {n: t.detach().clone() for n, t in model.state_dict().items()}
-        if on_progress is not None:
-            on_progress(TrainProgress(step, min(fraction, 1.0), smoothed, miou))
-    model.load_state_dict(best_state)
-    recipe: dict[str, Any] = {
-        "kind": "train",
-        "width": config.pool.width,
-        "config": to_plain(config),
-        "suite": f"rooms v{SUITE_VERSION}",
-        "steps": step,
-        "rooms": pool.rooms_rendered,
-        "seconds": round(time.monotonic() - began, 1),
-        "device": str(device),
-        "validation_miou": best_miou,
-        "history": history,
-    }
-    return Checkpoint(model.cpu().eval(), (), recipe)
+def train(
+    config: TrainConfig,
+    folder: Path | None = None,
+    *,
+    resume: bool = False,
+    on_progress: Callable[[TrainProgress], None] | None = None,
+    stopped: Callable[[], object] = bool,
+) -> Checkpoint:
+    """Train on the training rooms; returns the weights that were best on the validation rooms.
+
+    Args:
+        folder: For the state, the history, the curves and the best weights so far; None writes nothing.
+        resume: Go on with the state in ``folder``. The budget may be another one, the rest of the config may not.
+        stopped: Asked once a step; when it says yes, all is saved and the best weights so far are returned.
+
+    Raises:
+        ConfigError: a config that cannot be used, or another one than that of the run to go on with.
+        WeightsError: no state to go on with, or training has diverged.
+    """
+    ranks = ranks_from_environment()
+    device = choose_device(config.device, ranks.local)
+    _check(config, folder, resume)
+    with joined(ranks, device):
+        run = _Run(config, folder, ranks, device)
+        if resume:
+            run.restore()
+        return run.loop(on_progress, stopped)
 
 
 def learning_rate(fraction: float, config: TrainConfig) -> float:
     """Cosine from the first to the final learning rate, after a short linear warm-up."""
     cosine = cosine_rate(fraction, config.learning_rate, config.final_learning_rate)
-    return cosine * min(1.0, fraction / 0.01 + 0.1)
+    return cosine * min(1.0, fraction / WARM_UP + 0.1)
 
 
-def validate(model: LearnedField, rooms: Sequence[RoomViews], config: TrainConfig) -> tuple[float, float]:
-    """mIoU (over the classes present) and accuracy: in each room one view rendered from the others, with depth."""
-    device = next(model.parameters()).device
-    generator = torch.Generator().manual_seed(1)
-    classes = len(model.label_set)
-    confusion = torch.zeros(classes, classes)
-    sampling = config.step.sampling
-    model.eval()
-    with torch.inference_mode():
-        for room in rooms:
-            query = len(room.views) // 2
-            others = [i for i in range(len(room.views)) if i != query][: config.validation_views]
-            view = room.views[query]
-            flat = (view.channel.flatten() >= 0).nonzero()[:, 0]
-            flat = flat[torch.randint(len(flat), (config.validation_rays,), generator=generator)]
-            prior = view.depth_m.flatten()[flat]
-            rays, targets = query_rays(view, flat, near_m=sampling.near_m, far_m=sampling.far_m, prior=prior)
-            encoded = model.encode(to_device(stack_sources([room.views[i] for i in others]), device))
-            rays = to_device(rays, device)
-            render, _ = model.render_samples(rays, sample_guided(rays, sampling), encoded)
-            index = targets.channel * classes + render.logits.argmax(1).cpu()
-            confusion += torch.bincount(index, minlength=classes**2).view(classes, classes)
-    model.train()
-    right = confusion.diag()
-    union = confusion.sum(0) + confusion.sum(1) - right
-    present = confusion.sum(1) > 0
-    return float((right / union.clamp_min(1))[present].mean()), float(right.sum() / confusion.sum())
+def step_seed(seed: int, rank: int, step: int) -> int:
+    """Seed of all random draws of one step of one rank: a run goes on at any step without a generator's state."""
+    return int(np.random.SeedSequence((seed, rank, step)).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+class _StepLoss(nn.Module):
+    """The loss of a step as a module, which is what gradients are shared through."""
+
+    def __init__(self, field: LearnedField, config: LossConfig, *, encode_together: bool) -> None:
+        super().__init__()
+        self.field = field
+        self._config = config
+        self._together = encode_together
+
+    def forward(self, batches: Sequence[StepBatch]) -> torch.Tensor:
+        """(4,) the ``LOSS_PARTS``."""
+        loss = batch_loss(self.field, batches, self._config, encode_together=self._together)
+        return torch.stack([getattr(loss, part) for part in LOSS_PARTS])
+
+
+class _Run:
+    """One training run on one rank."""
+
+    def __init__(self, config: TrainConfig, folder: Path | None, ranks: Ranks, device: torch.device) -> None:
+        torch.manual_seed(config.seed)
+        self.config, self.folder, self.ranks, self.device = config, folder, ranks, device
+        self.field = build_field(config.kind, config.field, ROOMS).to(device)
+        self.loss: nn.Module = _StepLoss(self.field, config.step.loss, encode_together=config.encode_together)
+        if ranks.world > 1:  # parts that a config switches off (an attention, say) get no gradient
+            self.loss = DistributedDataParallel(self.loss, find_unused_parameters=True)
+        self.optimiser = torch.optim.AdamW(
+            self.field.parameters(), config.learning_rate, weight_decay=config.weight_decay
+        )
+        self.progress = Progress(torch.zeros(len(LOSS_PARTS), dtype=torch.float64, device=device))
+        self.scores: Scores | None = None
+        self.last_loss: float | None = None
+
+    def restore(self) -> None:
+        assert self.folder is not None
+        self.progress = load_state(self.folder / STATE_FILE, self.field, self.optimiser, self._identity())
+        done = int(min(self._fraction(self.progress.elapsed_s), 1.0) * self.config.validation.times)
+        self.progress.validated = min(self.progress.validated, done)  # fewer where the budget has grown
+        self.progress.finished = False
+        _log.info("training_resumed", step=self.progress.step, elapsed_s=round(self.progress.elapsed_s))
+
+    def loop(self, on_progress: Callable[[TrainProgress], None] | None, stopped: Callable[[], object]) -> Checkpoint:
+        config, progress = self.config, self.progress
+        rooms = validation_rooms(config.validation, config.pool, self.ranks, self.device)
+        self._check_encoding(rooms)
+        self._choose_precision()  # after that check, which rounding would disturb
+        pool = RoomPool(
+            config.pool,
+            config.seed * ROOMS_A_SEED + self.ranks.rank,
+            stride=self.ranks.world,
+            draws=progress.step * config.rooms_per_step,
+            workers=config.workers,
+            device=self.device,
+        )
+        log = TrainLog(self.folder if self.ranks.first else None, progress.history)
+        self._announce()
+        with pool, log:
+            saved = time.monotonic()
+            began = saved - progress.elapsed_s
+            while True:
+                progress.elapsed_s = time.monotonic() - began
+                asked = float(bool(stopped()))
+                fraction, stop = self.ranks.largest(min(self._fraction(progress.elapsed_s), 1.0), asked)
+                due = int(fraction * config.validation.times)
+                if due > progress.validated:
+                    self._validate(rooms, pool, log, due)
+                    self._save()
+                    saved = time.monotonic()
+                progress.finished = fraction >= 1
+                if progress.finished or stop:
+                    break
+                self._step(pool, log, fraction)
+                if time.monotonic() - saved >= config.save_every_s:
+                    self._save()
+                    saved = time.monotonic()
+                if on_progress is not None and self.ranks.first:
+                    on_progress(TrainProgress(progress.step, fraction, self.last_loss, self.scores))
+            self._save()
+            return self._checkpoint(pool)
+
+    def _step(self, pool: RoomPool, log: TrainLog, fraction: float) -> None:
+        config, progress = self.config, self.progress
+        seed = step_seed(config.seed, self.ranks.rank, progress.step)
+        torch.manual_seed(seed)  # for kinds of fields that draw from it
+        generator = torch.Generator().manual_seed(seed)
+        batches = [self._draw(pool, generator) for _ in range(config.rooms_per_step)]
+        rate = learning_rate(fraction, config)
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        parts: torch.Tensor = self.loss(batches)
+        self.optimiser.zero_grad()
+        parts[0].backward()
+        nn.utils.clip_grad_norm_(self.field.parameters(), config.gradient_clip)
+        self.optimiser.step()
+        progress.losses += parts.detach()
+        progress.step += 1
+        if progress.step % config.log_steps == 0:  # only then, because reading a loss waits for the GPU
+            self._log_losses(pool, log, rate)
+
+    def _draw(self, pool: RoomPool, generator: torch.Generator) -> StepBatch:
+        room = pool.draw(generator)
+        step = self.config.step
+        query, sources = pick_views_on_path(room.labelled, len(room.views), step, generator)
+        classes = len(self.field.label_set)
+        batch = draw_batch(room.views, query, sources, step, generator, classes, self.device, room.resident)
+        assert batch is not None  # the query is one of the labelled views
+        return batch
+
+    def _log_losses(self, pool: RoomPool, log: TrainLog, rate: float) -> None:
+        progress = self.progress
+        means = (progress.losses / self.config.log_steps).tolist()
+        progress.losses.zero_()
+        if not math.isfinite(means[0]):
+            raise WeightsError(
+                f"training has diverged by step {progress.step} (loss {means[0]}); lower learning_rate or "
+                "gradient_clip and start anew, the best weights so far are kept"
+            )
+        self.last_loss = means[0]
+        losses = {f"loss_{name}": round(mean, 6) for name, mean in zip(LOSS_PARTS, means, strict=True)}
+        rooms = pool.rooms_rendered * self.ranks.world
+        waited = round(pool.waited_s, 2)
+        log.add(self._line() | losses | {"rate": rate, "rooms": rooms, "waited_s": waited})
+
+    def _validate(self, rooms: Sequence[RoomViews], pool: RoomPool, log: TrainLog, done: int) -> None:
+        config, progress = self.config, self.progress
+        self.scores = scores = validate(self.field, rooms, config.validation, config.step, self.ranks)
+        progress.validated = done
+        figures = {name: round(getattr(scores, name), 5) for name in scores.__slots__}
+        log.add(self._line() | figures)
+        log.draw()
+        if self.ranks.first:
+            _log.info("validated", step=progress.step, **figures)
+        if scores.rank > progress.best_score:
+            progress.best = {n: t.detach().clone() for n, t in self.field.state_dict().items()}
+            progress.best_step, progress.best_score = progress.step, scores.rank
+            if self.folder is not None and self.ranks.first:
+                save_checkpoint(self._checkpoint(pool), self.folder / WEIGHTS_FILE)
+
+    def _save(self) -> None:
+        if self.folder is not None and self.ranks.first:
+            save_state(self.folder / STATE_FILE, self.progress, self.field, self.optimiser, self._identity())
+
+    def _checkpoint(self, pool: RoomPool) -> Checkpoint:
+        """The best weights so far, or the latest where nothing was validated yet."""
+        config, progress = self.config, self.progress
+        field = build_field(config.kind, config.field, ROOMS)
+        field.load_state_dict(progress.best or self.field.state_dict())
+        validations = [line for line in progress.history if "miou" in line]
+        best = next((line for line in validations if line["step"] == progress.best_step), {})
+        recipe: dict[str, Any] = {
+            "kind": "train",
+            "width": config.pool.width,
+            "config": to_plain(config),
+            "suite": f"rooms v{SUITE_VERSION}",
+            "seed": config.seed,
+            "steps": progress.step,
+            "best_step": progress.best_step,
+            "rooms": pool.rooms_rendered * self.ranks.world,
+            "seconds": round(progress.elapsed_s, 1),
+            "ranks": self.ranks.world,
+            "validation_miou": best.get("miou"),
+            "validation": best,
+            "history": validations,
+        }
+        return Checkpoint(field.eval(), (), recipe | provenance(self.device))
+
+    def _fraction(self, elapsed_s: float) -> float:
+        return budget_fraction(self.progress.step, elapsed_s, steps=self.config.steps, seconds=self.config.seconds)
+
+    def _line(self) -> dict[str, Any]:
+        return {"step": self.progress.step, "seconds": round(self.progress.elapsed_s, 2)}
+
+    def _identity(self) -> dict[str, Any]:
+        """What has to be the same when a run goes on."""
+        plain = {k: v for k, v in to_plain(self.config).items() if k not in _FREE}
+        return plain | {"ranks": self.ranks.world, "suite": SUITE_VERSION}
+
+    def _check_encoding(self, rooms: Sequence[RoomViews]) -> None:
+        if not (self.config.encode_together and rooms):
+            return
+        sources = stack_sources(rooms[0].resident[:4])
+        self.field.eval()
+        separately = encodes_views_separately(self.field, sources)
+        self.field.train()
+        if not separately:
+            raise ConfigError(
+                f"encode_together: fields of kind '{self.config.kind}' encode views in the light of each other, so the "
+                "rooms of a step cannot share one call; leave it out"
+            )
+
+    def _choose_precision(self) -> None:
+        if self.device.type == "cuda":
+            compute_in_bfloat16(self.field, self.config.bfloat16, self.device.type)
+        elif self.config.bfloat16 and self.ranks.first:
+            _log.info("float32_everywhere", reason="bfloat16 is slower than float32 on CPUs")
+
+    def _announce(self) -> None:
+        if self.ranks.first:
+            _log.info(
+                "training_started",
+                kind=self.config.kind,
+                parameters=sum(p.numel() for p in self.field.parameters()),
+                device=str(self.device),
+                ranks=self.ranks.world,
+                workers=self.config.workers,
+                step=self.progress.step,
+            )
+
+
+def _check(config: TrainConfig, folder: Path | None, resume: bool) -> None:
+    if config.seconds <= 0 and config.steps <= 0:
+        raise ConfigError("training needs a budget: set seconds, steps, or both")
+    if config.rooms_per_step < 1 or config.log_steps < 1:
+        raise ConfigError("rooms_per_step and log_steps must be at least 1")
+    if not 0 <= config.seed < len(TRAIN_SEEDS):
+        raise ConfigError(f"seed must be in 0..{len(TRAIN_SEEDS) - 1}, got {config.seed}")
+    step = config.step
+    if not 1 <= step.views_min <= step.views_max or step.rays < 1 or step.blind_thinning < 1:
+        raise ConfigError("step: need 1 <= views_min <= views_max, rays >= 1 and blind_thinning >= 1")
+    if resume and folder is None:
+        raise ConfigError("to go on with a run its folder is needed")
+    state = None if folder is None or resume else folder / STATE_FILE
+    stopped_at = unfinished_step(state) if state is not None and state.is_file() else None
+    if stopped_at is not None:
+        raise ConfigError(
+            f"{state}: a run was stopped here at step {stopped_at}; go on with --resume, or delete that file to "
+            "start anew"
+        )

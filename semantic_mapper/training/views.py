@@ -72,9 +72,29 @@ def stack_sources(views: Sequence[LabelledView], *, with_labels: bool = False) -
     return SourceViews(
         torch.stack([v.rgb for v in views]),
         torch.stack([v.depth_m for v in views]),
-        torch.stack([torch.from_numpy(camera_matrix(v.intrinsics)).float() for v in views]),
+        torch.stack([torch.from_numpy(camera_matrix(v.intrinsics)).float() for v in views]).to(views[0].rgb.device),
         torch.stack([v.T_world_camera for v in views]),
         torch.stack([v.channel for v in views]) if with_labels else None,
+    )
+
+
+def join_sources(parts: Sequence[SourceViews]) -> SourceViews:
+    """The views of several scenes one after the other; labels only where all parts have them."""
+    channels = [p.channel for p in parts if p.channel is not None]
+    return SourceViews(
+        torch.cat([p.rgb for p in parts]),
+        torch.cat([p.depth_m for p in parts]),
+        torch.cat([p.K for p in parts]),
+        torch.cat([p.T_world_camera for p in parts]),
+        torch.cat(channels) if len(channels) == len(parts) else None,
+    )
+
+
+def select_sources(sources: SourceViews, index: torch.Tensor) -> SourceViews:
+    """The views at ``index`` (k,) int64."""
+    channel = None if sources.channel is None else sources.channel[index]
+    return SourceViews(
+        sources.rgb[index], sources.depth_m[index], sources.K[index], sources.T_world_camera[index], channel
     )
 
 
@@ -82,7 +102,7 @@ def withhold_labels(sources: SourceViews, share: float, generator: torch.Generat
     """Set the known labels of a random share of the views to "none": most source views of a robot have none."""
     if sources.channel is None:
         return sources
-    keep = torch.rand(len(sources.rgb), generator=generator) >= share
+    keep = (torch.rand(len(sources.rgb), generator=generator) >= share).to(sources.channel.device)
     return replace(sources, channel=torch.where(keep[:, None, None], sources.channel, -1))
 
 

@@ -1,0 +1,63 @@
+"""Where training computes, and which parts of a field compute in bfloat16 there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import torch
+from torch import nn
+
+from semantic_mapper.errors import ConfigError
+
+DeviceName = Literal["auto", "cpu", "cuda"]
+
+
+def choose_device(name: DeviceName, local_rank: int) -> torch.device:
+    """``auto`` takes a GPU where there is one; of several, each rank of this machine takes its own.
+
+    Raises:
+        ConfigError: ``cuda`` is asked for and there are fewer GPUs than ranks.
+    """
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if name == "cpu" or (name == "auto" and count == 0):
+        return torch.device("cpu")
+    if local_rank >= count:
+        raise ConfigError(
+            f"process {local_rank} on this machine has no GPU: torch sees {count}; start fewer processes, "
+            'or set device = "cpu"'
+        )
+    torch.cuda.set_device(local_rank)
+    return torch.device("cuda", local_rank)
+
+
+def compute_in_bfloat16(model: nn.Module, names: Sequence[str], device_type: str) -> None:
+    """Let the named parts of ``model`` compute in bfloat16 under autocast and hand back float32.
+
+    Only named parts: reprojection in bfloat16, whose mantissa has 8 bits, would miss its pixel by several pixels.
+    Weights stay float32, as do names in the state dict.
+
+    Raises:
+        ConfigError: no part of that name.
+    """
+    parts = dict(model.named_modules())
+    for name in names:
+        if not name or name not in parts:
+            children = ", ".join(child for child, _ in model.named_children())
+            raise ConfigError(f"bfloat16: the field has no part '{name}'; there are {children}")
+        part: Any = parts[name]
+        part.forward = _in_bfloat16(part.forward, device_type)
+
+
+def _in_bfloat16(forward: Callable[..., Any], device_type: str) -> Callable[..., Any]:
+    def autocast_forward(*args: Any, **kwargs: Any) -> Any:
+        with torch.autocast(device_type, torch.bfloat16):
+            return _to_float32(forward(*args, **kwargs))
+
+    return autocast_forward
+
+
+def _to_float32(result: Any) -> Any:
+    if isinstance(result, tuple):
+        return tuple(_to_float32(r) for r in result)  # pyright: ignore[reportUnknownVariableType]
+    return result.float()

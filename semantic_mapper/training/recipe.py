@@ -1,0 +1,47 @@
+"""Where weights come from: what a checkpoint says of its training."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import semantic_mapper
+
+_PACKAGE = Path(semantic_mapper.__file__).resolve().parent
+
+
+def provenance(device: torch.device) -> dict[str, Any]:
+    """Versions, device and git revision, as plain data."""
+    on_gpu = device.type == "cuda"
+    return {
+        "version": semantic_mapper.__version__,
+        "git_revision": git_revision(_PACKAGE),
+        "torch": torch.__version__,
+        "device": torch.cuda.get_device_name(device) if on_gpu else f"cpu, {torch.get_num_threads()} threads",
+        "platform": platform.platform(),
+    }
+
+
+def git_revision(package: Path) -> str | None:
+    """Commit of the checkout whose top folder holds ``package``, with "-dirty" where files differ from it.
+
+    None where the package is installed rather than checked out, or where git is missing.
+    """
+    top = _git(package, "rev-parse", "--show-toplevel")
+    if top is None or Path(top).resolve() != package.parent:
+        return None
+    return _git(package, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=False, timeout=30
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None

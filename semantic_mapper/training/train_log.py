@@ -1,0 +1,92 @@
+"""What a training run leaves to look at: its history as JSON lines, curves as a picture, TensorBoard's event files."""
+
+from __future__ import annotations
+
+# TensorBoard's writer is untyped, and not there where it is not installed.
+# pyright: reportUnknownMemberType=false
+import json
+import os
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, Self
+
+import structlog
+
+from semantic_mapper.training.curves import write_curves
+
+HISTORY_FILE = "history.jsonl"
+CURVES_FILE = "curves.png"
+EVENTS_FOLDER = "tensorboard"
+
+_NAMES = {
+    "loss_total": "loss/total",
+    "loss_semantic": "loss/semantic",
+    "loss_colour": "loss/colour",
+    "loss_depth": "loss/depth",
+    "rate": "training/learning rate",
+    "rooms": "training/rooms",
+    "waited_s": "training/seconds waited for rooms",
+    "miou": "validation/mIoU",
+    "accuracy": "validation/accuracy",
+    "blind_miou": "validation/mIoU without depth",
+    "blind_accuracy": "validation/accuracy without depth",
+}
+
+_log = structlog.get_logger(__name__)
+
+
+class TrainLog(AbstractContextManager["TrainLog"]):
+    """Keeps the history and writes it to a folder as it grows.
+
+    Two kinds of lines, both with ``step`` and ``seconds``: means of the losses over the last steps, with the learning
+    rate, rooms rendered and time spent waiting for rooms; and the figures of a validation.
+
+    Args:
+        folder: None keeps the history in memory only.
+        history: Lines from before; ``add`` appends to this very list.
+    """
+
+    def __init__(self, folder: Path | None, history: list[dict[str, Any]]) -> None:
+        self._folder = folder
+        self._history = history
+        self._events = None if folder is None else _open_events(folder / EVENTS_FOLDER, history)
+        if folder is not None:  # a run that goes on may have written further than its state reaches
+            folder.mkdir(parents=True, exist_ok=True)
+            lines = "".join(json.dumps(line, allow_nan=False) + "\n" for line in history)
+            (folder / HISTORY_FILE).write_text(lines, encoding="utf-8")
+
+    def add(self, line: dict[str, Any]) -> None:
+        """Append one line."""
+        self._history.append(line)
+        if self._folder is None:
+            return
+        with (self._folder / HISTORY_FILE).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line, allow_nan=False) + "\n")
+        if self._events is not None:
+            for key, value in line.items():
+                if key in _NAMES:
+                    self._events.add_scalar(_NAMES[key], value, line["step"])
+
+    def draw(self) -> None:
+        """Draw the curves anew."""
+        if self._folder is not None:
+            write_curves(self._history, self._folder / CURVES_FILE)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.draw()
+        if self._events is not None:
+            self._events.close()
+
+
+def _open_events(folder: Path, history: list[dict[str, Any]]) -> Any:
+    """TensorBoard's writer, None where it is not installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        _log.info("no_tensorboard_files", reason="tensorboard is not installed", mend="install the extra 'tensorboard'")
+        return None
+    purge = history[-1]["step"] + 1 if history else None
+    return SummaryWriter(os.fspath(folder), purge_step=purge)

@@ -1,0 +1,163 @@
+"""All that a training run needs to go on where it stopped, in one file.
+
+Safetensors with JSON metadata: reading one runs no code. Random draws of a step follow from (seed, rank, step), and the
+rooms of the pool from the number of draws, so the step number stands for the generators and for the pool.
+"""
+
+from __future__ import annotations
+
+# torch and safetensors leave parts of their interface untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import nn
+
+from semantic_mapper.errors import ConfigError, WeightsError
+
+FORMAT = "semantic-mapper-training"
+VERSION = 1
+LOSS_PARTS = ("total", "semantic", "colour", "depth")
+
+
+@dataclass(slots=True)
+class Progress:
+    """How far a run is; everything but model and optimiser.
+
+    Args:
+        step: Steps done.
+        elapsed_s: Time spent in the loop, over all sittings.
+        validated: How many of the validations that the budget holds are done.
+        losses: (4,) float64 on the training device: sums of ``LOSS_PARTS`` since the last such line of the history.
+        history: Lines of plain data; see ``train_log``.
+        best: Weights that scored best in validation; None before the first.
+        best_step, best_score: Of ``best``; the score is what validation ranks by.
+        finished: The budget is used up.
+    """
+
+    losses: torch.Tensor
+    step: int = 0
+    elapsed_s: float = 0.0
+    validated: int = 0
+    history: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
+    best: dict[str, torch.Tensor] | None = None
+    best_step: int = 0
+    best_score: float = -1.0
+    finished: bool = False
+
+
+def save_state(
+    path: Path, progress: Progress, model: nn.Module, optimiser: torch.optim.Optimizer, config: dict[str, Any]
+) -> None:
+    """Write everything, whole or not at all: under another name, to the disk, then renamed into place.
+
+    Args:
+        config: Of the run, as plain data; ``load_state`` refuses to go on with another.
+    """
+    tensors = {f"model.{name}": t for name, t in model.state_dict().items()}
+    tensors |= {f"best.{name}": t for name, t in (progress.best or {}).items()}
+    for number, slots in optimiser.state_dict()["state"].items():
+        tensors |= {f"optimiser.{number}.{name}": torch.as_tensor(value) for name, value in slots.items()}
+    tensors["losses"] = progress.losses
+    metadata = {
+        "format": FORMAT,
+        "version": str(VERSION),
+        "config": json.dumps(config),
+        "step": str(progress.step),
+        "elapsed_s": repr(progress.elapsed_s),
+        "validated": str(progress.validated),
+        "best_step": str(progress.best_step),
+        "best_score": repr(progress.best_score),
+        "finished": str(progress.finished),
+        "history": json.dumps(progress.history),
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    save_file({name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}, part, metadata)
+    with part.open("rb+") as written:
+        os.fsync(written.fileno())
+    os.replace(part, path)
+
+
+def unfinished_step(path: Path) -> int | None:
+    """Step at which the run of a state stopped before its budget was used up; None where it was not stopped.
+
+    Raises:
+        WeightsError: missing, damaged or of another version.
+    """
+    _, metadata = _read(path, only_metadata=True)
+    return None if metadata.get("finished") == "True" else int(metadata["step"])
+
+
+def load_state(path: Path, model: nn.Module, optimiser: torch.optim.Optimizer, config: dict[str, Any]) -> Progress:
+    """Put model and optimiser where the run stopped.
+
+    Raises:
+        WeightsError: missing, damaged, of another version, or of another network.
+        ConfigError: the run had another config.
+    """
+    tensors, metadata = _read(path)
+    try:
+        _check_same(json.loads(metadata["config"]), config, path)
+        model.load_state_dict(_part(tensors, "model."))
+        _load_optimiser(optimiser, _part(tensors, "optimiser."))
+        best = _part(tensors, "best.")
+        return Progress(
+            losses=tensors["losses"].to(next(model.parameters()).device),
+            step=int(metadata["step"]),
+            elapsed_s=float(metadata["elapsed_s"]),
+            validated=int(metadata["validated"]),
+            history=json.loads(metadata["history"]),
+            best=best or None,
+            best_step=int(metadata["best_step"]),
+            best_score=float(metadata["best_score"]),
+        )
+    except ConfigError:
+        raise
+    except (KeyError, ValueError, IndexError, RuntimeError) as error:
+        raise WeightsError(f"{path}: does not fit this training ({error}); start anew in another folder") from error
+
+
+def _read(path: Path, *, only_metadata: bool = False) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+    if not path.is_file():
+        raise WeightsError(f"{path}: no such training state; train without --resume first, or check --out")
+    try:
+        with safe_open(path, framework="pt") as stored:
+            metadata = dict(stored.metadata() or {})
+            names = [] if only_metadata else list(stored.keys())
+            tensors = {name: stored.get_tensor(name) for name in names}
+    except (SafetensorError, OSError) as error:
+        raise WeightsError(f"{path}: not a readable training state ({error}); start anew") from error
+    if metadata.get("format") != FORMAT or metadata.get("version") != str(VERSION):
+        raise WeightsError(f"{path}: not a training state of this version ({FORMAT} {VERSION}); start anew")
+    return tensors, metadata
+
+
+def _part(tensors: dict[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+
+
+def _load_optimiser(optimiser: torch.optim.Optimizer, stored: dict[str, torch.Tensor]) -> None:
+    parameters = [p for group in optimiser.param_groups for p in group["params"]]
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for name, value in stored.items():
+        number, slot = name.split(".", 1)
+        like = parameters[int(number)]
+        # In the parameter's own memory format: another order of the same sums would give other last bits.
+        placed = value if value.ndim == 0 else torch.empty_like(like).copy_(value)
+        state.setdefault(int(number), {})[slot] = placed
+    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+
+
+def _check_same(stored: dict[str, Any], wanted: dict[str, Any], path: Path) -> None:
+    wanted = json.loads(json.dumps(wanted))  # as it would have been stored: tuples become lists
+    other = sorted(k for k in stored.keys() | wanted.keys() if stored.get(k) != wanted.get(k))
+    if other:
+        said = "; ".join(f"{k} was {stored.get(k)}, is {wanted.get(k)}" for k in other)
+        raise ConfigError(f"{path}: cannot go on with another config ({said}); start anew in another folder")

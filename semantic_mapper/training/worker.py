@@ -1,0 +1,38 @@
+"""What a process that renders rooms does. Imports nothing heavy: thread counts must be set before torch is loaded."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from multiprocessing.connection import wait
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from semantic_mapper.training.rooms import PackedRoom, RoomPoolConfig
+
+
+def prepare_worker() -> None:
+    """One thread of computation, deaf to Ctrl-C (the parent ends it), gone when the parent is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ[name] = "1"
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+    import torch
+
+    torch.set_num_threads(1)
+
+
+def render(seed: int, config: RoomPoolConfig) -> PackedRoom | str:
+    """One room, or why it cannot be made."""
+    from semantic_mapper.training.rooms import pack_room
+
+    return pack_room(seed, config)
+
+
+def _end_with(sentinel: int) -> None:
+    wait([sentinel])
+    os._exit(1)

@@ -1,0 +1,161 @@
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+
+from semantic_mapper.errors import ConfigError, WeightsError
+from semantic_mapper.fields.checkpoint import load_checkpoint
+from semantic_mapper.fields.sray import SRay
+from semantic_mapper.training.train import (
+    STATE_FILE,
+    WEIGHTS_FILE,
+    TrainConfig,
+    TrainProgress,
+    learning_rate,
+    step_seed,
+    train,
+)
+from tests.training.small_run import small_run
+
+TIMES = {"seconds", "waited_s"}
+
+
+def stop_after(steps: int):
+    """What to hand to ``train`` to stop after so many steps of this sitting."""
+    done: list[int] = []
+
+    def on_progress(progress: TrainProgress) -> None:
+        done.append(progress.step)
+
+    return {"on_progress": on_progress, "stopped": lambda: len(done) >= steps}
+
+
+def contents(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, object]]:
+    """Tensors and metadata of a state, but for what a clock says."""
+    with safe_open(path, framework="pt") as stored:
+        tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
+        metadata = dict(stored.metadata())
+    del metadata["elapsed_s"]
+    history = json.loads(metadata.pop("history"))
+    lines = [{k: v for k, v in line.items() if k not in TIMES} for line in history]
+    return tensors, {**metadata, "history": lines}
+
+
+def test_a_run_that_was_stopped_and_resumed_equals_one_that_was_not_bit_for_bit(tmp_path: Path):
+    config = small_run(steps=9, rooms_per_step=2)
+    whole = train(config, tmp_path / "whole")
+    first = train(config, tmp_path / "parts", **stop_after(2))
+    assert first.recipe["steps"] == 2
+    second = train(config, tmp_path / "parts", resume=True, **stop_after(3))
+    assert second.recipe["steps"] == 5
+    parts = train(config, tmp_path / "parts", resume=True)
+    (a, about_a), (b, about_b) = (contents(tmp_path / run / STATE_FILE) for run in ("whole", "parts"))
+    assert a.keys() == b.keys() and any(n.startswith("optimiser.") for n in a) and any(n.startswith("best.") for n in a)
+    assert [n for n in a if not torch.equal(a[n], b[n])] == []
+    assert about_a == about_b
+    assert whole.recipe["validation_miou"] == parts.recipe["validation_miou"]
+
+
+def test_another_seed_gives_other_weights_and_other_rooms():
+    a, b = (train(small_run(steps=2, seed=seed)).model.state_dict() for seed in (0, 1))
+    assert any(not torch.equal(a[n], b[n]) for n in a)
+    assert len({step_seed(s, r, k) for s in range(3) for r in range(3) for k in range(3)}) == 27
+
+
+def test_training_lowers_the_loss_and_keeps_the_best_weights(tmp_path: Path):
+    run = small_run(steps=36, log_steps=12, validation={"times": 3, "rooms": 1, "queries": 1, "rays": 64})
+    checkpoint = train(run, tmp_path)
+    lines = [json.loads(line) for line in (tmp_path / "history.jsonl").read_text().splitlines()]
+    losses = [line["loss_total"] for line in lines if "loss_total" in line]
+    scores = [line for line in lines if "miou" in line]
+    assert losses[-1] < losses[0] and len(scores) == 3
+    best = max(scores, key=lambda line: line["miou"] + line["blind_miou"])
+    assert checkpoint.recipe["best_step"] == best["step"]
+    kept = load_checkpoint(tmp_path / WEIGHTS_FILE).model.state_dict()
+    assert all(torch.equal(kept[n], t) for n, t in checkpoint.model.state_dict().items())
+
+
+def test_the_recipe_tells_where_the_weights_come_from():
+    recipe = train(small_run(steps=2)).recipe
+    assert recipe["steps"] == 2 and recipe["seed"] == 0 and recipe["rooms"] == 3 and recipe["ranks"] == 1
+    assert recipe["suite"].startswith("rooms v") and recipe["torch"] == torch.__version__
+    assert recipe["device"].startswith("cpu") and recipe["width"] == 48
+    assert set(recipe["validation"]) >= {"miou", "blind_miou", "accuracy", "blind_accuracy"}
+    assert "git_revision" in recipe and json.dumps(recipe, allow_nan=False)
+
+
+def test_a_stop_before_the_first_validation_gives_the_latest_weights(tmp_path: Path):
+    checkpoint = train(small_run(steps=500), tmp_path, **stop_after(3))
+    assert checkpoint.recipe["steps"] == 3 and checkpoint.recipe["validation_miou"] is None
+    tensors, _ = contents(tmp_path / STATE_FILE)
+    assert all(torch.equal(tensors[f"model.{n}"], t) for n, t in checkpoint.model.state_dict().items())
+
+
+def test_a_run_goes_on_with_a_larger_budget_but_with_no_other_config(tmp_path: Path):
+    train(small_run(steps=4), tmp_path)
+    longer = train(small_run(steps=8), tmp_path, resume=True)
+    assert longer.recipe["steps"] == 8
+    assert [line["step"] for line in longer.recipe["history"]] == [2, 4, 8]
+    with pytest.raises(ConfigError, match=r"another config .*learning_rate was 0\.001, is 0\.01"):
+        train(small_run(learning_rate=0.01), tmp_path, resume=True)
+
+
+def test_an_unfinished_run_is_not_overwritten_by_mistake(tmp_path: Path):
+    train(small_run(), tmp_path, **stop_after(1))
+    with pytest.raises(ConfigError, match="stopped here at step 1; go on with --resume"):
+        train(small_run(), tmp_path)
+    train(small_run(), tmp_path, resume=True)
+    assert train(small_run(steps=2), tmp_path).recipe["steps"] == 2
+
+
+def test_a_state_that_is_missing_or_damaged_says_so(tmp_path: Path):
+    with pytest.raises(WeightsError, match="no such training state"):
+        train(small_run(), tmp_path, resume=True)
+    (tmp_path / STATE_FILE).write_bytes(b"nothing of the kind")
+    with pytest.raises(WeightsError, match="not a readable training state"):
+        train(small_run(), tmp_path, resume=True)
+
+
+def test_a_loss_that_is_no_number_ends_training():
+    with pytest.raises(WeightsError, match="diverged by step"):
+        train(small_run(steps=40, learning_rate=1e18, final_learning_rate=1e18, gradient_clip=1e30))
+
+
+def test_the_kind_of_field_and_its_settings_come_from_the_config():
+    model = train(small_run(steps=1)).model
+    assert isinstance(model, SRay) and model.config.feature_dim == 16
+    with pytest.raises(ConfigError, match="no field of kind 'nerf'"):
+        train(small_run(kind="nerf"))
+    with pytest.raises(ConfigError, match="did you mean `heads`"):
+        train(small_run(field={"head": 2}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"steps": 0}, "needs a budget"),
+        ({"rooms_per_step": 0}, "rooms_per_step"),
+        ({"seed": -1}, "seed must be"),
+        ({"step": {"views_min": 5, "views_max": 4}}, "views_min <= views_max"),
+        ({"validation": {"rooms": 21}}, "1 to 20 rooms"),
+        ({"pool": {"rooms": 2, "rooms_at_start": 4}}, "rooms_at_start <= rooms"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(changes: dict, words: str):
+    with pytest.raises(ConfigError, match=words):
+        train(small_run(**changes))
+
+
+def test_labels_of_source_views_are_not_given_unless_asked_for():
+    assert not TrainConfig().step.known_labels
+    assert not small_run().step.known_labels, "a [step] table that leaves it out must not switch it on"
+
+
+def test_the_rate_warms_up_and_then_falls_to_its_end():
+    config = small_run()
+    assert learning_rate(0.0, config) == pytest.approx(0.1 * config.learning_rate)
+    assert learning_rate(0.01, config) > 0.99 * config.learning_rate
+    assert math.isclose(learning_rate(1.0, config), config.final_learning_rate)

@@ -1,0 +1,45 @@
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+import torch
+
+from semantic_mapper.training.recipe import git_revision, provenance
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A git checkout with the package folder in it, committed."""
+    (tmp_path / "package").mkdir()
+    (tmp_path / "package" / "file.py").write_text("a = 1\n", encoding="utf-8")
+    identity = ("-c", "user.name=test", "-c", "user.email=test@example.com")
+    for arguments in (("init", "-q"), ("add", "."), (*identity, "commit", "-qm", "first")):
+        subprocess.run(["git", "-C", str(tmp_path), *arguments], check=True, capture_output=True)
+    return tmp_path
+
+
+def test_the_revision_is_that_of_the_checkout_and_tells_of_changes(checkout: Path):
+    clean = git_revision(checkout / "package")
+    assert clean is not None and re.fullmatch(r"[0-9a-f]{40}", clean)
+    (checkout / "package" / "file.py").write_text("a = 2\n", encoding="utf-8")
+    assert git_revision(checkout / "package") == f"{clean}-dirty"
+
+
+def test_a_package_that_is_merely_installed_inside_a_checkout_has_no_revision(checkout: Path):
+    installed = checkout / "environment" / "site-packages" / "package"
+    installed.mkdir(parents=True)
+    assert git_revision(installed) is None
+
+
+def test_a_package_outside_any_checkout_has_no_revision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
+    assert git_revision(tmp_path) is None
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert git_revision(tmp_path) is None, "nor where there is no git"
+
+
+def test_provenance_names_versions_and_device():
+    about = provenance(torch.device("cpu"))
+    assert about["torch"] == torch.__version__ and "threads" in about["device"]
+    assert {"version", "git_revision", "platform"} <= about.keys()

@@ -1,0 +1,38 @@
+"""What each process of ``test_train_ranks`` runs: a few steps of training, then what it holds into a file."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+from safetensors.torch import save_file
+
+from semantic_mapper.training.rooms import RoomPool
+from semantic_mapper.training.train import train
+from tests.training.small_run import small_run
+
+
+def main(folder: Path) -> None:
+    seen: list[int] = []
+    plain_draw = RoomPool.draw
+
+    def draw(pool: RoomPool, generator):
+        room = plain_draw(pool, generator)
+        seen.append(room.seed)
+        return room
+
+    RoomPool.draw = draw
+    validation = {"times": 1, "rooms": 2, "queries": 1, "rays": 64, "views": 3}
+    one_attention = small_run().field | {"cross_view_attention": False}  # weights that get no gradient
+    checkpoint = train(small_run(steps=4, validation=validation, field=one_attention), folder)
+    rank = os.environ["RANK"]
+    score = checkpoint.recipe["validation_miou"]
+    about = {"rooms": " ".join(map(str, seen)), "score": str(score), "ranks": str(checkpoint.recipe["ranks"])}
+    save_file(
+        {n: t.contiguous() for n, t in checkpoint.model.state_dict().items()}, folder / f"rank{rank}.safetensors", about
+    )
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
