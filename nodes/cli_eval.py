@@ -111,6 +111,8 @@ def _evaluate_targets(
     from replay.artifacts import write_json
 
     folders = [t for t in targets if t.is_dir()]
+    if mesh is not None and not folders:
+        raise typer.BadParameter("goes with a DIR that `replay` has written", param_hint="--mesh")
     found: dict[str, Any] = {"replays": {}, "logs": {}}
     if folders:
         found["replays"] = print_results(output, folders)

@@ -10,6 +10,7 @@ import typer
 from nodes.console import Output
 from nodes.process import StopRequest
 from nodes.verb import verb
+from semantic_mapper.errors import LogError
 
 
 @verb
@@ -37,7 +38,20 @@ def up(
     from nodes.results import print_results
 
     checked = load_launch(launch, settings or (), out)
+    folders = [Path(o.out) for o in checked.options.values() if isinstance(o, MapperOptions)]
+    before = [_written(f) for f in folders]
     with StopRequest() as stop, Launcher(checked) as launcher:
         launcher.run(stop)
-    folders = [Path(o.out) for o in checked.options.values() if isinstance(o, MapperOptions)]
-    print_results(output, [f for f in folders if (f / "summary.json").exists()])
+    fresh = [f for f, stamp in zip(folders, before, strict=True) if _written(f) not in (0, stamp)]
+    results = print_results(output, fresh)
+    for name, summary in results.items():
+        if not summary["frames"]["fused"] and not stop:
+            why = [r["reason"] for r in summary["refusals"]] or summary["damaged_stretches"] or ["no frames came"]
+            count = summary["frames"]["published"]
+            raise LogError(f"{name}: none of {count} frames was mapped; the first: {why[0]}")
+
+
+def _written(folder: Path) -> int:
+    """When the folder's summary was written, 0 = there is none."""
+    file = folder / "summary.json"
+    return file.stat().st_mtime_ns if file.exists() else 0

@@ -9,8 +9,9 @@ import structlog
 
 from nodes.console import FrameProgress
 from nodes.process import StopRequest
+from nodes.run_replay import prepare_file
 from replay.log import LogReader
-from semantic_mapper.errors import ConfigError, FrameError, LabelError, LogError
+from semantic_mapper.errors import FrameError, LabelError, LogError
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint, save_checkpoint
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
@@ -44,18 +45,14 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
     Raises:
         LogError, LabelError, FrameError, WeightsError, ConfigError: with what is wrong and the mend.
     """
-    if not request.out.parent.is_dir():
-        try:
-            request.out.parent.mkdir(parents=True)
-        except OSError as error:
-            raise ConfigError(f"{request.out}: cannot be written there ({error.strerror})") from error
+    prepare_file(request.out)
     # First, so that a wrong path does not cost the reading of a log.
     start = None if request.from_scratch else load_checkpoint(request.weights or default_checkpoint_path())
     with LogReader(request.log) as log:
         label_set = log.info.label_set
         if label_set is None:
             raise LabelError(f"{request.log}: has no label images; finetuning needs labelled keyframes")
-        frames = choose_labelled(log, label_set, request, bar)
+        frames = choose_labelled(log, label_set, request, stop, bar)
     config = FinetuneConfig(seconds=request.seconds, steps=request.steps, seed=request.seed)
     bar.start(100)
 
@@ -63,30 +60,46 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
         note = f"step {progress.step} held-out loss {progress.held_out_loss:.3f}"
         bar.set(int(progress.fraction * 100), f"{note} accuracy {progress.held_out_accuracy * 100:.1f} %")
 
-    checkpoint = finetune(frames, label_set, None if start is None else start.model, config, on_progress, lambda: stop)
+    checkpoint = finetune(
+        frames,
+        label_set,
+        None if start is None else start.model,
+        config,
+        on_progress,
+        lambda: stop,
+        () if start is None else start.train_stamps_ns,
+    )
+    if stop and not checkpoint.recipe["steps"]:  # nothing learned: no reason to touch the file
+        raise KeyboardInterrupt
     checkpoint.recipe["source"] = request.log.name
     save_checkpoint(checkpoint, request.out)
     return checkpoint, [f.seq for f in frames]
 
 
 def choose_labelled(
-    log: LogReader, label_set: LabelSet, request: FinetuneRequest, bar: FrameProgress
+    log: LogReader, label_set: LabelSet, request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
 ) -> list[PosedFrame]:
     """The labelled frames that show most of what the log shows.
 
     Raises:
         LogError: fewer usable labelled frames than asked for.
+        KeyboardInterrupt: a stop request came.
     """
     candidates, numbers = [], []
+    size: tuple[int, int] | None = None
     bar.start(len(log))
     for number in range(len(log)):
         bar.set(number + 1, "choosing keyframes")
+        if stop:
+            raise KeyboardInterrupt
         try:
             frame = log.frame(number)
             if frame.label is None:
                 continue
             check_pose(frame.T_world_camera, f"frame seq={frame.seq}")
             label_set.to_channels(frame.label, f"frame seq={frame.seq}")
+            size = size or (frame.intrinsics.width, frame.intrinsics.height)
+            _check_size(frame, size)
         except (LogError, FrameError, LabelError) as error:
             _log.warning("frame_left_out", frame=number, reason=str(error))
             continue
@@ -98,3 +111,14 @@ def choose_labelled(
             f"--keyframes {request.keyframes} is more than that"
         )
     return [log.frame(numbers[i]) for i in choose_keyframes(candidates, request.keyframes, request.seed)]
+
+
+def _check_size(frame: PosedFrame, size: tuple[int, int]) -> None:
+    """One finetuning takes views of one size.
+
+    Raises:
+        FrameError: another size.
+    """
+    k = frame.intrinsics
+    if (k.width, k.height) != size:
+        raise FrameError(f"frame seq={frame.seq}: {k.width}x{k.height}, but the first one is {size[0]}x{size[1]}")

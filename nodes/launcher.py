@@ -67,11 +67,11 @@ class Launcher:
         while not stop and not self._failures and self._sources_run():
             self._look_after_all()
             time.sleep(POLL_S)
+        self._look_after_all()  # a camera that has failed since the last look
         if stop:
             _log.info("stopping", by=stop.name)
-        asked = bool(stop) or bool(self._failures)
         for kind in STOP_ORDER:
-            self._end(kind, asked=asked)
+            self._end(kind, stop)
         if self._failures:
             raise NodeError("; then ".join(self._failures))
 
@@ -103,15 +103,17 @@ class Launcher:
             elif child.has_failed():
                 self._fail(child)
 
-    def _end(self, kind: str, *, asked: bool) -> None:
-        """Wait for all nodes of a kind; ask them first where they would not end by themselves."""
+    def _end(self, kind: str, stop: StopRequest) -> None:
+        """Wait for all nodes of a kind; ask them as soon as there is a reason not to wait for the end of the stream."""
         patience = self._launch.finish_s if kind == "mapper" else self._launch.stop_s
         children = [c for c in self._children if c.kind == kind]
-        for child in children:
-            if asked:
-                child.ask_to_stop()
+        asked = False
         deadline = time.monotonic() + patience
         while time.monotonic() < deadline and any(c.exit_code() is None for c in children):
+            if not asked and (stop or self._failures):
+                asked = True
+                for child in children:
+                    child.ask_to_stop()
             self._look_after_all()
             time.sleep(POLL_S)
         for child in children:

@@ -122,10 +122,12 @@ class _Mapper:
             _log.error("results_not_written", reason=str(second), after=str(error))
 
     def _begin(self, info: StreamInfo) -> None:
+        from nodes.run_replay import clear_summary
         from replay.session import MapSession
 
         if self._session is not None:  # the same stream, told again to a newcomer
             return
+        clear_summary(Path(self._options.out))
         self._session = MapSession(
             self._bundle,
             stream_labels=info.label_set,

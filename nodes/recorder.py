@@ -12,7 +12,7 @@ import structlog
 
 from nodes.node import NodeContext, run_node
 from nodes.options import RecorderOptions
-from semantic_mapper.errors import TransportError
+from semantic_mapper.errors import LogError, TransportError
 
 if TYPE_CHECKING:
     from replay.log import LogWriter
@@ -77,6 +77,8 @@ class _Recording:
     def __init__(self, path: Path, options: RecorderOptions) -> None:
         self._path = path
         self._options = options
+        if path.exists() and not options.overwrite:  # before the stream begins, so that nothing else is overwritten
+            raise LogError(f"{path}: exists already; give another folder or set overwrite = true")
         self._log: LogWriter | None = None
         self._early: deque[list[bytes]] = deque(maxlen=MAX_EARLY)
 

@@ -15,7 +15,7 @@ from nodes.process import StopRequest
 from replay.log import LogReader
 from replay.session import MapSession, load_pipeline
 from semantic_mapper.config import MapperConfig, load_config
-from semantic_mapper.errors import ConfigError, LogError, MapError
+from semantic_mapper.errors import ConfigError, LogError, SemanticMapperError
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.types import PosedFrame
 
@@ -70,6 +70,7 @@ def replay_log(
         for notice in log.notices:
             _log.warning("log_notice", notice=notice)
         bundle = load_pipeline(request.weights, request.config)
+        clear_summary(request.out)
         session = MapSession(
             bundle,
             stream_labels=log.info.label_set,
@@ -84,7 +85,7 @@ def replay_log(
         _log.info("mapping", log=request.log.name, frames=total, weights=bundle.weights_path.name)
         try:
             done = _map_frames(session, log, total, stop, on_frame)
-        except MapError:  # the map is full: what is in it is worth keeping
+        except SemanticMapperError:  # the map is full, for one: what is in it is worth keeping
             finish_session(session, request.out, "error")
             raise
         summary = finish_session(session, request.out, stop.name)
@@ -131,6 +132,22 @@ def mapper_config(path: Path | None, voxel_size_m: float | None, seed: int | Non
         voxel_map = msgspec.structs.replace(config.voxel_map, voxel_size_m=voxel_size_m)
         config = msgspec.structs.replace(config, voxel_map=voxel_map)
     return config if seed is None else msgspec.structs.replace(config, seed=seed)
+
+
+def prepare_file(path: Path) -> None:
+    """Make sure that a file can be written, before minutes are spent on what is to be in it.
+
+    Raises:
+        ConfigError: it is a folder, or nothing can be written beside it.
+    """
+    if path.is_dir():
+        raise ConfigError(f"{path}: is a folder; give the name of a file")
+    prepare_folder(path.parent)
+
+
+def clear_summary(out: Path) -> None:
+    """Take an earlier run's summary away: one that is there says that the results beside it are whole."""
+    (out / "summary.json").unlink(missing_ok=True)
 
 
 def prepare_folder(out: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ def compare_with_mesh(folder: Path, mesh: Path) -> dict[str, Any]:
         with np.load(mesh) as data:
             vertices, faces = data["vertices"].astype(np.float32), data["faces"].astype(np.int32)
             label = data.get("label")
-    except (OSError, KeyError, ValueError) as error:
+    except (OSError, KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
         raise MapError(f"{mesh}: needs arrays 'vertices' (V, 3) and 'faces' (F, 3) in an .npz: {error}") from error
     voxel_map = VoxelMap.load(folder / "map.npz")
     points = voxel_map.points()

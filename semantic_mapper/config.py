@@ -8,11 +8,16 @@ from __future__ import annotations
 import difflib
 import tomllib
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
 from semantic_mapper.errors import ConfigError
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NotNegative = Annotated[int, msgspec.Meta(ge=0)]
+AtLeastOne = Annotated[int, msgspec.Meta(ge=1)]
+AtLeastTwo = Annotated[int, msgspec.Meta(ge=2)]
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -82,45 +87,59 @@ class SamplingConfig(Config, frozen=True):
     """Where a ray is sampled."""
 
     mode: Literal["reference", "streaming"] = "streaming"
-    coarse: int = 64  # reference: uniform in inverse depth
-    fine: int = 64  # reference: drawn from the coarse weights
-    guided: int = 8  # streaming: round the depth prior, or uniform in inverse depth where there is none
-    free_space: int = 1  # of the guided samples: between the camera and the guided interval
-    guided_sigma: float = 0.02  # half width of the guided interval: guided_sigma * z + guided_floor_m
-    guided_floor_m: float = 0.04
-    near_m: float = 0.3
-    far_m: float = 8.0
+    coarse: AtLeastTwo = 64  # reference: uniform in inverse depth
+    fine: AtLeastOne = 64  # reference: drawn from the coarse weights
+    guided: AtLeastTwo = 8  # streaming: round the depth prior, or uniform in inverse depth where there is none
+    free_space: NotNegative = 1  # of the guided samples: between the camera and the guided interval
+    guided_sigma: Positive = 0.02  # half width of the guided interval: guided_sigma * z + guided_floor_m
+    guided_floor_m: Positive = 0.04
+    near_m: Positive = 0.3
+    far_m: Positive = 8.0
+
+    def __post_init__(self) -> None:
+        if self.far_m <= self.near_m:
+            raise ValueError(f"far_m must lie beyond near_m ({self.near_m:g}), got {self.far_m:g}")
+        if self.guided - self.free_space < 2:
+            raise ValueError(
+                f"free_space must leave at least 2 of the {self.guided} guided samples, got {self.free_space}"
+            )
 
 
 class KeyframeConfig(Config, frozen=True):
     """When a frame becomes a source view, and which views a query uses."""
 
-    translation_m: float = 0.15  # new keyframe when moved this far from the nearest one, or ...
-    rotation_deg: float = 12.0  # ... turned this far
-    capacity: int = 64  # keyframes kept; the one whose loss costs least coverage goes first
-    source_views: int = 8  # m of the paper
+    translation_m: Positive = 0.15  # new keyframe when moved this far from the nearest one, or ...
+    rotation_deg: Positive = 12.0  # ... turned this far
+    capacity: AtLeastOne = 64  # keyframes kept; the one whose loss costs least coverage goes first
+    source_views: Annotated[int, msgspec.Meta(ge=1, le=16)] = 8  # m of the paper
     use_current_view: bool = True  # the frame being mapped is itself a source view of its rendering
 
 
 class VoxelMapConfig(Config, frozen=True):
     """The fused map."""
 
-    voxel_size_m: float = 0.02
-    truncation_voxels: float = 4.0
-    depth_max_m: float = 5.0
-    max_weight: float = 255.0  # cap of the TSDF weight, so that the map stays able to change
-    initial_blocks: int = 2000  # capacity at start; grows by half when full
-    max_blocks: int = 200_000  # refuse to grow past this, with a clear error
-    vote_discount: float = 0.5  # rho: how much a repeated view of a voxel repeats what earlier views said
-    vote_band_voxels: float = 2.0  # only voxels this near the surface take class votes
+    voxel_size_m: Positive = 0.02
+    truncation_voxels: Positive = 4.0
+    depth_max_m: Positive = 5.0
+    max_weight: Positive = 255.0  # cap of the TSDF weight, so that the map stays able to change
+    initial_blocks: AtLeastOne = 2000  # capacity at start; grows by half when full
+    max_blocks: AtLeastOne = 200_000  # refuse to grow past this, with a clear error
+    vote_discount: Annotated[float, msgspec.Meta(ge=0, le=1)] = (
+        0.5  # rho: how much a repeated view of a voxel repeats what earlier views said
+    )
+    vote_band_voxels: Positive = 2.0  # only voxels this near the surface take class votes
 
 
 class RenderConfig(Config, frozen=True):
     """Resolution and chunking of the rendered view."""
 
-    scale: float = 0.25  # rendered rays a side, relative to the frame; lifted to full size along image edges
-    encode_width: int = 0  # source images are resized to this width to be encoded; 0 = what the weights were trained at
-    rays_per_chunk: int = 2048
+    scale: Annotated[float, msgspec.Meta(gt=0, le=1)] = (
+        0.25  # rendered rays a side, relative to the frame; lifted to full size along image edges
+    )
+    encode_width: NotNegative = (
+        0  # source images are resized to this width to be encoded; 0 = what the weights were trained at
+    )
+    rays_per_chunk: AtLeastOne = 2048
 
 
 class MapperConfig(Config, frozen=True):

@@ -26,9 +26,15 @@ def share_threads() -> int:
     priority: Any = numba_config
     priority.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
     threads = torch.get_num_threads()
-    numba.set_num_threads(min(threads, numba.get_num_threads()))  # starts them
+    follow_torch_threads()  # starts them
     torch.set_num_threads(threads)
     return numba.get_num_threads()
+
+
+def follow_torch_threads() -> None:
+    """Let the kernels that this thread starts use as many threads as torch does now."""
+    started: Any = numba_config
+    numba.set_num_threads(min(torch.get_num_threads(), started.NUMBA_NUM_THREADS))
 
 
 def parallel_kernel(*, fastmath: bool = False) -> Callable[[FunctionT], FunctionT]:

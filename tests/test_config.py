@@ -98,3 +98,23 @@ def test_configs_cannot_be_changed() -> None:
     with pytest.raises(AttributeError):
         MapperConfig().seed = 1  # type: ignore[misc]
     assert msgspec.structs.replace(MapperConfig(), seed=1).seed == 1
+
+
+@pytest.mark.parametrize(
+    ("section", "what"),
+    [
+        ({"sampling": {"guided": 1}}, "guided"),
+        ({"sampling": {"near_m": 0}}, "near_m"),
+        ({"sampling": {"near_m": 2.0, "far_m": 1.0}}, "far_m must lie beyond near_m"),
+        ({"sampling": {"guided": 4, "free_space": 3}}, "free_space must leave"),
+        ({"keyframes": {"source_views": 17}}, "source_views"),
+        ({"keyframes": {"capacity": 0}}, "capacity"),
+        ({"render": {"scale": 0}}, "scale"),
+        ({"render": {"rays_per_chunk": -1}}, "rays_per_chunk"),
+        ({"voxel_map": {"voxel_size_m": -0.02}}, "voxel_size_m"),
+        ({"voxel_map": {"vote_discount": 1.5}}, "vote_discount"),
+    ],
+)
+def test_values_that_make_no_sense_are_refused_by_name(section: dict[str, Any], what: str) -> None:
+    with pytest.raises(ConfigError, match=what):
+        convert_config(section, MapperConfig, "settings.toml")

@@ -73,7 +73,11 @@ def default_checkpoint_path() -> Path:
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -> None:
-    """Write atomically; ``half`` stores weights as float16 (half the size, for shipping)."""
+    """Write atomically; ``half`` stores weights as float16 (half the size, for shipping).
+
+    Raises:
+        WeightsError: it cannot be written there.
+    """
     tensors = {f"model.{name}": _stored(t, half) for name, t in checkpoint.model.state_dict().items()}
     metadata = {
         "format": FORMAT,
@@ -86,10 +90,14 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -
     if checkpoint.anchors:
         anchor_tensors, metadata["anchors"] = _pack_anchors(checkpoint.anchors)
         tensors |= anchor_tensors
-    path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
-    save_file(tensors, part, metadata)
-    os.replace(part, path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_file(tensors, part, metadata)
+        os.replace(part, path)
+    except (SafetensorError, OSError) as error:
+        part.unlink(missing_ok=True)
+        raise WeightsError(f"{path}: cannot be written ({error}); give another file name") from error
 
 
 def load_checkpoint(path: Path) -> Checkpoint:

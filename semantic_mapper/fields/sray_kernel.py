@@ -21,6 +21,7 @@ from semantic_mapper.fields.sray import DOUBT
 from semantic_mapper.threads import parallel_kernel
 
 CUES = 4
+SCORE_HIDDEN = 16  # hidden width of ViewWeightNet
 _ZERO = np.float32(0.0)
 
 
@@ -293,7 +294,9 @@ def _make_scratch(views, samples, channels, classes):
             score,
         ),
         (
-            np.empty((4, max(channels + CUES, 2 * channels, views)), np.float32),  # one token's way through the weights
+            np.empty(
+                (4, max(channels + CUES, 2 * channels, views, SCORE_HIDDEN)), np.float32
+            ),  # one token's way through the weights
             np.empty((samples, channels), np.float32),  # s
             np.empty((samples, 3), np.float32),
             np.empty((samples, classes), np.float32),  # carried labels

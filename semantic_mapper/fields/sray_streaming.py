@@ -13,12 +13,13 @@ import torch
 from torch import nn
 
 from semantic_mapper.config import SamplingConfig
-from semantic_mapper.errors import ConfigError
+from semantic_mapper.errors import ConfigError, ShapeError
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_kernel import render_rays
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.threads import follow_torch_threads
 from semantic_mapper.types import FieldRender, Float32, RayBatch, SourceViews
 
 TASKS_PER_THREAD = 4  # rays differ in cost (views that see nothing), so give the threads something to balance
@@ -49,7 +50,7 @@ class StreamingSRay:
         self.sampling = sampling or SamplingConfig()
         self._weights = pack_weights(model)
         # Torch's count may have been changed since the threads were started.
-        numba.set_num_threads(min(torch.get_num_threads(), numba.get_num_threads()))
+        follow_torch_threads()
 
     @property
     def label_set(self) -> LabelSet:
@@ -74,7 +75,13 @@ class StreamingSRay:
         return self.render_samples(rays, sample_guided(rays, self.sampling), sources)
 
     def render_samples(self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews) -> FieldRender:
-        """Render rays at given sample depths z (R, N)."""
+        """Render rays at given sample depths z (R, N).
+
+        Raises:
+            ShapeError: fewer than 2 samples a ray.
+        """
+        if z.shape[1] < 2:
+            raise ShapeError(f"a ray needs at least 2 samples for its intervals to have a length, got {z.shape[1]}")
         count, channels = len(z), sources.feature.shape[1]
         # Torch's buffers are aligned alike every time; the matrix product of _classify rounds differently otherwise.
         rendered, colour = torch.empty(count, channels), torch.empty(count, 3)

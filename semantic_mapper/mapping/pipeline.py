@@ -69,6 +69,7 @@ class MappingPipeline:
         self._intrinsics: dict[str, CameraIntrinsics] = {}
         self._odd_sizes: dict[str, tuple[tuple[int, int], int]] = {}
         self._stage_ms: dict[str, float] = {}
+        self._told_sizes = False
         for anchor in anchors:
             self.keyframes.add(
                 self._make_keyframe(anchor, self._encode(anchor, self._known_channel(anchor)), labelled=True)
@@ -170,7 +171,16 @@ class MappingPipeline:
         count = config.source_views - (1 if config.use_current_view else 0)
         chosen = self.keyframes.choose(frame.T_world_camera, intrinsics, depth, count)
         # Cameras of another shape have feature maps of another size; one render takes views of one size.
-        return [k for k in chosen if k.encoded.size == current.size]
+        fitting = [k for k in chosen if k.encoded.size == current.size]
+        if len(fitting) < len(chosen) and not self._told_sizes:
+            self._told_sizes = True
+            _log.warning(
+                "source_views_left_out",
+                reason="keyframes were encoded at another size than this frame",
+                left_out=len(chosen) - len(fitting),
+                seq=frame.seq,
+            )
+        return fitting
 
     def _render(
         self, frame: PosedFrame, sources: list[Keyframe], current: EncodedViews

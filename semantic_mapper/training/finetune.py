@@ -6,12 +6,14 @@ Held-out rays decide which weights are kept.
 from __future__ import annotations
 
 import copy
+import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import structlog
 import torch
 
 from semantic_mapper.config import Config, SRayConfig, to_plain
@@ -26,6 +28,8 @@ from semantic_mapper.training.schedule import budget_fraction, cosine_rate
 from semantic_mapper.training.step import StepConfig, pick_views, training_loss
 from semantic_mapper.training.views import LabelledView, draw_pixels, query_rays, stack_sources, view_from_frame
 from semantic_mapper.types import PosedFrame
+
+_log = structlog.get_logger(__name__)
 
 HELD_OUT_BLOCK = 16  # pixels a side: single held-out pixels would be known from their neighbours
 
@@ -75,6 +79,7 @@ def finetune(
     config: FinetuneConfig,
     on_progress: Callable[[FinetuneProgress], None] | None = None,
     stopped: Callable[[], object] = bool,
+    seen_stamps_ns: Iterable[int] = (),
 ) -> Checkpoint:
     """Fit a field to the labelled keyframes ``frames``; never worse on held-out rays than where it started.
 
@@ -85,6 +90,7 @@ def finetune(
         config: At least one of ``seconds`` and ``steps`` set.
         on_progress: Called after every step.
         stopped: Asked before every step; once it says so (anything true), the best weights so far are the result.
+        seen_stamps_ns: Frames that ``start`` was fitted to; the result remembers them with its own.
 
     Raises:
         FrameError: fewer than two frames, or none with labels.
@@ -108,7 +114,7 @@ def finetune(
         "seconds": round(time.monotonic() - began, 1),
         "held_out_loss": best.loss,
         "held_out_accuracy": best.accuracy,
-        "train_stamps_ns": [int(f.stamp_ns) for f in frames],
+        "train_stamps_ns": sorted({int(f.stamp_ns) for f in frames} | {int(s) for s in seen_stamps_ns}),
     }
     anchors = tuple(anchor_from_frame(f, config.width) for f in frames)
     return Checkpoint(model.eval(), anchors, recipe)
@@ -126,6 +132,8 @@ def _run(
     optimiser = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
     best = _Best(*_evaluate(model, train, held_out, config), 0, copy.deepcopy(model.state_dict()))
     latest = (best.loss, best.accuracy)
+    if not math.isfinite(best.loss):
+        _log.warning("nothing_held_out", reason="too few labelled pixels; the last weights are kept, not the best")
     began, step, evaluated, stale = time.monotonic(), 0, 0, 0
     while (
         (fraction := budget_fraction(step, time.monotonic() - began, steps=config.steps, seconds=config.seconds)) < 1
@@ -149,7 +157,7 @@ def _run(
         if fraction * config.evaluations >= evaluated + 1 or fraction >= 1:
             evaluated = int(fraction * config.evaluations)
             latest = _evaluate(model, train, held_out, config)
-            improved = latest[0] < best.loss
+            improved = latest[0] < best.loss or not math.isfinite(best.loss)
             stale = 0 if improved else stale + 1
             if improved:
                 best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
@@ -157,7 +165,7 @@ def _run(
             on_progress(FinetuneProgress(step, min(fraction, 1.0), float(loss.total.detach()), *latest, improved))
     if stopped() and step > 0:  # what was learned since the last look
         latest = _evaluate(model, train, held_out, config)
-        if latest[0] < best.loss:
+        if latest[0] < best.loss or not math.isfinite(best.loss):
             best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
     return best, step
 
