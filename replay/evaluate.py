@@ -34,7 +34,7 @@ class Evaluation:
 
 
 def sray_predictors(bundle: PipelineBundle) -> dict[str, Predictor]:
-    """S-Ray as it maps (the frame itself is one of the source views) and for a novel view (its image is not used)."""
+    """S-Ray as it maps (the frame itself is a source view) and for a novel view (the frame is none)."""
     novel = _with_current_view(bundle.pipeline.config, False)
     pipeline = MappingPipeline(
         novel, make_field(bundle.checkpoint.model, novel), bundle.pipeline.label_set, anchors=bundle.checkpoint.anchors

@@ -17,6 +17,7 @@ from semantic_mapper.errors import ConfigError
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[int, msgspec.Meta(ge=0)]
 AtLeastOne = Annotated[int, msgspec.Meta(ge=1)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 AtLeastTwo = Annotated[int, msgspec.Meta(ge=2)]
 
 
@@ -124,21 +125,16 @@ class VoxelMapConfig(Config, frozen=True):
     max_weight: Positive = 255.0  # cap of the TSDF weight, so that the map stays able to change
     initial_blocks: AtLeastOne = 2000  # capacity at start; grows by half when full
     max_blocks: AtLeastOne = 200_000  # refuse to grow past this, with a clear error
-    vote_discount: Annotated[float, msgspec.Meta(ge=0, le=1)] = (
-        0.5  # rho: how much a repeated view of a voxel repeats what earlier views said
-    )
+    vote_discount: Share = 0.5  # rho: how much a repeated view of a voxel repeats what earlier views said
     vote_band_voxels: Positive = 2.0  # only voxels this near the surface take class votes
 
 
 class RenderConfig(Config, frozen=True):
     """Resolution and chunking of the rendered view."""
 
-    scale: Annotated[float, msgspec.Meta(gt=0, le=1)] = (
-        0.25  # rendered rays a side, relative to the frame; lifted to full size along image edges
-    )
-    encode_width: NotNegative = (
-        0  # source images are resized to this width to be encoded; 0 = what the weights were trained at
-    )
+    # Rendered rays a side, relative to the frame; lifted to full size along image edges.
+    scale: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.25
+    encode_width: NotNegative = 0  # of the source images when they are encoded; 0 = what the weights were trained at
     rays_per_chunk: AtLeastOne = 2048
 
 

@@ -26,8 +26,12 @@ def cast_pixels(shape, center, half, rotation, origin, camera_axes, fx, fy, cx, 
         for i in range(3):
             for j in range(3):
                 to_own[i, j] = rotation[p, j, i] / half[p, i]
-        start = to_own @ (origin - center[p])
-        turn = to_own @ camera_axes
+        start, turn = np.zeros(3), np.zeros((3, 3))  # written out: numba's matrix product would need SciPy's BLAS
+        for i in range(3):
+            for j in range(3):
+                start[i] += to_own[i, j] * (origin[j] - center[p, j])
+                for k in range(3):
+                    turn[i, k] += to_own[i, j] * camera_axes[j, k]
         u0, u1, v0, v1 = _screen_rectangle(
             center[p], half[p], rotation[p], origin, camera_axes, fx, fy, cx, cy, width, height
         )

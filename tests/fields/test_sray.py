@@ -189,6 +189,22 @@ def test_streaming_renderer_equals_the_reference_at_the_same_samples(changes: di
         torch.testing.assert_close(getattr(fast, name), getattr(reference, name), atol=1e-4, rtol=1e-4)
 
 
+def test_streaming_renderer_covers_the_narrowest_features():
+    torch.manual_seed(2)
+    field = SRay(SRayConfig(feature_dim=4, heads=2, encoder_width=8, encoder_blocks=(1,)), LABELS).eval()
+    streaming = StreamingSRay(field)
+    encoded, rays = streaming.encode(wall_sources(POSES)), wall_rays(pose_at(0.1), step=5)
+    with torch.inference_mode():
+        reference = field.render(rays, encoded)
+    torch.testing.assert_close(streaming.render(rays, encoded).logits, reference.logits, atol=1e-4, rtol=1e-4)
+
+
+def test_a_ray_of_one_sample_has_no_interval_and_is_refused():
+    streaming, rays = StreamingSRay(small_field()), wall_rays(pose_at(0.1), step=5)
+    with pytest.raises(ShapeError, match="at least 2 samples"):
+        streaming.render_samples(rays, rays.prior_depth_m[:, None], streaming.encode(wall_sources(POSES)))
+
+
 def test_streaming_renderer_refuses_variants_it_does_not_cover():
     with pytest.raises(ConfigError, match="parity"):
         StreamingSRay(small_field(parity="published"))
@@ -200,8 +216,14 @@ def test_published_parity_runs_and_differs_from_the_paper():
     assert published.cross.head_dim == 4 and paper.cross.head_dim == 8
     encoded = published.encode(wall_sources(POSES))
     rays = wall_rays(pose_at(0.0), step=31)
-    thin, _ = published.render_samples(rays, torch.tensor([[1.9, 2.0, 2.1]]).expand(len(rays.origin), 3), encoded)
+    z = torch.tensor([[1.9, 2.0, 2.1]]).expand(len(rays.origin), 3)
+    thin, _ = published.render_samples(rays, z, encoded)
     assert torch.isfinite(thin.logits).all()
+    for name, tensor in paper.state_dict().items():
+        if published.state_dict()[name].shape == tensor.shape:
+            tensor.copy_(published.state_dict()[name])
+    other, _ = paper.render_samples(rays, z, encoded)
+    assert not torch.allclose(thin.opacity, other.opacity, atol=0.01)  # alpha without the interval's length
 
 
 def test_published_parity_leaves_the_interval_length_out_of_alpha():

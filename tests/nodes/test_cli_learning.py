@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 import signal
@@ -12,7 +13,7 @@ import pytest
 from replay.log import LogWriter
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.transport.messages import StreamInfo
-from tests.nodes.support import Running, error_line, run
+from tests.nodes.support import Running, error_line, run, write_log
 from tests.small import INTRINSICS, tiny_frames
 
 
@@ -94,3 +95,32 @@ def test_eval_of_a_log_writes_beside_it(log: Path, weights: Path, config: Path, 
     done = run("eval", copy, "--weights", weights, "--config", config, "--max-frames", "2")
     assert done.returncode == 0, done.stderr
     assert json.loads((tmp_path / "copy.eval.json").read_text())["logs"][str(copy)]["scored"] == 2
+
+
+def test_finetuning_on_top_remembers_the_keyframes_of_both(log: Path, tuned: Path, tmp_path: Path) -> None:
+    out = tmp_path / "again.safetensors"
+    arguments = ("--keyframes", "2", "--seed", "5", "--seconds", "0", "--steps", "1", "--weights", tuned)
+    assert run("finetune", log, *arguments, "--out", out).returncode == 0
+    assert load_checkpoint(tuned).train_stamps_ns <= load_checkpoint(out).train_stamps_ns
+    assert len(load_checkpoint(out).anchors) == 2
+
+
+def test_a_folder_in_place_of_the_weights_file_is_refused_before_training(
+    log: Path, weights: Path, tmp_path: Path
+) -> None:
+    done = run("finetune", log, "--keyframes", "2", "--weights", weights, "--out", tmp_path)
+    assert done.returncode == 1 and "is a folder" in error_line(done.stderr)
+    assert "step 1" not in done.stderr
+
+
+def test_labelled_frames_of_another_size_are_left_out(weights: Path, tmp_path: Path) -> None:
+    frames = list(tiny_frames(4))
+    k = frames[1].intrinsics
+    half = {n: getattr(frames[1], n)[:36, :48].copy() for n in ("rgb", "depth_m", "label")}
+    frames[1] = dataclasses.replace(frames[1], intrinsics=dataclasses.replace(k, width=48, height=36), **half)
+    mixed = write_log(tmp_path / "mixed.mcap", frames)
+    out = tmp_path / "w.safetensors"
+    arguments = ("--keyframes", "3", "--seconds", "0", "--steps", "1", "--weights", weights)
+    done = run("finetune", mixed, *arguments, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "48x36, but the first one is 96x72" in done.stderr and len(load_checkpoint(out).anchors) == 3

@@ -176,3 +176,29 @@ def test_damage_of_a_played_log_stands_in_the_summary(weights: Path, config: Pat
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "up" / "summary.json").read_text())
     assert summary["frames"]["fused"] == 5 and "hurt.mcap" in summary["damaged_stretches"][0]
+
+
+def test_camera_that_cannot_start_ends_the_launch_at_once(weights: Path, config: Path, tmp_path: Path) -> None:
+    missing = tmp_path / "none.mcap"
+    done = run("up", REPLAY_LAUNCH, *_settings(missing, weights, config), "--out", tmp_path / "up")
+    assert done.returncode == 1
+    line = error_line(done.stderr)
+    assert "node 'camera'" in line and "none.mcap" in line and "did not end within" not in line
+
+
+def test_recording_to_a_file_that_exists_touches_neither_it_nor_the_map(
+    log: Path, weights: Path, config: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "up"
+    assert run("up", RECORD_LAUNCH, *_settings(log, weights, config), "--out", out).returncode == 0
+    before = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
+    again = run("up", RECORD_LAUNCH, *_settings(log, weights, config), "--out", out)
+    assert again.returncode == 1 and "recorded.mcap: exists already" in error_line(again.stderr)
+    assert {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()} == before
+
+
+def test_a_log_without_a_usable_frame_fails_as_replay_does(weights: Path, config: Path, tmp_path: Path) -> None:
+    skewed = [dataclasses.replace(f, T_world_camera=f.T_world_camera * 2) for f in tiny_frames(2)]
+    log = write_log(tmp_path / "skewed.mcap", skewed)
+    done = run("up", REPLAY_LAUNCH, *_settings(log, weights, config), "--out", tmp_path / "up")
+    assert done.returncode == 1 and "none of 2 frames was mapped" in error_line(done.stderr)

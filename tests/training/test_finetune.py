@@ -27,10 +27,17 @@ def test_finetuning_improves_held_out_rays_and_says_what_it_did():
     assert len(result.anchors) == 4 and all(a.label is not None for a in result.anchors)
 
 
+def start_loss(start):
+    """Held-out loss of the weights that a finetuning starts from: no learning, one look."""
+    still = config(steps=1, learning_rate=0.0, final_learning_rate=0.0, weight_decay=0.0)
+    return finetune(tiny_frames(3), ROOMS, start, still).recipe["held_out_loss"]
+
+
 def test_weights_are_never_worse_than_the_start_on_held_out_rays():
     ruined = config(steps=12, learning_rate=30.0, final_learning_rate=30.0, gradient_clip=1e9)
     start = tiny_field()
     result = finetune(tiny_frames(3), ROOMS, start, ruined)
+    assert start_loss(start) >= result.recipe["held_out_loss"]
     if result.recipe["best_step"] == 0:
         for name, tensor in start.state_dict().items():
             assert torch.equal(result.model.state_dict()[name], tensor)
