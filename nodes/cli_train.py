@@ -21,9 +21,10 @@ def train(
     steps: Annotated[int | None, typer.Option(min=0, help="Steps of training; 0 = only --seconds counts.")] = None,
     seed: Annotated[int | None, typer.Option(help="Of everything that is drawn at random.")] = None,
     workers: Annotated[int | None, typer.Option(min=0, help="Processes that render rooms; 0 = none beside it.")] = None,
+    weights: Annotated[Path | None, typer.Option(help="Weights to start from; without it random ones.")] = None,
     half: Annotated[bool, typer.Option("--half", help="Store weights as float16, for shipping.")] = False,
 ) -> int:
-    """Train a field from scratch on procedural rooms, which are rendered as it goes.
+    """Train a field on procedural rooms, which are rendered as it goes.
 
     Keeps the weights that were best on the validation rooms. Beside them it writes its state, its history
     (history.jsonl) and its curves (curves.png). Ctrl-C saves the state and the best weights so far (exit code 130);
@@ -39,7 +40,8 @@ def train(
     from semantic_mapper.training.train import train as train_field
 
     plain = to_plain(load_config(config, TrainConfig) if config else TrainConfig())
-    given = {"seconds": seconds, "steps": steps, "seed": seed, "workers": workers}
+    start = None if weights is None else str(weights)
+    given = {"seconds": seconds, "steps": steps, "seed": seed, "workers": workers, "start": start}
     plain |= {name: value for name, value in given.items() if value is not None}
     settings = convert_config(plain, TrainConfig, "command line")
     is_file = out.suffix == ".safetensors"
@@ -56,9 +58,9 @@ def train(
 
         checkpoint = train_field(settings, folder, resume=resume, on_progress=on_progress, stopped=lambda: stop)
     if ranks.first:
-        weights = out if is_file else out / WEIGHTS_FILE
-        save_checkpoint(checkpoint, weights, half=half)
-        output.print(f"{weights}: {_told(checkpoint.recipe)}")
+        file = out if is_file else out / WEIGHTS_FILE
+        save_checkpoint(checkpoint, file, half=half)
+        output.print(f"{file}: {_told(checkpoint.recipe)}")
         if stop:
             kept = f"stopped by {stop.name}; the state and the best weights so far are kept, --resume goes on"
             stderr_console().print(kept, style="yellow", soft_wrap=True)

@@ -20,7 +20,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from semantic_mapper.config import Config, to_plain
 from semantic_mapper.errors import ConfigError, WeightsError
-from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
+from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
@@ -69,6 +69,7 @@ class TrainConfig(Config, frozen=True):
     field: dict[str, Any] = msgspec.field(
         default_factory=dict
     )  # settings of that kind; what is left out keeps its default
+    start: str = ""  # weights file to start from, of this very shape; empty = random weights
     seconds: float = 1500.0  # wall-clock budget; 0 = only steps count (then a run repeats bit for bit on a CPU)
     steps: int = 0  # step budget; 0 = only seconds count
     rooms_per_step: int = 1  # a rank
@@ -115,7 +116,7 @@ def train(
 
     Raises:
         ConfigError: a config that cannot be used, or another one than that of the run to go on with.
-        WeightsError: no state to go on with, or training has diverged.
+        WeightsError: no state to go on with, weights to start from that cannot be read, or training has diverged.
     """
     ranks = ranks_from_environment()
     device = choose_device(config.device, ranks.local)
@@ -124,6 +125,8 @@ def train(
         run = _Run(config, folder, ranks, device)
         if resume:
             run.restore()
+        elif config.start:
+            run.take_over(Path(config.start))
         return run.loop(on_progress, stopped)
 
 
@@ -169,6 +172,20 @@ class _Run:
         self.progress = Progress(torch.zeros(len(LOSS_PARTS), dtype=torch.float64, device=device))
         self.scores: Scores | None = None
         self.last_loss: float | None = None
+
+    def take_over(self, path: Path) -> None:
+        """Start from weights instead of random numbers.
+
+        Raises:
+            WeightsError: they cannot be read.
+            ConfigError: they are of another kind, shape or label set.
+        """
+        start = load_checkpoint(path).model
+        own = (self.field.kind, to_plain(self.field.config), self.field.label_set)
+        if (start.kind, to_plain(start.config), start.label_set) != own:
+            raise ConfigError(f"{path}: weights of another field than the config names, or of other classes")
+        self.field.load_state_dict(start.state_dict())
+        _log.info("training_starts_from", weights=path.name)
 
     def restore(self) -> None:
         assert self.folder is not None

@@ -7,7 +7,7 @@ import torch
 from safetensors import safe_open
 
 from semantic_mapper.errors import ConfigError, WeightsError
-from semantic_mapper.fields.checkpoint import load_checkpoint
+from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.training.train import (
     STATE_FILE,
@@ -159,3 +159,15 @@ def test_the_rate_warms_up_and_then_falls_to_its_end():
     assert learning_rate(0.0, config) == pytest.approx(0.1 * config.learning_rate)
     assert learning_rate(0.01, config) > 0.99 * config.learning_rate
     assert math.isclose(learning_rate(1.0, config), config.final_learning_rate)
+
+
+def test_a_run_may_start_from_weights_of_the_same_shape_and_from_no_others(tmp_path: Path):
+    first = train(small_run(steps=2))
+    save_checkpoint(first, tmp_path / "first.safetensors")
+    still = {"steps": 1, "learning_rate": 0.0, "final_learning_rate": 0.0, "start": str(tmp_path / "first.safetensors")}
+    second = train(small_run(seed=5, **still))
+    assert all(torch.equal(a, b) for a, b in zip(first.model.parameters(), second.model.parameters(), strict=True))
+    with pytest.raises(ConfigError, match="another field"):
+        train(small_run(**{**still, "field": {"encoder_width": 8, "feature_dim": 8, "heads": 2}}))
+    with pytest.raises(WeightsError, match="no such weights file"):
+        train(small_run(**{**still, "start": str(tmp_path / "none.safetensors")}))
