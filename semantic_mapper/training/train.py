@@ -306,7 +306,7 @@ class _Run:
         recipe: dict[str, Any] = {
             "kind": "train",
             "width": config.pool.width,
-            "config": to_plain(config),
+            "config": to_plain(config) | {"start": Path(config.start).name},  # where it lay is nobody's business
             "suite": f"rooms v{SUITE_VERSION}",
             "seed": config.seed,
             "steps": progress.step,
