@@ -22,6 +22,8 @@ def train(
     seed: Annotated[int | None, typer.Option(help="Of everything that is drawn at random.")] = None,
     workers: Annotated[int | None, typer.Option(min=0, help="Processes that render rooms; 0 = none beside it.")] = None,
     weights: Annotated[Path | None, typer.Option(help="Weights to start from; without it random ones.")] = None,
+    kind: Annotated[str | None, typer.Option(help="Kind of field, sray or one of its peers.")] = None,
+    encoder: Annotated[Path | None, typer.Option(help="Weights of any kind whose image encoder to take over.")] = None,
     half: Annotated[bool, typer.Option("--half", help="Store weights as float16, for shipping.")] = False,
 ) -> int:
     """Train a field on procedural rooms, which are rendered as it goes.
@@ -41,7 +43,8 @@ def train(
 
     plain = to_plain(load_config(config, TrainConfig) if config else TrainConfig())
     start = None if weights is None else str(weights)
-    given = {"seconds": seconds, "steps": steps, "seed": seed, "workers": workers, "start": start}
+    given = {"seconds": seconds, "steps": steps, "seed": seed, "workers": workers, "start": start, "kind": kind}
+    given["encoder_from"] = None if encoder is None else str(encoder)
     plain |= {name: value for name, value in given.items() if value is not None}
     settings = convert_config(plain, TrainConfig, "command line")
     is_file = out.suffix == ".safetensors"

@@ -25,13 +25,20 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """Base of all configuration structs."""
 
 
+class EncoderConfig(Config, frozen=True):
+    """Shape of the image encoder that all kinds of fields share."""
+
+    channels: tuple[int, ...] = (32, 64, 128, 192)  # of each stage; the first works at half the size of the image
+    blocks: tuple[int, ...] = (1, 2, 3, 3)  # residual blocks a stage
+    depth: bool = False  # whether it sees measured depth (as ``fields.surface`` puts it) beside colours
+
+
 class SRayConfig(Config, frozen=True):
     """Shape of the S-Ray network; part of every checkpoint."""
 
     feature_dim: int = 32  # C of the paper
     heads: int = 4  # H; d_k = C / H
-    encoder_width: int = 32  # channels of the first encoder stage
-    encoder_blocks: tuple[int, ...] = (1, 2, 3, 3)  # residual blocks a stage
+    encoder: EncoderConfig = EncoderConfig(depth=True)
     tau: float = 0.02  # Eq. 12: view weights lie in (tau / m, 1 / (tau m))
     positional_encoding: bool = False  # sinusoid along the ray; the paper uses none
     intra_view_attention: bool = True  # Eq. 6 to 9
@@ -45,24 +52,21 @@ class UNetFieldConfig(Config, frozen=True):
     """Shape of the per-image U-Net; the encoder is S-Ray's."""
 
     feature_dim: int = 32  # channels that the classifier reads
-    encoder_width: int = 32
-    encoder_blocks: tuple[int, ...] = (1, 2, 3, 3)
+    encoder: EncoderConfig = EncoderConfig()
 
 
 class NeuRayConfig(Config, frozen=True):
     """Shape of NeuRay with a semantic head; the encoder is S-Ray's."""
 
     feature_dim: int = 32  # C
-    encoder_width: int = 32
-    encoder_blocks: tuple[int, ...] = (1, 2, 3, 3)
+    encoder: EncoderConfig = EncoderConfig()
 
 
 class MVSNeRFConfig(Config, frozen=True):
     """Shape of MVSNeRF with a semantic head; the encoder is S-Ray's."""
 
     feature_dim: int = 32  # channels whose variance the cost volume holds
-    encoder_width: int = 32
-    encoder_blocks: tuple[int, ...] = (1, 2, 3, 3)
+    encoder: EncoderConfig = EncoderConfig()
     views: int = 3  # source views used: those nearest to the query; the first of them is the reference
     planes: int = 64  # of the sweep, uniform in inverse depth
     plane_near_m: float = 0.3

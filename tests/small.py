@@ -6,14 +6,15 @@ from functools import cache
 
 import torch
 
-from semantic_mapper.config import MapperConfig, SRayConfig, convert_config
+from semantic_mapper.config import EncoderConfig, MapperConfig, SRayConfig, convert_config
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
 INTRINSICS = CameraIntrinsics(66.0, 66.0, 47.5, 35.5, 96, 72)
-SMALL_MODEL = SRayConfig(feature_dim=16, heads=2, encoder_width=8, encoder_blocks=(1, 1))
+SMALL_ENCODER = EncoderConfig(channels=(8, 16), blocks=(1, 1), depth=True)
+SMALL_MODEL = SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER)
 
 
 def tiny_field(label_set: LabelSet = ROOMS, seed: int = 0) -> SRay:

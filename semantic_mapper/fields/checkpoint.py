@@ -31,7 +31,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
 FORMAT = "semantic-mapper-weights"
-VERSION = 1
+VERSION = 2
 NEW_ROW_SPREAD = 0.2
 DEFAULT_WIDTH = 320  # of weights whose recipe does not say
 DEPTH_UNITS_PER_M = 4000.0  # anchors' depth as uint16: a quarter of a millimetre, up to 16 m
@@ -78,7 +78,11 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -
     Raises:
         WeightsError: it cannot be written there.
     """
-    tensors = {f"model.{name}": _stored(t, half) for name, t in checkpoint.model.state_dict().items()}
+    # Running variances span more powers of ten than float16 has.
+    tensors = {
+        f"model.{name}": _stored(t, half and "running_" not in name)
+        for name, t in checkpoint.model.state_dict().items()
+    }
     metadata = {
         "format": FORMAT,
         "version": str(VERSION),

@@ -12,6 +12,7 @@ from torch import nn
 
 from semantic_mapper.config import Config, SamplingConfig
 from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.sampling import merge_samples, sample_from_weights, sample_guided, sample_inverse_depth
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
@@ -43,6 +44,11 @@ class LearnedField(nn.Module, ABC):
     def label_set(self) -> LabelSet:
         """Classes of the rendered logits, in channel order."""
         return self._label_set
+
+    @property
+    def image_encoder(self) -> ImageEncoder | None:
+        """The encoder that all kinds with images share; None for kinds without one."""
+        return next((module for module in self.modules() if isinstance(module, ImageEncoder)), None)
 
     @abstractmethod
     def encode(self, views: SourceViews) -> EncodedViews:

@@ -35,7 +35,7 @@ from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.nerf_math import density_from, encode_frequencies, encoded_size, relu_layers
 from semantic_mapper.fields.projection import Reprojection, gather, reproject
 from semantic_mapper.fields.ray_render import composite_render
-from semantic_mapper.fields.source_maps import check_encoder, check_views, encoded_views
+from semantic_mapper.fields.source_maps import check_views, encoded_views
 from semantic_mapper.fields.volume import composite, compositing_weights, interval_lengths
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
@@ -72,7 +72,7 @@ class MVSNeRF(LearnedField):
         self.config: MVSNeRFConfig = config
         width, colours = config.width, COLOUR_CHANNELS * config.views
         self.sweep = Sweep(config.planes, config.plane_near_m, config.plane_far_m)
-        self.encoder = ImageEncoder(config.encoder_width, config.encoder_blocks, config.feature_dim)
+        self.encoder = ImageEncoder(config.encoder, config.feature_dim)
         self.volume_net = EncodingVolumeNet(config.feature_dim + colours, config.volume_channels)
         c_in = encoded_size(3, config.position_frequencies) + config.volume_channels + colours
         self.trunk = relu_layers(c_in, width, config.depth)
@@ -89,7 +89,7 @@ class MVSNeRF(LearnedField):
             ShapeError: tensors that do not fit together.
         """
         check_views(views)
-        return encoded_views(views, self.encoder(views.rgb))
+        return encoded_views(views, self.encoder(views))
 
     def encoding_volume(self, sources: EncodedViews, views: tuple[int, ...]) -> torch.Tensor:
         """S (1, volume_channels, planes, h, w) over the reference ``views[0]``, from the source views ``views``.
@@ -150,7 +150,6 @@ class MVSNeRF(LearnedField):
 
 
 def _check(config: MVSNeRFConfig) -> None:
-    check_encoder(config.encoder_width, config.encoder_blocks, config.feature_dim)
     if not 1 <= config.views <= MAX_SOURCE_VIEWS:
         raise ConfigError(f"views must lie in 1 .. {MAX_SOURCE_VIEWS}, got {config.views}")
     if not 0 < config.plane_near_m < config.plane_far_m or config.planes < 2:

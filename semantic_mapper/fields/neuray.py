@@ -24,7 +24,7 @@ from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.geometry_net import DensityNet, GeometryInit
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.ray_render import composite_render, weighted_moments
-from semantic_mapper.fields.source_maps import check_encoder, check_views, depth_at, encoded_views
+from semantic_mapper.fields.source_maps import check_views, depth_at, encoded_views
 from semantic_mapper.fields.sray import CUES
 from semantic_mapper.fields.view_weights import softmax_weights
 from semantic_mapper.fields.volume import composite, compositing_weights
@@ -46,10 +46,9 @@ class NeuRay(LearnedField):
 
     def __init__(self, config: NeuRayConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
         super().__init__(config, label_set, sampling)
-        check_encoder(config.encoder_width, config.encoder_blocks, config.feature_dim)
         self.config: NeuRayConfig = config
         dim, hidden = config.feature_dim, 2 * config.feature_dim
-        self.encoder = ImageEncoder(config.encoder_width, config.encoder_blocks, dim)
+        self.encoder = ImageEncoder(config.encoder, dim)
         self.geometry_init = GeometryInit(dim)
         self.density = DensityNet(dim)
         # Both together are one layer on (f_j, cues_j, mean, variance); the second part is the same for all views.
@@ -68,7 +67,7 @@ class NeuRay(LearnedField):
             ShapeError: tensors that do not fit together.
         """
         check_views(views)
-        feature = self.encoder(views.rgb)
+        feature = self.encoder(views)
         geometry = self.geometry_init(feature, depth_at(views, *feature.shape[-2:]))
         return encoded_views(views, feature, geometry)
 

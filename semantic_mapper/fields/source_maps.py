@@ -5,9 +5,7 @@ from __future__ import annotations
 import torch
 from torch.nn import functional
 
-from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.fields.encoder import GROUPS
 from semantic_mapper.fields.geometry_net import GEOMETRY_CHANNELS
 from semantic_mapper.geometry import expect_shape, invert_pose_torch
 from semantic_mapper.types import SourceViews
@@ -26,18 +24,6 @@ def check_views(views: SourceViews) -> None:
     expect_shape(views.T_world_camera, f"{count} 4 4", "source T_world_camera")
     if views.channel is not None:
         expect_shape(views.channel, f"{count} {height} {width}", "source channel")
-
-
-def check_encoder(width: int, blocks: tuple[int, ...], feature_dim: int) -> None:
-    """Refuse an encoder that cannot be built.
-
-    Raises:
-        ConfigError: naming the value that is off.
-    """
-    if width <= 0 or width % GROUPS or not blocks:
-        raise ConfigError(f"encoder_width must be a multiple of {GROUPS} and encoder_blocks not empty, got {width}")
-    if feature_dim <= 0:
-        raise ConfigError(f"feature_dim must be positive, got {feature_dim}")
 
 
 def scaled_camera(K: torch.Tensor, scale_x: float, scale_y: float) -> torch.Tensor:

@@ -24,7 +24,7 @@ from semantic_mapper.fields.attention import (
 )
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.contextual import CUES, ContextualSpace, contextual_space
-from semantic_mapper.fields.encoder import GROUPS, ImageEncoder
+from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.geometry_net import DensityNet, GeometryInit
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.source_maps import check_views, depth_at, encoded_views
@@ -55,7 +55,7 @@ class SRay(LearnedField):
         dim = config.feature_dim
         published = config.parity == "published"
         self.config: SRayConfig = config
-        self.encoder = ImageEncoder(config.encoder_width, config.encoder_blocks, dim)
+        self.encoder = ImageEncoder(config.encoder, dim)
         self.geometry_init = GeometryInit(dim)
         self.density = DensityNet(dim)
         self.cue_token = nn.Linear(CUES, dim)
@@ -73,7 +73,7 @@ class SRay(LearnedField):
             ShapeError: tensors that do not fit together.
         """
         check_views(views)
-        feature = self.encoder(views.rgb)
+        feature = self.encoder(views)
         geometry = self.geometry_init(feature, depth_at(views, feature.shape[-2], feature.shape[-1]))
         encoded = encoded_views(views, feature, geometry)
         if views.channel is None or not self.config.source_labels:
@@ -155,7 +155,5 @@ def _check(config: SRayConfig) -> None:
         raise ConfigError(
             f"feature_dim must be a multiple of 4 and of heads ({config.heads}), got {config.feature_dim}"
         )
-    if config.encoder_width <= 0 or config.encoder_width % GROUPS or not config.encoder_blocks:
-        raise ConfigError(f"encoder_width must be a multiple of {GROUPS}, got {config.encoder_width}")
     if not 0 < config.tau < 1:
         raise ConfigError(f"tau must lie between 0 and 1 (Eq. 12), got {config.tau}")

@@ -21,7 +21,7 @@ from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.projection import gather, reproject
 from semantic_mapper.fields.ray_render import field_render
-from semantic_mapper.fields.source_maps import check_encoder, check_views, encoded_views
+from semantic_mapper.fields.source_maps import check_views, encoded_views
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
@@ -43,9 +43,8 @@ class UNetField(LearnedField):
 
     def __init__(self, config: UNetFieldConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
         super().__init__(config, label_set, sampling)
-        check_encoder(config.encoder_width, config.encoder_blocks, config.feature_dim)
         self.config: UNetFieldConfig = config
-        self.encoder = ImageEncoder(config.encoder_width, config.encoder_blocks, config.feature_dim)
+        self.encoder = ImageEncoder(config.encoder, config.feature_dim)
         self.classifier = nn.Conv2d(config.feature_dim, len(label_set), 1)
 
     def encode(self, views: SourceViews) -> EncodedViews:
@@ -55,15 +54,16 @@ class UNetField(LearnedField):
             ShapeError: tensors that do not fit together.
         """
         check_views(views)
-        return encoded_views(views, self._logits(views.rgb))
+        return encoded_views(views, self._logits(views))
 
     def source_logits(self, sources: EncodedViews) -> torch.Tensor:
         """Logits (m, L, h, w) of the source images: what ``encode`` made of them."""
         return sources.feature
 
-    def predict_image(self, rgb: torch.Tensor) -> torch.Tensor:
-        """Logits (m, L, H, W) of images (m, 3, H, W) in [0, 1]; what rays through their own pixels render to."""
-        return functional.interpolate(self._logits(rgb), size=rgb.shape[-2:], mode="bilinear", align_corners=False)
+    def predict_image(self, views: SourceViews) -> torch.Tensor:
+        """Logits (m, L, H, W) of m images; what rays through their own pixels render to."""
+        size = views.rgb.shape[-2:]
+        return functional.interpolate(self._logits(views), size=size, mode="bilinear", align_corners=False)
 
     def render_samples(
         self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews
@@ -84,8 +84,8 @@ class UNetField(LearnedField):
         )
         return render, torch.zeros_like(z)
 
-    def _logits(self, rgb: torch.Tensor) -> torch.Tensor:
-        return self.classifier(functional.relu(self.encoder(rgb)))
+    def _logits(self, views: SourceViews) -> torch.Tensor:
+        return self.classifier(functional.relu(self.encoder(views)))
 
 
 def own_view(rays: RayBatch, sources: EncodedViews) -> tuple[torch.Tensor, torch.Tensor]:

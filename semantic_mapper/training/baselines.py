@@ -8,17 +8,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
 from torch.nn import functional
 
-from semantic_mapper.config import Config, SRayConfig
+from semantic_mapper.config import Config, UNetFieldConfig
 from semantic_mapper.errors import FrameError
-from semantic_mapper.fields.encoder import ImageEncoder
+from semantic_mapper.fields.unet_field import UNetField
 from semantic_mapper.geometry import invert_pose, transform, unproject
 from semantic_mapper.imaging import fill_holes, resize_depth
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.losses import IGNORE
-from semantic_mapper.training.views import jitter_colours, stack_sources, view_from_frame
+from semantic_mapper.training.views import jitter_colours, mirrored_view, stack_sources, view_from_frame
 from semantic_mapper.types import PosedFrame, UInt8
 
 WARP_TOLERANCE = 0.04  # share of z by which a keyframe's depth may disagree and still show the same surface
@@ -41,14 +40,9 @@ class UNetBaseline:
 
     def __init__(self, label_set: LabelSet, config: UNetConfig) -> None:
         torch.manual_seed(config.seed)
-        shape = SRayConfig()
         self.label_set = label_set
         self.config = config
-        self.net = nn.Sequential(
-            ImageEncoder(shape.encoder_width, shape.encoder_blocks, shape.feature_dim),
-            nn.ReLU(),
-            nn.Conv2d(shape.feature_dim, len(label_set), 1),
-        )
+        self.net = UNetField(UNetFieldConfig(), label_set)
 
     def fit(self, frames: Sequence[PosedFrame], on_progress: Callable[[float], None] | None = None) -> int:
         """Train on labelled frames for the budget, with colour jitter and mirrored images; returns the steps done."""
@@ -64,11 +58,13 @@ class UNetBaseline:
                 group["lr"] = self.config.final_learning_rate + span * 0.5 * (1 + float(np.cos(np.pi * fraction)))
             order = torch.randperm(len(views), generator=generator).tolist()[: self.config.batch]
             batch = [views[i] for i in order]
-            rgb = jitter_colours(stack_sources(batch), self.config.colour_jitter, generator).rgb
-            channel = torch.stack([v.channel for v in batch])
             if float(torch.rand(1, generator=generator)) < 0.5:
-                rgb, channel = rgb.flip(-1), channel.flip(-1)
-            loss = functional.cross_entropy(self._logits(rgb, channel.shape[-2:]), channel, ignore_index=IGNORE)
+                batch = [mirrored_view(v) for v in batch]
+            sources = jitter_colours(stack_sources(batch), self.config.colour_jitter, generator)
+            channel = torch.stack([v.channel for v in batch])
+            with self.net.encoder.batch_statistics():
+                logits = self.net.predict_image(sources)
+            loss = functional.cross_entropy(logits, channel, ignore_index=IGNORE)
             optimiser.zero_grad()
             loss.backward()  # pyright: ignore[reportUnknownMemberType]
             optimiser.step()
@@ -95,11 +91,10 @@ class UNetBaseline:
             self.config.width,
         )
         with torch.inference_mode():
-            channel = self._logits(view.rgb[None], frame.rgb.shape[:2])[0].argmax(0)
+            logits = self.net.predict_image(stack_sources([view]))
+            full = functional.interpolate(logits, size=frame.rgb.shape[:2], mode="bilinear", align_corners=False)
+            channel = full[0].argmax(0)
         return self.label_set.to_ids(channel.numpy())
-
-    def _logits(self, rgb: torch.Tensor, size: Sequence[int]) -> torch.Tensor:
-        return functional.interpolate(self.net(rgb), size=tuple(size), mode="bilinear", align_corners=False)
 
 
 class WarpBaseline:

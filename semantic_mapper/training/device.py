@@ -31,6 +31,11 @@ def choose_device(name: DeviceName, local_rank: int) -> torch.device:
     return torch.device("cuda", local_rank)
 
 
+def bfloat16_is_fast(device: torch.device) -> bool:
+    """GPUs, and CPUs with matrix units (AMX); elsewhere float32 is faster."""
+    return device.type != "cpu" or bool(torch.cpu.get_capabilities().get("amx_bf16", False))
+
+
 def compute_in_bfloat16(model: nn.Module, names: Sequence[str], device_type: str) -> None:
     """Let the named parts of ``model`` compute in bfloat16 under autocast and hand back float32.
 

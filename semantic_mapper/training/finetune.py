@@ -19,6 +19,7 @@ import torch
 from semantic_mapper.config import Config, SRayConfig, to_plain
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, anchor_from_frame
+from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
@@ -130,6 +131,9 @@ def _run(
     stopped: Callable[[], object],
 ) -> tuple[_Best, int]:
     optimiser = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
+    encoder = model.image_encoder
+    if encoder is not None and encoder.uncalibrated:
+        calibrate(encoder, stack_sources(train))
     best = _Best(*_evaluate(model, train, held_out, config), 0, copy.deepcopy(model.state_dict()))
     latest = (best.loss, best.accuracy)
     if not math.isfinite(best.loss):

@@ -13,6 +13,7 @@ from semantic_mapper.training.views import RayTargets
 from semantic_mapper.types import FieldRender
 
 IGNORE = -1
+RAREST = 1e-3  # share of the pixels below which a class is not weighted up further
 
 
 class LossConfig(Config, frozen=True):
@@ -22,6 +23,7 @@ class LossConfig(Config, frozen=True):
     colour: float = 0.75
     depth: float = 0.1
     source: float = 0.25  # per-pixel class loss on labelled source views: teaches the shared encoder densely
+    balance: float = 0.0  # of that loss, see ``image_loss``
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +40,26 @@ def semantic_loss(logits: torch.Tensor, channel: torch.Tensor) -> torch.Tensor:
     """Cross-entropy over the rays (S-Ray Eq. 14), ignored rays masked; 0 where all are ignored."""
     counted = (channel != IGNORE).sum().clamp_min(1)
     return functional.cross_entropy(logits, channel, ignore_index=IGNORE, reduction="sum") / counted
+
+
+def image_loss(logits: torch.Tensor, channel: torch.Tensor, balance: float) -> torch.Tensor:
+    """Cross-entropy over labelled pixels, 0 where there is none.
+
+    Args:
+        logits: (m, L, h, w).
+        channel: (m, H, W) int64, -1 = ignore; the nearest pixel counts where sizes differ.
+        balance: A class counts by its share of the pixels to the power of minus this: 0 as it comes, 1 all alike.
+    """
+    size = logits.shape[-2:]
+    small = functional.interpolate(channel[:, None].float(), size=size, mode="nearest-exact")[:, 0].long()
+    labelled = small != IGNORE
+    if balance <= 0:
+        total = functional.cross_entropy(logits, small, ignore_index=IGNORE, reduction="sum")
+        return total / labelled.sum().clamp_min(1)
+    share = torch.bincount(small[labelled], minlength=logits.shape[1]) / labelled.sum().clamp_min(1)
+    weight = (share.to(logits.dtype) + RAREST) ** -balance
+    total = functional.cross_entropy(logits, small, weight, ignore_index=IGNORE, reduction="sum")
+    return total / (weight * share).sum().clamp_min(1e-6) / labelled.sum().clamp_min(1)
 
 
 def ray_loss(render: FieldRender, targets: RayTargets, config: LossConfig) -> Loss:

@@ -9,19 +9,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from torch.nn import functional
 
 from semantic_mapper.config import Config, SamplingConfig
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided, sample_inverse_depth
-from semantic_mapper.training.losses import IGNORE, Loss, LossConfig, mean_loss, ray_loss
+from semantic_mapper.training.losses import IGNORE, Loss, LossConfig, image_loss, mean_loss, ray_loss
 from semantic_mapper.training.views import (
     LabelledView,
     RayTargets,
     draw_pixels,
     jitter_colours,
     join_sources,
+    mirrored_view,
     query_rays,
     select_sources,
     stack_sources,
@@ -48,6 +48,7 @@ class StepConfig(Config, frozen=True):
     blind_samples: int = 32  # samples a ray in steps without a depth prior
     blind_thinning: int = 1  # in steps without a depth prior, where a ray costs more, one ray in so many is rendered
     colour_jitter: float = 0.2
+    mirrored: float = 0.0  # share of steps in which the world is its mirror image
     loss: LossConfig = LossConfig()
     sampling: SamplingConfig = SamplingConfig()
 
@@ -137,6 +138,9 @@ def draw_batch(
         device: Of training.
         resident: The same views on ``device`` already; without them the sources are copied there.
     """
+    if config.mirrored > 0 and float(torch.rand(1, generator=generator)) < config.mirrored:
+        views = _mirrored(views, query, sources)
+        resident = None if resident is None else _mirrored(resident, query, sources)
     target = views[query]
     flat = draw_pixels(target.channel, config.rays, config.balanced_share, generator, classes)
     if len(flat) == 0:
@@ -164,7 +168,10 @@ def batch_loss(
         render, _ = model.render_samples(batch.rays, batch.z, encoded)
         loss = ray_loss(render, batch.targets, config)
         if config.source > 0:
-            loss = replace(loss, total=loss.total + config.source * _source_loss(model, encoded, batch.channel))
+            logits = model.source_logits(encoded)
+            if logits is not None:
+                dense = image_loss(logits, batch.channel, config.balance)
+                loss = replace(loss, total=loss.total + config.source * dense)
         losses.append(loss)
     return mean_loss(losses)
 
@@ -191,6 +198,12 @@ def _encode(model: LearnedField, batches: Sequence[StepBatch], together: bool) -
     return [encoded.select(part) for part in index.split([len(batch.sources.rgb) for batch in batches])]
 
 
+def _mirrored(views: Sequence[LabelledView], query: int, sources: Sequence[int]) -> Sequence[LabelledView]:
+    """The views of a step as their mirror images; the others are left as they are, for nobody looks at them."""
+    wanted = {query, *sources}
+    return [mirrored_view(view) if i in wanted else view for i, view in enumerate(views)]
+
+
 def _sources(
     views: Sequence[LabelledView], query: int, sources: Sequence[int], config: StepConfig, generator: torch.Generator
 ) -> SourceViews:
@@ -215,14 +228,3 @@ def _draw_samples(
     prior = target.depth_m.flatten()[flat] * noise
     rays, targets = query_rays(target, flat, near_m=near_m, far_m=far_m, prior=prior)
     return rays, targets, sample_guided(rays, config.sampling)
-
-
-def _source_loss(model: LearnedField, encoded: EncodedViews, channel: torch.Tensor) -> torch.Tensor:
-    """Class loss of the image features by themselves; channel (m, H, W)."""
-    logits = model.source_logits(encoded)
-    if logits is None:
-        return encoded.feature.new_zeros(())
-    size = logits.shape[-2:]
-    small = functional.interpolate(channel[:, None].float(), size=size, mode="nearest-exact")[:, 0].long()
-    counted = (small != IGNORE).sum().clamp_min(1)
-    return functional.cross_entropy(logits, small, ignore_index=IGNORE, reduction="sum") / counted

@@ -20,17 +20,21 @@ from torch.nn.parallel import DistributedDataParallel
 
 from semantic_mapper.config import Config, to_plain
 from semantic_mapper.errors import ConfigError, WeightsError
-from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
+from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes import SUITE_VERSION, TRAIN_SEEDS
-from semantic_mapper.training.device import DeviceName, choose_device, compute_in_bfloat16
+from semantic_mapper.training.device import DeviceName, bfloat16_is_fast, choose_device, compute_in_bfloat16
+from semantic_mapper.training.images import ImageBatch, ImageStepConfig, draw_images, images_loss
 from semantic_mapper.training.losses import LossConfig
+from semantic_mapper.training.optimiser import make_optimiser, set_rates
 from semantic_mapper.training.ranks import Ranks, joined, ranks_from_environment
 from semantic_mapper.training.recipe import provenance
 from semantic_mapper.training.rooms import RoomPool, RoomPoolConfig, RoomViews
 from semantic_mapper.training.schedule import budget_fraction, cosine_rate
+from semantic_mapper.training.start import take_over, take_over_encoder
 from semantic_mapper.training.step import (
     StepBatch,
     StepConfig,
@@ -46,6 +50,7 @@ from semantic_mapper.training.views import stack_sources
 
 STATE_FILE = "state.safetensors"
 WEIGHTS_FILE = "weights.safetensors"
+IMAGES_FILE = "after-images.safetensors"  # what steps on images alone have come to
 ROOMS_A_SEED = 10_000  # places between the first rooms of two training seeds
 WARM_UP = 0.01  # share of the budget
 _FREE = ("seconds", "steps", "device", "workers", "save_every_s")  # may differ when a run goes on
@@ -60,6 +65,8 @@ class TrainStepConfig(StepConfig, frozen=True):
     known_labels: bool = False
     blind: float = 0.25
     blind_thinning: int = 4  # 32 samples a ray instead of 8
+    mirrored: float = 0.5
+    loss: LossConfig = LossConfig(balance=0.25)
 
 
 class TrainConfig(Config, frozen=True):
@@ -70,14 +77,16 @@ class TrainConfig(Config, frozen=True):
         default_factory=dict
     )  # settings of that kind; what is left out keeps its default
     start: str = ""  # weights file to start from, of this very shape; empty = random weights
+    encoder_from: str = ""  # weights file of any kind whose image encoder is taken over; empty = random weights
     seconds: float = 1500.0  # wall-clock budget; 0 = only steps count (then a run repeats bit for bit on a CPU)
     steps: int = 0  # step budget; 0 = only seconds count
     rooms_per_step: int = 1  # a rank
     encode_together: bool = False  # one call of the encoder a step; for kinds that encode each view by itself
-    bfloat16: tuple[str, ...] = ()  # parts of the field that compute in bfloat16 on a GPU ("encoder", ...)
-    learning_rate: float = 1e-3
+    bfloat16: tuple[str, ...] = ()  # parts of the field ("encoder", ...) that compute in it where it is fast
+    learning_rate: float = 1e-3  # of steps on rays; ``images`` has its own
+    encoder_rate: float = 0.3  # of the image encoder, as a share of it
     final_learning_rate: float = 5e-5
-    weight_decay: float = 1e-4
+    weight_decay: float = 0.02
     gradient_clip: float = 10.0
     seed: int = 0
     device: DeviceName = "auto"
@@ -85,6 +94,7 @@ class TrainConfig(Config, frozen=True):
     save_every_s: float = 120.0
     log_steps: int = 20  # steps a line of the history
     pool: RoomPoolConfig = RoomPoolConfig()
+    images: ImageStepConfig = ImageStepConfig()
     step: TrainStepConfig = TrainStepConfig()
     validation: ValidationConfig = ValidationConfig()
 
@@ -125,15 +135,19 @@ def train(
         run = _Run(config, folder, ranks, device)
         if resume:
             run.restore()
-        elif config.start:
-            run.take_over(Path(config.start))
+        else:
+            run.begin()
         return run.loop(on_progress, stopped)
 
 
 def learning_rate(fraction: float, config: TrainConfig) -> float:
-    """Cosine from the first to the final learning rate, after a short linear warm-up."""
-    cosine = cosine_rate(fraction, config.learning_rate, config.final_learning_rate)
-    return cosine * min(1.0, fraction / WARM_UP + 0.1)
+    """For steps on images, then for steps on rays: half a cosine each, after a short linear warm-up."""
+    share = config.images.share
+    if fraction < share:
+        fraction, first = fraction / share, config.images.learning_rate
+    else:
+        fraction, first = (fraction - share) / max(1 - share, 1e-9), config.learning_rate
+    return cosine_rate(fraction, first, config.final_learning_rate) * min(1.0, fraction / WARM_UP + 0.1)
 
 
 def step_seed(seed: int, rank: int, step: int) -> int:
@@ -144,15 +158,18 @@ def step_seed(seed: int, rank: int, step: int) -> int:
 class _StepLoss(nn.Module):
     """The loss of a step as a module, which is what gradients are shared through."""
 
-    def __init__(self, field: LearnedField, config: LossConfig, *, encode_together: bool) -> None:
+    def __init__(self, field: LearnedField, config: TrainConfig) -> None:
         super().__init__()
         self.field = field
         self._config = config
-        self._together = encode_together
 
-    def forward(self, batches: Sequence[StepBatch]) -> torch.Tensor:
+    def forward(self, batch: ImageBatch | Sequence[StepBatch]) -> torch.Tensor:
         """(4,) the ``LOSS_PARTS``."""
-        loss = batch_loss(self.field, batches, self._config, encode_together=self._together)
+        if isinstance(batch, ImageBatch):
+            loss = images_loss(self.field, batch, self._config.images)
+        else:
+            together = self._config.encode_together
+            loss = batch_loss(self.field, batch, self._config.step.loss, encode_together=together)
         return torch.stack([getattr(loss, part) for part in LOSS_PARTS])
 
 
@@ -163,29 +180,25 @@ class _Run:
         torch.manual_seed(config.seed)
         self.config, self.folder, self.ranks, self.device = config, folder, ranks, device
         self.field = build_field(config.kind, config.field, ROOMS).to(device)
-        self.loss: nn.Module = _StepLoss(self.field, config.step.loss, encode_together=config.encode_together)
+        self.loss: nn.Module = _StepLoss(self.field, config)
         if ranks.world > 1:  # parts that a config switches off (an attention, say) get no gradient
             self.loss = DistributedDataParallel(self.loss, find_unused_parameters=True)
-        self.optimiser = torch.optim.AdamW(
-            self.field.parameters(), config.learning_rate, weight_decay=config.weight_decay
-        )
+        self.optimiser = make_optimiser(self.field, config.learning_rate, config.weight_decay)
         self.progress = Progress(torch.zeros(len(LOSS_PARTS), dtype=torch.float64, device=device))
         self.scores: Scores | None = None
         self.last_loss: float | None = None
 
-    def take_over(self, path: Path) -> None:
-        """Start from weights instead of random numbers.
+    def begin(self) -> None:
+        """Weights to start from, where the config names some.
 
         Raises:
             WeightsError: they cannot be read.
             ConfigError: they are of another kind, shape or label set.
         """
-        start = load_checkpoint(path).model
-        own = (self.field.kind, to_plain(self.field.config), self.field.label_set)
-        if (start.kind, to_plain(start.config), start.label_set) != own:
-            raise ConfigError(f"{path}: weights of another field than the config names, or of other classes")
-        self.field.load_state_dict(start.state_dict())
-        _log.info("training_starts_from", weights=path.name)
+        if self.config.start:
+            take_over(self.field, Path(self.config.start))
+        if self.config.encoder_from:
+            take_over_encoder(self.field, Path(self.config.encoder_from))
 
     def restore(self) -> None:
         assert self.folder is not None
@@ -200,11 +213,14 @@ class _Run:
         rooms = validation_rooms(config.validation, config.pool, self.ranks, self.device)
         self._check_encoding(rooms)
         self._choose_precision()  # after that check, which rounding would disturb
+        encoder = self.field.image_encoder
+        if encoder is not None and encoder.uncalibrated and config.images.share == 0 and rooms:
+            calibrate(encoder, stack_sources(rooms[0].resident))
         pool = RoomPool(
             config.pool,
             config.seed * ROOMS_A_SEED + self.ranks.rank,
             stride=self.ranks.world,
-            draws=progress.step * config.rooms_per_step,
+            draws=progress.draws,
             workers=config.workers,
             device=self.device,
         )
@@ -222,6 +238,8 @@ class _Run:
                     self._validate(rooms, pool, log, due)
                     self._save()
                     saved = time.monotonic()
+                if not progress.past_images and fraction >= config.images.share > 0:
+                    self._keep_after_images(pool)
                 progress.finished = fraction >= 1
                 if progress.finished or stop:
                     break
@@ -239,11 +257,10 @@ class _Run:
         seed = step_seed(config.seed, self.ranks.rank, progress.step)
         torch.manual_seed(seed)  # for kinds of fields that draw from it
         generator = torch.Generator().manual_seed(seed)
-        batches = [self._draw(pool, generator) for _ in range(config.rooms_per_step)]
+        batch = self._draw_images(pool, generator) if fraction < config.images.share else self._draw(pool, generator)
         rate = learning_rate(fraction, config)
-        for group in self.optimiser.param_groups:
-            group["lr"] = rate
-        parts: torch.Tensor = self.loss(batches)
+        set_rates(self.optimiser, rate, 1.0 if isinstance(batch, ImageBatch) else config.encoder_rate)
+        parts: torch.Tensor = self.loss(batch)
         self.optimiser.zero_grad()
         parts[0].backward()
         nn.utils.clip_grad_norm_(self.field.parameters(), config.gradient_clip)
@@ -253,8 +270,17 @@ class _Run:
         if progress.step % config.log_steps == 0:  # only then, because reading a loss waits for the GPU
             self._log_losses(pool, log, rate)
 
-    def _draw(self, pool: RoomPool, generator: torch.Generator) -> StepBatch:
-        room = pool.draw(generator)
+    def _draw_images(self, pool: RoomPool, generator: torch.Generator) -> ImageBatch:
+        rooms = [pool.draw(generator) for _ in range(self.config.images.rooms)]
+        self.progress.draws += len(rooms)
+        return draw_images(rooms, self.config.images, generator, self.device)
+
+    def _draw(self, pool: RoomPool, generator: torch.Generator) -> list[StepBatch]:
+        rooms = [pool.draw(generator) for _ in range(self.config.rooms_per_step)]
+        self.progress.draws += len(rooms)
+        return [self._draw_rays(room, generator) for room in rooms]
+
+    def _draw_rays(self, room: RoomViews, generator: torch.Generator) -> StepBatch:
         step = self.config.step
         query, sources = pick_views_on_path(room.labelled, len(room.views), step, generator)
         classes = len(self.field.label_set)
@@ -296,17 +322,25 @@ class _Run:
         if self.folder is not None and self.ranks.first:
             save_state(self.folder / STATE_FILE, self.progress, self.field, self.optimiser, self._identity())
 
-    def _checkpoint(self, pool: RoomPool) -> Checkpoint:
-        """The best weights so far, or the latest where nothing was validated yet."""
+    def _keep_after_images(self, pool: RoomPool) -> None:
+        """The weights as they are before the first ray: other kinds of fields may take over the encoder."""
+        self.progress.past_images = True
+        if self.folder is not None and self.ranks.first:
+            save_checkpoint(self._checkpoint(pool, self.field.state_dict()), self.folder / IMAGES_FILE)
+
+    def _checkpoint(self, pool: RoomPool, weights: dict[str, torch.Tensor] | None = None) -> Checkpoint:
+        """These weights; else the best so far, or the latest where nothing was validated yet."""
         config, progress = self.config, self.progress
         field = build_field(config.kind, config.field, ROOMS)
-        field.load_state_dict(progress.best or self.field.state_dict())
+        field.load_state_dict(weights or progress.best or self.field.state_dict())
         validations = [line for line in progress.history if "miou" in line]
         best = next((line for line in validations if line["step"] == progress.best_step), {})
         recipe: dict[str, Any] = {
             "kind": "train",
             "width": config.pool.width,
-            "config": to_plain(config) | {"start": Path(config.start).name},  # where it lay is nobody's business
+            # Where weights to start from lay is nobody's business.
+            "config": to_plain(config)
+            | {"start": Path(config.start).name, "encoder_from": Path(config.encoder_from).name},
             "suite": f"rooms v{SUITE_VERSION}",
             "seed": config.seed,
             "steps": progress.step,
@@ -345,10 +379,10 @@ class _Run:
             )
 
     def _choose_precision(self) -> None:
-        if self.device.type == "cuda":
+        if bfloat16_is_fast(self.device):
             compute_in_bfloat16(self.field, self.config.bfloat16, self.device.type)
         elif self.config.bfloat16 and self.ranks.first:
-            _log.info("float32_everywhere", reason="bfloat16 is slower than float32 on CPUs")
+            _log.info("float32_everywhere", reason="this processor has no matrix units for bfloat16 (AMX)")
 
     def _announce(self) -> None:
         if self.ranks.first:

@@ -22,7 +22,7 @@ from torch import nn
 from semantic_mapper.errors import ConfigError, WeightsError
 
 FORMAT = "semantic-mapper-training"
-VERSION = 1
+VERSION = 2
 LOSS_PARTS = ("total", "semantic", "colour", "depth")
 
 
@@ -32,23 +32,27 @@ class Progress:
 
     Args:
         step: Steps done.
+        draws: Rooms drawn from the pool.
         elapsed_s: Time spent in the loop, over all sittings.
         validated: How many of the validations that the budget holds are done.
         losses: (4,) float64 on the training device: sums of ``LOSS_PARTS`` since the last such line of the history.
         history: Lines of plain data; see ``train_log``.
         best: Weights that scored best in validation; None before the first.
         best_step, best_score: Of ``best``; the score is what validation ranks by.
+        past_images: Steps on images alone are over.
         finished: The budget is used up.
     """
 
     losses: torch.Tensor
     step: int = 0
+    draws: int = 0
     elapsed_s: float = 0.0
     validated: int = 0
     history: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     best: dict[str, torch.Tensor] | None = None
     best_step: int = 0
     best_score: float = -1.0
+    past_images: bool = False
     finished: bool = False
 
 
@@ -70,10 +74,12 @@ def save_state(
         "version": str(VERSION),
         "config": json.dumps(config),
         "step": str(progress.step),
+        "draws": str(progress.draws),
         "elapsed_s": repr(progress.elapsed_s),
         "validated": str(progress.validated),
         "best_step": str(progress.best_step),
         "best_score": repr(progress.best_score),
+        "past_images": str(progress.past_images),
         "finished": str(progress.finished),
         "history": json.dumps(progress.history),
     }
@@ -111,12 +117,14 @@ def load_state(path: Path, model: nn.Module, optimiser: torch.optim.Optimizer, c
         return Progress(
             losses=tensors["losses"].to(next(model.parameters()).device),
             step=int(metadata["step"]),
+            draws=int(metadata["draws"]),
             elapsed_s=float(metadata["elapsed_s"]),
             validated=int(metadata["validated"]),
             history=json.loads(metadata["history"]),
             best=best or None,
             best_step=int(metadata["best_step"]),
             best_score=float(metadata["best_score"]),
+            past_images=metadata["past_images"] == "True",
         )
     except ConfigError:
         raise

@@ -101,6 +101,8 @@ def _count(
     device = next(model.parameters()).device
     near_m, far_m = step.sampling.near_m, step.sampling.far_m
     others = sorted((i for i in range(len(room.views)) if i != query), key=lambda i: abs(i - query))[: config.views]
+    if model.needs_own_view:
+        others = [*others[: config.views - 1], query]
     sources = stack_sources([room.resident[i] for i in others])
     view: LabelledView = room.views[query]
     flat = (view.channel.flatten() >= 0).nonzero()[:, 0]

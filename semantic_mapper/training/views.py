@@ -61,6 +61,19 @@ def view_from_frame(frame: PosedFrame, label_set: LabelSet, width: int) -> Label
     )
 
 
+def mirrored_view(view: LabelledView) -> LabelledView:
+    """The view in the mirror image of the world (x to -x): left and right change sides, geometry stays consistent."""
+    k = view.intrinsics
+    mirror = torch.diag(view.T_world_camera.new_tensor((-1.0, 1.0, 1.0, 1.0)))
+    return LabelledView(
+        view.rgb.flip(-1),
+        view.depth_m.flip(-1),
+        view.channel.flip(-1),
+        CameraIntrinsics(k.fx, k.fy, k.width - 1 - k.cx, k.cy, k.width, k.height),
+        mirror @ view.T_world_camera @ mirror,
+    )
+
+
 def to_device(batch: BatchT, device: torch.device) -> BatchT:
     """A copy of a dataclass of tensors (``SourceViews``, ``RayBatch``, ``RayTargets``) on another device."""
     values = {f.name: getattr(batch, f.name) for f in fields(batch)}

@@ -19,22 +19,21 @@ from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.labels import LabelSet, make_label_set
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 from tests.fields.scene import pose_at, wall_rays, wall_sources
+from tests.small import SMALL_ENCODER
 
 LABELS = make_label_set("test", ["a", "b", "c"])
 POSES = [pose_at(-0.3), pose_at(-0.1, 0.1), pose_at(0.1), pose_at(0.3, -0.15)]
 AWAY = pose_at(0.0, 3.14159)
 
 TINY: dict[str, Config] = {
-    "sray": SRayConfig(feature_dim=16, heads=2, encoder_width=8, encoder_blocks=(1, 1)),
-    "unet": UNetFieldConfig(feature_dim=16, encoder_width=8, encoder_blocks=(1, 1)),
-    "neuray": NeuRayConfig(feature_dim=16, encoder_width=8, encoder_blocks=(1, 1)),
-    "mvsnerf": MVSNeRFConfig(
-        feature_dim=8, encoder_width=8, encoder_blocks=(1, 1), planes=8, volume_channels=4, width=16
-    ),
+    "sray": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
+    "unet": UNetFieldConfig(feature_dim=16, encoder=SMALL_ENCODER),
+    "neuray": NeuRayConfig(feature_dim=16, encoder=SMALL_ENCODER),
+    "mvsnerf": MVSNeRFConfig(feature_dim=8, encoder=SMALL_ENCODER, planes=8, volume_channels=4, width=16),
     "semantic_nerf": SemanticNeRFConfig(width=16, position_frequencies=4, half_extent_m=4.0),
-    "sray-none": SRayConfig(feature_dim=16, heads=2, encoder_width=8, encoder_blocks=(1, 1)),
-    "sray-intra": SRayConfig(feature_dim=16, heads=2, encoder_width=8, encoder_blocks=(1, 1)),
-    "sray-cross": SRayConfig(feature_dim=16, heads=2, encoder_width=8, encoder_blocks=(1, 1)),
+    "sray-none": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
+    "sray-intra": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
+    "sray-cross": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
 }
 
 

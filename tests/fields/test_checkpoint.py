@@ -73,7 +73,7 @@ def test_weights_with_nan_are_refused(tmp_path):
 def test_weights_that_do_not_fit_their_config_are_refused(tmp_path):
     path = tmp_path / "w.safetensors"
     save_checkpoint(Checkpoint(tiny_field()), path)
-    path.write_bytes(path.read_bytes().replace(b'encoder_width\\": 8', b'encoder_width\\": 9'))
+    path.write_bytes(path.read_bytes().replace(b'feature_dim\\": 16', b'feature_dim\\": 12'))
     with pytest.raises(WeightsError):
         load_checkpoint(path)
 

@@ -3,7 +3,7 @@ import copy
 import pytest
 import torch
 
-from semantic_mapper.config import MVSNeRFConfig
+from semantic_mapper.config import EncoderConfig, MVSNeRFConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.cost_volume import Sweep, cost_volume, nearest_views, query_camera
 from semantic_mapper.fields.mvsnerf import MVSNeRF
@@ -138,7 +138,7 @@ def test_a_kept_volume_hinders_neither_copies_nor_saving():
         ({"plane_near_m": 9.0}, "plane_near_m"),
         ({"volume_channels": 6}, "volume_channels"),
         ({"depth": 0}, "depth"),
-        ({"encoder_width": 9}, "encoder_width"),
+        ({"encoder": EncoderConfig(channels=(8,))}, "encoder"),
     ],
 )
 def test_a_config_that_cannot_be_built_is_refused_by_name(changes, named):

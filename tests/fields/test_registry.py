@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from semantic_mapper.config import NeuRayConfig, SRayConfig
+from semantic_mapper.config import EncoderConfig, NeuRayConfig, SRayConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.registry import KINDS, PRESETS, build_field, field_config, field_names
@@ -39,8 +39,8 @@ def test_a_config_of_another_kind_is_refused():
         build_field("neuray", SRayConfig(), LABELS)
     with pytest.raises(ConfigError, match="feature_dim"):
         build_field("neuray", {"feature_dims": 3}, LABELS)
-    assert build_field("neuray", {"feature_dim": 8, "encoder_width": 8}, LABELS).config == NeuRayConfig(
-        feature_dim=8, encoder_width=8
+    assert build_field("neuray", {"feature_dim": 8, "encoder": {"channels": [8] * 4}}, LABELS).config == NeuRayConfig(
+        feature_dim=8, encoder=EncoderConfig(channels=(8, 8, 8, 8))
     )
 
 

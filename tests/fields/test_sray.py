@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from semantic_mapper.config import SamplingConfig, SRayConfig
+from semantic_mapper.config import EncoderConfig, SamplingConfig, SRayConfig
 from semantic_mapper.errors import ConfigError, ShapeError
 from semantic_mapper.fields.base import EncodedViews, stack_views
 from semantic_mapper.fields.contextual import contextual_space
@@ -16,9 +16,11 @@ from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.types import RayBatch, SourceViews
 from tests.fields.scene import WALL_M, pose_at, wall_rays, wall_sources
+from tests.small import SMALL_ENCODER
 
 LABELS = make_label_set("test", ["a", "b", "c"])
-SMALL = SRayConfig(feature_dim=16, heads=2, encoder_width=8, encoder_blocks=(1, 1))
+ONE_STAGE = EncoderConfig(channels=(8,), blocks=(1,), depth=True)
+SMALL = SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER)
 POSES = [pose_at(-0.3), pose_at(-0.1, 0.1), pose_at(0.1), pose_at(0.3, -0.15)]
 
 
@@ -191,7 +193,7 @@ def test_streaming_renderer_equals_the_reference_at_the_same_samples(changes: di
 
 def test_streaming_renderer_covers_the_narrowest_features():
     torch.manual_seed(2)
-    field = SRay(SRayConfig(feature_dim=4, heads=2, encoder_width=8, encoder_blocks=(1,)), LABELS).eval()
+    field = SRay(SRayConfig(feature_dim=4, heads=2, encoder=ONE_STAGE), LABELS).eval()
     streaming = StreamingSRay(field)
     encoded, rays = streaming.encode(wall_sources(POSES)), wall_rays(pose_at(0.1), step=5)
     with torch.inference_mode():
@@ -250,7 +252,7 @@ def test_reference_sampling_concentrates_fine_samples_on_the_wall():
 
 def test_the_whole_field_passes_gradcheck():
     torch.manual_seed(1)
-    field = SRay(SRayConfig(feature_dim=8, heads=2, encoder_width=8, encoder_blocks=(1,)), LABELS).double().eval()
+    field = SRay(SRayConfig(feature_dim=8, heads=2, encoder=ONE_STAGE), LABELS).double().eval()
     rays = wall_rays(pose_at(0.0), step=500)
     rays = RayBatch(*(t.double() for t in (rays.origin, rays.direction, rays.near_m, rays.far_m, rays.prior_depth_m)))
     z = sample_guided(rays, SamplingConfig(guided=3, free_space=0))

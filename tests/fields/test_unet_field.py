@@ -20,7 +20,7 @@ def test_rays_of_a_source_camera_render_to_what_its_image_is_classified_as():
     rays = wall_rays(POSES[1])
     with torch.no_grad():
         render = field.render(rays, field.encode(views))
-        expected = field.predict_image(views.rgb)[1].flatten(1).T
+        expected = field.predict_image(views)[1].flatten(1).T
     assert render.known.all()
     torch.testing.assert_close(render.logits, expected, atol=1e-4, rtol=1e-4)
 

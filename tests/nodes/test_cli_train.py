@@ -23,8 +23,9 @@ device = "cpu"
 [field]
 feature_dim = 16
 heads = 2
-encoder_width = 8
-encoder_blocks = [1, 1]
+[field.encoder]
+channels = [8, 16]
+blocks = [1, 1]
 [pool]
 width = 48
 views = 4

@@ -168,6 +168,6 @@ def test_a_run_may_start_from_weights_of_the_same_shape_and_from_no_others(tmp_p
     second = train(small_run(seed=5, **still))
     assert all(torch.equal(a, b) for a, b in zip(first.model.parameters(), second.model.parameters(), strict=True))
     with pytest.raises(ConfigError, match="another field"):
-        train(small_run(**{**still, "field": {"encoder_width": 8, "feature_dim": 8, "heads": 2}}))
+        train(small_run(**{**still, "field": {"feature_dim": 8, "heads": 2}}))
     with pytest.raises(WeightsError, match="no such weights file"):
         train(small_run(**{**still, "start": str(tmp_path / "none.safetensors")}))
