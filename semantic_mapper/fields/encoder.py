@@ -97,6 +97,7 @@ class ImageEncoder(nn.Module):
         self._of_batch = False
         # Channels-last convolutions take a quarter of the CPU time at these widths (forward and backward).
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+        self.train()  # which is where the norms learn that they are constants
 
     def forward(self, views: SourceViews) -> torch.Tensor:
         """Features (m, C, H / 2, W / 2) of m views; H and W need not be multiples of the deepest stride."""

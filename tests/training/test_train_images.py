@@ -1,0 +1,128 @@
+"""Steps on single images, mirrored worlds, and encoders that are taken over."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch.nn import functional
+
+from semantic_mapper.config import SRayConfig
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.registry import build_field
+from semantic_mapper.geometry import invert_pose_torch
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.training.images import ImageStepConfig, draw_images, images_loss
+from semantic_mapper.training.losses import image_loss
+from semantic_mapper.training.rooms import RoomPoolConfig, render_room
+from semantic_mapper.training.train import IMAGES_FILE, train
+from semantic_mapper.training.views import mirrored_view, query_rays
+from tests.small import SMALL_ENCODER
+from tests.training.small_run import POOL, small_run
+
+CPU = torch.device("cpu")
+ROOM = render_room(3, RoomPoolConfig(**POOL))
+
+
+def test_image_loss_is_cross_entropy_and_balance_lifts_the_rare_class():
+    torch.manual_seed(0)
+    logits = torch.randn(2, 3, 4, 4)
+    channel = torch.zeros(2, 4, 4, dtype=torch.int64)
+    channel[0, 0, 0] = 1
+    channel[1, 3, :] = -1
+    plain = functional.cross_entropy(logits, channel, ignore_index=-1)
+    torch.testing.assert_close(image_loss(logits, channel, 0.0), plain)
+    each = functional.cross_entropy(logits, channel, ignore_index=-1, reduction="none")
+    share = torch.tensor([27 / 28, 1 / 28])
+    weight = (share + 1e-3) ** -0.5
+    by_hand = (weight[0] * each[channel == 0].sum() + weight[1] * each[0, 0, 0]) / 28 / (weight * share).sum()
+    torch.testing.assert_close(image_loss(logits, channel, 0.5), by_hand)
+    assert image_loss(logits, torch.full_like(channel, -1), 0.5) == 0
+
+
+def test_a_mirrored_view_shows_the_mirror_image_of_the_same_world():
+    view = ROOM.views[0]
+    mirror = mirrored_view(view)
+    width = view.intrinsics.width
+    rays, targets = query_rays(view, torch.tensor([5, 60, 700]), near_m=0.1, far_m=9.0, prior=None)
+    flat = torch.tensor([5, 60, 700])
+    flipped = flat // width * width + (width - 1 - flat % width)
+    theirs, same = query_rays(mirror, flipped, near_m=0.1, far_m=9.0, prior=None)
+    turn = torch.tensor([-1.0, 1.0, 1.0])
+    torch.testing.assert_close(theirs.origin, rays.origin * turn)
+    torch.testing.assert_close(theirs.direction, rays.direction * turn)
+    assert torch.equal(same.channel, targets.channel) and torch.equal(same.rgb, targets.rgb)
+    assert float(torch.linalg.det(mirror.T_world_camera[:3, :3])) == pytest.approx(1, abs=1e-5)
+    identity = invert_pose_torch(mirror.T_world_camera[None])[0] @ mirror.T_world_camera
+    torch.testing.assert_close(identity, torch.eye(4), atol=1e-5, rtol=0)
+
+
+def test_image_batches_repeat_and_withhold_depth_of_whole_images():
+    config = ImageStepConfig(rooms=2, images=3, depth_withheld=0.5, mirrored=0.5)
+    a, b = (draw_images([ROOM, ROOM], config, torch.Generator().manual_seed(1), CPU) for _ in range(2))
+    assert torch.equal(a.views.rgb, b.views.rgb) and torch.equal(a.channel, b.channel)
+    assert a.views.rgb.shape[0] == 6 and a.views.channel is None
+    without = (a.views.depth_m == 0).flatten(1).all(1)
+    assert 0 < int(without.sum()) < 6
+
+
+def test_every_kind_with_a_classifier_learns_from_images_and_the_others_say_so():
+    config = ImageStepConfig(rooms=1, images=3)
+    batch = draw_images([ROOM], config, torch.Generator().manual_seed(1), CPU)
+    for kind in ("sray", "neuray", "unet"):
+        torch.manual_seed(0)
+        field = build_field(kind, {"encoder": {"channels": [8, 8], "blocks": [1, 1]}}, ROOMS).train()
+        optimiser = torch.optim.Adam(field.parameters(), 1e-2)
+        losses = []
+        for _ in range(12):
+            loss = images_loss(field, batch, config).total
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            losses.append(float(loss.detach()))
+        assert losses[-1] < 0.7 * losses[0], (kind, losses)
+    with pytest.raises(ConfigError, match="encoder_from"):
+        images_loss(build_field("mvsnerf", {}, ROOMS), batch, config)
+    with pytest.raises(ConfigError, match="no image encoder"):
+        images_loss(build_field("semantic_nerf", {}, ROOMS), batch, config)
+
+
+def test_weights_after_the_images_are_kept_and_another_kind_takes_their_encoder_over(tmp_path: Path):
+    images = {"share": 0.5, "rooms": 1}
+    train(small_run(images=images, steps=4), tmp_path / "first")
+    kept = load_checkpoint(tmp_path / "first" / IMAGES_FILE).model
+    assert kept.kind == "sray" and kept.image_encoder is not None
+    still = {
+        "images": {"share": 0.0},
+        "learning_rate": 0.0,
+        "final_learning_rate": 0.0,
+        "weight_decay": 0.0,
+        "steps": 1,
+    }
+    source = {"encoder_from": str(tmp_path / "first" / IMAGES_FILE)}
+    peer = {"kind": "mvsnerf", "field": {"feature_dim": 16, "planes": 8, "volume_channels": 4, "width": 16}}
+    shape = {"channels": [8, 16], "blocks": [1, 1], "depth": True}
+    other = train(small_run(**still, **source, **{**peer, "field": {**peer["field"], "encoder": shape}})).model
+    assert other.image_encoder is not None
+    mine, theirs = other.image_encoder.state_dict(), kept.image_encoder.state_dict()
+    assert all(torch.equal(mine[name], tensor) for name, tensor in theirs.items())
+    with pytest.raises(ConfigError, match="another shape"):
+        train(small_run(**still, **source, **peer))
+    with pytest.raises(ConfigError, match="both sides"):
+        train(small_run(**still, **source, kind="semantic_nerf", field={}))
+
+
+def test_rays_from_the_first_step_on_start_with_a_calibrated_encoder(tmp_path: Path):
+    field = train(small_run(images={"share": 0.0}, steps=1)).model
+    assert field.image_encoder is not None and not field.image_encoder.uncalibrated
+
+
+def test_half_precision_files_keep_statistics_whole(tmp_path: Path):
+    field = build_field("sray", SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER), ROOMS)
+    assert field.image_encoder is not None
+    for module in field.image_encoder.modules():
+        if isinstance(module, torch.nn.BatchNorm2d) and module.running_var is not None:
+            module.running_var.fill_(3e5)  # beyond float16
+    save_checkpoint(Checkpoint(field), tmp_path / "w.safetensors", half=True)
+    again = load_checkpoint(tmp_path / "w.safetensors").model
+    assert all(float(t.min()) == 3e5 for n, t in again.named_buffers() if n.endswith("running_var"))
