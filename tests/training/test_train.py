@@ -79,7 +79,7 @@ def test_training_lowers_the_loss_and_keeps_the_best_weights(tmp_path: Path):
 
 
 def test_the_recipe_tells_where_the_weights_come_from():
-    recipe = train(small_run(steps=2)).recipe
+    recipe = train(small_run(steps=2, images={"share": 0.0})).recipe
     assert recipe["steps"] == 2 and recipe["seed"] == 0 and recipe["rooms"] == 3 and recipe["ranks"] == 1
     assert recipe["suite"].startswith("rooms v") and recipe["torch"] == torch.__version__
     assert recipe["device"].startswith("cpu") and recipe["width"] == 48
@@ -155,16 +155,24 @@ def test_labels_of_source_views_are_not_given_unless_asked_for():
 
 
 def test_the_rate_warms_up_and_then_falls_to_its_end():
-    config = small_run()
-    assert learning_rate(0.0, config) == pytest.approx(0.1 * config.learning_rate)
-    assert learning_rate(0.01, config) > 0.99 * config.learning_rate
+    config = small_run(images={"share": 0.5})
+    assert learning_rate(0.0, config) == pytest.approx(0.1 * config.images.learning_rate)
+    assert learning_rate(0.005, config) > 0.99 * config.images.learning_rate
+    assert learning_rate(0.4999, config) == pytest.approx(config.final_learning_rate, rel=1e-2)
+    assert learning_rate(0.5, config) == pytest.approx(0.1 * config.learning_rate), (
+        "rays begin with a rate of their own"
+    )
+    assert learning_rate(0.505, config) > 0.99 * config.learning_rate
     assert math.isclose(learning_rate(1.0, config), config.final_learning_rate)
+    from_the_first = small_run(images={"share": 0.0})
+    assert learning_rate(0.01, from_the_first) > 0.99 * config.learning_rate
 
 
 def test_a_run_may_start_from_weights_of_the_same_shape_and_from_no_others(tmp_path: Path):
     first = train(small_run(steps=2))
     save_checkpoint(first, tmp_path / "first.safetensors")
-    still = {"steps": 1, "learning_rate": 0.0, "final_learning_rate": 0.0, "start": str(tmp_path / "first.safetensors")}
+    still = {"steps": 1, "learning_rate": 0.0, "final_learning_rate": 0.0, "images": {"share": 0.0}}
+    still["start"] = str(tmp_path / "first.safetensors")
     second = train(small_run(seed=5, **still))
     assert all(torch.equal(a, b) for a, b in zip(first.model.parameters(), second.model.parameters(), strict=True))
     with pytest.raises(ConfigError, match="another field"):
