@@ -38,8 +38,9 @@ def train(
     from semantic_mapper.config import convert_config, load_config, to_plain
     from semantic_mapper.fields.checkpoint import save_checkpoint
     from semantic_mapper.training.ranks import ranks_from_environment
-    from semantic_mapper.training.train import WEIGHTS_FILE, TrainConfig, TrainProgress
+    from semantic_mapper.training.train import WEIGHTS_FILE, TrainProgress
     from semantic_mapper.training.train import train as train_field
+    from semantic_mapper.training.train_config import TrainConfig
 
     plain = to_plain(load_config(config, TrainConfig) if config else TrainConfig())
     start = None if weights is None else str(weights)

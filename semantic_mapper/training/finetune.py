@@ -16,8 +16,9 @@ import numpy as np
 import structlog
 import torch
 
-from semantic_mapper.config import Config, SRayConfig, to_plain
+from semantic_mapper.config import Config, Share, SRayConfig, to_plain
 from semantic_mapper.errors import FrameError
+from semantic_mapper.fields.base import MAX_SOURCE_VIEWS
 from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, anchor_from_frame
 from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.learned import LearnedField
@@ -25,6 +26,7 @@ from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.losses import IGNORE, semantic_loss
+from semantic_mapper.training.resting import encode_once, resting_loss
 from semantic_mapper.training.schedule import budget_fraction, cosine_rate
 from semantic_mapper.training.step import StepConfig, pick_views, training_loss
 from semantic_mapper.training.views import LabelledView, draw_pixels, query_rays, stack_sources, view_from_frame
@@ -49,6 +51,7 @@ class FinetuneConfig(Config, frozen=True):
     held_out_rays: int = 512  # a keyframe
     evaluations: int = 10  # over the whole budget
     patience: int = 4  # evaluations without a better loss before it stops early
+    resting_share: Share = 0.0  # of the budget, at its start, in which the image encoder rests: steps cost a third
     seed: int = 0
     step: StepConfig = StepConfig()
 
@@ -134,6 +137,9 @@ def _run(
     encoder = model.image_encoder
     if encoder is not None and encoder.uncalibrated:
         calibrate(encoder, stack_sources(train))
+    # A kind that classifies while it encodes has nothing to learn where its features are kept.
+    rests = config.resting_share > 0 and not model.needs_own_view
+    encoded = encode_once(model, train) if rests else None
     best = _Best(*_evaluate(model, train, held_out, config), 0, copy.deepcopy(model.state_dict()))
     latest = (best.loss, best.accuracy)
     if not math.isfinite(best.loss):
@@ -148,7 +154,10 @@ def _run(
         for group in optimiser.param_groups:
             group["lr"] = rate
         query, sources = pick_views(len(train), config.step, generator)
-        loss = training_loss(model, train, query, sources, config.step, generator)
+        if encoded is not None and fraction < config.resting_share:
+            loss = resting_loss(model, encoded, train, query, sources, config.step, generator)
+        else:
+            loss = training_loss(model, train, query, sources, config.step, generator)
         step += 1
         if loss is None:
             continue
@@ -205,7 +214,8 @@ def _evaluate(
                 continue
             prior = view.depth_m.flatten()[flat]
             rays, targets = query_rays(view, flat, near_m=sampling.near_m, far_m=sampling.far_m, prior=prior)
-            others = torch.tensor([j for j in range(len(held_out)) if j != i][:16])
+            own = model.needs_own_view
+            others = torch.tensor([j for j in range(len(held_out)) if (j == i) == own][:MAX_SOURCE_VIEWS])
             render, _ = model.render_samples(rays, sample_guided(rays, sampling), encoded.select(others))
             losses.append(float(semantic_loss(render.logits, targets.channel)))
             right += int((render.logits.argmax(1) == targets.channel).sum())

@@ -141,17 +141,29 @@ def draw_batch(
     if config.mirrored > 0 and float(torch.rand(1, generator=generator)) < config.mirrored:
         views = _mirrored(views, query, sources)
         resident = None if resident is None else _mirrored(resident, query, sources)
-    target = views[query]
-    flat = draw_pixels(target.channel, config.rays, config.balanced_share, generator, classes)
-    if len(flat) == 0:
-        return None
     blind = config.blind > 0 and float(torch.rand(1, generator=generator)) < config.blind
+    drawn = draw_rays(views[query], config, generator, classes, blind=blind)
+    if drawn is None:
+        return None
+    rays, targets, z = drawn
     stacked = _sources(resident or views, query, sources, config, generator)
     stacked = withhold_depth(stacked, 1.0 if blind else config.depth_withheld, generator)
     stacked = jitter_colours(to_device(stacked, device), config.colour_jitter, generator)
-    rays, targets, z = _draw_samples(target, flat, config, blind, generator)
     channel = torch.stack([(resident or views)[i].channel for i in sources])
     return StepBatch(stacked, channel.to(device), to_device(rays, device), to_device(targets, device), z.to(device))
+
+
+def draw_rays(
+    target: LabelledView, config: StepConfig, generator: torch.Generator, classes: int, *, blind: bool = False
+) -> tuple[RayBatch, RayTargets, torch.Tensor] | None:
+    """Rays of a view, what they should render to, and their sample depths; None where it has no labelled pixel.
+
+    Args:
+        classes: L of the label set.
+        blind: Without depth priors.
+    """
+    flat = draw_pixels(target.channel, config.rays, config.balanced_share, generator, classes)
+    return None if len(flat) == 0 else _draw_samples(target, flat, config, blind, generator)
 
 
 def batch_loss(

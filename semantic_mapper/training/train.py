@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import structlog
 import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from semantic_mapper.config import Config, to_plain
+from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.fields.encoder import calibrate
@@ -26,26 +25,25 @@ from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes import SUITE_VERSION, TRAIN_SEEDS
-from semantic_mapper.training.device import DeviceName, bfloat16_is_fast, choose_device, compute_in_bfloat16
-from semantic_mapper.training.images import ImageBatch, ImageStepConfig, draw_images, images_loss
-from semantic_mapper.training.losses import LossConfig
+from semantic_mapper.training.device import bfloat16_is_fast, choose_device, compute_in_bfloat16
+from semantic_mapper.training.images import ImageBatch, draw_images, images_loss
 from semantic_mapper.training.optimiser import make_optimiser, set_rates
 from semantic_mapper.training.ranks import Ranks, joined, ranks_from_environment
 from semantic_mapper.training.recipe import provenance
-from semantic_mapper.training.rooms import RoomPool, RoomPoolConfig, RoomViews
+from semantic_mapper.training.rooms import RoomPool, RoomViews
 from semantic_mapper.training.schedule import budget_fraction, cosine_rate
 from semantic_mapper.training.start import take_over, take_over_encoder
 from semantic_mapper.training.step import (
     StepBatch,
-    StepConfig,
     batch_loss,
     draw_batch,
     encodes_views_separately,
     pick_views_on_path,
 )
+from semantic_mapper.training.train_config import TrainConfig
 from semantic_mapper.training.train_log import TrainLog
 from semantic_mapper.training.train_state import LOSS_PARTS, Progress, load_state, save_state, unfinished_step
-from semantic_mapper.training.validation import Scores, ValidationConfig, validate, validation_rooms
+from semantic_mapper.training.validation import Scores, validate, validation_rooms
 from semantic_mapper.training.views import stack_sources
 
 STATE_FILE = "state.safetensors"
@@ -56,47 +54,6 @@ WARM_UP = 0.01  # share of the budget
 _FREE = ("seconds", "steps", "device", "workers", "save_every_s")  # may differ when a run goes on
 
 _log = structlog.get_logger(__name__)
-
-
-class TrainStepConfig(StepConfig, frozen=True):
-    """A step of training to generalize: many densities of views, no known labels, often no depth at all."""
-
-    views_max: int = 12
-    known_labels: bool = False
-    blind: float = 0.25
-    blind_thinning: int = 4  # 32 samples a ray instead of 8
-    mirrored: float = 0.5
-    loss: LossConfig = LossConfig(balance=0.25)
-
-
-class TrainConfig(Config, frozen=True):
-    """A training run."""
-
-    kind: str = "sray"  # of field, as in ``fields.registry``
-    field: dict[str, Any] = msgspec.field(
-        default_factory=dict
-    )  # settings of that kind; what is left out keeps its default
-    start: str = ""  # weights file to start from, of this very shape; empty = random weights
-    encoder_from: str = ""  # weights file of any kind whose image encoder is taken over; empty = random weights
-    seconds: float = 1500.0  # wall-clock budget; 0 = only steps count (then a run repeats bit for bit on a CPU)
-    steps: int = 0  # step budget; 0 = only seconds count
-    rooms_per_step: int = 1  # a rank
-    encode_together: bool = False  # one call of the encoder a step; for kinds that encode each view by itself
-    bfloat16: tuple[str, ...] = ()  # parts of the field ("encoder", ...) that compute in it where it is fast
-    learning_rate: float = 1e-3  # of steps on rays; ``images`` has its own
-    encoder_rate: float = 0.3  # of the image encoder, as a share of it
-    final_learning_rate: float = 5e-5
-    weight_decay: float = 0.02
-    gradient_clip: float = 10.0
-    seed: int = 0
-    device: DeviceName = "auto"
-    workers: int = 0  # processes that render rooms ahead, a rank; 0 = inline, right where the CPU trains
-    save_every_s: float = 120.0
-    log_steps: int = 20  # steps a line of the history
-    pool: RoomPoolConfig = RoomPoolConfig()
-    images: ImageStepConfig = ImageStepConfig()
-    step: TrainStepConfig = TrainStepConfig()
-    validation: ValidationConfig = ValidationConfig()
 
 
 @dataclass(frozen=True, slots=True)

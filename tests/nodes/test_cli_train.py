@@ -11,7 +11,7 @@ from semantic_mapper.config import load_config
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.training.train import TrainConfig
+from semantic_mapper.training.train_config import TrainConfig
 from tests.nodes.support import Running, eventually, run
 
 ROOT = Path(__file__).resolve().parents[2]

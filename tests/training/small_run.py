@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from semantic_mapper.config import convert_config, to_plain
-from semantic_mapper.training.train import TrainConfig
+from semantic_mapper.training.train_config import TrainConfig
 from tests.small import SMALL_MODEL
 
 POOL = {"width": 48, "views": 5, "rooms": 3, "rooms_at_start": 2, "draws_per_room": 2}

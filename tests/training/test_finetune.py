@@ -7,6 +7,7 @@ import torch
 
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import FrameError
+from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.finetune import FinetuneConfig, finetune
 from semantic_mapper.training.select import Candidate, candidate_from_frame, choose_keyframes
@@ -39,9 +40,31 @@ def test_weights_are_never_worse_than_the_start_on_held_out_rays():
     result = finetune(tiny_frames(3), ROOMS, start, ruined)
     assert start_loss(start) >= result.recipe["held_out_loss"]
     if result.recipe["best_step"] == 0:
-        for name, tensor in start.state_dict().items():
-            assert torch.equal(result.model.state_dict()[name], tensor)
+        fitted = dict(result.model.named_parameters())
+        assert all(torch.equal(fitted[name], p) for name, p in start.named_parameters())
     assert math.isfinite(result.recipe["held_out_loss"])
+
+
+def test_the_encoder_may_rest_at_the_start_and_its_weights_stay_what_they_were():
+    start = tiny_field()
+    result = finetune(tiny_frames(4), ROOMS, start, config(steps=30, resting_share=1.0))
+    assert result.recipe["best_step"] > 0, "the head alone learns something"
+    kept = {n: t for n, t in result.model.named_parameters() if n.startswith(("encoder.", "geometry_init."))}
+    assert kept and all(torch.equal(start.state_dict()[n], t) for n, t in kept.items())
+    later = finetune(tiny_frames(4), ROOMS, start, config(steps=40, resting_share=0.2))
+    assert later.recipe["best_step"] > 8, "it learns more once the encoder may"
+    assert any(not torch.equal(t, dict(later.model.named_parameters())[n]) for n, t in kept.items())
+
+
+def test_a_per_image_network_is_finetuned_and_judged_on_its_own_views():
+    torch.manual_seed(0)
+    shape = {"feature_dim": 16, "encoder": {"channels": [8, 16], "blocks": [1, 1]}}
+    seen: list[float] = []
+    start = build_field("unet", shape, ROOMS)
+    result = finetune(
+        tiny_frames(4), ROOMS, start, config(steps=40, resting_share=0.5), lambda p: seen.append(p.held_out_loss)
+    )
+    assert result.recipe["held_out_loss"] < 0.9 * seen[0]
 
 
 def test_a_stop_request_ends_it_with_the_best_weights_so_far():

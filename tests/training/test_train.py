@@ -12,12 +12,12 @@ from semantic_mapper.fields.sray import SRay
 from semantic_mapper.training.train import (
     STATE_FILE,
     WEIGHTS_FILE,
-    TrainConfig,
     TrainProgress,
     learning_rate,
     step_seed,
     train,
 )
+from semantic_mapper.training.train_config import TrainConfig
 from tests.training.small_run import small_run
 
 TIMES = {"seconds", "waited_s"}

@@ -18,7 +18,8 @@ from semantic_mapper.training.step import (
     encodes_views_separately,
     pick_views_on_path,
 )
-from semantic_mapper.training.train import TrainStepConfig, train
+from semantic_mapper.training.train import train
+from semantic_mapper.training.train_config import TrainStepConfig
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import SourceViews
 from tests.small import SMALL_MODEL, tiny_field, tiny_frames

@@ -10,7 +10,7 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes import VALIDATION_SEEDS
 from semantic_mapper.training.ranks import Ranks
 from semantic_mapper.training.rooms import RoomPoolConfig
-from semantic_mapper.training.train import TrainStepConfig
+from semantic_mapper.training.train_config import TrainStepConfig
 from semantic_mapper.training.validation import ValidationConfig, _figures, validate, validation_rooms
 from tests.small import tiny_field
 from tests.training.small_run import POOL
