@@ -29,7 +29,8 @@ SAME_CAMERA = 1e-3  # metres between the centres plus the error of a unit depth:
 
 
 class UNetField(LearnedField):
-    """Per-image classification behind the ray interface. Depth, measured or prior, plays no part.
+    """Per-image classification behind the ray interface. Depth priors of rays play no part; measured
+    depth of an image does where the encoder sees it.
 
     Args:
         config: Shape of the network.

@@ -5,7 +5,14 @@ from pathlib import Path
 import pytest
 import torch
 
+from scripts import peers
+from semantic_mapper.config import load_config
+from semantic_mapper.fields.registry import build_field
+from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.recipe import git_revision, provenance
+from semantic_mapper.training.train_config import TrainConfig
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -43,3 +50,25 @@ def test_provenance_names_versions_and_device():
     about = provenance(torch.device("cpu"))
     assert about["torch"] == torch.__version__ and "threads" in about["device"]
     assert {"version", "git_revision", "platform"} <= about.keys()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "recipes").glob("*.toml")), ids=lambda p: p.name)
+def test_every_recipe_is_a_config_of_a_field_that_can_be_built(path: Path):
+    config = load_config(path, TrainConfig)
+    assert config.seconds > 0 or config.steps > 0
+    field = build_field(config.kind, config.field, ROOMS)
+    assert all(part in dict(field.named_modules()) for part in config.bfloat16)
+
+
+@pytest.mark.parametrize("name", list(peers.RUNS))
+def test_recipes_of_the_comparison_are_configs_and_start_from_encoders_of_their_shape(name: str, tmp_path: Path):
+    (tmp_path / "r.toml").write_text(peers.recipe(name, 3, 100), encoding="utf-8")
+    config = load_config(tmp_path / "r.toml", TrainConfig)
+    run = peers.RUNS[name]
+    assert (config.seed, config.steps, config.kind) == (3, 100, run.kind)
+    encoder = build_field(config.kind, config.field, ROOMS).image_encoder
+    assert encoder is not None and encoder.depth is run.depth
+    if run.encoder:
+        assert peers.RUNS[run.encoder].depth is run.depth and config.images.share == 0
+    else:
+        assert config.images.share == 1

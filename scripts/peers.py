@@ -1,0 +1,143 @@
+"""Train S-Ray, its ablations and its peers with one budget, and compare them on the rooms of the test split.
+
+Two encoders learn from single images first: one sees colours, the other measured depth too. Each field starts from one
+of them and spends the same number of steps on rays (recipes/cpu-images.toml, recipes/cpu-rays.toml). Every run has one
+CPU core, two runs go on at a time; a run that was ended goes on where it stopped when the same command comes again.
+
+    python scripts/peers.py --out runs/peers [NAME...]        train, all of them without names
+    python scripts/peers.py --out runs/peers --eval [NAME...] compare what is trained, with and without depth
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tomllib
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from semantic_mapper.training.train import STATE_FILE, WEIGHTS_FILE
+from semantic_mapper.training.train_state import unfinished_step
+
+RECIPES = Path(__file__).resolve().parent.parent / "recipes"
+COMMAND = str(Path(sys.executable).with_name("semantic-mapper"))
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training: kind of field, whether its encoder sees depth, and the run whose encoder it starts from."""
+
+    kind: str
+    depth: bool
+    encoder: str = ""
+
+
+RUNS = {
+    "unet": Run("unet", depth=False),
+    "unet-depth": Run("unet", depth=True),
+    "sray": Run("sray", depth=True, encoder="unet-depth"),
+    "neuray": Run("neuray", depth=False, encoder="unet"),
+    "sray-none": Run("sray-none", depth=True, encoder="unet-depth"),
+    "mvsnerf": Run("mvsnerf", depth=False, encoder="unet"),
+    "sray-cross": Run("sray-cross", depth=True, encoder="unet-depth"),
+    "sray-intra": Run("sray-intra", depth=True, encoder="unet-depth"),
+    "sray-colours": Run("sray", depth=False, encoder="unet"),
+    "neuray-depth": Run("neuray", depth=True, encoder="unet-depth"),
+}
+
+
+def recipe(name: str, seed: int, steps: int) -> str:
+    """The recipe of a run as TOML; the files in recipes/ hold plain values and one level of tables."""
+    run = RUNS[name]
+    plain: dict[str, Any] = tomllib.loads(
+        (RECIPES / ("cpu-rays.toml" if run.encoder else "cpu-images.toml")).read_text(encoding="utf-8")
+    )
+    plain |= {"kind": run.kind, "seed": seed} | ({"steps": steps} if steps else {})
+    lines = [f"{key} = {_toml(value)}" for key, value in plain.items() if not isinstance(value, dict)]
+    lines += ["", "[field.encoder]", f"depth = {_toml(run.depth)}"]
+    for table, values in plain.items():
+        if isinstance(values, dict):
+            lines += ["", f"[{table}]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
+    return "\n".join(lines) + "\n"
+
+
+def train(name: str, out: Path, seed: int, steps: int) -> int:
+    """Train one run, or go on with it; returns the exit code of the command."""
+    folder = out / name
+    state = folder / STATE_FILE
+    if state.is_file() and unfinished_step(state) is None:
+        print(f"{name}: done", flush=True)
+        return 0
+    folder.mkdir(parents=True, exist_ok=True)
+    config = folder / "recipe.toml"
+    config.write_text(recipe(name, seed, steps), encoding="utf-8")
+    command = [COMMAND, "train", "--config", str(config), "--out", str(folder)]
+    if RUNS[name].encoder:
+        command += ["--encoder", str(out / RUNS[name].encoder / WEIGHTS_FILE)]
+    if state.is_file():
+        command += ["--resume"]
+    print(f"{name}: {' '.join(command)}", flush=True)
+    alone = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+    with (folder / "train.log").open("ab") as log:
+        code = subprocess.run(command, env=os.environ | alone, stdout=log, stderr=log, check=False).returncode
+    print(f"{name}: ended with {code}", flush=True)
+    return code
+
+
+def train_all(names: list[str], out: Path, seed: int, steps: int, jobs: int) -> int:
+    """Encoders first, then the fields that start from them."""
+    encoders = {RUNS[name].encoder for name in names} | {name for name in names if not RUNS[name].encoder}
+    for group in ([n for n in RUNS if n in encoders], [n for n in names if RUNS[n].encoder]):
+        with ThreadPoolExecutor(jobs) as pool:
+            codes = list(pool.map(lambda name: train(name, out, seed, steps), group))
+        if any(codes):
+            return max(codes)
+    return 0
+
+
+def compare(names: list[str], out: Path) -> int:
+    """All figures of what is trained, with and without depth."""
+    weights = [file for name in names if (file := out / name / WEIGHTS_FILE).is_file()]
+    for depth in ("on", "off"):
+        command = [COMMAND, "eval", "--suite", "rooms", "--depth", depth, "--json", str(out / f"depth-{depth}.json")]
+        for file in weights:
+            command += ["--weights", str(file)]
+        code = subprocess.run(command, check=False).returncode
+        if code:
+            return code
+    return 0
+
+
+def main() -> int:
+    """Run the verb that the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(RUNS)}")
+    parser.add_argument("--out", type=Path, required=True, help="folder of all runs")
+    parser.add_argument("--eval", action="store_true", help="compare instead of train")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--steps", type=int, default=0, help="of every run, instead of the recipes'")
+    parser.add_argument("--jobs", type=int, default=2, help="runs at a time, of one core each")
+    given = parser.parse_args()
+    unknown = sorted(set(given.names) - set(RUNS))
+    if unknown:
+        parser.error(f"no run {', '.join(unknown)}; there are {', '.join(RUNS)}")
+    names = given.names or list(RUNS)
+    if given.eval:
+        return compare(names, given.out)
+    return train_all(names, given.out, given.seed, given.steps, given.jobs)
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, list):
+        return f"[{', '.join(_toml(v) for v in value)}]"
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
