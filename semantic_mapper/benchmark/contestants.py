@@ -14,7 +14,7 @@ from semantic_mapper.fields.checkpoint import load_checkpoint
 
 
 def load_contestants(paths: Sequence[Path]) -> list[Contestant]:
-    """Load weights files onto the GPU where there is one, else the CPU; each is named by its file, apart from others.
+    """Load weights files onto the GPU where there is one, else the CPU; each is named by its file or its folder.
 
     Raises:
         WeightsError: a file that cannot be used, or one given twice.
@@ -24,9 +24,16 @@ def load_contestants(paths: Sequence[Path]) -> list[Contestant]:
     digests = [hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in paths]
     if len(set(digests)) < len(digests):
         raise WeightsError("the same weights are given twice; a difference to themselves says nothing")
-    stems = [path.stem for path in paths]
-    names = [s if stems.count(s) == 1 else str(p) for s, p in zip(stems, paths, strict=True)]
+    names = _names(paths)
     return [
         Contestant(name, digest, checkpoint.model.to(device).eval())
         for name, digest, checkpoint in zip(names, digests, checkpoints, strict=True)
     ]
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Names of the files; of their folders where all files are called alike, as training does; else whole paths."""
+    for names in ([path.stem for path in paths], [path.resolve().parent.name for path in paths]):
+        if len(set(names)) == len(names):
+            return names
+    return [str(path) for path in paths]

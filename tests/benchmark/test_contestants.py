@@ -1,0 +1,29 @@
+import shutil
+from pathlib import Path
+
+import pytest
+
+from semantic_mapper.benchmark.contestants import load_contestants
+from semantic_mapper.errors import WeightsError
+from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
+from tests.small import tiny_field
+
+
+def weights(path: Path, seed: int) -> Path:
+    save_checkpoint(Checkpoint(tiny_field(seed=seed)), path)
+    return path
+
+
+def test_weights_are_named_by_file_else_by_folder_else_by_path(tmp_path: Path):
+    a, b = weights(tmp_path / "x" / "a.safetensors", 0), weights(tmp_path / "x" / "b.safetensors", 1)
+    assert [c.name for c in load_contestants([a, b])] == ["a", "b"]
+    other = weights(tmp_path / "y" / "a.safetensors", 2)
+    assert [c.name for c in load_contestants([a, other])] == ["x", "y"]
+    assert [c.name for c in load_contestants([a, b, other])] == [str(a), str(b), str(other)]
+
+
+def test_the_same_weights_twice_are_refused(tmp_path: Path):
+    a = weights(tmp_path / "a.safetensors", 0)
+    shutil.copy(a, tmp_path / "b.safetensors")
+    with pytest.raises(WeightsError, match="given twice"):
+        load_contestants([a, tmp_path / "b.safetensors"])
