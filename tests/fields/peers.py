@@ -6,6 +6,7 @@ import torch
 
 from semantic_mapper.config import (
     Config,
+    EncoderConfig,
     MVSNeRFConfig,
     NeuRayConfig,
     SamplingConfig,
@@ -25,11 +26,12 @@ LABELS = make_label_set("test", ["a", "b", "c"])
 POSES = [pose_at(-0.3), pose_at(-0.1, 0.1), pose_at(0.1), pose_at(0.3, -0.15)]
 AWAY = pose_at(0.0, 3.14159)
 
+COLOURS_ONLY = EncoderConfig(channels=(8, 16), blocks=(1, 1))
 TINY: dict[str, Config] = {
     "sray": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
-    "unet": UNetFieldConfig(feature_dim=16, encoder=SMALL_ENCODER),
-    "neuray": NeuRayConfig(feature_dim=16, encoder=SMALL_ENCODER),
-    "mvsnerf": MVSNeRFConfig(feature_dim=8, encoder=SMALL_ENCODER, planes=8, volume_channels=4, width=16),
+    "unet": UNetFieldConfig(feature_dim=16, encoder=COLOURS_ONLY),
+    "neuray": NeuRayConfig(feature_dim=16, encoder=COLOURS_ONLY),
+    "mvsnerf": MVSNeRFConfig(feature_dim=8, encoder=COLOURS_ONLY, planes=8, volume_channels=4, width=16),
     "semantic_nerf": SemanticNeRFConfig(width=16, position_frequencies=4, half_extent_m=4.0),
     "sray-none": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
     "sray-intra": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
