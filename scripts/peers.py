@@ -1,8 +1,9 @@
 """Train S-Ray, its ablations and its peers with one budget, and compare them on the rooms of the test split.
 
-Two encoders learn from single images first: one sees colours, the other measured depth too. Each field starts from one
-of them and spends the same number of steps on rays (recipes/cpu-images.toml, recipes/cpu-rays.toml). Every run has one
-CPU core, two runs go on at a time; a run that was ended goes on where it stopped when the same command comes again.
+Encoders learn from single images first: one sees colours; from it grows one that sees measured depth too, where there
+is any. Each field starts from one of the two and spends the same number of steps on rays (recipes/cpu-images.toml,
+recipes/cpu-rays.toml). Every run has one CPU core, two runs go on at a time; a run that was ended goes on where it
+stopped when the same command comes again.
 
     python scripts/peers.py --out runs/peers [NAME...]        train, all of them without names
     python scripts/peers.py --out runs/peers --eval [NAME...] compare what is trained, with and without depth
@@ -29,16 +30,26 @@ COMMAND = str(Path(sys.executable).with_name("semantic-mapper"))
 
 @dataclass(frozen=True)
 class Run:
-    """One training: kind of field, whether its encoder sees depth, and the run whose encoder it starts from."""
+    """One training.
+
+    Args:
+        kind: Of field.
+        depth: Whether its encoder sees depth.
+        encoder: The run whose encoder it starts from; empty = random weights.
+        images: Trained on single images, not on rays.
+        steps: Other than the recipe's; 0 = the recipe's.
+    """
 
     kind: str
     depth: bool
     encoder: str = ""
+    images: bool = False
+    steps: int = 0
 
 
 RUNS = {
-    "unet": Run("unet", depth=False),
-    "unet-depth": Run("unet", depth=True),
+    "unet": Run("unet", depth=False, images=True),
+    "unet-depth": Run("unet", depth=True, encoder="unet", images=True, steps=2800),
     "sray": Run("sray", depth=True, encoder="unet-depth"),
     "neuray": Run("neuray", depth=False, encoder="unet"),
     "sray-none": Run("sray-none", depth=True, encoder="unet-depth"),
@@ -54,8 +65,9 @@ def recipe(name: str, seed: int, steps: int) -> str:
     """The recipe of a run as TOML; the files in recipes/ hold plain values and one level of tables."""
     run = RUNS[name]
     plain: dict[str, Any] = tomllib.loads(
-        (RECIPES / ("cpu-rays.toml" if run.encoder else "cpu-images.toml")).read_text(encoding="utf-8")
+        (RECIPES / ("cpu-images.toml" if run.images else "cpu-rays.toml")).read_text(encoding="utf-8")
     )
+    steps = steps or run.steps
     plain |= {"kind": run.kind, "seed": seed} | ({"steps": steps} if steps else {})
     lines = [f"{key} = {_toml(value)}" for key, value in plain.items() if not isinstance(value, dict)]
     lines += ["", "[field.encoder]", f"depth = {_toml(run.depth)}"]
@@ -90,8 +102,14 @@ def train(name: str, out: Path, seed: int, steps: int) -> int:
 
 def train_all(names: list[str], out: Path, seed: int, steps: int, jobs: int) -> int:
     """Encoders first, then the fields that start from them."""
-    encoders = {RUNS[name].encoder for name in names} | {name for name in names if not RUNS[name].encoder}
-    for group in ([n for n in RUNS if n in encoders], [n for n in names if RUNS[n].encoder]):
+    encoders = {name for name in names if RUNS[name].images} | {RUNS[name].encoder for name in names} - {""}
+    encoders |= {RUNS[name].encoder for name in encoders} - {""}
+    groups = (
+        [name for name in RUNS if name in encoders and not RUNS[name].encoder],
+        [name for name in RUNS if name in encoders and RUNS[name].encoder],
+        [name for name in names if name not in encoders],
+    )
+    for group in groups:
         with ThreadPoolExecutor(jobs) as pool:
             codes = list(pool.map(lambda name: train(name, out, seed, steps), group))
         if any(codes):

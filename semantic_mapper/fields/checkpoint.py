@@ -31,7 +31,8 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
 FORMAT = "semantic-mapper-weights"
-VERSION = 2
+VERSION = 3
+MESSAGE = 300  # characters of torch's message, which names every tensor
 NEW_ROW_SPREAD = 0.2
 DEFAULT_WIDTH = 320  # of weights whose recipe does not say
 DEPTH_UNITS_PER_M = 4000.0  # anchors' depth as uint16: a quarter of a millimetre, up to 16 m
@@ -135,7 +136,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
     try:
         model.load_state_dict(weights)
     except RuntimeError as error:
-        raise WeightsError(f"{path}: weights do not fit their model config: {error}") from error
+        first = " ".join(str(error).split())[:MESSAGE]
+        raise WeightsError(f"{path}: weights do not fit their model config: {first}") from error
     if not all(bool(torch.isfinite(t).all()) for t in weights.values()):
         raise WeightsError(f"{path}: weights hold NaN or infinity; training diverged, train again")
     return Checkpoint(model.eval(), anchors, recipe)

@@ -1,4 +1,4 @@
-"""The shared image encoder: a light residual U-Net that gives the F_j of S-Ray Eq. 5."""
+"""The shared image encoder: light residual U-Nets that give the F_j of S-Ray Eq. 5."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Self
 
 import torch
@@ -16,6 +17,9 @@ from semantic_mapper.config import EncoderConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.surface import SURFACE_CHANNELS, surface_maps
 from semantic_mapper.types import SourceViews
+
+COLOURS = 3
+MEASURED_SHARE = 0.05  # of the pixels: with less measured depth a view counts as one without
 
 
 class ResidualBlock(nn.Module):
@@ -55,8 +59,45 @@ class UpBlock(nn.Module):
         return self.refine(skip + up)
 
 
+class ResidualUNet(nn.Module):
+    """(B, c_in, H, W) -> (B, c_out, H / 2, W / 2); H and W need not be multiples of the deepest stride."""
+
+    def __init__(self, c_in: int, config: EncoderConfig, c_out: int) -> None:
+        super().__init__()
+        channels, blocks = config.channels, config.blocks
+        self.stem = nn.Conv2d(c_in, channels[0], 5, 2, 2)
+        stages: list[nn.Module] = []
+        width = channels[0]
+        for i, (out, count) in enumerate(zip(channels, blocks, strict=True)):
+            layers = [ResidualBlock(width if k == 0 else out, out, 2 if k == 0 and i > 0 else 1) for k in range(count)]
+            stages.append(nn.Sequential(*layers))
+            width = out
+        self.stages = nn.ModuleList(stages)
+        # At the finest stage a residual block would cost as much as all of the others, and brings little.
+        self.ups = nn.ModuleList(
+            UpBlock(channels[i + 1], channels[i], refine=i > 0) for i in reversed(range(len(blocks) - 1))
+        )
+        self.head = nn.Conv2d(channels[0], c_out, 3, 1, 1)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """(B, c_in, H, W) -> (B, c_out, H / 2, W / 2), sizes rounded up."""
+        x = functional.relu(self.stem(x.contiguous(memory_format=torch.channels_last)))
+        skips: list[torch.Tensor] = []
+        for stage in self.stages:
+            x = stage(x)
+            skips.append(x)
+        skips.pop()
+        for up in self.ups:
+            x = up(x, skips.pop())
+        return self.head(x)
+
+
 class ImageEncoder(nn.Module):
-    """Residual U-Net, shared by all views; each view is encoded by itself.
+    """Residual U-Nets, shared by all views; each view is encoded by itself.
+
+    Where the config asks for depth there are two: one for views with measured depth, which sees what
+    ``surface.surface_maps`` makes of it beside the colours, and one for views without, which sees colours alone. Both
+    give features of one kind. A single network that has to do with and without gives away much of what each can do.
 
     Batch norm, because on a CPU it costs half of what group norm does and learns faster. Its statistics come from the
     images only inside ``batch_statistics`` (where the encoder is trained on many different images at once); everywhere
@@ -78,22 +119,8 @@ class ImageEncoder(nn.Module):
                 "encoder: channels and blocks need one positive number a stage each, and feature_dim has to be "
                 f"positive; got {list(channels)}, {list(blocks)} and {feature_dim}"
             )
-        self.depth = config.depth
-        self.stem = nn.Conv2d(3 + (SURFACE_CHANNELS if config.depth else 0), channels[0], 5, 2, 2)
-        stages: list[nn.Module] = []
-        c_in = channels[0]
-        for i, (c_out, count) in enumerate(zip(channels, blocks, strict=True)):
-            layers = [
-                ResidualBlock(c_in if k == 0 else c_out, c_out, 2 if k == 0 and i > 0 else 1) for k in range(count)
-            ]
-            stages.append(nn.Sequential(*layers))
-            c_in = c_out
-        self.stages = nn.ModuleList(stages)
-        # At the finest stage a residual block would cost as much as all of the others, and brings little.
-        self.ups = nn.ModuleList(
-            UpBlock(channels[i + 1], channels[i], refine=i > 0) for i in reversed(range(len(blocks) - 1))
-        )
-        self.head = nn.Conv2d(channels[0], feature_dim, 3, 1, 1)
+        self.colour_net = ResidualUNet(COLOURS, config, feature_dim)
+        self.depth_net = ResidualUNet(COLOURS + SURFACE_CHANNELS, config, feature_dim) if config.depth else None
         self._of_batch = False
         # Channels-last convolutions take a quarter of the CPU time at these widths (forward and backward).
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
@@ -101,18 +128,32 @@ class ImageEncoder(nn.Module):
 
     def forward(self, views: SourceViews) -> torch.Tensor:
         """Features (m, C, H / 2, W / 2) of m views; H and W need not be multiples of the deepest stride."""
-        x = (views.rgb - 0.45) / 0.25
-        if self.depth:
-            x = torch.cat((x, surface_maps(views.depth_m, views.K)), dim=1)
-        x = functional.relu(self.stem(x.contiguous(memory_format=torch.channels_last)))
-        skips: list[torch.Tensor] = []
-        for stage in self.stages:
-            x = stage(x)
-            skips.append(x)
-        skips.pop()
-        for up in self.ups:
-            x = up(x, skips.pop())
-        return self.head(x)
+        rgb = (views.rgb - 0.45) / 0.25
+        if self.depth_net is None:
+            return self.colour_net(rgb)
+        measured = has_depth(views.depth_m)
+        if not bool(measured.any()):
+            return self.colour_net(rgb)
+        maps = surface_maps(views.depth_m[measured], views.K[measured])
+        with_depth = self.depth_net(torch.cat((rgb[measured], maps), dim=1))
+        if bool(measured.all()):
+            return with_depth
+        without = self.colour_net(rgb[~measured])
+        place = torch.cat((measured.nonzero()[:, 0], (~measured).nonzero()[:, 0]))
+        return torch.cat((with_depth, without))[place.argsort()]
+
+    def grow_depth(self) -> None:
+        """Let the network that sees depth start as the one that does not: its first layer ignores depth for now.
+
+        Raises:
+            ConfigError: an encoder without such a network.
+        """
+        if self.depth_net is None:
+            raise ConfigError("this encoder sees colours alone; set depth = true in [field.encoder]")
+        grown = self.colour_net.state_dict()
+        stem = torch.zeros_like(self.depth_net.stem.weight)
+        stem[:, :COLOURS] = grown["stem.weight"]
+        self.depth_net.load_state_dict(grown | {"stem.weight": stem})
 
     @property
     def uncalibrated(self) -> bool:
@@ -142,13 +183,22 @@ class ImageEncoder(nn.Module):
         return (module for module in self.modules() if isinstance(module, nn.BatchNorm2d))
 
 
+def has_depth(depth_m: torch.Tensor) -> torch.Tensor:
+    """(m,) bool: whether enough of each view (m, H, W) is measured to be worth looking at."""
+    return (depth_m > 0).flatten(1).float().mean(1) >= MEASURED_SHARE
+
+
 def calibrate(encoder: ImageEncoder, views: SourceViews) -> None:
-    """Set the norms of a fresh encoder to the statistics of these views; no weight changes."""
+    """Set the norms of a fresh encoder to the statistics of these views, with their depth and without; no weight
+    changes. Where no view has depth, the network that would see it is shown a flat wall."""
     norms = [module for module in encoder.modules() if isinstance(module, nn.BatchNorm2d)]
     momenta = [norm.momentum for norm in norms]
     for norm in norms:
         norm.momentum = 1.0
     with encoder.batch_statistics(), torch.no_grad():
-        encoder(views)
+        encoder(replace(views, depth_m=torch.zeros_like(views.depth_m)))
+        if encoder.depth_net is not None:
+            measured = bool(has_depth(views.depth_m).any())
+            encoder(views if measured else replace(views, depth_m=torch.ones_like(views.depth_m)))
     for norm, momentum in zip(norms, momenta, strict=True):
         norm.momentum = momentum

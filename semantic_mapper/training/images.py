@@ -27,7 +27,8 @@ class ImageStepConfig(Config, frozen=True):
     rooms: AtLeastOne = 8  # a step, of a rank
     images: AtLeastOne = 2  # of each
     learning_rate: Positive = 2e-3
-    depth_withheld: Share = 0.3  # share of images without depth
+    colours_first: Share = 0.5  # of this part, without any depth; the network that sees depth then grows from the other
+    depth_withheld: Share = 0.3  # share of images without depth after that
     mirrored: Share = 0.5  # share of images
     colour_jitter: float = 0.25
     balance: Share = 0.25  # see ``losses.image_loss``
@@ -42,9 +43,18 @@ class ImageBatch:
 
 
 def draw_images(
-    rooms: Sequence[RoomViews], config: ImageStepConfig, generator: torch.Generator, device: torch.device
+    rooms: Sequence[RoomViews],
+    config: ImageStepConfig,
+    generator: torch.Generator,
+    device: torch.device,
+    *,
+    colours_only: bool = False,
 ) -> ImageBatch:
-    """Draw labelled views of each room; all draws are made on the CPU, so they are the same whatever the device."""
+    """Draw labelled views of each room; all draws are made on the CPU, so they are the same whatever the device.
+
+    Args:
+        colours_only: None of them with depth.
+    """
     views = []
     for room in rooms:
         order = torch.randperm(len(room.labelled), generator=generator).tolist()[: config.images]
@@ -54,7 +64,8 @@ def draw_images(
             views.append(mirrored_view(view) if mirror else view)
     stacked = stack_sources(views, with_labels=True)
     assert stacked.channel is not None
-    sources = withhold_depth(replace(stacked, channel=None), config.depth_withheld, generator)
+    withheld = 1.0 if colours_only else config.depth_withheld
+    sources = withhold_depth(replace(stacked, channel=None), withheld, generator)
     sources = jitter_colours(to_device(sources, device), config.colour_jitter, generator)
     return ImageBatch(sources, stacked.channel.to(device))
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import structlog
+import torch
+from torch import nn
 
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError
@@ -32,6 +34,8 @@ def take_over(field: LearnedField, path: Path) -> None:
 def take_over_encoder(field: LearnedField, path: Path) -> None:
     """Copy the image encoder of a file, whatever its kind, into ``field``.
 
+    An encoder that sees colours alone may become one that sees depth: the network for depth grows from it.
+
     Raises:
         WeightsError: the file cannot be read.
         ConfigError: one of the two has no image encoder, or they differ in shape.
@@ -39,9 +43,15 @@ def take_over_encoder(field: LearnedField, path: Path) -> None:
     theirs, own = load_checkpoint(path).model.image_encoder, field.image_encoder
     if theirs is None or own is None:
         raise ConfigError(f"{path}: encoder_from needs fields with image encoders on both sides")
-    weights = theirs.state_dict()
-    shapes = {name: tensor.shape for name, tensor in own.state_dict().items()}
-    if {name: tensor.shape for name, tensor in weights.items()} != shapes:
+    grows = own.depth_net is not None and theirs.depth_net is None
+    weights, into = (theirs.colour_net, own.colour_net) if grows else (theirs, own)
+    if _shapes(weights) != _shapes(into):
         raise ConfigError(f"{path}: its image encoder has another shape than the config asks for ([field.encoder])")
-    own.load_state_dict(weights)
-    _log.info("encoder_taken_over", weights=path.name)
+    into.load_state_dict(weights.state_dict())
+    if grows:
+        own.grow_depth()
+    _log.info("encoder_taken_over", weights=path.name, depth="grown from colours" if grows else "as it is")
+
+
+def _shapes(module: nn.Module) -> dict[str, torch.Size]:
+    return {name: tensor.shape for name, tensor in module.state_dict().items()}

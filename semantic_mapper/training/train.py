@@ -195,6 +195,8 @@ class _Run:
                     self._validate(rooms, pool, log, due)
                     self._save()
                     saved = time.monotonic()
+                if fraction >= self._colours_until():
+                    self._grow_depth()
                 if not progress.past_images and fraction >= config.images.share > 0:
                     self._keep_after_images(pool)
                 progress.finished = fraction >= 1
@@ -230,7 +232,9 @@ class _Run:
     def _draw_images(self, pool: RoomPool, generator: torch.Generator) -> ImageBatch:
         rooms = [pool.draw(generator) for _ in range(self.config.images.rooms)]
         self.progress.draws += len(rooms)
-        return draw_images(rooms, self.config.images, generator, self.device)
+        return draw_images(
+            rooms, self.config.images, generator, self.device, colours_only=not self.progress.depth_grown
+        )
 
     def _draw(self, pool: RoomPool, generator: torch.Generator) -> list[StepBatch]:
         rooms = [pool.draw(generator) for _ in range(self.config.rooms_per_step)]
@@ -278,6 +282,18 @@ class _Run:
     def _save(self) -> None:
         if self.folder is not None and self.ranks.first:
             save_state(self.folder / STATE_FILE, self.progress, self.field, self.optimiser, self._identity())
+
+    def _colours_until(self) -> float:
+        """Share of the budget that belongs to images without depth."""
+        return self.config.images.share * self.config.images.colours_first
+
+    def _grow_depth(self) -> None:
+        """From now on images bring their depth; the network that sees it begins where the one for colours is."""
+        encoder = self.field.image_encoder
+        if not self.progress.depth_grown and encoder is not None and encoder.depth_net and self._colours_until() > 0:
+            encoder.grow_depth()
+            _log.info("depth_network_grown", step=self.progress.step)
+        self.progress.depth_grown = True
 
     def _keep_after_images(self, pool: RoomPool) -> None:
         """The weights as they are before the first ray: other kinds of fields may take over the encoder."""

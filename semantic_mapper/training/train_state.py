@@ -22,7 +22,7 @@ from torch import nn
 from semantic_mapper.errors import ConfigError, WeightsError
 
 FORMAT = "semantic-mapper-training"
-VERSION = 2
+VERSION = 3
 LOSS_PARTS = ("total", "semantic", "colour", "depth")
 
 
@@ -39,6 +39,7 @@ class Progress:
         history: Lines of plain data; see ``train_log``.
         best: Weights that scored best in validation; None before the first.
         best_step, best_score: Of ``best``; the score is what validation ranks by.
+        depth_grown: The encoder's network for views with depth has grown from the one for colours.
         past_images: Steps on images alone are over.
         finished: The budget is used up.
     """
@@ -52,6 +53,7 @@ class Progress:
     best: dict[str, torch.Tensor] | None = None
     best_step: int = 0
     best_score: float = -1.0
+    depth_grown: bool = False
     past_images: bool = False
     finished: bool = False
 
@@ -79,6 +81,7 @@ def save_state(
         "validated": str(progress.validated),
         "best_step": str(progress.best_step),
         "best_score": repr(progress.best_score),
+        "depth_grown": str(progress.depth_grown),
         "past_images": str(progress.past_images),
         "finished": str(progress.finished),
         "history": json.dumps(progress.history),
@@ -124,6 +127,7 @@ def load_state(path: Path, model: nn.Module, optimiser: torch.optim.Optimizer, c
             best=best or None,
             best_step=int(metadata["best_step"]),
             best_score=float(metadata["best_score"]),
+            depth_grown=metadata["depth_grown"] == "True",
             past_images=metadata["past_images"] == "True",
         )
     except ConfigError:

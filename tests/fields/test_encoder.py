@@ -1,9 +1,11 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
 from semantic_mapper.config import EncoderConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.encoder import ImageEncoder, calibrate
+from semantic_mapper.fields.encoder import ImageEncoder, calibrate, has_depth
 from semantic_mapper.types import SourceViews
 from tests.small import SMALL_ENCODER
 
@@ -45,7 +47,7 @@ def test_statistics_change_inside_batch_statistics_and_nowhere_else():
     assert all(torch.equal(before[name], t) for name, t in field.named_buffers())
     assert field.uncalibrated
     with field.batch_statistics():
-        field(views(3))
+        field(without_depth(views(3), 0))
     assert not all(torch.equal(before[name], t) for name, t in field.named_buffers())
     assert not field.uncalibrated and field.training
     assert not any(m.training for m in field.modules() if isinstance(m, torch.nn.BatchNorm2d))
@@ -57,7 +59,8 @@ def test_calibration_makes_a_fresh_encoder_normalise_and_changes_no_weight():
     calibrate(field, views(8))
     assert not field.uncalibrated and not field.training
     assert all(torch.equal(weights[name], p) for name, p in field.named_parameters())
-    norm = field.stages[0][0].norm1
+    assert field.depth_net is not None
+    norm = field.depth_net.stages[0][0].norm1
     seen: list[torch.Tensor] = []
     norm.register_forward_hook(lambda _m, _i, out: seen.append(out))
     with torch.no_grad():
@@ -73,6 +76,50 @@ def test_only_an_encoder_that_sees_depth_is_moved_by_it():
         near, far = views(1), views(1)
         far = SourceViews(far.rgb, far.depth_m * 2, far.K, far.T_world_camera)
         assert torch.equal(field(near), field(far)) is not depth
+
+
+def without_depth(given: SourceViews, *index: int) -> SourceViews:
+    depth = given.depth_m.clone()
+    depth[list(index)] = 0
+    return replace(given, depth_m=depth)
+
+
+def test_each_view_goes_through_the_network_that_fits_it_and_comes_back_in_its_place():
+    field = encoder().eval()
+    calibrate(field, views(4))
+    assert field.depth_net is not None
+    mixed = field(without_depth(views(4), 1, 2))
+    with_depth, colours = field(views(4)), field(without_depth(views(4), 0, 1, 2, 3))
+    torch.testing.assert_close(mixed[[0, 3]], with_depth[[0, 3]], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(mixed[[1, 2]], colours[[1, 2]], atol=1e-5, rtol=1e-4)
+    assert not torch.allclose(with_depth[1], colours[1], atol=1e-2)
+
+
+def test_a_view_with_a_few_measured_pixels_counts_as_one_without_depth():
+    field = encoder().eval()
+    few = torch.zeros(2, 24, 32)
+    few[:, 0, :9] = 1.5  # 1.2 % of the pixels
+    assert not has_depth(few).any()
+    none = without_depth(views(2), 0, 1)
+    assert torch.equal(field(replace(none, depth_m=few)), field(none))
+
+
+def test_the_network_for_depth_begins_where_the_one_for_colours_is_and_then_goes_its_own_way():
+    field = encoder().eval()
+    calibrate(field, views(4))
+    field.grow_depth()
+    none = without_depth(views(4), 0, 1, 2, 3)
+    torch.testing.assert_close(field(views(4)), field(none), atol=1e-5, rtol=1e-4)
+    field(views(4)).square().sum().backward()
+    assert field.depth_net is not None
+    surface = field.depth_net.stem.weight.grad
+    assert surface is not None and surface[:, 3:].abs().max() > 0, "what ignores depth now has to be able to learn it"
+    assert field.colour_net.stem.weight.grad is None
+
+
+def test_an_encoder_of_colours_alone_has_no_network_to_grow():
+    with pytest.raises(ConfigError, match="depth = true"):
+        encoder(EncoderConfig(channels=(8,), blocks=(1,))).grow_depth()
 
 
 @pytest.mark.parametrize(

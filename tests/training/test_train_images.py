@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
 from torch.nn import functional
 
 from semantic_mapper.config import SRayConfig
@@ -15,10 +16,17 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.images import ImageStepConfig, draw_images, images_loss
 from semantic_mapper.training.losses import image_loss
 from semantic_mapper.training.rooms import RoomPoolConfig, render_room
-from semantic_mapper.training.train import IMAGES_FILE, train
+from semantic_mapper.training.start import take_over_encoder
+from semantic_mapper.training.train import IMAGES_FILE, STATE_FILE, train
 from semantic_mapper.training.views import mirrored_view, query_rays
 from tests.small import SMALL_ENCODER
 from tests.training.small_run import POOL, small_run
+
+
+def load_state_of(folder: Path) -> dict[str, str]:
+    with safe_open(folder / STATE_FILE, framework="pt") as stored:
+        return dict(stored.metadata() or {})
+
 
 CPU = torch.device("cpu")
 ROOM = render_room(3, RoomPoolConfig(**POOL))
@@ -110,6 +118,34 @@ def test_weights_after_the_images_are_kept_and_another_kind_takes_their_encoder_
         train(small_run(**still, **source, **peer))
     with pytest.raises(ConfigError, match="both sides"):
         train(small_run(**still, **source, kind="semantic_nerf", field={}))
+
+
+def test_the_network_for_depth_grows_from_the_one_for_colours_after_its_share_of_the_images(tmp_path: Path):
+    images = {"share": 1.0, "rooms": 1, "colours_first": 0.5, "learning_rate": 1e-12}
+    rates = {"final_learning_rate": 1e-12, "weight_decay": 0.0, "validation": {"times": 1, "rooms": 1, "queries": 1}}
+    encoder = train(small_run(images=images, steps=4, **rates), tmp_path).model.image_encoder
+    assert encoder is not None and encoder.depth_net is not None
+    # Next to nothing was learned, so that the two are still the same but for the first layer's view of depth.
+    torch.testing.assert_close(encoder.depth_net.head.weight, encoder.colour_net.head.weight, atol=1e-6, rtol=0)
+    assert encoder.depth_net.stem.weight[:, 3:].abs().max() < 1e-6
+    state = load_state_of(tmp_path)
+    assert state["depth_grown"] == "True"
+
+
+def test_images_come_without_depth_at_first():
+    config = ImageStepConfig(rooms=1, images=4, depth_withheld=0.0)
+    for only in (True, False):
+        batch = draw_images([ROOM], config, torch.Generator().manual_seed(1), CPU, colours_only=only)
+        assert bool((batch.views.depth_m > 0).any()) is not only
+
+
+def test_a_network_for_depth_grows_from_an_encoder_of_colours_that_is_taken_over(tmp_path: Path):
+    colours = {"feature_dim": 16, "heads": 2, "encoder": {"channels": [8, 16], "blocks": [1, 1], "depth": False}}
+    save_checkpoint(Checkpoint(build_field("sray", colours, ROOMS)), tmp_path / "c.safetensors")
+    field = build_field("sray", SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER), ROOMS)
+    take_over_encoder(field, tmp_path / "c.safetensors")
+    assert field.image_encoder is not None and field.image_encoder.depth_net is not None
+    assert torch.equal(field.image_encoder.depth_net.head.weight, field.image_encoder.colour_net.head.weight)
 
 
 def test_rays_from_the_first_step_on_start_with_a_calibrated_encoder(tmp_path: Path):

@@ -67,8 +67,7 @@ def test_recipes_of_the_comparison_are_configs_and_start_from_encoders_of_their_
     run = peers.RUNS[name]
     assert (config.seed, config.steps, config.kind) == (3, 100, run.kind)
     encoder = build_field(config.kind, config.field, ROOMS).image_encoder
-    assert encoder is not None and encoder.depth is run.depth
-    if run.encoder:
-        assert peers.RUNS[run.encoder].depth is run.depth and config.images.share == 0
-    else:
-        assert config.images.share == 1
+    assert encoder is not None and (encoder.depth_net is not None) is run.depth
+    assert config.images.share == (1 if run.images else 0)
+    if not run.images:
+        assert peers.RUNS[run.encoder].depth is run.depth and peers.RUNS[run.encoder].images
