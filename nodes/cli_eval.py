@@ -53,6 +53,7 @@ def evaluate(
     split: suites.SplitOption = None,
     rooms: suites.RoomsOption = None,
     protocol: suites.ProtocolOption = None,
+    kind: suites.KindOption = None,
     views: suites.ViewsOption = None,
     baseline: suites.BaselineOption = None,
     depth: suites.DepthOption = None,
@@ -72,12 +73,13 @@ def evaluate(
 
     Example: semantic-mapper eval runs/a runs/b
     Example: semantic-mapper eval kitchen.mcap --weights kitchen.safetensors --baselines
+    Example: semantic-mapper eval --suite rooms --protocol scratch --kind semantic_nerf --rooms 3 --seconds 600
     Example: semantic-mapper eval --suite rooms --weights a.safetensors --weights b.safetensors --json runs/ab.json
     """
     given = {"split": split, "rooms": rooms, "protocol": protocol, "views": views, "baseline": baseline, "depth": depth}
     given |= {"keyframes": keyframes, "steps": steps}
     if suite is None:
-        if maps or tier or any(value is not None for value in given.values()):
+        if maps or tier or kind or any(value is not None for value in given.values()):
             raise typer.BadParameter("is what this option needs", param_hint="--suite rooms")
         options = _single(weights), baselines, seconds or BASELINE_SECONDS, max_frames, config, seed or 0
         return _evaluate_targets(targets or [], options, mesh, json_file)
@@ -88,7 +90,7 @@ def evaluate(
     from nodes.suite import run_suite_verb
 
     settings = suites.suite_config(config, tier, {**given, "seconds": seconds, "seed": seed})
-    return run_suite_verb(settings, weights or [], maps, json_file)
+    return run_suite_verb(settings, weights or [], kind or [], maps, json_file)
 
 
 def _single(weights: list[Path] | None) -> Path | None:

@@ -29,10 +29,16 @@ from semantic_mapper.labels import ROOMS
 PACKAGES = ("torch", "numpy", "numba")
 
 
-def run_suite_verb(suite: SuiteConfig, weights: Sequence[Path], maps: bool, json_file: Path | None) -> int:
+def run_suite_verb(
+    suite: SuiteConfig, weights: Sequence[Path], kinds: Sequence[str], maps: bool, json_file: Path | None
+) -> int:
     """Run what is missing, then print, write and draw what there is.
 
     Beside the JSON lie the records of the rooms (``.jsonl``), their pictures (``.views``) and the sheet (``.png``).
+
+    Args:
+        weights: Files under test; the shipped ones where neither these nor ``kinds`` are given.
+        kinds: Fields with random weights that are fitted to each room; protocol "scratch" only.
 
     Returns:
         The exit code: 0, or that of the signal that ended the run.
@@ -42,9 +48,13 @@ def run_suite_verb(suite: SuiteConfig, weights: Sequence[Path], maps: bool, json
     """
     if maps and suite.protocol != "generalize":
         raise ConfigError(f"maps are made with weights as they are; protocol '{suite.protocol}' makes none, drop --map")
+    if kinds and suite.protocol != "scratch":
+        raise ConfigError(
+            f"--kind has random weights, which protocol '{suite.protocol}' does not fit; --protocol scratch"
+        )
     output = Output.guarded()
-    paths = list(weights) or [default_checkpoint_path()]
-    contestants = load_contestants(paths)
+    paths = list(weights) or ([] if kinds else [default_checkpoint_path()])
+    contestants = load_contestants(paths, kinds)
     out = json_file or Path("runs") / f"rooms-{suite.protocol}.json"
     store, pictures = RecordStore(out.with_suffix(".jsonl")), out.with_suffix(".views")
     with StopRequest() as stop:
@@ -54,7 +64,7 @@ def run_suite_verb(suite: SuiteConfig, weights: Sequence[Path], maps: bool, json
         if maps and not stop:
             with frame_progress("map the rooms", None, unit="maps") as bar:
                 _map_rooms(suite, contestants, paths, store, bar, stop)
-        found = _collect(suite, contestants, paths, store, maps)
+        found = _collect(suite, contestants, store, maps)
         write_json(out, found)
         output.print(suite_table(found))
         for line in difference_lines(found):
@@ -95,17 +105,15 @@ def _map_rooms(
             bar.advance()
 
 
-def _collect(
-    suite: SuiteConfig, contestants: Sequence[Contestant], paths: Sequence[Path], store: RecordStore, maps: bool
-) -> dict[str, Any]:
+def _collect(suite: SuiteConfig, contestants: Sequence[Contestant], store: RecordStore, maps: bool) -> dict[str, Any]:
     """All figures of the run as plain data."""
     seeds = suite_seeds(suite)
     records = {c.name: room_records(suite, c, store) for c in contestants}
     found: dict[str, Any] = {"title": _title(suite, len(seeds)), "suite": to_plain(suite), "weights": {}}
-    for contestant, path in zip(contestants, paths, strict=True):
+    for contestant in contestants:
         field = contestant.field
         found["weights"][contestant.name] = {
-            "file": path.name,
+            "file": contestant.file or None,
             "digest": contestant.digest,
             "kind": field.kind,
             "parameters": sum(p.numel() for p in field.parameters()),

@@ -19,6 +19,10 @@ ProtocolOption = Annotated[
     Literal["generalize", "finetune", "scratch"] | None,
     typer.Option(help="Suite: weights as they are, fitted to each room, or random ones fitted.  [default: generalize]"),
 ]
+KindOption = Annotated[
+    list[str] | None,
+    typer.Option("--kind", help="Suite, scratch: a kind of field with random weights, without a file; may repeat."),
+]
 ViewsOption = Annotated[int | None, typer.Option(min=1, max=16, help="Suite: source views of a query.  [default: 8]")]
 BaselineOption = Annotated[
     Literal["wide", "narrow"] | None,

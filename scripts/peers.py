@@ -19,6 +19,7 @@ import tomllib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 from semantic_mapper.training.train import STATE_FILE, WEIGHTS_FILE
@@ -109,9 +110,18 @@ def train_all(names: list[str], out: Path, seed: int, steps: int, jobs: int) -> 
         [name for name in RUNS if name in encoders and RUNS[name].encoder],
         [name for name in names if name not in encoders],
     )
+    failed = Event()
+
+    def train_unless_failed(name: str) -> int:
+        """Ctrl-C ends the runs at hand; the ones that wait must not begin."""
+        code = 0 if failed.is_set() else train(name, out, seed, steps)
+        if code:
+            failed.set()
+        return code
+
     for group in groups:
         with ThreadPoolExecutor(jobs) as pool:
-            codes = list(pool.map(lambda name: train(name, out, seed, steps), group))
+            codes = list(pool.map(train_unless_failed, group))
         if any(codes):
             return max(codes)
     return 0

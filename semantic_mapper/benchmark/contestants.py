@@ -1,23 +1,31 @@
-"""Weights files as contestants of a run."""
+"""Weights files, and kinds of fields with random weights, as contestants of a run."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
 from semantic_mapper.benchmark.protocols import Contestant
-from semantic_mapper.errors import WeightsError
+from semantic_mapper.config import to_plain
+from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import load_checkpoint
+from semantic_mapper.fields.registry import build_field
+from semantic_mapper.labels import ROOMS
 
 
-def load_contestants(paths: Sequence[Path]) -> list[Contestant]:
+def load_contestants(paths: Sequence[Path], kinds: Sequence[str] = ()) -> list[Contestant]:
     """Load weights files onto the GPU where there is one, else the CPU; each is named by its file or its folder.
+
+    Args:
+        kinds: Names of ``fields.registry`` that take part with random weights and default settings, after the files.
 
     Raises:
         WeightsError: a file that cannot be used, or one given twice.
+        ConfigError: no such kind, or one given twice.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     checkpoints = [load_checkpoint(path) for path in paths]
@@ -25,10 +33,18 @@ def load_contestants(paths: Sequence[Path]) -> list[Contestant]:
     if len(set(digests)) < len(digests):
         raise WeightsError("the same weights are given twice; a difference to themselves says nothing")
     names = _names(paths)
+    if twice := sorted({kind for kind in kinds if [*names, *kinds].count(kind) > 1}):
+        raise ConfigError(f"--kind {', '.join(twice)}: the name of another column; give each once")
     return [
-        Contestant(name, digest, checkpoint.model.to(device).eval())
-        for name, digest, checkpoint in zip(names, digests, checkpoints, strict=True)
-    ]
+        Contestant(name, digest, checkpoint.model.to(device).eval(), path.name)
+        for name, digest, checkpoint, path in zip(names, digests, checkpoints, paths, strict=True)
+    ] + [_of_kind(kind, device) for kind in kinds]
+
+
+def _of_kind(kind: str, device: torch.device) -> Contestant:
+    field = build_field(kind, {}, ROOMS).to(device).eval()
+    shape = json.dumps([kind, to_plain(field.config)], sort_keys=True)
+    return Contestant(kind, hashlib.sha256(shape.encode()).hexdigest()[:16], field)
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

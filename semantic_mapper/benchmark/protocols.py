@@ -29,6 +29,8 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, finetune
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.training.step import StepConfig
+from semantic_mapper.training.views import stack_sources, view_from_frame
+from semantic_mapper.types import SourceViews
 
 ANYWHERE = SpacingConfig()
 
@@ -43,11 +45,18 @@ class RoomResult:
 
 @dataclass(frozen=True, slots=True)
 class Contestant:
-    """A weights file under test: ``name`` heads its column, ``digest`` tells its bytes from others'."""
+    """A field under test.
+
+    Args:
+        name: Heads its column.
+        digest: Tells its weights from others'; of a kind with random weights, its settings.
+        file: That the weights came from; empty = random ones.
+    """
 
     name: str
     digest: str
     field: LearnedField
+    file: str = ""
 
 
 def run_room(
@@ -143,13 +152,14 @@ def _fit_and_score(
         raise ConfigError(f"protocol {suite.protocol} needs a budget: set seconds, steps, or both")
     keyframes = choose_labelled(room, suite)
     frames = [as_given(room.frames[n], depth=suite.depth, label=True) for n in keyframes]
-    field = _start(contestant.field, suite)
+    views = stack_sources([view_from_frame(frame, ROOMS, suite.tier.width) for frame in frames])
+    field = _start(contestant.field, suite, views)
     answers = answer_from_keyframes(room, field.eval(), suite, keyframes)
     curve = [_curve_point(0.0, 0.0, 0, room_confusion(room, answers))]
     device = next(field.parameters()).device
     spent, whole = 0.0, sum(suite.scene.shares)
     for share in sorted(suite.scene.shares):
-        start = _start(contestant.field, suite)
+        start = _start(contestant.field, suite, views)
         progress = _progress(on_fit, spent, share, whole)
         fitted = finetune(frames, ROOMS, start, _fit_config(suite, share), progress, stopped)
         if stopped():
@@ -168,12 +178,17 @@ def _progress(
     return None if on_fit is None else lambda p: on_fit((spent + p.fraction * share) / whole)
 
 
-def _start(field: LearnedField, suite: SuiteConfig) -> LearnedField:
-    """A copy to start from: the field's own weights in the classes of the rooms, or random ones of its shape."""
+def _start(field: LearnedField, suite: SuiteConfig, views: SourceViews) -> LearnedField:
+    """A copy to start from: the field's own weights in the classes of the rooms, or random ones of its shape.
+
+    Args:
+        views: Of the scene to be fitted; a kind for one scene alone takes its box from them.
+    """
     torch.manual_seed(suite.seed)
     if suite.protocol == "finetune":
         return adapt_model(field, ROOMS)
-    return build_field(field.kind, field.config, ROOMS, field.sampling).to(next(field.parameters()).device)
+    config = field.scene_config(views, suite.tier.guided.far_m)
+    return build_field(field.kind, config, ROOMS, field.sampling).to(next(field.parameters()).device)
 
 
 def _fit_config(suite: SuiteConfig, share: float) -> FinetuneConfig:

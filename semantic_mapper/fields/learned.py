@@ -64,6 +64,14 @@ class LearnedField(nn.Module, ABC):
         """Logits (m, L, h, w) of the source images by themselves, for a dense loss; None where a kind has none."""
         return None
 
+    def scene_config(self, views: SourceViews, far_m: float) -> Config:
+        """The config that a field of this kind and shape should have to be fitted to the scene that ``views`` show.
+
+        Args:
+            far_m: How far pixels without measured depth may see.
+        """
+        return self.config
+
     def sample(self, rays: RayBatch, sources: EncodedViews, generator: torch.Generator | None = None) -> torch.Tensor:
         """Sample depths (R, N): coarse + fine, or guided by the depth prior, as ``sampling.mode`` says."""
         if self.sampling.mode == "streaming":

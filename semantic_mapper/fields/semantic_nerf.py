@@ -71,6 +71,10 @@ class SemanticNeRF(LearnedField):
         check_views(views)
         return encoded_views(views, views.rgb[:, :0])
 
+    def scene_config(self, views: SourceViews, far_m: float) -> SemanticNeRFConfig:
+        """This shape, in the smallest box that holds what the views can see."""
+        return config_for_scene(views, far_m, self.config)
+
     def render_samples(
         self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews
     ) -> tuple[FieldRender, torch.Tensor]:

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper.benchmark.contestants import load_contestants
-from semantic_mapper.errors import WeightsError
+from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from tests.small import tiny_field
 
@@ -20,6 +20,19 @@ def test_weights_are_named_by_file_else_by_folder_else_by_path(tmp_path: Path):
     other = weights(tmp_path / "y" / "a.safetensors", 2)
     assert [c.name for c in load_contestants([a, other])] == ["x", "y"]
     assert [c.name for c in load_contestants([a, b, other])] == [str(a), str(b), str(other)]
+
+
+def test_a_kind_takes_part_with_random_weights_of_its_defaults(tmp_path: Path):
+    a = weights(tmp_path / "a.safetensors", 0)
+    first, second = load_contestants([a], ["semantic_nerf"])
+    assert (first.file, second.file, second.name) == ("a.safetensors", "", "semantic_nerf")
+    assert second.field.kind == "semantic_nerf"
+    again, other = load_contestants([], ["semantic_nerf", "unet"])
+    assert again.digest == second.digest != other.digest
+    with pytest.raises(ConfigError, match="another column"):
+        load_contestants([], ["unet", "unet"])
+    with pytest.raises(ConfigError, match="no field of kind"):
+        load_contestants([], ["nerf"])
 
 
 def test_the_same_weights_twice_are_refused(tmp_path: Path):

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from semantic_mapper.benchmark.config import SuiteConfig
+from semantic_mapper.benchmark.contestants import load_contestants
 from semantic_mapper.benchmark.figures import view_figures
 from semantic_mapper.benchmark.predict import predict_view
 from semantic_mapper.benchmark.protocols import (
@@ -21,6 +22,7 @@ from semantic_mapper.benchmark.scoring import from_rows
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS, make_label_set
+from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import SourceViews
 from tests.benchmark.tiny import tiny_contestant, tiny_room, tiny_suite
 from tests.small import tiny_field
@@ -148,6 +150,22 @@ def test_scratch_starts_from_random_weights_whatever_the_file_holds() -> None:
     assert first.confusion == second.confusion
     tuned = [score(tiny_contestant(s), tiny_suite(protocol="finetune")).record for s in (0, 1)]
     assert tuned[0].curve[0].confusion != tuned[1].curve[0].confusion
+
+
+def test_a_kind_for_one_scene_is_fitted_in_a_box_round_what_the_keyframes_see() -> None:
+    suite = tiny_suite(protocol="scratch")
+    (contestant,) = load_contestants([], ["semantic_nerf"])
+    result = run_room(tiny_room(), contestant, suite)
+    assert result is not None
+    before, after = (from_rows(point.confusion).metrics() for point in result.record.curve[::2])
+    assert before.total_accuracy == 0, "unfitted it knows nothing"
+    assert after.total_accuracy > 0
+    room = tiny_room()
+    views = stack_sources([view_from_frame(room.frames[n], ROOMS, 48) for n in result.record.keyframes])
+    box = contestant.field.scene_config(views, suite.tier.guided.far_m)
+    assert box.half_extent_m < contestant.field.config.half_extent_m
+    depth_m = max(float(room.frames[n].depth_m.max()) for n in result.record.keyframes)
+    assert 0.5 * depth_m < box.half_extent_m
 
 
 def test_a_fitting_that_is_stopped_gives_no_figures() -> None:

@@ -79,10 +79,22 @@ def test_fitting_shows_its_curve(suite: Path, two: tuple[Path, Path], tmp_path: 
     assert written["suite"]["scene"]["seconds"] == 0 and not written["suite"]["depth"]
 
 
+def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Path) -> None:
+    out = tmp_path / "kind.json"
+    options = ("--suite", "rooms", "--config", suite, "--kind", "semantic_nerf", "--json", out)
+    done = run("eval", *options, "--protocol", "scratch", "--steps", "2", "--rooms", "1")
+    assert done.returncode == 0, done.stderr
+    (column,) = json.loads(out.read_text())["weights"].items()
+    assert column[0] == "semantic_nerf" and column[1]["file"] is None
+    refused = run("eval", *options)
+    assert refused.returncode == 1 and "--protocol scratch" in refused.stderr
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
         ("log.mcap", "--suite", "rooms"),
+        ("log.mcap", "--kind", "unet"),
         ("log.mcap", "--rooms", "2"),
         ("log.mcap", "--weights", "a", "--weights", "b"),
         ("--suite", "klevr"),
