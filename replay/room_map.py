@@ -22,7 +22,7 @@ from semantic_mapper.evaluation.metrics import (
 )
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS, LabelSet
-from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, Scene, make_room, render_view, room_frames
 from semantic_mapper.types import Float32, Float64, UInt8
 
@@ -35,6 +35,15 @@ class TrueSurface:
     """Points of a room's true surface that its camera has seen: xyz (N, 3) float32 metres, ids (N,) of ``ROOMS``."""
 
     xyz: Float32
+    label: UInt8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """A frame of the sequence: pose, true labels (H, W) and those that the pipeline rendered, ids of ``ROOMS``."""
+
+    T_world_camera: Float64
+    truth: UInt8
     label: UInt8
 
 
@@ -55,17 +64,14 @@ def map_room(seed: int, weights: Path, digest: str, suite: SuiteConfig) -> MapRe
     camera = camera_of_width(MAP_WIDTH)
     path = CameraPathConfig(step_m=suite.sequence.step_m)
     scene = make_room(seed)
-    views: list[ConfusionMatrix] = []
-    poses: list[Float64] = []
+    views: list[_View] = []
     for frame in room_frames(seed, suite.map_frames, camera, path=path, noise=NoiseConfig()):
         label = in_rooms(pipeline.step(as_given(frame, depth=suite.depth)).label, pipeline.label_set)
         assert frame.label is not None
-        views.append(confusion_of(frame.label, label, ROOMS, f"room {seed}, frame {frame.seq}"))
-        poses.append(frame.T_world_camera)
-    points = pipeline.voxel_map.points()
-    if not len(points.xyz):
+        views.append(_View(frame.T_world_camera, frame.label, label))
+    if not len(pipeline.voxel_map.points().xyz):
         raise MapError(f"room {seed}: none of its {suite.map_frames} frames could be fused; the map is empty")
-    return _compare(scene, points, pipeline.label_set, true_surface(scene, poses), views, digest, suite)
+    return _compare(scene, pipeline.voxel_map, views, digest, suite)
 
 
 def in_rooms(label: UInt8, label_set: LabelSet) -> UInt8:
@@ -89,18 +95,14 @@ def true_surface(scene: Scene, poses: list[Float64]) -> TrueSurface:
     return TrueSurface(points[first], labels[first])
 
 
-def _compare(
-    scene: Scene,
-    points: MapPoints,
-    label_set: LabelSet,
-    surface: TrueSurface,
-    views: list[ConfusionMatrix],
-    digest: str,
-    suite: SuiteConfig,
-) -> MapRecord:
-    label = in_rooms(points.label, label_set)
+def _compare(scene: Scene, voxel_map: VoxelMap, views: list[_View], digest: str, suite: SuiteConfig) -> MapRecord:
+    surface = true_surface(scene, [view.T_world_camera for view in views])
+    points = voxel_map.points()
+    label = in_rooms(points.label, voxel_map.label_set)
     truth = nearest_labels(points.xyz, surface.xyz, surface.label, ROOMS, max_distance_m=NEAR_M)
     at_surface = map_confusion(surface.xyz, surface.label, points.xyz, label, ROOMS, max_distance_m=NEAR_M)
+    rendered = [confusion_of(v.truth, v.label, ROOMS, f"room {scene.seed}") for v in views]
+    cast, cast_views = _seen_from_its_frames(voxel_map, views)
     return MapRecord(
         settings=settings_digest(suite, "map"),
         weights=digest,
@@ -110,6 +112,24 @@ def _compare(
         on_surface=float((truth != ROOMS.ignore_id).mean()),
         confusion=as_rows(confusion_of(truth, label, ROOMS, "map")),
         surface_confusion=as_rows(at_surface),
-        view_confusion=as_rows(sum(views, ConfusionMatrix(ROOMS))),
-        view_miou=metrics_per_image(views).miou,
+        view_confusion=as_rows(sum(rendered, ConfusionMatrix(ROOMS))),
+        view_miou=metrics_per_image(rendered).miou,
+        cast_confusion=as_rows(cast),
+        cast_view_confusion=as_rows(cast_views),
     )
+
+
+def _seen_from_its_frames(voxel_map: VoxelMap, views: list[_View]) -> tuple[ConfusionMatrix, ConfusionMatrix]:
+    """The finished map as its own frames see it, and their rendered labels, both at the pixels where it has a label.
+
+    The two are each other's like: the same pixels of the same classes, so that their difference is what fusing brings.
+    """
+    camera = camera_of_width(MAP_WIDTH)
+    cast, rendered = ConfusionMatrix(ROOMS), ConfusionMatrix(ROOMS)
+    for view in views:
+        seen = voxel_map.ray_cast(view.T_world_camera, camera).label
+        label = in_rooms(seen, voxel_map.label_set)
+        truth = np.where(seen == voxel_map.label_set.ignore_id, ROOMS.ignore_id, view.truth)
+        cast = cast + confusion_of(truth, label, ROOMS, "map seen from a frame")
+        rendered = rendered + confusion_of(truth, view.label, ROOMS, "frame")
+    return cast, rendered

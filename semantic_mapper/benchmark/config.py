@@ -10,7 +10,7 @@ from semantic_mapper.config import Config, MapperConfig, SamplingConfig, to_plai
 from semantic_mapper.scenes import SUITE_VERSION, TEST_SEEDS, VALIDATION_SEEDS
 from semantic_mapper.types import CameraIntrinsics
 
-RECORD_VERSION = 1  # a change of what a record means raises it, so that older ones are made anew
+RECORD_VERSION = 2  # a change of what a record means raises it, so that older ones are made anew
 
 FOCAL_PER_WIDTH = 882.5 / 1280  # an OAK-D at 1280 pixels
 MAP_WIDTH = 320

@@ -75,6 +75,8 @@ class MapRecord(Config, frozen=True, tag_field="record", tag="map"):
     surface_confusion: tuple[tuple[int, ...], ...]  # at points of the true surface; holes count as wrong
     view_confusion: tuple[tuple[int, ...], ...]  # of the frames' rendered labels
     view_miou: float | None  # mean of the frames' own mIoU
+    cast_confusion: tuple[tuple[int, ...], ...]  # of the finished map, cast into its frames, where it has an answer
+    cast_view_confusion: tuple[tuple[int, ...], ...]  # of the frames' rendered labels at those same pixels
 
 
 Record = RoomRecord | MapRecord

@@ -66,6 +66,7 @@ def map_record(room: int = 1) -> MapRecord:
     return MapRecord(
         settings="s", weights="w", room=room, programme="office", points=3, on_surface=1.0,
         confusion=rows, surface_confusion=rows, view_confusion=rows, view_miou=0.5,
+        cast_confusion=rows, cast_view_confusion=rows,
     )  # fmt: skip
 
 

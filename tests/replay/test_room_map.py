@@ -44,6 +44,11 @@ def test_a_mapped_room_is_scored_at_its_own_points_and_at_the_true_surface(tmp_p
     assert at_surface.counts.sum() > at_points.counts.sum()
     frames = from_rows(record.view_confusion).counts.sum()
     assert 0 < frames <= 3 * 320 * 240
+    cast, there = from_rows(record.cast_confusion), from_rows(record.cast_view_confusion)
+    assert 0.5 * frames < cast.counts.sum() == there.counts.sum() <= frames
+    np.testing.assert_array_equal(cast.counts.sum(1), there.counts.sum(1))
+    assert cast.counts[:, -1].sum() == 0, "only pixels where the map has a label are counted"
     figures = map_figures([record])
+    assert figures["cast_miou"] == cast.metrics().miou
     assert figures["map_miou"] == figures["map_miou_mean_of_rooms"] == at_points.metrics().miou
     assert figures["view_miou_mean_of_rooms"] == record.view_miou
