@@ -6,8 +6,10 @@ import hashlib
 import json
 from typing import Literal
 
-from semantic_mapper.config import Config, MapperConfig, SamplingConfig, to_plain
+from semantic_mapper.config import Config, MapperConfig, Positive, SamplingConfig, Share, to_plain
 from semantic_mapper.scenes import SUITE_VERSION, TEST_SEEDS, VALIDATION_SEEDS
+from semantic_mapper.training.finetune import FinetuneConfig
+from semantic_mapper.training.step import StepConfig
 from semantic_mapper.types import CameraIntrinsics
 
 RECORD_VERSION = 2  # a change of what a record means raises it, so that older ones are made anew
@@ -72,6 +74,9 @@ class SceneBudget(Config, frozen=True):
     labelled_sources: bool = True  # queries: give the keyframes' labels to fields that take labels of source views
     seconds: float = 120.0  # wall clock; 0 = only steps count
     steps: int = 0  # 0 = only seconds count
+    learning_rate: Positive = FinetuneConfig().learning_rate
+    resting_share: Share = FinetuneConfig().resting_share  # see ``FinetuneConfig``
+    doubtful_share: Share = StepConfig().doubtful_share  # see ``StepConfig``
     shares: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0)  # of the budget; each is a run of its own, a point of the curve
 
 

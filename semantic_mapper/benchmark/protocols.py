@@ -197,7 +197,11 @@ def _fit_config(suite: SuiteConfig, share: float) -> FinetuneConfig:
         seconds=scene.seconds * share,
         steps=max(1, round(scene.steps * share)) if scene.steps else 0,
         width=suite.tier.width,
-        step=StepConfig(sampling=suite.tier.guided if suite.depth else suite.tier.blind),
+        learning_rate=scene.learning_rate,
+        resting_share=scene.resting_share,
+        step=StepConfig(
+            sampling=suite.tier.guided if suite.depth else suite.tier.blind, doubtful_share=scene.doubtful_share
+        ),
         seed=suite.seed,
     )
 

@@ -25,6 +25,7 @@ from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.training.doubt import with_doubt
 from semantic_mapper.training.losses import IGNORE, semantic_loss
 from semantic_mapper.training.resting import encode_once, resting_loss
 from semantic_mapper.training.schedule import budget_fraction, cosine_rate
@@ -142,6 +143,8 @@ def _run(
     encoded = encode_once(model, train) if rests else None
     best = _Best(*_evaluate(model, train, held_out, config), 0, copy.deepcopy(model.state_dict()))
     latest = (best.loss, best.accuracy)
+    doubts = config.step.doubtful_share > 0
+    train = with_doubt(model, train) if doubts else train
     if not math.isfinite(best.loss):
         _log.warning("nothing_held_out", reason="too few labelled pixels; the last weights are kept, not the best")
     began, step, evaluated, stale = time.monotonic(), 0, 0, 0
@@ -174,6 +177,7 @@ def _run(
             stale = 0 if improved else stale + 1
             if improved:
                 best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
+            train = with_doubt(model, train) if doubts else train
         if on_progress is not None:
             on_progress(FinetuneProgress(step, min(fraction, 1.0), float(loss.total.detach()), *latest, improved))
     if stopped() and step > 0:  # what was learned since the last look

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from semantic_mapper.config import Config, SamplingConfig
+from semantic_mapper.config import Config, SamplingConfig, Share
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided, sample_inverse_depth
@@ -18,6 +18,7 @@ from semantic_mapper.training.losses import IGNORE, Loss, LossConfig, image_loss
 from semantic_mapper.training.views import (
     LabelledView,
     RayTargets,
+    draw_doubtful,
     draw_pixels,
     jitter_colours,
     join_sources,
@@ -40,6 +41,7 @@ class StepConfig(Config, frozen=True):
     views_max: int = 5
     own_view_share: float = 0.3  # how often the query view is itself a source, as when the current frame is mapped
     balanced_share: float = 0.5  # share of rays drawn with all classes equally likely
+    doubtful_share: Share = 0.0  # share of rays drawn where the field is in doubt, of views that know (finetuning)
     depth_withheld: float = 0.15  # share of source views, and of steps for the query's prior, without depth
     blind: float = 0.0  # share of steps without any depth: neither source views nor prior have it
     known_labels: bool = True  # source views other than the query bring their labels, as keyframes of a finetuning do
@@ -162,8 +164,13 @@ def draw_rays(
         classes: L of the label set.
         blind: Without depth priors.
     """
-    flat = draw_pixels(target.channel, config.rays, config.balanced_share, generator, classes)
-    return None if len(flat) == 0 else _draw_samples(target, flat, config, blind, generator)
+    doubtful = 0 if target.doubt is None else int(config.rays * config.doubtful_share)
+    flat = draw_pixels(target.channel, config.rays - doubtful, config.balanced_share, generator, classes)
+    if len(flat) == 0:
+        return None
+    if target.doubt is not None and doubtful > 0:
+        flat = torch.cat((flat, draw_doubtful(target.doubt, doubtful, generator)))
+    return _draw_samples(target, flat, config, blind, generator)
 
 
 def batch_loss(

@@ -27,6 +27,7 @@ class LabelledView:
         channel: (H, W) int64 class channels, -1 = ignore.
         intrinsics: Of (H, W).
         T_world_camera: (4, 4) float32.
+        doubt: (H, W) float32 how likely a pixel is drawn among the doubtful ones (``doubt.with_doubt``); None = never.
     """
 
     rgb: torch.Tensor
@@ -34,6 +35,7 @@ class LabelledView:
     channel: torch.Tensor
     intrinsics: CameraIntrinsics
     T_world_camera: torch.Tensor
+    doubt: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,6 +158,13 @@ def draw_pixels(
     u = torch.rand(int(count * balanced_share), generator=generator, dtype=torch.float64) * cumulative[-1]
     balanced = labelled[torch.searchsorted(cumulative, u).clamp_max(len(labelled) - 1)]
     return torch.cat((uniform, balanced))
+
+
+def draw_doubtful(doubt: torch.Tensor, count: int, generator: torch.Generator) -> torch.Tensor:
+    """Flat indices (count,) of pixels of ``doubt`` (H, W), each as likely as its doubt is high."""
+    cumulative = torch.cumsum(doubt.flatten().double(), 0)
+    u = torch.rand(count, generator=generator, dtype=torch.float64) * cumulative[-1]
+    return torch.searchsorted(cumulative, u, right=True).clamp_max(len(cumulative) - 1)
 
 
 def query_rays(

@@ -9,8 +9,10 @@ from semantic_mapper.config import convert_config
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.training.doubt import LEAST, with_doubt
 from semantic_mapper.training.finetune import FinetuneConfig, finetune
 from semantic_mapper.training.select import Candidate, candidate_from_frame, choose_keyframes
+from semantic_mapper.training.views import view_from_frame
 from tests.small import tiny_field, tiny_frames
 
 
@@ -54,6 +56,29 @@ def test_the_encoder_may_rest_at_the_start_and_its_weights_stay_what_they_were()
     later = finetune(tiny_frames(4), ROOMS, start, config(steps=40, resting_share=0.2))
     assert later.recipe["best_step"] > 8, "it learns more once the encoder may"
     assert any(not torch.equal(t, dict(later.model.named_parameters())[n]) for n, t in kept.items())
+
+
+def test_doubt_is_what_the_images_alone_give_to_other_classes_than_the_right_one():
+    views = [view_from_frame(f, ROOMS, 96) for f in tiny_frames(2)]
+    field = tiny_field()
+    with torch.no_grad():
+        field.classifier.weight.zero_()
+        field.classifier.bias.zero_()
+        field.classifier.bias[int(views[0].channel.max())] = 9.0
+    for view, plain in zip(with_doubt(field, views), views, strict=True):
+        assert view.doubt is not None and view.doubt.shape == plain.channel.shape
+        sure = plain.channel == int(views[0].channel.max())
+        assert view.doubt[sure].max() == pytest.approx(LEAST)
+        assert view.doubt[~sure & (plain.channel >= 0)].min() > 0.9
+        assert not view.doubt[plain.channel < 0].any()
+    assert with_doubt(build_field("semantic_nerf", {}, ROOMS), views)[0].doubt is None
+
+
+def test_rays_may_go_where_the_field_is_in_doubt():
+    start = tiny_field()
+    step = {"rays": 128, "doubtful_share": 0.5}
+    plain, doubtful = (finetune(tiny_frames(4), ROOMS, start, config(steps=20, **c)) for c in ({}, {"step": step}))
+    assert doubtful.recipe["best_step"] > 0 and plain.recipe["held_out_loss"] != doubtful.recipe["held_out_loss"]
 
 
 def test_a_per_image_network_is_finetuned_and_judged_on_its_own_views():

@@ -8,6 +8,7 @@ from semantic_mapper.training.losses import LossConfig, ray_loss, semantic_loss
 from semantic_mapper.training.step import StepConfig, _sources
 from semantic_mapper.training.views import (
     RayTargets,
+    draw_doubtful,
     draw_pixels,
     jitter_colours,
     query_rays,
@@ -55,6 +56,14 @@ def test_balanced_draws_show_rare_classes_as_often_as_common_ones():
     assert abs((drawn == 1).float().mean() - 0.5) < 0.05
     uniform = channel.flatten()[draw_pixels(channel, 2000, 0.0, generator, 5)]
     assert (uniform == 1).float().mean() < 0.02
+
+
+def test_doubtful_draws_go_where_the_doubt_is():
+    doubt = torch.zeros(10, 10)
+    doubt[3, 4], doubt[7, 1] = 3.0, 1.0
+    drawn = draw_doubtful(doubt, 4000, torch.Generator().manual_seed(0))
+    assert set(drawn.tolist()) == {34, 71}
+    assert abs((drawn == 34).float().mean() - 0.75) < 0.03
 
 
 def test_query_rays_carry_the_targets_of_their_pixels():
