@@ -78,4 +78,4 @@ def _told(recipe: dict[str, object]) -> str:
     if not isinstance(best, dict) or not best:
         return f"{line}, not validated yet"
     figures = f"{best['miou'] * 100:.1f} % with depth, {best['blind_miou'] * 100:.1f} % without"
-    return f"{line}; best at step {recipe['best_step']}: validation mIoU {figures}"
+    return f"{line}; weights of step {recipe['best_step']}: validation mIoU {figures}"

@@ -273,7 +273,7 @@ class _Run:
         log.draw()
         if self.ranks.first:
             _log.info("validated", step=progress.step, **figures)
-        if scores.rank > progress.best_score:
+        if scores.rank > progress.best_score or config.keep == "last":
             progress.best = {n: t.detach().clone() for n, t in self.field.state_dict().items()}
             progress.best_step, progress.best_score = progress.step, scores.rank
             if self.folder is not None and self.ranks.first:

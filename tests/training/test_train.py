@@ -65,6 +65,15 @@ def test_another_seed_gives_other_weights_and_other_rooms():
     assert len({step_seed(s, r, k) for s in range(3) for r in range(3) for k in range(3)}) == 27
 
 
+def test_the_last_weights_are_kept_where_asked_for(tmp_path: Path):
+    validation = {"times": 3, "rooms": 1, "queries": 1, "rays": 64, "views": 3}
+    last = train(small_run(keep="last", steps=6, validation=validation), tmp_path)
+    assert last.recipe["best_step"] == 6 and last.recipe["validation"]["step"] == 6
+    with safe_open(tmp_path / STATE_FILE, framework="pt") as state:
+        for name, tensor in last.model.state_dict().items():
+            assert torch.equal(state.get_tensor(f"model.{name}"), tensor), name
+
+
 def test_training_lowers_the_loss_and_keeps_the_best_weights(tmp_path: Path):
     run = small_run(steps=36, log_steps=12, validation={"times": 3, "rooms": 1, "queries": 1, "rays": 64})
     checkpoint = train(run, tmp_path)
