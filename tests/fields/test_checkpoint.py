@@ -86,7 +86,7 @@ def test_adapted_model_carries_classifier_rows_over_by_name():
     assert torch.equal(weight[1], old[ROOMS.names.index("chair")])
     assert torch.equal(weight[2], old[ROOMS.names.index("wall")])
     assert (weight[0] - old.mean(0)).abs().mean() < 0.5
-    assert torch.equal(adapted.encoder.head.weight, model.encoder.head.weight)
+    assert torch.equal(adapted.encoder.colour_net.head.weight, model.encoder.colour_net.head.weight)
 
 
 def test_the_shipped_checkpoint_is_small_and_says_where_it_comes_from():
