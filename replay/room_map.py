@@ -69,8 +69,6 @@ def map_room(seed: int, weights: Path, digest: str, suite: SuiteConfig) -> MapRe
         label = in_rooms(pipeline.step(as_given(frame, depth=suite.depth)).label, pipeline.label_set)
         assert frame.label is not None
         views.append(_View(frame.T_world_camera, frame.label, label))
-    if not len(pipeline.voxel_map.points().xyz):
-        raise MapError(f"room {seed}: none of its {suite.map_frames} frames could be fused; the map is empty")
     return _compare(scene, pipeline.voxel_map, views, digest, suite)
 
 
@@ -96,8 +94,10 @@ def true_surface(scene: Scene, poses: list[Float64]) -> TrueSurface:
 
 
 def _compare(scene: Scene, voxel_map: VoxelMap, views: list[_View], digest: str, suite: SuiteConfig) -> MapRecord:
-    surface = true_surface(scene, [view.T_world_camera for view in views])
     points = voxel_map.points()
+    if not len(points.xyz):
+        raise MapError(f"room {scene.seed}: none of its {suite.map_frames} frames could be fused; the map is empty")
+    surface = true_surface(scene, [view.T_world_camera for view in views])
     label = in_rooms(points.label, voxel_map.label_set)
     truth = nearest_labels(points.xyz, surface.xyz, surface.label, ROOMS, max_distance_m=NEAR_M)
     at_surface = map_confusion(surface.xyz, surface.label, points.xyz, label, ROOMS, max_distance_m=NEAR_M)
