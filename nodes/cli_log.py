@@ -23,15 +23,22 @@ def import_(
         Literal["folder", "tum", "scannet"] | None, typer.Option(help="Found out when not given.")
     ] = None,
     max_frames: Annotated[int, typer.Option(min=0, help="Stop after so many; 0 = all.")] = 0,
+    rename: Annotated[
+        Path | None, typer.Option(help='TOML: [classes] couch = "sofa", ...; classes that get one name become one.')
+    ] = None,
 ) -> None:
     """Make a log of a recording: sequence folder, TUM RGB-D, or exported ScanNet.
 
     Frames that cannot be used are left out, each with its file and the reason.
 
     Example: semantic-mapper import path/to/redkitchen kitchen.mcap
+    Example: semantic-mapper import path/to/adt_apartment flat.mcap --rename recipes/classes/adt-to-rooms.toml
     """
     output = Output.guarded()
-    from replay.importers import ImportOptions, import_recording
+    from replay.importers import ImportOptions, RenameConfig, import_recording
+    from semantic_mapper.config import load_config
+
+    renames = load_config(rename, RenameConfig).classes if rename is not None else None
 
     log.parent.mkdir(parents=True, exist_ok=True)
     with frame_progress("import", None) as bar:
@@ -41,9 +48,8 @@ def import_(
                 bar.start(total)
             bar.set(done)
 
-        report = import_recording(
-            source, log, format, on_progress, options=ImportOptions(max_frames=max_frames or None)
-        )
+        options = ImportOptions(max_frames=max_frames or None)
+        report = import_recording(source, log, format, on_progress, options=options, renames=renames)
     labels = "no labels" if not report.labelled else f"{report.labelled} of them labelled"
     output.print(f"{log}: {report.frames} frames ({labels}), {report.bytes / 1e6:.1f} MB, from a '{report.format}'")
     for notice in report.notices:

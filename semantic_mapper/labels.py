@@ -7,7 +7,7 @@ hold *channels*: the position of an id in ``LabelSet.ids``. Only this module con
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -80,6 +80,29 @@ class LabelSet:
         table = np.zeros((256, 3), np.uint8)
         table[list(self.ids)] = np.array(self.colors, np.uint8)
         return table[label]
+
+    def renamed(self, names: Mapping[str, str]) -> tuple[LabelSet, UInt8]:
+        """Give classes other names; classes that then have the same name become one, with the lowest of their ids.
+
+        Args:
+            names: New name of each class to rename, by its present one.
+
+        Returns:
+            The new set, and its id for each id 0..255 of this one (ids that this set lacks stay as they are).
+
+        Raises:
+            LabelError: a present name that is not in the set.
+        """
+        unknown = sorted(set(names) - set(self.names))
+        if unknown:
+            raise LabelError(f"label set '{self.name}' has no classes {unknown} to rename; it has {sorted(self.names)}")
+        table = np.arange(256, dtype=np.uint8)
+        first: dict[str, tuple[int, tuple[int, int, int]]] = {}
+        for old_id, old_name, color in sorted(zip(self.ids, self.names, self.colors, strict=True)):
+            new_id, _ = first.setdefault(names.get(old_name, old_name), (old_id, color))
+            table[old_id] = new_id
+        ids, colors = zip(*first.values(), strict=True)
+        return LabelSet(self.name, ids, tuple(first), colors, self.ignore_id), table
 
     def channel_map_from(self, other: LabelSet) -> NDArray[np.int64]:
         """For each id 0..255 of ``other``: this set's channel of the class with the same name, else -1."""

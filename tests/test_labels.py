@@ -82,6 +82,20 @@ def test_channels_of_another_set_are_found_by_name() -> None:
     assert table[NYU40.ignore_id] == -1
 
 
+def test_classes_that_get_one_name_become_one_class() -> None:
+    flat = make_label_set("flat", ["couch", "armchair", "lamp", "sofa"], ids=[9, 4, 2, 6], ignore_id=0)
+    merged, table = flat.renamed({"couch": "sofa", "armchair": "sofa"})
+    assert dict(zip(merged.names, merged.ids, strict=True)) == {"lamp": 2, "sofa": 4}
+    assert table[[9, 4, 6, 2, 0, 77]].tolist() == [4, 4, 4, 2, 0, 77]
+    assert merged.colors == (flat.colors[2], flat.colors[1])
+    merged.to_channels(table[np.array([9, 4, 2, 6, 0], np.uint8)])
+
+
+def test_a_class_to_rename_must_exist() -> None:
+    with pytest.raises(LabelError, match=r"no classes \['sofa'\] to rename"):
+        GAPS.renamed({"sofa": "couch"})
+
+
 def test_scannet20_has_its_published_ids() -> None:
     by_id = dict(zip(SCANNET20.ids, SCANNET20.names, strict=True))
     assert by_id[24] == "refrigerator" and by_id[28] == "showercurtain" and by_id[39] == "otherfurniture"

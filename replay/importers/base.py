@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic_mapper.config import Config
 from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LabelError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
@@ -37,6 +38,12 @@ class ImportOptions:
     frame_hz: float | None = None
     max_frames: int | None = None
     match_s: float = 0.02
+
+
+class RenameConfig(Config, frozen=True):
+    """A file of class names."""
+
+    classes: dict[str, str]  # new name of each class to rename, by the recording's name for it
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from replay.importers.base import BadFrameError, ImportOptions, ImportReport, Recording, Skipped
@@ -12,8 +12,9 @@ from replay.importers.folder import FolderRecording
 from replay.importers.scannet import ScanNetRecording
 from replay.importers.tum import TumRecording
 from replay.log import LogWriter
-from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LogError
+from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LabelError, LogError
 from semantic_mapper.transport.codec import CodecOptions
+from semantic_mapper.types import UInt8
 
 FORMATS: dict[str, Callable[[Path, ImportOptions], Recording]] = {
     "folder": FolderRecording,
@@ -59,6 +60,7 @@ def import_recording(
     on_progress: Callable[[int, int], None] | None = None,
     *,
     options: ImportOptions = _DEFAULTS,
+    renames: Mapping[str, str] | None = None,
     codec: CodecOptions | None = None,
 ) -> ImportReport:
     """Write the recording in folder ``src`` to the log ``dst``, which is replaced only by a complete import.
@@ -71,10 +73,12 @@ def import_recording(
         format_name: "folder", "tum" or "scannet"; None = found out.
         on_progress: Called with (frames looked at, frames in all).
         options: How to read.
+        renames: New names of classes by their present ones; classes of one name become one class.
         codec: How to pack; lossless by default, images that are JPEG or PNG files stay what they are.
 
     Raises:
         ImportSourceError: not such a recording, or not one good frame in it.
+        LabelError: a class to rename that the recording does not have.
         LogError: ``dst`` cannot be written.
     """
     name = format_name or detect_format(src)
@@ -85,11 +89,17 @@ def import_recording(
     recording = FORMATS[name](src, options)
     total = len(recording) if options.max_frames is None else min(len(recording), options.max_frames)
     info = dataclasses.replace(recording.info, frame_count=None)  # what the log holds counts, not what the folder did
+    new_ids = None
+    if renames:
+        if info.label_set is None:
+            raise LabelError(f"{src}: there are no classes to rename, it has no labels")
+        label_set, new_ids = info.label_set.renamed(renames)
+        info = dataclasses.replace(info, label_set=label_set)
     packing = codec or CodecOptions(depth_scale=recording.depth_scale)
     unfinished = dst.with_name(f".{dst.name}.importing")
     try:
         with LogWriter(unfinished, info, options=packing, overwrite=True) as writer:
-            labelled, skipped = _copy(recording, writer, total, on_progress, keep_files=codec is None)
+            labelled, skipped = _copy(recording, writer, total, new_ids, on_progress, keep_files=codec is None)
             frames = writer.frames
         if frames == 0:
             reasons = "; ".join(f"{s.file}: {s.reason}" for s in skipped[:3])
@@ -106,6 +116,7 @@ def _copy(
     recording: Recording,
     writer: LogWriter,
     total: int,
+    new_ids: UInt8 | None,
     on_progress: Callable[[int, int], None] | None,
     *,
     keep_files: bool,
@@ -115,7 +126,10 @@ def _copy(
     for number in range(total):
         try:
             loaded = recording.load(number)
-            writer.write_frame(loaded.frame, encoded_rgb=loaded.encoded_rgb if keep_files else None)
+            frame = loaded.frame
+            if new_ids is not None and frame.label is not None:
+                frame = dataclasses.replace(frame, label=new_ids[frame.label])
+            writer.write_frame(frame, encoded_rgb=loaded.encoded_rgb if keep_files else None)
         except BadFrameError as error:
             skipped.append(Skipped(error.file, error.reason, number))
         except (FrameError, CodecError) as error:
