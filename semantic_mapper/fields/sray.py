@@ -97,6 +97,17 @@ class SRay(LearnedField):
         s = sources.feature.permute(0, 2, 3, 1)
         return self.classifier(s + self.semantic(s)).permute(0, 3, 1, 2)
 
+    def seen(self, space: ContextualSpace) -> ContextualSpace:
+        """M without the views to which a sample is hidden, where some other view sees it.
+
+        Not in the paper, which leaves it to the attention to find out. A hidden view shows another surface at that
+        pixel, and within the bounds of Eq. 12 it would still weigh up to tau of a seen one.
+        """
+        if self.config.parity == "published":
+            return space
+        clear = space.valid & (space.visibility >= self.config.hidden_below)
+        return replace(space, valid=torch.where(clear.any(0), clear, space.valid))
+
     def attend(self, space: ContextualSpace) -> torch.Tensor:
         """Cross-reprojection attention: M -> M'' (m, R, N, C) (Eq. 6 to 10)."""
         x = (space.feature + self.cue_token(space.cues)).transpose(0, 1)  # (R, m, N, C)
@@ -126,7 +137,8 @@ class SRay(LearnedField):
     ) -> tuple[FieldRender, torch.Tensor]:
         """Render rays at given sample depths z (R, N) (Eq. 13); also returns the compositing weights (R, N)."""
         space = contextual_space(rays, z, sources)
-        s, colour = self.blend_views(self.attend(space), space)
+        seen = self.seen(space)
+        s, colour = self.blend_views(self.attend(seen), seen)
         sigma = self.density(space.feature, space.hit, space.visibility, space.valid, space.delta)
         interval = torch.ones_like(space.delta) if self.config.parity == "published" else space.delta
         weights = compositing_weights(sigma, interval)
@@ -155,5 +167,7 @@ def _check(config: SRayConfig) -> None:
         raise ConfigError(
             f"feature_dim must be a multiple of 4 and of heads ({config.heads}), got {config.feature_dim}"
         )
+    if not 0 <= config.hidden_below < 1:
+        raise ConfigError(f"hidden_below is a visibility and lies in [0, 1), got {config.hidden_below}")
     if not 0 < config.tau < 1:
         raise ConfigError(f"tau must lie between 0 and 1 (Eq. 12), got {config.tau}")

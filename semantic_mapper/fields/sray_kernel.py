@@ -15,89 +15,14 @@ import numba
 import numpy as np
 
 from semantic_mapper.fields.geometry_net import OWN_DENSITY_OFFSET
-from semantic_mapper.fields.kernel_math import attend, fast_exp, linear, relu, sigmoid, softplus, tanh
-from semantic_mapper.fields.projection import MIN_DEPTH_M
+from semantic_mapper.fields.kernel_math import attend, fast_exp, linear, relu, softplus, tanh
 from semantic_mapper.fields.sray import DOUBT
+from semantic_mapper.fields.sray_tokens import drop_hidden, fill_tokens, group_tokens
 from semantic_mapper.threads import parallel_kernel
 
 CUES = 4
 SCORE_HIDDEN = 16  # hidden width of ViewWeightNet
 _ZERO = np.float32(0.0)
-
-
-@numba.njit(fastmath=True, nogil=True, cache=True)
-def _gather_sample(maps, geometry, j, u, v, feature, rgb, mixture):
-    """Bilinear features and colour, nearest geometry of view j at pixel (u, v), with the border repeated."""
-    height, width, channels = maps.shape[1], maps.shape[2], feature.shape[0]
-    x = min(max(u, _ZERO), np.float32(width - 1))
-    y = min(max(v, _ZERO), np.float32(height - 1))
-    x0, y0 = int(x), int(y)
-    x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
-    fx, fy = x - np.float32(x0), y - np.float32(y0)
-    w00, w01 = (1 - fx) * (1 - fy), fx * (1 - fy)
-    w10, w11 = (1 - fx) * fy, fx * fy
-    for c in range(channels):
-        feature[c] = (
-            w00 * maps[j, y0, x0, c] + w01 * maps[j, y0, x1, c] + w10 * maps[j, y1, x0, c] + w11 * maps[j, y1, x1, c]
-        )
-    for c in range(3):
-        d = channels + c
-        rgb[c] = (
-            w00 * maps[j, y0, x0, d] + w01 * maps[j, y0, x1, d] + w10 * maps[j, y1, x0, d] + w11 * maps[j, y1, x1, d]
-        )
-    row = min(max(int(np.rint(v)), 0), height - 1)
-    column = min(max(int(np.rint(u)), 0), width - 1)
-    for g in range(geometry.shape[3]):
-        mixture[g] = geometry[j, row, column, g]
-
-
-@numba.njit(inline="always", fastmath=True)
-def _cdf(mixture, z):
-    near = sigmoid((z - mixture[0]) / mixture[1])
-    far = sigmoid((z - mixture[2]) / mixture[3])
-    return mixture[4] * near + (1 - mixture[4]) * far
-
-
-@numba.njit(fastmath=True, nogil=True, cache=True)
-def _fill_tokens(
-    origin, direction, z, delta, sources, token_view, token_sample, token_label, feature, rgb, cues, mixture
-):
-    """Reproject the samples of one ray into all views (Eq. 4, 5); return the number of tokens that some view sees."""
-    maps, geometry, K, T, labels = sources
-    count = 0
-    height, width = maps.shape[1], maps.shape[2]
-    rows, columns = labels.shape[1], labels.shape[2]
-    for j in range(maps.shape[0]):
-        dx = T[j, 0, 0] * direction[0] + T[j, 0, 1] * direction[1] + T[j, 0, 2] * direction[2]
-        dy = T[j, 1, 0] * direction[0] + T[j, 1, 1] * direction[1] + T[j, 1, 2] * direction[2]
-        dz = T[j, 2, 0] * direction[0] + T[j, 2, 1] * direction[1] + T[j, 2, 2] * direction[2]
-        ox = T[j, 0, 0] * origin[0] + T[j, 0, 1] * origin[1] + T[j, 0, 2] * origin[2] + T[j, 0, 3]
-        oy = T[j, 1, 0] * origin[0] + T[j, 1, 1] * origin[1] + T[j, 1, 2] * origin[2] + T[j, 1, 3]
-        oz = T[j, 2, 0] * origin[0] + T[j, 2, 1] * origin[1] + T[j, 2, 2] * origin[2] + T[j, 2, 3]
-        length = math.sqrt(dx * dx + dy * dy + dz * dz)
-        for k in range(z.shape[0]):
-            px, py, pz = ox + z[k] * dx, oy + z[k] * dy, oz + z[k] * dz
-            if not pz > np.float32(MIN_DEPTH_M):
-                continue
-            u = K[j, 0] * px / pz + K[j, 2]
-            v = K[j, 1] * py / pz + K[j, 3]
-            if not (u > -0.5 and u < width - 0.5 and v > -0.5 and v < height - 0.5):
-                continue
-            _gather_sample(maps, geometry, j, u, v, feature[count], rgb[count], mixture)
-            half = np.float32(0.5) * delta[k]
-            cdf_near = _cdf(mixture, pz - half)
-            norm = math.sqrt(px * px + py * py + pz * pz)
-            cues[count, 0] = _cdf(mixture, pz + half) - cdf_near
-            cues[count, 1] = 1 - cdf_near
-            cues[count, 2] = (px * dx + py * dy + pz * dz) / (norm * length)
-            cues[count, 3] = math.log(mixture[1])
-            row = int(np.rint((v + np.float32(0.5)) * np.float32(rows / height) - np.float32(0.5)))
-            column = int(np.rint((u + np.float32(0.5)) * np.float32(columns / width) - np.float32(0.5)))
-            token_label[count] = labels[j, min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)]
-            token_view[count] = j
-            token_sample[count] = k
-            count += 1
-    return count
 
 
 @numba.njit(fastmath=True, nogil=True, cache=True)
@@ -255,19 +180,6 @@ def _composite(s, colour, labels, sigma, delta, z, out, rendered_colour, carried
 
 
 @numba.njit(fastmath=True, nogil=True, cache=True)
-def _group_tokens(token_view, token_sample, count, by_view, view_size, by_sample, sample_size):
-    """List the tokens of each view and of each sample."""
-    view_size[:] = 0
-    sample_size[:] = 0
-    for t in range(count):
-        j, k = token_view[t], token_sample[t]
-        by_view[j, view_size[j]] = t
-        view_size[j] += 1
-        by_sample[k, sample_size[k]] = t
-        sample_size[k] += 1
-
-
-@numba.njit(fastmath=True, nogil=True, cache=True)
 def _make_scratch(views, samples, channels, classes):
     """Buffers of one thread: tokens, their groups, attention, samples, density."""
     tokens = views * samples
@@ -304,6 +216,7 @@ def _make_scratch(views, samples, channels, classes):
             np.empty((samples, channels), np.float32),
             np.empty(samples, np.float32),  # sigma
             np.empty(samples, np.float32),  # delta
+            np.empty(samples, np.float32),  # visibility from the view that sees the sample best
         ),
         (
             np.zeros((samples, 2 * channels + 4), np.float32),
@@ -321,20 +234,20 @@ def _make_scratch(views, samples, channels, classes):
 def _render_ray(r, rays, sources, settings, weights, scratch, out):
     """One ray, from reprojection to the composited feature."""
     origin, direction, z = rays
-    heads, keep, log_ratio = settings
+    heads, keep, log_ratio, hidden_below = settings
     cue_w, cue_b, radial, cross, blend, density, semantic = weights
     (token_view, token_sample, token_label), token_data, groups, attention, blending, density_scratch = scratch
     feature, rgb, cues, mixture = token_data
     by_view, view_size, by_sample, sample_size = groups
     x, zero, qkv, mixed, score = attention
-    one, s, blended, labels, wide, refined, sigma, delta = blending
+    one, s, blended, labels, wide, refined, sigma, delta, clearest = blending
     rendered, colour, depth, opacity, known, carried = out
     samples, channels = s.shape
     norm = math.sqrt(direction[r, 0] ** 2 + direction[r, 1] ** 2 + direction[r, 2] ** 2)
     for k in range(samples - 1):
         delta[k] = (z[r, k + 1] - z[r, k]) * norm
     delta[samples - 1] = delta[samples - 2]
-    count = _fill_tokens(
+    count = fill_tokens(
         origin[r],
         direction[r],
         z[r],
@@ -349,7 +262,11 @@ def _render_ray(r, rays, sources, settings, weights, scratch, out):
         mixture,
     )
     known[r] = count > 0
-    _group_tokens(token_view, token_sample, count, by_view, view_size, by_sample, sample_size)
+    group_tokens(token_view, token_sample, count, by_view, view_size, by_sample, sample_size)
+    _carry_labels(token_label, cues, by_sample, sample_size, labels)
+    _density(feature, cues, by_sample, sample_size, delta, density, density_scratch, sigma)
+    count = drop_hidden(count, hidden_below, clearest, token_view, token_sample, feature, rgb, cues)
+    group_tokens(token_view, token_sample, count, by_view, view_size, by_sample, sample_size)
     linear(cues, count, cue_w, cue_b, x)
     for t in range(count):
         for c in range(channels):
@@ -359,8 +276,6 @@ def _render_ray(r, rays, sources, settings, weights, scratch, out):
     if cross[0].shape[0] > 0:
         _attention_layer(x, by_sample, sample_size, count, cross[0], cross[1], zero, heads, keep, qkv, mixed, score)
     _blend(x, cues, rgb, by_sample, sample_size, blend, log_ratio, one, s, blended)
-    _carry_labels(token_label, cues, by_sample, sample_size, labels)
-    _density(feature, cues, by_sample, sample_size, delta, density, density_scratch, sigma)
     linear(s, samples, semantic[0], semantic[1], wide)
     relu(wide, samples, 2 * channels)
     linear(wide, samples, semantic[2], semantic[3], refined)
@@ -378,7 +293,7 @@ def render_rays(rays, sources, settings, weights, tasks, out):
         rays: origin (R, 3), direction (R, 3), z (R, N) ascending.
         sources: maps (m, h, w, C + 3) features and colour, geometry (m, h, w, 5), K (m, 4) fx fy cx cy, T (m, 3, 4),
             known labels (m, H, W).
-        settings: heads, weight of the residual, ln(1 / tau).
+        settings: heads, weight of the residual, ln(1 / tau), visibility below which a view is left out.
         weights: See ``sray_streaming.pack_weights``.
         tasks: Number of blocks the rays are split into; each has its own scratch.
         out: rendered (R, C), colour (R, 3), depth (R,), opacity (R,), known (R,), carried labels (R, L).

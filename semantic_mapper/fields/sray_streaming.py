@@ -87,7 +87,8 @@ class StreamingSRay:
         rendered, colour = torch.empty(count, channels), torch.empty(count, 3)
         depth, opacity, known = torch.empty(count), torch.empty(count), torch.empty(count, dtype=torch.bool)
         carried = torch.empty(count, len(self.label_set))
-        keep = 1.0 if self.model.config.attention_residual else 0.0
+        config = self.model.config
+        keep = 1.0 if config.attention_residual else 0.0
         poses = sources.T_camera_world[:, :3, :]
         maps = torch.cat((sources.feature, sources.rgb), dim=1).permute(0, 2, 3, 1)
         K = torch.stack((sources.K[:, 0, 0], sources.K[:, 1, 1], sources.K[:, 0, 2], sources.K[:, 1, 2]), dim=1)
@@ -100,7 +101,7 @@ class StreamingSRay:
                 _array(poses),
                 sources.channel.numpy(),
             ),
-            (self.model.config.heads, np.float32(keep), np.float32(math.log(1 / self.model.config.tau))),
+            (config.heads, np.float32(keep), np.float32(math.log(1 / config.tau)), np.float32(config.hidden_below)),
             self._weights,
             TASKS_PER_THREAD * numba.get_num_threads(),
             tuple(t.numpy() for t in (rendered, colour, depth, opacity, known, carried)),

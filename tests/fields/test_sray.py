@@ -107,6 +107,25 @@ def test_a_ray_that_no_view_sees_is_unknown():
     torch.testing.assert_close(away.entropy, torch.full_like(away.entropy, torch.log(torch.tensor(3.0)).item()))
 
 
+def test_a_view_is_left_out_where_the_sample_is_hidden_from_it_and_not_from_others():
+    field = small_field()
+    views = wall_sources(POSES)
+    depth_m = views.depth_m.clone()
+    depth_m[3] = 0.5 * WALL_M  # something stands before this camera
+    encoded = field.encode(replace(views, depth_m=depth_m))
+    rays = wall_rays(pose_at(0.0), step=31)
+    z = torch.tensor([[0.98 * WALL_M, 1.01 * WALL_M, 1.3 * WALL_M]]).expand(len(rays.origin), 3)
+    space = contextual_space(rays, z, encoded)
+    seen = field.seen(space).valid
+    inside = space.valid.all(0)
+    assert inside.float().mean() > 0.5
+    on_wall, behind = inside[:, :2], inside[:, 2]
+    assert seen[:3, :, :2][:, on_wall].all() and not seen[3, :, :2][on_wall].any()
+    assert seen[:, :, 2][:, behind].all()  # hidden from all: any view is better than none
+    keep_all = small_field(hidden_below=0.0)
+    assert torch.equal(keep_all.seen(space).valid, space.valid)
+
+
 def test_a_blind_view_changes_nothing():
     field = small_field()
     seeing = field.encode(wall_sources(POSES))
@@ -169,11 +188,12 @@ def test_mismatched_sources_give_a_shape_error():
         {"intra_view_attention": False},
         {"cross_view_attention": False},
         {"attention_residual": False},
+        {"hidden_below": 0.0},
         {"intra_view_attention": False, "cross_view_attention": False},
     ],
 )
 @pytest.mark.parametrize("guided", [True, False])
-def test_streaming_renderer_equals_the_reference_at_the_same_samples(changes: dict[str, bool], guided: bool):
+def test_streaming_renderer_equals_the_reference_at_the_same_samples(changes: dict[str, float], guided: bool):
     field = small_field(3, **changes)
     for p in field.parameters():
         p.data += 0.05 * torch.randn_like(p)
