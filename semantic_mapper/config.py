@@ -43,7 +43,7 @@ class SRayConfig(Config, frozen=True):
     positional_encoding: bool = False  # sinusoid along the ray; the paper uses none
     intra_view_attention: bool = True  # Eq. 6 to 9
     cross_view_attention: bool = True  # Eq. 10
-    hidden_below: float = 0.05  # views from which a sample has less visibility are left out; 0 = none, as in the paper
+    occlusion: bool = True  # views count by how much they see a sample; False = all alike, as in the paper
     source_labels: bool = True  # known labels of source views (finetuning keyframes) are part of their features
     attention_residual: bool = True  # M + f(M) instead of f(M) in Eq. 9 and 10; trains faster
     parity: Literal["paper", "published"] = "paper"  # "published": depart from the paper where its code does

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.fields.geometry_net import hit_and_visibility
+from semantic_mapper.fields.geometry_net import LEAST_VISIBILITY, hit_and_visibility
 from semantic_mapper.fields.projection import gather, reproject
 from semantic_mapper.fields.volume import interval_lengths
 from semantic_mapper.types import RayBatch
@@ -52,9 +52,6 @@ def contextual_space(rays: RayBatch, z: torch.Tensor, sources: EncodedViews) -> 
 
 
 def visibility_share(visibility: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """Weights of the views at each sample, in proportion to their visibility: (m, R, N), sum 1 over valid views.
-
-    A sample that is hidden from every view that it projects into takes all of them alike.
-    """
-    weight = (visibility + 1e-4) * valid
+    """Weights of the views at each sample, in proportion to their visibility: (m, R, N), sum 1 over valid views."""
+    weight = (visibility + LEAST_VISIBILITY) * valid
     return weight / weight.sum(0).clamp_min(1e-6)

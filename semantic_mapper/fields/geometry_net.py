@@ -18,6 +18,7 @@ OWN_DENSITY_OFFSET = 6.0  # at the start the views decide alone: 0.0025 / m of d
 MEASURED_SHIFT = 0.05  # a measured depth may be moved by at most this share
 MEASURED_SCALE = 0.01  # initial spread of a measured depth, share of z
 PREDICTED_SCALE = 0.25  # initial spread of a predicted depth, share of z
+LEAST_VISIBILITY = 1e-4  # a sample that is hidden from every view that it projects into takes all of them alike
 
 
 class GeometryInit(nn.Module):
@@ -96,7 +97,7 @@ class DensityNet(nn.Module):
             hit, visibility, valid: (m, R, N).
             delta: (R, N) interval lengths, metres.
         """
-        weight = visibility * valid + 1e-4 * valid
+        weight = (visibility + LEAST_VISIBILITY) * valid
         total = weight.sum(0).clamp_min(1e-6)  # (R, N)
         share = weight / total
         mean = torch.einsum("mrn,mrnc->rnc", share, feature)

@@ -25,7 +25,7 @@ from semantic_mapper.fields.attention import (
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.contextual import CUES, ContextualSpace, contextual_space
 from semantic_mapper.fields.encoder import ImageEncoder
-from semantic_mapper.fields.geometry_net import DensityNet, GeometryInit
+from semantic_mapper.fields.geometry_net import LEAST_VISIBILITY, DensityNet, GeometryInit
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.source_maps import check_views, depth_at, encoded_views
 from semantic_mapper.fields.view_weights import ViewWeightNet, constrained_weights, softmax_weights
@@ -34,6 +34,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
 LABEL_LOGIT = 8.0  # what full agreement of the labelled views on a class adds to its logit before any training
+HIDDEN = 0.05  # visibility below which a view is left out where another one sees the sample
 DOUBT = 0.05  # hit probability at which a label that a view carries over counts by half
 
 
@@ -58,7 +59,6 @@ class SRay(LearnedField):
         self.encoder = ImageEncoder(config.encoder, dim)
         self.geometry_init = GeometryInit(dim)
         self.density = DensityNet(dim)
-        self.cue_token = nn.Linear(CUES, dim)
         self.radial = MultiHeadAttention(dim, config.heads, published=published)
         self.cross = MultiHeadAttention(dim, config.heads, published=published)
         self.weights = ViewWeightNet(dim, CUES)
@@ -103,14 +103,14 @@ class SRay(LearnedField):
         Not in the paper, which leaves it to the attention to find out. A hidden view shows another surface at that
         pixel, and within the bounds of Eq. 12 it would still weigh up to tau of a seen one.
         """
-        if self.config.parity == "published":
+        if not self.config.occlusion or self.config.parity == "published":
             return space
-        clear = space.valid & (space.visibility >= self.config.hidden_below)
+        clear = space.valid & (space.visibility >= HIDDEN)
         return replace(space, valid=torch.where(clear.any(0), clear, space.valid))
 
     def attend(self, space: ContextualSpace) -> torch.Tensor:
         """Cross-reprojection attention: M -> M'' (m, R, N, C) (Eq. 6 to 10)."""
-        x = (space.feature + self.cue_token(space.cues)).transpose(0, 1)  # (R, m, N, C)
+        x = space.feature.transpose(0, 1)  # (R, m, N, C)
         valid = space.valid.transpose(0, 1)
         if self.config.positional_encoding or self.config.parity == "published":
             x = x + positional_encoding(x.shape[2], x.shape[3], x)
@@ -122,13 +122,20 @@ class SRay(LearnedField):
         return x.transpose(0, 1)
 
     def blend_views(self, refined: torch.Tensor, space: ContextualSpace) -> tuple[torch.Tensor, torch.Tensor]:
-        """Semantic ray s (Eq. 11, 12) and colour of each sample: (R, N, C), (R, N, 3)."""
+        """Semantic ray s (Eq. 11, 12) and colour of each sample: (R, N, C), (R, N, 3).
+
+        With ``occlusion`` the weights of Eq. 12 are times the views' visibilities: the bounds hold among views that see
+        the sample alike.
+        """
         semantic_score, colour_score = self.weights(refined, space.cues)
         colour_weight = softmax_weights(colour_score, space.valid)
         if self.config.parity == "published":
             semantic_weight = colour_weight
         else:
             semantic_weight = constrained_weights(semantic_score, space.valid, self.config.tau)
+            if self.config.occlusion:
+                semantic_weight = semantic_weight * (space.visibility + LEAST_VISIBILITY)
+                semantic_weight = semantic_weight / semantic_weight.sum(0).clamp_min(1e-12)
         s = torch.einsum("mrn,mrnc->rnc", semantic_weight, refined)
         return s, torch.einsum("mrn,mrnc->rnc", colour_weight, space.rgb)
 
@@ -167,7 +174,5 @@ def _check(config: SRayConfig) -> None:
         raise ConfigError(
             f"feature_dim must be a multiple of 4 and of heads ({config.heads}), got {config.feature_dim}"
         )
-    if not 0 <= config.hidden_below < 1:
-        raise ConfigError(f"hidden_below is a visibility and lies in [0, 1), got {config.hidden_below}")
     if not 0 < config.tau < 1:
         raise ConfigError(f"tau must lie between 0 and 1 (Eq. 12), got {config.tau}")

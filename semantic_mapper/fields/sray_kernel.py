@@ -14,9 +14,9 @@ import math
 import numba
 import numpy as np
 
-from semantic_mapper.fields.geometry_net import OWN_DENSITY_OFFSET
+from semantic_mapper.fields.geometry_net import LEAST_VISIBILITY, OWN_DENSITY_OFFSET
 from semantic_mapper.fields.kernel_math import attend, fast_exp, linear, relu, softplus, tanh
-from semantic_mapper.fields.sray import DOUBT
+from semantic_mapper.fields.sray import DOUBT, HIDDEN
 from semantic_mapper.fields.sray_tokens import drop_hidden, fill_tokens, group_tokens
 from semantic_mapper.threads import parallel_kernel
 
@@ -41,7 +41,7 @@ def _attention_layer(x, groups, sizes, count, qkv_weight, out_weight, zero_bias,
 
 
 @numba.njit(fastmath=True, nogil=True, cache=True)
-def _blend(x, cues, rgb, by_sample, sizes, weights, log_ratio, scratch, s, colour):
+def _blend(x, cues, rgb, by_sample, sizes, weights, log_ratio, occlusion, scratch, s, colour):
     """Semantic ray s and colour of each sample (Eq. 11, 12)."""
     samples, channels = by_sample.shape[0], s.shape[1]
     w1, b1, w2, b2 = weights
@@ -67,6 +67,8 @@ def _blend(x, cues, rgb, by_sample, sizes, weights, log_ratio, scratch, s, colou
                 semantic_score += scratch[1, c] * w2[c, 0]
                 colour_score += scratch[1, c] * w2[c, 1]
             scratch[2, i] = math.exp(np.float32(0.5) * log_ratio * tanh(semantic_score))
+            if occlusion:
+                scratch[2, i] *= cues[t, 1] + np.float32(LEAST_VISIBILITY)
             scratch[3, i] = colour_score
             total += scratch[2, i]
             top = max(top, colour_score)
@@ -116,11 +118,11 @@ def _density(feature, cues, by_sample, sizes, delta, weights, scratch, sigma):
         for i in range(n):
             seen += cues[by_sample[k, i], 1]
             hits += cues[by_sample[k, i], 0]
-            total += cues[by_sample[k, i], 1] + np.float32(1e-4)
+            total += cues[by_sample[k, i], 1] + np.float32(LEAST_VISIBILITY)
         total = max(total, np.float32(1e-6))
         for i in range(n):
             t = by_sample[k, i]
-            share = (cues[t, 1] + np.float32(1e-4)) / total
+            share = (cues[t, 1] + np.float32(LEAST_VISIBILITY)) / total
             for c in range(channels):
                 inputs[k, c] += share * feature[t, c]
                 inputs[k, channels + c] += share * feature[t, c] * feature[t, c]
@@ -234,8 +236,8 @@ def _make_scratch(views, samples, channels, classes):
 def _render_ray(r, rays, sources, settings, weights, scratch, out):
     """One ray, from reprojection to the composited feature."""
     origin, direction, z = rays
-    heads, keep, log_ratio, hidden_below = settings
-    cue_w, cue_b, radial, cross, blend, density, semantic = weights
+    heads, keep, log_ratio, occlusion = settings
+    radial, cross, blend, density, semantic = weights
     (token_view, token_sample, token_label), token_data, groups, attention, blending, density_scratch = scratch
     feature, rgb, cues, mixture = token_data
     by_view, view_size, by_sample, sample_size = groups
@@ -265,17 +267,17 @@ def _render_ray(r, rays, sources, settings, weights, scratch, out):
     group_tokens(token_view, token_sample, count, by_view, view_size, by_sample, sample_size)
     _carry_labels(token_label, cues, by_sample, sample_size, labels)
     _density(feature, cues, by_sample, sample_size, delta, density, density_scratch, sigma)
-    count = drop_hidden(count, hidden_below, clearest, token_view, token_sample, feature, rgb, cues)
-    group_tokens(token_view, token_sample, count, by_view, view_size, by_sample, sample_size)
-    linear(cues, count, cue_w, cue_b, x)
+    if occlusion:
+        count = drop_hidden(count, np.float32(HIDDEN), clearest, token_view, token_sample, feature, rgb, cues)
+        group_tokens(token_view, token_sample, count, by_view, view_size, by_sample, sample_size)
     for t in range(count):
         for c in range(channels):
-            x[t, c] += feature[t, c]
+            x[t, c] = feature[t, c]
     if radial[0].shape[0] > 0:
         _attention_layer(x, by_view, view_size, count, radial[0], radial[1], zero, heads, keep, qkv, mixed, score)
     if cross[0].shape[0] > 0:
         _attention_layer(x, by_sample, sample_size, count, cross[0], cross[1], zero, heads, keep, qkv, mixed, score)
-    _blend(x, cues, rgb, by_sample, sample_size, blend, log_ratio, one, s, blended)
+    _blend(x, cues, rgb, by_sample, sample_size, blend, log_ratio, occlusion, one, s, blended)
     linear(s, samples, semantic[0], semantic[1], wide)
     relu(wide, samples, 2 * channels)
     linear(wide, samples, semantic[2], semantic[3], refined)
@@ -293,7 +295,7 @@ def render_rays(rays, sources, settings, weights, tasks, out):
         rays: origin (R, 3), direction (R, 3), z (R, N) ascending.
         sources: maps (m, h, w, C + 3) features and colour, geometry (m, h, w, 5), K (m, 4) fx fy cx cy, T (m, 3, 4),
             known labels (m, H, W).
-        settings: heads, weight of the residual, ln(1 / tau), visibility below which a view is left out.
+        settings: heads, weight of the residual, ln(1 / tau), whether views count by their visibility.
         weights: See ``sray_streaming.pack_weights``.
         tasks: Number of blocks the rays are split into; each has its own scratch.
         out: rendered (R, C), colour (R, 3), depth (R,), opacity (R,), known (R,), carried labels (R, L).
@@ -301,9 +303,9 @@ def render_rays(rays, sources, settings, weights, tasks, out):
     count, samples = rays[2].shape
     views, channels = sources[0].shape[0], sources[0].shape[3] - 3
     block = (count + tasks - 1) // tasks
-    cue_w, cue_b, radial, cross, blend, density, semantic = weights  # a parallel loop takes no nested tuple
+    radial, cross, blend, density, semantic = weights  # a parallel loop takes no nested tuple
     for task in numba.prange(tasks):
-        packed = (cue_w, cue_b, radial, cross, blend, density, semantic)
+        packed = (radial, cross, blend, density, semantic)
         scratch = _make_scratch(views, samples, channels, out[5].shape[1])
         for r in range(task * block, min((task + 1) * block, count)):
             _render_ray(r, rays, sources, settings, packed, scratch, out)

@@ -101,7 +101,7 @@ class StreamingSRay:
                 _array(poses),
                 sources.channel.numpy(),
             ),
-            (config.heads, np.float32(keep), np.float32(math.log(1 / config.tau)), np.float32(config.hidden_below)),
+            (config.heads, np.float32(keep), np.float32(math.log(1 / config.tau)), config.occlusion),
             self._weights,
             TASKS_PER_THREAD * numba.get_num_threads(),
             tuple(t.numpy() for t in (rendered, colour, depth, opacity, known, carried)),
@@ -145,7 +145,7 @@ def pack_weights(model: SRay) -> tuple[Any, ...]:
         *_pair(model.density.out[2]),
     )
     semantic = (*_pair(model.semantic[0]), *_pair(model.semantic[2]))
-    return (*_pair(model.cue_token), radial, cross, blend, density, semantic)
+    return (radial, cross, blend, density, semantic)
 
 
 def _array(tensor: torch.Tensor) -> Float32:

@@ -122,7 +122,7 @@ def test_a_view_is_left_out_where_the_sample_is_hidden_from_it_and_not_from_othe
     on_wall, behind = inside[:, :2], inside[:, 2]
     assert seen[:3, :, :2][:, on_wall].all() and not seen[3, :, :2][on_wall].any()
     assert seen[:, :, 2][:, behind].all()  # hidden from all: any view is better than none
-    keep_all = small_field(hidden_below=0.0)
+    keep_all = small_field(occlusion=False)
     assert torch.equal(keep_all.seen(space).valid, space.valid)
 
 
@@ -188,12 +188,12 @@ def test_mismatched_sources_give_a_shape_error():
         {"intra_view_attention": False},
         {"cross_view_attention": False},
         {"attention_residual": False},
-        {"hidden_below": 0.0},
+        {"occlusion": False},
         {"intra_view_attention": False, "cross_view_attention": False},
     ],
 )
 @pytest.mark.parametrize("guided", [True, False])
-def test_streaming_renderer_equals_the_reference_at_the_same_samples(changes: dict[str, float], guided: bool):
+def test_streaming_renderer_equals_the_reference_at_the_same_samples(changes: dict[str, bool], guided: bool):
     field = small_field(3, **changes)
     for p in field.parameters():
         p.data += 0.05 * torch.randn_like(p)
