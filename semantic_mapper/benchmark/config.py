@@ -75,6 +75,7 @@ class SceneBudget(Config, frozen=True):
     seconds: float = 120.0  # wall clock; 0 = only steps count
     steps: int = 0  # 0 = only seconds count
     learning_rate: Positive = FinetuneConfig().learning_rate
+    encoder_rate: Share = FinetuneConfig().encoder_rate  # see ``FinetuneConfig``
     resting_share: Share = FinetuneConfig().resting_share  # see ``FinetuneConfig``
     doubtful_share: Share = StepConfig().doubtful_share  # see ``StepConfig``
     shares: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0)  # of the budget; each is a run of its own, a point of the curve

@@ -198,6 +198,7 @@ def _fit_config(suite: SuiteConfig, share: float) -> FinetuneConfig:
         steps=max(1, round(scene.steps * share)) if scene.steps else 0,
         width=suite.tier.width,
         learning_rate=scene.learning_rate,
+        encoder_rate=scene.encoder_rate,
         resting_share=scene.resting_share,
         step=StepConfig(
             sampling=suite.tier.guided if suite.depth else suite.tier.blind, doubtful_share=scene.doubtful_share

@@ -27,6 +27,7 @@ from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.doubt import with_doubt
 from semantic_mapper.training.losses import IGNORE, semantic_loss
+from semantic_mapper.training.optimiser import make_optimiser, set_rates
 from semantic_mapper.training.resting import encode_once, resting_loss
 from semantic_mapper.training.schedule import budget_fraction, cosine_rate
 from semantic_mapper.training.step import StepConfig, pick_views, training_loss
@@ -45,6 +46,7 @@ class FinetuneConfig(Config, frozen=True):
     steps: int = 0  # step budget; 0 = only seconds count
     width: int = 320  # working width of the images
     learning_rate: float = 1e-3
+    encoder_rate: Share = 1.0  # of the image encoder, as a share of it; 0 = only what reads its features learns
     final_learning_rate: float = 5e-5
     weight_decay: float = 1e-4
     gradient_clip: float = 10.0
@@ -134,7 +136,7 @@ def _run(
     on_progress: Callable[[FinetuneProgress], None] | None,
     stopped: Callable[[], object],
 ) -> tuple[_Best, int]:
-    optimiser = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
+    optimiser = make_optimiser(model, config.learning_rate, config.weight_decay)
     encoder = model.image_encoder
     if encoder is not None and encoder.uncalibrated:
         calibrate(encoder, stack_sources(train))
@@ -154,8 +156,7 @@ def _run(
         and not stopped()
     ):
         rate = cosine_rate(fraction, config.learning_rate, config.final_learning_rate)
-        for group in optimiser.param_groups:
-            group["lr"] = rate
+        set_rates(optimiser, rate, config.encoder_rate)
         query, sources = pick_views(len(train), config.step, generator)
         if encoded is not None and fraction < config.resting_share:
             loss = resting_loss(model, encoded, train, query, sources, config.step, generator)

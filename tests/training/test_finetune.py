@@ -47,6 +47,16 @@ def test_weights_are_never_worse_than_the_start_on_held_out_rays():
     assert math.isfinite(result.recipe["held_out_loss"])
 
 
+def test_an_encoder_of_rate_0_stays_what_it_was_and_the_rest_learns():
+    start = tiny_field()
+    result = finetune(tiny_frames(4), ROOMS, start, config(steps=30, encoder_rate=0.0))
+    fitted = dict(result.model.named_parameters())
+    same = {name: torch.equal(fitted[name], p) for name, p in start.named_parameters()}
+    assert result.recipe["best_step"] > 0
+    assert all(unchanged for name, unchanged in same.items() if name.startswith("encoder."))
+    assert not all(same.values())
+
+
 def test_the_encoder_may_rest_at_the_start_and_its_weights_stay_what_they_were():
     start = tiny_field()
     result = finetune(tiny_frames(4), ROOMS, start, config(steps=30, resting_share=1.0))
