@@ -1,9 +1,9 @@
 """Train S-Ray, its ablations and its peers with one budget, and compare them on the rooms of the test split.
 
-Encoders learn from single images first: one sees colours; from it grows one that sees measured depth too, where there
-is any. Each field starts from one of the two and spends the same number of steps on rays (recipes/cpu-images.toml,
-recipes/cpu-rays.toml). Every run has one CPU core, two runs go on at a time; a run that was ended goes on where it
-stopped when the same command comes again.
+Encoders learn from single images first: after a common start one goes on with colours, the other with measured depth
+too, where there is any. Each field takes one of the two over and spends the same number of steps on rays
+(recipes/cpu-images.toml, recipes/cpu-rays.toml), so every chain has the same steps. Every run has one CPU core, two
+runs go on at a time; a run that was ended goes on where it stopped when the same command comes again.
 
     python scripts/peers.py --out runs/peers [NAME...]        train, all of them without names
     python scripts/peers.py --out runs/peers --eval [NAME...] compare what is trained, with and without depth
@@ -49,8 +49,9 @@ class Run:
 
 
 RUNS = {
-    "unet": Run("unet", depth=False, images=True),
-    "unet-depth": Run("unet", depth=True, encoder="unet", images=True, steps=2800),
+    "start": Run("unet", depth=False, images=True),
+    "unet-depth": Run("unet", depth=True, encoder="start", images=True, steps=2400),
+    "unet": Run("unet", depth=False, encoder="start", images=True, steps=2400),
     "sray": Run("sray", depth=True, encoder="unet-depth"),
     "neuray": Run("neuray", depth=False, encoder="unet"),
     "sray-none": Run("sray-none", depth=True, encoder="unet-depth"),

@@ -200,6 +200,7 @@ def _with_tremor(states: Float64, rng: np.random.Generator, config: CameraPathCo
         shake[k] = keep * shake[k - 1] + np.sqrt(1 - keep**2) * shake[k]
     shift = np.clip(shake[:, :3], -3, 3) * config.tremor_m
     turn = np.radians(config.tremor_deg) * shake[:, 3:]
+    turn[:, 2] += np.radians(config.roll_deg)
     return np.array(
         [
             pose_of(state[:3] + shift[k], state[3] + turn[k, 0], state[4] + turn[k, 1], turn[k, 2])

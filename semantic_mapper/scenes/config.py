@@ -37,6 +37,7 @@ class CameraPathConfig(Config, frozen=True):
     clearance_m: float = 0.3  # to walls and furniture
     tremor_m: float = 0.004
     tremor_deg: float = 0.6
+    roll_deg: float = 0.0  # by which the camera is mounted askew
 
 
 class NoiseConfig(Config, frozen=True):

@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 from semantic_mapper.config import Config
 from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.scenes import TRAIN_SEEDS, CameraPathConfig, NoiseConfig, room_frames
+from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
+from semantic_mapper.training.cameras import CameraDraw, draw_camera
 from semantic_mapper.training.losses import IGNORE
 from semantic_mapper.training.room_feed import open_feed
 from semantic_mapper.training.views import LabelledView, view_from_frame
 from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
 
-FOCAL_SHARE = 0.69  # focal length over width: an OAK-D at 1280 pixels has 882.5
-ASPECT = 0.75
 CPU = torch.device("cpu")
 
 _log = structlog.get_logger(__name__)
@@ -40,6 +39,7 @@ class RoomPoolConfig(Config, frozen=True):
     draws_per_room: int = 6  # a new room replaces the oldest after this many draws
     step_m_min: float = 0.08  # way between two views of a room, drawn between these
     step_m_max: float = 0.35
+    camera: CameraDraw = CameraDraw()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,12 +84,11 @@ def pack_room(seed: int, config: RoomPoolConfig) -> PackedRoom | str:
     """Render one room's views; everything follows from the seed. A room that cannot be made gives the reason."""
     generator = torch.Generator().manual_seed(seed)
     u = float(torch.rand(1, generator=generator))
-    path = CameraPathConfig(step_m=config.step_m_min + u * (config.step_m_max - config.step_m_min))
-    height = round(config.width * ASPECT)
-    focal = FOCAL_SHARE * config.width
-    intrinsics = CameraIntrinsics(focal, focal, (config.width - 1) / 2, (height - 1) / 2, config.width, height)
+    step_m = config.step_m_min + u * (config.step_m_max - config.step_m_min)
+    camera = draw_camera(seed, config.width, step_m, config.camera)
+    how = {"path": camera.path, "noise": camera.noise, "pose_noise": camera.pose_noise}
     try:
-        frames = list(room_frames(seed, config.views, intrinsics, path=path, noise=NoiseConfig()))
+        frames = list(room_frames(seed, config.views, camera.intrinsics, **how))
     except SemanticMapperError as error:
         return f"room {seed}: {error}"
     views = [view_from_frame(f, ROOMS, config.width) for f in frames]
