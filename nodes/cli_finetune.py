@@ -17,9 +17,14 @@ def finetune(
     log: Annotated[Path, typer.Argument(help="Log with label images (.mcap).")],
     keyframes: Annotated[int, typer.Option("--keyframes", min=2, help="How many labelled frames to use.")],
     out: Annotated[Path, typer.Option("--out", help="Weights file to write (.safetensors).")],
-    seconds: Annotated[float, typer.Option(min=0, help="Time for training; 0 = only --steps counts.")] = 300.0,
-    steps: Annotated[int, typer.Option(min=0, help="Steps of training; 0 = only --seconds counts.")] = 0,
-    seed: Annotated[int, typer.Option(help="Of everything that is drawn at random.")] = 0,
+    seconds: Annotated[
+        float | None, typer.Option(min=0, help="Time for training [300]; 0 = only --steps counts.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=0, help="Steps of training; 0 = only --seconds counts.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of everything that is drawn at random [0].")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="TOML file with a FinetuneConfig; options here go before it.")
+    ] = None,
     weights: Annotated[
         Path | None, typer.Option(help="Weights to start from; without it the small ones in the package.")
     ] = None,
@@ -33,14 +38,21 @@ def finetune(
 
     Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors
     """
-    if seconds == 0 and steps == 0:
-        raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
     if from_scratch and weights is not None:
         raise typer.BadParameter("goes with random weights only", param_hint="--weights")
     output = Output.guarded()
-    from nodes.finetuning import FinetuneRequest, finetune_log
+    import msgspec
 
-    request = FinetuneRequest(log, keyframes, out, seconds, steps, seed, weights, from_scratch)
+    from nodes.finetuning import FinetuneRequest, finetune_log
+    from semantic_mapper.config import load_config
+    from semantic_mapper.training.finetune import FinetuneConfig
+
+    given = {"seconds": seconds, "steps": steps, "seed": seed}
+    settings = load_config(config, FinetuneConfig) if config is not None else FinetuneConfig()
+    settings = msgspec.structs.replace(settings, **{name: v for name, v in given.items() if v is not None})
+    if settings.seconds == 0 and settings.steps == 0:
+        raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
+    request = FinetuneRequest(log, keyframes, out, settings, weights, from_scratch)
     with StopRequest() as stop, frame_progress("finetune", None, unit="%") as bar:
         checkpoint, chosen = finetune_log(request, stop, bar)
     recipe = checkpoint.recipe

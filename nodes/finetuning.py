@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import structlog
 
 from nodes.console import FrameProgress
@@ -24,14 +25,18 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class FinetuneRequest:
-    """What the verb was asked for; ``weights`` None = those in the package, ``from_scratch`` = random ones."""
+    """What the verb was asked for.
+
+    Args:
+        config: Its width 0 = the one that the weights to start from were trained at.
+        weights: To start from; None = those in the package.
+        from_scratch: Start from random ones.
+    """
 
     log: Path
     keyframes: int
     out: Path
-    seconds: float
-    steps: int
-    seed: int
+    config: FinetuneConfig
     weights: Path | None
     from_scratch: bool
 
@@ -53,7 +58,9 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
         if label_set is None:
             raise LabelError(f"{request.log}: has no label images; finetuning needs labelled keyframes")
         frames = choose_labelled(log, label_set, request, stop, bar)
-    config = FinetuneConfig(seconds=request.seconds, steps=request.steps, seed=request.seed)
+    config = request.config
+    if config.width == 0 and start is not None:
+        config = msgspec.structs.replace(config, width=start.width)
     bar.start(100)
 
     def on_progress(progress: FinetuneProgress) -> None:
@@ -110,7 +117,7 @@ def choose_labelled(
             f"{request.log}: {len(candidates)} of its {len(log)} frames have usable labels; "
             f"--keyframes {request.keyframes} is more than that"
         )
-    return [log.frame(numbers[i]) for i in choose_keyframes(candidates, request.keyframes, request.seed)]
+    return [log.frame(numbers[i]) for i in choose_keyframes(candidates, request.keyframes, request.config.seed)]
 
 
 def _check_size(frame: PosedFrame, size: tuple[int, int]) -> None:

@@ -199,6 +199,7 @@ def _fit_config(suite: SuiteConfig, share: float) -> FinetuneConfig:
         width=suite.tier.width,
         learning_rate=scene.learning_rate,
         encoder_rate=scene.encoder_rate,
+        patience=scene.patience,
         resting_share=scene.resting_share,
         step=StepConfig(
             sampling=suite.tier.guided if suite.depth else suite.tier.blind, doubtful_share=scene.doubtful_share

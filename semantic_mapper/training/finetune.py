@@ -9,6 +9,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,22 +17,30 @@ import numpy as np
 import structlog
 import torch
 
-from semantic_mapper.config import Config, Share, SRayConfig, to_plain
+from semantic_mapper.config import Config, NotNegative, Share, SRayConfig, to_plain
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.base import MAX_SOURCE_VIEWS
-from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, anchor_from_frame
+from semantic_mapper.fields.checkpoint import DEFAULT_WIDTH, Checkpoint, adapt_model, anchor_from_frame
 from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.training.device import encoder_in_bfloat16
 from semantic_mapper.training.doubt import with_doubt
 from semantic_mapper.training.losses import IGNORE, semantic_loss
 from semantic_mapper.training.optimiser import make_optimiser, set_rates
 from semantic_mapper.training.resting import encode_once, resting_loss
 from semantic_mapper.training.schedule import budget_fraction, cosine_rate
 from semantic_mapper.training.step import StepConfig, pick_views, training_loss
-from semantic_mapper.training.views import LabelledView, draw_pixels, query_rays, stack_sources, view_from_frame
+from semantic_mapper.training.views import (
+    LabelledView,
+    draw_pixels,
+    query_rays,
+    stack_sources,
+    to_device,
+    view_from_frame,
+)
 from semantic_mapper.types import PosedFrame
 
 _log = structlog.get_logger(__name__)
@@ -44,7 +53,7 @@ class FinetuneConfig(Config, frozen=True):
 
     seconds: float = 300.0  # wall-clock budget; 0 = only steps count (then a run repeats bit for bit)
     steps: int = 0  # step budget; 0 = only seconds count
-    width: int = 320  # working width of the images
+    width: NotNegative = 0  # of the images, best that which the start was trained at; 0 = 320
     learning_rate: float = 1e-3
     encoder_rate: Share = 1.0  # of the image encoder, as a share of it; 0 = only what reads its features learns
     final_learning_rate: float = 5e-5
@@ -53,7 +62,8 @@ class FinetuneConfig(Config, frozen=True):
     held_out_share: float = 0.1  # of each keyframe's pixels, in blocks, never trained on
     held_out_rays: int = 512  # a keyframe
     evaluations: int = 10  # over the whole budget
-    patience: int = 4  # evaluations without a better loss before it stops early
+    patience: int = 4  # evaluations without a better loss before it stops early; 0 = the whole budget, come what may
+    bfloat16: bool = True  # the image encoder computes in it where that is fast (GPUs, CPUs with AMX)
     resting_share: Share = 0.0  # of the budget, at its start, in which the image encoder rests: steps cost a third
     seed: int = 0
     step: StepConfig = StepConfig()
@@ -107,14 +117,17 @@ def finetune(
     torch.manual_seed(config.seed)
     generator = torch.Generator().manual_seed(config.seed)
     model = SRay(SRayConfig(), label_set) if start is None else adapt_model(start, label_set)
-    views = [view_from_frame(f, label_set, config.width) for f in frames]
+    width = config.width or DEFAULT_WIDTH
+    views = [view_from_frame(f, label_set, width) for f in frames]
     train, held_out = zip(*(_split(v, config.held_out_share, generator) for v in views), strict=True)
+    device = next(model.parameters()).device
     began = time.monotonic()
-    best, steps = _run(model, train, held_out, config, generator, on_progress, stopped)
+    with encoder_in_bfloat16(model, device) if config.bfloat16 else nullcontext():
+        best, steps = _run(model, train, held_out, config, generator, on_progress, stopped)
     model.load_state_dict(best.state)
     recipe: dict[str, Any] = {
         "kind": "finetune",
-        "width": config.width,
+        "width": width,
         "config": to_plain(config),
         "steps": steps,
         "best_step": best.step,
@@ -123,7 +136,7 @@ def finetune(
         "held_out_accuracy": best.accuracy,
         "train_stamps_ns": sorted({int(f.stamp_ns) for f in frames} | {int(s) for s in seen_stamps_ns}),
     }
-    anchors = tuple(anchor_from_frame(f, config.width) for f in frames)
+    anchors = tuple(anchor_from_frame(f, width) for f in frames)
     return Checkpoint(model.eval(), anchors, recipe)
 
 
@@ -139,7 +152,7 @@ def _run(
     optimiser = make_optimiser(model, config.learning_rate, config.weight_decay)
     encoder = model.image_encoder
     if encoder is not None and encoder.uncalibrated:
-        calibrate(encoder, stack_sources(train))
+        calibrate(encoder, to_device(stack_sources(train), next(model.parameters()).device))
     # A kind that classifies while it encodes has nothing to learn where its features are kept.
     rests = config.resting_share > 0 and not model.needs_own_view
     encoded = encode_once(model, train) if rests else None
@@ -152,7 +165,7 @@ def _run(
     began, step, evaluated, stale = time.monotonic(), 0, 0, 0
     while (
         (fraction := budget_fraction(step, time.monotonic() - began, steps=config.steps, seconds=config.seconds)) < 1
-        and stale < config.patience
+        and (config.patience == 0 or stale < config.patience)
         and not stopped()
     ):
         rate = cosine_rate(fraction, config.learning_rate, config.final_learning_rate)
@@ -208,11 +221,12 @@ def _evaluate(
     """Class loss and accuracy of held-out rays, each view rendered from all others and their training labels."""
     generator = torch.Generator().manual_seed(config.seed)
     sampling = config.step.sampling
+    device = next(model.parameters()).device
     losses: list[float] = []
     right, counted = 0, 0
     model.eval()
     with torch.inference_mode():
-        encoded = model.encode(stack_sources(train, with_labels=True))
+        encoded = model.encode(to_device(stack_sources(train, with_labels=True), device))
         for i, view in enumerate(held_out):
             flat = draw_pixels(view.channel, config.held_out_rays, 0.5, generator, len(model.label_set))
             if len(flat) == 0:
@@ -221,7 +235,13 @@ def _evaluate(
             rays, targets = query_rays(view, flat, near_m=sampling.near_m, far_m=sampling.far_m, prior=prior)
             own = model.needs_own_view
             others = torch.tensor([j for j in range(len(held_out)) if (j == i) == own][:MAX_SOURCE_VIEWS])
-            render, _ = model.render_samples(rays, sample_guided(rays, sampling), encoded.select(others))
+            chosen = encoded.select(others.to(device))
+            rays, z, targets = (
+                to_device(rays, device),
+                sample_guided(rays, sampling).to(device),
+                to_device(targets, device),
+            )
+            render, _ = model.render_samples(rays, z, chosen)
             losses.append(float(semantic_loss(render.logits, targets.channel)))
             right += int((render.logits.argmax(1) == targets.channel).sum())
             counted += len(flat)

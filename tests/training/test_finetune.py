@@ -9,10 +9,11 @@ from semantic_mapper.config import convert_config
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.training import device
 from semantic_mapper.training.doubt import LEAST, with_doubt
 from semantic_mapper.training.finetune import FinetuneConfig, finetune
 from semantic_mapper.training.select import Candidate, candidate_from_frame, choose_keyframes
-from semantic_mapper.training.views import view_from_frame
+from semantic_mapper.training.views import stack_sources, view_from_frame
 from tests.small import tiny_field, tiny_frames
 
 
@@ -45,6 +46,32 @@ def test_weights_are_never_worse_than_the_start_on_held_out_rays():
         fitted = dict(result.model.named_parameters())
         assert all(torch.equal(fitted[name], p) for name, p in start.named_parameters())
     assert math.isfinite(result.recipe["held_out_loss"])
+
+
+def test_the_encoder_computes_as_before_once_bfloat16_is_over(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(device, "bfloat16_is_fast", lambda _: True)
+    field = tiny_field().eval()
+    views = stack_sources([view_from_frame(f, ROOMS, 96) for f in tiny_frames(2)])
+    with torch.inference_mode():
+        exact = field.encode(views).feature
+        with device.encoder_in_bfloat16(field, torch.device("cpu")):
+            rounded = field.encode(views).feature
+        again = field.encode(views).feature
+    assert torch.equal(exact, again) and rounded.dtype == torch.float32
+    assert 0 < (rounded - exact).abs().max() < 0.1 * exact.abs().max()
+
+
+def test_without_patience_a_budget_is_spent_to_its_end():
+    hopeless = {"learning_rate": 30.0, "final_learning_rate": 30.0, "gradient_clip": 1e9, "evaluations": 10}
+    assert finetune(tiny_frames(3), ROOMS, tiny_field(), config(steps=20, patience=2, **hopeless)).recipe["steps"] < 20
+    spent = finetune(tiny_frames(3), ROOMS, tiny_field(), config(steps=20, patience=0, **hopeless)).recipe
+    assert spent["steps"] == 20
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU on this machine")
+def test_finetuning_runs_on_a_gpu():
+    result = finetune(tiny_frames(3), ROOMS, tiny_field().to("cuda"), config(steps=4, step={"doubtful_share": 0.5}))
+    assert result.recipe["steps"] == 4 and math.isfinite(result.recipe["held_out_loss"])
 
 
 def test_an_encoder_of_rate_0_stays_what_it_was_and_the_rest_learns():
