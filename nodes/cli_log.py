@@ -26,13 +26,17 @@ def import_(
     rename: Annotated[
         Path | None, typer.Option(help='TOML: [classes] couch = "sofa", ...; classes that get one name become one.')
     ] = None,
+    rotate: Annotated[
+        Literal["0", "90", "180", "270"], typer.Option(help="Turn every image clockwise by so many degrees.")
+    ] = "0",
 ) -> None:
     """Make a log of a recording: sequence folder, TUM RGB-D, or exported ScanNet.
 
-    Frames that cannot be used are left out, each with its file and the reason.
+    Frames that cannot be used are left out, each with its file and the reason. --rotate is for cameras that are mounted
+    on their side: the weights know upright rooms. Poses and intrinsics turn with the images.
 
     Example: semantic-mapper import path/to/redkitchen kitchen.mcap
-    Example: semantic-mapper import path/to/adt_apartment flat.mcap --rename recipes/classes/adt-to-rooms.toml
+    Example: semantic-mapper import path/to/adt flat.mcap --rotate 90 --rename recipes/classes/adt-to-rooms.toml
     """
     output = Output.guarded()
     from replay.importers import ImportOptions, RenameConfig, import_recording
@@ -48,7 +52,7 @@ def import_(
                 bar.start(total)
             bar.set(done)
 
-        options = ImportOptions(max_frames=max_frames or None)
+        options = ImportOptions(max_frames=max_frames or None, quarters=int(rotate) // 90)
         report = import_recording(source, log, format, on_progress, options=options, renames=renames)
     labels = "no labels" if not report.labelled else f"{report.labelled} of them labelled"
     output.print(f"{log}: {report.frames} frames ({labels}), {report.bytes / 1e6:.1f} MB, from a '{report.format}'")

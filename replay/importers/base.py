@@ -31,12 +31,14 @@ class ImportOptions:
         frame_hz: Rate from which stamps are made where the recording has none; None = what the format has (folder 6,
             scannet 30).
         max_frames: Stop after this many frames; None = all.
+        quarters: Turn every image clockwise by so many quarters of a full turn: for a camera mounted on its side.
         match_s: TUM: largest time between a colour image, its depth image and its pose.
     """
 
     camera_id: str = "camera"
     frame_hz: float | None = None
     max_frames: int | None = None
+    quarters: int = 0
     match_s: float = 0.02
 
 

@@ -14,7 +14,8 @@ from replay.importers.tum import TumRecording
 from replay.log import LogWriter
 from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LabelError, LogError
 from semantic_mapper.transport.codec import CodecOptions
-from semantic_mapper.types import UInt8
+from semantic_mapper.turning import turned_frame, turned_intrinsics
+from semantic_mapper.types import PosedFrame
 
 FORMATS: dict[str, Callable[[Path, ImportOptions], Recording]] = {
     "folder": FolderRecording,
@@ -88,7 +89,9 @@ def import_recording(
         raise ImportSourceError(f"{src}: no such folder")
     recording = FORMATS[name](src, options)
     total = len(recording) if options.max_frames is None else min(len(recording), options.max_frames)
-    info = dataclasses.replace(recording.info, frame_count=None)  # what the log holds counts, not what the folder did
+    cameras = {camera: turned_intrinsics(k, options.quarters) for camera, k in recording.info.cameras.items()}
+    # What the log holds counts, not what the folder did.
+    info = dataclasses.replace(recording.info, cameras=cameras, frame_count=None)
     new_ids = None
     if renames:
         if info.label_set is None:
@@ -96,10 +99,18 @@ def import_recording(
         label_set, new_ids = info.label_set.renamed(renames)
         info = dataclasses.replace(info, label_set=label_set)
     packing = codec or CodecOptions(depth_scale=recording.depth_scale)
+
+    def changed(frame: PosedFrame) -> PosedFrame:
+        turned = turned_frame(frame, options.quarters)
+        if new_ids is None or turned.label is None:
+            return turned
+        return dataclasses.replace(turned, label=new_ids[turned.label])
+
     unfinished = dst.with_name(f".{dst.name}.importing")
     try:
         with LogWriter(unfinished, info, options=packing, overwrite=True) as writer:
-            labelled, skipped = _copy(recording, writer, total, new_ids, on_progress, keep_files=codec is None)
+            keep_files = codec is None and options.quarters % 4 == 0
+            labelled, skipped = _copy(recording, writer, total, changed, on_progress, keep_files=keep_files)
             frames = writer.frames
         if frames == 0:
             reasons = "; ".join(f"{s.file}: {s.reason}" for s in skipped[:3])
@@ -116,7 +127,7 @@ def _copy(
     recording: Recording,
     writer: LogWriter,
     total: int,
-    new_ids: UInt8 | None,
+    changed: Callable[[PosedFrame], PosedFrame],
     on_progress: Callable[[int, int], None] | None,
     *,
     keep_files: bool,
@@ -126,10 +137,7 @@ def _copy(
     for number in range(total):
         try:
             loaded = recording.load(number)
-            frame = loaded.frame
-            if new_ids is not None and frame.label is not None:
-                frame = dataclasses.replace(frame, label=new_ids[frame.label])
-            writer.write_frame(frame, encoded_rgb=loaded.encoded_rgb if keep_files else None)
+            writer.write_frame(changed(loaded.frame), encoded_rgb=loaded.encoded_rgb if keep_files else None)
         except BadFrameError as error:
             skipped.append(Skipped(error.file, error.reason, number))
         except (FrameError, CodecError) as error:

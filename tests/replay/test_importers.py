@@ -38,6 +38,11 @@ def imported(src: Path, **options: object) -> tuple[ImportReport, LogReader]:
     return report, LogReader(dst)
 
 
+def import_to(src: Path, dst: Path) -> Path:
+    import_recording(src, dst)
+    return dst
+
+
 def reasons(report: ImportReport) -> dict[int, str]:
     return {skipped.frame: f"{skipped.file.name}: {skipped.reason}" for skipped in report.skipped}
 
@@ -82,6 +87,20 @@ def test_classes_are_renamed_and_joined_on_the_way_in(folder: Path) -> None:
     for i, frame in enumerate(log):
         assert frame.label is not None
         assert np.array_equal(frame.label, np.where(rec.label(i) == 5, 2, rec.label(i)))
+
+
+def test_images_of_a_camera_on_its_side_are_turned_with_their_poses(folder: Path) -> None:
+    report, log = imported(folder, quarters=1)
+    assert report.frames == 6 and not report.skipped
+    assert (log.info.cameras["camera"].width, log.info.cameras["camera"].height) == (rec.HEIGHT, rec.WIDTH)
+    upright = LogReader(import_to(folder, folder.parent / "upright.mcap"))
+    for turned, frame in zip(log, upright, strict=True):
+        assert turned.label is not None and frame.label is not None and turned.depth_m is not None
+        assert np.array_equal(turned.rgb, np.rot90(frame.rgb, -1))
+        assert np.array_equal(turned.label, np.rot90(frame.label, -1))
+        assert turned.intrinsics == log.info.cameras["camera"]
+        np.testing.assert_allclose(turned.T_world_camera[:3, 2], frame.T_world_camera[:3, 2])
+        np.testing.assert_allclose(turned.T_world_camera[:3, 1], frame.T_world_camera[:3, 0])
 
 
 def test_renaming_what_is_not_there_writes_nothing(folder: Path) -> None:
