@@ -55,7 +55,7 @@ def run_suite_verb(
     output = Output.guarded()
     paths = list(weights) or ([] if kinds else [default_checkpoint_path()])
     contestants = load_contestants(paths, kinds)
-    out = json_file or Path("runs") / f"rooms-{suite.protocol}.json"
+    out = json_file or Path("runs") / f"{_file_stem(suite)}.json"
     store, pictures = RecordStore(out.with_suffix(".jsonl")), out.with_suffix(".views")
     with StopRequest() as stop:
         with frame_progress("benchmark", None, unit="%") as bar:
@@ -77,6 +77,13 @@ def run_suite_verb(
         if stop:
             stderr_console().print(f"stopped by {stop.name}; the same command goes on from here", style="yellow")
         return stop.exit_code
+
+
+def _file_stem(suite: SuiteConfig) -> str:
+    """One file for each table that a comparison usually has."""
+    depth = "depth" if suite.depth else "no-depth"
+    views = f"{suite.baseline}-" if suite.protocol == "generalize" else ""
+    return f"rooms-{suite.split}-{suite.protocol}-{views}{depth}-{suite.tier.width}"
 
 
 def _show(bar: FrameProgress, progress: Progress) -> None:

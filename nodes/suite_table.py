@@ -9,6 +9,8 @@ from rich.table import Table
 
 from nodes.summary_table import percent
 
+STILL_RISING = 0.01  # of mIoU in the last interval of a curve
+
 
 def suite_table(found: Mapping[str, Any]) -> Table:
     """One column a weights file; rows that nothing was measured for are left out, classes come last."""
@@ -45,11 +47,17 @@ def _add_curve(table: Table, entries: Sequence[Mapping[str, Any]]) -> None:
     if not shares:
         return
     table.add_section()
-    values = [entry["figures"]["seconds_to_95_percent"] for entry in entries]
-    table.add_row("time to 95 % of the last mIoU", *("-" if v is None else f"{v:.0f} s" for v in values))
+    table.add_row("time to 95 % of the last mIoU", *(_time_to_most(entry["figures"]) for entry in entries))
     for share in shares:
         cells = [_curve_cell(curve.get(share)) for curve in curves]
         table.add_row(f"mIoU after {percent(share)} of the budget" if share else "mIoU before fitting", *cells)
+
+
+def _time_to_most(figures: Mapping[str, Any]) -> str:
+    seconds, gain = figures["seconds_to_95_percent"], figures["last_gain"]
+    if seconds is None:
+        return "-"
+    return f"{seconds:.0f} s" if gain is None or gain < STILL_RISING else f"{seconds:.0f} s (still rising)"
 
 
 def _curve_cell(point: Mapping[str, Any] | None) -> str:

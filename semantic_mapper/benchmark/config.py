@@ -12,7 +12,7 @@ from semantic_mapper.training.finetune import FinetuneConfig
 from semantic_mapper.training.step import StepConfig
 from semantic_mapper.types import CameraIntrinsics
 
-RECORD_VERSION = 2  # a change of what a record means raises it, so that older ones are made anew
+RECORD_VERSION = 3  # raised by a change of what a record means or how views are rendered: older ones are made anew
 
 FOCAL_PER_WIDTH = 882.5 / 1280  # an OAK-D at 1280 pixels
 MAP_WIDTH = 320
@@ -79,7 +79,13 @@ class SceneBudget(Config, frozen=True):
     resting_share: Share = FinetuneConfig().resting_share  # see ``FinetuneConfig``
     doubtful_share: Share = StepConfig().doubtful_share  # see ``StepConfig``
     patience: int = 0  # see ``FinetuneConfig``; by default a budget is spent to its end
-    shares: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0)  # of the budget; each is a run of its own, a point of the curve
+    shares: tuple[float, ...] = (
+        0.0625,
+        0.125,
+        0.25,
+        0.5,
+        1.0,
+    )  # of the budget; each is a run of its own, a point of the curve
 
 
 class SuiteConfig(Config, frozen=True):
@@ -112,6 +118,23 @@ def camera_of_width(width: int) -> CameraIntrinsics:
     return CameraIntrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
 
 
+def fit_config(suite: SuiteConfig, share: float) -> FinetuneConfig:
+    """How a field is fitted to one room with a share of the budget."""
+    scene = suite.scene
+    sampling = suite.tier.guided if suite.depth else suite.tier.blind
+    return FinetuneConfig(
+        seconds=scene.seconds * share,
+        steps=max(1, round(scene.steps * share)) if scene.steps else 0,
+        width=suite.tier.width,
+        learning_rate=scene.learning_rate,
+        encoder_rate=scene.encoder_rate,
+        patience=scene.patience,
+        resting_share=scene.resting_share,
+        step=StepConfig(sampling=sampling, doubtful_share=scene.doubtful_share),
+        seed=suite.seed,
+    )
+
+
 def settings_digest(suite: SuiteConfig, part: Literal["views", "map"]) -> str:
     """What tells records apart that were made in another way: 16 hex digits.
 
@@ -129,5 +152,6 @@ def settings_digest(suite: SuiteConfig, part: Literal["views", "map"]) -> str:
             plain["spacing"] = repr(SPACINGS[suite.baseline])
         else:
             del plain["baseline"]
+            plain["fit"] = to_plain(fit_config(suite, 1.0))  # with its defaults, which may change
     plain |= {"part": part, "suite_version": SUITE_VERSION, "record_version": RECORD_VERSION}
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]

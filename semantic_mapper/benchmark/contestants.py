@@ -13,6 +13,7 @@ from semantic_mapper.benchmark.protocols import Contestant
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import load_checkpoint
+from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
 
@@ -29,7 +30,10 @@ def load_contestants(paths: Sequence[Path], kinds: Sequence[str] = ()) -> list[C
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     checkpoints = [load_checkpoint(path) for path in paths]
-    digests = [hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in paths]
+    # The config too: a file of before may lack a setting, whose default changes what the weights do.
+    digests = [
+        _digest(path.read_bytes(), checkpoint.model) for path, checkpoint in zip(paths, checkpoints, strict=True)
+    ]
     if len(set(digests)) < len(digests):
         raise WeightsError("the same weights are given twice; a difference to themselves says nothing")
     names = _names(paths)
@@ -43,8 +47,12 @@ def load_contestants(paths: Sequence[Path], kinds: Sequence[str] = ()) -> list[C
 
 def _of_kind(kind: str, device: torch.device) -> Contestant:
     field = build_field(kind, {}, ROOMS).to(device).eval()
-    shape = json.dumps([kind, to_plain(field.config)], sort_keys=True)
-    return Contestant(kind, hashlib.sha256(shape.encode()).hexdigest()[:16], field)
+    return Contestant(kind, _digest(b"", field), field)
+
+
+def _digest(data: bytes, field: LearnedField) -> str:
+    shape = json.dumps([field.kind, to_plain(field.config)], sort_keys=True)
+    return hashlib.sha256(data + shape.encode()).hexdigest()[:16]
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

@@ -42,6 +42,7 @@ def view_figures(records: Sequence[RoomRecord]) -> dict[str, Any]:
         "per_room_miou": {str(r.room): c.metrics().miou for r, c in zip(records, confusions, strict=True)},
         "curve": _curve(records),
         "seconds_to_95_percent": _seconds_to_most(_curve(records)),
+        "last_gain": _last_gain(_curve(records)),
     }
 
 
@@ -109,6 +110,13 @@ def _seconds_to_most(curve: Sequence[dict[str, Any]], most: float = 0.95) -> flo
     if final is None:
         return None
     return next(p["seconds"] for p in curve if p["miou"] is not None and p["miou"] >= most * final)
+
+
+def _last_gain(curve: Sequence[dict[str, Any]]) -> float | None:
+    """mIoU that the last interval of the curve brought: where it is much, the curve had not come to its end."""
+    if len(curve) < 2 or curve[-1]["miou"] is None or curve[-2]["miou"] is None:
+        return None
+    return curve[-1]["miou"] - curve[-2]["miou"]
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

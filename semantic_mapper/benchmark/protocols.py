@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from semantic_mapper.benchmark.config import SPACINGS, SpacingConfig, SuiteConfig, settings_digest
+from semantic_mapper.benchmark.config import SPACINGS, SpacingConfig, SuiteConfig, fit_config, settings_digest
 from semantic_mapper.benchmark.predict import predict_view
 from semantic_mapper.benchmark.records import CurvePoint, RoomRecord
 from semantic_mapper.benchmark.rooms import BenchmarkRoom, as_given
@@ -26,9 +26,8 @@ from semantic_mapper.fields.checkpoint import adapt_model
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, finetune
+from semantic_mapper.training.finetune import FinetuneProgress, finetune
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
-from semantic_mapper.training.step import StepConfig
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import SourceViews
 
@@ -161,7 +160,7 @@ def _fit_and_score(
     for share in sorted(suite.scene.shares):
         start = _start(contestant.field, suite, views)
         progress = _progress(on_fit, spent, share, whole)
-        fitted = finetune(frames, ROOMS, start, _fit_config(suite, share), progress, stopped)
+        fitted = finetune(frames, ROOMS, start, fit_config(suite, share), progress, stopped)
         if stopped():
             return None
         answers = answer_from_keyframes(room, fitted.model.to(device).eval(), suite, keyframes)
@@ -189,23 +188,6 @@ def _start(field: LearnedField, suite: SuiteConfig, views: SourceViews) -> Learn
         return adapt_model(field, ROOMS)
     config = field.scene_config(views, suite.tier.guided.far_m)
     return build_field(field.kind, config, ROOMS, field.sampling).to(next(field.parameters()).device)
-
-
-def _fit_config(suite: SuiteConfig, share: float) -> FinetuneConfig:
-    scene = suite.scene
-    return FinetuneConfig(
-        seconds=scene.seconds * share,
-        steps=max(1, round(scene.steps * share)) if scene.steps else 0,
-        width=suite.tier.width,
-        learning_rate=scene.learning_rate,
-        encoder_rate=scene.encoder_rate,
-        patience=scene.patience,
-        resting_share=scene.resting_share,
-        step=StepConfig(
-            sampling=suite.tier.guided if suite.depth else suite.tier.blind, doubtful_share=scene.doubtful_share
-        ),
-        seed=suite.seed,
-    )
 
 
 def _curve_point(share: float, seconds: float, steps: int, confusion: ConfusionMatrix) -> CurvePoint:

@@ -97,7 +97,7 @@ class SRay(LearnedField):
         s = sources.feature.permute(0, 2, 3, 1)
         return self.classifier(s + self.semantic(s)).permute(0, 3, 1, 2)
 
-    def seen(self, space: ContextualSpace) -> ContextualSpace:
+    def without_hidden(self, space: ContextualSpace) -> ContextualSpace:
         """M without the views to which a sample is hidden, where some other view sees it.
 
         Not in the paper, which leaves it to the attention to find out. A hidden view shows another surface at that
@@ -144,7 +144,7 @@ class SRay(LearnedField):
     ) -> tuple[FieldRender, torch.Tensor]:
         """Render rays at given sample depths z (R, N) (Eq. 13); also returns the compositing weights (R, N)."""
         space = contextual_space(rays, z, sources)
-        seen = self.seen(space)
+        seen = self.without_hidden(space)
         s, colour = self.blend_views(self.attend(seen), seen)
         sigma = self.density(space.feature, space.hit, space.visibility, space.valid, space.delta)
         interval = torch.ones_like(space.delta) if self.config.parity == "published" else space.delta

@@ -108,7 +108,7 @@ def group_tokens(token_view, token_sample, count, by_view, view_size, by_sample,
 
 @numba.njit(fastmath=True, nogil=True, cache=True)
 def drop_hidden(count, hidden_below, clearest, token_view, token_sample, feature, rgb, cues):
-    """Move the tokens that ``SRay.seen`` keeps to the front, in their order; return how many they are.
+    """Move the tokens that ``SRay.without_hidden`` keeps to the front, in their order; return how many they are.
 
     Args:
         clearest: (N,) buffer; becomes the best visibility of each sample.

@@ -116,14 +116,14 @@ def test_a_view_is_left_out_where_the_sample_is_hidden_from_it_and_not_from_othe
     rays = wall_rays(pose_at(0.0), step=31)
     z = torch.tensor([[0.98 * WALL_M, 1.01 * WALL_M, 1.3 * WALL_M]]).expand(len(rays.origin), 3)
     space = contextual_space(rays, z, encoded)
-    seen = field.seen(space).valid
+    seen = field.without_hidden(space).valid
     inside = space.valid.all(0)
     assert inside.float().mean() > 0.5
     on_wall, behind = inside[:, :2], inside[:, 2]
     assert seen[:3, :, :2][:, on_wall].all() and not seen[3, :, :2][on_wall].any()
     assert seen[:, :, 2][:, behind].all()  # hidden from all: any view is better than none
     keep_all = small_field(occlusion=False)
-    assert torch.equal(keep_all.seen(space).valid, space.valid)
+    assert torch.equal(keep_all.without_hidden(space).valid, space.valid)
 
 
 def test_a_blind_view_changes_nothing():
