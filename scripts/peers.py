@@ -6,7 +6,7 @@ too, where there is any. Each field takes one of the two over and spends the sam
 runs go on at a time; a run that was ended goes on where it stopped when the same command comes again.
 
     python scripts/peers.py --out runs/peers [NAME...]        train, all of them without names
-    python scripts/peers.py --out runs/peers --eval [NAME...] compare what is trained, with and without depth
+    python scripts/peers.py --out runs/peers --eval [NAME...] compare them, with and without depth
 """
 
 from __future__ import annotations
@@ -48,10 +48,11 @@ class Run:
     steps: int = 0
 
 
+START = "start"  # what both encoders have in common; nothing to compare
 RUNS = {
-    "start": Run("unet", depth=False, images=True),
-    "unet-depth": Run("unet", depth=True, encoder="start", images=True, steps=2400),
-    "unet": Run("unet", depth=False, encoder="start", images=True, steps=2400),
+    START: Run("unet", depth=False, images=True),
+    "unet-depth": Run("unet", depth=True, encoder=START, images=True, steps=2400),
+    "unet": Run("unet", depth=False, encoder=START, images=True, steps=2400),
     "sray": Run("sray", depth=True, encoder="unet-depth"),
     "neuray": Run("neuray", depth=False, encoder="unet"),
     "sray-none": Run("sray-none", depth=True, encoder="unet-depth"),
@@ -79,16 +80,24 @@ def recipe(name: str, seed: int, steps: int) -> str:
     return "\n".join(lines) + "\n"
 
 
+def finished(folder: Path) -> bool:
+    """Whether a run has used up its budget; its weights lie there long before."""
+    state = folder / STATE_FILE
+    return state.is_file() and unfinished_step(state) is None
+
+
 def train(name: str, out: Path, seed: int, steps: int) -> int:
     """Train one run, or go on with it; returns the exit code of the command."""
     folder = out / name
-    state = folder / STATE_FILE
-    if state.is_file() and unfinished_step(state) is None:
+    state, config, wanted = folder / STATE_FILE, folder / "recipe.toml", recipe(name, seed, steps)
+    if state.is_file() and config.read_text(encoding="utf-8") != wanted:
+        print(f"{name}: {config} differs from what is asked for (--seed, --steps?); take another --out", flush=True)
+        return 1
+    if finished(folder):
         print(f"{name}: done", flush=True)
         return 0
     folder.mkdir(parents=True, exist_ok=True)
-    config = folder / "recipe.toml"
-    config.write_text(recipe(name, seed, steps), encoding="utf-8")
+    config.write_text(wanted, encoding="utf-8")
     command = [COMMAND, "train", "--config", str(config), "--out", str(folder)]
     if RUNS[name].encoder:
         command += ["--encoder", str(out / RUNS[name].encoder / WEIGHTS_FILE)]
@@ -129,8 +138,12 @@ def train_all(names: list[str], out: Path, seed: int, steps: int, jobs: int) -> 
 
 
 def compare(names: list[str], out: Path) -> int:
-    """All figures of what is trained, with and without depth."""
-    weights = [file for name in names if (file := out / name / WEIGHTS_FILE).is_file()]
+    """All figures of these runs, with and without depth; nothing where one of them is not finished."""
+    missing = [name for name in names if not finished(out / name)]
+    if missing:
+        print(f"not trained to the end in {out}: {', '.join(missing)}; train them, or name the others", flush=True)
+        return 1
+    weights = [out / name / WEIGHTS_FILE for name in names]
     for depth in ("on", "off"):
         command = [COMMAND, "eval", "--suite", "rooms", "--depth", depth, "--json", str(out / f"depth-{depth}.json")]
         for file in weights:
@@ -154,7 +167,7 @@ def main() -> int:
     unknown = sorted(set(given.names) - set(RUNS))
     if unknown:
         parser.error(f"no run {', '.join(unknown)}; there are {', '.join(RUNS)}")
-    names = given.names or list(RUNS)
+    names = given.names or [name for name in RUNS if not (given.eval and name == START)]
     if given.eval:
         return compare(names, given.out)
     return train_all(names, given.out, given.seed, given.steps, given.jobs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
 import subprocess
 from pathlib import Path
@@ -24,6 +25,12 @@ def provenance(device: torch.device) -> dict[str, Any]:
         "device": torch.cuda.get_device_name(device) if on_gpu else f"cpu, {torch.get_num_threads()} threads",
         "platform": platform.platform(),
     }
+
+
+def origin(path: Path, recipe: dict[str, Any]) -> dict[str, Any]:
+    """What weights say of the file that they started from: its name, its digest, and how it was made in its turn."""
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return {"file": path.name, "sha256": digest, "recipe": {k: v for k, v in recipe.items() if k != "history"}}
 
 
 def git_revision(package: Path) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import structlog
 import torch
@@ -12,27 +13,30 @@ from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.training.recipe import origin
 
 _log = structlog.get_logger(__name__)
 
 
-def take_over(field: LearnedField, path: Path) -> None:
-    """Copy all weights of a file into ``field``.
+def take_over(field: LearnedField, path: Path) -> dict[str, Any]:
+    """Copy all weights of a file into ``field``; returns its ``recipe.origin``.
 
     Raises:
         WeightsError: they cannot be read.
         ConfigError: they are of another kind, shape or label set.
     """
-    start = load_checkpoint(path).model
+    checkpoint = load_checkpoint(path)
+    start = checkpoint.model
     own = (field.kind, to_plain(field.config), field.label_set)
     if (start.kind, to_plain(start.config), start.label_set) != own:
         raise ConfigError(f"{path}: weights of another field than the config names, or of other classes")
     field.load_state_dict(start.state_dict())
     _log.info("training_starts_from", weights=path.name)
+    return origin(path, checkpoint.recipe)
 
 
-def take_over_encoder(field: LearnedField, path: Path) -> None:
-    """Copy the image encoder of a file, whatever its kind, into ``field``.
+def take_over_encoder(field: LearnedField, path: Path) -> dict[str, Any]:
+    """Copy the image encoder of a file, whatever its kind, into ``field``; returns the file's ``recipe.origin``.
 
     An encoder that sees colours alone may become one that sees depth: the network for depth grows from it.
 
@@ -40,7 +44,8 @@ def take_over_encoder(field: LearnedField, path: Path) -> None:
         WeightsError: the file cannot be read.
         ConfigError: one of the two has no image encoder, or they differ in shape.
     """
-    theirs, own = load_checkpoint(path).model.image_encoder, field.image_encoder
+    checkpoint = load_checkpoint(path)
+    theirs, own = checkpoint.model.image_encoder, field.image_encoder
     if theirs is None or own is None:
         raise ConfigError(f"{path}: encoder_from needs fields with image encoders on both sides")
     grows = own.depth_net is not None and theirs.depth_net is None
@@ -51,6 +56,7 @@ def take_over_encoder(field: LearnedField, path: Path) -> None:
     if grows:
         own.grow_depth()
     _log.info("encoder_taken_over", weights=path.name, depth="grown from colours" if grows else "as it is")
+    return origin(path, checkpoint.recipe)
 
 
 def _shapes(module: nn.Module) -> dict[str, torch.Size]:

@@ -153,9 +153,9 @@ class _Run:
             ConfigError: they are of another kind, shape or label set.
         """
         if self.config.start:
-            take_over(self.field, Path(self.config.start))
+            self.progress.origins.append(take_over(self.field, Path(self.config.start)))
         if self.config.encoder_from:
-            take_over_encoder(self.field, Path(self.config.encoder_from))
+            self.progress.origins.append(take_over_encoder(self.field, Path(self.config.encoder_from)))
 
     def restore(self) -> None:
         assert self.folder is not None
@@ -324,6 +324,7 @@ class _Run:
             "validation_miou": best.get("miou"),
             "validation": best,
             "history": validations,
+            "origins": progress.origins,
         }
         return Checkpoint(field.eval(), (), recipe | provenance(self.device))
 

@@ -42,6 +42,7 @@ class Progress:
         depth_grown: The encoder's network for views with depth has grown from the one for colours.
         past_images: Steps on images alone are over.
         finished: The budget is used up.
+        origins: Of what the run started from, see ``recipe.origin``.
     """
 
     losses: torch.Tensor
@@ -56,6 +57,7 @@ class Progress:
     depth_grown: bool = False
     past_images: bool = False
     finished: bool = False
+    origins: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
 
 
 def save_state(
@@ -85,6 +87,7 @@ def save_state(
         "past_images": str(progress.past_images),
         "finished": str(progress.finished),
         "history": json.dumps(progress.history),
+        "origins": json.dumps(progress.origins),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
@@ -124,6 +127,7 @@ def load_state(path: Path, model: nn.Module, optimiser: torch.optim.Optimizer, c
             elapsed_s=float(metadata["elapsed_s"]),
             validated=int(metadata["validated"]),
             history=json.loads(metadata["history"]),
+            origins=json.loads(metadata.get("origins", "[]")),  # runs of before did not note them
             best=best or None,
             best_step=int(metadata["best_step"]),
             best_score=float(metadata["best_score"]),

@@ -110,7 +110,11 @@ def test_weights_after_the_images_are_kept_and_another_kind_takes_their_encoder_
     source = {"encoder_from": str(tmp_path / "first" / IMAGES_FILE)}
     peer = {"kind": "mvsnerf", "field": {"feature_dim": 16, "planes": 8, "volume_channels": 4, "width": 16}}
     shape = {"channels": [8, 16], "blocks": [1, 1], "depth": True}
-    other = train(small_run(**still, **source, **{**peer, "field": {**peer["field"], "encoder": shape}})).model
+    trained = train(small_run(**still, **source, **{**peer, "field": {**peer["field"], "encoder": shape}}))
+    (origin,) = trained.recipe["origins"]
+    assert (origin["file"], origin["recipe"]["kind"], origin["recipe"]["steps"]) == (IMAGES_FILE, "train", 2)
+    assert origin["recipe"]["config"]["images"]["share"] == 0.5 and len(origin["sha256"]) == 64
+    other = trained.model
     assert other.image_encoder is not None
     mine, theirs = other.image_encoder.state_dict(), kept.image_encoder.state_dict()
     assert all(torch.equal(mine[name], tensor) for name, tensor in theirs.items())

@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from scripts import peers
+from semantic_mapper.training.train import STATE_FILE
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """Commands that would have been run; each leaves a state behind."""
+    seen: list[list[str]] = []
+
+    class Done:
+        returncode = 0
+
+    def run(command: list[str], **_: object) -> Done:
+        seen.append(command)
+        if "train" in command:
+            (Path(command[command.index("--out") + 1]) / STATE_FILE).write_bytes(b"state")
+        return Done()
+
+    monkeypatch.setattr(peers.subprocess, "run", run)
+    monkeypatch.setattr(peers, "unfinished_step", lambda _: None)
+    return seen
+
+
+def trained(calls: list[list[str]]) -> list[str]:
+    return [Path(command[command.index("--out") + 1]).name for command in calls]
+
+
+def test_a_field_brings_the_encoders_that_it_starts_from(tmp_path: Path, calls: list[list[str]]) -> None:
+    assert peers.train_all(["sray"], tmp_path, 0, 0, 1) == 0
+    assert trained(calls) == ["start", "unet-depth", "sray"]
+    assert [c[c.index("--encoder") + 1] for c in calls[1:]] == [
+        str(tmp_path / "start" / "weights.safetensors"),
+        str(tmp_path / "unet-depth" / "weights.safetensors"),
+    ]
+
+
+def test_all_chains_have_the_same_steps() -> None:
+    def steps(name: str) -> tuple[int, int]:
+        images = rays = 0
+        while name:
+            recipe = peers.tomllib.loads(peers.recipe(name, 0, 0))
+            run = peers.RUNS[name]
+            images, rays = images + recipe["steps"] * run.images, rays + recipe["steps"] * (not run.images)
+            name = run.encoder
+        return images, rays
+
+    fields = [name for name, run in peers.RUNS.items() if not run.images]
+    assert len({steps(name) for name in fields}) == 1
+    assert {steps(name)[0] for name in ("unet", "unet-depth")} == {steps("sray")[0]}
+
+
+def test_what_is_done_is_not_trained_again_and_another_recipe_is_refused(
+    tmp_path: Path, calls: list[list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    peers.train_all(["unet"], tmp_path, 0, 0, 1)
+    before = len(calls)
+    assert peers.train_all(["unet"], tmp_path, 0, 0, 1) == 0 and len(calls) == before
+    assert peers.train_all(["unet"], tmp_path, 1, 0, 1) == 1 and len(calls) == before
+    assert "take another --out" in capsys.readouterr().out
+
+
+def test_only_finished_runs_are_compared(
+    tmp_path: Path, calls: list[list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert peers.compare(["sray", "unet"], tmp_path) == 1 and not calls
+    assert "sray, unet" in capsys.readouterr().out
+    peers.train_all(["unet"], tmp_path, 0, 0, 1)
+    calls.clear()
+    assert peers.compare(["unet"], tmp_path) == 0
+    assert [c[c.index("--depth") + 1] for c in calls] == ["on", "off"]
