@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
 import structlog
 
 from nodes.console import FrameProgress
@@ -25,13 +24,7 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class FinetuneRequest:
-    """What the verb was asked for.
-
-    Args:
-        config: Its width 0 = the one that the weights to start from were trained at.
-        weights: To start from; None = those in the package.
-        from_scratch: Start from random ones.
-    """
+    """What the verb was asked for; ``weights`` None = those in the package, ``from_scratch`` = random ones."""
 
     log: Path
     keyframes: int
@@ -58,9 +51,6 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
         if label_set is None:
             raise LabelError(f"{request.log}: has no label images; finetuning needs labelled keyframes")
         frames = choose_labelled(log, label_set, request, stop, bar)
-    config = request.config
-    if config.width == 0 and start is not None:
-        config = msgspec.structs.replace(config, width=start.width)
     bar.start(100)
 
     def on_progress(progress: FinetuneProgress) -> None:
@@ -71,7 +61,7 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
         frames,
         label_set,
         None if start is None else start.model,
-        config,
+        request.config,
         on_progress,
         lambda: stop,
         () if start is None else start.train_stamps_ns,

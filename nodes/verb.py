@@ -7,6 +7,7 @@ so); 1 too where a result is negative (``doctor`` finds something missing).
 from __future__ import annotations
 
 import functools
+import inspect
 import sys
 from collections.abc import Callable
 from typing import ParamSpec
@@ -59,6 +60,8 @@ def verb(function: Callable[ParamsT, int | None]) -> Callable[ParamsT, None]:
         sys.stderr.flush()
         raise typer.Exit(code or 0)
 
+    # Click joins the lines of a paragraph but for those after a backspace: an example is there to be copied.
+    command.__doc__ = inspect.cleandoc(function.__doc__ or "").replace("\n\nExample:", "\n\n\b\nExample:", 1)
     return command
 
 

@@ -17,10 +17,10 @@ import numpy as np
 import structlog
 import torch
 
-from semantic_mapper.config import Config, NotNegative, Share, SRayConfig, to_plain
+from semantic_mapper.config import AtLeastOne, Config, Share, SRayConfig, to_plain
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.base import MAX_SOURCE_VIEWS
-from semantic_mapper.fields.checkpoint import DEFAULT_WIDTH, Checkpoint, adapt_model, anchor_from_frame
+from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, anchor_from_frame
 from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided
@@ -53,7 +53,7 @@ class FinetuneConfig(Config, frozen=True):
 
     seconds: float = 300.0  # wall-clock budget; 0 = only steps count (then a run repeats bit for bit)
     steps: int = 0  # step budget; 0 = only seconds count
-    width: NotNegative = 0  # of the images, best that which the start was trained at; 0 = 320
+    width: AtLeastOne = 320  # working width of the images
     learning_rate: float = 1e-3
     encoder_rate: Share = 1.0  # of the image encoder, as a share of it; 0 = only what reads its features learns
     final_learning_rate: float = 5e-5
@@ -117,8 +117,7 @@ def finetune(
     torch.manual_seed(config.seed)
     generator = torch.Generator().manual_seed(config.seed)
     model = SRay(SRayConfig(), label_set) if start is None else adapt_model(start, label_set)
-    width = config.width or DEFAULT_WIDTH
-    views = [view_from_frame(f, label_set, width) for f in frames]
+    views = [view_from_frame(f, label_set, config.width) for f in frames]
     train, held_out = zip(*(_split(v, config.held_out_share, generator) for v in views), strict=True)
     device = next(model.parameters()).device
     began = time.monotonic()
@@ -127,7 +126,7 @@ def finetune(
     model.load_state_dict(best.state)
     recipe: dict[str, Any] = {
         "kind": "finetune",
-        "width": width,
+        "width": config.width,
         "config": to_plain(config),
         "steps": steps,
         "best_step": best.step,
@@ -136,7 +135,7 @@ def finetune(
         "held_out_accuracy": best.accuracy,
         "train_stamps_ns": sorted({int(f.stamp_ns) for f in frames} | {int(s) for s in seen_stamps_ns}),
     }
-    anchors = tuple(anchor_from_frame(f, width) for f in frames)
+    anchors = tuple(anchor_from_frame(f, config.width) for f in frames)
     return Checkpoint(model.eval(), anchors, recipe)
 
 

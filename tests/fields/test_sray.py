@@ -211,6 +211,28 @@ def test_streaming_renderer_equals_the_reference_at_the_same_samples(changes: di
         torch.testing.assert_close(getattr(fast, name), getattr(reference, name), atol=1e-4, rtol=1e-4)
 
 
+def test_streaming_renderer_leaves_out_the_same_hidden_views():
+    field = small_field(4)
+    for p in field.parameters():
+        p.data += 0.05 * torch.randn_like(p)
+    views = wall_sources(POSES)
+    depth_m = views.depth_m.clone()
+    depth_m[1, :, ::2] *= 0.6  # bars before the second camera, a post before the fourth
+    depth_m[3, :, 10:16] *= 0.4
+    streaming = StreamingSRay(field)
+    encoded = streaming.encode(replace(views, depth_m=depth_m))
+    rays = wall_rays(pose_at(0.1), step=3, prior=WALL_M)
+    z = sample_guided(rays, SamplingConfig())
+    space = contextual_space(rays, z, encoded)
+    left_out = space.valid & ~field.without_hidden(space).valid
+    assert 0.02 < left_out.float().mean() < 0.5
+    with torch.inference_mode():
+        reference, _ = field.render_samples(rays, z, encoded)
+    fast = streaming.render_samples(rays, z, encoded)
+    for name in ("logits", "depth_m", "opacity", "rgb", "entropy"):
+        torch.testing.assert_close(getattr(fast, name), getattr(reference, name), atol=1e-4, rtol=1e-4)
+
+
 def test_streaming_renderer_covers_the_narrowest_features():
     torch.manual_seed(2)
     field = SRay(SRayConfig(feature_dim=4, heads=2, encoder=ONE_STAGE), LABELS).eval()
