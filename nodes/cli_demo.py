@@ -18,7 +18,7 @@ from nodes.verb import verb
 def demo(
     out: Annotated[Path, typer.Option("--out", help="Folder for the results; made if missing.")] = Path("runs/demo"),
     frames: Annotated[int, typer.Option(min=4, max=2000, help="How many frames to make.")] = 40,
-    room: Annotated[int, typer.Option(min=0, max=31, help="Which of the rooms that no weights were trained on.")] = 0,
+    room: Annotated[int, typer.Option(min=0, max=19, help="Which of the 20 validation rooms.")] = 0,
     weights: WeightsOption = None,
     voxel_size: VoxelSizeOption = None,
 ) -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 from nodes.process import StopRequest
 from replay.log import LogWriter
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.scenes import TEST_SEEDS, NoiseConfig, room_frames
+from semantic_mapper.scenes import VALIDATION_SEEDS, NoiseConfig, room_frames
 from semantic_mapper.scenes.sequence import FRAME_NS
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics
@@ -17,12 +17,12 @@ CAMERA = CameraIntrinsics(220.6, 220.6, 159.5, 119.5, 320, 240)
 
 
 def write_room_log(path: Path, room: int, count: int, stop: StopRequest, on_frame: Callable[[], None]) -> None:
-    """Film test room number ``room`` with a noisy depth camera; a log that is there is replaced.
+    """Film validation room number ``room`` with a noisy depth camera; a log that is there is replaced.
 
     Raises:
         LogError: it cannot be written.
     """
-    seed = TEST_SEEDS[room]
+    seed = VALIDATION_SEEDS[room]
     info = StreamInfo(
         source=f"procedural room {seed}",
         cameras={"rooms": CAMERA},

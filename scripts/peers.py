@@ -1,9 +1,9 @@
 """Train S-Ray, its ablations and its peers with one budget, and compare them on the rooms of the test split.
 
 Encoders learn from single images first: after a common start one goes on with colours, the other with measured depth
-too, where there is any. Each field takes one of the two over and spends the same number of steps on rays
-(recipes/cpu-images.toml, recipes/cpu-rays.toml), so every chain has the same steps. Every run has one CPU core, two
-runs go on at a time; a run that was ended goes on where it stopped when the same command comes again.
+too, where there is any. Each field takes one of the two over and spends the same number of steps on rays, so every chain
+has the same steps (recipes/cpu-images.toml and cpu-rays.toml, or gpu-*). On CPUs every run has one core, two runs go on
+at a time. A run that was ended goes on where it stopped when the same command comes again.
 
     python scripts/peers.py --out runs/peers [NAME...]        train, all of them without names
     python scripts/peers.py --out runs/peers --eval [NAME...] compare them, with and without depth
@@ -38,21 +38,21 @@ class Run:
         depth: Whether its encoder sees depth.
         encoder: The run whose encoder it starts from; empty = random weights.
         images: Trained on single images, not on rays.
-        steps: Other than the recipe's; 0 = the recipe's.
+        share: Of the recipe's steps.
     """
 
     kind: str
     depth: bool
     encoder: str = ""
     images: bool = False
-    steps: int = 0
+    share: float = 1.0
 
 
 START = "start"  # what both encoders have in common; nothing to compare
 RUNS = {
     START: Run("unet", depth=False, images=True),
-    "unet-depth": Run("unet", depth=True, encoder=START, images=True, steps=2400),
-    "unet": Run("unet", depth=False, encoder=START, images=True, steps=2400),
+    "unet-depth": Run("unet", depth=True, encoder=START, images=True, share=0.5),
+    "unet": Run("unet", depth=False, encoder=START, images=True, share=0.5),
     "sray": Run("sray", depth=True, encoder="unet-depth"),
     "neuray": Run("neuray", depth=False, encoder="unet"),
     "sray-none": Run("sray-none", depth=True, encoder="unet-depth"),
@@ -64,20 +64,18 @@ RUNS = {
 }
 
 
-def recipe(name: str, seed: int, steps: int) -> str:
-    """The recipe of a run as TOML; the files in recipes/ hold plain values and one level of tables."""
+def recipe(name: str, seed: int, steps: int = 0, tier: str = "cpu") -> str:
+    """The recipe of a run as TOML.
+
+    Args:
+        steps: Instead of the recipe's; 0 = the recipe's.
+    """
     run = RUNS[name]
-    plain: dict[str, Any] = tomllib.loads(
-        (RECIPES / ("cpu-images.toml" if run.images else "cpu-rays.toml")).read_text(encoding="utf-8")
-    )
-    steps = steps or run.steps
-    plain |= {"kind": run.kind, "seed": seed} | ({"steps": steps} if steps else {})
-    lines = [f"{key} = {_toml(value)}" for key, value in plain.items() if not isinstance(value, dict)]
-    lines += ["", "[field.encoder]", f"depth = {_toml(run.depth)}"]
-    for table, values in plain.items():
-        if isinstance(values, dict):
-            lines += ["", f"[{table}]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
-    return "\n".join(lines) + "\n"
+    file = RECIPES / f"{tier}-{'images' if run.images else 'rays'}.toml"
+    plain: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
+    plain |= {"kind": run.kind, "seed": seed, "steps": steps or round(run.share * plain["steps"])}
+    plain["field"] = {"encoder": {"depth": run.depth}}
+    return "\n".join(_lines(plain, "")) + "\n"
 
 
 def finished(folder: Path) -> bool:
@@ -86,11 +84,11 @@ def finished(folder: Path) -> bool:
     return state.is_file() and unfinished_step(state) is None
 
 
-def train(name: str, out: Path, seed: int, steps: int) -> int:
+def train(name: str, out: Path, seed: int, steps: int, tier: str = "cpu") -> int:
     """Train one run, or go on with it; returns the exit code of the command."""
     folder = out / name
-    state, config, wanted = folder / STATE_FILE, folder / "recipe.toml", recipe(name, seed, steps)
-    if state.is_file() and config.read_text(encoding="utf-8") != wanted:
+    state, config, wanted = folder / STATE_FILE, folder / "recipe.toml", recipe(name, seed, steps, tier)
+    if state.is_file() and tomllib.loads(config.read_text(encoding="utf-8")) != tomllib.loads(wanted):
         print(f"{name}: {config} differs from what is asked for (--seed, --steps?); take another --out", flush=True)
         return 1
     if finished(folder):
@@ -104,14 +102,15 @@ def train(name: str, out: Path, seed: int, steps: int) -> int:
     if state.is_file():
         command += ["--resume"]
     print(f"{name}: {' '.join(command)}", flush=True)
-    alone = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+    one_core = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+    alone = one_core if tier == "cpu" else {}
     with (folder / "train.log").open("ab") as log:
         code = subprocess.run(command, env=os.environ | alone, stdout=log, stderr=log, check=False).returncode
     print(f"{name}: ended with {code}", flush=True)
     return code
 
 
-def train_all(names: list[str], out: Path, seed: int, steps: int, jobs: int) -> int:
+def train_all(names: list[str], out: Path, seed: int, steps: int, jobs: int, tier: str = "cpu") -> int:
     """Encoders first, then the fields that start from them."""
     encoders = {name for name in names if RUNS[name].images} | {RUNS[name].encoder for name in names} - {""}
     encoders |= {RUNS[name].encoder for name in encoders} - {""}
@@ -124,7 +123,7 @@ def train_all(names: list[str], out: Path, seed: int, steps: int, jobs: int) -> 
 
     def train_unless_failed(name: str) -> int:
         """Ctrl-C ends the runs at hand; the ones that wait must not begin."""
-        code = 0 if failed.is_set() else train(name, out, seed, steps)
+        code = 0 if failed.is_set() else train(name, out, seed, steps, tier)
         if code:
             failed.set()
         return code
@@ -137,7 +136,7 @@ def train_all(names: list[str], out: Path, seed: int, steps: int, jobs: int) -> 
     return 0
 
 
-def compare(names: list[str], out: Path) -> int:
+def compare(names: list[str], out: Path, tier: str = "cpu") -> int:
     """All figures of these runs, with and without depth; nothing where one of them is not finished."""
     missing = [name for name in names if not finished(out / name)]
     if missing:
@@ -145,7 +144,18 @@ def compare(names: list[str], out: Path) -> int:
         return 1
     weights = [out / name / WEIGHTS_FILE for name in names]
     for depth in ("on", "off"):
-        command = [COMMAND, "eval", "--suite", "rooms", "--depth", depth, "--json", str(out / f"depth-{depth}.json")]
+        command = [
+            COMMAND,
+            "eval",
+            "--suite",
+            "rooms",
+            "--depth",
+            depth,
+            "--tier",
+            tier,
+            "--json",
+            str(out / f"depth-{depth}.json"),
+        ]
         for file in weights:
             command += ["--weights", str(file)]
         code = subprocess.run(command, check=False).returncode
@@ -162,15 +172,32 @@ def main() -> int:
     parser.add_argument("--eval", action="store_true", help="compare instead of train")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=0, help="of every run, instead of the recipes'")
-    parser.add_argument("--jobs", type=int, default=2, help="runs at a time, of one core each")
+    parser.add_argument("--jobs", type=int, default=0, help="runs at a time [cpu: 2, of one core each; gpu: 1]")
+    parser.add_argument(
+        "--tier", choices=("cpu", "gpu"), default="cpu", help="160x120 on CPU cores, or 320x240 on a GPU"
+    )
     given = parser.parse_args()
     unknown = sorted(set(given.names) - set(RUNS))
     if unknown:
         parser.error(f"no run {', '.join(unknown)}; there are {', '.join(RUNS)}")
     names = given.names or [name for name in RUNS if not (given.eval and name == START)]
     if given.eval:
-        return compare(names, given.out)
-    return train_all(names, given.out, given.seed, given.steps, given.jobs)
+        return compare(names, given.out, given.tier)
+    jobs = given.jobs or (2 if given.tier == "cpu" else 1)
+    return train_all(names, given.out, given.seed, given.steps, jobs, given.tier)
+
+
+def _lines(table: dict[str, Any], path: str) -> list[str]:
+    """Lines of a table: its plain values first, then the tables in it."""
+    plain = [f"{key} = {_toml(value)}" for key, value in table.items() if not isinstance(value, dict)]
+    head = ["", f"[{path}]"] if path and plain else []
+    inner = [
+        line
+        for key, value in table.items()
+        if isinstance(value, dict)
+        for line in _lines(value, f"{path}.{key}" if path else key)
+    ]
+    return head + plain + inner
 
 
 def _toml(value: object) -> str:

@@ -40,11 +40,12 @@ def test_a_field_brings_the_encoders_that_it_starts_from(tmp_path: Path, calls: 
     ]
 
 
-def test_all_chains_have_the_same_steps() -> None:
+@pytest.mark.parametrize("tier", ["cpu", "gpu"])
+def test_all_chains_have_the_same_steps(tier: str) -> None:
     def steps(name: str) -> tuple[int, int]:
         images = rays = 0
         while name:
-            recipe = peers.tomllib.loads(peers.recipe(name, 0, 0))
+            recipe = peers.tomllib.loads(peers.recipe(name, 0, tier=tier))
             run = peers.RUNS[name]
             images, rays = images + recipe["steps"] * run.images, rays + recipe["steps"] * (not run.images)
             name = run.encoder
@@ -53,6 +54,12 @@ def test_all_chains_have_the_same_steps() -> None:
     fields = [name for name, run in peers.RUNS.items() if not run.images]
     assert len({steps(name) for name in fields}) == 1
     assert {steps(name)[0] for name in ("unet", "unet-depth")} == {steps("sray")[0]}
+
+
+def test_a_recipe_is_that_of_its_tier_with_the_runs_own_kind_encoder_and_seed() -> None:
+    file = peers.tomllib.loads((peers.RECIPES / "gpu-rays.toml").read_text(encoding="utf-8"))
+    own = {"kind": "neuray", "seed": 3, "field": {"encoder": {"depth": False}}}
+    assert peers.tomllib.loads(peers.recipe("neuray", 3, tier="gpu")) == file | own
 
 
 def test_what_is_done_is_not_trained_again_and_another_recipe_is_refused(

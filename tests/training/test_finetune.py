@@ -159,8 +159,17 @@ def test_too_few_or_unlabelled_keyframes_are_refused():
 
 
 def test_time_budget_ends_the_run():
-    result = finetune(tiny_frames(3), ROOMS, tiny_field(), config(seconds=1.0, steps=0))
-    assert result.recipe["steps"] >= 1
+    spent: list[float] = []
+    result = finetune(
+        tiny_frames(3),
+        ROOMS,
+        tiny_field(),
+        config(seconds=1.0, steps=0, patience=0),
+        lambda p: spent.append(p.fraction),
+    )
+    assert result.recipe["steps"] == len(spent) >= 1
+    assert spent[-1] == 1.0 and all(0 < share < 1 for share in spent[:-1]), "no step begins after the time is up"
+    assert result.recipe["seconds"] >= 1.0
 
 
 def test_chosen_keyframes_cover_different_places():
