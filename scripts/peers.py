@@ -1,7 +1,7 @@
 """Train S-Ray, its ablations and its peers with one budget, and compare them on the rooms of the test split.
 
 Encoders learn from single images first: after a common start one goes on with colours, the other with measured depth
-too, where there is any. Each field takes one of the two over and spends the same number of steps on rays, so every chain
+too, where there is any. Each field takes one of the two over and spends the same number of steps on rays: every chain
 has the same steps (recipes/cpu-images.toml and cpu-rays.toml, or gpu-*). On CPUs every run has one core, two runs go on
 at a time. A run that was ended goes on where it stopped when the same command comes again.
 
