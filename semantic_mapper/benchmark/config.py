@@ -7,7 +7,8 @@ import json
 from typing import Literal
 
 from semantic_mapper.config import Config, MapperConfig, Positive, SamplingConfig, Share, to_plain
-from semantic_mapper.scenes import SUITE_VERSION, TEST_SEEDS, VALIDATION_SEEDS
+from semantic_mapper.scenes import SUITE_VERSION, TEST_SEEDS, VALIDATION_SEEDS, CameraPathConfig
+from semantic_mapper.scenes.config import DepthSensorName
 from semantic_mapper.training.finetune import FinetuneConfig
 from semantic_mapper.training.step import StepConfig
 from semantic_mapper.types import CameraIntrinsics
@@ -43,6 +44,16 @@ TIERS: dict[Tier, TierConfig] = {
 }
 
 
+class CameraConfig(Config, frozen=True):
+    """The camera of the query and source views; by default an OAK-D in a hand. Maps are always made with that one."""
+
+    focal_per_width: Positive = FOCAL_PER_WIDTH
+    min_height_m: Positive = CameraPathConfig().min_height_m
+    max_height_m: Positive = CameraPathConfig().max_height_m
+    roll_deg: float = 0.0
+    sensor: DepthSensorName = "oak_d"
+
+
 class SequenceConfig(Config, frozen=True):
     """The walk through each room, and which of its frames are queries."""
 
@@ -50,6 +61,7 @@ class SequenceConfig(Config, frozen=True):
     step_m: float = 0.08  # way (a turn of 1 rad counts as 0.35 m) between frames
     query_pairs: int = 2  # spread evenly over the sequence
     pair_gap: int = 4  # the second view of a pair is so many frames on
+    camera: CameraConfig = CameraConfig()
 
 
 class SpacingConfig(Config, frozen=True):
@@ -111,10 +123,10 @@ def suite_seeds(suite: SuiteConfig) -> list[int]:
     return list(seeds[: suite.rooms] if suite.rooms else seeds)
 
 
-def camera_of_width(width: int) -> CameraIntrinsics:
+def camera_of_width(width: int, focal_per_width: float = FOCAL_PER_WIDTH) -> CameraIntrinsics:
     """The benchmark's camera: an OAK-D's field of view, 4:3."""
     height = width * 3 // 4
-    focal = FOCAL_PER_WIDTH * width
+    focal = focal_per_width * width
     return CameraIntrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
 
 

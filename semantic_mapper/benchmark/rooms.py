@@ -41,9 +41,15 @@ def make_benchmark_room(seed: int, suite: SuiteConfig) -> BenchmarkRoom:
     Raises:
         ConfigError: a sequence too short for its query views.
     """
-    camera = camera_of_width(suite.tier.width)
-    path = CameraPathConfig(step_m=suite.sequence.step_m)
-    frames = tuple(room_frames(seed, suite.sequence.frames, camera, path=path, noise=NoiseConfig()))
+    asked = suite.sequence.camera
+    camera = camera_of_width(suite.tier.width, asked.focal_per_width)
+    path = CameraPathConfig(
+        step_m=suite.sequence.step_m,
+        min_height_m=asked.min_height_m,
+        max_height_m=asked.max_height_m,
+        roll_deg=asked.roll_deg,
+    )
+    frames = tuple(room_frames(seed, suite.sequence.frames, camera, path=path, noise=NoiseConfig(depth=asked.sensor)))
     scene = make_room(seed)
     pairs = query_pairs(suite)
     queries = [number for pair in pairs for number in pair]

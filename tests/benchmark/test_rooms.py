@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from semantic_mapper.benchmark.config import TIERS, SuiteConfig, settings_digest, suite_seeds
-from semantic_mapper.benchmark.rooms import as_given, query_pairs
+from semantic_mapper.benchmark.rooms import as_given, make_benchmark_room, query_pairs
+from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.scenes import TEST_SEEDS, VALIDATION_SEEDS
 from tests.benchmark.tiny import tiny_room, tiny_suite
@@ -63,3 +64,13 @@ def test_records_are_told_apart_by_what_made_them_and_by_nothing_else() -> None:
 def test_the_cpu_tier_is_160_by_120() -> None:
     assert (TIERS["cpu"].width, TIERS["gpu"].width) == (160, 320)
     assert SuiteConfig().tier == TIERS["cpu"]
+
+
+def test_the_camera_of_the_sequence_may_be_another():
+    low = {"min_height_m": 0.5, "max_height_m": 0.7, "focal_per_width": 0.9, "sensor": "none"}
+    suite = convert_config({"sequence": {"frames": 12, "query_pairs": 1, "camera": low}}, SuiteConfig, "test")
+    room = make_benchmark_room(VALIDATION_SEEDS[0], suite)
+    heights = [frame.T_world_camera[2, 3] for frame in room.frames]
+    assert 0.45 < min(heights) and max(heights) < 0.75
+    assert room.frames[0].intrinsics.fx == pytest.approx(0.9 * suite.tier.width) and room.frames[0].depth_m is None
+    assert settings_digest(suite, "views") != settings_digest(SuiteConfig(), "views")
