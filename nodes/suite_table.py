@@ -106,6 +106,8 @@ _MAP_ROWS: _Rows = (
     ("map: mIoU of its frames", "map.views_miou", percent),
     ("map: mIoU seen from its frames", "map.cast_miou", percent),
     ("map: mIoU of its frames there", "map.cast_views_miou", percent),
+    ("map: mIoU of its points that frames see", "map.seen_miou", percent),
+    ("map: mIoU of one frame each there", "map.one_frame_miou", percent),
     ("map: mIoU of its points, mean of rooms", "map.map_miou_mean_of_rooms", percent),
     ("map: mIoU an image, mean of rooms", "map.view_miou_mean_of_rooms", percent),
     ("map: mIoU at the true surface", "map.surface_miou", percent),

@@ -20,13 +20,15 @@ from semantic_mapper.evaluation.metrics import (
     metrics_per_image,
     nearest_labels,
 )
-from semantic_mapper.geometry import transform, unproject
+from semantic_mapper.geometry import invert_pose, project, transform, unproject
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, Scene, make_room, render_view, room_frames
 from semantic_mapper.types import Float32, Float64, UInt8
 
 NEAR_M = 0.05  # a map point this near to the true surface speaks for it
+SEEN_M = 0.03  # a frame sees a map point that is this near, in depth, to where its ray meets the map
+UNSEEN = 255  # no id of ``ROOMS``
 TRUTH_VOXEL_M = 0.01  # the true surface is sampled this densely, where the camera saw it that densely
 
 
@@ -103,6 +105,8 @@ def _compare(scene: Scene, voxel_map: VoxelMap, views: list[_View], digest: str,
     at_surface = map_confusion(surface.xyz, surface.label, points.xyz, label, ROOMS, max_distance_m=NEAR_M)
     rendered = [confusion_of(v.truth, v.label, ROOMS, f"room {scene.seed}") for v in views]
     cast, cast_views = _seen_from_its_frames(voxel_map, views)
+    one_frame = _label_of_one_frame(points.xyz, voxel_map, views, scene.seed)
+    seen = np.where(one_frame == UNSEEN, ROOMS.ignore_id, truth)
     return MapRecord(
         settings=settings_digest(suite, "map"),
         weights=digest,
@@ -116,7 +120,35 @@ def _compare(scene: Scene, voxel_map: VoxelMap, views: list[_View], digest: str,
         view_miou=metrics_per_image(rendered).miou,
         cast_confusion=as_rows(cast),
         cast_view_confusion=as_rows(cast_views),
+        seen_confusion=as_rows(confusion_of(seen, label, ROOMS, "map")),
+        one_frame_confusion=as_rows(
+            confusion_of(seen, np.where(one_frame == UNSEEN, ROOMS.ignore_id, one_frame), ROOMS, "a frame")
+        ),
     )
+
+
+def _label_of_one_frame(xyz: Float32, voxel_map: VoxelMap, views: list[_View], seed: int) -> UInt8:
+    """For each map point (N, 3) what one of the frames that see it says, drawn at random; ``UNSEEN`` where none does.
+
+    That is the map without fusion: the same points, each counting once, labelled by a single look.
+    """
+    camera = camera_of_width(MAP_WIDTH)
+    rng = np.random.default_rng(seed)
+    chosen = np.full(len(xyz), UNSEEN, np.uint8)
+    looks = np.zeros(len(xyz), np.int64)
+    for view in views:
+        p = transform(invert_pose(view.T_world_camera), xyz.astype(np.float64))
+        front = np.flatnonzero(p[:, 2] > 0.05)
+        uv = np.rint(project(p[front], camera)).astype(np.int64)
+        inside = ((uv >= 0) & (uv < (camera.width, camera.height))).all(1)
+        index, (u, v) = front[inside], uv[inside].T
+        surface = voxel_map.ray_cast(view.T_world_camera, camera).depth_m[v, u]
+        visible = (surface > 0) & (np.abs(surface - p[index, 2]) < SEEN_M)
+        index, label = index[visible], view.label[v[visible], u[visible]]
+        looks[index] += 1
+        taken = rng.random(len(index)) * looks[index] < 1  # so that in the end every look was as likely
+        chosen[index[taken]] = label[taken]
+    return chosen
 
 
 def _seen_from_its_frames(voxel_map: VoxelMap, views: list[_View]) -> tuple[ConfusionMatrix, ConfusionMatrix]:

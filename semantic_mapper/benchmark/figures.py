@@ -56,6 +56,8 @@ def map_figures(records: Sequence[MapRecord]) -> dict[str, Any]:
         "views_miou": _summed([from_rows(r.view_confusion) for r in records]).metrics().miou,
         "cast_miou": _summed([from_rows(r.cast_confusion) for r in records]).metrics().miou,
         "cast_views_miou": _summed([from_rows(r.cast_view_confusion) for r in records]).metrics().miou,
+        "seen_miou": _summed([from_rows(r.seen_confusion) for r in records]).metrics().miou,
+        "one_frame_miou": _summed([from_rows(r.one_frame_confusion) for r in records]).metrics().miou,
         "map_miou_mean_of_rooms": _mean([c.metrics().miou for c in at_points]),
         "view_miou_mean_of_rooms": _mean([r.view_miou for r in records]),
         "on_surface": _mean([r.on_surface for r in records]),

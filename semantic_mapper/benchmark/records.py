@@ -77,6 +77,8 @@ class MapRecord(Config, frozen=True, tag_field="record", tag="map"):
     view_miou: float | None  # mean of the frames' own mIoU
     cast_confusion: tuple[tuple[int, ...], ...]  # of the finished map, cast into its frames, where it has an answer
     cast_view_confusion: tuple[tuple[int, ...], ...]  # of the frames' rendered labels at those same pixels
+    seen_confusion: tuple[tuple[int, ...], ...]  # at those of the map's points that some frame sees
+    one_frame_confusion: tuple[tuple[int, ...], ...]  # at the same points, of one frame each, drawn at random
 
 
 Record = RoomRecord | MapRecord

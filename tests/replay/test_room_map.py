@@ -48,6 +48,10 @@ def test_a_mapped_room_is_scored_at_its_own_points_and_at_the_true_surface(tmp_p
     assert 0.5 * frames < cast.counts.sum() == there.counts.sum() <= frames
     np.testing.assert_array_equal(cast.counts.sum(1), there.counts.sum(1))
     assert cast.counts[:, -1].sum() == 0, "only pixels where the map has a label are counted"
+    fused, single = from_rows(record.seen_confusion), from_rows(record.one_frame_confusion)
+    np.testing.assert_array_equal(fused.counts.sum(1), single.counts.sum(1))
+    assert 0.9 * at_points.counts.sum() < fused.counts.sum() <= at_points.counts.sum()
+    assert not np.array_equal(fused.counts, single.counts)
     figures = map_figures([record])
     assert figures["cast_miou"] == cast.metrics().miou
     assert figures["map_miou"] == figures["map_miou_mean_of_rooms"] == at_points.metrics().miou
