@@ -26,6 +26,7 @@ from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes import SUITE_VERSION, TRAIN_SEEDS
 from semantic_mapper.training.device import bfloat16_is_fast, choose_device, compute_in_bfloat16
+from semantic_mapper.training.folder_lock import sole_use_of
 from semantic_mapper.training.images import ImageBatch, draw_images, images_loss
 from semantic_mapper.training.optimiser import make_optimiser, set_rates
 from semantic_mapper.training.ranks import Ranks, joined, ranks_from_environment
@@ -82,13 +83,13 @@ def train(
         stopped: Asked once a step; when it says yes, all is saved and the best weights so far are returned.
 
     Raises:
-        ConfigError: a config that cannot be used, or another one than that of the run to go on with.
+        ConfigError: a config that cannot be used, another one than that of the run to go on with, or a folder in use.
         WeightsError: no state to go on with, weights to start from that cannot be read, or training has diverged.
     """
     ranks = ranks_from_environment()
     device = choose_device(config.device, ranks.local)
     _check(config, folder, resume)
-    with joined(ranks, device):
+    with sole_use_of(folder if ranks.first else None), joined(ranks, device):
         run = _Run(config, folder, ranks, device)
         if resume:
             run.restore()

@@ -112,6 +112,19 @@ def test_a_run_goes_on_with_a_larger_budget_but_with_no_other_config(tmp_path: P
         train(small_run(learning_rate=0.01), tmp_path, resume=True)
 
 
+def test_a_folder_takes_one_training_at_a_time(tmp_path: Path):
+    refused: list[str] = []
+
+    def second(_: TrainProgress) -> None:
+        with pytest.raises(ConfigError, match="another training") as caught:
+            train(small_run(steps=1), tmp_path)
+        refused.append(str(caught.value))
+
+    train(small_run(steps=1), tmp_path, on_progress=second)
+    assert refused and str(tmp_path) in refused[0]
+    train(small_run(steps=2), tmp_path, resume=True)  # free again
+
+
 def test_an_unfinished_run_is_not_overwritten_by_mistake(tmp_path: Path):
     train(small_run(), tmp_path, **stop_after(1))
     with pytest.raises(ConfigError, match="stopped here at step 1; go on with --resume"):
