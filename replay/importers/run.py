@@ -14,6 +14,7 @@ from replay.importers.tum import TumRecording
 from replay.log import LogWriter
 from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LabelError, LogError
 from semantic_mapper.transport.codec import CodecOptions
+from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.turning import turned_frame, turned_intrinsics
 from semantic_mapper.types import PosedFrame
 
@@ -89,22 +90,8 @@ def import_recording(
         raise ImportSourceError(f"{src}: no such folder")
     recording = FORMATS[name](src, options)
     total = len(recording) if options.max_frames is None else min(len(recording), options.max_frames)
-    cameras = {camera: turned_intrinsics(k, options.quarters) for camera, k in recording.info.cameras.items()}
-    # What the log holds counts, not what the folder did.
-    info = dataclasses.replace(recording.info, cameras=cameras, frame_count=None)
-    new_ids = None
-    if renames:
-        if info.label_set is None:
-            raise LabelError(f"{src}: there are no classes to rename, it has no labels")
-        label_set, new_ids = info.label_set.renamed(renames)
-        info = dataclasses.replace(info, label_set=label_set)
+    info, changed = _changes(src, recording.info, options, renames or {})
     packing = codec or CodecOptions(depth_scale=recording.depth_scale)
-
-    def changed(frame: PosedFrame) -> PosedFrame:
-        turned = turned_frame(frame, options.quarters)
-        if new_ids is None or turned.label is None:
-            return turned
-        return dataclasses.replace(turned, label=new_ids[turned.label])
 
     unfinished = dst.with_name(f".{dst.name}.importing")
     try:
@@ -121,6 +108,26 @@ def import_recording(
     finally:
         unfinished.unlink(missing_ok=True)
     return ImportReport(frames, labelled, tuple(skipped), tuple(recording.notices), name, info, dst.stat().st_size)
+
+
+def _changes(
+    src: Path, info: StreamInfo, options: ImportOptions, renames: Mapping[str, str]
+) -> tuple[StreamInfo, Callable[[PosedFrame], PosedFrame]]:
+    """What the log says of its frames, and what makes its frames of those of the recording."""
+    cameras = {camera: turned_intrinsics(k, options.quarters) for camera, k in info.cameras.items()}
+    # What the log holds counts, not what the folder did.
+    info = dataclasses.replace(info, cameras=cameras, frame_count=None)
+    if not renames:
+        return info, lambda frame: turned_frame(frame, options.quarters)
+    if info.label_set is None:
+        raise LabelError(f"{src}: there are no classes to rename, it has no labels")
+    label_set, new_ids = info.label_set.renamed(renames)
+
+    def changed(frame: PosedFrame) -> PosedFrame:
+        turned = turned_frame(frame, options.quarters)
+        return turned if turned.label is None else dataclasses.replace(turned, label=new_ids[turned.label])
+
+    return dataclasses.replace(info, label_set=label_set), changed
 
 
 def _copy(

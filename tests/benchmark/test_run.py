@@ -67,6 +67,7 @@ def map_record(room: int = 1) -> MapRecord:
         settings="s", weights="w", room=room, programme="office", points=3, on_surface=1.0,
         confusion=rows, surface_confusion=rows, view_confusion=rows, view_miou=0.5,
         cast_confusion=rows, cast_view_confusion=rows,
+        seen_confusion=rows, one_frame_confusion=rows,
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import pytest
 from replay.importers import ImportOptions, ImportReport, detect_format, import_recording
 from replay.importers.tum import match_nearest
 from replay.log import LogReader
-from semantic_mapper.errors import ImportSourceError, LabelError, LogError
+from semantic_mapper.errors import ImportSourceError, LogError
 from semantic_mapper.labels import NYU40
 
 from . import recordings as rec
@@ -36,11 +36,6 @@ def imported(src: Path, **options: object) -> tuple[ImportReport, LogReader]:
     dst = src.parent / "log.mcap"
     report = import_recording(src, dst, options=ImportOptions(**options))  # type: ignore[arg-type]
     return report, LogReader(dst)
-
-
-def import_to(src: Path, dst: Path) -> Path:
-    import_recording(src, dst)
-    return dst
 
 
 def reasons(report: ImportReport) -> dict[int, str]:
@@ -75,42 +70,6 @@ def test_classes_keep_their_ids_and_the_colours_of_the_known_set(folder: Path) -
         0,
     )
     assert labels.colors == tuple(rec.nyu40_color(name) for name in labels.names)
-
-
-def test_classes_are_renamed_and_joined_on_the_way_in(folder: Path) -> None:
-    dst = folder.parent / "log.mcap"
-    report = import_recording(folder, dst, renames={"floor": "ground", "chair": "ground"})
-    assert report.frames == report.labelled == 6
-    log = LogReader(dst)
-    assert log.info.label_set is not None
-    assert dict(zip(log.info.label_set.names, log.info.label_set.ids, strict=True)) == {"wall": 1, "ground": 2}
-    for i, frame in enumerate(log):
-        assert frame.label is not None
-        assert np.array_equal(frame.label, np.where(rec.label(i) == 5, 2, rec.label(i)))
-
-
-def test_images_of_a_camera_on_its_side_are_turned_with_their_poses(folder: Path) -> None:
-    report, log = imported(folder, quarters=1)
-    assert report.frames == 6 and not report.skipped
-    assert (log.info.cameras["camera"].width, log.info.cameras["camera"].height) == (rec.HEIGHT, rec.WIDTH)
-    upright = LogReader(import_to(folder, folder.parent / "upright.mcap"))
-    for turned, frame in zip(log, upright, strict=True):
-        assert turned.label is not None and frame.label is not None and turned.depth_m is not None
-        assert np.array_equal(turned.rgb, np.rot90(frame.rgb, -1))
-        assert np.array_equal(turned.label, np.rot90(frame.label, -1))
-        assert turned.intrinsics == log.info.cameras["camera"]
-        np.testing.assert_allclose(turned.T_world_camera[:3, 2], frame.T_world_camera[:3, 2])
-        np.testing.assert_allclose(turned.T_world_camera[:3, 1], frame.T_world_camera[:3, 0])
-
-
-def test_renaming_what_is_not_there_writes_nothing(folder: Path) -> None:
-    dst = folder.parent / "log.mcap"
-    with pytest.raises(LabelError, match="sofa"):
-        import_recording(folder, dst, renames={"sofa": "couch"})
-    (folder / "labels.json").unlink()
-    with pytest.raises(LabelError, match="no labels"):
-        import_recording(folder, dst, renames={"floor": "ground"})
-    assert not dst.exists()
 
 
 def test_classes_of_an_unknown_id_space_get_colours_of_their_own(folder: Path) -> None:
