@@ -1,0 +1,55 @@
+"""What the weights in the package can do, at the least: a change of the code that they do not fit must not pass."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import torch
+
+from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint
+from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.registry import build_field
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.training.cameras import CameraDraw
+from semantic_mapper.training.ranks import Ranks
+from semantic_mapper.training.rooms import RoomPoolConfig
+from semantic_mapper.training.train_config import TrainStepConfig
+from semantic_mapper.training.validation import Scores, ValidationConfig, validate, validation_rooms
+
+ALONE = Ranks()
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Checkpoint:
+    return load_checkpoint(default_checkpoint_path())
+
+
+def scores(field: LearnedField, width: int) -> Scores:
+    config = ValidationConfig(rooms=3, queries=2, rays=800, views=6)
+    pool = RoomPoolConfig(width=width, views=10, camera=CameraDraw(usual=1.0))
+    rooms = validation_rooms(config, pool, ALONE, torch.device("cpu"))
+    return validate(field.eval(), rooms, config, TrainStepConfig(), ALONE)
+
+
+def test_they_know_rooms_that_they_have_never_seen_with_depth_and_without(shipped: Checkpoint):
+    able = scores(shipped.model, shipped.width)
+    assert able.miou > 0.5 and able.accuracy > 0.75
+    assert able.blind_miou > 0.3 and able.blind_accuracy > 0.6
+    torch.manual_seed(0)
+    random = scores(build_field("sray", {}, ROOMS), shipped.width)
+    assert random.miou < 0.1 and random.accuracy < 0.3
+
+
+def test_they_say_how_they_were_made_and_what_was_measured(shipped: Checkpoint):
+    recipe = shipped.recipe
+    assert re.fullmatch(r"[0-9a-f]{40}", recipe["git_revision"]), "a commit that holds all of the code"
+    assert isinstance(recipe["config"]["seed"], int)
+    figures = {figure["depth"]: figure for figure in recipe["figures"]}
+    assert all(figure["split"] == "test" and figure["rooms"] == 20 for figure in figures.values())
+    assert figures[True]["data_set"]["miou"] > 0.6
+    chain, steps = recipe, recipe["steps"]
+    while chain.get("origins"):  # down to the run that began with random weights
+        chain = chain["origins"][0]["recipe"]
+        steps += chain["steps"]
+    assert steps > recipe["steps"]
