@@ -22,6 +22,7 @@ from semantic_mapper.evaluation.metrics import (
 )
 from semantic_mapper.geometry import invert_pose, project, transform, unproject
 from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, Scene, make_room, render_view, room_frames
 from semantic_mapper.types import Float32, Float64, UInt8
@@ -104,8 +105,10 @@ def _compare(scene: Scene, voxel_map: VoxelMap, views: list[_View], digest: str,
     truth = nearest_labels(points.xyz, surface.xyz, surface.label, ROOMS, max_distance_m=NEAR_M)
     at_surface = map_confusion(surface.xyz, surface.label, points.xyz, label, ROOMS, max_distance_m=NEAR_M)
     rendered = [confusion_of(v.truth, v.label, ROOMS, f"room {scene.seed}") for v in views]
-    cast, cast_views = _seen_from_its_frames(voxel_map, views)
-    one_frame = _label_of_one_frame(points.xyz, voxel_map, views, scene.seed)
+    camera = camera_of_width(MAP_WIDTH)
+    casts = [voxel_map.ray_cast(view.T_world_camera, camera) for view in views]
+    cast, cast_views = _seen_from_its_frames(casts, voxel_map.label_set, views)
+    one_frame = _label_of_one_frame(points.xyz, casts, views, scene.seed)
     seen = np.where(one_frame == UNSEEN, ROOMS.ignore_id, truth)
     return MapRecord(
         settings=settings_digest(suite, "map"),
@@ -127,7 +130,7 @@ def _compare(scene: Scene, voxel_map: VoxelMap, views: list[_View], digest: str,
     )
 
 
-def _label_of_one_frame(xyz: Float32, voxel_map: VoxelMap, views: list[_View], seed: int) -> UInt8:
+def _label_of_one_frame(xyz: Float32, casts: list[MapView], views: list[_View], seed: int) -> UInt8:
     """For each map point (N, 3) what one of the frames that see it says, drawn at random; ``UNSEEN`` where none does.
 
     That is the map without fusion: the same points, each counting once, labelled by a single look.
@@ -136,13 +139,13 @@ def _label_of_one_frame(xyz: Float32, voxel_map: VoxelMap, views: list[_View], s
     rng = np.random.default_rng(seed)
     chosen = np.full(len(xyz), UNSEEN, np.uint8)
     looks = np.zeros(len(xyz), np.int64)
-    for view in views:
+    for view, cast in zip(views, casts, strict=True):
         p = transform(invert_pose(view.T_world_camera), xyz.astype(np.float64))
         front = np.flatnonzero(p[:, 2] > 0.05)
         uv = np.rint(project(p[front], camera)).astype(np.int64)
         inside = ((uv >= 0) & (uv < (camera.width, camera.height))).all(1)
         index, (u, v) = front[inside], uv[inside].T
-        surface = voxel_map.ray_cast(view.T_world_camera, camera).depth_m[v, u]
+        surface = cast.depth_m[v, u]
         visible = (surface > 0) & (np.abs(surface - p[index, 2]) < SEEN_M)
         index, label = index[visible], view.label[v[visible], u[visible]]
         looks[index] += 1
@@ -151,17 +154,17 @@ def _label_of_one_frame(xyz: Float32, voxel_map: VoxelMap, views: list[_View], s
     return chosen
 
 
-def _seen_from_its_frames(voxel_map: VoxelMap, views: list[_View]) -> tuple[ConfusionMatrix, ConfusionMatrix]:
+def _seen_from_its_frames(
+    casts: list[MapView], label_set: LabelSet, views: list[_View]
+) -> tuple[ConfusionMatrix, ConfusionMatrix]:
     """The finished map as its own frames see it, and their rendered labels, both at the pixels where it has a label.
 
     The two are each other's like: the same pixels of the same classes, so that their difference is what fusing brings.
     """
-    camera = camera_of_width(MAP_WIDTH)
-    cast, rendered = ConfusionMatrix(ROOMS), ConfusionMatrix(ROOMS)
-    for view in views:
-        seen = voxel_map.ray_cast(view.T_world_camera, camera).label
-        label = in_rooms(seen, voxel_map.label_set)
-        truth = np.where(seen == voxel_map.label_set.ignore_id, ROOMS.ignore_id, view.truth)
-        cast = cast + confusion_of(truth, label, ROOMS, "map seen from a frame")
+    fused, rendered = ConfusionMatrix(ROOMS), ConfusionMatrix(ROOMS)
+    for view, cast in zip(views, casts, strict=True):
+        label = in_rooms(cast.label, label_set)
+        truth = np.where(cast.label == label_set.ignore_id, ROOMS.ignore_id, view.truth)
+        fused = fused + confusion_of(truth, label, ROOMS, "map seen from a frame")
         rendered = rendered + confusion_of(truth, view.label, ROOMS, "frame")
-    return cast, rendered
+    return fused, rendered

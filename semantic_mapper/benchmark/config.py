@@ -91,13 +91,7 @@ class SceneBudget(Config, frozen=True):
     resting_share: Share = FinetuneConfig().resting_share  # see ``FinetuneConfig``
     doubtful_share: Share = StepConfig().doubtful_share  # see ``StepConfig``
     patience: int = 0  # see ``FinetuneConfig``; by default a budget is spent to its end
-    shares: tuple[float, ...] = (
-        0.0625,
-        0.125,
-        0.25,
-        0.5,
-        1.0,
-    )  # of the budget; each is a run of its own, a point of the curve
+    shares: tuple[float, ...] = (0.0625, 0.125, 0.25, 0.5, 1.0)  # of the budget; a run, and a point of the curve, each
 
 
 class SuiteConfig(Config, frozen=True):
