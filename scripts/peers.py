@@ -2,8 +2,8 @@
 
 Encoders learn from single images first: after a common start one goes on with colours, the other with measured depth
 too, where there is any. Each field takes one of the two over and spends the same number of steps on rays: every chain
-has the same steps (recipes/cpu-images.toml and cpu-rays.toml, or gpu-*). On CPUs every run has one core, two runs go on
-at a time. A run that was ended goes on where it stopped when the same command comes again.
+has the same steps (recipes/cpu-images.toml and cpu-rays.toml, or gpu-*). On CPUs two runs go on at a time and
+share the cores. A run that was ended goes on where it stopped when the same command comes again.
 
     python scripts/peers.py --out runs/peers [NAME...]        train, all of them without names
     python scripts/peers.py --out runs/peers --eval [NAME...] compare them, with and without depth
@@ -89,8 +89,12 @@ def finished(folder: Path) -> bool:
     return state.is_file() and unfinished_step(state) is None
 
 
-def train(name: str, out: Path, seed: int, steps: int, tier: str = "cpu") -> int:
-    """Train one run, or go on with it; returns the exit code of the command."""
+def train(name: str, out: Path, seed: int, steps: int, tier: str = "cpu", threads: int = 1) -> int:
+    """Train one run, or go on with it; returns the exit code of the command.
+
+    Args:
+        threads: Of each library on CPUs; a GPU's run has all.
+    """
     folder = out / name
     state, config, wanted = folder / STATE_FILE, folder / "recipe.toml", recipe(name, seed, steps, tier)
     if state.is_file() and tomllib.loads(config.read_text(encoding="utf-8")) != tomllib.loads(wanted):
@@ -107,10 +111,10 @@ def train(name: str, out: Path, seed: int, steps: int, tier: str = "cpu") -> int
     if state.is_file():
         command += ["--resume"]
     print(f"{name}: {' '.join(command)}", flush=True)
-    one_core = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
-    alone = one_core if tier == "cpu" else {}
+    share = {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "passive"}
+    limits = share if tier == "cpu" else {}
     with (folder / "train.log").open("ab") as log:
-        code = subprocess.run(command, env=os.environ | alone, stdout=log, stderr=log, check=False).returncode
+        code = subprocess.run(command, env=os.environ | limits, stdout=log, stderr=log, check=False).returncode
     print(f"{name}: ended with {code}", flush=True)
     return code
 
@@ -125,10 +129,11 @@ def train_all(names: list[str], out: Path, seed: int, steps: int, jobs: int, tie
         [name for name in names if name not in encoders],
     )
     failed = Event()
+    threads = max((os.cpu_count() or 1) // jobs, 1)
 
     def train_unless_failed(name: str) -> int:
         """Ctrl-C ends the runs at hand; the ones that wait must not begin."""
-        code = 0 if failed.is_set() else train(name, out, seed, steps, tier)
+        code = 0 if failed.is_set() else train(name, out, seed, steps, tier, threads)
         if code:
             failed.set()
         return code
@@ -177,7 +182,7 @@ def main() -> int:
     parser.add_argument("--eval", action="store_true", help="compare instead of train")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=0, help="of every run, instead of the recipes'")
-    parser.add_argument("--jobs", type=int, default=0, help="runs at a time [cpu: 2, of one core each; gpu: 1]")
+    parser.add_argument("--jobs", type=int, default=0, help="runs at a time, which share the cores [cpu: 2; gpu: 1]")
     parser.add_argument(
         "--tier", choices=("cpu", "gpu"), default="cpu", help="160x120 on CPU cores, or 320x240 on a GPU"
     )
