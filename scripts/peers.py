@@ -89,11 +89,11 @@ def finished(folder: Path) -> bool:
     return state.is_file() and unfinished_step(state) is None
 
 
-def train(name: str, out: Path, seed: int, steps: int, tier: str = "cpu", threads: int = 1) -> int:
+def train(name: str, out: Path, seed: int, steps: int, tier: str = "cpu", cores: int = 1) -> int:
     """Train one run, or go on with it; returns the exit code of the command.
 
     Args:
-        threads: Of each library on CPUs; a GPU's run has all.
+        cores: On CPUs. One trains, the others render rooms ahead: more threads for the training itself gain little.
     """
     folder = out / name
     state, config, wanted = folder / STATE_FILE, folder / "recipe.toml", recipe(name, seed, steps, tier)
@@ -111,8 +111,10 @@ def train(name: str, out: Path, seed: int, steps: int, tier: str = "cpu", thread
     if state.is_file():
         command += ["--resume"]
     print(f"{name}: {' '.join(command)}", flush=True)
-    share = {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "passive"}
-    limits = share if tier == "cpu" else {}
+    one_thread = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+    limits = one_thread if tier == "cpu" else {}
+    if tier == "cpu" and cores > 1:
+        command += ["--workers", str(cores - 1)]
     with (folder / "train.log").open("ab") as log:
         code = subprocess.run(command, env=os.environ | limits, stdout=log, stderr=log, check=False).returncode
     print(f"{name}: ended with {code}", flush=True)
@@ -129,11 +131,11 @@ def train_all(names: list[str], out: Path, seed: int, steps: int, jobs: int, tie
         [name for name in names if name not in encoders],
     )
     failed = Event()
-    threads = max((os.cpu_count() or 1) // jobs, 1)
+    cores = max((os.cpu_count() or 1) // jobs, 1)
 
     def train_unless_failed(name: str) -> int:
         """Ctrl-C ends the runs at hand; the ones that wait must not begin."""
-        code = 0 if failed.is_set() else train(name, out, seed, steps, tier, threads)
+        code = 0 if failed.is_set() else train(name, out, seed, steps, tier, cores)
         if code:
             failed.set()
         return code

@@ -40,6 +40,16 @@ def test_a_field_brings_the_encoders_that_it_starts_from(tmp_path: Path, calls: 
     ]
 
 
+def test_a_run_alone_renders_rooms_on_the_other_cores(
+    tmp_path: Path, calls: list[list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(peers.os, "cpu_count", lambda: 4)
+    peers.train_all(["unet"], tmp_path / "alone", 0, 0, 1)
+    peers.train_all(["unet"], tmp_path / "four", 0, 0, 4)
+    workers = [c[c.index("--workers") + 1] if "--workers" in c else "" for c in calls]
+    assert workers == ["3", "3", "", ""]
+
+
 @pytest.mark.parametrize("tier", ["cpu", "gpu"])
 def test_all_chains_have_the_same_steps(tier: str) -> None:
     def steps(name: str) -> tuple[int, int]:
