@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -50,6 +50,30 @@ class Run:
     encoder_rate: float = 0.0
 
 
+@dataclass(frozen=True)
+class Budget:
+    """What all runs of one comparison have in common.
+
+    Args:
+        seed: Of every run.
+        steps: Of every run, instead of the recipes'; 0 = the recipes'.
+        tier: "cpu" or "gpu".
+        jobs: Runs at a time.
+        encoder: Settings of the image encoder other than the default ones.
+    """
+
+    seed: int = 0
+    steps: int = 0
+    tier: str = "cpu"
+    jobs: int = 2
+    encoder: dict[str, Any] = field(default_factory=dict[str, Any])
+
+    @property
+    def cores(self) -> int:
+        """CPU cores of one run."""
+        return max((os.cpu_count() or 1) // self.jobs, 1)
+
+
 START = "start"  # what both encoders have in common; nothing to compare
 RUNS = {
     START: Run("unet", depth=False, images=True),
@@ -67,19 +91,16 @@ RUNS = {
 }
 
 
-def recipe(name: str, seed: int, steps: int = 0, tier: str = "cpu") -> str:
-    """The recipe of a run as TOML.
-
-    Args:
-        steps: Instead of the recipe's; 0 = the recipe's.
-    """
+def recipe(name: str, budget: Budget) -> str:
+    """The recipe of a run as TOML."""
     run = RUNS[name]
-    file = RECIPES / f"{tier}-{'images' if run.images else 'rays'}.toml"
+    file = RECIPES / f"{budget.tier}-{'images' if run.images else 'rays'}.toml"
     plain: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
-    plain |= {"kind": run.kind, "seed": seed, "steps": steps or round(run.share * plain["steps"])}
+    steps = budget.steps or round(run.share * plain["steps"])
+    plain |= {"kind": run.kind, "seed": budget.seed, "steps": steps}
     if run.encoder_rate:
         plain["encoder_rate"] = run.encoder_rate
-    plain["field"] = {"encoder": {"depth": run.depth}}
+    plain["field"] = {"encoder": {"depth": run.depth} | budget.encoder}
     return "\n".join(_lines(plain, "")) + "\n"
 
 
@@ -89,14 +110,10 @@ def finished(folder: Path) -> bool:
     return state.is_file() and unfinished_step(state) is None
 
 
-def train(name: str, out: Path, seed: int, steps: int, tier: str = "cpu", cores: int = 1) -> int:
-    """Train one run, or go on with it; returns the exit code of the command.
-
-    Args:
-        cores: On CPUs. One trains, the others render rooms ahead: more threads for the training itself gain little.
-    """
+def train(name: str, out: Path, budget: Budget) -> int:
+    """Train one run, or go on with it; returns the exit code of the command."""
     folder = out / name
-    state, config, wanted = folder / STATE_FILE, folder / "recipe.toml", recipe(name, seed, steps, tier)
+    state, config, wanted = folder / STATE_FILE, folder / "recipe.toml", recipe(name, budget)
     if state.is_file() and tomllib.loads(config.read_text(encoding="utf-8")) != tomllib.loads(wanted):
         print(f"{name}: {config} differs from what is asked for (--seed, --steps?); take another --out", flush=True)
         return 1
@@ -112,16 +129,17 @@ def train(name: str, out: Path, seed: int, steps: int, tier: str = "cpu", cores:
         command += ["--resume"]
     print(f"{name}: {' '.join(command)}", flush=True)
     one_thread = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
-    limits = one_thread if tier == "cpu" else {}
-    if tier == "cpu" and cores > 1:
-        command += ["--workers", str(cores - 1)]
+    limits = one_thread if budget.tier == "cpu" else {}
+    if budget.tier == "cpu" and budget.cores > 1:
+        # One core trains and the others render rooms ahead: more threads for the training itself gain little.
+        command += ["--workers", str(budget.cores - 1)]
     with (folder / "train.log").open("ab") as log:
         code = subprocess.run(command, env=os.environ | limits, stdout=log, stderr=log, check=False).returncode
     print(f"{name}: ended with {code}", flush=True)
     return code
 
 
-def train_all(names: list[str], out: Path, seed: int, steps: int, jobs: int, tier: str = "cpu") -> int:
+def train_all(names: list[str], out: Path, budget: Budget) -> int:
     """Encoders first, then the fields that start from them."""
     encoders = {name for name in names if RUNS[name].images} | {RUNS[name].encoder for name in names} - {""}
     encoders |= {RUNS[name].encoder for name in encoders} - {""}
@@ -131,17 +149,16 @@ def train_all(names: list[str], out: Path, seed: int, steps: int, jobs: int, tie
         [name for name in names if name not in encoders],
     )
     failed = Event()
-    cores = max((os.cpu_count() or 1) // jobs, 1)
 
     def train_unless_failed(name: str) -> int:
         """Ctrl-C ends the runs at hand; the ones that wait must not begin."""
-        code = 0 if failed.is_set() else train(name, out, seed, steps, tier, cores)
+        code = 0 if failed.is_set() else train(name, out, budget)
         if code:
             failed.set()
         return code
 
     for group in groups:
-        with ThreadPoolExecutor(jobs) as pool:
+        with ThreadPoolExecutor(budget.jobs) as pool:
             codes = list(pool.map(train_unless_failed, group))
         if any(codes):
             return max(codes)
@@ -184,6 +201,12 @@ def main() -> int:
     parser.add_argument("--eval", action="store_true", help="compare instead of train")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=0, help="of every run, instead of the recipes'")
+    parser.add_argument(
+        "--encoder",
+        default="",
+        metavar="TOML",
+        help='settings of every image encoder, e.g. "channels = [32]; blocks = [2]"',
+    )
     parser.add_argument("--jobs", type=int, default=0, help="runs at a time, which share the cores [cpu: 2; gpu: 1]")
     parser.add_argument(
         "--tier", choices=("cpu", "gpu"), default="cpu", help="160x120 on CPU cores, or 320x240 on a GPU"
@@ -196,7 +219,8 @@ def main() -> int:
     if given.eval:
         return compare(names, given.out, given.tier)
     jobs = given.jobs or (2 if given.tier == "cpu" else 1)
-    return train_all(names, given.out, given.seed, given.steps, jobs, given.tier)
+    encoder = tomllib.loads(given.encoder.replace(";", "\n"))
+    return train_all(names, given.out, Budget(given.seed, given.steps, given.tier, jobs, encoder))
 
 
 def _lines(table: dict[str, Any], path: str) -> list[str]:

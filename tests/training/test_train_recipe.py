@@ -62,7 +62,7 @@ def test_every_recipe_is_a_config_of_a_field_that_can_be_built(path: Path):
 
 @pytest.mark.parametrize("name", list(peers.RUNS))
 def test_recipes_of_the_comparison_are_configs_and_start_from_encoders_of_their_shape(name: str, tmp_path: Path):
-    (tmp_path / "r.toml").write_text(peers.recipe(name, 3, 100), encoding="utf-8")
+    (tmp_path / "r.toml").write_text(peers.recipe(name, peers.Budget(seed=3, steps=100)), encoding="utf-8")
     config = load_config(tmp_path / "r.toml", TrainConfig)
     run = peers.RUNS[name]
     assert (config.seed, config.steps, config.kind) == (3, 100, run.kind)
