@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import platform
 import subprocess
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,3 +53,13 @@ def _git(folder: Path, *arguments: str) -> str | None:
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.strip() if done.returncode == 0 else None
+
+
+def rooms_before(origins: Sequence[Mapping[str, Any]]) -> int:
+    """How many rooms the runs of ``origin`` and theirs have seen.
+
+    A run goes on behind them: on rooms that its encoder was fitted to, features are surer than they will ever be again,
+    and all that reads them would learn to trust them.
+    """
+    recipes = [origin["recipe"] for origin in origins]
+    return sum(int(recipe.get("rooms", 0)) + rooms_before(recipe.get("origins", ())) for recipe in recipes)

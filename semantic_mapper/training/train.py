@@ -30,7 +30,7 @@ from semantic_mapper.training.folder_lock import sole_use_of
 from semantic_mapper.training.images import ImageBatch, draw_images, images_loss
 from semantic_mapper.training.optimiser import make_optimiser, set_rates
 from semantic_mapper.training.ranks import Ranks, joined, ranks_from_environment
-from semantic_mapper.training.recipe import provenance
+from semantic_mapper.training.recipe import provenance, rooms_before
 from semantic_mapper.training.rooms import RoomPool, RoomViews
 from semantic_mapper.training.schedule import budget_fraction, cosine_rate
 from semantic_mapper.training.start import take_over, take_over_encoder
@@ -50,7 +50,7 @@ from semantic_mapper.training.views import stack_sources
 STATE_FILE = "state.safetensors"
 WEIGHTS_FILE = "weights.safetensors"
 IMAGES_FILE = "after-images.safetensors"  # what steps on images alone have come to
-ROOMS_A_SEED = 10_000  # places between the first rooms of two training seeds
+ROOMS_A_SEED = 61_803  # places between the first rooms of two seeds: far apart, and no two seeds have the same
 WARM_UP = 0.01  # share of the budget
 _FREE = ("seconds", "steps", "device", "workers", "save_every_s")  # may differ when a run goes on
 
@@ -176,7 +176,7 @@ class _Run:
             calibrate(encoder, stack_sources(rooms[0].resident))
         pool = RoomPool(
             config.pool,
-            config.seed * ROOMS_A_SEED + self.ranks.rank,
+            config.seed * ROOMS_A_SEED + rooms_before(progress.origins) + self.ranks.rank,
             stride=self.ranks.world,
             draws=progress.draws,
             workers=config.workers,

@@ -19,6 +19,7 @@ class TrainStepConfig(StepConfig, frozen=True):
     """A step of training to generalize: many densities of views, no known labels, often no depth at all."""
 
     views_max: int = 12
+    own_view_share: float = 0.0  # the query's own image would give the answer away
     known_labels: bool = False
     blind: float = 0.25
     blind_thinning: int = 4  # 32 samples a ray instead of 8

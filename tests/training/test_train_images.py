@@ -1,6 +1,7 @@
 """Steps on single images, mirrored worlds, and encoders that are taken over."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -15,9 +16,10 @@ from semantic_mapper.geometry import invert_pose_torch
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.images import ImageStepConfig, draw_images, images_loss
 from semantic_mapper.training.losses import image_loss
-from semantic_mapper.training.rooms import RoomPoolConfig, render_room
+from semantic_mapper.training.recipe import rooms_before
+from semantic_mapper.training.rooms import RoomPool, RoomPoolConfig, render_room
 from semantic_mapper.training.start import take_over_encoder
-from semantic_mapper.training.train import IMAGES_FILE, STATE_FILE, train
+from semantic_mapper.training.train import IMAGES_FILE, STATE_FILE, WEIGHTS_FILE, train
 from semantic_mapper.training.views import mirrored_view, query_rays
 from tests.small import SMALL_ENCODER
 from tests.training.small_run import POOL, small_run
@@ -95,6 +97,24 @@ def test_every_kind_with_a_classifier_learns_from_images_and_the_others_say_so()
         images_loss(build_field("semantic_nerf", {}, ROOMS), batch, config)
 
 
+def test_a_run_never_meets_the_rooms_of_the_runs_it_started_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    firsts: list[int] = []
+
+    class Pool(RoomPool):
+        def __init__(self, config: RoomPoolConfig, first: int, **rest: Any) -> None:
+            firsts.append(first)
+            super().__init__(config, first, **rest)
+
+    monkeypatch.setattr("semantic_mapper.training.train.RoomPool", Pool)
+    seen = [0]
+    weights: dict[str, str] = {}
+    for name in ("a", "b", "c"):
+        run = train(small_run(images={"share": 1.0, "rooms": 1}, steps=3, **weights), tmp_path / name)
+        seen.append(seen[-1] + run.recipe["rooms"])
+        weights = {"encoder_from": str(tmp_path / name / WEIGHTS_FILE)}
+    assert [first - firsts[0] for first in firsts] == seen[:-1]
+
+
 def test_weights_after_the_images_are_kept_and_another_kind_takes_their_encoder_over(tmp_path: Path):
     images = {"share": 0.5, "rooms": 1}
     train(small_run(images=images, steps=4), tmp_path / "first")
@@ -114,6 +134,7 @@ def test_weights_after_the_images_are_kept_and_another_kind_takes_their_encoder_
     (origin,) = trained.recipe["origins"]
     assert (origin["file"], origin["recipe"]["kind"], origin["recipe"]["steps"]) == (IMAGES_FILE, "train", 2)
     assert origin["recipe"]["config"]["images"]["share"] == 0.5 and len(origin["sha256"]) == 64
+    assert rooms_before(trained.recipe["origins"]) == origin["recipe"]["rooms"] > 0
     other = trained.model
     assert other.image_encoder is not None
     mine, theirs = other.image_encoder.state_dict(), kept.image_encoder.state_dict()
