@@ -90,6 +90,11 @@ def evaluate(
     from nodes.suite import run_suite_verb
 
     settings = suites.suite_config(config, tier, {**given, "seconds": seconds, "seed": seed})
+    if settings.protocol != "generalize" and baseline is not None:
+        raise typer.BadParameter("goes with --protocol generalize: keyframes are all there is", param_hint="--baseline")
+    if settings.protocol == "generalize" and not (steps is None and seconds is None and keyframes is None):
+        hint = "--steps, --seconds, --keyframes"
+        raise typer.BadParameter("go with --protocol finetune and scratch", param_hint=hint)
     return run_suite_verb(settings, weights or [], kind or [], maps, json_file)
 
 

@@ -99,6 +99,7 @@ _VIEW_ROWS: _Rows = (
     ("multi-view consistency", "figures.consistency", percent),
     ("distance of source views", "figures.baseline_m", lambda v: f"{v:.2f} m"),
     ("seen by some source view", "figures.seen", percent),
+    ("labels carried by depth alone: mIoU", "figures.carried_miou", percent),
 )
 _MAP_ROWS: _Rows = (
     ("map: rooms", "map.rooms", str),

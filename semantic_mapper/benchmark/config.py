@@ -7,6 +7,7 @@ import json
 from typing import Literal
 
 from semantic_mapper.config import Config, MapperConfig, Positive, SamplingConfig, Share, to_plain
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.scenes import SUITE_VERSION, TEST_SEEDS, VALIDATION_SEEDS, CameraPathConfig
 from semantic_mapper.scenes.config import DepthSensorName
 from semantic_mapper.training.finetune import FinetuneConfig
@@ -83,7 +84,7 @@ class SceneBudget(Config, frozen=True):
 
     keyframes: int = 12  # labelled
     guard: int = 3  # frames on either side of a query that are no keyframes
-    labelled_sources: bool = True  # queries: give the keyframes' labels to fields that take labels of source views
+    labelled_sources: bool = True  # fitting and queries: the keyframes bring their labels to fields that take some
     seconds: float = 120.0  # wall clock; 0 = only steps count
     steps: int = 0  # 0 = only seconds count
     learning_rate: Positive = FinetuneConfig().learning_rate
@@ -111,6 +112,26 @@ class SuiteConfig(Config, frozen=True):
     seed: int = 0
 
 
+def check_suite(suite: SuiteConfig) -> None:
+    """Refuse settings that no run can follow.
+
+    Raises:
+        ConfigError: which, and what to do.
+    """
+    seeds = TEST_SEEDS if suite.split == "test" else VALIDATION_SEEDS
+    if not 0 <= suite.rooms <= len(seeds):
+        raise ConfigError(f"rooms: split '{suite.split}' has {len(seeds)} rooms, {suite.rooms} are asked for; 0 = all")
+    if suite.depth and suite.sequence.camera.sensor == "none":
+        raise ConfigError("sequence.camera: a camera without a depth sensor gives no depth; --depth off")
+    if suite.protocol == "generalize":
+        return
+    scene = suite.scene
+    if scene.seconds <= 0 and scene.steps <= 0:
+        raise ConfigError(f"protocol {suite.protocol} needs a budget: set seconds, steps, or both")
+    if not scene.shares or min(scene.shares) <= 0 or max(scene.shares) != 1:
+        raise ConfigError(f"scene.shares must lie in (0, 1] and end at 1.0, the whole budget; got {list(scene.shares)}")
+
+
 def suite_seeds(suite: SuiteConfig) -> list[int]:
     """Seeds of the rooms, in order."""
     seeds = TEST_SEEDS if suite.split == "test" else VALIDATION_SEEDS
@@ -136,7 +157,12 @@ def fit_config(suite: SuiteConfig, share: float) -> FinetuneConfig:
         encoder_rate=scene.encoder_rate,
         patience=scene.patience,
         resting_share=scene.resting_share,
-        step=StepConfig(sampling=sampling, doubtful_share=scene.doubtful_share),
+        step=StepConfig(
+            sampling=sampling,
+            blind_samples=suite.tier.blind.guided,
+            doubtful_share=scene.doubtful_share,
+            known_labels=scene.labelled_sources,
+        ),
         seed=suite.seed,
     )
 

@@ -40,6 +40,7 @@ def view_figures(records: Sequence[RoomRecord]) -> dict[str, Any]:
         "baseline_m": _mean([i.baseline_m for i in images]),
         "seen": _mean([i.seen for i in images]),
         "per_room_miou": {str(r.room): c.metrics().miou for r, c in zip(records, confusions, strict=True)},
+        "carried_miou": _carried(records),
         "curve": _curve(records),
         "seconds_to_95_percent": _seconds_to_most(_curve(records)),
         "last_gain": _last_gain(_curve(records)),
@@ -89,6 +90,12 @@ def _ece(records: Sequence[RoomRecord]) -> float | None:
     confidence = np.array([r.calibration.confidence for r in records], np.float64)
     right = np.array([r.calibration.right for r in records], np.float64)
     return calibration_of_bins(count.sum(axis=0), confidence.sum(axis=0), right.sum(axis=0)).ece
+
+
+def _carried(records: Sequence[RoomRecord]) -> float | None:
+    """mIoU of the keyframes' labels carried over by depth alone; None where any room has none."""
+    rows = [r.carried for r in records if r.carried is not None]
+    return _summed([from_rows(r) for r in rows]).metrics().miou if rows and len(rows) == len(records) else None
 
 
 def _curve(records: Sequence[RoomRecord]) -> list[dict[str, Any]]:

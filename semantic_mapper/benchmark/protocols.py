@@ -7,9 +7,16 @@ from dataclasses import dataclass
 
 import torch
 
-from semantic_mapper.benchmark.config import SPACINGS, SpacingConfig, SuiteConfig, fit_config, settings_digest
+from semantic_mapper.benchmark.config import (
+    SPACINGS,
+    SpacingConfig,
+    SuiteConfig,
+    check_suite,
+    fit_config,
+    settings_digest,
+)
 from semantic_mapper.benchmark.predict import predict_view
-from semantic_mapper.benchmark.records import CurvePoint, RoomRecord
+from semantic_mapper.benchmark.records import CurvePoint, RoomRecord, Rows
 from semantic_mapper.benchmark.rooms import BenchmarkRoom, as_given
 from semantic_mapper.benchmark.scoring import (
     Answer,
@@ -26,6 +33,7 @@ from semantic_mapper.fields.checkpoint import adapt_model
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.training.baselines import WarpBaseline
 from semantic_mapper.training.finetune import FinetuneProgress, finetune
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.training.views import stack_sources, view_from_frame
@@ -147,8 +155,7 @@ def _fit_and_score(
     stopped: Callable[[], object],
 ) -> RoomResult | None:
     """Fit to the keyframes with growing shares of the budget; the whole budget gives the room's figures."""
-    if suite.scene.seconds <= 0 and suite.scene.steps <= 0:
-        raise ConfigError(f"protocol {suite.protocol} needs a budget: set seconds, steps, or both")
+    check_suite(suite)
     keyframes = choose_labelled(room, suite)
     frames = [as_given(room.frames[n], depth=suite.depth, label=True) for n in keyframes]
     views = stack_sources([view_from_frame(frame, ROOMS, suite.tier.width) for frame in frames])
@@ -194,6 +201,15 @@ def _curve_point(share: float, seconds: float, steps: int, confusion: ConfusionM
     return CurvePoint(share=share, seconds=seconds, steps=steps, confusion=as_rows(confusion))
 
 
+def carried_labels(room: BenchmarkRoom, keyframes: Sequence[int]) -> Rows:
+    """What the labelled keyframes give by depth alone, without any field: the confusion over all query views."""
+    carried = WarpBaseline(ROOMS, [as_given(room.frames[n], depth=True, label=True) for n in keyframes])
+    total = ConfusionMatrix(ROOMS)
+    for query, truth in room.truth.items():
+        total.update(truth.label, carried.predict(as_given(room.frames[query], depth=True)), f"query view {query}")
+    return as_rows(total)
+
+
 def _scored(
     room: BenchmarkRoom,
     answers: dict[int, Answer],
@@ -215,5 +231,6 @@ def _scored(
         compared=agreement.compared,
         keyframes=keyframes,
         curve=curve,
+        carried=carried_labels(room, keyframes) if keyframes and suite.depth else None,
     )
     return RoomResult(record, answers)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from semantic_mapper.config import Config
 
+Rows = tuple[tuple[int, ...], ...]  # a confusion's counts
+
 
 class DepthRecord(Config, frozen=True):
     """``evaluation.depth_error.DepthErrors`` as data."""
@@ -43,7 +45,7 @@ class CurvePoint(Config, frozen=True):
     share: float
     seconds: float
     steps: int
-    confusion: tuple[tuple[int, ...], ...]
+    confusion: Rows
 
 
 class RoomRecord(Config, frozen=True, tag_field="record", tag="views"):
@@ -53,13 +55,14 @@ class RoomRecord(Config, frozen=True, tag_field="record", tag="views"):
     weights: str  # digest
     room: int
     programme: str
-    confusion: tuple[tuple[int, ...], ...]
+    confusion: Rows
     images: tuple[ImageRecord, ...]
     calibration: CalibrationRecord
     agreeing: int  # of the pixels of one query view that are found again in its neighbour
     compared: int
     keyframes: tuple[int, ...] = ()  # that the field was fitted to
     curve: tuple[CurvePoint, ...] = ()
+    carried: Rows | None = None  # of the keyframes' labels carried over by depth alone
 
 
 class MapRecord(Config, frozen=True, tag_field="record", tag="map"):
@@ -71,14 +74,14 @@ class MapRecord(Config, frozen=True, tag_field="record", tag="map"):
     programme: str
     points: int  # of the map's surface
     on_surface: float  # share of them near the true surface
-    confusion: tuple[tuple[int, ...], ...]  # at the map's own points
-    surface_confusion: tuple[tuple[int, ...], ...]  # at points of the true surface; holes count as wrong
-    view_confusion: tuple[tuple[int, ...], ...]  # of the frames' rendered labels
+    confusion: Rows  # at the map's own points
+    surface_confusion: Rows  # at points of the true surface; holes count as wrong
+    view_confusion: Rows  # of the frames' rendered labels
     view_miou: float | None  # mean of the frames' own mIoU
-    cast_confusion: tuple[tuple[int, ...], ...]  # of the finished map, cast into its frames, where it has an answer
-    cast_view_confusion: tuple[tuple[int, ...], ...]  # of the frames' rendered labels at those same pixels
-    seen_confusion: tuple[tuple[int, ...], ...]  # at those of the map's points that some frame sees
-    one_frame_confusion: tuple[tuple[int, ...], ...]  # at the same points, of one frame each, drawn at random
+    cast_confusion: Rows  # of the finished map, cast into its frames, where it has an answer
+    cast_view_confusion: Rows  # of the frames' rendered labels at those same pixels
+    seen_confusion: Rows  # at those of the map's points that some frame sees
+    one_frame_confusion: Rows  # at the same points, of one frame each, drawn at random
 
 
 Record = RoomRecord | MapRecord

@@ -18,7 +18,7 @@ import structlog
 import torch
 
 from semantic_mapper.config import AtLeastOne, Config, Share, SRayConfig, to_plain
-from semantic_mapper.errors import FrameError
+from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.fields.base import MAX_SOURCE_VIEWS
 from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, anchor_from_frame
 from semantic_mapper.fields.encoder import calibrate
@@ -26,7 +26,7 @@ from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.training.device import encoder_in_bfloat16
+from semantic_mapper.training.device import DeviceName, choose_device, encoder_in_bfloat16
 from semantic_mapper.training.doubt import with_doubt
 from semantic_mapper.training.losses import IGNORE, semantic_loss
 from semantic_mapper.training.optimiser import make_optimiser, set_rates
@@ -66,6 +66,7 @@ class FinetuneConfig(Config, frozen=True):
     bfloat16: bool = True  # the image encoder computes in it where that is fast (GPUs, CPUs with AMX)
     resting_share: Share = 0.0  # of the budget, at its start, in which the image encoder rests: steps cost a third
     seed: int = 0
+    device: DeviceName = "auto"
     step: StepConfig = StepConfig()
 
 
@@ -103,7 +104,8 @@ def finetune(
     Args:
         frames: Labelled keyframes with poses; at least 2.
         label_set: Classes of their labels, and of the result.
-        start: Weights to start from, adapted to ``label_set`` by class name; None = random.
+        start: Weights to start from, adapted to ``label_set`` by class name; None = random. A field of which nothing is
+            trained yet learns with batch norms that are alive.
         config: At least one of ``seconds`` and ``steps`` set.
         on_progress: Called after every step.
         stopped: Asked before every step; once it says so (anything true), the best weights so far are the result.
@@ -111,7 +113,10 @@ def finetune(
 
     Raises:
         FrameError: fewer than two frames, or none with labels.
+        ConfigError: no budget, or no GPU where one is asked for.
     """
+    if config.seconds <= 0 and config.steps <= 0:
+        raise ConfigError("finetuning needs a budget: set seconds, steps, or both")
     if len(frames) < 2 or all(f.label is None for f in frames):
         raise FrameError(f"finetuning needs at least 2 labelled keyframes, got {len(frames)}; raise --keyframes")
     torch.manual_seed(config.seed)
@@ -119,7 +124,8 @@ def finetune(
     model = SRay(SRayConfig(), label_set) if start is None else adapt_model(start, label_set)
     views = [view_from_frame(f, label_set, config.width) for f in frames]
     train, held_out = zip(*(_split(v, config.held_out_share, generator) for v in views), strict=True)
-    device = next(model.parameters()).device
+    device = choose_device(config.device, 0)
+    model.to(device)
     began = time.monotonic()
     with encoder_in_bfloat16(model, device) if config.bfloat16 else nullcontext():
         best, steps = _run(model, train, held_out, config, generator, on_progress, stopped)
@@ -136,7 +142,7 @@ def finetune(
         "train_stamps_ns": sorted({int(f.stamp_ns) for f in frames} | {int(s) for s in seen_stamps_ns}),
     }
     anchors = tuple(anchor_from_frame(f, config.width) for f in frames)
-    return Checkpoint(model.eval(), anchors, recipe)
+    return Checkpoint(model.cpu().eval(), anchors, recipe)
 
 
 def _run(
@@ -150,11 +156,12 @@ def _run(
 ) -> tuple[_Best, int]:
     optimiser = make_optimiser(model, config.learning_rate, config.weight_decay)
     encoder = model.image_encoder
-    if encoder is not None and encoder.uncalibrated:
+    fresh = encoder is not None and encoder.uncalibrated
+    if encoder is not None and fresh:
         calibrate(encoder, to_device(stack_sources(train), next(model.parameters()).device))
     # A kind that classifies while it encodes has nothing to learn where its features are kept.
     rests = config.resting_share > 0 and not model.needs_own_view
-    encoded = encode_once(model, train) if rests else None
+    encoded = encode_once(model, train, with_labels=config.step.known_labels) if rests else None
     best = _Best(*_evaluate(model, train, held_out, config), 0, copy.deepcopy(model.state_dict()))
     latest = (best.loss, best.accuracy)
     doubts = config.step.doubtful_share > 0
@@ -173,7 +180,8 @@ def _run(
         if encoded is not None and fraction < config.resting_share:
             loss = resting_loss(model, encoded, train, query, sources, config.step, generator)
         else:
-            loss = training_loss(model, train, query, sources, config.step, generator)
+            with encoder.batch_statistics() if encoder is not None and fresh else nullcontext():
+                loss = training_loss(model, train, query, sources, config.step, generator)
         step += 1
         if loss is None:
             continue
@@ -217,7 +225,8 @@ def _split(view: LabelledView, share: float, generator: torch.Generator) -> tupl
 def _evaluate(
     model: LearnedField, train: Sequence[LabelledView], held_out: Sequence[LabelledView], config: FinetuneConfig
 ) -> tuple[float, float]:
-    """Class loss and accuracy of held-out rays, each view rendered from all others and their training labels."""
+    """Class loss and accuracy of held-out rays, each view rendered from all others; with their training labels, if the
+    config makes them known."""
     generator = torch.Generator().manual_seed(config.seed)
     sampling = config.step.sampling
     device = next(model.parameters()).device
@@ -225,7 +234,8 @@ def _evaluate(
     right, counted = 0, 0
     model.eval()
     with torch.inference_mode():
-        encoded = model.encode(to_device(stack_sources(train, with_labels=True), device))
+        sources = stack_sources(train, with_labels=config.step.known_labels)
+        encoded = model.encode(to_device(sources, device))
         for i, view in enumerate(held_out):
             flat = draw_pixels(view.channel, config.held_out_rays, 0.5, generator, len(model.label_set))
             if len(flat) == 0:
@@ -242,7 +252,7 @@ def _evaluate(
             )
             render, _ = model.render_samples(rays, z, chosen)
             losses.append(float(semantic_loss(render.logits, targets.channel)))
-            right += int((render.logits.argmax(1) == targets.channel).sum())
+            right += int(((render.logits.argmax(1) == targets.channel) & render.known).sum())
             counted += len(flat)
     model.train()
     return float(np.mean(losses)) if losses else float("inf"), right / max(counted, 1)

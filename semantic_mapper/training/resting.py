@@ -14,11 +14,11 @@ from semantic_mapper.training.step import StepConfig, draw_rays
 from semantic_mapper.training.views import LabelledView, stack_sources, to_device
 
 
-def encode_once(model: LearnedField, views: Sequence[LabelledView]) -> EncodedViews:
-    """All views with their labels, without gradients; on the model's device."""
+def encode_once(model: LearnedField, views: Sequence[LabelledView], *, with_labels: bool) -> EncodedViews:
+    """All views, with their labels or without, but without gradients; on the model's device."""
     device = next(model.parameters()).device
     with torch.no_grad():
-        return model.encode(to_device(stack_sources(views, with_labels=True), device))
+        return model.encode(to_device(stack_sources(views, with_labels=with_labels), device))
 
 
 def resting_loss(
@@ -41,7 +41,8 @@ def resting_loss(
         return None
     rays, targets, z = drawn
     chosen = encoded.select(torch.tensor(list(sources), device=device))
-    chosen = replace(chosen, channel=_withheld(chosen.channel, query, sources, config, generator))
+    if config.known_labels:
+        chosen = replace(chosen, channel=_withheld(chosen.channel, query, sources, config, generator))
     render, _ = model.render_samples(to_device(rays, device), z.to(device), chosen)
     loss = ray_loss(render, to_device(targets, device), config.loss)
     logits = model.source_logits(chosen) if config.loss.source > 0 else None
@@ -56,5 +57,5 @@ def _withheld(
 ) -> torch.Tensor:
     """Known labels (m, H, W) of the sources without the query's own and those of a random share of the others."""
     keep = torch.rand(len(sources), generator=generator) >= config.labels_withheld
-    keep &= torch.tensor([config.known_labels and i != query for i in sources])
+    keep &= torch.tensor([i != query for i in sources])
     return torch.where(keep.to(channel.device)[:, None, None], channel, IGNORE)

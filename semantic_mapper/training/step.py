@@ -241,7 +241,7 @@ def _draw_samples(
     noise = 1 + config.prior_noise * torch.randn(len(flat), generator=generator)
     withheld = float(torch.rand(1, generator=generator)) < config.depth_withheld
     near_m, far_m = config.sampling.near_m, config.sampling.far_m
-    if blind or withheld:
+    if blind or withheld or not bool((target.depth_m > 0).any()):
         rays, targets = query_rays(target, flat[:: config.blind_thinning], near_m=near_m, far_m=far_m, prior=None)
         return rays, targets, sample_inverse_depth(rays.near_m, rays.far_m, config.blind_samples, generator)
     prior = target.depth_m.flatten()[flat] * noise

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from semantic_mapper.benchmark.config import SuiteConfig
+from semantic_mapper.benchmark.config import SuiteConfig, check_suite, fit_config
 from semantic_mapper.benchmark.contestants import load_contestants
 from semantic_mapper.benchmark.figures import view_figures
 from semantic_mapper.benchmark.predict import predict_view
@@ -144,6 +144,28 @@ def test_labels_of_the_keyframes_can_be_kept_from_the_queries() -> None:
         assert (field.seen.channel is not None) == given
 
 
+def test_labels_kept_from_the_queries_play_no_part_in_fitting_either() -> None:
+    plain = {"keyframes": 3, "guard": 1, "seconds": 0, "steps": 3, "shares": (1.0,)}
+    kept = score(tiny_contestant(), tiny_suite(protocol="finetune", scene={**plain, "labelled_sources": False}))
+    given = score(tiny_contestant(), tiny_suite(protocol="finetune", scene=plain))
+    assert kept.record.curve[0].confusion != given.record.curve[0].confusion
+    for known, suite in ((False, {**plain, "labelled_sources": False}), (True, plain)):
+        assert fit_config(tiny_suite(protocol="finetune", scene=suite), 1.0).step.known_labels is known
+
+
+def test_labels_carried_by_depth_alone_stand_beside_what_was_fitted() -> None:
+    suite = tiny_suite(protocol="finetune", scene={"keyframes": 3, "guard": 1, "seconds": 0, "steps": 1})
+    record = score(tiny_contestant(), suite).record
+    assert record.carried is not None
+    metrics = from_rows(record.carried).metrics()
+    assert metrics.total_accuracy is not None and metrics.total_accuracy > 0.3
+    assert metrics.coverage is not None and metrics.coverage < 1, "nothing where no keyframe looked"
+    assert view_figures([record])["carried_miou"] == metrics.miou
+    assert score(tiny_contestant(), tiny_suite()).record.carried is None
+    blind = {"keyframes": 3, "guard": 1, "seconds": 0, "steps": 1}
+    assert score(tiny_contestant(), tiny_suite(protocol="finetune", depth=False, scene=blind)).record.carried is None
+
+
 def test_scratch_starts_from_random_weights_whatever_the_file_holds() -> None:
     suite = tiny_suite(protocol="scratch")
     first, second = (score(tiny_contestant(seed), suite).record for seed in (0, 1))
@@ -178,3 +200,20 @@ def test_a_fitting_that_is_stopped_gives_no_figures() -> None:
 def test_a_budget_of_nothing_is_refused() -> None:
     with pytest.raises(ConfigError, match="needs a budget"):
         score(tiny_contestant(), tiny_suite(protocol="scratch", scene={"seconds": 0, "steps": 0}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"protocol": "finetune", "scene": {"shares": ()}}, "end at 1.0"),
+        ({"protocol": "finetune", "scene": {"shares": (0.0, 1.0)}}, "end at 1.0"),
+        ({"protocol": "scratch", "scene": {"shares": (-0.5, 1.0)}}, "end at 1.0"),
+        ({"protocol": "scratch", "scene": {"shares": (0.5, 3.0)}}, "end at 1.0"),
+        ({"protocol": "scratch", "scene": {"shares": (0.5,)}}, "end at 1.0"),
+        ({"rooms": 21}, "20 rooms"),
+        ({"sequence": {"camera": {"sensor": "none"}}}, "--depth off"),
+    ],
+)
+def test_settings_that_no_run_can_follow_are_refused(changes: dict[str, object], reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        check_suite(tiny_suite(**changes))

@@ -71,7 +71,7 @@ def test_weights_side_by_side_with_maps_and_a_second_call_that_continues(
 
 def test_fitting_shows_its_curve(suite: Path, two: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "fit.json"
-    options = ("--protocol", "scratch", "--steps", "2", "--rooms", "1", "--depth", "off", "--baseline", "wide")
+    options = ("--protocol", "scratch", "--steps", "2", "--rooms", "1", "--depth", "off")
     done = run("eval", "--suite", "rooms", "--config", suite, "--weights", two[0], *options, "--json", out)
     assert done.returncode == 0, done.stderr
     assert "mIoU before fitting" in done.stdout and "2 steps" in done.stdout
@@ -97,6 +97,9 @@ def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Pat
         ("log.mcap", "--kind", "unet"),
         ("log.mcap", "--rooms", "2"),
         ("log.mcap", "--weights", "a", "--weights", "b"),
+        ("--suite", "rooms", "--protocol", "finetune", "--baseline", "wide"),
+        ("--suite", "rooms", "--seconds", "3"),
+        ("--suite", "rooms", "--keyframes", "3"),
         ("--suite", "klevr"),
         ("--suite", "rooms", "--protocol", "finetune", "--map"),
         ("--suite", "rooms", "--views", "17"),

@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from semantic_mapper.config import convert_config
-from semantic_mapper.errors import FrameError
+from semantic_mapper.errors import ConfigError, FrameError
+from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training import device
 from semantic_mapper.training.doubt import LEAST, with_doubt
@@ -39,7 +41,7 @@ def start_loss(start):
 
 def test_weights_are_never_worse_than_the_start_on_held_out_rays():
     ruined = config(steps=12, learning_rate=30.0, final_learning_rate=30.0, gradient_clip=1e9)
-    start = tiny_field()
+    start = calibrated_field()
     result = finetune(tiny_frames(3), ROOMS, start, ruined)
     assert start_loss(start) >= result.recipe["held_out_loss"]
     if result.recipe["best_step"] == 0:
@@ -72,6 +74,39 @@ def test_without_patience_a_budget_is_spent_to_its_end():
 def test_finetuning_runs_on_a_gpu():
     result = finetune(tiny_frames(3), ROOMS, tiny_field().to("cuda"), config(steps=4, step={"doubtful_share": 0.5}))
     assert result.recipe["steps"] == 4 and math.isfinite(result.recipe["held_out_loss"])
+
+
+def test_a_budget_of_nothing_is_refused():
+    with pytest.raises(ConfigError, match="needs a budget"):
+        finetune(tiny_frames(3), ROOMS, tiny_field(), config(steps=0))
+
+
+def calibrated_field():
+    """Random weights whose norms are set: no fresh field to a finetuning."""
+    field = tiny_field()
+    calibrate(field.encoder, stack_sources([view_from_frame(f, ROOMS, 96) for f in tiny_frames(2)]))
+    return field
+
+
+def test_norms_live_in_a_field_of_which_nothing_is_trained_and_rest_in_any_other():
+    def moved(start: SRay) -> bool:
+        """Whether three steps that learn next to nothing change the statistics more than one does."""
+        still = {"learning_rate": 1e-9, "final_learning_rate": 1e-9, "held_out_share": 0.0}  # the last weights are kept
+        first, second = (finetune(tiny_frames(2), ROOMS, start, config(steps=n, **still)).model for n in (1, 3))
+        return any(
+            not torch.equal(a, b)
+            for (name, a), b in zip(first.state_dict().items(), second.state_dict().values(), strict=True)
+            if name.startswith("encoder.") and name.endswith("running_mean")
+        )
+
+    assert moved(tiny_field()) and not moved(calibrated_field())
+
+
+def test_held_out_rays_are_judged_without_labels_where_training_knows_none():
+    step = {"rays": 128, "known_labels": False}
+    still = {"steps": 1, "learning_rate": 0.0, "final_learning_rate": 0.0, "weight_decay": 0.0}
+    given, kept = (finetune(tiny_frames(3), ROOMS, tiny_field(), config(**still, **c)) for c in ({}, {"step": step}))
+    assert given.recipe["held_out_loss"] < kept.recipe["held_out_loss"], "labels of the others say much"
 
 
 def test_an_encoder_of_rate_0_stays_what_it_was_and_the_rest_learns():
