@@ -13,6 +13,7 @@ import torch
 
 from semantic_mapper.config import AtLeastOne, Config, Positive, Share
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.training.losses import Loss, image_loss
 from semantic_mapper.training.rooms import RoomViews
@@ -76,15 +77,26 @@ def images_loss(model: LearnedField, batch: ImageBatch, config: ImageStepConfig)
     Raises:
         ConfigError: a kind of field that says nothing of an image by itself.
     """
-    encoder = model.image_encoder
-    if encoder is None:
-        raise ConfigError(f"images.share: a field of kind '{model.kind}' has no image encoder; set it to 0")
+    encoder = encoder_for_images(model)
     with encoder.batch_statistics():
         logits = model.source_logits(model.encode(batch.views))
-    if logits is None:
-        raise ConfigError(
-            f"images.share: a field of kind '{model.kind}' does not classify single images; set it to 0, and take over "
-            "a trained encoder with encoder_from"
-        )
+    assert logits is not None  # or there would be no such encoder
     loss = image_loss(logits, batch.channel, config.balance)
     return Loss(loss, loss, torch.zeros_like(loss), torch.zeros_like(loss))
+
+
+def encoder_for_images(model: LearnedField) -> ImageEncoder:
+    """The image encoder of a field, where it can learn from single images.
+
+    Raises:
+        ConfigError: a kind of field that says nothing of an image by itself.
+    """
+    encoder = model.image_encoder
+    # The class is asked: the field itself would need views to encode, and there are none yet where a run is checked.
+    if encoder is None or type(model).source_logits is LearnedField.source_logits:
+        raise ConfigError(
+            f"a field of kind '{model.kind}' does not classify single images, so it can only learn from rays: set "
+            "share = 0 under [images] in the file that --config names (recipes/cpu-rays.toml does), and take over an "
+            "image encoder that has learned already with --encoder"
+        )
+    return encoder

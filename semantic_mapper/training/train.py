@@ -24,7 +24,7 @@ from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.scenes import SUITE_VERSION, TRAIN_SEEDS
+from semantic_mapper.scenes import SUITE_VERSION
 from semantic_mapper.training.device import bfloat16_is_fast, choose_device, compute_in_bfloat16
 from semantic_mapper.training.folder_lock import sole_use_of
 from semantic_mapper.training.images import ImageBatch, draw_images, images_loss
@@ -41,9 +41,10 @@ from semantic_mapper.training.step import (
     encodes_views_separately,
     pick_views_on_path,
 )
+from semantic_mapper.training.train_checks import check_field, check_nothing_is_overwritten, check_settings
 from semantic_mapper.training.train_config import TrainConfig
 from semantic_mapper.training.train_log import TrainLog
-from semantic_mapper.training.train_state import LOSS_PARTS, Progress, load_state, save_state, unfinished_step
+from semantic_mapper.training.train_state import LOSS_PARTS, Progress, load_state, save_state
 from semantic_mapper.training.validation import Scores, validate, validation_rooms
 from semantic_mapper.training.views import stack_sources
 
@@ -88,7 +89,11 @@ def train(
     """
     ranks = ranks_from_environment()
     device = choose_device(config.device, ranks.local)
-    _check(config, folder, resume)
+    check_settings(config)
+    if folder is None and resume:
+        raise ConfigError("to go on with a run its folder is needed")
+    if folder is not None and not resume:
+        check_nothing_is_overwritten(folder / STATE_FILE)
     with sole_use_of(folder if ranks.first else None), joined(ranks, device):
         run = _Run(config, folder, ranks, device)
         if resume:
@@ -138,6 +143,7 @@ class _Run:
         torch.manual_seed(config.seed)
         self.config, self.folder, self.ranks, self.device = config, folder, ranks, device
         self.field = build_field(config.kind, config.field, ROOMS).to(device)
+        check_field(self.field, config)
         self.loss: nn.Module = _StepLoss(self.field, config)
         if ranks.world > 1:  # parts that a config switches off (an attention, say) get no gradient
             self.loss = DistributedDataParallel(self.loss, find_unused_parameters=True)
@@ -370,24 +376,3 @@ class _Run:
                 workers=self.config.workers,
                 step=self.progress.step,
             )
-
-
-def _check(config: TrainConfig, folder: Path | None, resume: bool) -> None:
-    if config.seconds <= 0 and config.steps <= 0:
-        raise ConfigError("training needs a budget: set seconds, steps, or both")
-    if config.rooms_per_step < 1 or config.log_steps < 1:
-        raise ConfigError("rooms_per_step and log_steps must be at least 1")
-    if not 0 <= config.seed < len(TRAIN_SEEDS):
-        raise ConfigError(f"seed must be in 0..{len(TRAIN_SEEDS) - 1}, got {config.seed}")
-    step = config.step
-    if not 1 <= step.views_min <= step.views_max or step.rays < 1 or step.blind_thinning < 1:
-        raise ConfigError("step: need 1 <= views_min <= views_max, rays >= 1 and blind_thinning >= 1")
-    if resume and folder is None:
-        raise ConfigError("to go on with a run its folder is needed")
-    state = None if folder is None or resume else folder / STATE_FILE
-    stopped_at = unfinished_step(state) if state is not None and state.is_file() else None
-    if stopped_at is not None:
-        raise ConfigError(
-            f"{state}: a run was stopped here at step {stopped_at}; go on with --resume, or delete that file to "
-            "start anew"
-        )

@@ -133,9 +133,7 @@ def test_an_unfinished_run_is_not_overwritten_by_mistake(tmp_path: Path):
     assert train(small_run(steps=2), tmp_path).recipe["steps"] == 2
 
 
-def test_a_state_that_is_missing_or_damaged_says_so(tmp_path: Path):
-    with pytest.raises(WeightsError, match="no such training state"):
-        train(small_run(), tmp_path, resume=True)
+def test_a_state_that_is_damaged_says_so(tmp_path: Path):
     (tmp_path / STATE_FILE).write_bytes(b"nothing of the kind")
     with pytest.raises(WeightsError, match="not a readable training state"):
         train(small_run(), tmp_path, resume=True)

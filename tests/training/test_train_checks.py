@@ -1,0 +1,65 @@
+"""What is refused before the first room is rendered."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from semantic_mapper.errors import ConfigError, WeightsError
+from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
+from semantic_mapper.fields.registry import build_field
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.training.train import train
+from tests.training.small_run import small_run
+
+RAYS_ALONE = {"share": 0.0}
+
+
+@pytest.fixture(autouse=True)
+def no_rooms(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A test in which a room is rendered fails."""
+
+    def rendered(*_: Any) -> None:
+        pytest.fail("a room was about to be rendered")
+
+    monkeypatch.setattr("semantic_mapper.training.train.validation_rooms", rendered)
+
+
+@pytest.fixture
+def encoder(tmp_path: Path) -> str:
+    """Weights of a per-image field."""
+    path = tmp_path / "unet.safetensors"
+    shape = {"encoder": {"channels": [8, 16], "blocks": [1, 1], "depth": True}}
+    save_checkpoint(Checkpoint(build_field("unet", shape, ROOMS)), path)
+    return str(path)
+
+
+def test_kinds_that_do_not_classify_images_are_told_which_setting_to_change(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"kind 'mvsnerf' .* share = 0 under \[images\] .* --encoder"):
+        train(small_run(kind="mvsnerf", field={}), tmp_path)
+
+
+@pytest.mark.parametrize("images", [{}, RAYS_ALONE])
+def test_a_field_of_one_scene_has_nothing_to_learn_for_other_rooms(images: dict[str, float]):
+    with pytest.raises(ConfigError, match=r"a single scene .* --protocol scratch --kind semantic_nerf"):
+        train(small_run(kind="semantic_nerf", field={}, images=images))
+
+
+def test_a_state_to_go_on_with_has_to_be_there(tmp_path: Path):
+    with pytest.raises(WeightsError, match="no such training state; train without --resume first"):
+        train(small_run(), tmp_path, resume=True)
+    with pytest.raises(ConfigError, match="its folder is needed"):
+        train(small_run(), resume=True)
+
+
+def test_weights_to_start_from_have_to_be_of_the_same_field(encoder: str):
+    with pytest.raises(ConfigError, match="weights of another field"):
+        train(small_run(start=encoder))
+
+
+def test_an_encoder_to_take_over_has_to_be_there_and_of_the_same_shape(encoder: str, tmp_path: Path):
+    with pytest.raises(WeightsError, match="no such weights file"):
+        train(small_run(encoder_from=str(tmp_path / "none.safetensors")))
+    other = {"encoder": {"channels": [8, 24], "blocks": [1, 1]}}
+    with pytest.raises(ConfigError, match="another shape"):
+        train(small_run(encoder_from=encoder, field=other, images=RAYS_ALONE))
