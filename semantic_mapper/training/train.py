@@ -84,7 +84,8 @@ def train(
         stopped: Asked once a step; when it says yes, all is saved and the best weights so far are returned.
 
     Raises:
-        ConfigError: a config that cannot be used, another one than that of the run to go on with, or a folder in use.
+        ConfigError: a config that cannot be used, another one than that of the run to go on with, or a folder in use
+            or with the state of another run in it.
         WeightsError: no state to go on with, weights to start from that cannot be read, or training has diverged.
     """
     ranks = ranks_from_environment()

@@ -46,7 +46,7 @@ def check_field(field: LearnedField, config: TrainConfig) -> None:
 
 
 def check_nothing_is_overwritten(state: Path) -> None:
-    """A new run where there is the state of another one.
+    """A new run where there is the state of another one, finished or not: it may have taken hours.
 
     Raises:
         ConfigError: there is one.
@@ -55,8 +55,11 @@ def check_nothing_is_overwritten(state: Path) -> None:
     if not state.is_file():
         return
     stopped_at = unfinished_step(state)
-    if stopped_at is not None:
+    if stopped_at is None:
         raise ConfigError(
-            f"{state}: a run was stopped here at step {stopped_at}; go on with --resume, or delete that file to "
-            "start anew"
+            f"{state}: a run has finished here; train it further with --resume and a larger budget, give the new run "
+            "another --out, or delete that file to start anew"
         )
+    raise ConfigError(
+        f"{state}: a run was stopped here at step {stopped_at}; go on with --resume, or delete that file to start anew"
+    )

@@ -149,9 +149,11 @@ def _read(path: Path, *, only_metadata: bool = False) -> tuple[dict[str, torch.T
             names = [] if only_metadata else list(stored.keys())
             tensors = {name: stored.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:
-        raise WeightsError(f"{path}: not a readable training state ({error}); start anew") from error
+        raise WeightsError(f"{path}: not a readable training state ({error}); delete it to start anew") from error
     if metadata.get("format") != FORMAT or metadata.get("version") != str(VERSION):
-        raise WeightsError(f"{path}: not a training state of this version ({FORMAT} {VERSION}); start anew")
+        raise WeightsError(
+            f"{path}: not a training state of this version ({FORMAT} {VERSION}); delete it to start anew"
+        )
     return tensors, metadata
 
 

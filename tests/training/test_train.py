@@ -125,12 +125,18 @@ def test_a_folder_takes_one_training_at_a_time(tmp_path: Path):
     train(small_run(steps=2), tmp_path, resume=True)  # free again
 
 
-def test_an_unfinished_run_is_not_overwritten_by_mistake(tmp_path: Path):
-    train(small_run(), tmp_path, **stop_after(1))
+def test_neither_an_unfinished_nor_a_finished_run_is_overwritten_by_mistake(tmp_path: Path):
+    config = small_run(steps=2, images={"share": 0.0})
+    train(config, tmp_path, **stop_after(1))
     with pytest.raises(ConfigError, match="stopped here at step 1; go on with --resume"):
-        train(small_run(), tmp_path)
-    train(small_run(), tmp_path, resume=True)
-    assert train(small_run(steps=2), tmp_path).recipe["steps"] == 2
+        train(config, tmp_path)
+    train(config, tmp_path, resume=True)
+    finished = (tmp_path / STATE_FILE).read_bytes()
+    with pytest.raises(ConfigError, match=r"finished here; .*--resume and a larger budget.*another --out.*delete"):
+        train(config, tmp_path)
+    assert (tmp_path / STATE_FILE).read_bytes() == finished
+    (tmp_path / STATE_FILE).unlink()
+    assert train(small_run(steps=1, images={"share": 0.0}), tmp_path).recipe["steps"] == 1
 
 
 def test_a_state_that_is_damaged_says_so(tmp_path: Path):
