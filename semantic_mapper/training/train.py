@@ -32,7 +32,7 @@ from semantic_mapper.training.optimiser import make_optimiser, set_rates
 from semantic_mapper.training.ranks import Ranks, joined, ranks_from_environment
 from semantic_mapper.training.recipe import provenance, rooms_before
 from semantic_mapper.training.rooms import RoomPool, RoomViews
-from semantic_mapper.training.schedule import budget_fraction, cosine_rate
+from semantic_mapper.training.schedule import budget_fraction, learning_rate
 from semantic_mapper.training.start import take_over, take_over_encoder
 from semantic_mapper.training.step import (
     StepBatch,
@@ -52,7 +52,6 @@ STATE_FILE = "state.safetensors"
 WEIGHTS_FILE = "weights.safetensors"
 IMAGES_FILE = "after-images.safetensors"  # what steps on images alone have come to
 ROOMS_A_SEED = 61_803  # places between the first rooms of two seeds: far apart, and no two seeds have the same
-WARM_UP = 0.01  # share of the budget
 _FREE = ("seconds", "steps", "device", "workers", "save_every_s")  # may differ when a run goes on
 
 _log = structlog.get_logger(__name__)
@@ -102,16 +101,6 @@ def train(
         else:
             run.begin()
         return run.loop(on_progress, stopped)
-
-
-def learning_rate(fraction: float, config: TrainConfig) -> float:
-    """For steps on images, then for steps on rays: half a cosine each, after a short linear warm-up."""
-    share = config.images.share
-    if fraction < share:
-        fraction, first = fraction / share, config.images.learning_rate
-    else:
-        fraction, first = (fraction - share) / max(1 - share, 1e-9), config.learning_rate
-    return cosine_rate(fraction, first, config.final_learning_rate) * min(1.0, fraction / WARM_UP + 0.1)
 
 
 def step_seed(seed: int, rank: int, step: int) -> int:
@@ -171,6 +160,8 @@ class _Run:
         done = int(min(self._fraction(self.progress.elapsed_s), 1.0) * self.config.validation.times)
         self.progress.validated = min(self.progress.validated, done)  # fewer where the budget has grown
         self.progress.finished = False
+        if self.config.images.share == 1:  # there are no rays to go on with, so a larger budget holds more images
+            self.progress.past_images = False
         _log.info("training_resumed", step=self.progress.step, elapsed_s=round(self.progress.elapsed_s))
 
     def loop(self, on_progress: Callable[[TrainProgress], None] | None, stopped: Callable[[], object]) -> Checkpoint:
@@ -224,8 +215,9 @@ class _Run:
         seed = step_seed(config.seed, self.ranks.rank, progress.step)
         torch.manual_seed(seed)  # for kinds of fields that draw from it
         generator = torch.Generator().manual_seed(seed)
-        batch = self._draw_images(pool, generator) if fraction < config.images.share else self._draw(pool, generator)
-        rate = learning_rate(fraction, config)
+        share = self._images_share()
+        batch = self._draw_images(pool, generator) if fraction < share else self._draw(pool, generator)
+        rate = learning_rate(fraction, share, config)
         set_rates(self.optimiser, rate, 1.0 if isinstance(batch, ImageBatch) else config.encoder_rate)
         parts: torch.Tensor = self.loss(batch)
         self.optimiser.zero_grad()
@@ -291,6 +283,17 @@ class _Run:
         if self.folder is not None and self.ranks.first:
             save_state(self.folder / STATE_FILE, self.progress, self.field, self.optimiser, self._identity())
 
+    def _images_share(self) -> float:
+        """Share of the budget that belongs to images.
+
+        Once they are over, what they took of it. So after a resume with a larger budget the rays go on, and all that
+        it has more is theirs.
+        """
+        config, progress = self.config, self.progress
+        if not progress.past_images:
+            return config.images.share
+        return budget_fraction(progress.images_steps, progress.images_s, steps=config.steps, seconds=config.seconds)
+
     def _colours_until(self) -> float:
         """Share of the budget that belongs to images without depth."""
         return self.config.images.share * self.config.images.colours_first
@@ -305,7 +308,10 @@ class _Run:
 
     def _keep_after_images(self, pool: RoomPool) -> None:
         """The weights as they are before the first ray: other kinds of fields may take over the encoder."""
-        self.progress.past_images = True
+        progress = self.progress
+        progress.past_images, progress.images_steps = True, progress.step
+        # The least of all ranks: so they agree on the rate, and no rank's clock is ever before it.
+        progress.images_s = -self.ranks.largest(-progress.elapsed_s)[0]
         if self.folder is not None and self.ranks.first:
             save_checkpoint(self._checkpoint(pool, self.field.state_dict()), self.folder / IMAGES_FILE)
 

@@ -40,7 +40,8 @@ class Progress:
         best: Weights that scored best in validation; None before the first.
         best_step, best_score: Of ``best``; the score is what validation ranks by.
         depth_grown: The encoder's network for views with depth has grown from the one for colours.
-        past_images: Steps on images alone are over.
+        past_images: Steps on images alone are over, once and for all.
+        images_steps, images_s: Steps and seconds that they took, once they are over.
         finished: The budget is used up.
         origins: Of what the run started from, see ``recipe.origin``.
     """
@@ -56,6 +57,8 @@ class Progress:
     best_score: float = -1.0
     depth_grown: bool = False
     past_images: bool = False
+    images_steps: int = 0
+    images_s: float = 0.0
     finished: bool = False
     origins: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
 
@@ -85,6 +88,8 @@ def save_state(
         "best_score": repr(progress.best_score),
         "depth_grown": str(progress.depth_grown),
         "past_images": str(progress.past_images),
+        "images_steps": str(progress.images_steps),
+        "images_s": repr(progress.images_s),
         "finished": str(progress.finished),
         "history": json.dumps(progress.history),
         "origins": json.dumps(progress.origins),
@@ -127,7 +132,10 @@ def load_state(path: Path, model: nn.Module, optimiser: torch.optim.Optimizer, c
             elapsed_s=float(metadata["elapsed_s"]),
             validated=int(metadata["validated"]),
             history=json.loads(metadata["history"]),
-            origins=json.loads(metadata.get("origins", "[]")),  # runs of before did not note them
+            # Runs of before did not note these three.
+            origins=json.loads(metadata.get("origins", "[]")),
+            images_steps=int(metadata.get("images_steps", 0)),
+            images_s=float(metadata.get("images_s", 0.0)),
             best=best or None,
             best_step=int(metadata["best_step"]),
             best_score=float(metadata["best_score"]),

@@ -9,11 +9,11 @@ from safetensors import safe_open
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
 from semantic_mapper.fields.sray import SRay
+from semantic_mapper.training.schedule import learning_rate
 from semantic_mapper.training.train import (
     STATE_FILE,
     WEIGHTS_FILE,
     TrainProgress,
-    learning_rate,
     step_seed,
     train,
 )
@@ -38,7 +38,7 @@ def contents(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, object]]:
     with safe_open(path, framework="pt") as stored:
         tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
         metadata = dict(stored.metadata())
-    del metadata["elapsed_s"]
+    del metadata["elapsed_s"], metadata["images_s"]
     history = json.loads(metadata.pop("history"))
     lines = [{k: v for k, v in line.items() if k not in TIMES} for line in history]
     return tensors, {**metadata, "history": lines}
@@ -181,17 +181,16 @@ def test_labels_of_source_views_are_not_given_unless_asked_for():
 
 
 def test_the_rate_warms_up_and_then_falls_to_its_end():
-    config = small_run(images={"share": 0.5})
-    assert learning_rate(0.0, config) == pytest.approx(0.1 * config.images.learning_rate)
-    assert learning_rate(0.005, config) > 0.99 * config.images.learning_rate
-    assert learning_rate(0.4999, config) == pytest.approx(config.final_learning_rate, rel=1e-2)
-    assert learning_rate(0.5, config) == pytest.approx(0.1 * config.learning_rate), (
+    config = small_run()
+    assert learning_rate(0.0, 0.5, config) == pytest.approx(0.1 * config.images.learning_rate)
+    assert learning_rate(0.005, 0.5, config) > 0.99 * config.images.learning_rate
+    assert learning_rate(0.4999, 0.5, config) == pytest.approx(config.final_learning_rate, rel=1e-2)
+    assert learning_rate(0.5, 0.5, config) == pytest.approx(0.1 * config.learning_rate), (
         "rays begin with a rate of their own"
     )
-    assert learning_rate(0.505, config) > 0.99 * config.learning_rate
-    assert math.isclose(learning_rate(1.0, config), config.final_learning_rate)
-    from_the_first = small_run(images={"share": 0.0})
-    assert learning_rate(0.01, from_the_first) > 0.99 * config.learning_rate
+    assert learning_rate(0.505, 0.5, config) > 0.99 * config.learning_rate
+    assert math.isclose(learning_rate(1.0, 0.5, config), config.final_learning_rate)
+    assert learning_rate(0.01, 0.0, config) > 0.99 * config.learning_rate, "rays from the first step on"
 
 
 def test_a_run_may_start_from_weights_of_the_same_shape_and_from_no_others(tmp_path: Path):

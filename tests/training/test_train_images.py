@@ -1,5 +1,6 @@
 """Steps on single images, mirrored worlds, and encoders that are taken over."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from semantic_mapper.training.images import ImageStepConfig, draw_images, images
 from semantic_mapper.training.losses import image_loss
 from semantic_mapper.training.recipe import rooms_before
 from semantic_mapper.training.rooms import RoomPool, RoomPoolConfig, render_room
+from semantic_mapper.training.schedule import cosine_rate
 from semantic_mapper.training.start import take_over_encoder
 from semantic_mapper.training.train import IMAGES_FILE, STATE_FILE, WEIGHTS_FILE, train
 from semantic_mapper.training.views import mirrored_view, query_rays
@@ -142,6 +144,49 @@ def test_weights_after_the_images_are_kept_and_another_kind_takes_their_encoder_
         train(small_run(**still, **source, **peer))
     with pytest.raises(ConfigError, match="both sides"):
         take_over_encoder(build_field("semantic_nerf", {}, ROOMS), tmp_path / "first" / IMAGES_FILE)
+
+
+def refuse(*_: Any, **__: Any) -> None:
+    """In the place of what must not be called."""
+    pytest.fail("a step of the wrong sort")
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_larger_budget_goes_on_with_rays_once_the_images_are_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stopped: bool
+):
+    how = {"images": {"share": 0.5, "rooms": 1}, "log_steps": 1}
+    done: list[int] = []
+    train(
+        small_run(steps=6 if stopped else 4, **how),
+        tmp_path,
+        on_progress=lambda progress: done.append(progress.step),
+        stopped=lambda: len(done) == 4,
+    )
+    images = 3 if stopped else 2
+    state = load_state_of(tmp_path)
+    assert (state["past_images"], state["images_steps"]) == ("True", str(images))
+    assert state["finished"] == str(not stopped)
+    after_images = (tmp_path / IMAGES_FILE).read_bytes()
+    monkeypatch.setattr("semantic_mapper.training.train.draw_images", refuse)
+    longer = small_run(steps=10, **how)
+    train(longer, tmp_path, resume=True)
+    lines = [json.loads(line) for line in (tmp_path / "history.jsonl").read_text().splitlines()]
+    rates = [line["rate"] for line in lines if "rate" in line]
+    assert len(rates) == 10
+    for step in range(4, 10):  # along the cosine of a run whose images took as many steps from the first
+        used = (step - images) / (10 - images)
+        expected = cosine_rate(used, longer.learning_rate, longer.final_learning_rate)
+        assert rates[step] == pytest.approx(expected), step
+    assert (tmp_path / IMAGES_FILE).read_bytes() == after_images
+
+
+def test_a_larger_budget_of_a_run_on_images_alone_is_for_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("semantic_mapper.training.train.draw_batch", refuse)
+    images = {"share": 1.0, "rooms": 1}
+    for steps in (2, 4):
+        train(small_run(images=images, steps=steps), tmp_path, resume=steps > 2)
+    assert load_checkpoint(tmp_path / IMAGES_FILE).recipe["steps"] == 4
 
 
 def test_the_network_for_depth_grows_from_the_one_for_colours_after_its_share_of_the_images(tmp_path: Path):
