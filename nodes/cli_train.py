@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -16,7 +16,9 @@ from nodes.verb import verb
 def train(
     out: Annotated[Path, typer.Option("--out", help="Folder for everything, or a weights file (.safetensors).")],
     config: Annotated[Path | None, typer.Option(help="TOML file with a TrainConfig, recipes/cpu-2h.toml say.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on where the run in --out stopped.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on where the run in --out stopped, or train it further.")
+    ] = False,
     seconds: Annotated[float | None, typer.Option(min=0, help="Time for training; 0 = only --steps counts.")] = None,
     steps: Annotated[int | None, typer.Option(min=0, help="Steps of training; 0 = only --seconds counts.")] = None,
     seed: Annotated[int | None, typer.Option(help="Of everything that is drawn at random.")] = None,
@@ -28,9 +30,10 @@ def train(
 ) -> int:
     """Train a field on procedural rooms, which are rendered as it goes.
 
-    Keeps the weights that were best on the validation rooms. Beside them it writes its state, its history
-    (history.jsonl) and its curves (curves.png). Ctrl-C saves the state and the best weights so far (exit code 130);
-    the same command with --resume goes on. Start it with torchrun to use several GPUs.
+    Keeps the weights that were best on the validation rooms, or with keep = "last" in the TOML file, as some recipes
+    have it, those of the last validation. Beside them it writes its state, its history (history.jsonl) and its curves
+    (curves.png). Ctrl-C saves the state and the weights kept so far (exit code 130); the same command with --resume
+    goes on. A run in --out is never overwritten. Start it with torchrun to use several GPUs.
 
     Example: semantic-mapper train --config recipes/cpu-2h.toml --out runs/rooms --half
     """
@@ -66,16 +69,23 @@ def train(
         save_checkpoint(checkpoint, file, half=half)
         output.print(f"{file}: {_told(checkpoint.recipe)}")
         if stop:
-            kept = f"stopped by {stop.name}; the state and the best weights so far are kept, --resume goes on"
-            stderr_console().print(kept, style="yellow", soft_wrap=True)
+            told = f"stopped by {stop.name}; the state and {_kept(checkpoint.recipe)} are saved, --resume goes on"
+            stderr_console().print(told, style="yellow", soft_wrap=True)
     return stop.exit_code
 
 
-def _told(recipe: dict[str, object]) -> str:
+def _told(recipe: dict[str, Any]) -> str:
     """The recipe in a line."""
     line = f"{recipe['steps']} steps on {recipe['rooms']} rooms in {recipe['seconds']:.0f} s"
-    best = recipe["validation"]
-    if not isinstance(best, dict) or not best:
+    validation = recipe["validation"]
+    if not validation:
         return f"{line}, not validated yet"
-    figures = f"{best['miou'] * 100:.1f} % with depth, {best['blind_miou'] * 100:.1f} % without"
-    return f"{line}; weights of step {recipe['best_step']}: validation mIoU {figures}"
+    figures = f"{validation['miou'] * 100:.1f} % with depth, {validation['blind_miou'] * 100:.1f} % without"
+    return f"{line}; {_kept(recipe)}, of step {recipe['best_step']}: mIoU {figures}"
+
+
+def _kept(recipe: dict[str, Any]) -> str:
+    """Which weights these are."""
+    if not recipe["validation"]:
+        return "the latest weights"
+    return "the best weights so far" if recipe["config"]["keep"] == "best" else "the weights of the last validation"

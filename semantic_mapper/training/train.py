@@ -75,12 +75,12 @@ def train(
     on_progress: Callable[[TrainProgress], None] | None = None,
     stopped: Callable[[], object] = bool,
 ) -> Checkpoint:
-    """Train on the training rooms; returns the weights that were best on the validation rooms.
+    """Train on the training rooms; returns the weights that ``config.keep`` asks for.
 
     Args:
-        folder: For the state, the history, the curves and the best weights so far; None writes nothing.
+        folder: For the state, the history, the curves and the weights kept so far; None writes nothing.
         resume: Go on with the state in ``folder``. The budget may be another one, the rest of the config may not.
-        stopped: Asked once a step; when it says yes, all is saved and the best weights so far are returned.
+        stopped: Asked once a step; when it says yes, all is saved and the weights kept so far are returned.
 
     Raises:
         ConfigError: a config that cannot be used, another one than that of the run to go on with, or a folder in use
@@ -256,7 +256,7 @@ class _Run:
         if not math.isfinite(means[0]):
             raise WeightsError(
                 f"training has diverged by step {progress.step} (loss {means[0]}); lower learning_rate or "
-                "gradient_clip and start anew, the best weights so far are kept"
+                "gradient_clip and start anew, the weights that were kept before are still there"
             )
         self.last_loss = means[0]
         losses = {f"loss_{name}": round(mean, 6) for name, mean in zip(LOSS_PARTS, means, strict=True)}
@@ -316,7 +316,7 @@ class _Run:
             save_checkpoint(self._checkpoint(pool, self.field.state_dict()), self.folder / IMAGES_FILE)
 
     def _checkpoint(self, pool: RoomPool, weights: dict[str, torch.Tensor] | None = None) -> Checkpoint:
-        """These weights; else the best so far, or the latest where nothing was validated yet."""
+        """These weights; else the ones kept so far, or the latest where nothing was validated yet."""
         config, progress = self.config, self.progress
         field = build_field(config.kind, config.field, ROOMS)
         field.load_state_dict(weights or progress.best or self.field.state_dict())

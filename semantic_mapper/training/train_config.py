@@ -46,7 +46,7 @@ class TrainConfig(Config, frozen=True):
     final_learning_rate: float = 5e-5
     weight_decay: float = 0.02
     gradient_clip: float = 10.0
-    keep: Literal["best", "last"] = "best"  # of the weights that were validated; few rooms choose by chance
+    keep: Literal["best", "last"] = "best"  # of the validated weights; few rooms choose the best by chance
     seed: int = 0
     device: DeviceName = "auto"
     workers: int = 0  # processes that render rooms ahead, a rank; 0 = inline, right where the CPU trains

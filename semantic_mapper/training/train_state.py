@@ -37,7 +37,7 @@ class Progress:
         validated: How many of the validations that the budget holds are done.
         losses: (4,) float64 on the training device: sums of ``LOSS_PARTS`` since the last such line of the history.
         history: Lines of plain data; see ``train_log``.
-        best: Weights that scored best in validation; None before the first.
+        best: Weights to keep: of the validation that scored best, or of the last one; None before the first.
         best_step, best_score: Of ``best``; the score is what validation ranks by.
         depth_grown: The encoder's network for views with depth has grown from the one for colours.
         past_images: Steps on images alone are over, once and for all.

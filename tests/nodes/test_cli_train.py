@@ -51,7 +51,8 @@ def test_training_into_a_folder_leaves_weights_state_history_and_curves(recipe: 
     out = tmp_path / "made" / "run"
     done = run("train", "--config", recipe, "--out", out, "--seed", "3", "--half")
     assert done.returncode == 0, done.stderr
-    assert "weights.safetensors: 4 steps on 1 rooms" in done.stdout and "validation mIoU" in done.stdout
+    assert "weights.safetensors: 4 steps on 1 rooms" in done.stdout
+    assert "the best weights so far, of step 4: mIoU" in done.stdout
     names = {p.name for p in out.iterdir()}
     assert names >= {"weights.safetensors", "state.safetensors", "history.jsonl", "curves.png"}
     assert "after-images.safetensors" in names
@@ -60,15 +61,17 @@ def test_training_into_a_folder_leaves_weights_state_history_and_curves(recipe: 
 
 
 def test_ctrl_c_saves_what_resume_goes_on_with(recipe: Path, tmp_path: Path) -> None:
+    recipe.write_text(f'keep = "last"\n{CONFIG}', encoding="utf-8")
     out = tmp_path / "rooms.safetensors"
     history = tmp_path / "rooms-training" / "history.jsonl"
     with Running("train", "--config", recipe, "--out", out, "--steps", "100000") as running:
         assert eventually(lambda: history.is_file() and len(history.read_text().splitlines()) >= 2), running.text
         running.process.send_signal(signal.SIGINT)
         assert running.wait() == 130, running.text
-    assert "--resume goes on" in running.text
+    assert "the state and the latest weights are saved, --resume goes on" in running.text
     stopped_at = load_checkpoint(out).recipe["steps"]
     assert stopped_at >= 4
     done = run("train", "--config", recipe, "--out", out, "--steps", str(stopped_at + 2), "--resume")
     assert done.returncode == 0, done.stderr
+    assert f"the weights of the last validation, of step {stopped_at + 2}: mIoU" in done.stdout
     assert load_checkpoint(out).recipe["steps"] == stopped_at + 2
