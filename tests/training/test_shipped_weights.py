@@ -7,6 +7,7 @@ import re
 import pytest
 import torch
 
+from scripts.ship_weights import BEGIN, CARD, END, chain, check_chain, metadata_block
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
@@ -48,8 +49,10 @@ def test_they_say_how_they_were_made_and_what_was_measured(shipped: Checkpoint):
     figures = {figure["depth"]: figure for figure in recipe["figures"]}
     assert all(figure["split"] == "test" and figure["rooms"] == 20 for figure in figures.values())
     assert figures[True]["data_set"]["miou"] > 0.6
-    chain, steps = recipe, recipe["steps"]
-    while chain.get("origins"):  # down to the run that began with random weights
-        chain = chain["origins"][0]["recipe"]
-        steps += chain["steps"]
-    assert steps > recipe["steps"]
+    check_chain(default_checkpoint_path(), recipe)
+    assert sum(run["steps"] for run in chain(recipe)) > recipe["steps"], "with those of the runs that it started from"
+
+
+def test_the_model_card_says_what_the_file_says():
+    found = CARD.read_text(encoding="utf-8").partition(f"{BEGIN}\n")[2].partition(END)[0]
+    assert found == metadata_block(default_checkpoint_path()), "run `python scripts/ship_weights.py --card`"
