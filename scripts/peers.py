@@ -1,9 +1,11 @@
 """Train S-Ray, its ablations and its peers with one budget, and compare them on the rooms of the test split.
 
 Encoders learn from single images first: after a common start one goes on with colours, the other with measured depth
-too, where there is any. Each field takes one of the two over and spends the same number of steps on rays: every chain
-has the same steps (recipes/cpu-images.toml and cpu-rays.toml, or gpu-*). On CPUs two runs go on at a time and
-share the cores. A run that was ended goes on where it stopped when the same command comes again.
+too, where there is any. Each field takes one of the two over and spends the same number of steps on rays
+(recipes/cpu-images.toml and cpu-rays.toml, or gpu-*). The per-image U-Nets are those encoders themselves: the same
+steps on images, none on rays, and the best of their validations is kept where a field keeps its last weights. On CPUs
+two runs go on at a time and share the cores. A run that was ended goes on where it stopped when the same command comes
+again.
 
     python scripts/peers.py --out runs/peers [NAME...]        train, all of them without names
     python scripts/peers.py --out runs/peers --eval [NAME...] compare them, with and without depth
@@ -40,6 +42,7 @@ class Run:
         images: Trained on single images, not on rays.
         share: Of the recipe's steps.
         encoder_rate: Other than the recipe's; 0 = the recipe's.
+        settings: Of the field, other than the default ones; the encoder's are not among them.
     """
 
     kind: str
@@ -48,6 +51,7 @@ class Run:
     images: bool = False
     share: float = 1.0
     encoder_rate: float = 0.0
+    settings: dict[str, Any] = field(default_factory=dict[str, Any])
 
 
 @dataclass(frozen=True)
@@ -88,6 +92,8 @@ RUNS = {
     "sray-intra": Run("sray-intra", depth=True, encoder="unet-depth"),
     "sray-colours": Run("sray", depth=False, encoder="unet"),
     "neuray-depth": Run("neuray", depth=True, encoder="unet-depth"),
+    "mvsnerf-depth": Run("mvsnerf", depth=True, encoder="unet-depth", encoder_rate=1.0),
+    "sray-paper": Run("sray", depth=True, encoder="unet-depth", settings={"occlusion": False}),
 }
 
 
@@ -100,7 +106,7 @@ def recipe(name: str, budget: Budget) -> str:
     plain |= {"kind": run.kind, "seed": budget.seed, "steps": steps}
     if run.encoder_rate:
         plain["encoder_rate"] = run.encoder_rate
-    plain["field"] = {"encoder": {"depth": run.depth} | budget.encoder}
+    plain["field"] = run.settings | {"encoder": {"depth": run.depth} | budget.encoder}
     return "\n".join(_lines(plain, "")) + "\n"
 
 

@@ -53,7 +53,7 @@ def test_a_run_alone_renders_rooms_on_the_other_cores(
 
 
 @pytest.mark.parametrize("tier", ["cpu", "gpu"])
-def test_all_chains_have_the_same_steps(tier: str) -> None:
+def test_all_fields_have_the_same_steps_and_the_unets_have_none_on_rays(tier: str) -> None:
     def steps(name: str) -> tuple[int, int]:
         images = rays = 0
         while name:
@@ -65,7 +65,7 @@ def test_all_chains_have_the_same_steps(tier: str) -> None:
 
     fields = [name for name, run in peers.RUNS.items() if not run.images]
     assert len({steps(name) for name in fields}) == 1
-    assert {steps(name)[0] for name in ("unet", "unet-depth")} == {steps("sray")[0]}
+    assert {steps(name) for name in ("unet", "unet-depth")} == {(steps("sray")[0], 0)}
 
 
 def test_a_recipe_is_that_of_its_tier_with_the_runs_own_kind_encoder_and_seed() -> None:
@@ -78,7 +78,13 @@ def test_every_encoder_can_have_another_shape() -> None:
     shallow = peers.Budget(encoder={"channels": [32], "blocks": [2]})
     for name, run in peers.RUNS.items():
         own = {"channels": [32], "blocks": [2], "depth": run.depth}
-        assert peers.tomllib.loads(peers.recipe(name, shallow))["field"] == {"encoder": own}
+        assert peers.tomllib.loads(peers.recipe(name, shallow))["field"] == run.settings | {"encoder": own}
+
+
+def test_a_run_can_have_settings_of_its_own() -> None:
+    recipe = peers.tomllib.loads(peers.recipe("sray-paper", ALONE))
+    assert recipe["field"] == {"occlusion": False, "encoder": {"depth": True}}
+    assert recipe | {"field": {"encoder": {"depth": True}}} == peers.tomllib.loads(peers.recipe("sray", ALONE))
 
 
 def test_what_is_done_is_not_trained_again_and_another_recipe_is_refused(
