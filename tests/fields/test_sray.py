@@ -15,6 +15,7 @@ from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.types import RayBatch, SourceViews
+from tests.fields.peers import assert_gradients_are_right, tiny
 from tests.fields.scene import WALL_M, pose_at, wall_rays, wall_sources
 from tests.small import SMALL_ENCODER
 
@@ -315,6 +316,15 @@ def test_the_whole_field_passes_gradcheck():
         return field.render_samples(rays, z, sources)[0].logits
 
     assert torch.autograd.gradcheck(render, (flat,), atol=1e-4)
+
+
+def test_the_whole_field_passes_gradcheck_with_labels_that_a_source_view_brings():
+    field = tiny("sray")
+    assert isinstance(field, SRay)
+    encoded = labelled_wall(field, torch.full((1, 32, 48), 2), pose_at(0.0))
+    field.render(wall_rays(pose_at(0.1), step=101), encoded).logits[:, 2].sum().backward()
+    assert field.label_logit.grad is not None and field.label_logit.grad > 1, "labels reach the logits"
+    assert_gradients_are_right(tiny("sray"), labelled=True)
 
 
 def labelled_wall(field: SRay, channel: torch.Tensor, *poses: np.ndarray) -> EncodedViews:
