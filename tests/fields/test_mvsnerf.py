@@ -1,4 +1,5 @@
 import copy
+from dataclasses import replace
 
 import pytest
 import torch
@@ -7,6 +8,7 @@ from semantic_mapper.config import EncoderConfig, MVSNeRFConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.cost_volume import Sweep, cost_volume, nearest_views, query_camera
 from semantic_mapper.fields.mvsnerf import MVSNeRF
+from semantic_mapper.fields.nerf_math import encoded_size
 from semantic_mapper.fields.render import render_image
 from tests.fields.peers import AWAY, LABELS, POSES, assert_gradients_are_right, assert_unknown, tiny
 from tests.fields.scene import INTRINSICS, WALL_M, pose_at, wall_rays, wall_sources
@@ -77,6 +79,37 @@ def test_features_of_all_views_agree_on_the_plane_that_the_wall_stands_on():
     assert middle.sum() > 20
     variance = cost[:3].mean(0)
     assert (variance[wall_plane][middle] < 0.2 * variance[near_plane][middle]).float().mean() > 0.9
+
+
+class _CostItself(torch.nn.Module):
+    """In place of the 3D network: the first channels of the cost volume, whose first three are variances."""
+
+    def forward(self, cost: torch.Tensor) -> torch.Tensor:
+        return cost[:, :4]
+
+
+def test_a_sample_looks_up_the_volume_at_its_own_place():
+    """Seen aslant by a camera that is no source: with the wall's colours as features, the views agree on the wall.
+
+    The wall is at another depth in every column, so that a volume which is mirrored or shifted agrees elsewhere.
+    """
+    field = tiny("mvsnerf")
+    assert isinstance(field, MVSNeRF)
+    field.sweep = Sweep(planes=64, near_m=1.0, far_m=8.0)
+    field.volume_net = _CostItself()  # pyright: ignore[reportAttributeAccessIssue]
+    looked_up: list[torch.Tensor] = []
+    field.trunk.register_forward_pre_hook(lambda _, given: looked_up.append(given[0]))
+    encoded = field.encode(wall_sources([pose_at(0.0, 0.4), pose_at(0.4, 0.35), pose_at(-0.4, 0.4)]))
+    rays = wall_rays(pose_at(0.1, 0.4), step=7)
+    wall = (WALL_M - rays.origin[:, 2]) / rays.direction[:, 2]
+    depths = wall[:, None] * torch.tensor([0.7, 0.8, 0.9, 1.0, 1.12, 1.25, 1.5])
+    with torch.no_grad():
+        field.render_samples(rays, depths, replace(encoded, feature=encoded.rgb))
+    place = encoded_size(3, field.config.position_frequencies)
+    variance, masks = looked_up[0][..., place : place + 3].mean(-1), looked_up[0][..., place + 7 :: 4]
+    seen_by_all = masks.amin((1, 2)) > 0  # at every depth
+    assert seen_by_all.sum() > 50
+    assert (variance[seen_by_all].argmin(1) == 3).float().mean() > 0.9
 
 
 def test_planes_are_where_the_sweep_places_them():
