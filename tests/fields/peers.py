@@ -76,7 +76,7 @@ def assert_gradients_are_right(field: LearnedField, *, labelled: bool = False) -
 
     def outputs(*_: torch.Tensor) -> tuple[torch.Tensor, ...]:
         encoded = field.encode(views)
-        render, _ = field.render_samples(rays, z, encoded)
+        render = field.render_samples(rays, z, encoded)[0]
         assert render.known.all()
         own = field.source_logits(encoded)
         rendered = (render.logits, render.rgb, render.depth_m, render.entropy)
