@@ -9,7 +9,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -155,10 +155,7 @@ def _run(
     stopped: Callable[[], object],
 ) -> tuple[_Best, int]:
     optimiser = make_optimiser(model, config.learning_rate, config.weight_decay)
-    encoder = model.image_encoder
-    fresh = encoder is not None and encoder.uncalibrated
-    if encoder is not None and fresh:
-        calibrate(encoder, to_device(stack_sources(train), next(model.parameters()).device))
+    norms = _prepare_norms(model, train)
     # A kind that classifies while it encodes has nothing to learn where its features are kept.
     rests = config.resting_share > 0 and not model.needs_own_view
     encoded = encode_once(model, train, with_labels=config.step.known_labels) if rests else None
@@ -180,7 +177,7 @@ def _run(
         if encoded is not None and fraction < config.resting_share:
             loss = resting_loss(model, encoded, train, query, sources, config.step, generator)
         else:
-            with encoder.batch_statistics() if encoder is not None and fresh else nullcontext():
+            with norms():
                 loss = training_loss(model, train, query, sources, config.step, generator)
         step += 1
         if loss is None:
@@ -206,6 +203,15 @@ def _run(
         if latest[0] < best.loss or not math.isfinite(best.loss):
             best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
     return best, step
+
+
+def _prepare_norms(model: LearnedField, views: Sequence[LabelledView]) -> Callable[[], AbstractContextManager[None]]:
+    """What steps are made in: batch norms of an encoder of which nothing is trained are set by the views and live on."""
+    encoder = model.image_encoder
+    if encoder is None or not encoder.uncalibrated:
+        return nullcontext
+    calibrate(encoder, to_device(stack_sources(views), next(model.parameters()).device))
+    return encoder.batch_statistics
 
 
 def _split(view: LabelledView, share: float, generator: torch.Generator) -> tuple[LabelledView, LabelledView]:
