@@ -206,7 +206,7 @@ def _run(
 
 
 def _prepare_norms(model: LearnedField, views: Sequence[LabelledView]) -> Callable[[], AbstractContextManager[None]]:
-    """What steps are made in; batch norms of an encoder of which nothing is trained are set by the views and live on."""
+    """What steps are made in; batch norms of a fresh encoder are set by the views, and live on."""
     encoder = model.image_encoder
     if encoder is None or not encoder.uncalibrated:
         return nullcontext
