@@ -13,7 +13,7 @@ from nodes.process import StopRequest
 from nodes.suite_table import difference_lines, suite_table
 from replay.artifacts import write_json
 from semantic_mapper import __version__
-from semantic_mapper.benchmark.config import SuiteConfig, check_suite, settings_digest, suite_seeds
+from semantic_mapper.benchmark.config import SuiteConfig, settings_digest, suite_seeds
 from semantic_mapper.benchmark.contestants import load_contestants
 from semantic_mapper.benchmark.figures import compare, map_figures, view_figures
 from semantic_mapper.benchmark.protocols import Contestant
@@ -52,7 +52,6 @@ def run_suite_verb(
         raise ConfigError(
             f"--kind has random weights, which protocol '{suite.protocol}' does not fit; --protocol scratch"
         )
-    check_suite(suite)
     output = Output.guarded()
     paths = list(weights) or ([] if kinds else [default_checkpoint_path()])
     contestants = load_contestants(paths, kinds)

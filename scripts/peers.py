@@ -225,7 +225,10 @@ def main() -> int:
     if given.eval:
         return compare(names, given.out, given.tier)
     jobs = given.jobs or (2 if given.tier == "cpu" else 1)
-    encoder = tomllib.loads(given.encoder.replace(";", "\n"))
+    try:
+        encoder = tomllib.loads(given.encoder.replace(";", "\n"))
+    except tomllib.TOMLDecodeError as error:
+        parser.error(f"--encoder: {error}")
     return train_all(names, given.out, Budget(given.seed, given.steps, given.tier, jobs, encoder))
 
 

@@ -201,7 +201,7 @@ def _curve_point(share: float, seconds: float, steps: int, confusion: ConfusionM
     return CurvePoint(share=share, seconds=seconds, steps=steps, confusion=as_rows(confusion))
 
 
-def carried_labels(room: BenchmarkRoom, keyframes: Sequence[int]) -> Rows:
+def _carried_labels(room: BenchmarkRoom, keyframes: Sequence[int]) -> Rows:
     """What the labelled keyframes give by depth alone, without any field: the confusion over all query views."""
     carried = WarpBaseline(ROOMS, [as_given(room.frames[n], depth=True, label=True) for n in keyframes])
     total = ConfusionMatrix(ROOMS)
@@ -231,6 +231,6 @@ def _scored(
         compared=agreement.compared,
         keyframes=keyframes,
         curve=curve,
-        carried=carried_labels(room, keyframes) if keyframes and suite.depth else None,
+        carried=_carried_labels(room, keyframes) if keyframes and suite.depth else None,
     )
     return RoomResult(record, answers)

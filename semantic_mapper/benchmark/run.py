@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import structlog
 
-from semantic_mapper.benchmark.config import SuiteConfig, settings_digest, suite_seeds
+from semantic_mapper.benchmark.config import SuiteConfig, check_suite, settings_digest, suite_seeds
 from semantic_mapper.benchmark.figures import image_note
 from semantic_mapper.benchmark.protocols import Contestant, RoomResult, run_room
 from semantic_mapper.benchmark.records import RoomRecord
@@ -49,7 +49,11 @@ def run_suite(
         on_progress: Told of every step.
         stopped: Asked before each room, contestant and step of a fitting; once it says so (anything true), the run
             ends. A room that is not done by then leaves no record.
+
+    Raises:
+        ConfigError: settings that no run can follow.
     """
+    check_suite(suite)
     settings, seeds = settings_digest(suite, "views"), suite_seeds(suite)
     total, done = len(seeds) * len(contestants), 0
     for seed in seeds:

@@ -111,6 +111,11 @@ def test_options_that_do_not_go_together_are_wrong_usage(arguments: tuple[str, .
     assert "Usage: semantic-mapper" in done.stderr
 
 
+def test_more_rooms_than_there_are_is_refused() -> None:
+    done = run("eval", "--suite", "rooms", "--rooms", "21")
+    assert done.returncode == 1 and "has 20 rooms" in error_line(done.stderr)
+
+
 def test_an_unknown_setting_names_the_nearest_one(tmp_path: Path) -> None:
     path = tmp_path / "suite.toml"
     path.write_text("veiws = 3\n", encoding="utf-8")
