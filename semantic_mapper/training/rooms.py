@@ -41,6 +41,12 @@ class RoomPoolConfig(Config, frozen=True):
     step_m_max: float = 0.35
     camera: CameraDraw = CameraDraw()
 
+    def __post_init__(self) -> None:
+        if not 1 <= self.rooms_at_start <= self.rooms or self.draws_per_room < 1 or self.views < 2:
+            raise ValueError("need 1 <= rooms_at_start <= rooms, draws_per_room >= 1 and views >= 2")
+        if not 0 < self.step_m_min <= self.step_m_max or self.width < 16:
+            raise ValueError("need 0 < step_m_min <= step_m_max and a width of at least 16")
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedRoom:
@@ -158,8 +164,6 @@ class RoomPool(AbstractContextManager["RoomPool"]):
         workers: int = 0,
         device: torch.device = CPU,
     ) -> None:
-        if not 1 <= config.rooms_at_start <= config.rooms or config.draws_per_room < 1 or config.views < 2:
-            raise ConfigError("RoomPoolConfig: need 1 <= rooms_at_start <= rooms, draws_per_room >= 1 and views >= 2")
         self._config = config
         self._device = device
         self._draws = draws

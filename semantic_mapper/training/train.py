@@ -38,7 +38,6 @@ from semantic_mapper.training.step import (
     StepBatch,
     batch_loss,
     draw_batch,
-    encodes_views_separately,
     pick_views_on_path,
 )
 from semantic_mapper.training.train_checks import check_field, check_nothing_is_overwritten, check_settings
@@ -167,8 +166,7 @@ class _Run:
     def loop(self, on_progress: Callable[[TrainProgress], None] | None, stopped: Callable[[], object]) -> Checkpoint:
         config, progress = self.config, self.progress
         rooms = validation_rooms(config.validation, config.pool, self.ranks, self.device)
-        self._check_encoding(rooms)
-        self._choose_precision()  # after that check, which rounding would disturb
+        self._choose_precision()
         encoder = self.field.image_encoder
         if encoder is not None and encoder.uncalibrated and config.images.share == 0 and rooms:
             calibrate(encoder, stack_sources(rooms[0].resident))
@@ -352,19 +350,6 @@ class _Run:
         """What has to be the same when a run goes on."""
         plain = {k: v for k, v in to_plain(self.config).items() if k not in _FREE}
         return plain | {"ranks": self.ranks.world, "suite": SUITE_VERSION}
-
-    def _check_encoding(self, rooms: Sequence[RoomViews]) -> None:
-        if not (self.config.encode_together and rooms):
-            return
-        sources = stack_sources(rooms[0].resident[:4])
-        self.field.eval()
-        separately = encodes_views_separately(self.field, sources)
-        self.field.train()
-        if not separately:
-            raise ConfigError(
-                f"encode_together: fields of kind '{self.config.kind}' encode views in the light of each other, so the "
-                "rooms of a step cannot share one call; leave it out"
-            )
 
     def _choose_precision(self) -> None:
         if bfloat16_is_fast(self.device):

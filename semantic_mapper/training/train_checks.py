@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import torch
+
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.scenes import TRAIN_SEEDS
+from semantic_mapper.training.device import check_parts
 from semantic_mapper.training.images import encoder_for_images
+from semantic_mapper.training.step import encodes_views_separately
 from semantic_mapper.training.train_config import TrainConfig
 from semantic_mapper.training.train_state import unfinished_step
+from semantic_mapper.training.views import to_device
+from semantic_mapper.types import SourceViews
 
 
 def check_settings(config: TrainConfig) -> None:
@@ -43,6 +49,27 @@ def check_field(field: LearnedField, config: TrainConfig) -> None:
         )
     if config.images.share > 0:
         encoder_for_images(field)
+    check_parts(field, config.bfloat16)
+    if config.encode_together and not _encodes_views_separately(field):
+        raise ConfigError(
+            f"encode_together: fields of kind '{field.kind}' encode views in the light of each other, so the rooms of "
+            "a step cannot share one call; leave it out"
+        )
+
+
+def _encodes_views_separately(field: LearnedField) -> bool:
+    """See ``encodes_views_separately``; of made-up views, because it is a matter of the kind, not of the images."""
+    generator = torch.Generator().manual_seed(0)
+    rgb = torch.rand(4, 3, 48, 64, generator=generator)
+    depth_m = 1 + torch.rand(4, 48, 64, generator=generator)
+    K = torch.tensor([[44.0, 0.0, 31.5], [0.0, 44.0, 23.5], [0.0, 0.0, 1.0]]).repeat(4, 1, 1)
+    poses = torch.eye(4).repeat(4, 1, 1)
+    poses[:, 0, 3] = 0.05 * torch.arange(4)
+    views = to_device(SourceViews(rgb, depth_m, K, poses), next(field.parameters()).device)
+    training = field.training
+    separately = encodes_views_separately(field.eval(), views)
+    field.train(training)
+    return separately
 
 
 def check_nothing_is_overwritten(state: Path) -> None:

@@ -1,15 +1,21 @@
 """What is refused before the first room is rendered."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from semantic_mapper.errors import ConfigError, WeightsError
+from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.train import train
+from semantic_mapper.training.train_checks import check_field
+from semantic_mapper.types import SourceViews
+from tests.small import SMALL_MODEL, tiny_field
 from tests.training.small_run import small_run
 
 RAYS_ALONE = {"share": 0.0}
@@ -63,3 +69,32 @@ def test_an_encoder_to_take_over_has_to_be_there_and_of_the_same_shape(encoder: 
     other = {"encoder": {"channels": [8, 24], "blocks": [1, 1]}}
     with pytest.raises(ConfigError, match="another shape"):
         train(small_run(encoder_from=encoder, field=other, images=RAYS_ALONE))
+
+
+class AveragingField(SRay):
+    """Encodes every view in the light of the others, as no kind of the package does."""
+
+    def encode(self, views: SourceViews) -> EncodedViews:
+        encoded = super().encode(views)
+        return dataclasses.replace(encoded, feature=encoded.feature + encoded.feature.mean(0))
+
+
+def test_rooms_of_a_step_share_one_call_only_where_a_kind_encodes_each_view_by_itself(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("semantic_mapper.training.train.build_field", lambda *_: AveragingField(SMALL_MODEL, ROOMS))
+    with pytest.raises(ConfigError, match="in the light of each other"):
+        train(small_run(images=RAYS_ALONE, encode_together=True))
+    check_field(tiny_field(), small_run(encode_together=True))
+
+
+def test_parts_that_compute_in_bfloat16_have_to_be_there():
+    with pytest.raises(ConfigError, match="no part 'decoder'"):
+        train(small_run(bfloat16=["decoder"]))
+
+
+@pytest.mark.parametrize(
+    ("pool", "what"),
+    [({"rooms": 2, "rooms_at_start": 3}, "rooms_at_start <= rooms"), ({"step_m_min": 0.5}, "step_m_min <= step_m_max")],
+)
+def test_a_pool_that_cannot_be_filled_is_refused_where_it_is_read(pool: dict[str, float], what: str):
+    with pytest.raises(ConfigError, match=what):
+        small_run(pool=pool)

@@ -5,8 +5,6 @@ import torch
 
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.device import choose_device, compute_in_bfloat16
 from semantic_mapper.training.losses import LossConfig
@@ -15,26 +13,13 @@ from semantic_mapper.training.step import (
     StepConfig,
     batch_loss,
     draw_batch,
-    encodes_views_separately,
     pick_views_on_path,
 )
-from semantic_mapper.training.train import train
 from semantic_mapper.training.train_config import TrainStepConfig
 from semantic_mapper.training.views import stack_sources, view_from_frame
-from semantic_mapper.types import SourceViews
-from tests.small import SMALL_MODEL, tiny_field, tiny_frames
-from tests.training.small_run import small_run
+from tests.small import tiny_field, tiny_frames
 
 VIEWS = [view_from_frame(f, ROOMS, 48) for f in tiny_frames()]
-
-
-class AveragingField(SRay):
-    """Encodes every view in the light of the others, as a cost volume does."""
-
-    def encode(self, views: SourceViews) -> EncodedViews:
-        encoded = super().encode(views)
-        mixed = encoded.feature + encoded.feature.mean(0)
-        return EncodedViews(mixed, encoded.rgb, encoded.geometry, encoded.K, encoded.T_camera_world, encoded.channel)
 
 
 def batch(seed: int = 0, sources: tuple[int, ...] = (0, 2, 3), **changes: object) -> StepBatch:
@@ -118,16 +103,6 @@ def test_the_loss_of_several_rooms_is_the_mean_of_their_losses():
     batches, model = [batch(0), batch(1)], tiny_field()
     alone = [batch_loss(model, [b], LossConfig()).total for b in batches]
     torch.testing.assert_close(batch_loss(model, batches, LossConfig()).total, (alone[0] + alone[1]) / 2)
-
-
-def test_fields_that_look_across_views_are_not_encoded_together(monkeypatch: pytest.MonkeyPatch):
-    sources = stack_sources(VIEWS[:4])
-    assert encodes_views_separately(tiny_field(), sources)
-    across = AveragingField(SMALL_MODEL, ROOMS).eval()
-    assert not encodes_views_separately(across, sources)
-    monkeypatch.setattr("semantic_mapper.training.train.build_field", lambda *_: across)
-    with pytest.raises(ConfigError, match="in the light of each other"):
-        train(small_run(encode_together=True))
 
 
 def test_named_parts_compute_in_bfloat16_and_hand_back_float32():
