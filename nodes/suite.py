@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
 from itertools import combinations
 from pathlib import Path
@@ -16,6 +16,7 @@ from semantic_mapper import __version__
 from semantic_mapper.benchmark.config import SuiteConfig, settings_digest, suite_seeds
 from semantic_mapper.benchmark.contestants import load_contestants
 from semantic_mapper.benchmark.figures import compare, map_figures, view_figures
+from semantic_mapper.benchmark.fit_plot import draw_fit_curves
 from semantic_mapper.benchmark.protocols import Contestant
 from semantic_mapper.benchmark.records import MapRecord
 from semantic_mapper.benchmark.run import Progress, room_records, run_suite, sheet_rows
@@ -34,7 +35,8 @@ def run_suite_verb(
 ) -> int:
     """Run what is missing, then print, write and draw what there is.
 
-    Beside the JSON lie the records of the rooms (``.jsonl``), their pictures (``.views``) and the sheet (``.png``).
+    Beside the JSON lie the records of the rooms (``.jsonl``), their pictures (``.views``), the sheet (``.png``)
+    and, of what was fitted, mIoU against seconds (``.curves.png``).
 
     Args:
         weights: Files under test; the shipped ones where neither these nor ``kinds`` are given.
@@ -70,13 +72,25 @@ def run_suite_verb(
         for line in difference_lines(found):
             output.print(line)
         output.print(f"written to {out}")
-        if rows := sheet_rows(suite, contestants, store, pictures):
-            names = [c.name for c in contestants]
-            write_picture(out.with_suffix(".png"), draw_sheet(rows, names, ROOMS, title=found["title"]))
-            output.print(f"picture: {out.with_suffix('.png')}")
+        for picture in _draw(suite, contestants, store, found, out):
+            output.print(f"picture: {picture}")
         if stop:
             stderr_console().print(f"stopped by {stop.name}; the same command goes on from here", style="yellow")
         return stop.exit_code
+
+
+def _draw(
+    suite: SuiteConfig, contestants: Sequence[Contestant], store: RecordStore, found: Mapping[str, Any], out: Path
+) -> Iterator[Path]:
+    """Write the contact sheet, and the curves of what was fitted; yields the files."""
+    if rows := sheet_rows(suite, contestants, store, out.with_suffix(".views")):
+        names = [c.name for c in contestants]
+        write_picture(sheet := out.with_suffix(".png"), draw_sheet(rows, names, ROOMS, title=found["title"]))
+        yield sheet
+    figures = {name: entry["figures"] for name, entry in found["weights"].items()}
+    if (picture := draw_fit_curves(figures, found["title"])) is not None:
+        write_picture(curves := out.with_suffix(".curves.png"), picture)
+        yield curves
 
 
 def _file_stem(suite: SuiteConfig) -> str:

@@ -75,6 +75,7 @@ def test_fitting_shows_its_curve(suite: Path, two: tuple[Path, Path], tmp_path: 
     done = run("eval", "--suite", "rooms", "--config", suite, "--weights", two[0], *options, "--json", out)
     assert done.returncode == 0, done.stderr
     assert "mIoU before fitting" in done.stdout and "2 steps" in done.stdout
+    assert out.with_suffix(".curves.png").stat().st_size > 1000
     written = json.loads(out.read_text())
     assert written["suite"]["scene"]["seconds"] == 0 and not written["suite"]["depth"]
 

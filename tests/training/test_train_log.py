@@ -3,12 +3,10 @@ import json
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from semantic_mapper.evaluation.canvas import PANEL
-from semantic_mapper.training.curves import Curve, draw_panel, ticks, write_curves
+from semantic_mapper.training.curves import write_curves
 from semantic_mapper.training.train_log import TrainLog
 
 LINES = [
@@ -61,29 +59,9 @@ def test_with_tensorboard_its_event_files_hold_the_figures(tmp_path: Path):
     assert [round(e.value, 6) for e in events.Scalars("validation/mIoU without depth")] == [0.1]
 
 
-def test_curves_are_drawn_where_their_points_are():
-    panel = np.zeros((320, 460, 3), np.uint8)
-    draw_panel(panel, "loss", [Curve("", ((0.0, 0.0), (100.0, 100.0)))])
-    drawn = np.argwhere((np.abs(panel.astype(int) - (94, 180, 255)).sum(-1) < 60)[70:])
-    first, last = drawn[drawn[:, 1].argmin()], drawn[drawn[:, 1].argmax()]
-    assert first[0] > 200 and last[0] < 10, "from the lower left to the upper right"
-    assert tuple(panel[2, 2]) == PANEL
-
-
 def test_a_picture_can_be_drawn_before_there_is_anything_to_draw(tmp_path: Path):
     for history in ([], LINES[:1], LINES):
         write_curves(history, tmp_path / "curves.png")
         picture = cv2.imread(str(tmp_path / "curves.png"))
         assert picture is not None and picture.shape[1] > 1000 and picture.std() > 1
     assert [p.name for p in tmp_path.iterdir()] == ["curves.png"]
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "expected"),
-    [(0, 10, [0, 2, 4, 6, 8, 10]), (0, 0.98, [0, 0.2, 0.4, 0.6, 0.8, 1.0]), (0, 0, None), (-1, 1, None)],
-)
-def test_ticks_are_round_and_span_the_range(low: float, high: float, expected: list[float] | None):
-    found = ticks(low, high)
-    assert found[0] <= low and found[-1] >= high and 2 <= len(found) <= 8
-    if expected is not None:
-        assert found == pytest.approx(expected)
