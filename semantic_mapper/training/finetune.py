@@ -155,9 +155,10 @@ def _run(
     stopped: Callable[[], object],
 ) -> tuple[_Best, int]:
     optimiser = make_optimiser(model, config.learning_rate, config.weight_decay)
-    norms = _prepare_norms(model, train)
-    # A kind that classifies while it encodes has nothing to learn where its features are kept.
-    rests = config.resting_share > 0 and not model.needs_own_view
+    alive, norms = _prepare_norms(model, train)
+    patience = 0 if alive else config.patience  # random weights get worse before they get better
+    # Kept features leave a kind that classifies while it encodes nothing to learn, and random ones say little.
+    rests = config.resting_share > 0 and not model.needs_own_view and not alive
     encoded = encode_once(model, train, with_labels=config.step.known_labels) if rests else None
     best = _Best(*_evaluate(model, train, held_out, config), 0, copy.deepcopy(model.state_dict()))
     latest = (best.loss, best.accuracy)
@@ -168,7 +169,7 @@ def _run(
     began, step, evaluated, stale = time.monotonic(), 0, 0, 0
     while (
         (fraction := budget_fraction(step, time.monotonic() - began, steps=config.steps, seconds=config.seconds)) < 1
-        and (config.patience == 0 or stale < config.patience)
+        and (patience == 0 or stale < patience)
         and not stopped()
     ):
         rate = cosine_rate(fraction, config.learning_rate, config.final_learning_rate)
@@ -190,6 +191,8 @@ def _run(
         improved = False
         if fraction * config.evaluations >= evaluated + 1 or fraction >= 1:
             evaluated = int(fraction * config.evaluations)
+            if alive:
+                _settle_norms(model, train)
             latest = _evaluate(model, train, held_out, config)
             improved = latest[0] < best.loss or not math.isfinite(best.loss)
             stale = 0 if improved else stale + 1
@@ -199,19 +202,29 @@ def _run(
         if on_progress is not None:
             on_progress(FinetuneProgress(step, min(fraction, 1.0), float(loss.total.detach()), *latest, improved))
     if stopped() and step > 0:  # what was learned since the last look
+        if alive:
+            _settle_norms(model, train)
         latest = _evaluate(model, train, held_out, config)
         if latest[0] < best.loss or not math.isfinite(best.loss):
             best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
     return best, step
 
 
-def _prepare_norms(model: LearnedField, views: Sequence[LabelledView]) -> Callable[[], AbstractContextManager[None]]:
-    """What steps are made in; batch norms of a fresh encoder are set by the views, and live on."""
+def _prepare_norms(
+    model: LearnedField, views: Sequence[LabelledView]
+) -> tuple[bool, Callable[[], AbstractContextManager[None]]]:
+    """Whether batch norms are alive, and what steps are made in; those of a fresh encoder are set by the views."""
     encoder = model.image_encoder
     if encoder is None or not encoder.uncalibrated:
-        return nullcontext
-    calibrate(encoder, to_device(stack_sources(views), next(model.parameters()).device))
-    return encoder.batch_statistics
+        return False, nullcontext
+    _settle_norms(model, views)
+    return True, encoder.batch_statistics
+
+
+def _settle_norms(model: LearnedField, views: Sequence[LabelledView]) -> None:
+    """Norms that are alive take the statistics of all views: running means lag behind weights that change fast."""
+    if model.image_encoder is not None:
+        calibrate(model.image_encoder, to_device(stack_sources(views), next(model.parameters()).device))
 
 
 def _split(view: LabelledView, share: float, generator: torch.Generator) -> tuple[LabelledView, LabelledView]:

@@ -65,9 +65,15 @@ def test_the_encoder_computes_as_before_once_bfloat16_is_over(monkeypatch: pytes
 
 def test_without_patience_a_budget_is_spent_to_its_end():
     hopeless = {"learning_rate": 30.0, "final_learning_rate": 30.0, "gradient_clip": 1e9, "evaluations": 10}
-    assert finetune(tiny_frames(3), ROOMS, tiny_field(), config(steps=20, patience=2, **hopeless)).recipe["steps"] < 20
-    spent = finetune(tiny_frames(3), ROOMS, tiny_field(), config(steps=20, patience=0, **hopeless)).recipe
-    assert spent["steps"] == 20
+    start, fresh = calibrated_field(), tiny_field()
+
+    def steps(field: SRay, patience: int) -> int:
+        recipe = finetune(tiny_frames(3), ROOMS, field, config(steps=20, patience=patience, **hopeless)).recipe
+        return recipe["steps"]
+
+    assert steps(start, 2) < 20
+    assert steps(start, 0) == 20
+    assert steps(fresh, 2) == 20, "random weights get worse before they get better"
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU on this machine")
@@ -88,18 +94,24 @@ def calibrated_field():
     return field
 
 
-def test_norms_live_in_a_field_of_which_nothing_is_trained_and_rest_in_any_other():
-    def moved(start: SRay) -> bool:
-        """Whether three steps that learn next to nothing change the statistics more than one does."""
-        still = {"learning_rate": 1e-9, "final_learning_rate": 1e-9, "held_out_share": 0.0}  # the last weights are kept
-        first, second = (finetune(tiny_frames(2), ROOMS, start, config(steps=n, **still)).model for n in (1, 3))
-        return any(
-            not torch.equal(a, b)
-            for (name, a), b in zip(first.state_dict().items(), second.state_dict().values(), strict=True)
-            if name.startswith("encoder.") and name.endswith("running_mean")
-        )
+def running_means(model: torch.nn.Module) -> dict[str, torch.Tensor]:
+    return {name: t.clone() for name, t in model.state_dict().items() if name.endswith("running_mean")}
 
-    assert moved(tiny_field()) and not moved(calibrated_field())
+
+def test_norms_live_in_a_field_of_which_nothing_is_trained_and_rest_in_any_other():
+    start = calibrated_field()
+    rested = running_means(finetune(tiny_frames(2), ROOMS, start, config(steps=3)).model)
+    assert rested and all(torch.equal(rested[name], t) for name, t in running_means(start).items())
+
+    frames = tiny_frames(2)
+    lived = finetune(
+        frames, ROOMS, tiny_field(), config(steps=3, held_out_share=0.0)
+    ).model  # the last weights are kept
+    means = running_means(lived)
+    calibrate(lived.encoder, stack_sources([view_from_frame(f, ROOMS, 96) for f in frames]))
+    for name, settled in running_means(lived).items():
+        assert torch.allclose(means[name], settled, atol=1e-4), "what is kept has the statistics of all its views"
+        assert not torch.equal(settled, torch.zeros_like(settled))
 
 
 def test_held_out_rays_are_judged_without_labels_where_training_knows_none():
@@ -120,7 +132,7 @@ def test_an_encoder_of_rate_0_stays_what_it_was_and_the_rest_learns():
 
 
 def test_the_encoder_may_rest_at_the_start_and_its_weights_stay_what_they_were():
-    start = tiny_field()
+    start = calibrated_field()
     result = finetune(tiny_frames(4), ROOMS, start, config(steps=30, resting_share=1.0))
     assert result.recipe["best_step"] > 0, "the head alone learns something"
     kept = {n: t for n, t in result.model.named_parameters() if n.startswith(("encoder.", "geometry_init."))}
@@ -128,6 +140,14 @@ def test_the_encoder_may_rest_at_the_start_and_its_weights_stay_what_they_were()
     later = finetune(tiny_frames(4), ROOMS, start, config(steps=40, resting_share=0.2))
     assert later.recipe["best_step"] > 8, "it learns more once the encoder may"
     assert any(not torch.equal(t, dict(later.model.named_parameters())[n]) for n, t in kept.items())
+
+
+def test_an_encoder_that_has_learned_nothing_yet_does_not_rest():
+    kept, fresh = calibrated_field(), tiny_field()
+    for start, rests in ((kept, True), (fresh, False)):
+        config_ = config(steps=3, resting_share=1.0, held_out_share=0.0)  # the last weights are kept
+        fitted = dict(finetune(tiny_frames(3), ROOMS, start, config_).model.named_parameters())
+        assert all(torch.equal(fitted[n], p) for n, p in start.named_parameters() if n.startswith("encoder.")) == rests
 
 
 def test_doubt_is_what_the_images_alone_give_to_other_classes_than_the_right_one():
