@@ -45,6 +45,7 @@ def finetune(
 
     from nodes.finetuning import FinetuneRequest, finetune_log
     from semantic_mapper.config import load_config
+    from semantic_mapper.memory import keep_freed_memory
     from semantic_mapper.training.finetune import FinetuneConfig
 
     given = {"seconds": seconds, "steps": steps, "seed": seed}
@@ -52,6 +53,7 @@ def finetune(
     settings = msgspec.structs.replace(settings, **{name: v for name, v in given.items() if v is not None})
     if settings.seconds == 0 and settings.steps == 0:
         raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
+    keep_freed_memory()
     request = FinetuneRequest(log, keyframes, out, settings, weights, from_scratch)
     with StopRequest() as stop, frame_progress("finetune", None, unit="%") as bar:
         checkpoint, chosen = finetune_log(request, stop, bar)

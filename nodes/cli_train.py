@@ -40,6 +40,7 @@ def train(
     output = Output.guarded()
     from semantic_mapper.config import convert_config, load_config, to_plain
     from semantic_mapper.fields.checkpoint import save_checkpoint
+    from semantic_mapper.memory import keep_freed_memory
     from semantic_mapper.training.ranks import ranks_from_environment
     from semantic_mapper.training.train import WEIGHTS_FILE, TrainProgress
     from semantic_mapper.training.train import train as train_field
@@ -54,6 +55,7 @@ def train(
     is_file = out.suffix == ".safetensors"
     folder = out.with_name(f"{out.stem}-training") if is_file else out
     ranks = ranks_from_environment()
+    keep_freed_memory()
     # torchrun hands on Ctrl-C and then asks once more in its own way: both mean the same.
     with StopRequest(patient=ranks.world > 1) as stop, frame_progress("training", None, unit="%") as bar:
         bar.start(100)

@@ -26,6 +26,7 @@ from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.sheet import draw_sheet, write_picture
 from semantic_mapper.fields.checkpoint import default_checkpoint_path
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.memory import keep_freed_memory
 
 PACKAGES = ("torch", "numpy", "numba")
 
@@ -55,6 +56,7 @@ def run_suite_verb(
             f"--kind has random weights, which protocol '{suite.protocol}' does not fit; --protocol scratch"
         )
     output = Output.guarded()
+    keep_freed_memory()
     paths = list(weights) or ([] if kinds else [default_checkpoint_path()])
     contestants = load_contestants(paths, kinds)
     out = json_file or Path("runs") / f"{_file_stem(suite)}.json"

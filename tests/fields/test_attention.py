@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from semantic_mapper.fields.attention import (
+    FUSED_FROM,
     MultiHeadAttention,
     cross_view_attention,
     masked_attention,
@@ -27,6 +28,21 @@ def test_masked_attention_equals_torch_on_the_valid_keys():
     valid = torch.tensor([True, True, False, True, False, True]).expand(5, 6)
     expected = torch.nn.functional.scaled_dot_product_attention(q, k, v, attn_mask=valid[:, None, None, :])
     torch.testing.assert_close(masked_attention(q, k, v, valid), expected, atol=1e-5, rtol=1e-5)
+
+
+def test_one_fused_kernel_for_many_tokens_gives_what_eq_7_says():
+    tokens = FUSED_FROM + 3
+    q, k, v = (t.requires_grad_() for t in torch.randn(3, 5, 2, tokens, 4, dtype=torch.float64).unbind(0))
+    valid = torch.rand(5, tokens) < 0.6
+    valid[2] = False
+    score = (q @ k.transpose(-1, -2)) / math.sqrt(4)
+    weight = torch.softmax(score.masked_fill(~valid[:, None, None, :], -1e9), -1) * valid[:, None, None, :]
+    expected, out = weight @ v, masked_attention(q, k, v, valid)
+    torch.testing.assert_close(out, expected)
+    assert out[2].abs().max() == 0
+    toward = torch.randn_like(out)
+    for a, b in zip(*(torch.autograd.grad(y, (q, k, v), toward) for y in (out, expected)), strict=True):
+        torch.testing.assert_close(a, b)
 
 
 def test_invalid_keys_have_no_influence():
