@@ -17,9 +17,9 @@ import numpy as np
 import structlog
 import torch
 
-from semantic_mapper.config import AtLeastOne, Config, Share, SRayConfig, to_plain
+from semantic_mapper.config import AtLeastOne, Config, NotNegative, Share, SRayConfig, to_plain
 from semantic_mapper.errors import ConfigError, FrameError
-from semantic_mapper.fields.base import MAX_SOURCE_VIEWS
+from semantic_mapper.fields.base import MAX_SOURCE_VIEWS, EncodedViews
 from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, anchor_from_frame
 from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.learned import LearnedField
@@ -28,6 +28,7 @@ from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.device import DeviceName, choose_device, encoder_in_bfloat16
 from semantic_mapper.training.doubt import with_doubt
+from semantic_mapper.training.head_start import fit_class_rows
 from semantic_mapper.training.losses import IGNORE, semantic_loss
 from semantic_mapper.training.optimiser import make_optimiser, set_rates
 from semantic_mapper.training.resting import encode_once, resting_loss
@@ -64,6 +65,7 @@ class FinetuneConfig(Config, frozen=True):
     evaluations: int = 10  # over the whole budget
     patience: int = 4  # evaluations without a better loss before it stops early; 0 = the whole budget, come what may
     bfloat16: bool = True  # the image encoder computes in it where that is fast (GPUs, CPUs with AMX)
+    head_start: NotNegative = 40  # steps of the classifier alone, on features as they are, before the first ray
     resting_share: Share = 0.0  # of the budget, at its start, in which the image encoder rests: steps cost a third
     seed: int = 0
     device: DeviceName = "auto"
@@ -157,16 +159,20 @@ def _run(
     optimiser = make_optimiser(model, config.learning_rate, config.weight_decay)
     alive, norms = _prepare_norms(model, train)
     patience = 0 if alive else config.patience  # random weights get worse before they get better
-    # Kept features leave a kind that classifies while it encodes nothing to learn, and random ones say little.
-    rests = config.resting_share > 0 and not model.needs_own_view and not alive
-    encoded = encode_once(model, train, with_labels=config.step.known_labels) if rests else None
-    best = _Best(*_evaluate(model, train, held_out, config), 0, copy.deepcopy(model.state_dict()))
+
+    def look() -> tuple[float, float]:
+        if alive:
+            _settle_norms(model, train)
+        return _evaluate(model, train, held_out, config)
+
+    best = _Best(*look(), 0, copy.deepcopy(model.state_dict()))
+    began, step, evaluated, stale = time.monotonic(), 0, 0, 0
+    best, encoded = (best, None) if alive else _head_start(model, train, held_out, config, best)
     latest = (best.loss, best.accuracy)
     doubts = config.step.doubtful_share > 0
     train = with_doubt(model, train) if doubts else train
     if not math.isfinite(best.loss):
         _log.warning("nothing_held_out", reason="too few labelled pixels; the last weights are kept, not the best")
-    began, step, evaluated, stale = time.monotonic(), 0, 0, 0
     while (
         (fraction := budget_fraction(step, time.monotonic() - began, steps=config.steps, seconds=config.seconds)) < 1
         and (patience == 0 or stale < patience)
@@ -191,9 +197,7 @@ def _run(
         improved = False
         if fraction * config.evaluations >= evaluated + 1 or fraction >= 1:
             evaluated = int(fraction * config.evaluations)
-            if alive:
-                _settle_norms(model, train)
-            latest = _evaluate(model, train, held_out, config)
+            latest = look()
             improved = latest[0] < best.loss or not math.isfinite(best.loss)
             stale = 0 if improved else stale + 1
             if improved:
@@ -202,12 +206,34 @@ def _run(
         if on_progress is not None:
             on_progress(FinetuneProgress(step, min(fraction, 1.0), float(loss.total.detach()), *latest, improved))
     if stopped() and step > 0:  # what was learned since the last look
-        if alive:
-            _settle_norms(model, train)
-        latest = _evaluate(model, train, held_out, config)
+        latest = look()
         if latest[0] < best.loss or not math.isfinite(best.loss):
             best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
     return best, step
+
+
+def _head_start(
+    model: LearnedField,
+    train: Sequence[LabelledView],
+    held_out: Sequence[LabelledView],
+    config: FinetuneConfig,
+    start: _Best,
+) -> tuple[_Best, EncodedViews | None]:
+    """Fit the class rows alone, undone where held-out rays say that it did no good.
+
+    Returns:
+        The better state, and the views as they are encoded now; None where no step asks for them.
+    """
+    # Kept features leave a kind that classifies while it encodes nothing to learn.
+    if model.needs_own_view or (config.head_start == 0 and config.resting_share == 0):
+        return start, None
+    encoded = encode_once(model, train, with_labels=config.step.known_labels)
+    fit_class_rows(model, encoded, train, config.head_start)
+    after = _Best(*_evaluate(model, train, held_out, config), 0, copy.deepcopy(model.state_dict()))
+    if after.loss < start.loss or not math.isfinite(start.loss):
+        return after, encoded
+    model.load_state_dict(start.state)
+    return start, encoded
 
 
 def _prepare_norms(

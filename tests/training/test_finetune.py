@@ -35,12 +35,12 @@ def test_finetuning_improves_held_out_rays_and_says_what_it_did():
 
 def start_loss(start):
     """Held-out loss of the weights that a finetuning starts from: no learning, one look."""
-    still = config(steps=1, learning_rate=0.0, final_learning_rate=0.0, weight_decay=0.0)
+    still = config(steps=1, head_start=0, learning_rate=0.0, final_learning_rate=0.0, weight_decay=0.0)
     return finetune(tiny_frames(3), ROOMS, start, still).recipe["held_out_loss"]
 
 
 def test_weights_are_never_worse_than_the_start_on_held_out_rays():
-    ruined = config(steps=12, learning_rate=30.0, final_learning_rate=30.0, gradient_clip=1e9)
+    ruined = config(steps=12, head_start=0, learning_rate=30.0, final_learning_rate=30.0, gradient_clip=1e9)
     start = calibrated_field()
     result = finetune(tiny_frames(3), ROOMS, start, ruined)
     assert start_loss(start) >= result.recipe["held_out_loss"]
@@ -121,6 +121,27 @@ def test_held_out_rays_are_judged_without_labels_where_training_knows_none():
     assert given.recipe["held_out_loss"] < kept.recipe["held_out_loss"], "labels of the others say much"
 
 
+def test_a_head_start_fits_the_classifier_alone():
+    frames, start = tiny_frames(3), calibrated_field()
+    still = {"steps": 1, "learning_rate": 0.0, "final_learning_rate": 0.0, "weight_decay": 0.0}
+    plain, ahead = (finetune(frames, ROOMS, start, config(**still, head_start=n)) for n in (0, 40))
+    assert ahead.recipe["held_out_loss"] < plain.recipe["held_out_loss"]
+    changed = {n for n, p in ahead.model.named_parameters() if not torch.equal(p, start.state_dict()[n])}
+    assert changed == set(SRay.class_rows)
+
+
+def test_a_head_start_that_does_no_good_is_undone(monkeypatch: pytest.MonkeyPatch):
+    def ruin(model: SRay, *_: object) -> None:
+        with torch.no_grad():
+            model.classifier.bias.add_(torch.linspace(-9, 9, len(ROOMS)))
+
+    monkeypatch.setattr("semantic_mapper.training.finetune.fit_class_rows", ruin)
+    start = calibrated_field()
+    still = {"steps": 1, "learning_rate": 0.0, "final_learning_rate": 0.0, "weight_decay": 0.0}
+    fitted = finetune(tiny_frames(3), ROOMS, start, config(**still)).model.state_dict()
+    assert torch.equal(fitted["classifier.bias"], start.state_dict()["classifier.bias"])
+
+
 def test_an_encoder_of_rate_0_stays_what_it_was_and_the_rest_learns():
     start = tiny_field()
     result = finetune(tiny_frames(4), ROOMS, start, config(steps=30, encoder_rate=0.0))
@@ -133,11 +154,11 @@ def test_an_encoder_of_rate_0_stays_what_it_was_and_the_rest_learns():
 
 def test_the_encoder_may_rest_at_the_start_and_its_weights_stay_what_they_were():
     start = calibrated_field()
-    result = finetune(tiny_frames(4), ROOMS, start, config(steps=30, resting_share=1.0))
+    result = finetune(tiny_frames(4), ROOMS, start, config(steps=30, head_start=0, resting_share=1.0))
     assert result.recipe["best_step"] > 0, "the head alone learns something"
     kept = {n: t for n, t in result.model.named_parameters() if n.startswith(("encoder.", "geometry_init."))}
     assert kept and all(torch.equal(start.state_dict()[n], t) for n, t in kept.items())
-    later = finetune(tiny_frames(4), ROOMS, start, config(steps=40, resting_share=0.2))
+    later = finetune(tiny_frames(4), ROOMS, start, config(steps=40, head_start=0, resting_share=0.2))
     assert later.recipe["best_step"] > 8, "it learns more once the encoder may"
     assert any(not torch.equal(t, dict(later.model.named_parameters())[n]) for n, t in kept.items())
 
