@@ -6,7 +6,7 @@ import hashlib
 import json
 from typing import Literal
 
-from semantic_mapper.config import Config, MapperConfig, Positive, SamplingConfig, Share, to_plain
+from semantic_mapper.config import Config, MapperConfig, NotNegative, Positive, SamplingConfig, Share, to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.scenes import SUITE_VERSION, TEST_SEEDS, VALIDATION_SEEDS, CameraPathConfig
 from semantic_mapper.scenes.config import DepthSensorName
@@ -89,6 +89,7 @@ class SceneBudget(Config, frozen=True):
     steps: int = 0  # 0 = only seconds count
     learning_rate: Positive = FinetuneConfig().learning_rate
     encoder_rate: Share = FinetuneConfig().encoder_rate  # see ``FinetuneConfig``
+    head_start: NotNegative = FinetuneConfig().head_start  # see ``FinetuneConfig``
     resting_share: Share = FinetuneConfig().resting_share  # see ``FinetuneConfig``
     doubtful_share: Share = StepConfig().doubtful_share  # see ``StepConfig``
     patience: int = 0  # see ``FinetuneConfig``; by default a budget is spent to its end
@@ -156,6 +157,7 @@ def fit_config(suite: SuiteConfig, share: float) -> FinetuneConfig:
         learning_rate=scene.learning_rate,
         encoder_rate=scene.encoder_rate,
         patience=scene.patience,
+        head_start=scene.head_start,
         resting_share=scene.resting_share,
         step=StepConfig(
             sampling=sampling,
