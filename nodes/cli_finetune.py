@@ -10,6 +10,7 @@ import typer
 from nodes.console import Output, frame_progress, stderr_console
 from nodes.process import StopRequest
 from nodes.verb import verb
+from semantic_mapper.memory import keep_freed_memory
 
 
 @verb
@@ -45,7 +46,6 @@ def finetune(
 
     from nodes.finetuning import FinetuneRequest, finetune_log
     from semantic_mapper.config import load_config
-    from semantic_mapper.memory import keep_freed_memory
     from semantic_mapper.training.finetune import FinetuneConfig
 
     given = {"seconds": seconds, "steps": steps, "seed": seed}

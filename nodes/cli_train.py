@@ -10,6 +10,7 @@ import typer
 from nodes.console import Output, frame_progress, stderr_console
 from nodes.process import StopRequest
 from nodes.verb import verb
+from semantic_mapper.memory import keep_freed_memory
 
 
 @verb
@@ -40,7 +41,6 @@ def train(
     output = Output.guarded()
     from semantic_mapper.config import convert_config, load_config, to_plain
     from semantic_mapper.fields.checkpoint import save_checkpoint
-    from semantic_mapper.memory import keep_freed_memory
     from semantic_mapper.training.ranks import ranks_from_environment
     from semantic_mapper.training.train import WEIGHTS_FILE, TrainProgress
     from semantic_mapper.training.train import train as train_field

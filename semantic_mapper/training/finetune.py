@@ -29,7 +29,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.device import DeviceName, choose_device, encoder_in_bfloat16
 from semantic_mapper.training.doubt import with_doubt
 from semantic_mapper.training.head_start import fit_class_rows
-from semantic_mapper.training.losses import IGNORE, semantic_loss
+from semantic_mapper.training.losses import IGNORE, Loss, semantic_loss
 from semantic_mapper.training.optimiser import make_optimiser, set_rates
 from semantic_mapper.training.resting import encode_once, resting_loss
 from semantic_mapper.training.schedule import budget_fraction, cosine_rate
@@ -180,12 +180,9 @@ def _run(
     ):
         rate = cosine_rate(fraction, config.learning_rate, config.final_learning_rate)
         set_rates(optimiser, rate, config.encoder_rate)
-        query, sources = pick_views(len(train), config.step, generator)
-        if encoded is not None and fraction < config.resting_share:
-            loss = resting_loss(model, encoded, train, query, sources, config.step, generator)
-        else:
-            with norms():
-                loss = training_loss(model, train, query, sources, config.step, generator)
+        with norms():
+            kept = encoded if fraction < config.resting_share else None
+            loss = _draw_loss(model, train, kept, config.step, generator)
         step += 1
         if loss is None:
             continue
@@ -210,6 +207,20 @@ def _run(
         if latest[0] < best.loss or not math.isfinite(best.loss):
             best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
     return best, step
+
+
+def _draw_loss(
+    model: LearnedField,
+    train: Sequence[LabelledView],
+    encoded: EncodedViews | None,
+    config: StepConfig,
+    generator: torch.Generator,
+) -> Loss | None:
+    """Loss of a step, from kept features where there are some; None where the query has no labelled pixel."""
+    query, sources = pick_views(len(train), config, generator)
+    if encoded is not None:
+        return resting_loss(model, encoded, train, query, sources, config, generator)
+    return training_loss(model, train, query, sources, config, generator)
 
 
 def _head_start(
