@@ -12,8 +12,8 @@ def keep_freed_memory() -> bool:
     """Let this process use freed memory again instead of returning it to the system, from now until it ends.
 
     By default glibc maps each large tensor anew and unmaps it when it is freed, and the kernel clears its pages every
-    time: of the steps of a training on a CPU that takes up to a fifth. The price is that memory stays the process's own
-    at its peak. For processes that do the same work over and over; the library itself never calls this.
+    time. The price is that memory stays the process's own at its peak. For processes that do the same work over and
+    over; the library itself never calls this.
 
     Returns:
         Whether it could be set: other C libraries than glibc have no such switch.

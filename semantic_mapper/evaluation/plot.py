@@ -12,7 +12,6 @@ import numpy as np
 from semantic_mapper.evaluation.canvas import DIM_TEXT, PANEL, TEXT, draw_text, text_width
 from semantic_mapper.types import UInt8
 
-PANEL_WIDTH, PANEL_HEIGHT = 460, 320  # of a panel that stands beside others
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 16, 66, 40  # from a panel's edges to its axes
 _GRID = (56, 61, 71)
 _LETTERS = 13

@@ -10,7 +10,9 @@ from typing import Any
 import cv2
 
 from semantic_mapper.evaluation.canvas import GAP, MARGIN, new_canvas
-from semantic_mapper.evaluation.plot import PANEL_HEIGHT, PANEL_WIDTH, Curve, draw_panel
+from semantic_mapper.evaluation.plot import Curve, draw_panel
+
+PANEL_WIDTH, PANEL_HEIGHT = 460, 320
 
 
 def write_curves(history: Sequence[dict[str, Any]], path: Path) -> None:

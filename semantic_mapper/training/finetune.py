@@ -66,7 +66,7 @@ class FinetuneConfig(Config, frozen=True):
     patience: int = 4  # evaluations without a better loss before it stops early; 0 = the whole budget, come what may
     bfloat16: bool = True  # the image encoder computes in it where that is fast (GPUs, CPUs with AMX)
     head_start: NotNegative = 40  # steps of the classifier alone, on features as they are, before the first ray
-    resting_share: Share = 0.0  # of the budget, at its start, in which the image encoder rests: steps cost a third
+    resting_share: Share = 0.0  # of the budget, at its start, in which the image encoder rests, so that steps cost less
     seed: int = 0
     device: DeviceName = "auto"
     step: StepConfig = StepConfig()
@@ -233,13 +233,14 @@ def _head_start(
     """Fit the class rows alone, undone where held-out rays say that it did no good.
 
     Returns:
-        The better state, and the views as they are encoded now; None where no step asks for them.
+        The better state, and the views as they are encoded now, for an encoder that rests; None without either.
     """
     # Kept features leave a kind that classifies while it encodes nothing to learn.
     if model.needs_own_view or (config.head_start == 0 and config.resting_share == 0):
         return start, None
     encoded = encode_once(model, train, with_labels=config.step.known_labels)
-    fit_class_rows(model, encoded, train, config.head_start)
+    if not fit_class_rows(model, encoded, train, config.head_start):
+        return start, encoded
     after = _Best(*_evaluate(model, train, held_out, config), 0, copy.deepcopy(model.state_dict()))
     if after.loss < start.loss or not math.isfinite(start.loss):
         return after, encoded

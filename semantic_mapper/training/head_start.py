@@ -16,7 +16,7 @@ RATE = 0.03  # of Adam: rows of classes that are new to the weights start from n
 BALANCE = 0.5  # see ``image_loss``
 
 
-def fit_class_rows(model: LearnedField, encoded: EncodedViews, views: Sequence[LabelledView], steps: int) -> None:
+def fit_class_rows(model: LearnedField, encoded: EncodedViews, views: Sequence[LabelledView], steps: int) -> bool:
     """Fit the class rows of ``model`` to the labelled pixels of ``views``; nothing else changes.
 
     Convex, since the classifier is linear, and cheap, since nothing is rendered or encoded: what is left for the steps
@@ -26,6 +26,9 @@ def fit_class_rows(model: LearnedField, encoded: EncodedViews, views: Sequence[L
         encoded: The same views, encoded by ``model``.
         views: Their labels count, at the size of the features.
         steps: Over all views at once.
+
+    Returns:
+        Whether anything was fitted.
     """
     rows = [model.get_parameter(name) for name in model.class_rows]
     channel = torch.stack([view.channel for view in views]).to(encoded.feature.device)
@@ -33,9 +36,10 @@ def fit_class_rows(model: LearnedField, encoded: EncodedViews, views: Sequence[L
     for _ in range(steps):
         logits = model.source_logits(encoded)
         if logits is None:
-            return
+            return False
         gradients = torch.autograd.grad(image_loss(logits, channel, BALANCE), rows)
         for row, gradient in zip(rows, gradients, strict=True):
             row.grad = gradient
         optimiser.step()
     optimiser.zero_grad()
+    return steps > 0

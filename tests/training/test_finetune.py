@@ -131,9 +131,10 @@ def test_a_head_start_fits_the_classifier_alone():
 
 
 def test_a_head_start_that_does_no_good_is_undone(monkeypatch: pytest.MonkeyPatch):
-    def ruin(model: SRay, *_: object) -> None:
+    def ruin(model: SRay, *_: object) -> bool:
         with torch.no_grad():
             model.classifier.bias.add_(torch.linspace(-9, 9, len(ROOMS)))
+        return True
 
     monkeypatch.setattr("semantic_mapper.training.finetune.fit_class_rows", ruin)
     start = calibrated_field()
