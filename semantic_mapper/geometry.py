@@ -10,6 +10,7 @@ from semantic_mapper.errors import PoseError, ShapeError
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, RayBatch
 
 ROTATION_TOLERANCE = 1e-3  # |R^T R - I|: logs store 6 to 9 digits; a real mistake (scale, mirror) is far larger
+NEAREST_Z_M = 0.05  # nearer points are looked up in no image
 
 
 def expect_shape(x: torch.Tensor | NDArray[np.generic], pattern: str, name: str = "array") -> dict[str, int]:
@@ -115,6 +116,22 @@ def project(p_camera: Float64, intrinsics: CameraIntrinsics) -> Float64:
     u = intrinsics.fx * p_camera[:, 0] / p_camera[:, 2] + intrinsics.cx
     v = intrinsics.fy * p_camera[:, 1] / p_camera[:, 2] + intrinsics.cy
     return np.stack((u, v), axis=1)
+
+
+def nearest_pixels(
+    p_camera: Float64, intrinsics: CameraIntrinsics
+) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
+    """The pixels that points (N, 3) of the camera's frame fall on.
+
+    Returns:
+        (N,) whether the point is at least 5 cm in front of the camera and in its image; (N,) rows; (N,) columns, both 0
+        where it is not.
+    """
+    z = np.maximum(p_camera[:, 2], NEAREST_Z_M)
+    u = np.rint(intrinsics.fx * p_camera[:, 0] / z + intrinsics.cx)
+    v = np.rint(intrinsics.fy * p_camera[:, 1] / z + intrinsics.cy)
+    inside = (p_camera[:, 2] > NEAREST_Z_M) & (u >= 0) & (u < intrinsics.width) & (v >= 0) & (v < intrinsics.height)
+    return inside, np.where(inside, v, 0).astype(np.int64), np.where(inside, u, 0).astype(np.int64)
 
 
 def unproject(depth_m: Float32, intrinsics: CameraIntrinsics) -> Float64:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.benchmark.config import SpacingConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.geometry import invert_pose, transform, unproject
+from semantic_mapper.geometry import invert_pose, nearest_pixels, transform, unproject
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 
 PROBE_WIDTH = 40  # pixels a row of the query that are asked what another view sees of them
@@ -83,12 +83,8 @@ def _surface_points(pose: Float64, depth_m: Float32, intrinsics: CameraIntrinsic
 def _sees(frame: PosedFrame, points: Float64) -> NDArray[np.bool_]:
     """(N,): the point lies in the image, and its depth is what the sensor measured there."""
     assert frame.depth_m is not None
-    k = frame.intrinsics
     p = transform(invert_pose(frame.T_world_camera), points)
-    z = np.maximum(p[:, 2], 1e-3)
-    u, v = np.rint(k.fx * p[:, 0] / z + k.cx), np.rint(k.fy * p[:, 1] / z + k.cy)
-    inside = (p[:, 2] > 0.05) & (u >= 0) & (u < k.width) & (v >= 0) & (v < k.height)
-    row, column = np.where(inside, v, 0).astype(np.int64), np.where(inside, u, 0).astype(np.int64)
+    inside, row, column = nearest_pixels(p, frame.intrinsics)
     measured = frame.depth_m[row, column]
     # A hole of the sensor hides nothing from the colour image.
-    return inside & ((measured <= 0) | (np.abs(measured - p[:, 2]) < SAME_SURFACE * z))
+    return inside & ((measured <= 0) | (np.abs(measured - p[:, 2]) < SAME_SURFACE * p[:, 2]))

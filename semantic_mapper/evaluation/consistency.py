@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import ShapeError
-from semantic_mapper.geometry import invert_pose, transform, unproject
+from semantic_mapper.geometry import invert_pose, nearest_pixels, transform, unproject
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 SAME_SURFACE = 0.02  # share of z by which two depths of one surface may differ, for the half pixel that rounding moves
@@ -61,13 +61,11 @@ def matching_pixels(
     size = (k.height, k.width)
     if depth_b_m.shape != size:
         raise ShapeError(f"depth_b_m: expected shape {size}, got {depth_b_m.shape}")
-    z = np.maximum(p[:, 2], 1e-3)
-    u, v = np.rint(k.fx * p[:, 0] / z + k.cx), np.rint(k.fy * p[:, 1] / z + k.cy)
-    inside = (depth_a_m.ravel() > 0) & (p[:, 2] > 0.05) & (u >= 0) & (u < k.width) & (v >= 0) & (v < k.height)
-    index_a = np.flatnonzero(inside)
-    index_b = (v[index_a] * k.width + u[index_a]).astype(np.int64)
-    found = depth_b_m.ravel()[index_b]
-    same = (found > 0) & (np.abs(found - z[index_a]) <= tolerance * z[index_a])
+    inside, row, column = nearest_pixels(p, k)
+    index_a = np.flatnonzero(inside & (depth_a_m.ravel() > 0))
+    index_b = row[index_a] * k.width + column[index_a]
+    found, z = depth_b_m.ravel()[index_b], p[index_a, 2]
+    same = (found > 0) & (np.abs(found - z) <= tolerance * z)
     return index_a[same], index_b[same]
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.config import KeyframeConfig
 from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.geometry import invert_pose, transform, unproject
+from semantic_mapper.geometry import invert_pose, nearest_pixels, transform, unproject
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 
 COVERAGE_GRID = (12, 16)  # rows, columns of query points whose visibility decides the choice of views
@@ -143,11 +143,7 @@ def _query_points(T_world_camera: Float64, intrinsics: CameraIntrinsics, depth_m
 def _sees(keyframe: Keyframe, points: Float64) -> NDArray[np.bool_]:
     """Which world points (P, 3) the keyframe sees: inside its image and not behind its measured depth."""
     p = transform(invert_pose(keyframe.T_world_camera), points)
-    k = keyframe.intrinsics
-    z = np.maximum(p[:, 2], 1e-3)
-    u = np.rint(k.fx * p[:, 0] / z + k.cx).astype(np.int64)
-    v = np.rint(k.fy * p[:, 1] / z + k.cy).astype(np.int64)
-    inside = (p[:, 2] > 0.05) & (u >= 0) & (u < k.width) & (v >= 0) & (v < k.height)
-    measured = keyframe.depth_m[np.clip(v, 0, k.height - 1), np.clip(u, 0, k.width - 1)]
+    inside, row, column = nearest_pixels(p, keyframe.intrinsics)
+    measured = keyframe.depth_m[row, column]
     free = (measured <= 0) | (p[:, 2] < measured * (1 + VISIBLE_TOLERANCE))
     return inside & free

@@ -13,7 +13,7 @@ from torch.nn import functional
 from semantic_mapper.config import Config, UNetFieldConfig
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.unet_field import UNetField
-from semantic_mapper.geometry import invert_pose, transform, unproject
+from semantic_mapper.geometry import NEAREST_Z_M, invert_pose, nearest_pixels, transform, unproject
 from semantic_mapper.imaging import fill_holes, resize_depth
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.losses import IGNORE
@@ -125,11 +125,8 @@ class WarpBaseline:
         assert keyframe.label is not None
         k = keyframe.intrinsics
         p = transform(invert_pose(keyframe.T_world_camera), points)
-        z = np.maximum(p[:, 2], 1e-3)
-        u = np.rint(k.fx * p[:, 0] / z + k.cx)
-        v = np.rint(k.fy * p[:, 1] / z + k.cy)
-        inside = (p[:, 2] > 0.05) & (u >= 0) & (u < k.width) & (v >= 0) & (v < k.height)
-        row, column = np.where(inside, v, 0).astype(int), np.where(inside, u, 0).astype(int)
+        inside, row, column = nearest_pixels(p, k)
         measured = resize_depth(keyframe, k)[row, column]
-        error = np.where(inside & (measured > 0), np.abs(measured - p[:, 2]) / z, np.inf)
+        z = np.maximum(p[:, 2], NEAREST_Z_M)
+        error = np.where(inside & (measured > 0), np.abs(measured - z) / z, np.inf)
         return error, keyframe.label[row, column]

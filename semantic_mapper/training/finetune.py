@@ -19,7 +19,7 @@ import torch
 
 from semantic_mapper.config import AtLeastOne, Config, NotNegative, Share, SRayConfig, to_plain
 from semantic_mapper.errors import ConfigError, FrameError
-from semantic_mapper.fields.base import MAX_SOURCE_VIEWS, EncodedViews
+from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, anchor_from_frame
 from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.learned import LearnedField
@@ -31,6 +31,7 @@ from semantic_mapper.training.doubt import with_doubt
 from semantic_mapper.training.head_start import fit_class_rows
 from semantic_mapper.training.losses import IGNORE, Loss, semantic_loss
 from semantic_mapper.training.optimiser import make_optimiser, set_rates
+from semantic_mapper.training.overlap import view_overlap
 from semantic_mapper.training.resting import encode_once, resting_loss
 from semantic_mapper.training.schedule import budget_fraction, cosine_rate
 from semantic_mapper.training.step import StepConfig, pick_views, training_loss
@@ -47,6 +48,8 @@ from semantic_mapper.types import PosedFrame
 _log = structlog.get_logger(__name__)
 
 HELD_OUT_BLOCK = 16  # pixels a side: single held-out pixels would be known from their neighbours
+HELD_OUT_RAYS = 6144  # over all keyframes: a look must not cost more the more keyframes there are
+HELD_OUT_SOURCES = 8  # that a held-out ray is rendered from: those that see most of its view
 
 
 class FinetuneConfig(Config, frozen=True):
@@ -61,7 +64,7 @@ class FinetuneConfig(Config, frozen=True):
     weight_decay: float = 1e-4
     gradient_clip: float = 10.0
     held_out_share: float = 0.1  # of each keyframe's pixels, in blocks, never trained on
-    held_out_rays: int = 512  # a keyframe
+    held_out_rays: int = 512  # a keyframe, but no more than 6,144 in all
     evaluations: int = 10  # over the whole budget
     patience: int = 4  # evaluations without a better loss before it stops early; 0 = the whole budget, come what may
     bfloat16: bool = True  # the image encoder computes in it where that is fast (GPUs, CPUs with AMX)
@@ -85,6 +88,21 @@ class FinetuneProgress:
 
 
 @dataclass(slots=True)
+class _Scene:
+    """The views to learn from (held-out blocks ignored), the same to look at (all else ignored), and who sees whom.
+
+    Args:
+        queries: Views with something to learn; the others are source views only.
+        overlap: (n, n) of ``view_overlap``.
+    """
+
+    train: Sequence[LabelledView]
+    held_out: Sequence[LabelledView]
+    queries: Sequence[int]
+    overlap: torch.Tensor
+
+
+@dataclass(slots=True)
 class _Best:
     loss: float
     accuracy: float
@@ -104,7 +122,7 @@ def finetune(
     """Fit a field to the labelled keyframes ``frames``; never worse on held-out rays than where it started.
 
     Args:
-        frames: Labelled keyframes with poses; at least 2.
+        frames: Keyframes with poses; at least 2, one of them labelled. Those without labels are source views only.
         label_set: Classes of their labels, and of the result.
         start: Weights to start from, adapted to ``label_set`` by class name; None = random. A field of which nothing is
             trained yet learns with batch norms that are alive.
@@ -119,18 +137,22 @@ def finetune(
     """
     if config.seconds <= 0 and config.steps <= 0:
         raise ConfigError("finetuning needs a budget: set seconds, steps, or both")
-    if len(frames) < 2 or all(f.label is None for f in frames):
-        raise FrameError(f"finetuning needs at least 2 labelled keyframes, got {len(frames)}; raise --keyframes")
+    labelled = [f for f in frames if f.label is not None]
+    if len(frames) < 2 or not labelled:
+        raise FrameError(
+            f"finetuning needs at least 2 frames, one of them labelled, got {len(frames)} with {len(labelled)} "
+            "labelled; raise --keyframes"
+        )
     torch.manual_seed(config.seed)
     generator = torch.Generator().manual_seed(config.seed)
     model = SRay(SRayConfig(), label_set) if start is None else adapt_model(start, label_set)
     views = [view_from_frame(f, label_set, config.width) for f in frames]
-    train, held_out = zip(*(_split(v, config.held_out_share, generator) for v in views), strict=True)
+    scene = _make_scene(views, config, generator)
     device = choose_device(config.device, 0)
     model.to(device)
     began = time.monotonic()
     with encoder_in_bfloat16(model, device) if config.bfloat16 else nullcontext():
-        best, steps = _run(model, train, held_out, config, generator, on_progress, stopped)
+        best, steps = _run(model, scene, config, generator, on_progress, stopped)
     model.load_state_dict(best.state)
     recipe: dict[str, Any] = {
         "kind": "finetune",
@@ -141,36 +163,35 @@ def finetune(
         "seconds": round(time.monotonic() - began, 1),
         "held_out_loss": best.loss,
         "held_out_accuracy": best.accuracy,
-        "train_stamps_ns": sorted({int(f.stamp_ns) for f in frames} | {int(s) for s in seen_stamps_ns}),
+        "train_stamps_ns": sorted({int(f.stamp_ns) for f in labelled} | {int(s) for s in seen_stamps_ns}),
     }
-    anchors = tuple(anchor_from_frame(f, config.width) for f in frames)
+    anchors = tuple(anchor_from_frame(f, config.width) for f in labelled)
     return Checkpoint(model.cpu().eval(), anchors, recipe)
 
 
 def _run(
     model: LearnedField,
-    train: Sequence[LabelledView],
-    held_out: Sequence[LabelledView],
+    scene: _Scene,
     config: FinetuneConfig,
     generator: torch.Generator,
     on_progress: Callable[[FinetuneProgress], None] | None,
     stopped: Callable[[], object],
 ) -> tuple[_Best, int]:
     optimiser = make_optimiser(model, config.learning_rate, config.weight_decay)
-    alive, norms = _prepare_norms(model, train)
+    alive, norms = _prepare_norms(model, scene.train)
     patience = 0 if alive else config.patience  # random weights get worse before they get better
 
     def look() -> tuple[float, float]:
         if alive:
-            _settle_norms(model, train)
-        return _evaluate(model, train, held_out, config)
+            _settle_norms(model, scene.train)
+        return _evaluate(model, scene, config)
 
     best = _Best(*look(), 0, copy.deepcopy(model.state_dict()))
     began, step, evaluated, stale = time.monotonic(), 0, 0, 0
-    best, encoded = (best, None) if alive else _head_start(model, train, held_out, config, best)
+    best, encoded = (best, None) if alive else _head_start(model, scene, config, best)
     latest = (best.loss, best.accuracy)
     doubts = config.step.doubtful_share > 0
-    train = with_doubt(model, train) if doubts else train
+    scene.train = with_doubt(model, scene.train) if doubts else scene.train
     if not math.isfinite(best.loss):
         _log.warning("nothing_held_out", reason="too few labelled pixels; the last weights are kept, not the best")
     while (
@@ -182,7 +203,7 @@ def _run(
         set_rates(optimiser, rate, config.encoder_rate)
         with norms():
             kept = encoded if fraction < config.resting_share else None
-            loss = _draw_loss(model, train, kept, config.step, generator)
+            loss = _draw_loss(model, scene, kept, config.step, generator)
         step += 1
         if loss is None:
             continue
@@ -199,7 +220,7 @@ def _run(
             stale = 0 if improved else stale + 1
             if improved:
                 best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
-            train = with_doubt(model, train) if doubts else train
+            scene.train = with_doubt(model, scene.train) if doubts else scene.train
         if on_progress is not None:
             on_progress(FinetuneProgress(step, min(fraction, 1.0), float(loss.total.detach()), *latest, improved))
     if stopped() and step > 0:  # what was learned since the last look
@@ -211,22 +232,21 @@ def _run(
 
 def _draw_loss(
     model: LearnedField,
-    train: Sequence[LabelledView],
+    scene: _Scene,
     encoded: EncodedViews | None,
     config: StepConfig,
     generator: torch.Generator,
 ) -> Loss | None:
     """Loss of a step, from kept features where there are some; None where the query has no labelled pixel."""
-    query, sources = pick_views(len(train), config, generator)
+    query, sources = pick_views(scene.queries, scene.overlap, config, generator)
     if encoded is not None:
-        return resting_loss(model, encoded, train, query, sources, config, generator)
-    return training_loss(model, train, query, sources, config, generator)
+        return resting_loss(model, encoded, scene.train, query, sources, config, generator)
+    return training_loss(model, scene.train, query, sources, config, generator)
 
 
 def _head_start(
     model: LearnedField,
-    train: Sequence[LabelledView],
-    held_out: Sequence[LabelledView],
+    scene: _Scene,
     config: FinetuneConfig,
     start: _Best,
 ) -> tuple[_Best, EncodedViews | None]:
@@ -238,10 +258,10 @@ def _head_start(
     # Kept features leave a kind that classifies while it encodes nothing to learn.
     if model.needs_own_view or (config.head_start == 0 and config.resting_share == 0):
         return start, None
-    encoded = encode_once(model, train, with_labels=config.step.known_labels)
-    if not fit_class_rows(model, encoded, train, config.head_start):
+    encoded = encode_once(model, scene.train, with_labels=config.step.known_labels)
+    if not fit_class_rows(model, encoded, scene.train, config.head_start):
         return start, encoded
-    after = _Best(*_evaluate(model, train, held_out, config), 0, copy.deepcopy(model.state_dict()))
+    after = _Best(*_evaluate(model, scene, config), 0, copy.deepcopy(model.state_dict()))
     if after.loss < start.loss or not math.isfinite(start.loss):
         return after, encoded
     model.load_state_dict(start.state)
@@ -265,6 +285,12 @@ def _settle_norms(model: LearnedField, views: Sequence[LabelledView]) -> None:
         calibrate(model.image_encoder, to_device(stack_sources(views), next(model.parameters()).device))
 
 
+def _make_scene(views: Sequence[LabelledView], config: FinetuneConfig, generator: torch.Generator) -> _Scene:
+    train, held_out = zip(*(_split(v, config.held_out_share, generator) for v in views), strict=True)
+    queries = [i for i, view in enumerate(train) if bool((view.channel != IGNORE).any())]
+    return _Scene(train, held_out, queries or range(len(views)), view_overlap(views))
+
+
 def _split(view: LabelledView, share: float, generator: torch.Generator) -> tuple[LabelledView, LabelledView]:
     """The view for training (held-out blocks ignored) and for evaluation (all but held-out blocks ignored)."""
     height, width = view.channel.shape
@@ -279,29 +305,26 @@ def _split(view: LabelledView, share: float, generator: torch.Generator) -> tupl
     )
 
 
-def _evaluate(
-    model: LearnedField, train: Sequence[LabelledView], held_out: Sequence[LabelledView], config: FinetuneConfig
-) -> tuple[float, float]:
-    """Class loss and accuracy of held-out rays, each view rendered from all others; with their training labels, if the
-    config makes them known."""
+def _evaluate(model: LearnedField, scene: _Scene, config: FinetuneConfig) -> tuple[float, float]:
+    """Class loss and accuracy of held-out rays, each view rendered from the others that see most of it; with their
+    training labels, if the config makes them known."""
     generator = torch.Generator().manual_seed(config.seed)
     sampling = config.step.sampling
     device = next(model.parameters()).device
+    rays_a_view = min(config.held_out_rays, max(1, HELD_OUT_RAYS // len(scene.queries)))
     losses: list[float] = []
     right, counted = 0, 0
     model.eval()
     with torch.inference_mode():
-        sources = stack_sources(train, with_labels=config.step.known_labels)
+        sources = stack_sources(scene.train, with_labels=config.step.known_labels)
         encoded = model.encode(to_device(sources, device))
-        for i, view in enumerate(held_out):
-            flat = draw_pixels(view.channel, config.held_out_rays, 0.5, generator, len(model.label_set))
+        for i, view in enumerate(scene.held_out):
+            flat = draw_pixels(view.channel, rays_a_view, 0.5, generator, len(model.label_set))
             if len(flat) == 0:
                 continue
             prior = view.depth_m.flatten()[flat]
             rays, targets = query_rays(view, flat, near_m=sampling.near_m, far_m=sampling.far_m, prior=prior)
-            own = model.needs_own_view
-            others = torch.tensor([j for j in range(len(held_out)) if (j == i) == own][:MAX_SOURCE_VIEWS])
-            chosen = encoded.select(others.to(device))
+            chosen = encoded.select(_looking_on(scene, i, own=model.needs_own_view).to(device))
             rays, z, targets = (
                 to_device(rays, device),
                 sample_guided(rays, sampling).to(device),
@@ -313,3 +336,11 @@ def _evaluate(
             counted += len(flat)
     model.train()
     return float(np.mean(losses)) if losses else float("inf"), right / max(counted, 1)
+
+
+def _looking_on(scene: _Scene, view: int, *, own: bool) -> torch.Tensor:
+    """Indices (k,) of the views that see most of a view, without it; or of it alone."""
+    if own:
+        return torch.tensor([view])
+    order = scene.overlap[view].argsort(descending=True, stable=True)
+    return order[order != view][:HELD_OUT_SOURCES]

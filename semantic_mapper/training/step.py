@@ -32,6 +32,8 @@ from semantic_mapper.training.views import (
 )
 from semantic_mapper.types import RayBatch, SourceViews
 
+LEAST_WORTH = 0.05  # of a view that sees nothing of the query: it may still be drawn, to learn what is no use
+
 
 class StepConfig(Config, frozen=True):
     """How a training step draws its views, rays and samples."""
@@ -74,12 +76,20 @@ class StepBatch:
     z: torch.Tensor
 
 
-def pick_views(count: int, config: StepConfig, generator: torch.Generator) -> tuple[int, list[int]]:
-    """Draw a query view and its source views from ``count`` views of one scene."""
-    order = torch.randperm(count, generator=generator).tolist()
-    query, others = order[0], order[1:]
+def pick_views(
+    queries: Sequence[int], overlap: torch.Tensor, config: StepConfig, generator: torch.Generator
+) -> tuple[int, list[int]]:
+    """Draw a query view of ``queries``, and its source views: the more one sees of the query, the likelier it is.
+
+    Args:
+        overlap: (n, n) of ``view_overlap``, of all views of one scene.
+    """
+    query = queries[int(torch.randint(len(queries), (1,), generator=generator))]
+    worth = overlap[query] + LEAST_WORTH
+    worth[query] = 0
     size = int(torch.randint(config.views_min, config.views_max + 1, (1,), generator=generator))
-    sources = others[: max(1, size)] or [query]
+    size = max(1, min(size, len(overlap) - 1))
+    sources = torch.multinomial(worth, size, generator=generator).tolist() if len(overlap) > 1 else [query]
     if float(torch.rand(1, generator=generator)) < config.own_view_share:
         sources = [*sources[: max(0, size - 1)], query]
     return query, sources

@@ -228,11 +228,20 @@ def test_same_seed_and_steps_give_the_same_weights():
 
 
 def test_too_few_or_unlabelled_keyframes_are_refused():
-    with pytest.raises(FrameError, match="at least 2 labelled keyframes"):
+    with pytest.raises(FrameError, match="at least 2 frames, one of them labelled"):
         finetune(tiny_frames(4)[:1], ROOMS, None, config())
     blind = [dataclasses.replace(f, label=None) for f in tiny_frames(3)]
-    with pytest.raises(FrameError, match="at least 2 labelled keyframes"):
+    with pytest.raises(FrameError, match="at least 2 frames, one of them labelled"):
         finetune(blind, ROOMS, None, config())
+
+
+def test_frames_without_labels_are_source_views_only():
+    frames = tiny_frames(4)
+    given = [frames[0], *(dataclasses.replace(f, label=None) for f in frames[1:])]
+    result = finetune(given, ROOMS, tiny_field(), config(steps=20))
+    assert result.recipe["steps"] == 20 and result.recipe["best_step"] > 0
+    assert result.train_stamps_ns == {frames[0].stamp_ns}, "nobody was told the others' labels"
+    assert len(result.anchors) == 1
 
 
 def test_time_budget_ends_the_run():
