@@ -14,7 +14,7 @@ from semantic_mapper.training.finetune import FinetuneConfig
 from semantic_mapper.training.step import StepConfig
 from semantic_mapper.types import CameraIntrinsics
 
-RECORD_VERSION = 3  # raised by a change of what a record means or how views are rendered: older ones are made anew
+RECORD_VERSION = 4  # raised by a change of what a record means or how views are rendered: older ones are made anew
 
 FOCAL_PER_WIDTH = 882.5 / 1280  # an OAK-D at 1280 pixels
 MAP_WIDTH = 320
@@ -83,6 +83,7 @@ class SceneBudget(Config, frozen=True):
     """How a field is fitted to one room, for ``finetune`` and ``scratch``."""
 
     keyframes: int = 12  # labelled
+    unlabelled: NotNegative = 0  # further frames of the room, which bring their images (and depth) as source views
     guard: int = 3  # frames on either side of a query that are no keyframes
     labelled_sources: bool = True  # fitting and queries: the keyframes bring their labels to fields that take some
     seconds: float = 120.0  # wall clock; 0 = only steps count

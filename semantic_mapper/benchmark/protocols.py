@@ -9,7 +9,6 @@ import torch
 
 from semantic_mapper.benchmark.config import (
     SPACINGS,
-    SpacingConfig,
     SuiteConfig,
     check_suite,
     fit_config,
@@ -26,7 +25,7 @@ from semantic_mapper.benchmark.scoring import (
     room_calibration,
     room_confusion,
 )
-from semantic_mapper.benchmark.views import choose_sources
+from semantic_mapper.benchmark.views import Sources, choose_covering, choose_sources
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.fields.checkpoint import adapt_model
@@ -39,8 +38,6 @@ from semantic_mapper.training.select import candidate_from_frame, choose_keyfram
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import SourceViews
 
-ANYWHERE = SpacingConfig()
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoomResult:
@@ -48,6 +45,14 @@ class RoomResult:
 
     record: RoomRecord
     answers: dict[int, Answer]
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframes:
+    """Numbers of the frames that a field is fitted to, and that queries are rendered from."""
+
+    labelled: tuple[int, ...]
+    unlabelled: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,23 +95,34 @@ def run_room(
 
 def answer_queries(room: BenchmarkRoom, field: LearnedField, suite: SuiteConfig) -> dict[int, Answer]:
     """Render all query views from source views without labels, chosen by the baseline of the run."""
-    numbers = range(len(room.frames))
-    return {
-        q: _answer(room, field, suite, q, [n for n in numbers if n != q], SPACINGS[suite.baseline], labelled=False)
-        for q in room.queries
-    }
+    answers: dict[int, Answer] = {}
+    for q in room.queries:
+        pool = [n for n in range(len(room.frames)) if n != q]
+        count = max(1, min(_source_count(field, suite), len(pool)))
+        candidates = [room.frames[n] for n in pool]
+        pose, depth_m = room.frames[q].T_world_camera, room.truth[q].depth_m
+        sources = choose_sources(pose, depth_m, candidates, count, SPACINGS[suite.baseline])
+        answers[q] = _answer(room, field, suite, q, pool, sources)
+    return answers
 
 
 def answer_from_keyframes(
-    room: BenchmarkRoom, field: LearnedField, suite: SuiteConfig, keyframes: Sequence[int]
+    room: BenchmarkRoom, field: LearnedField, suite: SuiteConfig, keyframes: Keyframes
 ) -> dict[int, Answer]:
     """Render all query views from the keyframes, whatever their distance: they are all that there is."""
-    labelled = suite.scene.labelled_sources
-    return {q: _answer(room, field, suite, q, keyframes, ANYWHERE, labelled=labelled) for q in room.queries}
+    pool = [*keyframes.labelled, *keyframes.unlabelled]
+    labelled = keyframes.labelled if suite.scene.labelled_sources else ()
+    candidates, brings = [room.frames[n] for n in pool], [n in labelled for n in pool]
+    answers: dict[int, Answer] = {}
+    for q in room.queries:
+        pose, depth_m = room.frames[q].T_world_camera, room.truth[q].depth_m
+        sources = choose_covering(pose, depth_m, candidates, brings, max(1, _source_count(field, suite)))
+        answers[q] = _answer(room, field, suite, q, pool, sources, labelled)
+    return answers
 
 
-def choose_labelled(room: BenchmarkRoom, suite: SuiteConfig) -> list[int]:
-    """Frame numbers of the keyframes that are labelled: what shows most of the room, none of it near a query view.
+def choose_fitted(room: BenchmarkRoom, suite: SuiteConfig) -> Keyframes:
+    """The frames that a field is fitted to: what shows most of the room, none of it near a query view.
 
     Raises:
         ConfigError: too few frames are left.
@@ -118,8 +134,19 @@ def choose_labelled(room: BenchmarkRoom, suite: SuiteConfig) -> list[int]:
             f"{suite.scene.keyframes} keyframes are asked for; {len(free)} frames of the room are no query view and "
             f"not within {guard} frames of one, and 2 are the least"
         )
-    candidates = [candidate_from_frame(room.frames[n]) for n in free]
-    return [free[i] for i in choose_keyframes(candidates, suite.scene.keyframes, suite.seed)]
+    labelled = _most_telling(room, free, suite.scene.keyframes, suite.seed)
+    rest = [n for n in free if n not in labelled]
+    return Keyframes(tuple(labelled), tuple(_most_telling(room, rest, suite.scene.unlabelled, suite.seed)))
+
+
+def _most_telling(room: BenchmarkRoom, numbers: Sequence[int], count: int, seed: int) -> list[int]:
+    candidates = [candidate_from_frame(room.frames[n]) for n in numbers]
+    return [numbers[i] for i in choose_keyframes(candidates, count, seed)] if candidates else []
+
+
+def _source_count(field: LearnedField, suite: SuiteConfig) -> int:
+    """Source views of a query besides the query's own image."""
+    return suite.views - (1 if field.needs_own_view else 0)
 
 
 def _answer(
@@ -128,21 +155,15 @@ def _answer(
     suite: SuiteConfig,
     query: int,
     pool: Sequence[int],
-    spacing: SpacingConfig,
-    *,
-    labelled: bool,
+    sources: Sources,
+    labelled: Sequence[int] = (),
 ) -> Answer:
+    """Render a query view from ``sources``, positions in ``pool``; frames of ``labelled`` bring their labels."""
     frames = room.frames
-    own = field.needs_own_view
-    count = min(suite.views, len(pool)) - (1 if own else 0)
-    truth = room.truth[query]
-    sources = choose_sources(
-        frames[query].T_world_camera, truth.depth_m, [frames[n] for n in pool], max(1, count), spacing
-    )
-    chosen = [pool[i] for i in sources.numbers][:count]
-    given = [as_given(frames[n], depth=suite.depth, label=labelled) for n in chosen]
+    chosen = [pool[i] for i in sources.numbers][: _source_count(field, suite)]
+    given = [as_given(frames[n], depth=suite.depth, label=n in labelled) for n in chosen]
     asked = as_given(frames[query], depth=suite.depth)
-    if own:  # last, where the mapping pipeline has the current view, too
+    if field.needs_own_view:  # last, where the mapping pipeline has the current view, too
         given, chosen = [*given, asked], [*chosen, query]
     return Answer(predict_view(field, given, asked, suite.tier), sources, tuple(chosen))
 
@@ -156,8 +177,9 @@ def _fit_and_score(
 ) -> RoomResult | None:
     """Fit to the keyframes with growing shares of the budget; the whole budget gives the room's figures."""
     check_suite(suite)
-    keyframes = choose_labelled(room, suite)
-    frames = [as_given(room.frames[n], depth=suite.depth, label=True) for n in keyframes]
+    keyframes = choose_fitted(room, suite)
+    frames = [as_given(room.frames[n], depth=suite.depth, label=True) for n in keyframes.labelled]
+    frames += [as_given(room.frames[n], depth=suite.depth) for n in keyframes.unlabelled]
     views = stack_sources([view_from_frame(frame, ROOMS, suite.tier.width) for frame in frames])
     field = _start(contestant.field, suite, views)
     answers = answer_from_keyframes(room, field.eval(), suite, keyframes)
@@ -174,7 +196,7 @@ def _fit_and_score(
         recipe = fitted.recipe
         curve.append(_curve_point(share, float(recipe["seconds"]), int(recipe["steps"]), room_confusion(room, answers)))
         spent += share
-    return _scored(room, answers, contestant, suite, tuple(keyframes), tuple(curve))
+    return _scored(room, answers, contestant, suite, keyframes.labelled, tuple(curve))
 
 
 def _progress(

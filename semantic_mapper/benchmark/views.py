@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.benchmark.config import SpacingConfig
+from semantic_mapper.coverage import cover
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import invert_pose, nearest_pixels, transform, unproject
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 
 PROBE_WIDTH = 40  # pixels a row of the query that are asked what another view sees of them
+LABELLED_VALUE = 2.0  # of a frame whose labels are known, as a source view, against one without
 SAME_SURFACE = 0.05  # share of z; sensor noise and rounding to pixels come together
 
 
@@ -71,6 +73,25 @@ def choose_sources(
                 chosen.append(i)
     together = np.any([seen[i] for i in chosen], axis=0) if len(points) else np.zeros(1)
     return Sources(tuple(chosen), float(away[chosen].mean()), float(together.mean()))
+
+
+def choose_covering(
+    query_pose: Float64, query_depth_m: Float32, candidates: Sequence[PosedFrame], labelled: Sequence[bool], count: int
+) -> Sources:
+    """The frames that together show most of what the query sees, as the mapping pipeline chooses its source views.
+
+    Args:
+        query_pose, query_depth_m, candidates: As for ``choose_sources``.
+        labelled: Of each candidate, whether it brings labels: such a view counts twice.
+        count: At most so many; at least one is chosen, whatever it sees.
+    """
+    points = _surface_points(query_pose, query_depth_m, candidates[0].intrinsics)
+    seen = np.stack([_sees(frame, points) for frame in candidates])
+    value = np.where(labelled, LABELLED_VALUE, 1.0)
+    chosen = cover(seen, value, np.zeros(len(candidates)), count) or [0]
+    away = [np.linalg.norm(candidates[i].T_world_camera[:3, 3] - query_pose[:3, 3]) for i in chosen]
+    together = seen[chosen].any(axis=0) if len(points) else np.zeros(1)
+    return Sources(tuple(chosen), float(np.mean(away)), float(together.mean()))
 
 
 def _surface_points(pose: Float64, depth_m: Float32, intrinsics: CameraIntrinsics) -> Float64:

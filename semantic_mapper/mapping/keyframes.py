@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.config import KeyframeConfig
+from semantic_mapper.coverage import cover
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.geometry import invert_pose, nearest_pixels, transform, unproject
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
@@ -15,7 +16,6 @@ from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 COVERAGE_GRID = (12, 16)  # rows, columns of query points whose visibility decides the choice of views
 BLIND_DEPTHS_M = (0.7, 1.5, 3.0)  # where query points are put when the query has no depth
 VISIBLE_TOLERANCE = 0.05  # share of z by which a keyframe's depth may disagree and still see the point
-REPEAT_VALUE = 0.5  # a second view of the same point is worth half of the first, a third a quarter
 LABELLED_VALUE = 2.0  # a view that the field was finetuned on counts this many times
 NEARNESS_VALUE = 0.05  # breaks ties towards near views
 
@@ -87,20 +87,10 @@ class KeyframeStore:
         if not self._keyframes or count <= 0:
             return []
         points = _query_points(T_world_camera, intrinsics, depth_m)
-        seen = np.stack([_sees(k, points) for k in self._keyframes]).astype(np.float64)  # (K, P)
+        seen = np.stack([_sees(k, points) for k in self._keyframes])
         value = np.array([LABELLED_VALUE if k.labelled else 1.0 for k in self._keyframes])
         nearness = np.array([_nearness(k.T_world_camera, T_world_camera) for k in self._keyframes])
-        worth = np.ones(len(points))
-        chosen: list[int] = []
-        while len(chosen) < min(count, len(self._keyframes)):
-            gain = value * (seen @ worth) / len(points) + NEARNESS_VALUE * nearness * seen.any(axis=1)
-            gain[chosen] = 0
-            best = int(gain.argmax())
-            if gain[best] <= 0:
-                break
-            chosen.append(best)
-            worth = np.where(seen[best] > 0, worth * REPEAT_VALUE, worth)
-        return [self._keyframes[i] for i in chosen]
+        return [self._keyframes[i] for i in cover(seen, value, NEARNESS_VALUE * nearness, count)]
 
     def _drop_most_redundant(self) -> None:
         poses = [k.T_world_camera for k in self._keyframes]

@@ -12,9 +12,10 @@ from semantic_mapper.benchmark.figures import view_figures
 from semantic_mapper.benchmark.predict import predict_view
 from semantic_mapper.benchmark.protocols import (
     Contestant,
+    Keyframes,
     RoomResult,
     answer_from_keyframes,
-    choose_labelled,
+    choose_fitted,
     run_room,
 )
 from semantic_mapper.benchmark.rooms import as_given
@@ -117,10 +118,29 @@ def test_labels_of_another_set_are_compared_by_name() -> None:
 
 
 def test_keyframes_are_no_queries_and_not_next_to_one() -> None:
-    chosen = choose_labelled(tiny_room(), tiny_suite())
-    assert len(chosen) == 3 and not set(chosen) & {5, 6, 7, 8, 9}
+    chosen = choose_fitted(tiny_room(), tiny_suite())
+    assert len(chosen.labelled) == 3 and not set(chosen.labelled) & {5, 6, 7, 8, 9} and not chosen.unlabelled
     with pytest.raises(ConfigError, match="9 keyframes are asked for"):
-        choose_labelled(tiny_room(), tiny_suite(scene={"keyframes": 9, "guard": 2}))
+        choose_fitted(tiny_room(), tiny_suite(scene={"keyframes": 9, "guard": 2}))
+
+
+def test_further_frames_take_part_without_their_labels() -> None:
+    scene = {"keyframes": 2, "unlabelled": 4, "guard": 1, "seconds": 0, "steps": 2, "shares": (1.0,)}
+    suite = tiny_suite(protocol="finetune", scene=scene, views=6)
+    chosen = choose_fitted(tiny_room(), suite)
+    assert len(chosen.labelled) == 2 and len(chosen.unlabelled) == 4
+    assert not {*chosen.labelled, *chosen.unlabelled} & {5, 6, 7, 8, 9} and not set(chosen.labelled) & {
+        *chosen.unlabelled
+    }
+    field = watched()
+    answers = answer_from_keyframes(tiny_room(), field, suite, chosen)
+    channel = field.seen.channel
+    assert channel is not None
+    used = list(answers.values())[-1].source_frames
+    assert set(used) - set(chosen.labelled), "unlabelled frames are source views"
+    for number, labels in zip(used, channel, strict=True):
+        assert bool((labels >= 0).any()) == (number in chosen.labelled)
+    assert score(tiny_contestant(), suite).record.keyframes == chosen.labelled
 
 
 def test_fitting_gives_a_curve_and_renders_from_the_labelled_keyframes() -> None:
@@ -140,7 +160,7 @@ def test_labels_of_the_keyframes_can_be_kept_from_the_queries() -> None:
     field = watched()
     for given in (True, False):
         suite = tiny_suite(scene={"labelled_sources": given})
-        answer_from_keyframes(tiny_room(), field, suite, [0, 2, 12])
+        answer_from_keyframes(tiny_room(), field, suite, Keyframes((0, 2, 12), ()))
         assert (field.seen.channel is not None) == given
 
 

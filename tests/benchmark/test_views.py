@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.benchmark.config import SpacingConfig
-from semantic_mapper.benchmark.views import choose_sources
+from semantic_mapper.benchmark.views import choose_covering, choose_sources
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
@@ -65,3 +65,17 @@ def test_sensor_holes_hide_nothing() -> None:
 def test_more_views_than_frames_are_refused() -> None:
     with pytest.raises(ConfigError, match="3 source views"):
         choose([frame(0.1)], 3, 0.0, 0.0)
+
+
+def test_covering_views_add_to_each_other_and_labelled_ones_count_twice() -> None:
+    left, near, right = frame(-0.6), frame(-0.55), frame(0.6)
+    found = choose_covering(np.eye(4), WALL, [left, near, right, frame(0.0, turned=True)], [False] * 4, 2)
+    assert set(found.numbers) == {1, 2}, "not both from the left"
+    assert found.seen > 0.95
+    assert found.distance_m == pytest.approx(0.575)
+    assert choose_covering(np.eye(4), WALL, [left, near, right], [True, False, False], 1).numbers == (0,)
+
+
+def test_a_view_is_chosen_even_where_none_sees_anything() -> None:
+    blind = choose_covering(np.eye(4), WALL, [frame(0.0, turned=True)], [True], 3)
+    assert blind.numbers == (0,) and blind.seen == 0
