@@ -35,7 +35,7 @@ BaselinesOption = Annotated[
 MeshOption = Annotated[
     Path | None, typer.Option(metavar="NPZ", help="DIR: also compare its map with this reference mesh.")
 ]
-SeedOption = Annotated[int | None, typer.Option(help="Of everything that is drawn at random.  [default: 0]")]
+SeedOption = Annotated[int | None, typer.Option(min=0, help="Of everything that is drawn at random.  [default: 0]")]
 
 
 @verb
@@ -81,7 +81,10 @@ def evaluate(
     if suite is None:
         if maps or tier or kind or any(value is not None for value in given.values()):
             raise typer.BadParameter("is what this option needs", param_hint="--suite rooms")
-        options = _single(weights), baselines, seconds or BASELINE_SECONDS, max_frames, config, seed or 0
+        if baselines and seconds == 0:
+            raise typer.BadParameter("the U-Net needs time to learn", param_hint="--seconds")
+        baseline_s = BASELINE_SECONDS if seconds is None else seconds
+        options = _single(weights), baselines, baseline_s, max_frames, config, seed or 0
         return _evaluate_targets(targets or [], options, mesh, json_file)
     if targets or baselines or mesh or max_frames:
         raise typer.BadParameter("takes no DIR_OR_LOG, --baselines, --mesh or --max-frames", param_hint="--suite")

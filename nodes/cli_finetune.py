@@ -22,7 +22,7 @@ def finetune(
         float | None, typer.Option(min=0, help="Time for training [300]; 0 = only --steps counts.")
     ] = None,
     steps: Annotated[int | None, typer.Option(min=0, help="Steps of training; 0 = only --seconds counts.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of everything that is drawn at random [0].")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of everything that is drawn at random [0].")] = None,
     config: Annotated[
         Path | None, typer.Option(help="TOML file with a FinetuneConfig; options here go before it.")
     ] = None,

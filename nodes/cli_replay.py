@@ -38,7 +38,7 @@ def replay(
     ] = False,
     rerun: Annotated[Path | None, typer.Option(help="Also write a Rerun recording (.rrd).")] = None,
     config: ConfigOption = None,
-    seed: Annotated[int | None, typer.Option(help="Of everything that is drawn at random.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of everything that is drawn at random.")] = None,
 ) -> int:
     """Map a recorded log: writes summary.json, map.ply, map.npz and overview.png.
 

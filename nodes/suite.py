@@ -10,6 +10,7 @@ from typing import Any
 
 from nodes.console import FrameProgress, Output, frame_progress, stderr_console
 from nodes.process import StopRequest
+from nodes.run_replay import prepare_file
 from nodes.suite_table import difference_lines, suite_table
 from replay.artifacts import write_json
 from semantic_mapper import __version__
@@ -58,8 +59,9 @@ def run_suite_verb(
     output = Output.guarded()
     keep_freed_memory()
     paths = list(weights) or ([] if kinds else [default_checkpoint_path()])
-    contestants = load_contestants(paths, kinds)
     out = json_file or Path("runs") / f"{_file_stem(suite)}.json"
+    prepare_file(out)
+    contestants = load_contestants(paths, kinds)
     store, pictures = RecordStore(out.with_suffix(".jsonl")), out.with_suffix(".views")
     with StopRequest() as stop:
         with frame_progress("benchmark", None, unit="%") as bar:
@@ -161,7 +163,16 @@ def _map_records(suite: SuiteConfig, contestant: Contestant, store: RecordStore)
 
 
 def _title(suite: SuiteConfig, rooms: int) -> str:
-    sources = f"{suite.views} {suite.baseline} views" if suite.protocol == "generalize" else f"{suite.views} views"
+    sources = f"{suite.views} {suite.baseline} views" if suite.protocol == "generalize" else _fit_title(suite)
     depth = "with depth" if suite.depth else "without depth"
-    width = suite.tier.width
-    return f"ROOMS {suite.split}, {rooms} rooms, {suite.protocol}: {sources}, {depth}, {width}x{width * 3 // 4}"
+    width, count = suite.tier.width, "1 room" if rooms == 1 else f"{rooms} rooms"
+    return f"ROOMS {suite.split}, {count}, {suite.protocol}: {sources}, {depth}, {width}x{width * 3 // 4}"
+
+
+def _fit_title(suite: SuiteConfig) -> str:
+    """What a field was fitted to, and for how long."""
+    scene = suite.scene
+    budget = " or ".join([f"{scene.seconds:g} s"] * (scene.seconds > 0) + [f"{scene.steps} steps"] * (scene.steps > 0))
+    more = f" and {scene.unlabelled} without labels" if scene.unlabelled else ""
+    known = "" if scene.labelled_sources else ", labels kept back"
+    return f"{scene.keyframes} keyframes{more}{known}, {budget}, {suite.views} views"

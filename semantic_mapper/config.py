@@ -16,6 +16,7 @@ from semantic_mapper.errors import ConfigError
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[int, msgspec.Meta(ge=0)]
+AtLeastZero = Annotated[float, msgspec.Meta(ge=0)]
 AtLeastOne = Annotated[int, msgspec.Meta(ge=1)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 AtLeastTwo = Annotated[int, msgspec.Meta(ge=2)]
@@ -36,8 +37,8 @@ class EncoderConfig(Config, frozen=True):
 class SRayConfig(Config, frozen=True):
     """Shape of the S-Ray network; part of every checkpoint."""
 
-    feature_dim: int = 32  # C of the paper
-    heads: int = 4  # H; d_k = C / H
+    feature_dim: AtLeastOne = 32  # C of the paper
+    heads: AtLeastOne = 4  # H; d_k = C / H
     encoder: EncoderConfig = EncoderConfig(depth=True)
     tau: float = 0.02  # Eq. 12: view weights lie in (tau / m, 1 / (tau m))
     positional_encoding: bool = False  # sinusoid along the ray; the paper uses none

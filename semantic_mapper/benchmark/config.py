@@ -4,10 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Literal
+from typing import Annotated, Literal
 
-from semantic_mapper.config import Config, MapperConfig, NotNegative, Positive, SamplingConfig, Share, to_plain
+import msgspec
+
+from semantic_mapper.config import (
+    AtLeastOne,
+    AtLeastTwo,
+    AtLeastZero,
+    Config,
+    MapperConfig,
+    NotNegative,
+    Positive,
+    SamplingConfig,
+    Share,
+    to_plain,
+)
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.base import MAX_SOURCE_VIEWS
 from semantic_mapper.scenes import SUITE_VERSION, TEST_SEEDS, VALIDATION_SEEDS, CameraPathConfig
 from semantic_mapper.scenes.config import DepthSensorName
 from semantic_mapper.training.finetune import FinetuneConfig
@@ -28,8 +42,8 @@ Tier = Literal["cpu", "gpu"]
 class TierConfig(Config, frozen=True):
     """Resolution and samples; ``cpu`` runs everywhere, ``gpu`` is the full size."""
 
-    width: int = 160  # pixels; height is three quarters of it
-    rays_per_chunk: int = 2048
+    width: Annotated[int, msgspec.Meta(ge=16)] = 160  # pixels; height is three quarters of it
+    rays_per_chunk: AtLeastOne = 2048
     guided: SamplingConfig = SamplingConfig()  # where depth is given
     blind: SamplingConfig = SamplingConfig(guided=32, free_space=0)  # without: uniform in inverse depth
 
@@ -58,10 +72,10 @@ class CameraConfig(Config, frozen=True):
 class SequenceConfig(Config, frozen=True):
     """The walk through each room, and which of its frames are queries."""
 
-    frames: int = 80
-    step_m: float = 0.08  # way (a turn of 1 rad counts as 0.35 m) between frames
-    query_pairs: int = 2  # spread evenly over the sequence
-    pair_gap: int = 4  # the second view of a pair is so many frames on
+    frames: AtLeastTwo = 80
+    step_m: Positive = 0.08  # way (a turn of 1 rad counts as 0.35 m) between frames
+    query_pairs: AtLeastOne = 2  # spread evenly over the sequence
+    pair_gap: AtLeastOne = 4  # the second view of a pair is so many frames on
     camera: CameraConfig = CameraConfig()
 
 
@@ -82,18 +96,18 @@ SPACINGS: dict[Baseline, SpacingConfig] = {
 class SceneBudget(Config, frozen=True):
     """How a field is fitted to one room, for ``finetune`` and ``scratch``."""
 
-    keyframes: int = 12  # labelled
+    keyframes: AtLeastTwo = 12  # labelled
     unlabelled: NotNegative = 0  # further frames of the room, which bring their images (and depth) as source views
-    guard: int = 3  # frames on either side of a query that are no keyframes
+    guard: NotNegative = 3  # frames on either side of a query that are no keyframes
     labelled_sources: bool = True  # fitting and queries: the keyframes bring their labels to fields that take some
-    seconds: float = 120.0  # wall clock; 0 = only steps count
-    steps: int = 0  # 0 = only seconds count
+    seconds: AtLeastZero = 120.0  # wall clock; 0 = only steps count
+    steps: NotNegative = 0  # 0 = only seconds count
     learning_rate: Positive = FinetuneConfig().learning_rate
     encoder_rate: Share = FinetuneConfig().encoder_rate  # see ``FinetuneConfig``
     head_start: NotNegative = FinetuneConfig().head_start  # see ``FinetuneConfig``
     resting_share: Share = FinetuneConfig().resting_share  # see ``FinetuneConfig``
     doubtful_share: Share = StepConfig().doubtful_share  # see ``StepConfig``
-    patience: int = 0  # see ``FinetuneConfig``; by default a budget is spent to its end
+    patience: NotNegative = 0  # see ``FinetuneConfig``; by default a budget is spent to its end
     shares: tuple[float, ...] = (0.0625, 0.125, 0.25, 0.5, 1.0)  # of the budget; a run, and a point of the curve, each
 
 
@@ -101,17 +115,17 @@ class SuiteConfig(Config, frozen=True):
     """A run of the benchmark."""
 
     split: Split = "test"
-    rooms: int = 0  # the first so many of the split; 0 = all
+    rooms: NotNegative = 0  # the first so many of the split; 0 = all
     protocol: Protocol = "generalize"
-    views: int = 8  # source views of a query
+    views: Annotated[int, msgspec.Meta(ge=1, le=MAX_SOURCE_VIEWS)] = 8  # source views of a query
     baseline: Baseline = "narrow"
     depth: bool = True  # whether fields are given sensor depth
     tier: TierConfig = TierConfig()
     sequence: SequenceConfig = SequenceConfig()
     scene: SceneBudget = SceneBudget()
-    map_frames: int = 40  # of a room that are mapped for the map-level figures
+    map_frames: AtLeastOne = 40  # of a room that are mapped for the map-level figures
     mapper: MapperConfig = MapperConfig()  # that they are mapped with
-    seed: int = 0
+    seed: NotNegative = 0
 
 
 def check_suite(suite: SuiteConfig) -> None:

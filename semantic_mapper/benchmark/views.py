@@ -10,14 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.benchmark.config import SpacingConfig
-from semantic_mapper.coverage import cover
+from semantic_mapper.coverage import LABELLED_VALUE, cover, sees
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.geometry import invert_pose, nearest_pixels, transform, unproject
+from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 
 PROBE_WIDTH = 40  # pixels a row of the query that are asked what another view sees of them
-LABELLED_VALUE = 2.0  # of a frame whose labels are known, as a source view, against one without
-SAME_SURFACE = 0.05  # share of z; sensor noise and rounding to pixels come together
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +76,7 @@ def choose_sources(
 def choose_covering(
     query_pose: Float64, query_depth_m: Float32, candidates: Sequence[PosedFrame], labelled: Sequence[bool], count: int
 ) -> Sources:
-    """The frames that together show most of what the query sees, as the mapping pipeline chooses its source views.
+    """The frames that together show most of what the query sees: greedily, as ``coverage.cover`` does it.
 
     Args:
         query_pose, query_depth_m, candidates: As for ``choose_sources``.
@@ -102,10 +100,5 @@ def _surface_points(pose: Float64, depth_m: Float32, intrinsics: CameraIntrinsic
 
 
 def _sees(frame: PosedFrame, points: Float64) -> NDArray[np.bool_]:
-    """(N,): the point lies in the image, and its depth is what the sensor measured there."""
     assert frame.depth_m is not None
-    p = transform(invert_pose(frame.T_world_camera), points)
-    inside, row, column = nearest_pixels(p, frame.intrinsics)
-    measured = frame.depth_m[row, column]
-    # A hole of the sensor hides nothing from the colour image.
-    return inside & ((measured <= 0) | (np.abs(measured - p[:, 2]) < SAME_SURFACE * p[:, 2]))
+    return sees(points, frame.T_world_camera, frame.intrinsics, frame.depth_m, measured=True)

@@ -22,10 +22,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from semantic_mapper.config import to_plain
-from semantic_mapper.errors import ConfigError, LabelError, WeightsError
+from semantic_mapper.errors import SemanticMapperError, WeightsError
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.fields.sray import SRay
+from semantic_mapper.geometry import check_pose
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, working_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
@@ -98,11 +99,19 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -
     part = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        save_file(tensors, part, metadata)
+        save_tensors(tensors, part, metadata)
         os.replace(part, path)
     except (SafetensorError, OSError) as error:
         part.unlink(missing_ok=True)
         raise WeightsError(f"{path}: cannot be written ({error}); give another file name") from error
+
+
+def save_tensors(tensors: dict[str, torch.Tensor], path: Path, metadata: dict[str, str]) -> None:
+    """``safetensors.save_file``, but with the mode that any new file has: its own are readable by the owner alone."""
+    path.touch()
+    mode = path.stat().st_mode & 0o777
+    save_file(tensors, path, metadata)
+    path.chmod(mode)
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
@@ -127,11 +136,12 @@ def load_checkpoint(path: Path) -> Checkpoint:
         raise WeightsError(f"{path}: weights format {metadata.get('version')}, this version reads {VERSION}")
     try:
         label_set = _label_set_from_plain(json.loads(metadata["label_set"]))
-        recipe = json.loads(metadata["recipe"])
+        recipe = _checked_recipe(json.loads(metadata["recipe"]))
         anchors = _unpack_anchors(tensors, json.loads(metadata["anchors"])) if "anchors" in metadata else ()
         model = build_field(metadata.get("field", SRay.kind), json.loads(metadata["model_config"]), label_set)
-    except (KeyError, TypeError, ValueError, ConfigError, LabelError) as error:
-        raise WeightsError(f"{path}: its metadata is damaged: {error}") from error
+    except (KeyError, TypeError, ValueError, ArithmeticError, RuntimeError, SemanticMapperError) as error:
+        reason = " ".join(str(error).split())[:MESSAGE]
+        raise WeightsError(f"{path}: its metadata is damaged: {type(error).__name__}: {reason}") from error
     weights = {n.removeprefix("model."): t.float() for n, t in tensors.items() if n.startswith("model.")}
     try:
         model.load_state_dict(weights)
@@ -185,6 +195,20 @@ def anchor_from_frame(frame: PosedFrame, width: int) -> PosedFrame:
     )
 
 
+def _checked_recipe(recipe: Any) -> dict[str, Any]:
+    """The recipe, if it is one whose parts that are read here can be.
+
+    Raises:
+        ValueError, TypeError: it is not.
+    """
+    if not isinstance(recipe, dict):
+        raise TypeError(f"the recipe is {type(recipe).__name__}, not a table")
+    if not int(recipe.get("width", DEFAULT_WIDTH)) >= 4:
+        raise ValueError(f"the recipe's width is {recipe['width']}")
+    _ = [int(stamp) for stamp in recipe.get("train_stamps_ns", ())]
+    return recipe
+
+
 def _stored(tensor: torch.Tensor, half: bool) -> torch.Tensor:
     tensor = tensor.detach().cpu().contiguous()
     return tensor.half() if half and tensor.is_floating_point() else tensor
@@ -223,6 +247,8 @@ def _pack_anchors(anchors: Sequence[PosedFrame]) -> tuple[dict[str, torch.Tensor
 def _unpack_anchors(tensors: dict[str, torch.Tensor], described: list[dict[str, Any]]) -> tuple[PosedFrame, ...]:
     anchors: list[PosedFrame] = []
     for i, d in enumerate(described):
+        pose = np.array(d["T_world_camera"], np.float64)
+        check_pose(pose, f"anchor {i}")
         depth, label = tensors.get(f"anchor.{i}.depth"), tensors.get(f"anchor.{i}.label")
         anchors.append(
             PosedFrame(
@@ -233,7 +259,7 @@ def _unpack_anchors(tensors: dict[str, torch.Tensor], described: list[dict[str, 
                 depth_m=None if depth is None else _depth_from_units(depth.numpy()),
                 label=None if label is None else label.numpy(),
                 intrinsics=CameraIntrinsics(*d["intrinsics"]),
-                T_world_camera=np.array(d["T_world_camera"], np.float64),
+                T_world_camera=pose,
             )
         )
     return tuple(anchors)

@@ -5,18 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semantic_mapper.config import KeyframeConfig
-from semantic_mapper.coverage import cover
+from semantic_mapper.coverage import GUESSED_DEPTHS_M, LABELLED_VALUE, cover, sees
 from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.geometry import invert_pose, nearest_pixels, transform, unproject
+from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 
 COVERAGE_GRID = (12, 16)  # rows, columns of query points whose visibility decides the choice of views
-BLIND_DEPTHS_M = (0.7, 1.5, 3.0)  # where query points are put when the query has no depth
-VISIBLE_TOLERANCE = 0.05  # share of z by which a keyframe's depth may disagree and still see the point
-LABELLED_VALUE = 2.0  # a view that the field was finetuned on counts this many times
 NEARNESS_VALUE = 0.05  # breaks ties towards near views
 
 
@@ -87,7 +83,10 @@ class KeyframeStore:
         if not self._keyframes or count <= 0:
             return []
         points = _query_points(T_world_camera, intrinsics, depth_m)
-        seen = np.stack([_sees(k, points) for k in self._keyframes])
+        # A keyframe's depth is small and the query's may be guessed: only what stands before a point hides it.
+        seen = np.stack(
+            [sees(points, k.T_world_camera, k.intrinsics, k.depth_m, measured=False) for k in self._keyframes]
+        )
         value = np.array([LABELLED_VALUE if k.labelled else 1.0 for k in self._keyframes])
         nearness = np.array([_nearness(k.T_world_camera, T_world_camera) for k in self._keyframes])
         return [self._keyframes[i] for i in cover(seen, value, NEARNESS_VALUE * nearness, count)]
@@ -126,14 +125,5 @@ def _query_points(T_world_camera: Float64, intrinsics: CameraIntrinsics, depth_m
     depth = depth_m[np.ix_(rows, columns)].reshape(-1).astype(np.float64)
     measured = unit[depth > 0] * depth[depth > 0, None]
     blind = unit[depth <= 0]
-    guesses = [blind * z for z in BLIND_DEPTHS_M]
+    guesses = [blind * z for z in GUESSED_DEPTHS_M]
     return transform(T_world_camera, np.concatenate((measured, *guesses)))
-
-
-def _sees(keyframe: Keyframe, points: Float64) -> NDArray[np.bool_]:
-    """Which world points (P, 3) the keyframe sees: inside its image and not behind its measured depth."""
-    p = transform(invert_pose(keyframe.T_world_camera), points)
-    inside, row, column = nearest_pixels(p, keyframe.intrinsics)
-    measured = keyframe.depth_m[row, column]
-    free = (measured <= 0) | (p[:, 2] < measured * (1 + VISIBLE_TOLERANCE))
-    return inside & free

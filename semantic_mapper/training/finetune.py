@@ -8,16 +8,17 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 import structlog
 import torch
 
-from semantic_mapper.config import AtLeastOne, Config, NotNegative, Share, SRayConfig, to_plain
+from semantic_mapper.config import AtLeastOne, AtLeastZero, Config, NotNegative, Positive, Share, SRayConfig, to_plain
 from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, anchor_from_frame
@@ -55,22 +56,28 @@ HELD_OUT_SOURCES = 8  # that a held-out ray is rendered from: those that see mos
 class FinetuneConfig(Config, frozen=True):
     """Budget and optimiser of a finetuning."""
 
-    seconds: float = 300.0  # wall-clock budget; 0 = only steps count (then a run repeats bit for bit)
-    steps: int = 0  # step budget; 0 = only seconds count
+    # Wall-clock budget of all of it, looks at held-out rays included; 0 = only steps count (then a run repeats bit for
+    # bit). The first look is made in any case.
+    seconds: AtLeastZero = 300.0
+    steps: NotNegative = 0  # step budget; 0 = only seconds count
     width: AtLeastOne = 320  # working width of the images
-    learning_rate: float = 1e-3
+    learning_rate: AtLeastZero = 1e-3
     encoder_rate: Share = 1.0  # of the image encoder, as a share of it; 0 = only what reads its features learns
-    final_learning_rate: float = 5e-5
-    weight_decay: float = 1e-4
-    gradient_clip: float = 10.0
-    held_out_share: float = 0.1  # of each keyframe's pixels, in blocks, never trained on
-    held_out_rays: int = 512  # a keyframe, but no more than 6,144 in all
-    evaluations: int = 10  # over the whole budget
-    patience: int = 4  # evaluations without a better loss before it stops early; 0 = the whole budget, come what may
+    final_learning_rate: AtLeastZero = 5e-5
+    weight_decay: AtLeastZero = 1e-4
+    gradient_clip: Positive = 10.0
+    held_out_share: Annotated[float, msgspec.Meta(ge=0, lt=1)] = (
+        0.1  # of each keyframe's pixels, in blocks, never trained on
+    )
+    held_out_rays: AtLeastOne = 512  # a keyframe, but no more than 6,144 in all
+    evaluations: AtLeastOne = 10  # over the whole budget
+    patience: NotNegative = (
+        4  # evaluations without a better loss before it stops early; 0 = the whole budget, come what may
+    )
     bfloat16: bool = True  # the image encoder computes in it where that is fast (GPUs, CPUs with AMX)
     head_start: NotNegative = 40  # steps of the classifier alone, on features as they are, before the first ray
     resting_share: Share = 0.0  # of the budget, at its start, in which the image encoder rests, so that steps cost less
-    seed: int = 0
+    seed: NotNegative = 0
     device: DeviceName = "auto"
     step: StepConfig = StepConfig()
 
@@ -100,6 +107,33 @@ class _Scene:
     held_out: Sequence[LabelledView]
     queries: Sequence[int]
     overlap: torch.Tensor
+
+
+class _Clock:
+    """How much of a budget is used; from the time that is left, a last look at held-out rays is set aside."""
+
+    def __init__(self, config: FinetuneConfig) -> None:
+        self._config = config
+        self._began = time.monotonic()
+        self._look_s = 0.0
+
+    @property
+    def elapsed_s(self) -> float:
+        """Since the finetuning was called."""
+        return time.monotonic() - self._began
+
+    def used(self, step: int) -> float:
+        """Share of the budget that is used after ``step`` steps."""
+        seconds = self._config.seconds
+        left_for_steps = max(seconds - self._look_s, 1e-9) if seconds > 0 else 0.0
+        return budget_fraction(step, self.elapsed_s, steps=self._config.steps, seconds=left_for_steps)
+
+    @contextmanager
+    def looking(self) -> Iterator[None]:
+        """Round each look: the next one is expected to take as long."""
+        began = time.monotonic()
+        yield
+        self._look_s = time.monotonic() - began
 
 
 @dataclass(slots=True)
@@ -143,6 +177,7 @@ def finetune(
             f"finetuning needs at least 2 frames, one of them labelled, got {len(frames)} with {len(labelled)} "
             "labelled; raise --keyframes"
         )
+    clock = _Clock(config)
     torch.manual_seed(config.seed)
     generator = torch.Generator().manual_seed(config.seed)
     model = SRay(SRayConfig(), label_set) if start is None else adapt_model(start, label_set)
@@ -150,9 +185,8 @@ def finetune(
     scene = _make_scene(views, config, generator)
     device = choose_device(config.device, 0)
     model.to(device)
-    began = time.monotonic()
     with encoder_in_bfloat16(model, device) if config.bfloat16 else nullcontext():
-        best, steps = _run(model, scene, config, generator, on_progress, stopped)
+        best, steps = _run(model, scene, config, clock, generator, on_progress, stopped)
     model.load_state_dict(best.state)
     recipe: dict[str, Any] = {
         "kind": "finetune",
@@ -160,7 +194,7 @@ def finetune(
         "config": to_plain(config),
         "steps": steps,
         "best_step": best.step,
-        "seconds": round(time.monotonic() - began, 1),
+        "seconds": round(clock.elapsed_s, 1),
         "held_out_loss": best.loss,
         "held_out_accuracy": best.accuracy,
         "train_stamps_ns": sorted({int(f.stamp_ns) for f in labelled} | {int(s) for s in seen_stamps_ns}),
@@ -173,6 +207,7 @@ def _run(
     model: LearnedField,
     scene: _Scene,
     config: FinetuneConfig,
+    clock: _Clock,
     generator: torch.Generator,
     on_progress: Callable[[FinetuneProgress], None] | None,
     stopped: Callable[[], object],
@@ -186,19 +221,16 @@ def _run(
             _settle_norms(model, scene.train)
         return _evaluate(model, scene, config)
 
-    best = _Best(*look(), 0, copy.deepcopy(model.state_dict()))
-    began, step, evaluated, stale = time.monotonic(), 0, 0, 0
+    with clock.looking():
+        best = _Best(*look(), 0, copy.deepcopy(model.state_dict()))
+    step, evaluated, stale = 0, 0, 0
     best, encoded = (best, None) if alive else _head_start(model, scene, config, best)
     latest = (best.loss, best.accuracy)
     doubts = config.step.doubtful_share > 0
     scene.train = with_doubt(model, scene.train) if doubts else scene.train
     if not math.isfinite(best.loss):
         _log.warning("nothing_held_out", reason="too few labelled pixels; the last weights are kept, not the best")
-    while (
-        (fraction := budget_fraction(step, time.monotonic() - began, steps=config.steps, seconds=config.seconds)) < 1
-        and (patience == 0 or stale < patience)
-        and not stopped()
-    ):
+    while (fraction := clock.used(step)) < 1 and (patience == 0 or stale < patience) and not stopped():
         rate = cosine_rate(fraction, config.learning_rate, config.final_learning_rate)
         set_rates(optimiser, rate, config.encoder_rate)
         with norms():
@@ -211,11 +243,12 @@ def _run(
         loss.total.backward()  # pyright: ignore[reportUnknownMemberType]
         torch.nn.utils.clip_grad_norm_(model.parameters(), config.gradient_clip)
         optimiser.step()
-        fraction = budget_fraction(step, time.monotonic() - began, steps=config.steps, seconds=config.seconds)
+        fraction = clock.used(step)
         improved = False
         if fraction * config.evaluations >= evaluated + 1 or fraction >= 1:
             evaluated = int(fraction * config.evaluations)
-            latest = look()
+            with clock.looking():
+                latest = look()
             improved = latest[0] < best.loss or not math.isfinite(best.loss)
             stale = 0 if improved else stale + 1
             if improved:

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from semantic_mapper.config import Config, SamplingConfig, Share
-from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.config import AtLeastOne, AtLeastTwo, AtLeastZero, Config, SamplingConfig, Share
+from semantic_mapper.fields.base import MAX_SOURCE_VIEWS, EncodedViews
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided, sample_inverse_depth
 from semantic_mapper.training.losses import IGNORE, Loss, LossConfig, image_loss, mean_loss, ray_loss
@@ -38,23 +38,31 @@ LEAST_WORTH = 0.05  # of a view that sees nothing of the query: it may still be 
 class StepConfig(Config, frozen=True):
     """How a training step draws its views, rays and samples."""
 
-    rays: int = 1024
-    views_min: int = 3  # source views of a step are drawn from views_min..views_max
-    views_max: int = 5
-    own_view_share: float = 0.3  # how often the query view is itself a source, as when the current frame is mapped
-    balanced_share: float = 0.5  # share of rays drawn with all classes equally likely
+    rays: AtLeastOne = 1024
+    views_min: AtLeastOne = 3  # source views of a step are drawn from views_min..views_max
+    views_max: AtLeastOne = 5
+    own_view_share: Share = 0.3  # how often the query view is itself a source, as when the current frame is mapped
+    balanced_share: Share = 0.5  # share of rays drawn with all classes equally likely
     doubtful_share: Share = 0.0  # share of rays drawn where the field is in doubt, of views that know (finetuning)
-    depth_withheld: float = 0.15  # share of source views, and of steps for the query's prior, without depth
-    blind: float = 0.0  # share of steps without any depth: neither source views nor prior have it
+    depth_withheld: Share = 0.15  # share of source views, and of steps for the query's prior, without depth
+    blind: Share = 0.0  # share of steps without any depth: neither source views nor prior have it
     known_labels: bool = True  # source views other than the query bring their labels, as keyframes of a finetuning do
-    labels_withheld: float = 0.3  # share of source views without known labels
-    prior_noise: float = 0.01  # sigma of the depth prior's error as a share of z
-    blind_samples: int = 32  # samples a ray in steps without a depth prior
-    blind_thinning: int = 1  # in steps without a depth prior, where a ray costs more, one ray in so many is rendered
-    colour_jitter: float = 0.2
-    mirrored: float = 0.0  # share of steps in which the world is its mirror image
+    labels_withheld: Share = 0.3  # share of source views without known labels
+    prior_noise: AtLeastZero = 0.01  # sigma of the depth prior's error as a share of z
+    blind_samples: AtLeastTwo = 32  # samples a ray in steps without a depth prior
+    blind_thinning: AtLeastOne = (
+        1  # in steps without a depth prior, where a ray costs more, one ray in so many is rendered
+    )
+    colour_jitter: Share = 0.2
+    mirrored: Share = 0.0  # share of steps in which the world is its mirror image
     loss: LossConfig = LossConfig()
     sampling: SamplingConfig = SamplingConfig()
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.views_min <= self.views_max <= MAX_SOURCE_VIEWS:
+            raise ValueError(
+                f"need 1 <= views_min <= views_max <= {MAX_SOURCE_VIEWS}, got {self.views_min} and {self.views_max}"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -30,9 +30,6 @@ def check_settings(config: TrainConfig) -> None:
         raise ConfigError("rooms_per_step and log_steps must be at least 1")
     if not 0 <= config.seed < len(TRAIN_SEEDS):
         raise ConfigError(f"seed must be in 0..{len(TRAIN_SEEDS) - 1}, got {config.seed}")
-    step = config.step
-    if not 1 <= step.views_min <= step.views_max or step.rays < 1 or step.blind_thinning < 1:
-        raise ConfigError("step: need 1 <= views_min <= views_max, rays >= 1 and blind_thinning >= 1")
 
 
 def check_field(field: LearnedField, config: TrainConfig) -> None:

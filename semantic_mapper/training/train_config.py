@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from semantic_mapper.config import Config
+from semantic_mapper.config import AtLeastOne, Config, Share
 from semantic_mapper.training.device import DeviceName
 from semantic_mapper.training.images import ImageStepConfig
 from semantic_mapper.training.losses import LossConfig
@@ -18,12 +18,12 @@ from semantic_mapper.training.validation import ValidationConfig
 class TrainStepConfig(StepConfig, frozen=True):
     """A step of training to generalize: many densities of views, no known labels, often no depth at all."""
 
-    views_max: int = 12
-    own_view_share: float = 0.0  # the query's own image would give the answer away
+    views_max: AtLeastOne = 12
+    own_view_share: Share = 0.0  # the query's own image would give the answer away
     known_labels: bool = False
-    blind: float = 0.25
-    blind_thinning: int = 4  # 32 samples a ray instead of 8
-    mirrored: float = 0.5
+    blind: Share = 0.25
+    blind_thinning: AtLeastOne = 4  # 32 samples a ray instead of 8
+    mirrored: Share = 0.5
     loss: LossConfig = LossConfig(balance=0.25)
 
 

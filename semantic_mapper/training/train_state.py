@@ -16,10 +16,10 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import nn
 
 from semantic_mapper.errors import ConfigError, WeightsError
+from semantic_mapper.fields.checkpoint import save_tensors
 
 FORMAT = "semantic-mapper-training"
 VERSION = 3
@@ -96,7 +96,7 @@ def save_state(
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
-    save_file({name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}, part, metadata)
+    save_tensors({name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}, part, metadata)
     with part.open("rb+") as written:
         os.fsync(written.fileno())
     os.replace(part, path)

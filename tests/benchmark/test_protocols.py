@@ -124,6 +124,30 @@ def test_keyframes_are_no_queries_and_not_next_to_one() -> None:
         choose_fitted(tiny_room(), tiny_suite(scene={"keyframes": 9, "guard": 2}))
 
 
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"scene": {"guard": -1}},
+        {"scene": {"keyframes": 0}},
+        {"scene": {"seconds": -1.0}},
+        {"views": 0},
+        {"views": 40},
+        {"seed": -1},
+        {"map_frames": 0},
+        {"sequence": {"query_pairs": 0}},
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(bad: dict[str, object]) -> None:
+    with pytest.raises(ConfigError, match="test suite"):
+        tiny_suite(**bad)
+
+
+def test_a_guard_of_none_still_keeps_the_queries_out() -> None:
+    scene = {"keyframes": 6, "unlabelled": 6, "guard": 0}
+    chosen = choose_fitted(tiny_room(), tiny_suite(protocol="finetune", scene=scene))
+    assert not {*chosen.labelled, *chosen.unlabelled} & set(tiny_room().queries)
+
+
 def test_further_frames_take_part_without_their_labels() -> None:
     scene = {"keyframes": 2, "unlabelled": 4, "guard": 1, "seconds": 0, "steps": 2, "shares": (1.0,)}
     suite = tiny_suite(protocol="finetune", scene=scene, views=6)

@@ -1,6 +1,9 @@
+import json
+
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import save_file
 
 from semantic_mapper.errors import WeightsError
@@ -76,6 +79,51 @@ def test_weights_that_do_not_fit_their_config_are_refused(tmp_path):
     path.write_bytes(path.read_bytes().replace(b'feature_dim\\": 16', b'feature_dim\\": 12'))
     with pytest.raises(WeightsError):
         load_checkpoint(path)
+
+
+def change_metadata(path, **changes):
+    with safe_open(path, framework="pt") as stored:
+        metadata = dict(stored.metadata())
+        tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118 - not a dict
+    save_file(tensors, path, metadata | {name: json.dumps(value) for name, value in changes.items()})
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"recipe": []},
+        {"recipe": {"width": "x"}},
+        {"recipe": {"width": 0}},
+        {"recipe": {"train_stamps_ns": ["soon"]}},
+        {"model_config": {"heads": 0}},
+        {"model_config": {"feature_dim": 10**9}},
+        {"model_config": {"feature_din": 16}},
+        {"label_set": {"name": "x"}},
+        {"anchors": [{"seq": 1}]},
+    ],
+    ids=str,
+)
+def test_metadata_that_cannot_be_used_are_refused_with_the_reason(tmp_path, changes):
+    path = tmp_path / "w.safetensors"
+    save_checkpoint(Checkpoint(tiny_field()), path)
+    change_metadata(path, **changes)
+    with pytest.raises(WeightsError, match=r"w\.safetensors: its metadata is damaged: \w+: "):
+        load_checkpoint(path)
+
+
+def test_an_anchor_without_a_usable_pose_is_refused(tmp_path):
+    path = tmp_path / "w.safetensors"
+    lost = tiny_frames(1)[0]
+    lost.T_world_camera[0, 3] = np.nan
+    save_checkpoint(Checkpoint(tiny_field(), (anchor_from_frame(lost, 64),)), path)
+    with pytest.raises(WeightsError, match="anchor 0: the pose holds NaN"):
+        load_checkpoint(path)
+
+
+def test_others_may_read_weights_as_any_new_file(tmp_path):
+    (tmp_path / "any").touch()
+    save_checkpoint(Checkpoint(tiny_field()), tmp_path / "w.safetensors")
+    assert (tmp_path / "w.safetensors").stat().st_mode == (tmp_path / "any").stat().st_mode
 
 
 def test_adapted_model_carries_classifier_rows_over_by_name():

@@ -78,6 +78,15 @@ def test_fitting_shows_its_curve(suite: Path, two: tuple[Path, Path], tmp_path: 
     assert out.with_suffix(".curves.png").stat().st_size > 1000
     written = json.loads(out.read_text())
     assert written["suite"]["scene"]["seconds"] == 0 and not written["suite"]["depth"]
+    assert written["title"].endswith("1 room, scratch: 3 keyframes, 2 steps, 3 views, without depth, 48x36")
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_a_room_is_made(suite: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    out = tmp_path / "file" / "a.json"
+    refused = run("eval", "--suite", "rooms", "--config", suite, "--rooms", "1", "--json", out)
+    assert refused.returncode == 1 and str(tmp_path / "file") in error_line(refused.stderr)
+    assert "benchmark" not in refused.stderr, "no room was begun"
 
 
 def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+import semantic_mapper.training.finetune as finetuning
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.fields.encoder import calibrate
@@ -244,18 +245,63 @@ def test_frames_without_labels_are_source_views_only():
     assert len(result.anchors) == 1
 
 
-def test_time_budget_ends_the_run():
+class FakeTime:
+    """A clock that ticks where a finetuning spends time: 2 s a look, 1 s a step."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 100.0
+        self.looks = 0
+        monkeypatch.setattr(finetuning.time, "monotonic", lambda: self.now)
+        evaluate, draw = finetuning._evaluate, finetuning._draw_loss
+
+        def look(*given):
+            self.now += 2.0
+            self.looks += 1
+            return evaluate(*given)
+
+        def step(*given):
+            self.now += 1.0
+            return draw(*given)
+
+        monkeypatch.setattr(finetuning, "_evaluate", look)
+        monkeypatch.setattr(finetuning, "_draw_loss", step)
+
+
+def test_a_time_budget_holds_all_of_it_the_last_look_included(monkeypatch: pytest.MonkeyPatch):
+    clock = FakeTime(monkeypatch)
     spent: list[float] = []
-    result = finetune(
-        tiny_frames(3),
-        ROOMS,
-        tiny_field(),
-        config(seconds=1.0, steps=0, patience=0),
-        lambda p: spent.append(p.fraction),
-    )
-    assert result.recipe["steps"] == len(spent) >= 1
-    assert all(0 < share < 1 for share in spent[:-1]), "no step begins after the time is up"
-    assert result.recipe["seconds"] >= 1.0
+    still = config(seconds=20.0, steps=0, patience=0, evaluations=2, head_start=0)
+    result = finetune(tiny_frames(3), ROOMS, calibrated_field(), still, lambda p: spent.append(p.fraction))
+    assert clock.looks == 3, "at the start, in the middle and at the end"
+    assert result.recipe["steps"] == len(spent) == 14
+    assert result.recipe["seconds"] == 20.0
+    assert spent[-1] == 1.0 and all(0 < share < 1 for share in spent[:-1])
+
+
+def test_where_the_first_look_takes_all_the_time_no_step_begins(monkeypatch: pytest.MonkeyPatch):
+    FakeTime(monkeypatch)
+    result = finetune(tiny_frames(3), ROOMS, calibrated_field(), config(seconds=2.5, steps=0, head_start=0))
+    assert result.recipe["steps"] == 0 and result.recipe["seconds"] == 2.0
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"seed": -1},
+        {"held_out_share": 1.0},
+        {"held_out_rays": 0},
+        {"evaluations": 0},
+        {"learning_rate": -1.0},
+        {"step": {"rays": 0}},
+        {"step": {"views_min": 5, "views_max": 3}},
+        {"step": {"views_max": 40}},
+        {"step": {"balanced_share": 3.0}},
+        {"step": {"blind_thinning": 0}},
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(bad: dict[str, object]):
+    with pytest.raises(ConfigError, match="test config"):
+        config(**bad)
 
 
 def test_chosen_keyframes_cover_different_places():

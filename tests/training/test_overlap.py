@@ -42,6 +42,14 @@ def test_without_depth_views_overlap_where_their_frusta_do():
     assert overlap[0, 2] == 0
 
 
+def test_views_with_and_without_depth_see_each_other():
+    blind, near, wall = view(0.0, depth_m=0.0), view(0.1), view(0.2, depth_m=0.0)
+    overlap = view_overlap([blind, near, wall])
+    assert overlap[0, 1] > 0.3, "the guesses before the wall are free, those behind it are hidden"
+    assert overlap[0, 1] < overlap[0, 2], "a view without depth hides nothing"
+    assert overlap[1, 0] > 0.9
+
+
 def test_source_views_are_drawn_by_what_they_see_of_the_query():
     generator = torch.Generator().manual_seed(0)
     overlap = torch.tensor([[0.0, 0.9, 0.9, 0.0, 0.0]] + [[0.5] * 5] * 4)
