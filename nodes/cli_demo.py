@@ -30,7 +30,8 @@ def demo(
     """
     output = Output.guarded()
     from nodes.demo_log import write_room_log
-    from nodes.run_replay import ReplayRequest, mapper_config, prepare_folder, replay_log
+    from nodes.outputs import prepare_folder
+    from nodes.run_replay import ReplayRequest, mapper_config, replay_log
     from nodes.summary_table import notes, result_lines, summary_table
 
     began = time.monotonic()

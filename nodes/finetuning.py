@@ -8,8 +8,8 @@ from pathlib import Path
 import structlog
 
 from nodes.console import FrameProgress
+from nodes.outputs import prepare_file
 from nodes.process import StopRequest
-from nodes.run_replay import prepare_file
 from replay.log import LogReader
 from semantic_mapper.errors import FrameError, LabelError, LogError
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint, save_checkpoint

@@ -32,7 +32,8 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
         MapError: the map is full, or cannot be written.
         TransportError: the endpoint is taken.
     """
-    from nodes.run_replay import mapper_config, prepare_folder
+    from nodes.outputs import prepare_folder
+    from nodes.run_replay import mapper_config
     from replay.session import load_pipeline
     from semantic_mapper.fields.checkpoint import load_checkpoint
     from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher

@@ -11,11 +11,12 @@ import msgspec
 import structlog
 
 from nodes.finishing import finish_session
+from nodes.outputs import prepare_folder
 from nodes.process import StopRequest
 from replay.log import LogReader
 from replay.session import MapSession, load_pipeline
 from semantic_mapper.config import MapperConfig, load_config
-from semantic_mapper.errors import ConfigError, LogError, SemanticMapperError
+from semantic_mapper.errors import LogError, SemanticMapperError
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.types import PosedFrame
 
@@ -134,32 +135,6 @@ def mapper_config(path: Path | None, voxel_size_m: float | None, seed: int | Non
     return config if seed is None else msgspec.structs.replace(config, seed=seed)
 
 
-def prepare_file(path: Path) -> None:
-    """Make sure that a file can be written, before minutes are spent on what is to be in it.
-
-    Raises:
-        ConfigError: it is a folder, or nothing can be written beside it.
-    """
-    if path.is_dir():
-        raise ConfigError(f"{path}: is a folder; give the name of a file")
-    prepare_folder(path.parent)
-
-
 def clear_summary(out: Path) -> None:
     """Take an earlier run's summary away: one that is there says that the results beside it are whole."""
     (out / "summary.json").unlink(missing_ok=True)
-
-
-def prepare_folder(out: Path) -> None:
-    """Make the folder for results, before minutes are spent on them.
-
-    Raises:
-        ConfigError: it cannot be made or written to.
-    """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".writable"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot hold the results ({error.strerror}); choose another folder") from error

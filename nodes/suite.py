@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from nodes.console import FrameProgress, Output, frame_progress, stderr_console
+from nodes.outputs import prepare_file
 from nodes.process import StopRequest
-from nodes.run_replay import prepare_file
 from nodes.suite_table import difference_lines, suite_table
 from replay.artifacts import write_json
 from semantic_mapper import __version__
