@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import FrameError
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE
-from semantic_mapper.mapping.block_index import KEY_LIMIT, first_slot, pack_key
+from semantic_mapper.mapping.block_index import KEY_LIMIT, first_slot, pack_key, pack_keys
 from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 
@@ -70,6 +70,29 @@ def blocks_in_band(
         if counts.max() <= capacity:
             return np.unique(np.concatenate([row[:count] for row, count in zip(keys, counts, strict=True)]))
         capacity *= 4  # a band of the image crosses unusually many blocks (fine voxels): again with more room
+
+
+def blocks_in_view(
+    camera: Camera, intrinsics: CameraIntrinsics, keys: NDArray[np.int32], voxel_size_m: float, reach_m: float
+) -> NDArray[np.int64]:
+    """Packed keys of those blocks of ``keys`` (B, 3) that a camera may see up to ``reach_m`` of z, the nearest first.
+
+    A block counts whose bounding sphere touches the frustum.
+    """
+    side = voxel_size_m * BLOCK_SIDE
+    radius = 0.5 * np.sqrt(3.0) * side
+    p = ((keys + 0.5) * side - camera.t) @ camera.R
+    z = p[:, 2]
+    seen = (z > -radius) & (z < reach_m + radius)
+    for at, focal, center, size in (
+        (p[:, 0], camera.fx, camera.cx, intrinsics.width),
+        (p[:, 1], camera.fy, camera.cy, intrinsics.height),
+    ):
+        for edge, sign in ((-0.5, 1.0), (size - 0.5, -1.0)):
+            slope = (edge - center) / focal  # of the plane through the camera and this edge of the image
+            seen &= sign * (at - slope * z) / np.hypot(1.0, slope) > -radius
+    order = np.argsort(z[seen], kind="stable")
+    return pack_keys(keys[seen][order])
 
 
 @njit(nogil=True, cache=True, inline="always")

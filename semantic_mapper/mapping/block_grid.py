@@ -1,11 +1,15 @@
 """Storage of the map: Open3D's sparse voxel blocks, with numpy views of their buffers and growth in bounded steps.
 
+With a limit on memory, the blocks that were used longest ago go to a ``BlockStore`` on disk and come back, equal to the
+bit, when they are asked for.
+
 A block holds 8 x 8 x 8 voxels in the order [z][y][x]; voxel (i, j, k) of block (x, y, z) is the point
 ``(8 * (x, y, z) + (i, j, k)) * voxel_size_m`` in the world.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,11 +26,15 @@ from semantic_mapper.mapping.block_index import (
     pack_keys,
     unpack_keys,
 )
+from semantic_mapper.mapping.block_store import BLOCK_VOXELS, BlockStore, BlockValues
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.types import Float32
 
 BLOCK_SIDE = 8
-BLOCK_VOXELS = BLOCK_SIDE**3
+LEAST_RESIDENT = 256  # blocks that memory has room for, whatever the limit
+EVICTED_AT_ONCE = 32  # at least: room for the next frame's blocks, too
+TILE_BLOCKS = 4096  # blocks brought together at a time to be read where some are on disk
+NEIGHBOURS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
 ATTRIBUTES = ("tsdf", "weight", "color", "evidence", "votes")
 
 _log = structlog.get_logger(__name__)
@@ -59,18 +67,30 @@ class BlockGrid:
         voxel_size_m: Edge of a voxel.
         classes: L, channels of the class evidence.
         initial_blocks: Capacity at start.
-        max_blocks: Capacity at most.
+        max_blocks: Blocks at most, in memory and on disk.
+        memory_bytes: For blocks in memory; 0 = no limit.
     """
 
-    def __init__(self, voxel_size_m: float, classes: int, initial_blocks: int, max_blocks: int) -> None:
+    def __init__(
+        self, voxel_size_m: float, classes: int, initial_blocks: int, max_blocks: int, memory_bytes: int = 0
+    ) -> None:
         self._o3d = load_open3d()
         self._max_blocks = max_blocks
         self._voxel_size_m = voxel_size_m
+        self._classes = classes
         channels = (1, 1, 3, classes, 1)
         self._block_bytes = 4 * BLOCK_VOXELS * sum(channels) + 12
+        self._max_resident = max_blocks
+        if memory_bytes > 0:
+            self._max_resident = min(max_blocks, max(LEAST_RESIDENT, memory_bytes // self._block_bytes))
+            initial_blocks = self._max_resident  # at once: growing needs room for the old memory beside the new
         self._grid = make_open3d_grid(voxel_size_m, channels, max(1, min(initial_blocks, max_blocks)))
         self._map = self._grid.hashmap()
         self._index = make_block_index(np.empty((0, 3), np.int32), np.empty(0, np.int32))
+        self._store: BlockStore | None = None
+        self._clock = 0
+        self._used = np.zeros(self.capacity, np.int64)  # by buffer index: when last asked for
+        self._version = np.zeros(self.capacity, np.int64)  # by buffer index: see ``mark_changed``
 
     @property
     def grid(self) -> Any:
@@ -84,8 +104,18 @@ class BlockGrid:
 
     @property
     def block_count(self) -> int:
-        """Blocks in the map."""
+        """Blocks in the map, in memory and on disk."""
+        return self.resident_count + self.stored_count
+
+    @property
+    def resident_count(self) -> int:
+        """Blocks in memory."""
         return int(self._map.size())
+
+    @property
+    def stored_count(self) -> int:
+        """Blocks on disk."""
+        return 0 if self._store is None else len(self._store)
 
     @property
     def capacity(self) -> int:
@@ -118,34 +148,154 @@ class BlockGrid:
         return keys[order], indices[order]
 
     def activate(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Make sure that the blocks of unique packed keys (B,) exist, new ones zeroed; return buffer indices (B,).
+        """Make sure that the blocks of unique packed keys (B,) exist in memory; return buffer indices (B,).
+
+        New ones are zero; those on disk come back as they were.
 
         Raises:
-            MapError: where the map would exceed ``max_blocks``; nothing has changed then.
+            MapError: where the map would exceed ``max_blocks``, or these blocks alone the memory; nothing has changed
+                then. Or the disk fails.
         """
+        self._clock += 1
         found = find_blocks(self._index, packed)
-        new = packed[found < 0]
-        if not len(new):
-            return found
-        needed = self.block_count + len(new)
-        if needed > self._max_blocks:
+        missing = packed[found < 0]
+        if len(missing):
+            self._check_room(packed, missing)
+            self._bring_in(packed, missing)
+            found = find_blocks(self._index, packed)
+        self._used[found] = self._clock
+        return found
+
+    def page_in(self, packed: NDArray[np.int64]) -> None:
+        """Make sure that the first of these existing blocks (B,) are in memory: as many as it has room for."""
+        self.activate(packed[: self._max_resident])
+
+    def mark_changed(self, blocks: NDArray[np.int32], version: int) -> None:
+        """Note that blocks with these buffer indices were changed at ``version`` of the map."""
+        self._version[blocks] = version
+
+    def changed_since(self, version: int) -> NDArray[np.int32]:
+        """Keys (B, 3) of all blocks that were changed after ``version``, in lexicographic order."""
+        keys, indices = self.sorted_blocks()
+        packed = pack_keys(keys[self._version[indices] > version])
+        if self._store is not None:
+            stored = np.array([k for k, v in self._store.versions.items() if v > version], np.int64)
+            packed = np.sort(np.concatenate((packed, stored)))
+        return unpack_keys(packed)
+
+    def stored_keys(self) -> NDArray[np.int32]:
+        """Keys (B, 3) of the blocks on disk."""
+        versions = {} if self._store is None else self._store.versions
+        return unpack_keys(np.fromiter(versions, np.int64, len(versions)))
+
+    def all_keys(self) -> NDArray[np.int32]:
+        """Keys (B, 3) of all blocks in lexicographic order."""
+        keys = np.concatenate((self.sorted_blocks()[0], self.stored_keys()))
+        return keys[np.argsort(pack_keys(keys))]
+
+    def tiles(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], BlockGrid]]:
+        """All blocks, in lexicographic order, in parts that fit in memory.
+
+        Yields:
+            Keys (B, 3), their buffer indices (B,) in a grid, and that grid: this one where nothing is on disk, else a
+            temporary one, which also holds the next blocks along each axis.
+        """
+        if self._store is None or not len(self._store):
+            yield (*self.sorted_blocks(), self)
+            return
+        everything = pack_keys(self.all_keys())
+        for start in range(0, len(everything), TILE_BLOCKS):
+            part = everything[start : start + TILE_BLOCKS]
+            around = np.unique(pack_keys((unpack_keys(part)[:, None] + NEIGHBOURS).reshape(-1, 3)))
+            wanted = around[np.isin(around, everything)]
+            tile = BlockGrid(self._voxel_size_m, self._classes, len(wanted), len(wanted))
+            tile.fill(wanted, self.read(wanted))
+            yield unpack_keys(part), find_blocks(tile.index, part), tile
+
+    def read(self, packed: NDArray[np.int64]) -> BlockValues:
+        """A copy of blocks (B,) that exist, from memory or disk."""
+        found = find_blocks(self._index, packed)
+        here = found >= 0
+        buffers = self.buffers()
+        values = BlockValues(*(getattr(buffers, name)[found] for name in ATTRIBUTES))
+        if not here.all():
+            assert self._store is not None
+            stored = self._store.get(packed[~here])
+            for mine, theirs in zip(values, stored, strict=True):
+                mine[~here] = theirs
+        return values
+
+    def fill(self, packed: NDArray[np.int64], values: BlockValues) -> NDArray[np.int32]:
+        """Make blocks (B,) be ``values``, new or not; returns their buffer indices."""
+        blocks = self.activate(packed)
+        buffers = self.buffers()
+        for name in ATTRIBUTES:
+            getattr(buffers, name)[blocks] = getattr(values, name)
+        return blocks
+
+    def _check_room(self, packed: NDArray[np.int64], missing: NDArray[np.int64]) -> None:
+        new = len(missing) if self._store is None else sum(int(key) not in self._store for key in missing)
+        if self.block_count + new > self._max_blocks:
             raise MapError(
-                f"the map is full: {self.block_count} blocks, {len(new)} more asked for, limit {self._max_blocks} "
+                f"the map is full: {self.block_count} blocks, {new} more asked for, limit {self._max_blocks} "
                 f"(voxel_map.max_blocks; {self._block_bytes / 1024:.0f} KiB a block). Raise the limit, use larger "
                 "voxels, or start a new map; what is in this one stays usable"
             )
-        if needed > self.capacity:
+        if len(packed) > self._max_resident:
+            need = len(packed) * self._block_bytes / 1e6
+            raise MapError(
+                f"one frame touches {len(packed)} blocks, memory has room for {self._max_resident}; raise "
+                f"voxel_map.memory_mb to {need:.0f} or more, or use larger voxels"
+            )
+
+    def _bring_in(self, packed: NDArray[np.int64], missing: NDArray[np.int64]) -> None:
+        """Make room for the missing blocks, add them, and read those that were on disk."""
+        needed = self.resident_count + len(missing)
+        if needed > self._max_resident:
+            self._evict(needed - self._max_resident, packed)
+        elif needed > self.capacity:
             self._grow(needed)
-        added = self._add(new)
+        stored = None if self._store is None else self._store
+        back = missing[:0]
+        if stored is not None and len(stored):
+            back = missing[np.fromiter((int(key) in stored for key in missing), np.bool_, len(missing))]
+        values = stored.get(back) if stored is not None and len(back) else None
+        added = self._add(missing)
         self._zero(added)
-        return find_blocks(self._index, packed)
+        self._version[added] = 0
+        if stored is None or values is None:
+            return
+        indices, buffers = find_blocks(self._index, back), self.buffers()
+        for name in ATTRIBUTES:
+            getattr(buffers, name)[indices] = getattr(values, name)
+        self._version[indices] = [stored.versions[int(key)] for key in back]
+        stored.drop(back)
+
+    def _evict(self, count: int, keep: NDArray[np.int64]) -> None:
+        """Put the ``count`` blocks that were used longest ago, and some more, on disk; those of ``keep`` stay."""
+        if self._store is None:
+            self._store = BlockStore(self._classes)
+            _log.info("map_pages", resident=self._max_resident, reason="voxel_map.memory_mb is used up")
+        keys, indices = self.sorted_blocks()
+        packed = pack_keys(keys)
+        free = ~np.isin(packed, keep)
+        oldest = np.flatnonzero(free)[np.argsort(self._used[indices[free]], kind="stable")]
+        going = np.sort(oldest[: max(count, min(EVICTED_AT_ONCE, len(oldest)))])
+        gone = packed[going]
+        self._store.put(gone, self._version[indices[going]], self.read(gone))
+        self._map.erase(self._o3d.core.Tensor.from_numpy(np.ascontiguousarray(keys[going])))
+        self._index = make_block_index(*self.sorted_blocks())
 
     def _grow(self, needed: int) -> None:
-        capacity = min(max(needed, self.capacity + self.capacity // 2), self._max_blocks)
+        capacity = min(max(needed, self.capacity + self.capacity // 2), self._max_resident)
         _log.debug("map_grows", blocks=self.block_count, capacity=capacity)
+        _, before = self.sorted_blocks()
+        used, version = self._used[before], self._version[before]
         self._map.reserve(capacity)  # moves the memory and renumbers the blocks
         keys, indices = self.sorted_blocks()
         self._index = make_block_index(keys, indices)
+        self._used, self._version = np.zeros(self.capacity, np.int64), np.zeros(self.capacity, np.int64)
+        self._used[indices], self._version[indices] = used, version
 
     def _add(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
         keys = np.ascontiguousarray(unpack_keys(packed))
@@ -153,7 +303,7 @@ class BlockGrid:
         if not bool(inserted.numpy().all()):  # the index says that they were not there: the two tables disagree
             raise MapError(f"block table and Open3D's hash map disagree about {len(keys)} new blocks; this is a bug")
         added = indices.numpy().astype(np.int32)
-        if not has_room(self._index, self.block_count):
+        if not has_room(self._index, self.resident_count):
             self._index = make_block_index(*self.sorted_blocks())
         else:
             insert_blocks(self._index, packed, added)

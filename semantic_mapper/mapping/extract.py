@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid, GridBuffers, make_open3d_grid
 from semantic_mapper.mapping.block_index import BlockIndex, find_block, find_blocks, pack_key, pack_keys, unpack_keys
+from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import Float32, Float64
@@ -132,12 +134,29 @@ def _triangles_of(mesh: Any) -> Float32:
     return mesh.vertex.positions.numpy()[mesh.triangle.indices.numpy()]
 
 
+def join_meshes(parts: Sequence[MapMesh]) -> MapMesh:
+    """One mesh of several that share vertices at their borders, in the order that ``triangle_mesh`` gives."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    corners = np.concatenate([part.vertices for part in parts])
+    vertices, first, inverse = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)])
+    faces = _in_order(inverse.reshape(-1)[faces])
+    rgb, label, confidence = (
+        np.concatenate([getattr(part, name) for part in parts])[first] for name in ("rgb", "label", "confidence")
+    )
+    return MapMesh(vertices, faces, rgb, label, confidence)
+
+
 def _weld(triangles: Float32) -> tuple[Float32, NDArray[np.int32]]:
     """Join equal corners and put vertices and faces in an order that does not depend on threads."""
     vertices, inverse = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
-    faces = inverse.reshape(-1, 3)
+    return vertices.astype(np.float32), _in_order(inverse.reshape(-1, 3))
+
+
+def _in_order(faces: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Faces (F, 3) in one spelling and order, those without area left out."""
     first = faces.argmin(axis=1)[:, None]  # start each face at its least vertex: same winding, one spelling
     faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
     faces = faces[np.lexsort(faces.T[::-1])]
     proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])
-    return vertices.astype(np.float32), faces[proper].astype(np.int32)
+    return faces[proper].astype(np.int32)

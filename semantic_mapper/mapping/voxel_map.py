@@ -13,10 +13,11 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError, FrameError, MapError, ShapeError
 from semantic_mapper.geometry import check_pose, expect_shape
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.allocation import Camera, blocks_in_band, make_camera
+from semantic_mapper.mapping.allocation import Camera, blocks_in_band, blocks_in_view, make_camera
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys
-from semantic_mapper.mapping.extract import surface_voxels, triangle_mesh
+from semantic_mapper.mapping.block_store import BlockValues
+from semantic_mapper.mapping.extract import join_meshes, surface_voxels, triangle_mesh
 from semantic_mapper.mapping.fusion import FusionLimits, fuse_blocks, no_votes, vote_weights
 from semantic_mapper.mapping.map_file import read_map, write_map
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapState, MapView
@@ -31,6 +32,8 @@ _log = structlog.get_logger(__name__)
 _KERNEL_LOCK = threading.RLock()
 
 BoolImage = NDArray[np.bool_]
+POINT_FIELDS = ("xyz", "rgb", "label", "confidence")
+LOADED_AT_ONCE = 256  # blocks
 
 
 class VoxelMap:
@@ -54,7 +57,13 @@ class VoxelMap:
         self.label_set = label_set
         self.frames = 0
         self.last_stamp_ns = 0
-        self._grid = BlockGrid(config.voxel_size_m, len(label_set), config.initial_blocks, config.max_blocks)
+        self._grid = BlockGrid(
+            config.voxel_size_m,
+            len(label_set),
+            config.initial_blocks,
+            config.max_blocks,
+            int(config.memory_mb * 1e6),
+        )
         self._truncation_m = config.truncation_voxels * config.voxel_size_m
         self._limits = FusionLimits(
             voxel_size=config.voxel_size_m,
@@ -68,6 +77,16 @@ class VoxelMap:
     def block_count(self) -> int:
         """Blocks of 8^3 voxels in the map."""
         return self._grid.block_count
+
+    @property
+    def stored_blocks(self) -> int:
+        """Those of them that are on disk because of ``memory_mb``."""
+        return self._grid.stored_count
+
+    def changed_since(self, version: int) -> NDArray[np.int32]:
+        """Coordinates (B, 3) of the blocks changed after ``frames`` was ``version``, in lexicographic order."""
+        with _KERNEL_LOCK:
+            return self._grid.changed_since(version)
 
     @property
     def memory_bytes(self) -> int:
@@ -109,6 +128,7 @@ class VoxelMap:
             fuse_blocks(blocks, self._grid.buffers(), camera, self._limits, depth, rgb, weights, probs)
             self.frames += 1
             self.last_stamp_ns = frame.stamp_ns
+            self._grid.mark_changed(blocks, self.frames)
         return len(blocks)
 
     def points(self, min_weight: float = 1.0) -> MapPoints:
@@ -118,20 +138,24 @@ class VoxelMap:
             min_weight: Voxels with fewer depth measurements are left out; > 0.
         """
         _check_min_weight(min_weight)
+        parts: list[MapPoints] = []
         with _KERNEL_LOCK:
-            keys, blocks = self._grid.sorted_blocks()
-            voxels = surface_voxels(keys, blocks, self._grid, min_weight)
-            rgb, label, confidence = self._read(voxels)
-        return MapPoints((voxels * self.config.voxel_size_m).astype(np.float32), rgb, label, confidence)
+            for keys, blocks, grid in self._grid.tiles():
+                voxels = surface_voxels(keys, blocks, grid, min_weight)
+                xyz = (voxels * self.config.voxel_size_m).astype(np.float32)
+                parts.append(MapPoints(xyz, *self._read(grid, voxels)))
+        return MapPoints(*(np.concatenate([getattr(part, name) for part in parts]) for name in POINT_FIELDS))
 
     def mesh(self, min_weight: float = 1.0) -> MapMesh:
         """Triangle mesh of the surface by marching cubes, in a fixed order; see ``points``."""
         _check_min_weight(min_weight)
+        parts: list[MapMesh] = []
         with _KERNEL_LOCK:
-            keys, blocks = self._grid.sorted_blocks()
-            vertices, faces = triangle_mesh(keys, blocks, self._grid, self.config.voxel_size_m, min_weight)
-            rgb, label, confidence = self._read(vertices.astype(np.float64) / self.config.voxel_size_m)
-        return MapMesh(vertices, faces, rgb, label, confidence)
+            for keys, blocks, grid in self._grid.tiles():
+                vertices, faces = triangle_mesh(keys, blocks, grid, self.config.voxel_size_m, min_weight)
+                read = self._read(grid, vertices.astype(np.float64) / self.config.voxel_size_m)
+                parts.append(MapMesh(vertices, faces, *read))
+        return parts[0] if len(parts) == 1 else join_meshes(parts)
 
     def ray_cast(self, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> MapView:
         """The map as a camera would see it, up to ``depth_max_m`` away.
@@ -146,6 +170,7 @@ class VoxelMap:
         check_pose(T_world_camera, "ray_cast")
         camera = make_camera(intrinsics, T_world_camera)
         with _KERNEL_LOCK:
+            self._page_in_view(camera, intrinsics)
             depth_m, rgb, channel, confidence = cast_rays(
                 camera,
                 intrinsics.height,
@@ -200,34 +225,37 @@ class VoxelMap:
         except ConfigError as error:
             raise MapError(f"{path}: the saved configuration cannot be used: {error}") from error
         with _KERNEL_LOCK:
-            blocks = loaded._grid.activate(pack_keys(state.keys))
-            if loaded._grid.block_count != len(blocks):
+            packed = pack_keys(state.keys)
+            if len(np.unique(packed)) != len(packed):
                 raise MapError(f"{path}: block coordinates are not unique")
-            buffers = loaded._grid.buffers()
-            for name in ("tsdf", "weight", "color", "evidence", "votes"):
-                getattr(buffers, name)[blocks] = getattr(state, name)
+            for start in range(0, len(packed), LOADED_AT_ONCE):
+                part = slice(start, start + LOADED_AT_ONCE)
+                values = BlockValues(*(getattr(state, name)[part] for name in BlockValues._fields))
+                blocks = loaded._grid.fill(packed[part], values)
+                loaded._grid.mark_changed(blocks, state.frames)
         loaded.frames, loaded.last_stamp_ns = state.frames, state.last_stamp_ns
         return loaded
 
     def _state(self) -> MapState:
         with _KERNEL_LOCK:
-            keys, blocks = self._grid.sorted_blocks()
-            b = self._grid.buffers()
+            keys = self._grid.all_keys()
             return MapState(
-                config=self.config,
-                label_set=self.label_set,
-                frames=self.frames,
-                last_stamp_ns=self.last_stamp_ns,
-                keys=keys,
-                tsdf=b.tsdf[blocks],
-                weight=b.weight[blocks],
-                color=b.color[blocks],
-                evidence=b.evidence[blocks],
-                votes=b.votes[blocks],
+                self.config,
+                self.label_set,
+                self.frames,
+                self.last_stamp_ns,
+                keys,
+                **self._grid.read(pack_keys(keys))._asdict(),
             )
 
-    def _read(self, voxels: Float64) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Float32]:
-        grid = self._grid
+    def _page_in_view(self, camera: Camera, intrinsics: CameraIntrinsics) -> None:
+        """Bring back from disk what a camera may see; the nearest, where memory has no room for all of it."""
+        if self._grid.stored_count:
+            reach = self.config.depth_max_m + self._truncation_m
+            keys = self._grid.all_keys()
+            self._grid.page_in(blocks_in_view(camera, intrinsics, keys, self.config.voxel_size_m, reach))
+
+    def _read(self, grid: BlockGrid, voxels: Float64) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Float32]:
         return read_points(voxels, grid.index, grid.buffers(), self.label_set, self.config.vote_discount)
 
     def _check_images(
