@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,38 +14,70 @@ from nodes.console import Output
 from nodes.verb import verb
 
 
+class Part(StrEnum):
+    """What to measure."""
+
+    ALL = "all"
+    RENDER = "render"
+    FUSION = "fusion"
+    PIPELINE = "pipeline"
+
+
 @verb
 def bench(
+    part: Annotated[Part, typer.Argument(help="What to measure.")] = Part.ALL,
     weights: Annotated[
         Path | None, typer.Option(help="Weights to render with; those in the package without it.")
     ] = None,
-    repeats: Annotated[int, typer.Option(min=1, help="Best of so many runs of everything but the reference.")] = 3,
+    repeats: Annotated[
+        int, typer.Option(min=1, help="render: best of so many runs of everything but the reference.")
+    ] = 3,
+    frames: Annotated[int, typer.Option(min=1, help="fusion, pipeline: frames that count.")] = 20,
+    config: Annotated[Path | None, typer.Option(help="pipeline: TOML file with settings of the mapper.")] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Also write the figures here.")
     ] = None,
 ) -> None:
-    """Time the reference renderer against the streaming one, at the same weights and in one run.
+    """Measure speed on this machine, as ratios between things measured in one run.
 
-    Both render a 320x240 view of a test room from 8 source views. Quote ratios, not seconds: seconds depend on the
-    machine and on what else it does.
+    render: a 320x240 view of a test room from 8 source views, by the reference renderer and by the streaming one at
+    the same weights. fusion: 640x480 frames into 2 cm voxels, our fusion with 20 and 40 classes against Open3D's own
+    without any. pipeline: whole steps, 640x480 frames with depth in, the semantic map out. Quote ratios, not seconds:
+    seconds depend on the machine and on what else it does.
 
     Example: semantic-mapper bench --json runs/bench.json
+    Example: semantic-mapper bench pipeline --frames 40 --config fast.toml
     """
     output = Output.guarded()
     from replay.artifacts import versions, write_json
-    from replay.bench import bench_render
-    from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
 
-    render = bench_render(load_checkpoint(weights or default_checkpoint_path()), repeats=repeats)
-    machine = {"cpu": cpu_name(), "threads": render["threads"], "versions": versions()}
-    output.print(_table(render))
-    output.print(
-        f"streaming is {render['speedup']} times faster than the reference, "
-        f"{render['speedup_at_equal_samples']} times at equal samples ({machine['cpu']}, "
-        f"{machine['threads']} threads)"
-    )
+    wanted = [p for p in Part if p is not Part.ALL] if part is Part.ALL else [part]
+    found: dict[str, Any] = {}
+    if Part.RENDER in wanted:
+        from replay.bench import bench_render
+        from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
+
+        found["render"] = bench_render(load_checkpoint(weights or default_checkpoint_path()), repeats=repeats)
+        output.print(_render_table(found["render"]))
+        output.print(
+            f"streaming is {found['render']['speedup']} times faster than the reference, "
+            f"{found['render']['speedup_at_equal_samples']} times at equal samples"
+        )
+    if Part.FUSION in wanted:
+        from replay.bench_map import bench_fusion
+
+        found["fusion"] = bench_fusion(frames)
+        output.print(_fusion_line(found["fusion"]))
+    if Part.PIPELINE in wanted:
+        from nodes.run_replay import mapper_config
+        from replay.bench_map import bench_pipeline
+
+        found["pipeline"] = bench_pipeline(weights, mapper_config(config, None, None), frames)
+        output.print(_pipeline_line(found["pipeline"]))
+    found["machine"] = {"cpu": cpu_name(), "versions": versions()}
+    output.print(f"on {found['machine']['cpu']}")
     if json_file is not None:
-        write_json(json_file, {"render": render, "machine": machine})
+        write_json(json_file, found)
         output.print(f"written to {json_file}")
 
 
@@ -56,7 +89,7 @@ def cpu_name() -> str:
     return platform.machine()
 
 
-def _table(render: dict[str, Any]) -> Table:
+def _render_table(render: dict[str, Any]) -> Table:
     table = Table(title=f"rendering {render['view']}")
     for column in ("renderer", "rays/s", "view, wall s", "view, CPU s", "CPU s per 2048 rays"):
         table.add_column(column, justify="left" if column == "renderer" else "right")
@@ -64,3 +97,19 @@ def _table(render: dict[str, Any]) -> Table:
         values = (row["rays_per_s"], row["view_wall_s"], row["view_cpu_s"], row["cpu_s_per_2048_rays"])
         table.add_row(name, *(f"{v:,}" for v in values))
     return table
+
+
+def _fusion_line(fusion: dict[str, Any]) -> str:
+    return (
+        f"fusion of 640x480 into {fusion['voxel_size_m'] * 100:g} cm voxels: Open3D {fusion['open3d_ms']} ms a frame "
+        f"without classes, ours {fusion['ms_20']} ms with 20 ({fusion['ratio_20']} times) and {fusion['ms_40']} ms "
+        f"with 40 ({fusion['ratio_40']} times)"
+    )
+
+
+def _pipeline_line(pipeline: dict[str, Any]) -> str:
+    stages = ", ".join(f"{name} {value}" for name, value in pipeline["stages_ms"].items())
+    return (
+        f"pipeline at {pipeline['size']}: {pipeline['hz']} frames/s, a step {pipeline['p50_ms']} ms (p50), "
+        f"{pipeline['p95_ms']} ms (p95); stages in ms: {stages}"
+    )

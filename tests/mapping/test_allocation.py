@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from semantic_mapper.geometry import look_at, unproject
-from semantic_mapper.mapping.allocation import blocks_in_band, make_camera
-from semantic_mapper.mapping.block_index import pack_keys
+from semantic_mapper.mapping.allocation import blocks_in_band, blocks_in_view, make_camera
+from semantic_mapper.mapping.block_index import pack_keys, unpack_keys
 from semantic_mapper.types import CameraIntrinsics
 from tests.mapping.views import INTRINSICS, frame, plane_depth, small_map
 
@@ -62,3 +62,18 @@ def test_more_blocks_than_the_first_guess_has_room_for(rng: np.random.Generator)
 def test_an_image_of_one_pixel_is_enough() -> None:
     camera = make_camera(CameraIntrinsics(100, 100, 0, 0, 1, 1), np.eye(4))
     assert len(blocks_in_band(np.full((1, 1), 1.0, np.float32), camera, 0.02, 0.08, 5.0)) == 2
+
+
+def test_blocks_in_view_are_all_that_a_camera_sees_the_nearest_first() -> None:
+    camera, side = make_camera(INTRINSICS, POSE), 0.16
+    grid = np.arange(-14, 15)
+    keys = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), -1).reshape(-1, 3).astype(np.int32)
+    found = unpack_keys(blocks_in_view(camera, INTRINSICS, keys, 0.02, 1.5))
+    z = ((found + 0.5) * side - camera.t) @ camera.R[:, 2]
+    assert np.diff(z).min() > -1e-9
+    depth = np.linspace(0.01, 1.5, 100, dtype=np.float32)
+    rays = unproject(np.ones((120, 160), np.float32), INTRINSICS).reshape(-1, 3) @ POSE[:3, :3].T
+    met = np.floor((depth[:, None, None] * rays + POSE[:3, 3]).reshape(-1, 3) / side).astype(np.int32)
+    needed = np.intersect1d(pack_keys(met), pack_keys(keys))
+    assert np.isin(needed, pack_keys(found)).all(), "nothing that a ray meets is left out"
+    assert len(found) < 2.5 * len(needed) < 0.2 * len(keys)
