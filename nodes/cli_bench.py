@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from nodes.cli_replay import QualityOption
 from nodes.console import Output
 from nodes.verb import verb
 
@@ -34,6 +35,7 @@ def bench(
     ] = 3,
     frames: Annotated[int, typer.Option(min=1, help="fusion, pipeline: frames that count.")] = 20,
     config: Annotated[Path | None, typer.Option(help="pipeline: TOML file with settings of the mapper.")] = None,
+    quality: QualityOption = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Also write the figures here.")
     ] = None,
@@ -46,7 +48,7 @@ def bench(
     seconds depend on the machine and on what else it does.
 
     Example: semantic-mapper bench --json runs/bench.json
-    Example: semantic-mapper bench pipeline --frames 40 --config fast.toml
+    Example: semantic-mapper bench pipeline --frames 40 --quality fast
     """
     output = Output.guarded()
     from replay.artifacts import versions, write_json
@@ -72,7 +74,7 @@ def bench(
         from nodes.run_replay import mapper_config
         from replay.bench_map import bench_pipeline
 
-        found["pipeline"] = bench_pipeline(weights, mapper_config(config, None, None), frames)
+        found["pipeline"] = bench_pipeline(weights, mapper_config(config, None, None, quality), frames)
         output.print(_pipeline_line(found["pipeline"]))
     found["machine"] = {"cpu": cpu_name(), "versions": versions()}
     output.print(f"on {found['machine']['cpu']}")
@@ -111,5 +113,5 @@ def _pipeline_line(pipeline: dict[str, Any]) -> str:
     stages = ", ".join(f"{name} {value}" for name, value in pipeline["stages_ms"].items())
     return (
         f"pipeline at {pipeline['size']}: {pipeline['hz']} frames/s, a step {pipeline['p50_ms']} ms (p50), "
-        f"{pipeline['p95_ms']} ms (p95); stages in ms: {stages}"
+        f"{pipeline['p95_ms']} ms (p95); mIoU {pipeline['miou'] * 100:.1f} %; stages in ms: {stages}"
     )

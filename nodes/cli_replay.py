@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -19,6 +19,10 @@ VoxelSizeOption = Annotated[
     float | None, typer.Option("--voxel-size", min=0.002, max=1.0, help="Edge of a voxel in metres.  [default: 0.02]")
 ]
 MaxFramesOption = Annotated[int, typer.Option("--max-frames", min=0, help="Stop after so many; 0 = all.")]
+QualityOption = Annotated[
+    Literal["fast", "balanced", "reference"] | None,
+    typer.Option("--quality", help="Rays and samples: fewer, some or all; without it as --config says."),
+]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with settings of the mapper.")]
 
 
@@ -38,6 +42,7 @@ def replay(
     ] = False,
     rerun: Annotated[Path | None, typer.Option(help="Also write a Rerun recording (.rrd).")] = None,
     config: ConfigOption = None,
+    quality: QualityOption = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of everything that is drawn at random.")] = None,
 ) -> int:
     """Map a recorded log: writes summary.json, map.ply, map.npz and overview.png.
@@ -51,7 +56,7 @@ def replay(
     from nodes.run_replay import ReplayRequest, mapper_config, replay_log
     from nodes.summary_table import notes, result_lines, summary_table
 
-    settings = mapper_config(config, voxel_size, seed)
+    settings = mapper_config(config, voxel_size, seed, quality)
     request = ReplayRequest(log, out, weights, settings, max_frames, eval_exclude, rerun)
     with StopRequest() as stop:
         with frame_progress("replay", None) as bar:

@@ -15,7 +15,7 @@ from nodes.outputs import prepare_folder
 from nodes.process import StopRequest
 from replay.log import LogReader
 from replay.session import MapSession, load_pipeline
-from semantic_mapper.config import MapperConfig, load_config
+from semantic_mapper.config import MapperConfig, Quality, load_config
 from semantic_mapper.errors import LogError, SemanticMapperError
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.types import PosedFrame
@@ -122,7 +122,9 @@ def _frames(log: LogReader, total: int) -> Iterator[PosedFrame | LogError]:
             yield error
 
 
-def mapper_config(path: Path | None, voxel_size_m: float | None, seed: int | None = None) -> MapperConfig:
+def mapper_config(
+    path: Path | None, voxel_size_m: float | None, seed: int | None = None, quality: Quality | None = None
+) -> MapperConfig:
     """The mapper's config from a TOML file (None = defaults) with what the command line says on top.
 
     Raises:
@@ -132,7 +134,8 @@ def mapper_config(path: Path | None, voxel_size_m: float | None, seed: int | Non
     if voxel_size_m is not None:
         voxel_map = msgspec.structs.replace(config.voxel_map, voxel_size_m=voxel_size_m)
         config = msgspec.structs.replace(config, voxel_map=voxel_map)
-    return config if seed is None else msgspec.structs.replace(config, seed=seed)
+    given = {"seed": seed, "quality": quality}
+    return msgspec.structs.replace(config, **{name: value for name, value in given.items() if value is not None})
 
 
 def clear_summary(out: Path) -> None:

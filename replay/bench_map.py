@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from replay.session import load_pipeline
 from semantic_mapper.config import MapperConfig, VoxelMapConfig
+from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.geometry import invert_pose
-from semantic_mapper.labels import make_label_set
+from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.mapping.block_grid import make_open3d_grid
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -69,11 +70,14 @@ def bench_pipeline(weights: Path | None, config: MapperConfig, frames: int = 40)
     """Time whole steps: 640x480 frames with depth of a test room in, the semantic map out.
 
     Returns:
-        Plain data: ``hz`` (1 / mean of a step), ``p50_ms`` and ``p95_ms`` of ``step``, medians of its stages.
+        Plain data: ``hz`` (1 / mean of a step), ``p50_ms`` and ``p95_ms`` of ``step``, medians of its stages, and the
+        mIoU of the rendered labels.
     """
     pipeline = load_pipeline(weights, config).pipeline
     posed = list(room_frames(TEST_SEEDS[0], frames + WARM_UP, VGA, path=CameraPathConfig(step_m=STEP_M)))
     steps: list[float] = []
+    confusion = ConfusionMatrix(pipeline.label_set)
+    in_map = pipeline.label_set.channel_map_from(ROOMS)
     stages: dict[str, list[float]] = {}
     for number, frame in enumerate(posed):
         began = time.perf_counter()
@@ -81,8 +85,12 @@ def bench_pipeline(weights: Path | None, config: MapperConfig, frames: int = 40)
         if number < WARM_UP:
             continue
         steps.append((time.perf_counter() - began) * 1e3)
+        assert frame.label is not None
+        confusion.update(pipeline.label_set.to_ids(in_map[frame.label]), update.label, f"frame {number}")
         for name, value in update.stage_ms.items():
             stages.setdefault(name, []).append(value)
+    score = confusion.metrics().miou
+    assert score is not None
     return {
         "frames": frames,
         "size": f"{VGA.width}x{VGA.height}",
@@ -93,6 +101,8 @@ def bench_pipeline(weights: Path | None, config: MapperConfig, frames: int = 40)
         "p95_ms": round(float(np.percentile(steps, 95)), 1),
         "stages_ms": {name: round(float(np.median(values)), 1) for name, values in stages.items()},
         "blocks": pipeline.voxel_map.block_count,
+        "miou": round(score, 4),
+        "quality": config.quality,
     }
 
 

@@ -15,7 +15,7 @@ import structlog
 
 from replay.artifacts import write_artifacts
 from replay.truth import SurfaceTruth, TruthMapper
-from semantic_mapper.config import MapperConfig, convert_config, to_plain
+from semantic_mapper.config import MapperConfig, convert_config, to_plain, with_quality
 from semantic_mapper.errors import FrameError, LabelError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, confusion_of
 from semantic_mapper.fields.base import SemanticField
@@ -53,6 +53,7 @@ def load_pipeline(weights: Path | None, config: MapperConfig) -> PipelineBundle:
     Raises:
         WeightsError: missing, damaged or foreign weights.
     """
+    config = with_quality(config)
     path = weights or default_checkpoint_path()
     checkpoint = load_checkpoint(path)
     if config.render.encode_width == 0:

@@ -141,8 +141,18 @@ class RenderConfig(Config, frozen=True):
 
     # Rendered rays a side, relative to the frame; lifted to full size along image edges.
     scale: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.25
+    # 1 = all rays; below, every second one a side, and at most this share of the others where these do not tell enough.
+    refine: Share = 1.0
     encode_width: NotNegative = 0  # of the source images when they are encoded; 0 = what the weights were trained at
     rays_per_chunk: AtLeastOne = 2048
+
+
+Quality = Literal["custom", "fast", "balanced", "reference"]
+QUALITIES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # of ``sampling`` and of ``render``
+    "fast": ({"mode": "streaming", "guided": 2, "free_space": 0}, {"refine": 0.2}),
+    "balanced": ({"mode": "streaming", "guided": 4, "free_space": 1}, {"refine": 0.2}),
+    "reference": ({"mode": "reference", "coarse": 64, "fine": 64}, {"refine": 1.0}),
+}
 
 
 class MapperConfig(Config, frozen=True):
@@ -152,7 +162,25 @@ class MapperConfig(Config, frozen=True):
     keyframes: KeyframeConfig = KeyframeConfig()
     voxel_map: VoxelMapConfig = VoxelMapConfig()
     render: RenderConfig = RenderConfig()
+    quality: Quality = "custom"  # another one sets samples and rays; see ``with_quality``
     seed: int = 0
+
+
+def with_quality(config: MapperConfig) -> MapperConfig:
+    """The config with the settings that its ``quality`` stands for; "custom" leaves all as they are.
+
+    "reference" renders all rays with 64 + 64 samples, "balanced" and "fast" fewer rays, with 4 and 2 samples round the
+    depth prior.
+    """
+    if config.quality == "custom":
+        return config
+    sampling, render = msgspec.to_builtins(config.sampling), msgspec.to_builtins(config.render)
+    samples, rays = QUALITIES[config.quality]
+    return msgspec.structs.replace(
+        config,
+        sampling=msgspec.convert({**sampling, **samples}, SamplingConfig),
+        render=msgspec.convert({**render, **rays}, RenderConfig),
+    )
 
 
 ConfigT = TypeVar("ConfigT", bound=msgspec.Struct)

@@ -25,8 +25,11 @@ def tiny_field(label_set: LabelSet = ROOMS, seed: int = 0) -> SRay:
 
 @cache
 def tiny_frames(count: int = 6, seed: int = 7) -> tuple[PosedFrame, ...]:
-    """Labelled 96x72 frames of one room."""
-    return tuple(room_frames(TRAIN_SEEDS[seed], count, INTRINSICS))
+    """Labelled 96x72 frames of one room, shared by all tests: what a test changes, it copies first."""
+    frames = tuple(room_frames(TRAIN_SEEDS[seed], count, INTRINSICS))
+    for frame in frames:
+        frame.T_world_camera.flags.writeable = False
+    return frames
 
 
 def tiny_config(**changes: object) -> MapperConfig:

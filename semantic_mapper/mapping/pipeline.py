@@ -15,10 +15,11 @@ import structlog
 import torch
 from numpy.typing import NDArray
 
-from semantic_mapper.config import MapperConfig
+from semantic_mapper.config import MapperConfig, with_quality
 from semantic_mapper.errors import FrameError, WeightsError
 from semantic_mapper.fields.base import EncodedViews, SemanticField, stack_views
 from semantic_mapper.fields.render import render_view
+from semantic_mapper.fields.sparse_render import render_sparse_view
 from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
 from semantic_mapper.imaging import fill_holes, resize_depth, resize_label, resize_rgb, working_intrinsics
 from semantic_mapper.labels import LabelSet
@@ -61,7 +62,7 @@ class MappingPipeline:
                 f"the field renders label set '{field.label_set.name}' ({len(field.label_set)} classes), "
                 f"the map holds '{label_set.name}' ({len(label_set)}); use weights made for this label set"
             )
-        self.config = config
+        self.config = config = with_quality(config)
         self.field = field
         self.label_set = label_set
         self.voxel_map = VoxelMap(config.voxel_map, label_set)
@@ -158,7 +159,7 @@ class MappingPipeline:
             rgb=torch.from_numpy(rgb).permute(2, 0, 1).float().div(255)[None],
             depth_m=torch.from_numpy(depth)[None],
             K=torch.from_numpy(camera_matrix(intrinsics)).float()[None],
-            T_world_camera=torch.from_numpy(frame.T_world_camera).float()[None],
+            T_world_camera=torch.tensor(frame.T_world_camera, dtype=torch.float32)[None],
             channel=channel,
         )
         with torch.inference_mode():
@@ -196,15 +197,11 @@ class MappingPipeline:
             return np.zeros((height, width, len(self.label_set)), np.float32), empty > 0, empty
         intrinsics = scale_intrinsics(frame.intrinsics, width, height)
         prior = self._depth_prior(frame, intrinsics)
-        return render_view(
-            self.field,
-            stack_views(views),
-            intrinsics,
-            frame.T_world_camera,
-            prior,
-            self.config.sampling,
-            self.config.render.rays_per_chunk,
-        )
+        config = self.config.render
+        scene = (self.field, stack_views(views), intrinsics, frame.T_world_camera, prior, self.config.sampling)
+        if config.refine == 1:
+            return render_view(*scene, config.rays_per_chunk)
+        return render_sparse_view(*scene, config.rays_per_chunk, config.refine)[:3]
 
     def _depth_prior(self, frame: PosedFrame, intrinsics: CameraIntrinsics) -> Float32:
         """Where the surface is expected: the sensor's depth with its holes filled, else the map's own ray cast."""

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import numpy as np
@@ -113,8 +114,9 @@ def test_metadata_that_cannot_be_used_are_refused_with_the_reason(tmp_path, chan
 
 def test_an_anchor_without_a_usable_pose_is_refused(tmp_path):
     path = tmp_path / "w.safetensors"
-    lost = tiny_frames(1)[0]
-    lost.T_world_camera[0, 3] = np.nan
+    pose = tiny_frames(1)[0].T_world_camera.copy()
+    pose[0, 3] = np.nan
+    lost = dataclasses.replace(tiny_frames(1)[0], T_world_camera=pose)
     save_checkpoint(Checkpoint(tiny_field(), (anchor_from_frame(lost, 64),)), path)
     with pytest.raises(WeightsError, match="anchor 0: the pose holds NaN"):
         load_checkpoint(path)

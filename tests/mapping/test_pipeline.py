@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import FrameError, PoseError, WeightsError
+from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
 from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapping.pipeline import MappingPipeline
@@ -170,6 +171,33 @@ def test_reference_field_and_streaming_field_agree_on_real_frames():
         a, b = fast.step(frame), slow.step(frame)
         np.testing.assert_allclose(a.confidence, b.confidence, atol=1e-3)
         assert (a.label == b.label).mean() > 0.999
+
+
+class CountingField(StreamingSRay):
+    """Counts the rays that it renders."""
+
+    rays = 0
+
+    def render(self, rays, sources):
+        self.rays += len(rays.origin)
+        return super().render(rays, sources)
+
+
+def test_fewer_rays_give_nearly_the_same_view_and_a_map_that_repeats():
+    trained = load_checkpoint(default_checkpoint_path()).model
+    frames = tiny_frames(3)
+    updates, rays, pipelines = [], [], []
+    for refine in (1.0, 0.4, 0.4):
+        config = tiny_config(render={"encode_width": 64, "refine": refine, "scale": 0.5})
+        field = CountingField(trained, config.sampling)
+        pipeline = MappingPipeline(config, field, ROOMS)
+        updates.append([pipeline.step(f) for f in frames])
+        rays.append(field.rays)
+        pipelines.append(pipeline)
+    assert rays[1] < 0.6 * rays[0]
+    same = np.mean([(a.label == b.label).mean() for a, b in zip(updates[0], updates[1], strict=True)])
+    assert same > 0.9
+    assert same_map(pipelines[1], pipelines[2])
 
 
 def test_every_stage_is_timed():

@@ -1,0 +1,89 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from semantic_mapper.config import SamplingConfig
+from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.render import render_view
+from semantic_mapper.fields.sparse_render import render_sparse_view
+from semantic_mapper.labels import make_label_set
+from semantic_mapper.types import CameraIntrinsics, FieldRender, RayBatch
+
+CAMERA = CameraIntrinsics(30.0, 30.0, 19.5, 14.5, 40, 30)
+LABELS = make_label_set("two", ("left", "right"), ids=(1, 2), ignore_id=0)
+SAMPLING = SamplingConfig()
+NOTHING = EncodedViews(*(torch.zeros(1) for _ in range(6)))
+
+
+@dataclasses.dataclass
+class Halves:
+    """Says "left" of rays to the left of ``border`` (pixels), sure; nothing of the rows above ``unknown_above``."""
+
+    border: float = 17.0
+    unknown_above: int = 0
+    sure: float = 6.0
+    rays: int = 0
+    label_set = LABELS
+
+    def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
+        u = rays.direction[:, 0] / rays.direction[:, 2] * CAMERA.fx + CAMERA.cx
+        v = rays.direction[:, 1] / rays.direction[:, 2] * CAMERA.fy + CAMERA.cy
+        self.rays += len(u)
+        logits = self.sure * torch.stack(((u < self.border).float(), (u >= self.border).float()), 1)
+        known = v > self.unknown_above - 0.5
+        ones = torch.ones_like(u)
+        return FieldRender(logits, rays.prior_depth_m, ones, torch.zeros(len(u), 3), ones, known)
+
+
+def sparse(field: Halves, prior: np.ndarray | None = None, refine: float = 1.0):
+    prior = np.full((30, 40), 2.0, np.float32) if prior is None else prior
+    return render_sparse_view(field, NOTHING, CAMERA, np.eye(4), prior, SAMPLING, 128, refine)  # type: ignore[arg-type]
+
+
+def dense(field: Halves, prior: np.ndarray | None = None):
+    prior = np.full((30, 40), 2.0, np.float32) if prior is None else prior
+    return render_view(field, NOTHING, CAMERA, np.eye(4), prior, SAMPLING, 128)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("border", [16.5, 17.5])
+def test_a_border_between_classes_is_found_to_the_pixel_with_a_third_of_the_rays(border: float):
+    field = Halves(border)
+    p, known, depth, rays = sparse(field)
+    expected, _, expected_depth = dense(Halves(border))
+    np.testing.assert_array_equal(p.argmax(2), expected.argmax(2))
+    np.testing.assert_allclose(p, expected, atol=1e-6)
+    np.testing.assert_allclose(depth, expected_depth, atol=1e-6)
+    assert known.all()
+    assert rays == field.rays < 0.35 * 30 * 40
+
+
+def test_pixels_whose_depth_is_another_than_their_neighbours_have_rays_of_their_own():
+    prior = np.full((30, 40), 2.0, np.float32)
+    prior[:, 31] = 1.0  # a pole, one pixel wide, between two columns of the coarse grid
+    _, _, depth, _ = sparse(Halves(), prior)
+    np.testing.assert_array_equal(depth[:, 31], 1.0)
+    np.testing.assert_array_equal(depth[:, 25], 2.0)
+
+
+def test_where_the_field_is_in_doubt_all_pixels_have_rays():
+    field = Halves(border=-1, sure=0.1)
+    assert sparse(field)[3] == 30 * 40
+
+
+def test_the_share_of_refined_pixels_is_a_limit_and_the_most_doubtful_go_first():
+    field = Halves(17.5)
+    prior = np.full((30, 40), 2.0, np.float32)
+    prior[10] = 1.0
+    p, _, _, rays = sparse(field, prior, refine=0.05)
+    assert rays == 300 + int(0.05 * 900)
+    np.testing.assert_array_equal(p.argmax(2), dense(Halves(17.5))[0].argmax(2))
+    assert sparse(Halves(), refine=0.0)[3] == 300
+
+
+def test_what_no_ray_knows_stays_unknown():
+    p, known, _, _ = sparse(Halves(unknown_above=9))
+    expected = dense(Halves(unknown_above=9))
+    np.testing.assert_array_equal(known, expected[1])
+    np.testing.assert_allclose(p[known], expected[0][known], atol=1e-6)
