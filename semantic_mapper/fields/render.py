@@ -41,7 +41,7 @@ def render_image(
     device = sources.feature.device
     pixels = pixel_grid(intrinsics.width, intrinsics.height, device)
     prior = torch.from_numpy(np.ascontiguousarray(prior_depth_m)).to(device).flatten()
-    pose = torch.from_numpy(T_world_camera).to(device=device, dtype=torch.float32)
+    pose = torch.tensor(T_world_camera, device=device, dtype=torch.float32)
     parts: list[FieldRender] = []
     with torch.inference_mode():
         for start in range(0, len(pixels), rays_per_chunk):

@@ -47,7 +47,7 @@ def render_sparse_view(
     known, depth_m = np.zeros((height, width), np.bool_), np.zeros((height, width), np.float32)
 
     def trace(rows: NDArray[np.int64], columns: NDArray[np.int64]) -> None:
-        pose = torch.from_numpy(T_world_camera).to(device=sources.feature.device, dtype=torch.float32)
+        pose = torch.tensor(T_world_camera, device=sources.feature.device, dtype=torch.float32)
         for start in range(0, len(rows), rays_per_chunk):
             v, u = rows[start : start + rays_per_chunk], columns[start : start + rays_per_chunk]
             pixels = torch.from_numpy(np.stack((u, v), axis=1).astype(np.float32)).to(pose.device)

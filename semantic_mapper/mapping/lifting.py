@@ -1,4 +1,8 @@
-"""Lift a coarse rendered view to full resolution along the edges of the image and its depth."""
+"""Lift a coarse rendered view to full resolution along the edges of the image and its depth.
+
+The coarse pixels round a full pixel decide together which class it is of; then one of them speaks for it. So a lifted
+view is an index a pixel, not a vector of probabilities a pixel.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +12,25 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic_mapper.fields.kernel_math import fast_exp
 from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import Float32, UInt8
 
-COLOUR_SIGMA = 20.0  # 8-bit steps
+COLOUR_RATE = 1 / (2 * 20.0**2)  # sigma of 20 8-bit steps
 DEPTH_SIGMA = 0.02  # share of z
+LARGEST_STEP = 8.0  # a depth that differs by more counts no more: then colour decides among the rest
+LEAST_WEIGHT = 1e-9  # where nothing looks alike, something must still be said
+
+Int32 = NDArray[np.int32]
 
 
 def lift(
     probabilities: Float32, known: NDArray[np.bool_], rgb_low: UInt8, depth_low: Float32, rgb: UInt8, depth: Float32
-) -> tuple[Float32, NDArray[np.bool_]]:
-    """Joint bilateral upsampling: every full pixel mixes the 3x3 coarse pixels round it that look like it.
+) -> Int32:
+    """Joint bilateral upsampling: every full pixel takes one of the 3x3 coarse pixels round it.
+
+    It is of the class that these nine give together, weighted by how much they look like the pixel, and of that class
+    the one that is most like it. Where all nine are of one class the middle one speaks.
 
     Args:
         probabilities: (h, w, L) float32; known: (h, w) bool.
@@ -26,60 +38,80 @@ def lift(
         rgb, depth: (H, W, 3) uint8 and (H, W) float32; depth 0 = none, then colour alone decides.
 
     Returns:
-        (H, W, L) float32 probabilities and (H, W) bool known.
+        (H, W) int32 number of the coarse pixel (row * w + column), -1 where none of the nine is known.
     """
-    height, width = depth.shape
-    out = np.zeros((height, width, probabilities.shape[2]), np.float32)
-    out_known = np.zeros((height, width), np.bool_)
-    _lift(probabilities, known, rgb_low, depth_low, rgb, depth, out, out_known)
-    return out, out_known
+    out = np.empty(depth.shape, np.int32)
+    channel = np.where(known, probabilities.argmax(axis=2), -1)
+    look = np.dstack((rgb_low.astype(np.float32), depth_low))
+    _lift(probabilities.reshape(-1, probabilities.shape[2]), channel, _of_one_class(channel), look, rgb, depth, out)
+    return out
 
 
-@parallel_kernel(fastmath=True)
-def _lift(  # pragma: no cover - compiled
-    probabilities: Float32,
-    known: NDArray[np.bool_],
-    rgb_low: UInt8,
-    depth_low: Float32,
-    rgb: UInt8,
-    depth: Float32,
-    out: Float32,
-    out_known: NDArray[np.bool_],
-) -> None:
-    low_height, low_width, classes = probabilities.shape
-    height, width = depth.shape
-    scale_y, scale_x = low_height / height, low_width / width
-    colour_rate = 1.0 / (2.0 * COLOUR_SIGMA * COLOUR_SIGMA)
-    for v in numba.prange(height):
-        y = (v + 0.5) * scale_y - 0.5
-        y0 = math.floor(y + 0.5)
-        for u in range(width):
-            x = (u + 0.5) * scale_x - 0.5
-            x0 = math.floor(x + 0.5)
-            total = 0.0
-            z = depth[v, u]
-            for dy in range(-1, 2):
-                j = y0 + dy
-                if j < 0 or j >= low_height:
+@parallel_kernel()
+def _of_one_class(channel):
+    """Whether the 3x3 coarse pixels round each (as far as they are in the image) are known and of one class."""
+    height, width = channel.shape
+    out = np.empty((height, width), np.bool_)
+    for j in numba.prange(height):
+        for i in range(width):
+            same = channel[j, i] >= 0
+            for y in range(max(j - 1, 0), min(j + 2, height)):
+                for x in range(max(i - 1, 0), min(i + 2, width)):
+                    same = same and channel[y, x] == channel[j, i]
+            out[j, i] = same
+    return out
+
+
+@parallel_kernel()
+def _lift(probabilities, channel, one_class, look, rgb, depth, out):
+    for v in numba.prange(len(depth)):
+        _lift_row(v, probabilities, channel, one_class, look, rgb, depth, out)
+
+
+@numba.njit(nogil=True, cache=True)
+def _lift_row(v, probabilities, channel, one_class, look, rgb, depth, out):
+    """One row of full pixels; a function of its own for each pixel would cost more than what it does."""
+    (height, width), half = channel.shape, np.float32(0.5)
+    scale_y, scale_x = np.float32(height / depth.shape[0]), np.float32(width / depth.shape[1])
+    taps, of_class, weights = np.empty(9, np.int64), np.empty(9, np.int64), np.empty(9, np.float32)
+    y = (np.float32(v) + half) * scale_y - half
+    j0 = min(max(math.floor(y + half), 0), height - 1)
+    for u in range(depth.shape[1]):
+        x = (np.float32(u) + half) * scale_x - half
+        i0 = min(max(math.floor(x + half), 0), width - 1)
+        if one_class[j0, i0]:
+            out[v, u] = j0 * width + i0
+            continue
+        z, count = depth[v, u], 0
+        depth_rate = np.float32(1.0 / DEPTH_SIGMA) / z if z > 0 else np.float32(0.0)
+        for j in range(max(j0 - 1, 0), min(j0 + 2, height)):
+            for i in range(max(i0 - 1, 0), min(i0 + 2, width)):
+                if channel[j, i] < 0:
                     continue
-                for dx in range(-1, 2):
-                    i = x0 + dx
-                    if i < 0 or i >= low_width or not known[j, i]:
-                        continue
-                    exponent = (y - j) * (y - j) + (x - i) * (x - i)
-                    r = float(rgb[v, u, 0]) - float(rgb_low[j, i, 0])
-                    g = float(rgb[v, u, 1]) - float(rgb_low[j, i, 1])
-                    b = float(rgb[v, u, 2]) - float(rgb_low[j, i, 2])
-                    exponent += (r * r + g * g + b * b) * colour_rate
-                    z_low = depth_low[j, i]
-                    if z > 0 and z_low > 0:
-                        step = (z - z_low) / (DEPTH_SIGMA * z)
-                        exponent += min(step * step, 8.0)
-                    weight = math.exp(-exponent) + 1e-9
-                    total += weight
-                    for c in range(classes):
-                        out[v, u, c] += weight * probabilities[j, i, c]
-            if total > 0:
-                out_known[v, u] = True
-                for c in range(classes):
-                    out[v, u, c] /= total
+                dy, dx = y - np.float32(j), x - np.float32(i)
+                r, g = np.float32(rgb[v, u, 0]) - look[j, i, 0], np.float32(rgb[v, u, 1]) - look[j, i, 1]
+                b, step = np.float32(rgb[v, u, 2]) - look[j, i, 2], (z - look[j, i, 3]) * depth_rate
+                cost = (r * r + g * g + b * b) * np.float32(COLOUR_RATE) + dy * dy + dx * dx
+                if look[j, i, 3] > 0:
+                    cost += min(step * step, np.float32(LARGEST_STEP))
+                weights[count] = fast_exp(-cost) + np.float32(LEAST_WEIGHT)
+                taps[count], of_class[count] = j * width + i, channel[j, i]
+                count += 1
+        out[v, u] = _nearest_of_class(taps, of_class, weights, count, probabilities)
+
+
+@numba.njit(inline="always")
+def _nearest_of_class(taps, of_class, weights, count, probabilities):
+    """The tap of the largest weight among those of the class that all give the largest total, -1 without taps."""
+    best, top, most = -1, -1, np.float32(-1.0)
+    for a in range(count):
+        if of_class[a] == top:
+            if weights[a] > weights[best]:
+                best = a
+            continue
+        total = np.float32(0.0)
+        for b in range(count):
+            total += weights[b] * probabilities[taps[b], of_class[a]]
+        if total > most:
+            best, top, most = a, of_class[a], total
+    return taps[best] if best >= 0 else -1

@@ -26,7 +26,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore
 from semantic_mapper.mapping.lifting import lift
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.types import CameraIntrinsics, Float32, MapUpdate, PosedFrame, SourceViews
+from semantic_mapper.types import CameraIntrinsics, Float32, MapUpdate, PosedFrame, SourceViews, UInt8
 
 _log = structlog.get_logger(__name__)
 
@@ -91,16 +91,17 @@ class MappingPipeline:
         with self._stage("render"):
             probabilities, known, rendered_depth = self._render(frame, sources, current)
         with self._stage("lift"):
-            depth, full, full_known = self._lift(frame, probabilities, known, rendered_depth)
+            depth, rows = self._lift(frame, probabilities, known, rendered_depth)
+        table = probabilities.reshape(-1, len(self.label_set))
         with self._stage("fuse"):
-            touched = self.voxel_map.integrate(frame, depth, full, full_known)
+            touched = self.voxel_map.integrate(frame, depth, table, rows=rows)
         with self._stage("keyframe"):
             is_keyframe = self.keyframes.wants(frame.T_world_camera)
             if is_keyframe:
                 self.keyframes.add(self._make_keyframe(frame, current))
         self._intrinsics[frame.camera_id] = frame.intrinsics
         self._odd_sizes.pop(frame.camera_id, None)
-        channel = np.where(full_known, full.argmax(axis=2), -1)
+        label, confidence = self._at_rows(table, rows)
         return MapUpdate(
             stamp_ns=frame.stamp_ns,
             seq=frame.seq,
@@ -108,8 +109,8 @@ class MappingPipeline:
             fused=touched > 0,
             is_keyframe=is_keyframe,
             source_seqs=tuple(k.seq for k in sources),
-            label=self.label_set.to_ids(channel),
-            confidence=full.max(axis=2),
+            label=label,
+            confidence=confidence,
             depth_m=depth,
             blocks=self.voxel_map.block_count,
             blocks_touched=touched,
@@ -214,8 +215,8 @@ class MappingPipeline:
 
     def _lift(
         self, frame: PosedFrame, probabilities: Float32, known: NDArray[np.bool_], rendered_depth: Float32
-    ) -> tuple[Float32, Float32, NDArray[np.bool_]]:
-        """Full-size depth to fuse, class probabilities and where they are known."""
+    ) -> tuple[Float32, NDArray[np.int32]]:
+        """Full-size depth to fuse, and which coarse pixel each pixel takes its probabilities from."""
         size = (frame.intrinsics.width, frame.intrinsics.height)
         low = scale_intrinsics(frame.intrinsics, known.shape[1], known.shape[0])
         rgb_low, depth_low = resize_rgb(frame, low), resize_depth(frame, low)
@@ -223,8 +224,12 @@ class MappingPipeline:
             depth = np.asarray(cv2.resize(rendered_depth, size, interpolation=cv2.INTER_LINEAR), np.float32)
         else:
             depth = resize_depth(frame, frame.intrinsics)
-        full, full_known = lift(probabilities, known, rgb_low, depth_low, frame.rgb, depth)
-        return depth, full, full_known
+        return depth, lift(probabilities, known, rgb_low, depth_low, frame.rgb, depth)
+
+    def _at_rows(self, table: Float32, rows: NDArray[np.int32]) -> tuple[UInt8, Float32]:
+        """Class ids and confidence (H, W) of what the pixels take from a table (K, L); row -1 is unknown."""
+        ids = np.append(self.label_set.to_ids(table.argmax(axis=1)), np.uint8(self.label_set.ignore_id))
+        return ids[rows], np.append(table.max(axis=1), np.float32(0))[rows]
 
     def _make_keyframe(self, frame: PosedFrame, encoded: EncodedViews, *, labelled: bool = False) -> Keyframe:
         intrinsics = working_intrinsics(frame.intrinsics, COVERAGE_WIDTH)

@@ -18,7 +18,7 @@ from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys
 from semantic_mapper.mapping.block_store import BlockValues
 from semantic_mapper.mapping.extract import join_meshes, surface_voxels, triangle_mesh
-from semantic_mapper.mapping.fusion import FusionLimits, fuse_blocks, no_votes, vote_weights
+from semantic_mapper.mapping.fusion import FusionLimits, Votes, fuse_blocks, make_votes, no_votes
 from semantic_mapper.mapping.map_file import read_map, write_map
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapState, MapView
 from semantic_mapper.mapping.ray_casting import cast_rays
@@ -94,7 +94,13 @@ class VoxelMap:
         return self._grid.memory_bytes
 
     def integrate(
-        self, frame: PosedFrame, depth_m: Float32, probabilities: Float32 | None, known: BoolImage | None
+        self,
+        frame: PosedFrame,
+        depth_m: Float32,
+        probabilities: Float32 | None,
+        known: BoolImage | None = None,
+        *,
+        rows: NDArray[np.int32] | None = None,
     ) -> int:
         """Fuse one frame.
 
@@ -103,6 +109,8 @@ class VoxelMap:
             depth_m: (H, W) float32 z in metres; 0, negative, NaN or beyond ``depth_max_m`` = no measurement.
             probabilities: (H, W, L) float32, each known pixel summing to 1; None = geometry and colour alone.
             known: (H, W) bool, where ``probabilities`` mean something; None = everywhere.
+            rows: (H, W) int32, where several pixels share their probabilities: these are (K, L) then, and this says
+                which row is a pixel's, -1 = unknown. ``known`` is None then.
 
         Returns:
             Blocks touched, 0 where the depth image holds no measurement.
@@ -116,16 +124,17 @@ class VoxelMap:
         check_pose(frame.T_world_camera, where)
         if any(frame.intrinsics.distortion):
             raise FrameError(f"{where}: the image is not rectified (distortion {frame.intrinsics.distortion})")
-        depth, known_image, probs = self._check_images(frame.intrinsics, depth_m, probabilities, known, where)
+        depth = self._check_depth(frame.intrinsics, depth_m, where)
+        table = self._table(depth, probabilities, known, rows, where)
         camera = make_camera(frame.intrinsics, frame.T_world_camera)
         with _KERNEL_LOCK:
-            weights, probs = self._weigh(depth, probs, known_image, camera, where)
+            votes = self._votes(depth, table, camera, where)
             packed = blocks_in_band(
                 depth, camera, self.config.voxel_size_m, self._truncation_m, self.config.depth_max_m
             )
             blocks = self._grid.activate(packed)
             rgb = np.ascontiguousarray(frame.rgb)
-            fuse_blocks(blocks, self._grid.buffers(), camera, self._limits, depth, rgb, weights, probs)
+            fuse_blocks(blocks, self._grid.buffers(), camera, self._limits, depth, rgb, votes)
             self.frames += 1
             self.last_stamp_ns = frame.stamp_ns
             self._grid.mark_changed(blocks, self.frames)
@@ -258,40 +267,51 @@ class VoxelMap:
     def _read(self, grid: BlockGrid, voxels: Float64) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Float32]:
         return read_points(voxels, grid.index, grid.buffers(), self.label_set, self.config.vote_discount)
 
-    def _check_images(
+    def _check_depth(self, intrinsics: CameraIntrinsics, depth_m: Float32, where: str) -> Float32:
+        expect_shape(depth_m, f"{intrinsics.height} {intrinsics.width}", f"{where}: depth_m")
+        _expect_dtype(depth_m, np.float32, f"{where}: depth_m")
+        return np.ascontiguousarray(depth_m)
+
+    def _table(
         self,
-        intrinsics: CameraIntrinsics,
-        depth_m: Float32,
+        depth: Float32,
         probabilities: Float32 | None,
         known: BoolImage | None,
+        rows: NDArray[np.int32] | None,
         where: str,
-    ) -> tuple[Float32, BoolImage, Float32 | None]:
-        size = f"{intrinsics.height} {intrinsics.width}"
-        expect_shape(depth_m, size, f"{where}: depth_m")
-        _expect_dtype(depth_m, np.float32, f"{where}: depth_m")
-        if known is not None:
-            expect_shape(known, size, f"{where}: known")
-            _expect_dtype(known, np.bool_, f"{where}: known")
-        else:
-            known = np.ones(depth_m.shape, np.bool_)
-        if probabilities is not None:
-            expect_shape(probabilities, f"{size} {len(self.label_set)}", f"{where}: probabilities")
-            _expect_dtype(probabilities, np.float32, f"{where}: probabilities")
-            probabilities = np.ascontiguousarray(probabilities)
-        return np.ascontiguousarray(depth_m), np.ascontiguousarray(known), probabilities
-
-    def _weigh(
-        self, depth: Float32, probabilities: Float32 | None, known: BoolImage, camera: Camera, where: str
-    ) -> tuple[Float32, Float32]:
+    ) -> tuple[Float32, NDArray[np.int32]] | None:
+        """Class probabilities (K, L) and the row of each pixel (H, W), however they were given."""
         if probabilities is None:
+            return None
+        size, classes = f"{depth.shape[0]} {depth.shape[1]}", len(self.label_set)
+        _expect_dtype(probabilities, np.float32, f"{where}: probabilities")
+        if rows is None:
+            expect_shape(probabilities, f"{size} {classes}", f"{where}: probabilities")
+            rows = np.arange(depth.size, dtype=np.int32).reshape(depth.shape)
+            if known is not None:
+                expect_shape(known, size, f"{where}: known")
+                _expect_dtype(known, np.bool_, f"{where}: known")
+                rows[~known] = -1
+        else:
+            expect_shape(probabilities, f"K {classes}", f"{where}: probabilities")
+            expect_shape(rows, size, f"{where}: rows")
+            _expect_dtype(rows, np.int32, f"{where}: rows")
+            if known is not None or rows.min() < -1 or rows.max() >= len(probabilities):
+                raise ShapeError(f"{where}: rows must be -1 ... {len(probabilities) - 1}, and known None")
+        return np.ascontiguousarray(probabilities).reshape(-1, classes), np.ascontiguousarray(rows)
+
+    def _votes(
+        self, depth: Float32, table: tuple[Float32, NDArray[np.int32]] | None, camera: Camera, where: str
+    ) -> Votes:
+        if table is None:
             return no_votes(depth.shape[0], depth.shape[1], len(self.label_set))
-        weights, bad = vote_weights(depth, known, probabilities, camera, self.config.depth_max_m)
+        votes, bad = make_votes(*table, depth, camera, self.config.depth_max_m)
         if bad:
             raise FrameError(
                 f"{where}: {bad} known pixels hold class probabilities that are NaN, negative or do not sum to 1; "
                 "give a softmax, or mark the pixels as not known"
             )
-        return weights, probabilities
+        return votes
 
 
 def _expect_dtype(array: NDArray[np.generic], dtype: type[np.generic], name: str) -> None:

@@ -1,6 +1,14 @@
-import numpy as np
+import math
 
-from semantic_mapper.mapping.lifting import lift
+import numpy as np
+import pytest
+
+from semantic_mapper.mapping.lifting import COLOUR_RATE, DEPTH_SIGMA, LARGEST_STEP, LEAST_WEIGHT, lift
+
+
+def channels(probabilities: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Likeliest class (H, W) of what each pixel takes."""
+    return probabilities.reshape(-1, probabilities.shape[2])[rows].argmax(2)
 
 
 def test_lifted_classes_follow_the_image_edge_not_the_coarse_grid():
@@ -11,9 +19,9 @@ def test_lifted_classes_follow_the_image_edge_not_the_coarse_grid():
     probabilities = np.zeros((8, 8, 2), np.float32)
     probabilities[..., 0] = low_rgb[..., 0] == 0
     probabilities[..., 1] = low_rgb[..., 0] > 0
-    full, known = lift(probabilities, np.ones((8, 8), bool), low_rgb, depth[2::4, 2::4].copy(), rgb, depth)
-    assert known.all()
-    assert (full.argmax(2) == (rgb[..., 0] > 0)).all()
+    rows = lift(probabilities, np.ones((8, 8), bool), low_rgb, depth[2::4, 2::4].copy(), rgb, depth)
+    assert (rows >= 0).all()
+    assert (channels(probabilities, rows) == (rgb[..., 0] > 0)).all()
 
 
 def test_lifted_classes_follow_a_depth_edge_between_equal_colours():
@@ -22,18 +30,59 @@ def test_lifted_classes_follow_a_depth_edge_between_equal_colours():
     depth[:, 18:] = 3.0
     low_depth = depth[2::4, 2::4].copy()
     probabilities = np.stack((low_depth < 2.5, low_depth > 2.5), -1).astype(np.float32)
-    full, _ = lift(probabilities, np.ones((8, 8), bool), rgb[2::4, 2::4].copy(), low_depth, rgb, depth)
-    assert (full.argmax(2) == (depth > 2.5)).all()
+    rows = lift(probabilities, np.ones((8, 8), bool), rgb[2::4, 2::4].copy(), low_depth, rgb, depth)
+    assert (channels(probabilities, rows) == (depth > 2.5)).all()
 
 
-def test_lifted_probabilities_sum_to_one():
-    rng = np.random.default_rng(0)
+def test_where_all_round_are_of_one_class_the_middle_one_speaks():
+    p = np.full((6, 8, 2), (0.9, 0.1), np.float32)
+    rgb = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
+    depth = np.ones((24, 32), np.float32)
+    rows = lift(p, np.ones((6, 8), bool), rgb[2::4, 2::4].copy(), depth[2::4, 2::4].copy(), rgb, depth)
+    np.testing.assert_array_equal(rows, np.arange(24)[:, None] // 4 * 8 + np.arange(32)[None] // 4)
+
+
+def spoken_by(v, u, p, known, rgb_low, depth_low, rgb, depth):
+    """The rule of ``lift`` in plain words, for one pixel where the classes differ."""
+    height, width = known.shape
+    y, x = (v + 0.5) * height / depth.shape[0] - 0.5, (u + 0.5) * width / depth.shape[1] - 0.5
+    j0, i0 = math.floor(y + 0.5), math.floor(x + 0.5)
+    round_it = [
+        (j, i) for j in range(j0 - 1, j0 + 2) for i in range(i0 - 1, i0 + 2) if 0 <= j < height and 0 <= i < width
+    ]
+    if all(known[at] and p[at].argmax() == p[j0, i0].argmax() for at in round_it):
+        return j0 * width + i0
+    weight = {}
+    for j, i in round_it:
+        if known[j, i]:
+            cost = (y - j) ** 2 + (x - i) ** 2
+            cost += COLOUR_RATE * ((rgb[v, u].astype(float) - rgb_low[j, i]) ** 2).sum()
+            if depth[v, u] > 0 and depth_low[j, i] > 0:
+                cost += min(((depth[v, u] - depth_low[j, i]) / (DEPTH_SIGMA * depth[v, u])) ** 2, LARGEST_STEP)
+            weight[j, i] = math.exp(-cost) + LEAST_WEIGHT
+    if not weight:
+        return -1
+    total = {int(p[at].argmax()): 0.0 for at in weight}
+    total = {c: sum(w * p[at][c] for at, w in weight.items()) for c in total}
+    top = max(total, key=total.__getitem__)
+    j, i = max((at for at in weight if p[at].argmax() == top), key=weight.__getitem__)
+    return j * width + i
+
+
+@pytest.mark.parametrize("holes", [False, True])
+def test_a_pixel_takes_the_most_alike_of_the_class_that_all_give_together(holes: bool):
+    rng = np.random.default_rng(3)
     p = rng.random((6, 8, 5)).astype(np.float32)
     p /= p.sum(2, keepdims=True)
-    rgb = rng.integers(0, 255, (24, 32, 3), dtype=np.uint8)
-    depth = rng.random((24, 32)).astype(np.float32) + 1
-    full, _ = lift(p, np.ones((6, 8), bool), rgb[2::4, 2::4].copy(), depth[2::4, 2::4].copy(), rgb, depth)
-    np.testing.assert_allclose(full.sum(2), 1, atol=1e-5)
+    rgb = rng.integers(80, 130, (24, 32, 3), dtype=np.uint8)
+    depth = (1 + 0.05 * rng.random((24, 32))).astype(np.float32)
+    known = rng.random((6, 8)) > (0.5 if holes else -1)
+    if holes:
+        depth[rng.random(depth.shape) < 0.3] = 0
+    low = rgb[2::4, 2::4].copy(), depth[2::4, 2::4].copy()
+    rows = lift(p, known, *low, rgb, depth)
+    expected = [[spoken_by(v, u, p, known, *low, rgb, depth) for u in range(32)] for v in range(24)]
+    assert (rows == np.array(expected)).mean() > 0.995  # float32 may decide a tie the other way
 
 
 def test_pixels_without_a_known_neighbour_stay_unknown():
@@ -41,6 +90,6 @@ def test_pixels_without_a_known_neighbour_stay_unknown():
     known[0, 0] = True
     p = np.full((8, 8, 2), 0.5, np.float32)
     rgb, depth = np.zeros((32, 32, 3), np.uint8), np.ones((32, 32), np.float32)
-    full, full_known = lift(p, known, rgb[::4, ::4].copy(), depth[::4, ::4].copy(), rgb, depth)
-    assert full_known[0, 0] and not full_known[20:, 20:].any()
-    assert full[20:, 20:].max() == 0
+    rows = lift(p, known, rgb[::4, ::4].copy(), depth[::4, ::4].copy(), rgb, depth)
+    assert rows[0, 0] == 0
+    assert (rows[20:, 20:] == -1).all()

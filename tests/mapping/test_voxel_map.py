@@ -220,6 +220,22 @@ def test_images_that_do_not_fit_are_refused_by_name() -> None:
     assert voxel_map.block_count == 0
 
 
+def test_pixels_may_share_their_probabilities() -> None:
+    shared, each = small_map(), small_map()
+    rng = np.random.default_rng(2)
+    table = rng.dirichlet(np.ones(3), 7).astype(np.float32)
+    rows = rng.integers(-1, 7, (120, 160)).astype(np.int32)
+    depth = plane_depth(OBLIQUE, (0.2, 0.1, 1.0), 0.45)
+    shared.integrate(frame(OBLIQUE), depth, table, rows=rows)
+    each.integrate(frame(OBLIQUE), depth, table[rows], rows >= 0)
+    assert same(shared.block_state(), each.block_state())
+    assert shared.block_state()["votes"].max() > 0
+    for wrong in (rows[:60], rows.astype(np.int64), np.where(rows == 3, 7, rows).astype(np.int32), rows - 1):
+        with pytest.raises(ShapeError, match="rows"):
+            shared.integrate(frame(OBLIQUE), depth, table, rows=wrong)
+    assert same(shared.block_state(), each.block_state())
+
+
 @pytest.mark.parametrize("wrong", [np.nan, -0.5, 3.0])
 def test_what_is_no_probability_is_refused_and_changes_nothing(wrong: float) -> None:
     voxel_map = small_map()
