@@ -81,12 +81,14 @@ def bench_pipeline(weights: Path | None, config: MapperConfig, frames: int = 40)
     confusion = ConfusionMatrix(pipeline.label_set)
     in_map = pipeline.label_set.channel_map_from(ROOMS)
     stages: dict[str, list[float]] = {}
+    rays: list[int] = []
     for number, frame in enumerate(posed):
         began = time.perf_counter()
         update = pipeline.step(frame)
         if number < WARM_UP:
             continue
         steps.append((time.perf_counter() - began) * 1e3)
+        rays.append(update.rays)
         assert frame.label is not None
         confusion.update(pipeline.label_set.to_ids(in_map[frame.label]), update.label, f"frame {number}")
         for name, value in update.stage_ms.items():
@@ -102,6 +104,7 @@ def bench_pipeline(weights: Path | None, config: MapperConfig, frames: int = 40)
         "p50_ms": round(float(np.percentile(steps, 50)), 1),
         "p95_ms": round(float(np.percentile(steps, 95)), 1),
         "stages_ms": {name: round(float(np.median(values)), 1) for name, values in stages.items()},
+        "rays": round(float(np.mean(rays))),
         "blocks": pipeline.voxel_map.block_count,
         "miou": round(score, 4),
         "quality": config.quality,

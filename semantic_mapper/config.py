@@ -141,36 +141,40 @@ class RenderConfig(Config, frozen=True):
 
     # Rendered rays a side, relative to the frame; lifted to full size along image edges.
     scale: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.25
-    # 1 = all rays; below, every second one a side, and at most this share of the others where these do not tell enough.
-    refine: Share = 1.0
+    # 1 = rays for all its pixels; below, for every fourth a side and, up to this share, where these do not tell enough.
+    share: Share = 0.3
+    blind_samples: AtLeastTwo = 32  # a ray, of views of which neither sensor nor map knows any depth
+    target_hz: Annotated[float, msgspec.Meta(ge=0)] = (
+        0.0  # hold this rate by fewer rays and samples than set; 0 = off, for maps that repeat
+    )
     encode_width: NotNegative = 0  # of the source images when they are encoded; 0 = what the weights were trained at
     rays_per_chunk: AtLeastOne = 2048
 
 
 Quality = Literal["custom", "fast", "balanced", "reference"]
 QUALITIES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # of ``sampling`` and of ``render``
-    "fast": ({"mode": "streaming", "guided": 2, "free_space": 0}, {"refine": 0.2}),
-    "balanced": ({"mode": "streaming", "guided": 4, "free_space": 1}, {"refine": 0.2}),
-    "reference": ({"mode": "reference", "coarse": 64, "fine": 64}, {"refine": 1.0}),
+    "fast": ({"mode": "streaming", "guided": 2, "free_space": 0}, {"share": 0.2}),
+    "balanced": ({"mode": "streaming", "guided": 4, "free_space": 1}, {"share": 0.3}),
+    "reference": ({"mode": "reference", "coarse": 64, "fine": 64}, {"share": 1.0, "target_hz": 0.0}),
 }
 
 
 class MapperConfig(Config, frozen=True):
-    """Everything ``MappingPipeline`` needs."""
+    """Everything ``MappingPipeline`` needs. The defaults are those of the "balanced" quality."""
 
-    sampling: SamplingConfig = SamplingConfig()
+    sampling: SamplingConfig = SamplingConfig(guided=4)
     keyframes: KeyframeConfig = KeyframeConfig()
     voxel_map: VoxelMapConfig = VoxelMapConfig()
     render: RenderConfig = RenderConfig()
-    quality: Quality = "custom"  # another one sets samples and rays; see ``with_quality``
+    quality: Quality = "custom"  # any other sets samples and rays; see ``with_quality``
     seed: int = 0
 
 
 def with_quality(config: MapperConfig) -> MapperConfig:
     """The config with the settings that its ``quality`` stands for; "custom" leaves all as they are.
 
-    "reference" renders all rays with 64 + 64 samples, "balanced" and "fast" fewer rays, with 4 and 2 samples round the
-    depth prior.
+    "reference" renders all rays with 64 + 64 samples, "balanced" and "fast" at most 0.3 and 0.2 of them, with 4 and 2
+    samples near the depth prior.
     """
     if config.quality == "custom":
         return config

@@ -165,6 +165,7 @@ class MapUpdate:
         confidence: (H, W) float32 probability of ``label``.
         depth_m: (H, W) float32 depth that was fused.
         blocks: Blocks in the map; ``blocks_touched``: visited by this frame.
+        rays: Rendered for this frame; ``samples``: of a ray, 0 where the field draws its own.
         stage_ms: Wall time of each stage.
     """
 
@@ -179,4 +180,6 @@ class MapUpdate:
     depth_m: Float32
     blocks: int
     blocks_touched: int
+    rays: int = 0
+    samples: int = 0
     stage_ms: dict[str, float] = field(default_factory=dict[str, float])

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 
+from semantic_mapper.config import SamplingConfig
 from semantic_mapper.errors import ShapeError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
@@ -91,3 +92,10 @@ class SemanticField(Protocol):
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
         """Render rays from encoded source views; differentiable in training."""
         ...
+
+
+@runtime_checkable
+class Sampled(Protocol):
+    """A field whose ``render`` draws its samples as a setting says, which may change between two renders."""
+
+    sampling: SamplingConfig

@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 from semantic_mapper.config import MapperConfig, with_quality
 from semantic_mapper.errors import FrameError, WeightsError
 from semantic_mapper.fields.base import EncodedViews, SemanticField, stack_views
-from semantic_mapper.fields.render import render_view
-from semantic_mapper.fields.sparse_render import render_sparse_view
 from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
 from semantic_mapper.imaging import fill_holes, resize_depth, resize_label, resize_rgb, working_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore
 from semantic_mapper.mapping.lifting import lift
+from semantic_mapper.mapping.view_renderer import RenderedView, ViewRenderer
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import CameraIntrinsics, Float32, MapUpdate, PosedFrame, SourceViews, UInt8
 
@@ -67,6 +66,7 @@ class MappingPipeline:
         self.label_set = label_set
         self.voxel_map = VoxelMap(config.voxel_map, label_set)
         self.keyframes = KeyframeStore(config.keyframes)
+        self._renderer = ViewRenderer(field, config.render, config.sampling)
         self._intrinsics: dict[str, CameraIntrinsics] = {}
         self._odd_sizes: dict[str, tuple[tuple[int, int], int]] = {}
         self._stage_ms: dict[str, float] = {}
@@ -89,10 +89,10 @@ class MappingPipeline:
         with self._stage("choose"):
             sources = self._choose_sources(frame, current)
         with self._stage("render"):
-            probabilities, known, rendered_depth = self._render(frame, sources, current)
+            view = self._render(frame, sources, current)
         with self._stage("lift"):
-            depth, rows = self._lift(frame, probabilities, known, rendered_depth)
-        table = probabilities.reshape(-1, len(self.label_set))
+            depth, rows = self._lift(frame, view)
+        table = view.probabilities.reshape(-1, len(self.label_set))
         with self._stage("fuse"):
             touched = self.voxel_map.integrate(frame, depth, table, rows=rows)
         with self._stage("keyframe"):
@@ -102,6 +102,8 @@ class MappingPipeline:
         self._intrinsics[frame.camera_id] = frame.intrinsics
         self._odd_sizes.pop(frame.camera_id, None)
         label, confidence = self._at_rows(table, rows)
+        spent = self._stage_ms
+        self._renderer.note(spent["render"], sum(spent.values()) - spent["render"])
         return MapUpdate(
             stamp_ns=frame.stamp_ns,
             seq=frame.seq,
@@ -114,6 +116,8 @@ class MappingPipeline:
             depth_m=depth,
             blocks=self.voxel_map.block_count,
             blocks_touched=touched,
+            rays=view.rays,
+            samples=view.samples,
             stage_ms=self._stage_ms,
         )
 
@@ -184,10 +188,8 @@ class MappingPipeline:
             )
         return fitting
 
-    def _render(
-        self, frame: PosedFrame, sources: list[Keyframe], current: EncodedViews
-    ) -> tuple[Float32, NDArray[np.bool_], Float32]:
-        """Coarse class probabilities (h, w, L), known (h, w) and rendered depth (h, w)."""
+    def _render(self, frame: PosedFrame, sources: list[Keyframe], current: EncodedViews) -> RenderedView:
+        """The coarse view (h, w)."""
         views = [k.encoded for k in sources]
         if self.config.keyframes.use_current_view:
             views.append(current)
@@ -195,14 +197,11 @@ class MappingPipeline:
         width, height = round(frame.intrinsics.width * scale), round(frame.intrinsics.height * scale)
         if not views:
             empty = np.zeros((height, width), np.float32)
-            return np.zeros((height, width, len(self.label_set)), np.float32), empty > 0, empty
+            return RenderedView(np.zeros((height, width, len(self.label_set)), np.float32), empty > 0, empty, 0, 0)
         intrinsics = scale_intrinsics(frame.intrinsics, width, height)
         prior = self._depth_prior(frame, intrinsics)
-        config = self.config.render
-        scene = (self.field, stack_views(views), intrinsics, frame.T_world_camera, prior, self.config.sampling)
-        if config.refine == 1:
-            return render_view(*scene, config.rays_per_chunk)
-        return render_sparse_view(*scene, config.rays_per_chunk, config.refine)[:3]
+        rgb = resize_rgb(frame, intrinsics)
+        return self._renderer.render(stack_views(views), intrinsics, frame.T_world_camera, prior, rgb)
 
     def _depth_prior(self, frame: PosedFrame, intrinsics: CameraIntrinsics) -> Float32:
         """Where the surface is expected: the sensor's depth with its holes filled, else the map's own ray cast."""
@@ -213,18 +212,16 @@ class MappingPipeline:
             depth = self.voxel_map.ray_cast(frame.T_world_camera, intrinsics).depth_m
         return fill_holes(depth)
 
-    def _lift(
-        self, frame: PosedFrame, probabilities: Float32, known: NDArray[np.bool_], rendered_depth: Float32
-    ) -> tuple[Float32, NDArray[np.int32]]:
+    def _lift(self, frame: PosedFrame, view: RenderedView) -> tuple[Float32, NDArray[np.int32]]:
         """Full-size depth to fuse, and which coarse pixel each pixel takes its probabilities from."""
         size = (frame.intrinsics.width, frame.intrinsics.height)
-        low = scale_intrinsics(frame.intrinsics, known.shape[1], known.shape[0])
+        low = scale_intrinsics(frame.intrinsics, view.known.shape[1], view.known.shape[0])
         rgb_low, depth_low = resize_rgb(frame, low), resize_depth(frame, low)
         if frame.depth_m is None:
-            depth = np.asarray(cv2.resize(rendered_depth, size, interpolation=cv2.INTER_LINEAR), np.float32)
+            depth = np.asarray(cv2.resize(view.depth_m, size, interpolation=cv2.INTER_LINEAR), np.float32)
         else:
             depth = resize_depth(frame, frame.intrinsics)
-        return depth, lift(probabilities, known, rgb_low, depth_low, frame.rgb, depth)
+        return depth, lift(view.probabilities, view.known, rgb_low, depth_low, frame.rgb, depth)
 
     def _at_rows(self, table: Float32, rows: NDArray[np.int32]) -> tuple[UInt8, Float32]:
         """Class ids and confidence (H, W) of what the pixels take from a table (K, L); row -1 is unknown."""

@@ -200,6 +200,8 @@ def encode_map_update(update: MapUpdate, options: CodecOptions = _DEFAULTS) -> l
         source_seqs=tuple(int(s) for s in update.source_seqs),
         blocks=int(update.blocks),
         blocks_touched=int(update.blocks_touched),
+        rays=int(update.rays),
+        samples=int(update.samples),
         stage_ms={name: float(ms) for name, ms in update.stage_ms.items()},
         label=headers.LabelSpec(encoding="u8_zstd", bytes=len(label)),
         confidence=confidence_spec,
@@ -229,6 +231,8 @@ def decode_map_update(parts: Parts) -> MapUpdate:
         depth_m=decode_depth(header.depth, depth, size, what),
         blocks=header.blocks,
         blocks_touched=header.blocks_touched,
+        rays=header.rays,
+        samples=header.samples,
         stage_ms=dict(header.stage_ms),
     )
 

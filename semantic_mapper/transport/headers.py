@@ -113,6 +113,8 @@ class MapUpdateHeader(Header, frozen=True, kw_only=True):
     source_seqs: Annotated[tuple[Count, ...], Meta(max_length=_MAX_ENTRIES)]
     blocks: Count
     blocks_touched: Count
+    rays: Count = 0
+    samples: Count = 0
     stage_ms: Annotated[Milliseconds, Meta(max_length=64)]
     label: LabelSpec
     confidence: ConfidenceSpec

@@ -37,9 +37,10 @@ class Halves:
         return FieldRender(logits, rays.prior_depth_m, ones, torch.zeros(len(u), 3), ones, known)
 
 
-def sparse(field: Halves, prior: np.ndarray | None = None, refine: float = 1.0):
+def sparse(field: Halves, prior: np.ndarray | None = None, share: float = 0.99, rgb: np.ndarray | None = None):
     prior = np.full((30, 40), 2.0, np.float32) if prior is None else prior
-    return render_sparse_view(field, NOTHING, CAMERA, np.eye(4), prior, SAMPLING, 128, refine)  # type: ignore[arg-type]
+    rgb = np.full((30, 40, 3), 90, np.uint8) if rgb is None else rgb
+    return render_sparse_view(field, NOTHING, CAMERA, np.eye(4), prior, SAMPLING, 128, rgb, share)  # type: ignore[arg-type]
 
 
 def dense(field: Halves, prior: np.ndarray | None = None):
@@ -47,8 +48,8 @@ def dense(field: Halves, prior: np.ndarray | None = None):
     return render_view(field, NOTHING, CAMERA, np.eye(4), prior, SAMPLING, 128)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("border", [16.5, 17.5])
-def test_a_border_between_classes_is_found_to_the_pixel_with_a_third_of_the_rays(border: float):
+@pytest.mark.parametrize("border", [15.5, 16.5, 17.5, 18.5])
+def test_a_border_between_classes_is_found_to_the_pixel_with_a_fifth_of_the_rays(border: float):
     field = Halves(border)
     p, known, depth, rays = sparse(field)
     expected, _, expected_depth = dense(Halves(border))
@@ -56,30 +57,41 @@ def test_a_border_between_classes_is_found_to_the_pixel_with_a_third_of_the_rays
     np.testing.assert_allclose(p, expected, atol=1e-6)
     np.testing.assert_allclose(depth, expected_depth, atol=1e-6)
     assert known.all()
-    assert rays == field.rays < 0.35 * 30 * 40
+    assert rays == field.rays < 0.2 * 30 * 40
 
 
 def test_pixels_whose_depth_is_another_than_their_neighbours_have_rays_of_their_own():
     prior = np.full((30, 40), 2.0, np.float32)
-    prior[:, 31] = 1.0  # a pole, one pixel wide, between two columns of the coarse grid
+    prior[:, 31] = 1.0  # a pole, one pixel wide, between the columns of every coarser grid
     _, _, depth, _ = sparse(Halves(), prior)
     np.testing.assert_array_equal(depth[:, 31], 1.0)
     np.testing.assert_array_equal(depth[:, 25], 2.0)
 
 
+def test_a_plane_that_is_seen_at_an_angle_needs_no_more_rays_than_a_frontal_one():
+    slope = np.broadcast_to(np.linspace(1.0, 4.0, 40, dtype=np.float32), (30, 40)).copy()
+    assert sparse(Halves(), slope)[3] <= sparse(Halves())[3] + 30  # the last columns have nobody on their right
+
+
+def test_what_has_another_colour_than_all_round_it_has_rays_of_its_own():
+    rgb = np.full((30, 40, 3), 90, np.uint8)
+    rgb[11, 27] = 200
+    assert sparse(Halves(), rgb=rgb)[3] == sparse(Halves())[3] + 1
+
+
 def test_where_the_field_is_in_doubt_all_pixels_have_rays():
     field = Halves(border=-1, sure=0.1)
-    assert sparse(field)[3] == 30 * 40
+    assert sparse(field, share=1.0)[3] == 30 * 40
 
 
-def test_the_share_of_refined_pixels_is_a_limit_and_the_most_doubtful_go_first():
-    field = Halves(17.5)
+def test_the_share_is_a_limit_and_the_most_doubtful_go_first():
     prior = np.full((30, 40), 2.0, np.float32)
     prior[10] = 1.0
-    p, _, _, rays = sparse(field, prior, refine=0.05)
-    assert rays == 300 + int(0.05 * 900)
+    needed = sparse(Halves(17.5))[3]
+    p, _, _, rays = sparse(Halves(17.5), prior, share=needed / 1200)
+    assert rays == needed < sparse(Halves(17.5), prior)[3]
     np.testing.assert_array_equal(p.argmax(2), dense(Halves(17.5))[0].argmax(2))
-    assert sparse(Halves(), refine=0.0)[3] == 300
+    assert sparse(Halves(), share=0.0)[3] == 80
 
 
 def test_what_no_ray_knows_stays_unknown():
