@@ -9,7 +9,7 @@ A block holds 8 x 8 x 8 voxels in the order [z][y][x]; voxel (i, j, k) of block 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -91,6 +91,8 @@ class BlockGrid:
         self._clock = 0
         self._used = np.zeros(self.capacity, np.int64)  # by buffer index: when last asked for
         self._version = np.zeros(self.capacity, np.int64)  # by buffer index: see ``mark_changed``
+        # Called with the packed keys that ``activate`` was asked for, before anything is done about them.
+        self.watchers: list[Callable[[NDArray[np.int64]], None]] = []
 
     @property
     def grid(self) -> Any:
@@ -157,6 +159,8 @@ class BlockGrid:
                 then. Or the disk fails.
         """
         self._clock += 1
+        for watcher in self.watchers:
+            watcher(packed)
         found = find_blocks(self._index, packed)
         missing = packed[found < 0]
         if len(missing):

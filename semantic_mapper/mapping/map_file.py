@@ -1,236 +1,267 @@
-"""The map on disk: ``map.npz``, a zip of ``manifest.json`` and compressed .npy arrays that ``numpy.load`` can open.
+"""The map on disk: ``map.npz``, a zip of compressed .npy arrays in chunks of blocks, and ``manifest.json``.
 
-Only voxels that hold something are stored: TSDF, weight and colour where there was a measurement, evidence and votes
-where there was a vote. The manifest carries the format version, configuration, label set, counters, and for each
-array its dtype, shape and SHA-256. A file appears under its name whole and flushed, or not at all.
+``numpy.load`` opens it: array ``tsdf`` of the first chunk is ``"000000/tsdf"``. Only voxels that hold something are
+stored: TSDF, weight and colour where there was a measurement, evidence and votes where there was a vote. Blocks stand
+in lexicographic order, and nothing in the file depends on when or where it was written: the same map gives the same
+bytes. The manifest (``map_manifest``) holds a SHA-256 of each chunk; its own is the comment of the zip.
+
+Writing and reading take memory for one chunk, whatever the size of the map.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
-import json
-import os
+import struct
 import zipfile
 import zlib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.config import VoxelMapConfig, convert_config, to_plain
-from semantic_mapper.errors import ConfigError, LabelError, MapError
-from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.block_grid import BLOCK_VOXELS
-from semantic_mapper.mapping.map_types import MapState
+from semantic_mapper.errors import MapError
+from semantic_mapper.mapping.block_grid import BLOCK_SIDE
+from semantic_mapper.mapping.block_index import KEY_LIMIT, pack_keys
+from semantic_mapper.mapping.block_store import BLOCK_VOXELS, BlockValues
+from semantic_mapper.mapping.map_manifest import (
+    MEND,
+    MapChunk,
+    MapManifest,
+    digest,
+    encode_manifest,
+    parse_manifest,
+)
+from semantic_mapper.mapping.replacing import replacing
 
-FORMAT = "semantic-mapper voxel map"
-FORMAT_VERSION = 1
+BlockPart = tuple[NDArray[np.int32], BlockValues]  # keys (B, 3) and voxels
+
 _MANIFEST = "manifest.json"
+_MAX_MANIFEST_BYTES = 64 << 20  # 100 million blocks
+_COMMENT = b"sha256 of manifest.json: "
+_END_BYTES = 22  # of a zip's last record, without the comment
 _COMPRESSION_LEVEL = 1  # measured: higher levels take several times as long for a few percent
-_HEADER_BYTES = 4096  # room for an .npy header
+_ARRAYS = {  # name -> dtype; in the order of the file
+    "keys": "<i4",  # (B, 3) block coordinates
+    "measured": "|u1",  # (B, 64) bit mask of the voxels with weight > 0: M of them
+    "voted": "|u1",  # (B, 64) bit mask of the voxels with votes > 0: V of them
+    "tsdf": "<f4",  # (M,)
+    "weight": "<f4",  # (M,)
+    "color": "<f4",  # (M, 3)
+    "evidence": "<f4",  # (V, L)
+    "votes": "<f4",  # (V,)
+}
+_UNREADABLE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError, OSError)
 
 
-def write_map(path: Path, state: MapState) -> None:
+def write_map(path: Path, manifest: MapManifest, parts: Iterable[BlockPart]) -> MapManifest:
     """Write a map, replacing a file of that name in one step.
+
+    Args:
+        path: The file.
+        manifest: Its settings, classes and counters; what depends on the blocks is filled in here.
+        parts: Blocks in lexicographic order, ``CHUNK_BLOCKS`` at a time and at last the rest.
+
+    Returns:
+        The manifest as written.
 
     Raises:
         MapError: the file cannot be written; one that was there before is untouched.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            _write_members(file, state)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise MapError(f"{path}: cannot write the map: {error}") from error
-
-
-def read_map(path: Path) -> MapState:
-    """Read a map written by ``write_map``.
-
-    Raises:
-        MapError: no such file, not a map, of a newer format, or damaged; says which part.
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            manifest = _read_manifest(path, archive)
-            config, label_set = _read_settings(path, manifest)
-            arrays = {name: _read_array(path, archive, name, entry) for name, entry in _entries(path, manifest, config)}
-            return _unpack(path, manifest, config, label_set, arrays)
-    except FileNotFoundError as error:
-        raise MapError(f"{path}: no such map file") from error
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, OSError) as error:
-        raise MapError(f"{path}: the map file is damaged or not a map: {error}. {_MEND}") from error
-
-
-_MEND = "Use another copy, or make the map anew from its log with `semantic-mapper replay`"
-_ARRAYS = {  # name -> (dtype, shape after the first axis; None = flat)
-    "keys": ("<i4", (3,)),
-    "measured": ("|u1", (BLOCK_VOXELS // 8,)),  # bit mask of the voxels with weight > 0
-    "voted": ("|u1", (BLOCK_VOXELS // 8,)),  # bit mask of the voxels with votes > 0
-    "tsdf": ("<f4", ()),
-    "weight": ("<f4", ()),
-    "color": ("<f4", (3,)),
-    "evidence": ("<f4", None),  # (L,)
-    "votes": ("<f4", ()),
-}
-
-
-def _pack(state: MapState) -> dict[str, NDArray[Any]]:
-    measured, voted = state.weight > 0, state.votes > 0
-    return {
-        "keys": state.keys,
-        "measured": np.packbits(measured, axis=1),
-        "voted": np.packbits(voted, axis=1),
-        "tsdf": state.tsdf[measured],
-        "weight": state.weight[measured],
-        "color": state.color[measured],
-        "evidence": state.evidence[voted],
-        "votes": state.votes[voted],
-    }
-
-
-def _unpack(
-    path: Path, manifest: dict[str, Any], config: VoxelMapConfig, label_set: LabelSet, arrays: dict[str, NDArray[Any]]
-) -> MapState:
-    blocks = len(arrays["keys"])
-    measured = np.unpackbits(arrays["measured"], axis=1).astype(bool)
-    voted = np.unpackbits(arrays["voted"], axis=1).astype(bool)
-    sizes = (len(measured), len(voted), len(arrays["tsdf"]), len(arrays["votes"]))
-    if sizes != (blocks, blocks, int(measured.sum()), int(voted.sum())) or (
-        len(arrays["weight"]) != sizes[2] or len(arrays["color"]) != sizes[2] or len(arrays["evidence"]) != sizes[3]
+    chunks: list[MapChunk] = []
+    corners: list[NDArray[np.int32]] = []
+    with (
+        replacing(path) as file,
+        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=_COMPRESSION_LEVEL) as archive,
     ):
-        raise MapError(f"{path}: the arrays do not fit each other ({blocks} blocks). {_MEND}")
-    full: dict[str, NDArray[np.float32]] = {}
-    for name, mask in {
-        "tsdf": measured,
-        "weight": measured,
-        "color": measured,
-        "evidence": voted,
-        "votes": voted,
-    }.items():
-        full[name] = np.zeros((*mask.shape, *arrays[name].shape[1:]), np.float32)
-        full[name][mask] = arrays[name]
-    counters = manifest["counters"]
-    return MapState(config, label_set, int(counters["frames"]), int(counters["last_stamp_ns"]), arrays["keys"], **full)
-
-
-def _write_members(file: io.BufferedWriter, state: MapState) -> None:
-    entries: dict[str, dict[str, Any]] = {}
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=_COMPRESSION_LEVEL) as archive:
-        for name, array in _pack(state).items():
-            buffer = io.BytesIO()
-            np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
-            content = buffer.getbuffer()
-            entries[name] = {
-                "dtype": array.dtype.str,
-                "shape": list(array.shape),
-                "sha256": hashlib.sha256(content).hexdigest(),
-            }
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                member.write(content)
-        archive.writestr(_MANIFEST, json.dumps(_manifest(state, entries), indent=1))
-
-
-def _manifest(state: MapState, entries: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    labels = state.label_set
-    return {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
-        "config": to_plain(state.config),
-        "label_set": {
-            "name": labels.name,
-            "ids": labels.ids,
-            "names": labels.names,
-            "colors": labels.colors,
-            "ignore_id": labels.ignore_id,
-        },
-        "counters": {"frames": state.frames, "last_stamp_ns": state.last_stamp_ns, "blocks": len(state.keys)},
-        "arrays": entries,
-    }
-
-
-def _read_manifest(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
-    try:
-        manifest = json.loads(archive.read(_MANIFEST))
-        kind, version = manifest["format"], int(manifest["version"])
-    except (KeyError, ValueError, TypeError) as error:
-        raise MapError(f"{path}: not a map file: no readable {_MANIFEST} ({error}). {_MEND}") from error
-    if kind != FORMAT:
-        raise MapError(f"{path}: not a voxel map but '{kind}'")
-    if version != FORMAT_VERSION:
-        raise MapError(
-            f"{path}: map format {version}, this version reads format {FORMAT_VERSION}; update semantic-mapper "
-            "or make the map anew from its log"
-        )
+        for keys, values in parts:
+            chunks.append(_write_chunk(archive, len(chunks), keys, values))
+            corners += [keys.min(axis=0), keys.max(axis=0) + 1]
+        blocks = sum(chunk.blocks for chunk in chunks)
+        bounds = _bounds_m(corners, manifest.config.voxel_size_m)
+        manifest = msgspec.structs.replace(manifest, blocks=blocks, bounds_m=bounds, chunks=tuple(chunks))
+        content = encode_manifest(manifest)
+        with archive.open(_MANIFEST, "w") as member:
+            member.write(content)
+        archive.comment = _COMMENT + digest(content).encode()
     return manifest
 
 
-def _read_settings(path: Path, manifest: dict[str, Any]) -> tuple[VoxelMapConfig, LabelSet]:
+def describe_map(path: Path) -> MapManifest:
+    """What a saved map says of itself; its blocks are not read, and not checked.
+
+    Raises:
+        MapError: no such file, not a map, of another format version, or damaged where it says this.
+    """
+    with open_map(path) as reader:
+        return reader.manifest
+
+
+@contextmanager
+def open_map(path: Path) -> Iterator[MapReader]:
+    """Open a saved map to be read chunk by chunk.
+
+    Raises:
+        MapError: see ``describe_map``.
+    """
     try:
-        config = convert_config(manifest["config"], VoxelMapConfig, f"{path}: {_MANIFEST}")
-        labels = manifest["label_set"]
-        label_set = LabelSet(
-            str(labels["name"]),
-            tuple(int(i) for i in labels["ids"]),
-            tuple(str(n) for n in labels["names"]),
-            tuple((int(r), int(g), int(b)) for r, g, b in labels["colors"]),
-            int(labels["ignore_id"]),
-        )
-        _ = int(manifest["counters"]["frames"]), int(manifest["counters"]["last_stamp_ns"])
-    except (KeyError, ValueError, TypeError, LabelError, ConfigError) as error:
-        raise MapError(f"{path}: {_MANIFEST} cannot be used: {error}. {_MEND}") from error
-    return config, label_set
+        file = path.open("rb")
+    except FileNotFoundError as error:
+        raise MapError(f"{path}: no such map file") from error
+    except OSError as error:
+        raise MapError(f"{path}: damaged or not a map: {error.strerror}") from error
+    with file:
+        with _told(str(path), "damaged or not a map"):
+            archive = zipfile.ZipFile(file)
+        with archive:
+            yield MapReader(path, archive, _read_manifest(path, file, archive))
 
 
-def _entries(path: Path, manifest: dict[str, Any], config: VoxelMapConfig) -> list[tuple[str, dict[str, Any]]]:
-    """The manifest's array entries, checked against the format before anything is allocated for them."""
-    classes = len(manifest["label_set"]["ids"])
-    checked = []
-    for name, (dtype, tail) in _ARRAYS.items():
-        try:
-            entry = manifest["arrays"][name]
-            shape = tuple(int(n) for n in entry["shape"])
-            fits = entry["dtype"] == dtype and shape[1:] == ((classes,) if tail is None else tail)
-            fits = fits and 0 <= shape[0] <= config.max_blocks * BLOCK_VOXELS
-        except (KeyError, ValueError, TypeError, IndexError) as error:
-            raise MapError(f"{path}: {_MANIFEST} says nothing usable of array '{name}' ({error}). {_MEND}") from error
-        if not fits:
-            raise MapError(f"{path}: array '{name}' has dtype {entry['dtype']} and shape {shape}: not of this format")
-        checked.append((name, {"dtype": dtype, "shape": shape, "sha256": entry.get("sha256")}))
-    return checked
+class MapReader:
+    """A saved map that is open.
+
+    Args:
+        manifest: What it says of itself, checked.
+    """
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile, manifest: MapManifest) -> None:
+        self.manifest = manifest
+        self._path = path
+        self._archive = archive
+
+    def parts(self) -> Iterator[BlockPart]:
+        """All blocks in lexicographic order, a chunk at a time, each checked before it is given out.
+
+        Raises:
+            MapError: a chunk is damaged; says which.
+        """
+        last = -1
+        for n, chunk in enumerate(self.manifest.chunks):
+            where = f"{self._path}: chunk {n} of {len(self.manifest.chunks)}"
+            keys, values = _unpack(self._read_chunk(n, chunk, where), chunk, where)
+            packed = pack_keys(keys)
+            if np.abs(keys.astype(np.int64)).max() >= KEY_LIMIT or not (np.diff(packed, prepend=last) > 0).all():
+                raise MapError(f"{where}: block coordinates are out of range or not in order. {MEND}")
+            last = int(packed[-1])
+            yield keys, values
+
+    def _read_chunk(self, n: int, chunk: MapChunk, where: str) -> dict[str, NDArray[Any]]:
+        arrays: dict[str, NDArray[Any]] = {}
+        hashed = hashlib.sha256()
+        for name, shape in _shapes(chunk, len(self.manifest.label_set)).items():
+            head = _npy_head(_ARRAYS[name], shape)
+            size = len(head) + int(np.prod(shape)) * np.dtype(_ARRAYS[name]).itemsize
+            content = _read_member(self._archive, _member(n, name), size, f"{where}: {name}")
+            if not content.startswith(head):
+                raise MapError(f"{where}: {name} is not an array {_ARRAYS[name]} of shape {shape}. {MEND}")
+            hashed.update(content)
+            arrays[name] = np.frombuffer(content, _ARRAYS[name], offset=len(head)).reshape(shape)
+        if hashed.hexdigest() != chunk.sha256:
+            raise MapError(f"{where} is damaged: its SHA-256 is not the manifest's. {MEND}")
+        return arrays
 
 
-def _read_array(path: Path, archive: zipfile.ZipFile, name: str, entry: dict[str, Any]) -> NDArray[Any]:
-    member = f"{name}.npy"
-    expected = int(np.prod(entry["shape"])) * np.dtype(entry["dtype"]).itemsize
+def _member(n: int, name: str) -> str:
+    return f"{n:06d}/{name}.npy"
+
+
+def _write_chunk(archive: zipfile.ZipFile, n: int, keys: NDArray[np.int32], values: BlockValues) -> MapChunk:
+    measured, voted = values.weight > 0, values.votes > 0
+    arrays = {
+        "keys": keys,
+        "measured": np.packbits(measured, axis=1),
+        "voted": np.packbits(voted, axis=1),
+        "tsdf": values.tsdf[measured],
+        "weight": values.weight[measured],
+        "color": values.color[measured],
+        "evidence": values.evidence[voted],
+        "votes": values.votes[voted],
+    }
+    hashed = hashlib.sha256()
+    for name, dtype in _ARRAYS.items():
+        array = np.ascontiguousarray(arrays[name], dtype)
+        with archive.open(_member(n, name), "w") as member:
+            for content in (_npy_head(dtype, array.shape), array.reshape(-1).view(np.uint8).data):
+                hashed.update(content)
+                member.write(content)
+    return MapChunk(blocks=len(keys), measured=int(measured.sum()), voted=int(voted.sum()), sha256=hashed.hexdigest())
+
+
+def _unpack(arrays: dict[str, NDArray[Any]], chunk: MapChunk, where: str) -> BlockPart:
+    measured = np.unpackbits(arrays["measured"], axis=1).astype(np.bool_)
+    voted = np.unpackbits(arrays["voted"], axis=1).astype(np.bool_)
+    if (int(measured.sum()), int(voted.sum())) != (chunk.measured, chunk.voted):
+        raise MapError(f"{where}: its masks and its values do not fit each other. {MEND}")
+    full: dict[str, NDArray[np.float32]] = {}
+    for name in BlockValues._fields:
+        mask = voted if name in ("evidence", "votes") else measured
+        full[name] = np.zeros((*mask.shape, *arrays[name].shape[1:]), np.float32)
+        full[name][mask] = arrays[name]
+    return arrays["keys"], BlockValues(**full)
+
+
+def _shapes(chunk: MapChunk, classes: int) -> dict[str, tuple[int, ...]]:
+    mask, measured, voted = (chunk.blocks, BLOCK_VOXELS // 8), (chunk.measured,), (chunk.voted,)
+    shapes = ((chunk.blocks, 3), mask, mask, measured, measured, (*measured, 3), (*voted, classes), voted)
+    return dict(zip(_ARRAYS, shapes, strict=True))
+
+
+def _npy_head(dtype: str, shape: tuple[int, ...]) -> bytes:
+    """What stands before the values in an .npy file of version 1.0; NumPy's own differs between its versions."""
+    text = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape!r}, }}"
+    padded = text.ljust(128 - 10 - 1) + "\n"  # starts on a multiple of 64 bytes
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(padded)) + padded.encode("ascii")
+
+
+def _bounds_m(corners: list[NDArray[np.int32]], voxel_size_m: float) -> Any:
+    if not corners:
+        return None
+    both = np.stack((np.min(corners, axis=0), np.max(corners, axis=0))) * (BLOCK_SIDE * voxel_size_m)
+    return tuple(tuple(float(x) for x in corner) for corner in both)
+
+
+def _read_manifest(path: Path, file: BinaryIO, archive: zipfile.ZipFile) -> MapManifest:
+    where = f"{path}: {_MANIFEST}"
+    names = archive.namelist()
+    if _MANIFEST not in names:
+        raise MapError(f"{path}: not a map file: there is no {_MANIFEST} in it")
+    size = archive.getinfo(_MANIFEST).file_size
+    if size > _MAX_MANIFEST_BYTES:
+        raise MapError(f"{where} is damaged: {size} bytes are too many. {MEND}")
+    content = _read_member(archive, _MANIFEST, size, where)
+    manifest = parse_manifest(content, where)
+    comment = _COMMENT + digest(content).encode()
+    if archive.comment != comment:
+        raise MapError(f"{where} is damaged: its SHA-256 is not the one at the end of the file. {MEND}")
+    with _told(str(path), "cannot be read"):
+        file.seek(-_END_BYTES - len(comment), 2)
+        end = file.read()
+    if not (end.startswith(b"PK\5\6") and end.endswith(comment)):
+        raise MapError(f"{path}: damaged: something stands behind its end. {MEND}")
+    if names != [*(_member(n, name) for n in range(len(manifest.chunks)) for name in _ARRAYS), _MANIFEST]:
+        raise MapError(f"{path}: damaged: arrays are missing, or others are there. {MEND}")
+    return manifest
+
+
+def _read_member(archive: zipfile.ZipFile, name: str, size: int, where: str) -> bytes:
+    """A member that must have ``size`` bytes."""
+    info = archive.getinfo(name)
+    if info.file_size != size or info.compress_type != zipfile.ZIP_DEFLATED or info.flag_bits & 1:
+        raise MapError(f"{where} is damaged: not {size} compressed bytes. {MEND}")
+    with _told(where, "is damaged"), archive.open(info) as member:
+        content = member.read()
+    if len(content) != size:
+        raise MapError(f"{where} is damaged: {len(content)} bytes instead of {size}. {MEND}")
+    return content
+
+
+@contextmanager
+def _told(where: str, what: str) -> Iterator[None]:
+    """What zip and decompression find wrong is an error of ours."""
     try:
-        size = archive.getinfo(member).file_size
-        content = archive.read(member) if size <= expected + _HEADER_BYTES else b""
-    except KeyError as error:
-        raise MapError(f"{path}: array '{name}' is missing. {_MEND}") from error
-    except zipfile.BadZipFile as error:
-        raise MapError(f"{path}: array '{name}' is damaged: {error}. {_MEND}") from error
-    if hashlib.sha256(content).hexdigest() != entry["sha256"]:
-        raise MapError(f"{path}: array '{name}' is damaged: its SHA-256 is not the manifest's. {_MEND}")
-    array = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
-    if array.dtype.str != entry["dtype"] or array.shape != entry["shape"]:
-        raise MapError(
-            f"{path}: array '{name}' is {array.dtype.str} {array.shape}, not what the manifest says. {_MEND}"
-        )
-    return array
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the rename itself survive a power cut."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        yield
+    except _UNREADABLE as error:
+        raise MapError(f"{where}: {what}: {error}. {MEND}") from error

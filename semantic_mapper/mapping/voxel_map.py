@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import structlog
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
@@ -16,10 +18,11 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.allocation import Camera, blocks_in_band, blocks_in_view, make_camera
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys
-from semantic_mapper.mapping.block_store import BlockValues
 from semantic_mapper.mapping.extract import join_meshes, surface_voxels, triangle_mesh
 from semantic_mapper.mapping.fusion import FusionLimits, Votes, fuse_blocks, make_votes, no_votes
-from semantic_mapper.mapping.map_file import read_map, write_map
+from semantic_mapper.mapping.grid_snapshot import GridSnapshot
+from semantic_mapper.mapping.map_file import BlockPart, open_map, write_map
+from semantic_mapper.mapping.map_manifest import CHUNK_BLOCKS, MapManifest
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapState, MapView
 from semantic_mapper.mapping.ray_casting import cast_rays
 from semantic_mapper.mapping.readout import read_points
@@ -33,7 +36,6 @@ _KERNEL_LOCK = threading.RLock()
 
 BoolImage = NDArray[np.bool_]
 POINT_FIELDS = ("xyz", "rgb", "label", "confidence")
-LOADED_AT_ONCE = 256  # blocks
 
 
 class VoxelMap:
@@ -212,37 +214,52 @@ class VoxelMap:
         }
 
     def save(self, path: Path) -> None:
-        """Write the map to one file (``map.npz``), whole or not at all.
+        """Write the map as it is now to one file (``map.npz``), whole or not at all, in memory for ``CHUNK_BLOCKS``.
+
+        Other threads may go on integrating: they wait for a copy of ``CHUNK_BLOCKS`` at most, and what they change
+        before it is written is first put aside in the folder for temporary files.
 
         Raises:
-            MapError: the file cannot be written.
+            MapError: the file cannot be written; one that was there before is as it was.
         """
-        state = self._state()
-        write_map(path, state)
-        _log.info("map_saved", path=str(path), blocks=len(state.keys), bytes=path.stat().st_size)
+        with _KERNEL_LOCK:
+            snapshot = GridSnapshot(self._grid, len(self.label_set))
+            manifest = MapManifest(
+                config=self.config,
+                label_set=self.label_set,
+                frames=self.frames,
+                last_stamp_ns=self.last_stamp_ns,
+            )
+        try:
+            manifest = write_map(path, manifest, _parts(snapshot))
+        finally:
+            with _KERNEL_LOCK:
+                snapshot.close()
+        _log.info("map_saved", path=str(path), blocks=manifest.blocks, bytes=path.stat().st_size)
 
     @classmethod
-    def load(cls, path: Path) -> VoxelMap:
+    def load(cls, path: Path, memory_mb: int | None = None) -> VoxelMap:
         """Read a saved map; it is the saved one bit for bit and can go on integrating.
+
+        Args:
+            path: What ``save`` wrote.
+            memory_mb: In place of the saved setting, for a machine with less memory, say; 0 = no limit.
 
         Raises:
             MapError: no such file, not a map, of another format version, or damaged (and what is).
         """
-        state = read_map(path)
-        try:
-            loaded = cls(state.config, state.label_set)
-        except ConfigError as error:
-            raise MapError(f"{path}: the saved configuration cannot be used: {error}") from error
-        with _KERNEL_LOCK:
-            packed = pack_keys(state.keys)
-            if len(np.unique(packed)) != len(packed):
-                raise MapError(f"{path}: block coordinates are not unique")
-            for start in range(0, len(packed), LOADED_AT_ONCE):
-                part = slice(start, start + LOADED_AT_ONCE)
-                values = BlockValues(*(getattr(state, name)[part] for name in BlockValues._fields))
-                blocks = loaded._grid.fill(packed[part], values)
-                loaded._grid.mark_changed(blocks, state.frames)
-        loaded.frames, loaded.last_stamp_ns = state.frames, state.last_stamp_ns
+        with open_map(path) as reader:
+            saved = reader.manifest
+            config = saved.config if memory_mb is None else replace(saved.config, memory_mb=memory_mb)
+            try:
+                loaded = cls(config, saved.label_set)
+            except (ConfigError, RuntimeError) as error:  # RuntimeError: Open3D has no memory for initial_blocks
+                raise MapError(f"{path}: the saved configuration cannot be used: {error}") from error
+            for keys, values in reader.parts():
+                with _KERNEL_LOCK:
+                    blocks = loaded._grid.fill(pack_keys(keys), values)
+                    loaded._grid.mark_changed(blocks, saved.frames)
+        loaded.frames, loaded.last_stamp_ns = saved.frames, saved.last_stamp_ns
         return loaded
 
     def _state(self) -> MapState:
@@ -312,6 +329,15 @@ class VoxelMap:
                 "give a softmax, or mark the pixels as not known"
             )
         return votes
+
+
+def _parts(snapshot: GridSnapshot) -> Iterator[BlockPart]:
+    while True:
+        with _KERNEL_LOCK:
+            if not len(snapshot):
+                return
+            part = snapshot.read(CHUNK_BLOCKS)
+        yield part
 
 
 def _expect_dtype(array: NDArray[np.generic], dtype: type[np.generic], name: str) -> None:

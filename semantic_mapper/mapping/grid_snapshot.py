@@ -1,0 +1,75 @@
+"""The blocks of a grid as they were at one moment, read part by part while the grid goes on changing."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.errors import MapError
+from semantic_mapper.mapping.block_grid import BlockGrid
+from semantic_mapper.mapping.block_index import pack_keys, unpack_keys
+from semantic_mapper.mapping.block_store import BlockStore, BlockValues
+
+
+class GridSnapshot:
+    """Copy on write: blocks that may be about to change are put on disk first, unless they have been read already.
+
+    That costs a copy of each block that frames touch meanwhile, once. Whoever calls ``read``, ``close`` or a method of
+    the grid holds the lock of the map.
+
+    Args:
+        grid: To be read; the snapshot is of now.
+        classes: L.
+    """
+
+    def __init__(self, grid: BlockGrid, classes: int) -> None:
+        self._grid = grid
+        self._classes = classes
+        self._waiting = pack_keys(grid.all_keys())  # not read yet, sorted
+        self._kept: BlockStore | None = None
+        self._failure: MapError | None = None
+        grid.watchers.append(self._keep)
+
+    def __len__(self) -> int:
+        """Blocks that wait to be read."""
+        return len(self._waiting)
+
+    def read(self, count: int) -> tuple[NDArray[np.int32], BlockValues]:
+        """The next ``count`` blocks (B <= count): keys (B, 3) in lexicographic order, and voxels.
+
+        Raises:
+            MapError: blocks could not be kept, or not be read back, because a disk is full or fails.
+        """
+        if self._failure is not None:
+            raise self._failure
+        part, self._waiting = self._waiting[:count], self._waiting[count:]
+        values = self._grid.read(part)
+        kept = self._kept
+        if kept is not None:
+            old = np.fromiter((int(key) in kept for key in part), np.bool_, len(part))
+            for now, then in zip(values, kept.get(part[old]), strict=True):
+                now[old] = then
+            kept.drop(part[old])
+        return unpack_keys(part), values
+
+    def close(self) -> None:
+        """Let the grid change without being watched."""
+        self._grid.watchers.remove(self._keep)
+        if self._kept is not None:
+            self._kept.close()
+
+    def _keep(self, packed: NDArray[np.int64]) -> None:
+        """Blocks (B,) are about to be used. A failure is the reader's, not the frame's that is being fused."""
+        if self._failure is not None or not len(self._waiting):
+            return
+        slots = np.minimum(np.searchsorted(self._waiting, packed), len(self._waiting) - 1)
+        found = packed[self._waiting[slots] == packed]
+        try:
+            if self._kept is None:
+                self._kept = BlockStore(self._classes)
+            kept = self._kept
+            new = found[np.fromiter((int(key) not in kept for key in found), np.bool_, len(found))]
+            if len(new):
+                kept.put(new, np.zeros(len(new), np.int64), self._grid.read(new))
+        except MapError as error:
+            self._failure = error
