@@ -114,7 +114,7 @@ def open_map(path: Path) -> Iterator[MapReader]:
     except OSError as error:
         raise MapError(f"{path}: damaged or not a map: {error.strerror}") from error
     with file:
-        with _told(str(path), "damaged or not a map"):
+        with _told(f"{path}: damaged or not a map"):
             archive = zipfile.ZipFile(file)
         with archive:
             yield MapReader(path, archive, _read_manifest(path, file, archive))
@@ -236,7 +236,7 @@ def _read_manifest(path: Path, file: BinaryIO, archive: zipfile.ZipFile) -> MapM
     comment = _COMMENT + digest(content).encode()
     if archive.comment != comment:
         raise MapError(f"{where} is damaged: its SHA-256 is not the one at the end of the file. {MEND}")
-    with _told(str(path), "cannot be read"):
+    with _told(f"{path}: cannot be read"):
         file.seek(-_END_BYTES - len(comment), 2)
         end = file.read()
     if not (end.startswith(b"PK\5\6") and end.endswith(comment)):
@@ -251,7 +251,7 @@ def _read_member(archive: zipfile.ZipFile, name: str, size: int, where: str) -> 
     info = archive.getinfo(name)
     if info.file_size != size or info.compress_type != zipfile.ZIP_DEFLATED or info.flag_bits & 1:
         raise MapError(f"{where} is damaged: not {size} compressed bytes. {MEND}")
-    with _told(where, "is damaged"), archive.open(info) as member:
+    with _told(f"{where} is damaged"), archive.open(info) as member:
         content = member.read()
     if len(content) != size:
         raise MapError(f"{where} is damaged: {len(content)} bytes instead of {size}. {MEND}")
@@ -259,9 +259,9 @@ def _read_member(archive: zipfile.ZipFile, name: str, size: int, where: str) -> 
 
 
 @contextmanager
-def _told(where: str, what: str) -> Iterator[None]:
+def _told(what: str) -> Iterator[None]:
     """What zip and decompression find wrong is an error of ours."""
     try:
         yield
     except _UNREADABLE as error:
-        raise MapError(f"{where}: {what}: {error}. {MEND}") from error
+        raise MapError(f"{what}: {error}. {MEND}") from error

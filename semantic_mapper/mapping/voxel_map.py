@@ -254,7 +254,10 @@ class VoxelMap:
             try:
                 loaded = cls(config, saved.label_set)
             except (ConfigError, RuntimeError) as error:  # RuntimeError: Open3D has no memory for initial_blocks
-                raise MapError(f"{path}: the saved configuration cannot be used: {error}") from error
+                raise MapError(
+                    f"{path}: the saved configuration cannot be used: {error}. Where memory is short, load with a "
+                    "memory_mb of your own"
+                ) from error
             for keys, values in reader.parts():
                 with _KERNEL_LOCK:
                     blocks = loaded._grid.fill(pack_keys(keys), values)
