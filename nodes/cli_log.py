@@ -1,4 +1,4 @@
-"""Verbs about logs: ``import``, ``info``, ``recover``."""
+"""Verbs about what is on disk: ``import``, ``info``, ``recover``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from nodes.verb import EXIT_FAILED, verb
 
 LISTED = 10  # skipped files and damages that are shown one by one
 
-LogArgument = Annotated[Path, typer.Argument(help="Recorded log (.mcap).")]
+MAP_SUFFIX = ".npz"
 
 
 @verb
@@ -67,26 +67,41 @@ def import_(
 
 @verb
 def info(
-    log: LogArgument,
+    file: Annotated[Path, typer.Argument(help="Recorded log (.mcap), or saved map (.npz).")],
     json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
 ) -> int:
-    """Say what a log holds: topics, frames, cameras, classes, duration, size, damage.
+    """Say what a log holds (topics, frames, cameras, duration, damage), or a map (frames, size, blocks, classes).
 
-    Reads every message, so that damage anywhere is found; exit code 1 where there is any.
+    Of a log it reads every message, so that damage anywhere is found; exit code 1 where there is any. Of a map it reads
+    what the file says of itself, which is quick however large the map is.
 
     Example: semantic-mapper info kitchen.mcap
+    Example: semantic-mapper info runs/demo/map.npz
     """
     output = Output.guarded()
+    if file.suffix == MAP_SUFFIX:
+        return _map_info(output, file, json)
     from nodes.log_info import describe_log, info_table
 
     with frame_progress("read", None, unit="messages") as bar:
-        found = describe_log(log, bar.advance)
+        found = describe_log(file, bar.advance)
     if json:
         output.json(found)
     else:
         output.print(info_table(found))
-        _print_damage(output, log, found)
+        _print_damage(output, file, found)
     return EXIT_FAILED if found["damage"] else 0
+
+
+def _map_info(output: Output, file: Path, json: bool) -> int:
+    from nodes.map_info import map_summary, map_table
+
+    found = map_summary(file)
+    if json:
+        output.json(found)
+    else:
+        output.print(map_table(found))
+    return 0
 
 
 def _print_damage(output: Output, log: Path, found: dict[str, Any]) -> None:

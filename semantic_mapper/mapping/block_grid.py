@@ -170,6 +170,11 @@ class BlockGrid:
         self._used[found] = self._clock
         return found
 
+    def reserve(self, blocks: int) -> None:
+        """Make room for so many blocks at once, as far as the limit on memory goes."""
+        if min(blocks, self._max_resident) > self.capacity:
+            self._grow(blocks)
+
     def page_in(self, packed: NDArray[np.int64]) -> None:
         """Make sure that the first of these existing blocks (B,) are in memory: as many as it has room for."""
         self.activate(packed[: self._max_resident])

@@ -42,7 +42,8 @@ BlockPart = tuple[NDArray[np.int32], BlockValues]  # keys (B, 3) and voxels
 _MANIFEST = "manifest.json"
 _MAX_MANIFEST_BYTES = 64 << 20  # 100 million blocks
 _COMMENT = b"sha256 of manifest.json: "
-_END_BYTES = 22  # of a zip's last record, without the comment
+_COMMENT_BYTES = len(_COMMENT) + 64
+_END_BYTES = 22 + _COMMENT_BYTES  # of a zip's last record
 _COMPRESSION_LEVEL = 1  # measured: higher levels take several times as long for a few percent
 _ARRAYS = {  # name -> dtype; in the order of the file
     "keys": "<i4",  # (B, 3) block coordinates
@@ -233,14 +234,13 @@ def _read_manifest(path: Path, file: BinaryIO, archive: zipfile.ZipFile) -> MapM
         raise MapError(f"{where} is damaged: {size} bytes are too many. {MEND}")
     content = _read_member(archive, _MANIFEST, size, where)
     manifest = parse_manifest(content, where)
-    comment = _COMMENT + digest(content).encode()
-    if archive.comment != comment:
-        raise MapError(f"{where} is damaged: its SHA-256 is not the one at the end of the file. {MEND}")
     with _told(f"{path}: cannot be read"):
-        file.seek(-_END_BYTES - len(comment), 2)
+        file.seek(-_END_BYTES, 2)
         end = file.read()
-    if not (end.startswith(b"PK\5\6") and end.endswith(comment)):
-        raise MapError(f"{path}: damaged: something stands behind its end. {MEND}")
+    if not (end.startswith(b"PK\5\6") and end[-_COMMENT_BYTES:].startswith(_COMMENT)):
+        raise MapError(f"{path}: damaged: it is cut off, or something stands behind its end. {MEND}")
+    if archive.comment != _COMMENT + digest(content).encode():
+        raise MapError(f"{where} is damaged: its SHA-256 is not the one at the end of the file. {MEND}")
     if names != [*(_member(n, name) for n in range(len(manifest.chunks)) for name in _ARRAYS), _MANIFEST]:
         raise MapError(f"{path}: damaged: arrays are missing, or others are there. {MEND}")
     return manifest

@@ -253,7 +253,8 @@ class VoxelMap:
             config = saved.config if memory_mb is None else replace(saved.config, memory_mb=memory_mb)
             try:
                 loaded = cls(config, saved.label_set)
-            except (ConfigError, RuntimeError) as error:  # RuntimeError: Open3D has no memory for initial_blocks
+                loaded._grid.reserve(saved.blocks)
+            except (ConfigError, RuntimeError) as error:  # RuntimeError: Open3D gets no memory
                 raise MapError(
                     f"{path}: the saved configuration cannot be used: {error}. Where memory is short, load with a "
                     "memory_mb of your own"

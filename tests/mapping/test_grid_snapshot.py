@@ -46,7 +46,7 @@ def read_all(snapshot: GridSnapshot, between: list[np.ndarray], grid: BlockGrid)
 @pytest.mark.parametrize("memory_bytes", [0, 1], ids=["in memory", "most blocks on disk"])
 def test_a_snapshot_does_not_change_with_the_grid(memory_bytes: int, rng: np.random.Generator) -> None:
     grid = filled_grid(memory_bytes)
-    assert grid.stored_count == (BLOCKS - LEAST_RESIDENT if memory_bytes else 0) or grid.stored_count > 400
+    assert grid.stored_count >= BLOCKS - LEAST_RESIDENT if memory_bytes else grid.stored_count == 0
     before = grid.read(KEYS)
     new = pack_keys(np.array([[-5, 0, 0], [3, 3, 90], [50, 0, 0]], np.int32))
     between = [np.sort(np.append(rng.choice(KEYS, 120, replace=False), new)) for _ in range(7)]

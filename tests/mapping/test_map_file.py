@@ -107,7 +107,7 @@ def test_any_flipped_bit_is_found_or_harmless(saved: tuple[VoxelMap, Path], rng:
     voxel_map, path = saved
     good, state = path.read_bytes(), voxel_map.block_state()
     refused = 0
-    positions = [*rng.integers(0, len(good), 60), *range(0, 60, 3), *range(len(good) - 120, len(good), 3)]
+    positions = [*rng.integers(0, len(good), 60), *range(0, 60, 3), *range(len(good) - 1600, len(good), 5)]
     for position in positions:
         bad = bytearray(good)
         bad[position] ^= 1 << int(rng.integers(8))
@@ -118,7 +118,7 @@ def test_any_flipped_bit_is_found_or_harmless(saved: tuple[VoxelMap, Path], rng:
             refused += 1
         else:
             assert same(loaded.block_state(), state)  # a time stamp of the container, say
-    assert refused > 50
+    assert refused > 200
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.99])
@@ -128,13 +128,17 @@ def test_truncated_file_is_refused(saved: tuple[VoxelMap, Path], share: float) -
     path.write_bytes(content[: int(share * len(content))])
     with pytest.raises(MapError, match="damaged or not a map"):
         VoxelMap.load(path)
+    for lost in (1, 2, 30, 64, 100):
+        path.write_bytes(content[:-lost])
+        with pytest.raises(MapError, match="damaged"):
+            VoxelMap.load(path)
 
 
 @pytest.mark.parametrize("tail", [b"\0", b"x" * 5000, b"PK\5\6" + bytes(18)], ids=["byte", "long", "another end"])
 def test_a_file_with_something_behind_its_end_is_refused(saved: tuple[VoxelMap, Path], tail: bytes) -> None:
     path = saved[1]
     path.write_bytes(path.read_bytes() + tail)
-    with pytest.raises(MapError, match="damaged|not a map file"):
+    with pytest.raises(MapError, match=r"damaged|not a map file"):
         VoxelMap.load(path)
 
 

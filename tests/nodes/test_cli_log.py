@@ -1,4 +1,4 @@
-"""``import``, ``info`` and ``recover``."""
+"""``import``, ``info`` and ``recover`` of logs; ``info`` of maps."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 
 from semantic_mapper.types import PosedFrame
+from tests.mapping.test_voxel_map import fuse_sphere
+from tests.mapping.views import small_map
 from tests.nodes.support import error_line, run
 from tests.small import INTRINSICS, tiny_frames
 
@@ -62,6 +64,37 @@ def test_info_shows_topics_frames_and_classes(log: Path) -> None:
     assert done.returncode == 0, done.stderr
     for text in ("6 (6 with depth, 6 with labels)", "96x72", "topic frame/rooms", "rooms: wall, floor", "none"):
         assert text in done.stdout
+
+
+def test_info_of_a_map_says_what_it_is(tmp_path: Path) -> None:
+    voxel_map = small_map(voxel_size_m=0.03)
+    fuse_sphere(voxel_map, 3)
+    path = tmp_path / "map.npz"
+    voxel_map.save(path)
+    done = run("info", path)
+    assert done.returncode == 0, done.stderr
+    state = voxel_map.block_state()
+    low, high = state["keys"].min(axis=0) * 0.24, (state["keys"].max(axis=0) + 1) * 0.24
+    extent = " x ".join(f"{x:.2f}" for x in high - low)
+    for text in ("version 2", "3, the last one at", "3 cm", extent, "72", "three: table, cup, wall"):
+        assert text in done.stdout
+    found = json.loads(run("info", path, "--json").stdout)
+    assert (found["frames"], found["last_stamp_ns"], found["blocks"]) == (3, 1002, voxel_map.block_count)
+    np.testing.assert_allclose(found["bounds_m"], [low, high])
+    assert found["measured_voxels"] == (state["weight"] > 0).sum()
+    assert found["voted_voxels"] == (state["votes"] > 0).sum()
+    assert found["label_set"] == {"name": "three", "ids": [5, 9, 2], "classes": ["table", "cup", "wall"]}
+    assert found["config"]["voxel_size_m"] == 0.03 and found["size_bytes"] == path.stat().st_size
+
+
+def test_info_of_a_damaged_map_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    small_map().save(path)
+    assert "blocks" in run("info", path).stdout
+    path.write_bytes(path.read_bytes()[:-1])
+    done = run("info", path)
+    assert done.returncode == 1
+    assert "map.npz: damaged: it is cut off" in error_line(done.stderr)
 
 
 def test_damaged_log_is_reported_and_recovered(log: Path, tmp_path: Path) -> None:
