@@ -10,6 +10,8 @@ from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys, unpack_keys
 from semantic_mapper.mapping.block_store import BlockStore, BlockValues
 
+KEPT_AT_ONCE = 256  # blocks copied in memory
+
 
 class GridSnapshot:
     """Copy on write: blocks that may be about to change are put on disk first, unless they have been read already.
@@ -69,7 +71,8 @@ class GridSnapshot:
                 self._kept = BlockStore(self._classes)
             kept = self._kept
             new = found[np.fromiter((int(key) not in kept for key in found), np.bool_, len(found))]
-            if len(new):
-                kept.put(new, np.zeros(len(new), np.int64), self._grid.read(new))
+            for start in range(0, len(new), KEPT_AT_ONCE):
+                part = new[start : start + KEPT_AT_ONCE]
+                kept.put(part, np.zeros(len(part), np.int64), self._grid.read(part))
         except MapError as error:
             self._failure = error

@@ -1,4 +1,4 @@
-"""What a voxel map gives out, and what of it goes into a file: plain data."""
+"""What a voxel map gives out: plain data."""
 
 from __future__ import annotations
 

@@ -26,16 +26,15 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     """
     part = path.with_name(path.name + PART_SUFFIX)
     try:
-        file = _open_alone(part)
-        try:
-            with file:
+        with _open_alone(part) as file:
+            try:
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
-                os.replace(part, path)  # with the lock held: until then nobody else writes to it
-        except BaseException:
-            part.unlink(missing_ok=True)
-            raise
+                os.replace(part, path)
+            except BaseException:
+                part.unlink(missing_ok=True)
+                raise
         _sync_folder(path.parent)
     except OSError as error:
         reason = error.strerror or str(error)

@@ -35,7 +35,7 @@ def start_child(function: Callable[..., None], *arguments: Any) -> tuple[BasePro
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])
     ours, theirs = context.Pipe()
-    process = context.Process(target=function, args=(*arguments, theirs))
+    process = context.Process(target=function, args=(*arguments, theirs), daemon=True)
     process.start()
     theirs.close()
     return process, ours
