@@ -35,13 +35,13 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             except BaseException:
                 part.unlink(missing_ok=True)
                 raise
-        _sync_folder(path.parent)
     except OSError as error:
         reason = error.strerror or str(error)
         raise MapError(
             f"{path}: cannot write the map: {reason}. A file that was there before is as it was; make room, or choose "
             "another folder"
         ) from error
+    _sync_folder(path)
 
 
 def _open_alone(part: Path) -> BinaryIO:
@@ -69,10 +69,15 @@ def _is_still(handle: int, part: Path) -> bool:
         return False
 
 
-def _sync_folder(folder: Path) -> None:
+def _sync_folder(path: Path) -> None:
     """Make the rename itself survive a power cut."""
-    handle = os.open(folder, os.O_RDONLY)
     try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        handle = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        raise MapError(
+            f"{path}: the map is written, but a power cut may still lose it: {error.strerror}; save it again"
+        ) from error
