@@ -112,5 +112,6 @@ _MAP_ROWS: _Rows = (
     ("map: mIoU of its points, mean of rooms", "map.map_miou_mean_of_rooms", percent),
     ("map: mIoU an image, mean of rooms", "map.view_miou_mean_of_rooms", percent),
     ("map: mIoU at the true surface", "map.surface_miou", percent),
+    ("map: calibration error (ECE)", "map.ece", percent),
     ("map: points at the true surface", "map.on_surface", percent),
 )

@@ -11,7 +11,7 @@ from replay.session import load_pipeline
 from semantic_mapper.benchmark.config import MAP_WIDTH, SuiteConfig, camera_of_width, settings_digest
 from semantic_mapper.benchmark.records import MapRecord
 from semantic_mapper.benchmark.rooms import as_given
-from semantic_mapper.benchmark.scoring import as_rows
+from semantic_mapper.benchmark.scoring import as_calibration, as_rows
 from semantic_mapper.errors import MapError
 from semantic_mapper.evaluation.metrics import (
     ConfusionMatrix,
@@ -110,6 +110,7 @@ def _compare(scene: Scene, voxel_map: VoxelMap, views: list[_View], digest: str,
     cast, cast_views = _seen_from_its_frames(casts, voxel_map.label_set, views)
     one_frame = _label_of_one_frame(points.xyz, casts, views, scene.seed)
     seen = np.where(one_frame == UNSEEN, ROOMS.ignore_id, truth)
+    answered = (truth != ROOMS.ignore_id) & (label != ROOMS.ignore_id)
     return MapRecord(
         settings=settings_digest(suite, "map"),
         weights=digest,
@@ -127,6 +128,7 @@ def _compare(scene: Scene, voxel_map: VoxelMap, views: list[_View], digest: str,
         one_frame_confusion=as_rows(
             confusion_of(seen, np.where(one_frame == UNSEEN, ROOMS.ignore_id, one_frame), ROOMS, "a frame")
         ),
+        calibration=as_calibration(points.confidence[answered], label[answered] == truth[answered]),
     )
 
 

@@ -62,6 +62,7 @@ def map_figures(records: Sequence[MapRecord]) -> dict[str, Any]:
         "map_miou_mean_of_rooms": _mean([c.metrics().miou for c in at_points]),
         "view_miou_mean_of_rooms": _mean([r.view_miou for r in records]),
         "on_surface": _mean([r.on_surface for r in records]),
+        "ece": _ece(records),
         "per_room": {
             str(r.room): {"map_miou": c.metrics().miou, "view_miou": r.view_miou}
             for r, c in zip(records, at_points, strict=True)
@@ -83,7 +84,7 @@ def _summed(confusions: Sequence[ConfusionMatrix]) -> ConfusionMatrix:
     return sum(confusions, ConfusionMatrix(ROOMS))
 
 
-def _ece(records: Sequence[RoomRecord]) -> float | None:
+def _ece(records: Sequence[RoomRecord] | Sequence[MapRecord]) -> float | None:
     if not records:
         return None
     count = np.array([r.calibration.count for r in records], np.int64)

@@ -82,6 +82,7 @@ class MapRecord(Config, frozen=True, tag_field="record", tag="map"):
     cast_view_confusion: Rows  # of the frames' rendered labels at those same pixels
     seen_confusion: Rows  # at those of the map's points that some frame sees
     one_frame_confusion: Rows  # at the same points, of one frame each, drawn at random
+    calibration: CalibrationRecord  # of the map's points with a label and a truth
 
 
 Record = RoomRecord | MapRecord

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from semantic_mapper.benchmark.predict import Prediction
 from semantic_mapper.benchmark.records import CalibrationRecord, DepthRecord, ImageRecord
@@ -69,7 +70,12 @@ def room_calibration(room: BenchmarkRoom, answers: Mapping[int, Answer]) -> Cali
         counted = (truth != ROOMS.ignore_id) & prediction.known
         confidence.append(np.clip(prediction.confidence[counted], 0, 1))
         right.append(prediction.label[counted] == truth[counted])
-    found = calibration(np.concatenate(confidence), np.concatenate(right))
+    return as_calibration(np.concatenate(confidence), np.concatenate(right))
+
+
+def as_calibration(confidence: Float32, right: NDArray[np.bool_]) -> CalibrationRecord:
+    """Sums by bin of the confidence (N,) of answers that are right or not (N,)."""
+    found = calibration(confidence, right)
     count = found.count.astype(np.float64)
     return CalibrationRecord(
         count=tuple(int(n) for n in found.count),

@@ -8,7 +8,7 @@ import pytest
 
 from semantic_mapper.benchmark.config import settings_digest
 from semantic_mapper.benchmark.figures import compare, view_figures
-from semantic_mapper.benchmark.records import MapRecord, RoomRecord
+from semantic_mapper.benchmark.records import CalibrationRecord, MapRecord, RoomRecord
 from semantic_mapper.benchmark.run import Progress, room_records, run_suite, sheet_rows
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.errors import ConfigError
@@ -68,6 +68,7 @@ def map_record(room: int = 1) -> MapRecord:
         confusion=rows, surface_confusion=rows, view_confusion=rows, view_miou=0.5,
         cast_confusion=rows, cast_view_confusion=rows,
         seen_confusion=rows, one_frame_confusion=rows,
+        calibration=CalibrationRecord(count=(0, 3), confidence=(0.0, 2.7), right=(0.0, 2.0)),
     )  # fmt: skip
 
 
