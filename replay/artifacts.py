@@ -17,7 +17,7 @@ from semantic_mapper import __version__
 from semantic_mapper.evaluation.metrics import confusion_of, metrics_per_image
 from semantic_mapper.evaluation.report import ViewStrip, write_overview
 from semantic_mapper.evaluation.upright import camera_up
-from semantic_mapper.mapping.export import write_ply
+from semantic_mapper.mapping.formats.ply import write_ply
 from semantic_mapper.mapping.map_types import MapPoints
 
 if TYPE_CHECKING:  # session imports this module

@@ -217,9 +217,16 @@ class BlockGrid:
             part = everything[start : start + TILE_BLOCKS]
             around = np.unique(pack_keys((unpack_keys(part)[:, None] + NEIGHBOURS).reshape(-1, 3)))
             wanted = around[np.isin(around, everything)]
-            tile = BlockGrid(self._voxel_size_m, self._classes, len(wanted), len(wanted))
-            tile.fill(wanted, self.read(wanted))
+            tile = self.holding(wanted)
             yield unpack_keys(part), find_blocks(tile.index, part), tile
+
+    def holding(self, packed: NDArray[np.int64]) -> BlockGrid:
+        """A grid with these existing blocks (B,) in memory: this one where nothing is on disk, else a temporary one."""
+        if not self.stored_count:
+            return self
+        copy = BlockGrid(self._voxel_size_m, self._classes, len(packed), len(packed))
+        copy.fill(packed, self.read(packed))
+        return copy
 
     def read(self, packed: NDArray[np.int64]) -> BlockValues:
         """A copy of blocks (B,) that exist, from memory or disk."""

@@ -1,54 +1,45 @@
-"""Maps for other programs."""
+"""What of a map is exported, and in which colours."""
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
+import dataclasses
+from typing import Literal, TypeVar
 
+import cv2
 import numpy as np
 
-from semantic_mapper.errors import MapError
-from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.map_types import MapMesh, MapPoints
+from semantic_mapper.types import Float32, UInt8
 
-_PLY_VERTEX = np.dtype(
-    [
-        ("x", "<f4"),
-        ("y", "<f4"),
-        ("z", "<f4"),
-        ("red", "u1"),
-        ("green", "u1"),
-        ("blue", "u1"),
-        ("label", "u1"),
-        ("confidence", "<f4"),
-    ]
-)
-_PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
+ColorBy = Literal["rgb", "class", "confidence"]
+SurfaceT = TypeVar("SurfaceT", MapPoints, MapMesh)
 
 
-def write_ply(path: Path, points: MapPoints) -> None:
-    """Write points as binary little-endian PLY with x y z red green blue label confidence, metres.
+def sure_points(points: MapPoints, min_confidence: float) -> MapPoints:
+    """The points whose label is at least so sure; all of them for 0."""
+    keep = points.confidence >= min_confidence
+    return MapPoints(points.xyz[keep], points.rgb[keep], points.label[keep], points.confidence[keep])
 
-    The file appears whole or not at all.
 
-    Raises:
-        MapError: the file cannot be written.
-    """
-    vertices = np.empty(len(points.xyz), _PLY_VERTEX)
-    for column, name in enumerate(("x", "y", "z")):
-        vertices[name] = points.xyz[:, column]
-    for column, name in enumerate(("red", "green", "blue")):
-        vertices[name] = points.rgb[:, column]
-    vertices["label"] = points.label
-    vertices["confidence"] = points.confidence
-    names = _PLY_VERTEX.names or ()
-    properties = "".join(f"property {_PLY_TYPES[_PLY_VERTEX[name].str]} {name}\n" for name in names)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{properties}end_header\n"
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(header.encode("ascii"))
-            file.write(vertices.tobytes())
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise MapError(f"{path}: cannot write the point cloud: {error}") from error
+def sure_faces(mesh: MapMesh, min_confidence: float) -> MapMesh:
+    """The faces all of whose corners are at least so sure, and their vertices; the whole mesh for 0."""
+    if min_confidence <= 0:
+        return mesh
+    faces = mesh.faces[(mesh.confidence >= min_confidence)[mesh.faces].all(axis=1)]
+    used, corners = np.unique(faces, return_inverse=True)
+    faces = corners.reshape(-1, 3).astype(np.int32)
+    return MapMesh(mesh.vertices[used], faces, mesh.rgb[used], mesh.label[used], mesh.confidence[used])
+
+
+def colored(surface: SurfaceT, label_set: LabelSet, by: ColorBy) -> SurfaceT:
+    """The surface with other colours: the camera's, those of the classes, or dark (0) to bright (1) for confidence."""
+    if by == "rgb":
+        return surface
+    rgb = label_set.colorize(surface.label) if by == "class" else _confidence_colors(surface.confidence)
+    return dataclasses.replace(surface, rgb=rgb)
+
+
+def _confidence_colors(confidence: Float32) -> UInt8:
+    table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
+    return np.asarray(table, np.uint8)[np.rint(confidence * 255).astype(np.uint8)]

@@ -17,7 +17,7 @@ from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import Float32, Float64
 
 MESH_TILE_BLOCKS = 16_384  # Open3D fails past 262,100 blocks of 8^3 (int32), and needs 8 KiB a block to mesh
-_LARGEST_STEP = 0.95  # two neighbours that differ by more straddle a depth edge, not a surface
+LARGEST_STEP = 0.95  # two neighbours that differ by more straddle a depth edge, not a surface
 
 
 def surface_voxels(keys: NDArray[np.int32], blocks: NDArray[np.int32], grid: BlockGrid, min_weight: float) -> Float64:
@@ -54,7 +54,7 @@ def _crossing(buffers, block, voxel, axis, neighbours, min_weight):
     if other_block < 0 or buffers.weight[other_block, other] < min_weight:
         return -1.0
     a, b = buffers.tsdf[block, voxel], buffers.tsdf[other_block, other]
-    if (a > 0) == (b > 0) or abs(a - b) > _LARGEST_STEP:
+    if (a > 0) == (b > 0) or abs(a - b) > LARGEST_STEP:
         return -1.0
     return np.float64(a) / (np.float64(a) - np.float64(b))
 
@@ -80,7 +80,7 @@ def _block_crossings(key, block, index, buffers, min_weight, points):
     _neighbours(key, block, index, neighbours)
     count = 0
     for voxel in range(512):
-        if buffers.weight[block, voxel] < min_weight or abs(buffers.tsdf[block, voxel]) > _LARGEST_STEP:
+        if buffers.weight[block, voxel] < min_weight or abs(buffers.tsdf[block, voxel]) > LARGEST_STEP:
             continue
         for axis in range(3):
             along = _crossing(buffers, block, voxel, axis, neighbours, min_weight)

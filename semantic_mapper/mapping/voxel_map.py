@@ -24,6 +24,7 @@ from semantic_mapper.mapping.grid_snapshot import GridSnapshot
 from semantic_mapper.mapping.map_file import BlockPart, open_map, write_map
 from semantic_mapper.mapping.map_manifest import CHUNK_BLOCKS, MapManifest
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapState, MapView
+from semantic_mapper.mapping.merge import add_blocks, check_fit, copy_blocks, voxel_transform
 from semantic_mapper.mapping.ray_casting import cast_rays
 from semantic_mapper.mapping.readout import read_points
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
@@ -265,6 +266,31 @@ class VoxelMap:
                     loaded._grid.mark_changed(blocks, saved.frames)
         loaded.frames, loaded.last_stamp_ns = saved.frames, saved.last_stamp_ns
         return loaded
+
+    def merged(self, other: VoxelMap, T_self_other: Float64) -> VoxelMap:
+        """A new map of what both have measured, in this map's frame and with its settings; see ``merge``.
+
+        Where voxels coincide (no rotation but quarter turns, a shift by whole voxels) measurements add up exactly;
+        else those of ``other`` are interpolated.
+
+        Args:
+            other: Of the same voxel size, truncation and classes.
+            T_self_other: (4, 4) float64, where its frame lies in this map's.
+
+        Raises:
+            MapError: the maps do not fit each other, or the new one would grow past ``max_blocks``.
+            PoseError: the pose is not a rigid transform.
+        """
+        check_pose(T_self_other, "merge")
+        check_fit(self.config, self.label_set, other.config, other.label_set)
+        joined = VoxelMap(self.config, self.label_set)
+        with _KERNEL_LOCK:
+            joined.frames = self.frames + other.frames
+            joined.last_stamp_ns = max(self.last_stamp_ns, other.last_stamp_ns)
+            transform = voxel_transform(T_self_other, self.config.voxel_size_m)
+            copy_blocks(joined._grid, self._grid, joined.frames)
+            add_blocks(joined._grid, other._grid, transform, self.config.max_weight, joined.frames)
+        return joined
 
     def _state(self) -> MapState:
         with _KERNEL_LOCK:

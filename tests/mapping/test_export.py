@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.mapping.export import write_ply
+from semantic_mapper.mapping.formats.ply import write_ply
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.open3d_loader import load_open3d
 

@@ -1,0 +1,275 @@
+"""Adding the voxels of one map to another: sums of what both have measured, resampled where their voxels differ.
+
+Two maps with the same voxels add up: weights, evidence and votes are sums, TSDF and colour are means by weight; the
+caps are those of fusion, except that where votes pass theirs, old and new fade alike, since neither map is the older.
+Maps whose voxels do not coincide are interpolated first, between the eight voxels around each new one (trilinear), over
+those of them that were observed and only where these outweigh the others. Across a depth edge, where free space meets
+the back of something, the nearest voxel is taken: in between there would be a surface that nobody saw.
+
+Works on some blocks at a time: what is in memory at once does not grow with the maps. No order among threads matters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from semantic_mapper.config import VoxelMapConfig
+from semantic_mapper.errors import MapError
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
+from semantic_mapper.mapping.block_index import find_block, pack_key, pack_keys, unpack_keys
+from semantic_mapper.mapping.block_store import BLOCK_VOXELS, BlockValues
+from semantic_mapper.mapping.extract import LARGEST_STEP
+from semantic_mapper.threads import parallel_kernel
+from semantic_mapper.types import Float64
+
+MERGED_AT_ONCE = 128  # blocks
+SNAP_VOXELS = 1e-6  # a shift nearer than this to whole voxels is one: metres have been rounded on their way here
+SNAP_ROTATION = 1e-9  # likewise for rotations by quarter turns
+_DUST = 1e-6  # voxels with less share are there by rounding alone
+LEAST_SHARE = 0.5  # of the eight voxels around a point, by their weights in the interpolation, that were observed
+
+
+class VoxelTransform(NamedTuple):
+    """Points of map b to map a, in voxels: ``a = R @ b + t``."""
+
+    R: Float64
+    t: Float64
+
+
+def voxel_transform(T_a_b: Float64, voxel_size_m: float) -> VoxelTransform:
+    """In units of voxels, and exact where it maps voxels onto voxels."""
+    R, t = T_a_b[:3, :3], T_a_b[:3, 3] / voxel_size_m
+    if np.abs(R - np.rint(R)).max() < SNAP_ROTATION:
+        R = np.rint(R)
+        if np.abs(t - np.rint(t)).max() < SNAP_VOXELS:
+            t = np.rint(t)
+    return VoxelTransform(np.ascontiguousarray(R), np.ascontiguousarray(t))
+
+
+def check_fit(config_a: VoxelMapConfig, labels_a: LabelSet, config_b: VoxelMapConfig, labels_b: LabelSet) -> None:
+    """Refuse maps whose voxels mean different things.
+
+    Raises:
+        MapError: another voxel size or truncation, or other classes (their colours and the set's name do not matter).
+    """
+    for name in ("voxel_size_m", "truncation_voxels"):
+        a, b = getattr(config_a, name), getattr(config_b, name)
+        if a != b:
+            raise MapError(
+                f"maps of different voxel_map.{name} ({a:g} and {b:g}) cannot be merged; make one of them anew from "
+                "its log with the setting of the other"
+            )
+    a, b = (set(zip(labels.ids, labels.names, strict=True)) for labels in (labels_a, labels_b))
+    if a != b or labels_a.ids != labels_b.ids or labels_a.ignore_id != labels_b.ignore_id:
+        differing = ", ".join(f"{i} {name}" for i, name in sorted(a ^ b)) or "their order, or the ignore id"
+        raise MapError(
+            f"maps with different classes cannot be merged: label sets '{labels_a.name}' ({len(labels_a)} classes) and "
+            f"'{labels_b.name}' ({len(labels_b)}) differ in {differing}; make both with the same weights"
+        )
+
+
+def add_blocks(target: BlockGrid, source: BlockGrid, T_target_source: VoxelTransform, cap: float, version: int) -> None:
+    """Add all that ``source`` holds to ``target``.
+
+    Args:
+        target: Is changed; of the same voxel size and classes.
+        source: Another grid.
+        T_target_source: Where the source lies.
+        cap: Of weights and of votes.
+        version: That the blocks are marked as changed at.
+
+    Raises:
+        MapError: the target has no room.
+    """
+    pairs = _overlaps(pack_keys(source.all_keys()), T_target_source)
+    R_source_target = np.ascontiguousarray(T_target_source.R.T)
+    for wanted, needed in _parts(pairs):
+        grid = source.holding(needed)
+        moved = _empty_blocks(len(wanted), grid.buffers().evidence.shape[2])
+        _resample(unpack_keys(wanted), R_source_target, T_target_source.t, grid.index, grid.buffers(), moved)
+        holds = (moved.weight > 0).any(axis=1)  # votes come with weight
+        if holds.any():
+            blocks = target.activate(wanted[holds])
+            _add(blocks, target.buffers(), BlockValues(*(part[holds] for part in moved)), cap)
+            target.mark_changed(blocks, version)
+
+
+def copy_blocks(target: BlockGrid, source: BlockGrid, version: int) -> None:
+    """Make ``target``, which is empty, hold what ``source`` holds; blocks without a measurement are left out.
+
+    Raises:
+        MapError: the target has no room.
+    """
+    for keys, _, grid in source.tiles():
+        packed = pack_keys(keys)
+        for start in range(0, len(packed), MERGED_AT_ONCE):
+            part = packed[start : start + MERGED_AT_ONCE]
+            values = grid.read(part)
+            holds = (values.weight > 0).any(axis=1)
+            blocks = target.fill(part[holds], BlockValues(*(array[holds] for array in values)))
+            target.mark_changed(blocks, version)
+
+
+def _overlaps(sources: NDArray[np.int64], T_target_source: VoxelTransform) -> NDArray[np.int64]:
+    """Pairs (P, 2) of packed keys, sorted: a block of the target and a source block that may say something of it."""
+    corners = np.array([[x, y, z] for x in (-1, BLOCK_SIDE) for y in (-1, BLOCK_SIDE) for z in (-1, BLOCK_SIDE)])
+    ends = (unpack_keys(sources)[:, None] * BLOCK_SIDE + corners) @ T_target_source.R.T + T_target_source.t
+    # A source block speaks for what lies strictly between: less than a voxel outside of its own voxels 0..7.
+    first = np.floor((np.floor(ends.min(axis=1)) + 1) / BLOCK_SIDE).astype(np.int64)
+    last = np.floor((np.ceil(ends.max(axis=1)) - 1) / BLOCK_SIDE).astype(np.int64)
+    most = int((last - first).max(initial=0)) + 1
+    pairs: list[NDArray[np.int64]] = []
+    for step in np.ndindex(most, most, most):
+        inside = (first + step <= last).all(axis=1)
+        keys = (first[inside] + step).astype(np.int32)
+        pairs.append(np.stack((pack_keys(keys), sources[inside]), axis=1))
+    joined = np.concatenate(pairs)
+    return joined[np.lexsort((joined[:, 1], joined[:, 0]))]
+
+
+def _parts(pairs: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """The blocks of the target, some at a time, each time with the source blocks that they need."""
+    wanted, starts = np.unique(pairs[:, 0], return_index=True)
+    ends = np.append(starts[1:], len(pairs))
+    for start in range(0, len(wanted), MERGED_AT_ONCE):
+        stop = min(start + MERGED_AT_ONCE, len(wanted))
+        yield wanted[start:stop], np.unique(pairs[starts[start] : ends[stop - 1], 1])
+
+
+def _empty_blocks(count: int, classes: int) -> BlockValues:
+    flat = (count, BLOCK_VOXELS)
+    shapes = (flat, flat, (*flat, 3), (*flat, classes), flat)
+    return BlockValues(*(np.zeros(shape, np.float32) for shape in shapes))
+
+
+@parallel_kernel()
+def _resample(keys, R, t, index, buffers, moved):
+    """Fill blocks ``moved``, which lie at ``keys`` (B, 3): their point p is the source's ``R @ (p - t)``, in voxels."""
+    for n in prange(len(keys)):
+        blocks, voxels, shares = np.empty(8, np.int64), np.empty(8, np.int64), np.empty(8, np.float64)
+        for voxel in range(BLOCK_VOXELS):
+            x = keys[n, 0] * BLOCK_SIDE + (voxel & 7) - t[0]
+            y = keys[n, 1] * BLOCK_SIDE + ((voxel >> 3) & 7) - t[1]
+            z = keys[n, 2] * BLOCK_SIDE + (voxel >> 6) - t[2]
+            sx = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
+            sy = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
+            sz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
+            count = _corners(sx, sy, sz, index, blocks, voxels, shares)
+            if count == 0:
+                continue
+            total = _nearest_at_edges(count, blocks, voxels, shares, buffers)
+            _blend_geometry(count, blocks, voxels, shares, total, buffers, moved, n, voxel)
+            _blend_votes(count, blocks, voxels, shares, total, buffers, moved, n, voxel)
+
+
+@njit(nogil=True, cache=True)
+def _corners(x, y, z, index, blocks, voxels, shares):
+    """The voxels around a point that lie in blocks of the map, with their shares; returns how many."""
+    x0, y0, z0 = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+    fx, fy, fz = x - x0, y - y0, z - z0
+    count = 0
+    last_key, block = np.int64(-1), np.int64(-1)
+    for corner in range(8):
+        i, j, k = corner & 1, (corner >> 1) & 1, corner >> 2
+        share = (fx if i else 1 - fx) * (fy if j else 1 - fy) * (fz if k else 1 - fz)
+        if share < _DUST:
+            continue
+        u, v, w = x0 + i, y0 + j, z0 + k
+        key = pack_key(u >> 3, v >> 3, w >> 3)
+        if key != last_key:
+            last_key, block = key, find_block(index, key)
+        if block >= 0:
+            blocks[count], voxels[count], shares[count] = block, ((w & 7) << 6) | ((v & 7) << 3) | (u & 7), share
+            count += 1
+    return count
+
+
+@njit(nogil=True, cache=True)
+def _nearest_at_edges(count, blocks, voxels, shares, buffers):
+    """Across a depth edge, take all share from all but the nearest observed voxel; returns what they then sum up to.
+
+    That is 1 where nothing changes: voxels without a block count as not observed.
+    """
+    least, most, nearest = np.float32(2), np.float32(-2), 0
+    for i in range(count):
+        if buffers.weight[blocks[i], voxels[i]] > 0:
+            value = buffers.tsdf[blocks[i], voxels[i]]
+            if most < least or shares[i] > shares[nearest]:
+                nearest = i
+            least, most = min(least, value), max(most, value)
+    if most - least <= LARGEST_STEP:
+        return 1.0
+    for i in range(count):
+        if i != nearest:
+            shares[i] = 0
+    return shares[nearest]
+
+
+@njit(nogil=True, cache=True)
+def _blend_geometry(count, blocks, voxels, shares, total, buffers, moved, n, voxel):
+    tsdf, weight, red, green, blue, observed = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(count):
+        b, v, share = blocks[i], voxels[i], shares[i]
+        if buffers.weight[b, v] > 0:
+            observed += share
+            weight += share * buffers.weight[b, v]
+            tsdf += share * buffers.tsdf[b, v]
+            red += share * buffers.color[b, v, 0]
+            green += share * buffers.color[b, v, 1]
+            blue += share * buffers.color[b, v, 2]
+    if observed >= LEAST_SHARE * total:
+        moved.weight[n, voxel] = weight / observed
+        moved.tsdf[n, voxel] = tsdf / observed
+        moved.color[n, voxel, 0] = red / observed
+        moved.color[n, voxel, 1] = green / observed
+        moved.color[n, voxel, 2] = blue / observed
+
+
+@njit(nogil=True, cache=True)
+def _blend_votes(count, blocks, voxels, shares, total, buffers, moved, n, voxel):
+    votes, voted = 0.0, 0.0
+    for i in range(count):
+        if buffers.votes[blocks[i], voxels[i]] > 0:
+            voted += shares[i]
+            votes += shares[i] * buffers.votes[blocks[i], voxels[i]]
+    if voted == 0 or voted < LEAST_SHARE * total:
+        return
+    moved.votes[n, voxel] = votes / voted
+    for c in range(moved.evidence.shape[2]):
+        evidence = 0.0
+        for i in range(count):
+            if buffers.votes[blocks[i], voxels[i]] > 0:
+                evidence += shares[i] * buffers.evidence[blocks[i], voxels[i], c]
+        moved.evidence[n, voxel, c] = evidence / voted
+
+
+@parallel_kernel()
+def _add(blocks, buffers, added, cap):
+    """Add blocks ``added`` to those with buffer indices ``blocks``, in place."""
+    for n in prange(len(blocks)):
+        _add_block(blocks[n], buffers, n, added, cap)  # numba drops what is written to a tuple's arrays right here
+
+
+@njit(nogil=True, cache=True)
+def _add_block(b, buffers, n, added, cap):
+    for v in range(BLOCK_VOXELS):
+        mine, theirs = np.float64(buffers.weight[b, v]), np.float64(added.weight[n, v])
+        if theirs > 0:
+            weight = mine + theirs
+            buffers.tsdf[b, v] = (mine * buffers.tsdf[b, v] + theirs * added.tsdf[n, v]) / weight
+            for c in range(3):
+                buffers.color[b, v, c] = (mine * buffers.color[b, v, c] + theirs * added.color[n, v, c]) / weight
+            buffers.weight[b, v] = min(weight, cap)
+        votes = np.float64(buffers.votes[b, v]) + np.float64(added.votes[n, v])
+        if added.votes[n, v] > 0:
+            keep = min(1.0, cap / votes)
+            buffers.votes[b, v] = votes * keep
+            for c in range(buffers.evidence.shape[2]):
+                said = np.float64(buffers.evidence[b, v, c]) + np.float64(added.evidence[n, v, c])
+                buffers.evidence[b, v, c] = said * keep
