@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from nodes import cli_demo, cli_doctor, cli_eval, cli_finetune, cli_log, cli_replay, cli_up
+from nodes import cli_demo, cli_doctor, cli_eval, cli_export, cli_finetune, cli_log, cli_replay, cli_up
 from nodes.verb import Settings
 from semantic_mapper import __version__
 
@@ -28,6 +28,8 @@ for _function in (
     cli_log.import_,
     cli_log.info,
     cli_log.recover,
+    cli_export.export,
+    cli_export.merge,
     cli_finetune.finetune,
     cli_eval.evaluate,
     cli_doctor.doctor,

@@ -108,22 +108,22 @@ def voxels(state: dict) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_weights_and_votes_stop_at_their_cap() -> None:
-    a, b = (fuse_views(small_map(max_weight=4), views) for views in (range(8), range(8, 12)))
+    a, b = (fuse_views(small_map(max_weight=2), views) for views in (range(8), range(8, 12)))
     joined = a.merged(b, np.eye(4)).block_state()
     one, other = measured_blocks(a), measured_blocks(b)
-    assert joined["weight"].max() == 4 and joined["votes"].max() <= 4
+    assert joined["weight"].max() == 2 and joined["votes"].max() <= 2
     shared, mine, theirs = np.intersect1d(*(pack_keys(s["keys"]) for s in (one, other)), return_indices=True)
     here = np.searchsorted(pack_keys(joined["keys"]), shared)
     a_w, b_w = one["weight"][mine].astype(np.float64), other["weight"][theirs]
-    over = (a_w > 0) & (b_w > 0) & (a_w + b_w > 4)
+    over = (a_w > 0) & (b_w > 0) & (a_w + b_w > 2)
     mean = (a_w * one["tsdf"][mine] + b_w * other["tsdf"][theirs])[over] / (a_w + b_w)[over]
     assert over.sum() > 100
     np.testing.assert_allclose(joined["tsdf"][here][over], mean, atol=1e-6)
     votes = one["votes"][mine] + other["votes"][theirs]
-    over = votes > 4
+    over = votes > 2
     said = (one["evidence"][mine] + other["evidence"][theirs])[over] / votes[over][:, None]
     assert over.sum() > 20
-    np.testing.assert_allclose(joined["evidence"][here][over], 4 * said, rtol=1e-5)
+    np.testing.assert_allclose(joined["evidence"][here][over], 2 * said, rtol=1e-5)
 
 
 def test_a_map_of_another_frame_comes_to_lie_where_it_belongs() -> None:

@@ -1,0 +1,96 @@
+"""Verbs about saved maps: ``export``, ``merge``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from nodes.console import Output
+from nodes.verb import verb
+
+
+@verb
+def export(
+    map_: Annotated[Path, typer.Argument(metavar="MAP", help="Saved map (map.npz), or a folder of results with one.")],
+    out: Annotated[Path, typer.Option("--out", help="File to write; its ending says the format.")],
+    format: Annotated[  # noqa: A002 - the name of the option
+        Literal["ply", "ply-mesh", "obj", "glb", "npz", "grid", "rrd"] | None,
+        typer.Option(help="Where the ending does not say it: ply and npz are points, ply-mesh, obj and glb meshes."),
+    ] = None,
+    color: Annotated[
+        Literal["rgb", "class", "confidence"] | None, typer.Option(help="Of points and meshes.  [default: rgb]")
+    ] = None,
+    min_weight: Annotated[float, typer.Option(help="Leave voxels with fewer depth measurements out.")] = 1.0,
+    min_confidence: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Leave surface with a less sure label out.")
+    ] = 0.0,
+    up: Annotated[
+        str, typer.Option(help="glb, grid: up in the world: x, -y, ..., or three numbers; auto finds it.")
+    ] = "auto",
+    height: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="LOW HIGH", help="grid: what is in a robot's way, above the floor.  [default: 0.1 1.8]"),
+    ] = None,
+    resolution: Annotated[float | None, typer.Option(help="grid: side of a cell in metres.  [default: 0.05]")] = None,
+    floor: Annotated[float | None, typer.Option(help="grid: height of the floor; found when not given.")] = None,
+) -> None:
+    """Write a saved map in a format of other programs.
+
+    .ply points (with --format ply-mesh a mesh), .obj mesh with materials, .glb mesh for viewers, .npz arrays for
+    numpy, .yaml/.pgm floor plan for nav2 and map_server, .rrd for Rerun. In a floor plan a cell is free only where the
+    floor was seen.
+
+    Example: semantic-mapper export runs/kitchen --out kitchen.glb --color class
+    Example: semantic-mapper export runs/kitchen/map.npz --out plan.yaml --height 0.1 1.2
+    """
+    output = Output.guarded()
+    from nodes.outputs import prepare_file
+    from nodes.saved_maps import map_path, refuse_overwriting
+    from replay.map_export import ExportRequest, export_map, format_of, parse_up
+    from semantic_mapper.mapping.voxel_map import VoxelMap
+
+    source = map_path(map_)
+    request = ExportRequest(
+        format_of(out, format), min_weight, min_confidence, color, parse_up(up), height, resolution, floor
+    )
+    refuse_overwriting(out, source)
+    prepare_file(out)
+    report = export_map(VoxelMap.load(source), out, request)
+    output.print(f"{' and '.join(map(str, report.files))}: {report.content}")
+    for line in report.found:
+        output.print(f"  {line}")
+
+
+@verb
+def merge(
+    a: Annotated[Path, typer.Argument(metavar="A", help="Saved map, or a folder of results with one.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="Another one of the same voxel size and classes.")],
+    out: Annotated[Path, typer.Option("--out", help="Map to write (.npz), in the frame of A.")],
+    transform: Annotated[
+        str,
+        typer.Option(help='Where B lies in A: "x y z yaw_deg" (metres; about +z), or a file with T_A_B, 4 rows of 4.'),
+    ] = "0 0 0 0",
+) -> None:
+    """Make one map of two: what both have measured adds up.
+
+    Shifts by whole voxels are exact; for others, B's voxels are interpolated. The maps have to be aligned already:
+    nothing is searched for. Settings are those of A.
+
+    Example: semantic-mapper merge runs/east runs/west --transform "3.2 0 0 90" --out house.npz
+    """
+    output = Output.guarded()
+    from nodes.outputs import prepare_file
+    from nodes.saved_maps import map_path, parse_transform, refuse_overwriting
+    from semantic_mapper.mapping.voxel_map import VoxelMap
+
+    T_a_b = parse_transform(transform)
+    sources = map_path(a), map_path(b)
+    refuse_overwriting(out, *sources)
+    prepare_file(out)
+    one, other = map(VoxelMap.load, sources)
+    joined = one.merged(other, T_a_b)
+    joined.save(out)
+    blocks = f"{one.block_count} and {other.block_count} made {joined.block_count} blocks"
+    output.print(f"{out}: {joined.frames} frames; {blocks}")

@@ -1,0 +1,70 @@
+"""Saved maps and transforms as the command line names them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.geometry import check_pose
+from semantic_mapper.types import Float64
+
+MAP_NAME = "map.npz"
+
+
+def map_path(path: Path) -> Path:
+    """The file of a map that is named itself, or by the folder it is in.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if not path.is_dir():
+        return path
+    if not (path / MAP_NAME).is_file():
+        raise ConfigError(f"{path}: no {MAP_NAME}; give a saved map or a folder that `replay` has written")
+    return path / MAP_NAME
+
+
+def refuse_overwriting(out: Path, *sources: Path) -> None:
+    """Refuse a result under the name of what it is made from.
+
+    Raises:
+        ConfigError: naming the file.
+    """
+    if out.resolve() in {source.resolve() for source in sources}:
+        raise ConfigError(f"{out}: is the map itself; choose another name for the result")
+
+
+def parse_transform(text: str) -> Float64:
+    """``"x y z yaw_deg"``, or the name of a text file that holds a rigid (4, 4) row by row.
+
+    Raises:
+        ConfigError: neither of these.
+        PoseError: the file holds something else than a rigid transform.
+    """
+    words = text.replace(",", " ").split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        return _read_transform(Path(text))
+    if len(numbers) != 4 or not np.isfinite(numbers).all():
+        raise ConfigError(f"--transform '{text}': expected four numbers, x y z in metres and yaw in degrees")
+    c, s = np.cos(np.deg2rad(numbers[3])), np.sin(np.deg2rad(numbers[3]))
+    T = np.eye(4)
+    T[:2, :2] = ((c, -s), (s, c))
+    T[:3, 3] = numbers[:3]
+    return T
+
+
+def _read_transform(path: Path) -> Float64:
+    try:
+        T = np.loadtxt(path, dtype=np.float64, ndmin=2)
+    except FileNotFoundError as error:
+        raise ConfigError(f'--transform {path}: neither "x y z yaw_deg" nor a file') from error
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"--transform {path}: cannot be read as numbers: {error}") from error
+    if T.shape != (4, 4):
+        raise ConfigError(f"--transform {path}: expected 4 rows of 4 numbers, got {T.shape[0]} of {T.shape[1]}")
+    check_pose(T, str(path))
+    return T
