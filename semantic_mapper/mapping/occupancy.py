@@ -69,7 +69,7 @@ def occupancy_grid(
     T_grid_world[:3, :3] = turn_onto(up, np.array((0.0, 0.0, 1.0)))
     xyz = points.xyz.astype(np.float64) @ T_grid_world[:3, :3].T
     floor = floor_height(xyz[:, 2]) if floor_m is None else floor_m
-    T_grid_world[2, 3] = -floor
+    T_grid_world[2, 3] = 0.0 - floor  # never -0
     height = xyz[:, 2] - floor
     within = (height >= -low) & (height <= high)
     if not within.any():
