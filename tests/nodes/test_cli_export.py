@@ -62,7 +62,7 @@ def test_a_transform_is_four_numbers_or_a_file(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "T.txt", T)
     np.testing.assert_array_equal(parse_transform(str(tmp_path / "T.txt")), T)
     np.savetxt(tmp_path / "mirror.txt", np.diag((1, 1, -1, 1)))
-    with pytest.raises(PoseError, match="mirror.txt"):
+    with pytest.raises(PoseError, match="mirror"):
         parse_transform(str(tmp_path / "mirror.txt"))
     np.savetxt(tmp_path / "short.txt", T[:3])
     (tmp_path / "words.txt").write_text("east of here")
@@ -79,7 +79,7 @@ def test_a_transform_is_four_numbers_or_a_file(tmp_path: Path) -> None:
 
 def test_maps_are_named_by_file_or_folder(results: Path, tmp_path: Path) -> None:
     assert map_path(results) == results / "map.npz" == map_path(results / "map.npz")
-    with pytest.raises(ConfigError, match="no map.npz"):
+    with pytest.raises(ConfigError, match="no map"):
         map_path(tmp_path)
     with pytest.raises(ConfigError, match="the map itself"):
         refuse_overwriting(results / ".." / results.name / "map.npz", tmp_path / "other.npz", results / "map.npz")
