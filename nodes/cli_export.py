@@ -27,7 +27,7 @@ def export(
         float, typer.Option(min=0.0, max=1.0, help="Leave surface with a less sure label out.")
     ] = 0.0,
     up: Annotated[
-        str, typer.Option(help="glb, grid: up in the world: x, -y, ..., or three numbers; auto finds it.")
+        str, typer.Option(help="glb, grid: up in the world: x, -y, ..., or three numbers; auto = away from the floor.")
     ] = "auto",
     height: Annotated[
         tuple[float, float] | None,

@@ -56,7 +56,7 @@ class ExportRequest:
         min_weight: Voxels with fewer depth measurements are left out.
         min_confidence: Surface whose label is less sure is left out; 0 keeps what nothing voted for, too.
         color: Points and meshes: what the colours show; the camera's by default.
-        up: GLB and grid: (3,) unit vector, up in the world; found by ``find_up`` by default.
+        up: GLB and grid: (3,) unit vector, up in the world; found by ``find_up`` by default, or refused.
         height: Grid: LOW and HIGH in metres above the floor.
         resolution: Grid: side of a cell in metres; 5 cm by default, or a voxel where that is larger.
         floor: Grid: height of the floor along ``up`` in metres; found by default.
@@ -184,7 +184,8 @@ def _export_grid(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> Exp
     content = f"{grid.cells.shape[1]} x {grid.cells.shape[0]} cells of {resolution:g} m: " + ", ".join(
         f"{square:.1f} m2 {name}" for name, square in area.items()
     )
-    floor = () if request.floor is not None else (f"floor at {-grid.T_grid_world[2, 3]:.2f} m (--floor sets it)",)
+    level = round(-float(grid.T_grid_world[2, 3]), 2) + 0.0  # never -0
+    floor = () if request.floor is not None else (f"floor at {level:.2f} m (--floor sets it)",)
     return ExportReport(files, content, _found_up(request, up) + floor)
 
 
