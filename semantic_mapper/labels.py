@@ -7,7 +7,7 @@ hold *channels*: the position of an id in ``LabelSet.ids``. Only this module con
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -80,6 +80,20 @@ class LabelSet:
         table = np.zeros((256, 3), np.uint8)
         table[list(self.ids)] = np.array(self.colors, np.uint8)
         return table[label]
+
+    def id_of(self, name: str) -> int:
+        """Id of a class.
+
+        Raises:
+            LabelError: no class of that name; lists those there are.
+        """
+        if name not in self.names:
+            raise LabelError(f"label set '{self.name}' has no class '{name}'; it has {', '.join(self.names)}")
+        return self.ids[self.names.index(name)]
+
+    def thing_ids(self, stuff: Collection[str]) -> tuple[int, ...]:
+        """Ids of the classes that come in countable pieces: all but those named in ``stuff`` (see ``STUFF_NAMES``)."""
+        return tuple(i for i, name in zip(self.ids, self.names, strict=True) if name not in stuff)
 
     def renamed(self, names: Mapping[str, str]) -> tuple[LabelSet, UInt8]:
         """Give classes other names; classes that then have the same name become one, with the lowest of their ids.
@@ -167,6 +181,12 @@ KITTI360 = make_label_set("kitti360", _KITTI360)
 CARLA = make_label_set("carla", _CARLA)
 
 PROVIDED = {s.name: s for s in (NYU40, SCANNET20, ROOMS, CAMVID11, KITTI360, CARLA)}
+
+# Classes of the provided sets that are surfaces or masses, not countable things.
+STUFF_NAMES = frozenset(
+    "wall floor ceiling floormat otherstructure sky building road roads roadline pavement sidewalk sidewalks parking "
+    "terrain vegetation tree fence ground water bridge static".split()
+)
 
 
 def label_set_named(name: str) -> LabelSet:

@@ -185,12 +185,19 @@ class BlockGrid:
 
     def changed_since(self, version: int) -> NDArray[np.int32]:
         """Keys (B, 3) of all blocks that were changed after ``version``, in lexicographic order."""
+        return unpack_keys(self.versions_since(version)[0])
+
+    def versions_since(self, version: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Packed keys (B,) of all blocks that were changed after ``version``, sorted, and when each was: (B,)."""
         keys, indices = self.sorted_blocks()
-        packed = pack_keys(keys[self._version[indices] > version])
+        packed, versions = pack_keys(keys), self._version[indices]
         if self._store is not None:
-            stored = np.array([k for k, v in self._store.versions.items() if v > version], np.int64)
-            packed = np.sort(np.concatenate((packed, stored)))
-        return unpack_keys(packed)
+            stored = self._store.versions
+            packed = np.concatenate((packed, np.fromiter(stored, np.int64, len(stored))))
+            versions = np.concatenate((versions, np.fromiter(stored.values(), np.int64, len(stored))))
+        newer = np.flatnonzero(versions > version)
+        newer = newer[np.argsort(packed[newer])]
+        return packed[newer], versions[newer]
 
     def stored_keys(self) -> NDArray[np.int32]:
         """Keys (B, 3) of the blocks on disk."""

@@ -76,8 +76,12 @@ def _refine(origin, d, near, far, step, index, buffers, p):
 
 
 @njit(nogil=True, cache=True)
-def _march(origin, d, truncation_voxels, z_max, index, buffers, p):
-    """z of the first surface that the ray meets from its front, 0 where there is none."""
+def march(origin, d, truncation_voxels, z_max, index, buffers, p):
+    """z of the first surface that the ray meets from its front, 0 where there is none.
+
+    ``buffers`` is anything with ``tsdf`` and ``weight`` of blocks (B, 512); where its TSDF is in other units,
+    ``truncation_voxels`` is the length of one.
+    """
     per_voxel = 1.0 / np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])  # z a voxel of ray length
     z, z_before, before = 0.0, 0.0, -1.0  # ``before`` > 0: TSDF at ``z_before``, in front of a surface
     last_key, block = np.int64(-1), np.int64(-1)
@@ -129,7 +133,7 @@ def cast_rays(camera, height, width, voxel_size, truncation_voxels, z_max, index
             for axis in range(3):
                 origin[axis] = camera.t[axis] / voxel_size
                 d[axis] = (camera.R[axis, 0] * x + camera.R[axis, 1] * y + camera.R[axis, 2]) / voxel_size
-            z = _march(origin, d, truncation_voxels, z_max, index, buffers, p)
+            z = march(origin, d, truncation_voxels, z_max, index, buffers, p)
             if z <= 0:
                 continue
             for axis in range(3):

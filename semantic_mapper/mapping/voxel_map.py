@@ -18,6 +18,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.allocation import Camera, blocks_in_band, blocks_in_view, make_camera
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys
+from semantic_mapper.mapping.changes import BlockChanges, oldest_first, read_changes
 from semantic_mapper.mapping.extract import join_meshes, surface_voxels, triangle_mesh
 from semantic_mapper.mapping.fusion import FusionLimits, Votes, fuse_blocks, make_votes, no_votes
 from semantic_mapper.mapping.grid_snapshot import GridSnapshot
@@ -90,6 +91,31 @@ class VoxelMap:
         """Coordinates (B, 3) of the blocks changed after ``frames`` was ``version``, in lexicographic order."""
         with _KERNEL_LOCK:
             return self._grid.changed_since(version)
+
+    def changes(self, since: int, limit: int = 0, min_weight: float = 1.0) -> BlockChanges:
+        """The blocks changed after ``frames`` was ``since``, in compact form.
+
+        Args:
+            since: 0 for the whole map; else the ``version`` of the changes before.
+            limit: At most so many blocks, those that have been waiting longest, but never less than one whole version
+                (a frame; a loaded map is one version); 0 = all. Whoever goes on asking with the version they got
+                comes to the present map.
+            min_weight: Voxels with fewer depth measurements count as not observed; > 0.
+
+        Raises:
+            MapError: ``since`` is not a version of this map, or a bad ``limit`` or ``min_weight``.
+        """
+        _check_min_weight(min_weight)
+        with _KERNEL_LOCK:
+            if not 0 <= since <= self.frames or limit < 0:
+                raise MapError(
+                    f"changes since version {since}, limit {limit}: versions of this map go from 0 to {self.frames}, "
+                    "and a limit is not negative; a mirror of another map starts anew from version 0"
+                )
+            packed, versions = self._grid.versions_since(since)
+            chosen, version = oldest_first(versions, limit, self.frames)
+            decision = (self.label_set, self.config.vote_discount, min_weight)
+            return read_changes(self._grid, packed[chosen], (since, version), *decision)
 
     @property
     def memory_bytes(self) -> int:

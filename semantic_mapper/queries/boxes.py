@@ -1,0 +1,87 @@
+"""Part of a map: surface points and mesh in a box."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from semantic_mapper.mapping.block_grid import BlockGrid
+from semantic_mapper.mapping.block_index import find_blocks
+from semantic_mapper.mapping.block_store import BlockValues
+from semantic_mapper.mapping.changes import TSDF_STEPS
+from semantic_mapper.mapping.extract import triangle_mesh
+from semantic_mapper.mapping.map_types import MapMesh, MapPoints
+from semantic_mapper.queries.checks import check_box, rows_in_box
+from semantic_mapper.queries.rays import speaker
+from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.surface import surface_voxels
+
+
+def points_in_box(snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike) -> MapPoints:
+    """Surface points in a box, one a surface voxel, in a fixed order.
+
+    Args:
+        snapshot: The map.
+        lower, upper: (3,) corners, world metres.
+
+    Raises:
+        MapError: see ``checks.check_box``.
+    """
+    low, high = check_box(lower, upper, snapshot)
+    surface = surface_voxels(snapshot, rows_in_box(snapshot, low, high))
+    inside = ((surface.point >= low) & (surface.point <= high)).all(axis=1)
+    label, confidence, rgb = snapshot.read(
+        snapshot.slots[surface.row[inside]].astype(np.int64), surface.voxel[inside].astype(np.int64)
+    )
+    return MapPoints((surface.point[inside] * snapshot.voxel_size_m).astype(np.float32), rgb, label, confidence)
+
+
+def mesh_in_box(snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike) -> MapMesh:
+    """Triangles with their centre in a box, by the map's own marching cubes (needs Open3D), in a fixed order.
+
+    Args:
+        snapshot: The map.
+        lower, upper: (3,) corners, world metres.
+
+    Raises:
+        MapError: see ``checks.check_box``.
+        DependencyError: Open3D cannot be loaded.
+    """
+    low, high = check_box(lower, upper, snapshot)
+    cells = rows_in_box(snapshot, low - 1, high)  # a triangle lies at most a voxel above its cell's first corner
+    around = rows_in_box(snapshot, low - 1, high + 8)  # cells reach into the next blocks
+    grid = BlockGrid(snapshot.voxel_size_m, 1, max(1, len(around)), max(1, len(around)))
+    grid.fill(snapshot.packed[around], _values(snapshot, around))
+    blocks = find_blocks(grid.index, snapshot.packed[cells])
+    corners, faces = triangle_mesh(snapshot.keys[cells], blocks, grid, snapshot.voxel_size_m, 1.0)
+    center = corners[faces].mean(axis=1, dtype=np.float64) / snapshot.voxel_size_m
+    faces = faces[((center >= low) & (center <= high)).all(axis=1)]
+    kept, renumbered = np.unique(faces, return_inverse=True)
+    vertices = corners[kept]
+    places, ignore_id = vertices.astype(np.float64) / snapshot.voxel_size_m, snapshot.label_set.ignore_id
+    label, confidence, rgb = snapshot.read(*_speakers(places, snapshot.index, snapshot.voxels, ignore_id))
+    return MapMesh(vertices, renumbered.reshape(-1, 3).astype(np.int32), rgb, label, confidence)
+
+
+def _values(snapshot: MapSnapshot, rows: NDArray[np.int64]) -> BlockValues:
+    """Geometry of blocks (B,) as the map's storage has it; no classes and no colours."""
+    slots = snapshot.slots[rows]
+    tsdf = snapshot.voxels.tsdf[slots] / np.float32(TSDF_STEPS)
+    weight = snapshot.voxels.weight[slots].astype(np.float32)
+    none = np.zeros((), np.float32)
+    return BlockValues(
+        tsdf,
+        weight,
+        np.broadcast_to(none, (*tsdf.shape, 3)),
+        np.broadcast_to(none, (*tsdf.shape, 1)),
+        np.broadcast_to(none, tsdf.shape),
+    )
+
+
+@njit(nogil=True, cache=True)
+def _speakers(points, index, voxels, ignore_id):
+    slots, chosen = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
+    for n in range(len(points)):  # vertices lie between observed voxels: there always is one
+        slots[n], chosen[n] = speaker(points[n], index, voxels, ignore_id)
+    return slots, chosen

@@ -1,0 +1,160 @@
+"""A mirror of a map in memory, fed with what changes; needs neither Open3D nor the map's own process.
+
+Blocks are written once, one behind the other, into a pool; a snapshot is a table of where its blocks lie. So a new
+snapshot costs its changed blocks and a new table, and an old one stays as it was. A full pool is replaced by a larger
+one with only the living blocks; the old pool goes when its last snapshot does.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from semantic_mapper.errors import LabelError, MapError
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.block_index import KEY_LIMIT, make_block_index, pack_keys, unpack_keys
+from semantic_mapper.mapping.block_store import BLOCK_VOXELS
+from semantic_mapper.mapping.changes import BlockChanges
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
+from semantic_mapper.queries.surface import NEAREST_STEPS
+
+LEAST_SPARE = 256  # blocks that a new pool has room for beyond the living ones; or half of these, if that is more
+
+
+class MapMirror:
+    """Follows a map by its changes and hands out snapshots of it. Safe to use from several threads.
+
+    Args:
+        voxel_size_m, truncation_voxels: Of the map (``VoxelMapConfig``).
+        label_set: Of the map.
+    """
+
+    def __init__(self, voxel_size_m: float, truncation_voxels: float, label_set: LabelSet) -> None:
+        none = np.empty(0, np.int64)
+        slots = np.empty(0, np.int32)
+        index = make_block_index(unpack_keys(none), slots)
+        self._snapshot = MapSnapshot(
+            0, voxel_size_m, truncation_voxels, label_set, none, slots, index, _new_pool(LEAST_SPARE)
+        )
+        self._used = 0
+        self._lock = threading.Lock()
+
+    @classmethod
+    def of(cls, voxel_map: VoxelMap) -> MapMirror:
+        """Mirror of a live or loaded map as it is now; further ``changes`` since its version may be applied."""
+        mirror = cls(voxel_map.config.voxel_size_m, voxel_map.config.truncation_voxels, voxel_map.label_set)
+        mirror.apply(voxel_map.changes(0))
+        return mirror
+
+    @property
+    def version(self) -> int:
+        """The mirror is complete up to here; what to ask the map's next ``changes`` with."""
+        return self._snapshot.version
+
+    def snapshot(self) -> MapSnapshot:
+        """The present state; stays as it is whatever is applied later."""
+        return self._snapshot
+
+    def apply(self, changes: BlockChanges) -> MapSnapshot:
+        """Take over changes and return the new state.
+
+        Raises:
+            MapError: changes are missing between the mirror's version and these, these are older than the mirror, or
+                their arrays are not of the form that ``BlockChanges`` has.
+            LabelError: a class id that is not in the label set.
+            In every case the mirror is as it was.
+        """
+        packed = _check(changes, self._snapshot.label_set)
+        with self._lock:
+            old = self._snapshot
+            if not changes.since <= old.version <= changes.version:
+                raise MapError(
+                    f"changes from version {changes.since} to {changes.version} do not continue a mirror at version "
+                    f"{old.version}; ask the map for its changes since {old.version}"
+                )
+            staying = ~np.isin(old.packed, packed)
+            merged = np.concatenate((old.packed[staying], packed))
+            pool, kept = self._make_room(old, old.slots[staying], len(packed))
+            slots = np.concatenate((kept, np.arange(self._used, self._used + len(packed), dtype=np.int32)))
+            _write(pool, self._used, changes, old.label_set.ignore_id)
+            self._used += len(packed)
+            order = np.argsort(merged)
+            merged, slots = merged[order], slots[order]
+            index = make_block_index(unpack_keys(merged), slots)
+            self._snapshot = dataclasses.replace(
+                old, version=changes.version, packed=merged, slots=slots, index=index, voxels=pool
+            )
+            return self._snapshot
+
+    def _make_room(self, old: MapSnapshot, kept: NDArray[np.int32], more: int) -> tuple[BlockVoxels, NDArray[np.int32]]:
+        """A pool with room for ``more`` blocks behind those in use, and where in it those in slots ``kept`` lie."""
+        if self._used + more <= len(old.voxels.tsdf):
+            return old.voxels, kept
+        living = len(kept) + more
+        pool = _new_pool(living + max(living // 2, LEAST_SPARE))
+        for mine, theirs in zip(pool, old.voxels, strict=True):
+            mine[: len(kept)] = theirs[kept]
+        self._used = len(kept)
+        return pool, np.arange(len(kept), dtype=np.int32)
+
+
+def _new_pool(blocks: int) -> BlockVoxels:
+    flat = (blocks, BLOCK_VOXELS)
+    tsdf, rgb, classes = np.empty(flat, np.int8), np.empty((*flat, 3), np.uint8), np.empty((blocks, 4), np.uint64)
+    weight, label, confidence = (np.empty(flat, np.uint8) for _ in range(3))
+    return BlockVoxels(tsdf, weight, label, confidence, rgb, classes)
+
+
+def _write(pool: BlockVoxels, start: int, changes: BlockChanges, ignore_id: int) -> None:
+    part = slice(start, start + len(changes.keys))
+    pool.tsdf[part] = changes.tsdf
+    pool.weight[part] = changes.observed
+    pool.label[part] = changes.label
+    pool.confidence[part] = changes.confidence
+    pool.rgb[part] = changes.rgb
+    _collect_classes(pool.tsdf[part], pool.weight[part], pool.label[part], ignore_id, pool.classes[part])
+
+
+@njit(nogil=True, cache=True)
+def _collect_classes(tsdf, weight, label, ignore_id, classes):
+    """Classes (B, 4) of the voxels that lie near enough to a surface to be one of its own (``surface_offset``)."""
+    for block in range(len(tsdf)):
+        classes[block] = 0
+        for voxel in range(BLOCK_VOXELS):
+            c = label[block, voxel]
+            if c == ignore_id or not weight[block, voxel] or abs(np.int64(tsdf[block, voxel])) > NEAREST_STEPS:
+                continue
+            classes[block, c >> 6] |= np.uint64(1) << np.uint64(c & 63)
+
+
+def _check(changes: BlockChanges, label_set: LabelSet) -> NDArray[np.int64]:
+    """Packed keys of changes that may come from a network."""
+    blocks = len(changes.keys)
+    forms = {"keys": (np.int32, (3,)), "tsdf": (np.int8, (BLOCK_VOXELS,)), "label": (np.uint8, (BLOCK_VOXELS,))}
+    forms |= {"confidence": (np.uint8, (BLOCK_VOXELS,)), "rgb": (np.uint8, (BLOCK_VOXELS, 3))}
+    for name, (dtype, tail) in forms.items():
+        array: NDArray[np.generic] = getattr(changes, name)
+        if array.dtype != dtype or array.shape != (blocks, *tail):
+            raise MapError(
+                f"changes up to version {changes.version}: {name} must be {np.dtype(dtype).name} {(blocks, *tail)}, "
+                f"got {array.dtype.name} {array.shape}"
+            )
+    if blocks and not -KEY_LIMIT <= changes.keys.min() <= changes.keys.max() < KEY_LIMIT:
+        raise MapError(f"changes up to version {changes.version}: block coordinates beyond {KEY_LIMIT}")
+    packed = pack_keys(changes.keys)
+    if len(np.unique(packed)) != blocks:
+        raise MapError(f"changes up to version {changes.version}: a block comes twice")
+    known = np.zeros(256, np.bool_)
+    known[[*label_set.ids, label_set.ignore_id]] = True
+    if not known[changes.label].all():
+        foreign = sorted({int(i) for i in np.unique(changes.label)} - {*label_set.ids, label_set.ignore_id})
+        raise LabelError(
+            f"changes up to version {changes.version}: class ids {foreign} are not in label set '{label_set.name}'; "
+            "the mirror was made for another map"
+        )
+    return packed

@@ -1,0 +1,82 @@
+"""One state of a mirrored map, which never changes: what all queries look at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.block_index import BlockIndex, unpack_keys
+from semantic_mapper.mapping.changes import CONFIDENCE_STEPS, TSDF_STEPS
+from semantic_mapper.types import Float32, UInt8
+
+
+class BlockVoxels(NamedTuple):
+    """Voxels of S block slots, in the order [z][y][x]; ``tsdf`` and ``weight`` have the names ``march`` knows.
+
+    Args:
+        tsdf: (S, 512) int8 signed distance over truncation, times 127.
+        weight: (S, 512) uint8, 1 where observed.
+        label: (S, 512) uint8 class ids, the ignore id where nothing voted.
+        confidence: (S, 512) uint8 probability of ``label``, times 255.
+        rgb: (S, 512, 3) uint8.
+        classes: (S, 4) uint64, a bit for each class id that a surface voxel of the block may have.
+    """
+
+    tsdf: NDArray[np.int8]
+    weight: UInt8
+    label: UInt8
+    confidence: UInt8
+    rgb: UInt8
+    classes: NDArray[np.uint64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapSnapshot:
+    """A map as it was at one version. Immutable, so any number of threads may query it.
+
+    Args:
+        version: ``VoxelMap.frames`` of that state.
+        voxel_size_m: Edge of a voxel.
+        truncation_voxels: Of the TSDF.
+        label_set: Of the map.
+        packed: (B,) int64 sorted packed keys of the blocks.
+        slots: (B,) int32 where each of them lies in ``voxels``.
+        index: The same as a table for compiled code.
+        voxels: Memory shared with other snapshots; only ``slots`` of it belong to this one.
+    """
+
+    version: int
+    voxel_size_m: float
+    truncation_voxels: float
+    label_set: LabelSet
+    packed: NDArray[np.int64]
+    slots: NDArray[np.int32]
+    index: BlockIndex
+    voxels: BlockVoxels
+
+    @property
+    def block_count(self) -> int:
+        """Blocks of 8^3 voxels."""
+        return len(self.packed)
+
+    @property
+    def keys(self) -> NDArray[np.int32]:
+        """(B, 3) block coordinates in lexicographic order."""
+        return unpack_keys(self.packed)
+
+    def read(self, slot: NDArray[np.int64], voxel: NDArray[np.int64]) -> tuple[UInt8, Float32, UInt8]:
+        """Label (N,), confidence (N,) and rgb (N, 3) of voxels (N,); ignore id, 0 and black where ``slot`` is -1."""
+        there, voxels = slot >= 0, self.voxels
+        label = np.where(there, voxels.label[slot, voxel], self.label_set.ignore_id).astype(np.uint8)
+        steps = np.where(there, voxels.confidence[slot, voxel], 0)
+        rgb = np.where(there[:, None], voxels.rgb[slot, voxel], 0).astype(np.uint8)
+        return label, (steps / np.float32(CONFIDENCE_STEPS)).astype(np.float32), rgb
+
+    @property
+    def voxels_per_step(self) -> float:
+        """Length of one step of the quantised TSDF, in voxels."""
+        return self.truncation_voxels / TSDF_STEPS
