@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from nodes import cli_demo, cli_doctor, cli_eval, cli_export, cli_finetune, cli_log, cli_replay, cli_up
+from nodes import cli_demo, cli_doctor, cli_eval, cli_export, cli_finetune, cli_log, cli_query, cli_replay, cli_up
 from nodes.verb import Settings
 from semantic_mapper import __version__
 
@@ -35,6 +35,9 @@ for _function in (
     cli_doctor.doctor,
 ):
     app.command(_function.__name__.rstrip("_").replace("evaluate", "eval"))(_function)
+
+# Coordinates below 0 look like options.
+app.command("query", context_settings={"ignore_unknown_options": True})(cli_query.query)
 
 for _name in ("train", "bench"):  # measuring and training are no part of a robot's installation
     if importlib.util.find_spec(f"nodes.cli_{_name}") is not None:

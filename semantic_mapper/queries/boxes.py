@@ -67,7 +67,7 @@ def mesh_in_box(snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike) -> Ma
 def _values(snapshot: MapSnapshot, rows: NDArray[np.int64]) -> BlockValues:
     """Geometry of blocks (B,) as the map's storage has it; no classes and no colours."""
     slots = snapshot.slots[rows]
-    tsdf = snapshot.voxels.tsdf[slots] / np.float32(TSDF_STEPS)
+    tsdf = (snapshot.voxels.tsdf[slots] / TSDF_STEPS).astype(np.float32)
     weight = snapshot.voxels.weight[slots].astype(np.float32)
     none = np.zeros((), np.float32)
     return BlockValues(

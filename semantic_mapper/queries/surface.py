@@ -60,7 +60,7 @@ def may_be_surface(slot, voxel, voxels):
     return voxels.weight[slot, voxel] != 0 and abs(np.int64(voxels.tsdf[slot, voxel])) <= NEAREST_STEPS
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, inline="always")
 def surface_offset(slot, voxel, near, voxels, offset):
     """Whether a voxel is one of the surface; ``offset`` (3,) then leads from its centre to its surface point.
 

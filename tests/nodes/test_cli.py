@@ -7,7 +7,7 @@ import pytest
 from semantic_mapper import __version__
 from tests.nodes.support import run
 
-VERBS = ("demo", "replay", "up", "import", "info", "recover", "finetune", "eval", "doctor", "train", "bench")
+VERBS = ("demo", "replay", "up", "import", "info", "recover", "finetune", "eval", "doctor", "query", "train", "bench")
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -38,6 +38,11 @@ def test_version_is_that_of_the_package() -> None:
         ("finetune", "room.mcap", "--keyframes", "1", "--out", "w"),
         ("finetune", "room.mcap", "--keyframes", "4", "--out", "w", "--seconds", "0"),
         ("eval",),
+        ("query", "map.npz", "where"),
+        ("query", "map.npz", "at", "1", "2"),
+        ("query", "map.npz", "at", "1", "2", "east"),
+        ("query", "map.npz", "nearest", "1", "2", "3"),
+        ("query", "map.npz", "info", "--jason", "x"),
     ],
 )
 def test_wrong_usage_exits_with_2_and_says_so_on_stderr(arguments: tuple[str, ...]) -> None:

@@ -1,0 +1,137 @@
+"""Answers about a map, as plain data and as tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from semantic_mapper.queries.instances import InstanceTracker
+from semantic_mapper.queries.lookup import at
+from semantic_mapper.queries.nearest import nearest
+from semantic_mapper.queries.occupancy import State
+from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.surface import surface_voxels
+from semantic_mapper.types import Float64
+
+DIGITS = 4  # 0.1 mm
+
+
+def describe_map(snapshot: MapSnapshot) -> dict[str, Any]:
+    """Size and classes of a map."""
+    surface = surface_voxels(snapshot)
+    label = snapshot.voxels.label[snapshot.slots[surface.row], surface.voxel]
+    labels = snapshot.label_set
+    counts = {name: int((label == i).sum()) for i, name in zip(labels.ids, labels.names, strict=True)}
+    xyz = surface.point * snapshot.voxel_size_m
+    return {
+        "question": "info",
+        "frames": snapshot.version,
+        "voxel_size_m": snapshot.voxel_size_m,
+        "blocks": snapshot.block_count,
+        "surface_voxels": len(label),
+        "without_class": int((label == labels.ignore_id).sum()),
+        "lower": _rounded(xyz.min(axis=0)) if len(xyz) else None,
+        "upper": _rounded(xyz.max(axis=0)) if len(xyz) else None,
+        "label_set": labels.name,
+        "classes": counts,
+    }
+
+
+def answer_at(snapshot: MapSnapshot, point: Sequence[float]) -> dict[str, Any]:
+    """What is at a point.
+
+    Raises:
+        MapError: see ``lookup.at``.
+    """
+    answers = at(snapshot, [point])
+    label, labels = int(answers.label[0]), snapshot.label_set
+    known = np.isfinite(answers.distance_m[0])
+    return {
+        "question": "at",
+        "point": list(point),
+        "class": labels.names[labels.ids.index(label)] if label != labels.ignore_id else None,
+        "confidence": round(float(answers.confidence[0]), DIGITS),
+        "surface_distance_m": round(float(answers.distance_m[0]), DIGITS) if known else None,
+        "state": State(int(answers.state[0])).name.lower(),
+    }
+
+
+def answer_nearest(snapshot: MapSnapshot, class_name: str, point: Sequence[float]) -> dict[str, Any]:
+    """Where the nearest surface of a class is.
+
+    Raises:
+        LabelError, MapError: see ``nearest.nearest``.
+    """
+    hit = nearest(snapshot, class_name, point)
+    found: dict[str, Any] = {"question": "nearest", "class": class_name, "point": list(point), "found": hit is not None}
+    if hit is not None:
+        found |= {"xyz": _rounded(hit.xyz), "distance_m": round(hit.distance_m, DIGITS)}
+        found["confidence"] = round(hit.confidence, DIGITS)
+    return found
+
+
+def answer_instances(snapshot: MapSnapshot, up: Sequence[float]) -> dict[str, Any]:
+    """The things in a map.
+
+    Raises:
+        MapError: see ``instances.InstanceTracker``.
+    """
+    things = [
+        {
+            "id": thing.id,
+            "class": thing.class_name,
+            "confidence": round(thing.confidence, DIGITS),
+            "voxels": len(thing.voxels),
+            "centroid": _rounded(thing.centroid),
+            "box": {
+                "center": _rounded(thing.box.center),
+                "size": _rounded(thing.box.size),
+                "R_world_box": np.round(thing.box.R_world_box, 6).tolist(),
+            },
+        }
+        for thing in InstanceTracker(up=up).update(snapshot)
+    ]
+    return {"question": "instances", "up": list(up), "instances": things}
+
+
+def answer_table(found: dict[str, Any]) -> Table:
+    """An answer, for people."""
+    if found["question"] == "instances":
+        return _instance_table(found)
+    table = Table(title=found["map"], title_justify="left", show_header=False)
+    for key, value in found.items():
+        if key not in ("map", "question", "classes"):
+            table.add_row(key.replace("_", " "), _text(value))
+    if "classes" in found:
+        table.add_section()
+        for name, count in sorted(found["classes"].items(), key=lambda item: -item[1]):
+            if count:
+                table.add_row(name, f"{count} surface voxels")
+    return table
+
+
+def _instance_table(found: dict[str, Any]) -> Table:
+    table = Table(title=found["map"], title_justify="left")
+    for name in ("id", "class", "confidence", "voxels", "centroid, m", "box, m"):
+        table.add_column(name, no_wrap=True)
+    for thing in found["instances"]:
+        row = (thing["class"], f"{thing['confidence']:.2f}", str(thing["voxels"]))
+        table.add_row(str(thing["id"]), *row, _joined(thing["centroid"]), _joined(thing["box"]["size"]))
+    return table
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list):
+        return f"{_joined(value)} m"
+    return "none" if value is None else str(value)
+
+
+def _joined(xyz: list[float]) -> str:
+    return " ".join(f"{x:.2f}" for x in xyz)
+
+
+def _rounded(xyz: Float64) -> list[float]:
+    return np.round(xyz, DIGITS).tolist()
