@@ -1,0 +1,143 @@
+"""A mirror is its map, however it was fed; its snapshots never change."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import LabelError, MapError
+from semantic_mapper.mapping.changes import BlockChanges
+from semantic_mapper.queries import mirror as mirror_module
+from semantic_mapper.queries.lookup import at
+from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.nearest import nearest
+from semantic_mapper.queries.rays import cast_rays
+from semantic_mapper.queries.snapshot import MapSnapshot
+from tests.mapping.test_paging import MEMORY_MB, walk
+from tests.mapping.views import small_map
+from tests.queries.scene import FLOOR, LABELS, TABLE, integrate, painted, poses, whole_map
+
+
+def content(snapshot: MapSnapshot) -> dict[str, np.ndarray]:
+    return {"packed": snapshot.packed} | {k: v[snapshot.slots] for k, v in snapshot.voxels._asdict().items()}
+
+
+def assert_same(a: MapSnapshot, b: MapSnapshot) -> None:
+    assert a.version == b.version
+    for name, values in content(a).items():
+        np.testing.assert_array_equal(values, content(b)[name], err_msg=name)
+
+
+def empty_mirror() -> MapMirror:
+    return MapMirror(0.02, 4.0, LABELS)
+
+
+def test_fed_in_parts_while_the_map_grows_it_is_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mirror_module, "LEAST_SPARE", 16)  # the pool is replaced several times
+    voxel_map, mirror = small_map(LABELS), empty_mirror()
+    monkeypatch.undo()
+    pools = set()
+    for seq, pose in enumerate(poses(9)):
+        integrate(voxel_map, pose, seq)
+        mirror.apply(voxel_map.changes(mirror.version, limit=150))
+        pools.add(id(mirror.snapshot().voxels.tsdf.ctypes.data))
+    while mirror.version < voxel_map.frames:
+        mirror.apply(voxel_map.changes(mirror.version, limit=150))
+    assert len(pools) > 1
+    assert_same(mirror.snapshot(), MapMirror.of(voxel_map).snapshot())
+    assert mirror.snapshot().block_count == voxel_map.block_count
+
+
+def test_a_paged_map_has_the_same_mirror() -> None:
+    free, paged = small_map(voxel_size_m=0.01), small_map(voxel_size_m=0.01, memory_mb=MEMORY_MB)
+    mirror = MapMirror(0.01, 4.0, paged.label_set)
+    for n in range(8):
+        for voxel_map in (free, paged):
+            walk(voxel_map, 1, first=n)
+        mirror.apply(paged.changes(mirror.version, limit=300))
+    while mirror.version < paged.frames:
+        mirror.apply(paged.changes(mirror.version, limit=300))
+    assert paged.stored_blocks > 100
+    assert_same(mirror.snapshot(), MapMirror.of(free).snapshot())
+    assert_same(MapMirror.of(paged).snapshot(), MapMirror.of(free).snapshot())
+
+
+def test_a_saved_map_has_the_same_mirror(tmp_path: Path) -> None:
+    voxel_map = whole_map()
+    voxel_map.save(tmp_path / "map.npz")
+    loaded = type(voxel_map).load(tmp_path / "map.npz")
+    assert_same(MapMirror.of(loaded).snapshot(), MapMirror.of(voxel_map).snapshot())
+
+
+def test_a_snapshot_stays_as_it_was() -> None:
+    mirror = empty_mirror()
+    before = mirror.snapshot()
+    first = mirror.apply(painted(np.full((16, 16), TABLE, np.uint8), 0, 1))
+    kept = {name: values.copy() for name, values in content(first).items()}
+    for version in range(2, 200):
+        mirror.apply(painted(np.full((16, 24), FLOOR, np.uint8), version - 1, version))
+    assert before.block_count == 0 and nearest(before, "table", (0, 0, 0)) is None
+    for name, values in content(first).items():
+        np.testing.assert_array_equal(values, kept[name])
+    assert nearest(first, "table", (0, 0, 0)) and not nearest(mirror.snapshot(), "table", (0, 0, 0))
+    assert mirror.snapshot().block_count == 6 and len(mirror.snapshot().voxels.tsdf) < 1000
+
+
+def test_gaps_and_old_changes_are_refused() -> None:
+    mirror, plan = empty_mirror(), np.full((8, 8), TABLE, np.uint8)
+    mirror.apply(painted(plan, 0, 3))
+    for since, version in ((4, 5), (0, 2)):
+        with pytest.raises(MapError, match=r"do not continue a mirror at version 3"):
+            mirror.apply(painted(plan, since, version))
+    assert mirror.version == 3
+    assert mirror.apply(painted(plan, 2, 5)).version == 5  # more than was missing does no harm
+
+
+def test_damaged_changes_are_refused_and_leave_the_mirror_as_it_was() -> None:
+    mirror, good = empty_mirror(), painted(np.full((16, 8), TABLE, np.uint8), 0, 1)
+
+    def refused(error: type[Exception], match: str, **changed: np.ndarray) -> None:
+        with pytest.raises(error, match=match):
+            mirror.apply(dataclasses.replace(good, **changed))
+
+    refused(MapError, "tsdf must be int8", tsdf=good.tsdf[:1])
+    refused(MapError, "rgb must be uint8", rgb=good.rgb.astype(np.int16))
+    refused(MapError, "a block comes twice", keys=good.keys[[0, 0]])
+    refused(MapError, "block coordinates beyond", keys=good.keys + (1 << 22))
+    refused(LabelError, r"class ids \[77\]", label=np.where(good.label > 0, 77, 0).astype(np.uint8))
+    assert mirror.version == 0 and mirror.snapshot().block_count == 0
+
+
+def test_queries_see_whole_versions_while_another_thread_applies() -> None:
+    """Every version paints all of the surface in one class: an answer that mixes versions would show two."""
+    mirror = empty_mirror()
+    mirror.apply(painted(np.full((32, 32), FLOOR, np.uint8), 0, 1))
+    plans = {c: painted(np.full((32, 32), c, np.uint8), 0, 1) for c in (FLOOR, TABLE)}
+    stop, wrong, asked = threading.Event(), [], [0] * 3
+    places = np.stack(np.meshgrid(np.arange(32), np.arange(32), [3.3]), -1).reshape(-1, 3)[::7] * 0.02
+
+    def ask(who: int) -> None:
+        while not stop.is_set() or asked[who] < 5:
+            snapshot = mirror.snapshot()
+            want = FLOOR if snapshot.version % 2 else TABLE
+            label = at(snapshot, places).label
+            rays = cast_rays(snapshot, places + np.array([0, 0, 0.06]), (0.0, 0.0, -1.0)).label
+            other = nearest(snapshot, "table" if want == FLOOR else "floor", places[5])
+            if (label != want).any() or (rays != want).any() or other is not None:
+                wrong.append(snapshot.version)
+            asked[who] += 1
+
+    threads = [threading.Thread(target=ask, args=(n,)) for n in range(3)]
+    for thread in threads:
+        thread.start()
+    for version in range(2, 400):
+        plan: BlockChanges = plans[FLOOR if version % 2 else TABLE]
+        mirror.apply(dataclasses.replace(plan, since=version - 1, version=version))
+    stop.set()
+    for thread in threads:
+        thread.join()
+    assert not wrong and min(asked) >= 5
