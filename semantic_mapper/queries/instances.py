@@ -71,7 +71,7 @@ class InstanceTracker:
             raise MapError(f"min_voxels must be at least 1, got {min_voxels}")
         self._stuff = frozenset(stuff)
         self._min_voxels = min_voxels
-        self._up = check_direction(up, "up").reshape(-1)
+        self._up = check_direction(up, "up")
         if self._up.shape != (3,):
             raise MapError(f"up: expected shape (3,), got {np.shape(up)}")
         self._next_id = 1

@@ -20,7 +20,11 @@ MAX_BOX_VOXELS = 1 << 24  # 134 m^3 at 2 cm; about 0.5 GB while the distances ar
 
 
 class State(IntEnum):
-    """What is known of a place. Occupied: the surface is less than half a voxel before it, or it lies behind one."""
+    """What is known of a voxel.
+
+    Occupied: the surface is at most half a voxel in front of it, or it lies behind a surface, up to the truncation.
+    Unknown is also the air that cameras looked through far from any surface: the map keeps no blocks there.
+    """
 
     UNKNOWN = 0
     FREE = 1

@@ -21,6 +21,7 @@ LABELS = make_label_set("known", ("floor", "table", "cup", "lamp"), ids=(2, 5, 9
 FLOOR, TABLE, CUP, LAMP = LABELS.ids
 BALL, RADIUS = np.array([0.75, 0.1, 0.2]), 0.2
 BOX, HALF, YAW = np.array([-0.1, 0.05, 0.2]), np.array([0.3, 0.2, 0.2]), np.deg2rad(25)
+REACH_M = 2.0  # the floor ends there
 MIDDLE = np.array([0.3, 0.0, 0.15])
 
 
@@ -52,6 +53,7 @@ def seen(T_world_camera: Float64) -> tuple[Float32, UInt8]:
     layers = np.stack((*layers, sphere_depth(T_world_camera, BALL, RADIUS)))
     first = np.where(layers > 0, layers, np.inf).argmin(axis=0)
     depth = np.take_along_axis(layers, first[None], axis=0)[0]
+    depth[depth > REACH_M] = 0
     return depth, np.where(depth > 0, np.array([FLOOR, TABLE, CUP], np.uint8)[first], 0).astype(np.uint8)
 
 

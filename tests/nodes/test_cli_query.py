@@ -1,0 +1,72 @@
+"""The command on a saved map of a known scene."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.nodes.support import run
+from tests.queries.scene import BALL, BOX, HALF, RADIUS, whole_map
+
+
+@pytest.fixture(scope="module")
+def map_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("map") / "map.npz"
+    whole_map().save(path)
+    return path
+
+
+def ask(map_file: Path, *arguments: object) -> tuple[dict, str]:
+    answer = map_file.with_name("answer.json")
+    done = run("query", map_file, *map(str, arguments), "--json", answer)
+    assert done.returncode == 0, done.stderr
+    return json.loads(answer.read_text()), done.stdout
+
+
+def test_info(map_file: Path) -> None:
+    found, shown = ask(map_file, "info")
+    assert (found["frames"], found["blocks"], found["label_set"]) == (14, whole_map().block_count, "known")
+    assert found["classes"]["floor"] > found["classes"]["table"] > 500 and found["classes"]["lamp"] == 0
+    assert found["surface_voxels"] == found["without_class"] + sum(found["classes"].values())
+    assert "table" in shown and "lamp" not in shown
+
+
+def test_at_points_below_zero_too(map_file: Path) -> None:
+    x, y, z = BOX + np.array([0.0, 0.0, HALF[2]])
+    assert x < 0
+    found, shown = ask(map_file, "at", x, y, z)
+    assert found["class"] == "table" and found["confidence"] > 0.5 and found["surface_distance_m"] < 0.01
+    assert found["state"] == "occupied" and "table" in shown
+    found, _ = ask(map_file, "at", "-1e1", "-2", ".5")
+    assert (found["class"], found["state"], found["surface_distance_m"]) == (None, "unknown", None)
+
+
+def test_nearest(map_file: Path) -> None:
+    above = BALL + np.array([0.0, 0.0, 1.0])
+    found, shown = ask(map_file, "nearest", "cup", *above)
+    assert found["found"] and abs(found["distance_m"] - (1.0 - RADIUS)) < 0.006
+    np.testing.assert_allclose(found["xyz"], BALL + np.array([0.0, 0.0, RADIUS]), atol=0.03)
+    assert "cup" in shown
+    found, _ = ask(map_file, "nearest", "lamp", *above)
+    assert found["found"] is False
+    done = run("query", map_file, "nearest", "kettle", "0", "0", "0")
+    assert done.returncode == 1 and "floor, table, cup, lamp" in done.stderr.replace("\n", " ")
+
+
+def test_instances(map_file: Path) -> None:
+    found, shown = ask(map_file, "instances", "--up", "0", "0", "-1")
+    large = {thing["class"]: thing for thing in found["instances"] if thing["voxels"] > 200}
+    assert set(large) == {"table", "cup"}
+    np.testing.assert_allclose(large["table"]["box"]["center"], BOX, atol=0.03)
+    assert large["table"]["box"]["R_world_box"][2][2] == -1
+    assert "table" in shown and str(large["cup"]["voxels"]) in shown
+
+
+def test_what_cannot_be_asked_is_said(map_file: Path, tmp_path: Path) -> None:
+    missing = run("query", tmp_path / "none.npz", "info")
+    assert missing.returncode == 1 and "no such map file" in missing.stderr
+    nan = run("query", map_file, "at", "nan", "0", "0")
+    assert nan.returncode == 1 and "row 0" in nan.stderr

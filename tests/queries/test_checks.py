@@ -1,0 +1,84 @@
+"""Whatever is asked wrongly is refused in words, by every query."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import MapError, PoseError
+from semantic_mapper.queries import boxes, lookup, nearest, occupancy, rays
+from tests.mapping.views import INTRINSICS
+from tests.queries.scene import whole
+
+NAN = float("nan")
+
+
+@pytest.mark.parametrize("query", [lookup.at, occupancy.occupancy])
+@pytest.mark.parametrize(
+    ("points", "match"),
+    [
+        ([[0, 0, NAN]], "row 0 is .*nan"),
+        ([[0, 0, 0], [0, np.inf, 0]], "row 1"),
+        ([[0, 0, 1e9]], "coordinates must be numbers below"),
+        ([0, 0, 0], r"expected shape \(N, 3\), got \(3,\)"),
+        ([[0, 0]], r"got \(1, 2\)"),
+        ([["a", "b", "c"]], "expected numbers"),
+        ([[0, 0, 0], [1]], "expected numbers"),
+    ],
+)
+def test_points(query: Callable[..., Any], points: Any, match: str) -> None:
+    with pytest.raises(MapError, match=match):
+        query(whole(), points)
+    assert len(lookup.at(whole(), np.empty((0, 3))).label) == 0
+
+
+def test_radius() -> None:
+    for radius, match in ((0.0, "above 0"), (NAN, "above 0"), (0.6, "at most 0.5")):
+        with pytest.raises(MapError, match=match):
+            lookup.at(whole(), [[0, 0, 0]], radius)
+
+
+@pytest.mark.parametrize("point", [(0, 0), [(0, 0, 0)], (0, 0, NAN)])
+def test_point(point: Any) -> None:
+    with pytest.raises(MapError, match="point"):
+        nearest.nearest(whole(), "cup", point)
+
+
+@pytest.mark.parametrize("query", [boxes.points_in_box, boxes.mesh_in_box, occupancy.distance_field])
+def test_box(query: Callable[..., Any]) -> None:
+    for lower, upper, match in (
+        ((0, 0, 0), (1, 0, 1), "is empty"),
+        ((0, 0, 0), (1, -1, 1), "is empty"),
+        ((0, 0, NAN), (1, 1, 1), "lower"),
+        ((0, 0, 0), (1, 1), "upper"),
+    ):
+        with pytest.raises(MapError, match=match):
+            query(whole(), lower, upper)
+
+
+def test_boxes_that_hold_too_much_or_nothing() -> None:
+    with pytest.raises(MapError, match=r"501 x 501 x 501 voxels of 0.02 m.*smaller box"):
+        occupancy.distance_field(whole(), (0, 0, 0), (10, 10, 10))
+    with pytest.raises(MapError, match="smaller box"):
+        occupancy.distance_field(whole(), (-8e4, -8e4, -8e4), (8e4, 8e4, 8e4))
+    with pytest.raises(MapError, match="larger box"):
+        occupancy.distance_field(whole(), (0.001, 0, 0), (0.019, 1, 1))
+
+
+def test_rays() -> None:
+    def refused(match: str, *arguments: Any) -> None:
+        with pytest.raises(MapError, match=match):
+            rays.cast_rays(whole(), *arguments)
+
+    refused("directions: .* above 0", (0, 0, 0), (0, 0, 0))
+    refused("directions", (0, 0, 0), (0, NAN, 1))
+    refused("directions: expected shape", (0, 0, 0), (1, 0))
+    refused("origins", (0, NAN, 0), (0, 0, 1))
+    refused("2 origins and 3 directions", np.zeros((2, 3)), np.ones((3, 3)))
+    refused("max_m must be at most 100", (0, 0, 0), (0, 0, 1), 1e6)
+    refused("max_m must be a finite number above 0", (0, 0, 0), (0, 0, 1), 0.0)
+    with pytest.raises(PoseError):
+        rays.ray_cast(whole(), np.full((4, 4), NAN), INTRINSICS)

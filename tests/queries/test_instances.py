@@ -1,0 +1,173 @@
+"""Components against scipy's, boxes against the known scene, and ids that stay while the map grows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from semantic_mapper.errors import MapError
+from semantic_mapper.queries.components import find_components
+from semantic_mapper.queries.instances import Instance, InstanceTracker
+from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.oriented_box import upright_box
+from semantic_mapper.types import UInt8
+from tests.mapping.views import small_map
+from tests.queries.scene import (
+    BALL,
+    BOX,
+    CUP,
+    FLOOR,
+    HALF,
+    LABELS,
+    LAMP,
+    TABLE,
+    YAW,
+    box_axes,
+    integrate,
+    painted,
+    poses,
+    whole,
+)
+
+
+class Painting:
+    """A map of one level surface that is painted over again and again."""
+
+    def __init__(self, min_voxels: int = 1) -> None:
+        self.mirror = MapMirror(0.02, 4.0, LABELS)
+        self.tracker = InstanceTracker(min_voxels=min_voxels)
+
+    def paint(self, plan: UInt8) -> dict[tuple[int, ...], Instance]:
+        """Instances by their first voxel."""
+        version = self.mirror.version
+        snapshot = self.mirror.apply(painted(plan, version, version + 1))
+        return {tuple(thing.voxels[0][:2].tolist()): thing for thing in self.tracker.update(snapshot)}
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.1, 0.9), least=st.integers(1, 9))
+def test_components_are_those_of_scipy(seed: int, share: float, least: int) -> None:
+    rng = np.random.default_rng(seed)
+    plan = np.where(rng.random((32, 24)) < share, rng.choice([TABLE, CUP, FLOOR], (32, 24)), 0).astype(np.uint8)
+    mirror = MapMirror(0.02, 4.0, LABELS)
+    found = find_components(mirror.apply(painted(plan, 0, 1)), (TABLE, CUP), least)
+    x, y = np.divmod(found.row, 3)
+    mine = np.full(plan.shape, -1)
+    mine[x * 8 + (found.voxel & 7), y * 8 + ((found.voxel >> 3) & 7)] = found.component
+    pairs = set()
+    for class_id in (TABLE, CUP):
+        theirs, count = ndimage.label(plan == class_id, np.ones((3, 3)))
+        sizes = np.bincount(theirs.ravel(), minlength=count + 1)
+        large = (theirs > 0) & (sizes[theirs] >= least)
+        assert (large == ((mine >= 0) & (plan == class_id))).all()
+        pairs |= {(class_id, a, b) for a, b in zip(theirs[large], mine[large], strict=True)}
+    assert len(pairs) == len({p[:2] for p in pairs}) == len({p[2] for p in pairs})
+    assert sorted(p[2] for p in pairs) == list(range(len(pairs)))
+
+
+def test_table_and_cup_are_found_where_they_stand() -> None:
+    things = InstanceTracker(min_voxels=200).update(whole())
+    assert [thing.class_name for thing in things] in (["table", "cup"], ["cup", "table"])
+    by_name = {thing.class_name: thing for thing in things}
+    table, cup = by_name["table"], by_name["cup"]
+    assert (table.class_id, cup.class_id) == (TABLE, CUP) and {table.id, cup.id} == {1, 2}
+    np.testing.assert_allclose(table.box.size, 2 * HALF, atol=0.06)  # votes spill onto the floor
+    np.testing.assert_allclose(table.box.center, BOX, atol=0.03)
+    turned = np.abs(table.box.R_world_box.T @ box_axes())
+    np.testing.assert_allclose(turned, np.eye(3), atol=np.sin(np.deg2rad(4)))
+    np.testing.assert_allclose(cup.box.center[:2], BALL[:2], atol=0.02)
+    assert np.linalg.norm(cup.centroid - BALL) < 0.1 and cup.confidence > 0.5
+    assert np.abs(cup.voxels * 0.02 - BALL).max() < 0.26
+
+
+def test_stuff_and_small_pieces_are_left_out() -> None:
+    names = [thing.class_name for thing in InstanceTracker(stuff=("table",), min_voxels=200).update(whole())]
+    assert sorted(names) == ["cup", "floor"]
+    assert InstanceTracker(min_voxels=10**6).update(whole()) == ()
+
+
+def test_ids_stay_while_the_map_grows() -> None:
+    voxel_map, mirror = small_map(LABELS), MapMirror(0.02, 4.0, LABELS)
+    tracker = InstanceTracker(min_voxels=100)
+    ids: dict[str, set[int]] = {"table": set(), "cup": set()}
+    sizes = []
+    for seq, pose in enumerate(poses(10)):
+        integrate(voxel_map, pose, seq)
+        things = tracker.update(mirror.apply(voxel_map.changes(mirror.version)))
+        for name, known in ids.items():
+            largest = max((t for t in things if t.class_name == name), key=lambda t: len(t.voxels))
+            known.add(largest.id)
+        sizes.append(sum(len(t.voxels) for t in things))
+    assert [len(known) for known in ids.values()] == [1, 1] and sizes[-1] > 1.3 * sizes[0]
+
+
+def test_a_merge_keeps_the_older_id_and_a_split_the_larger_parts() -> None:
+    painting, plan = Painting(), np.zeros((32, 32), np.uint8)
+    plan[2:6, 2:20] = TABLE
+    assert painting.paint(plan)[2, 2].id == 1
+    plan[20:30, 2:20] = TABLE
+    plan[10, 30] = LAMP
+    first = painting.paint(plan)
+    assert (first[2, 2].id, sorted(thing.id for thing in first.values())) == (1, [1, 2, 3])
+    table = first[20, 2].id
+    plan[6:20, 5] = TABLE  # a bridge
+    merged = painting.paint(plan)
+    assert merged[2, 2].id == 1 and len(merged) == 2
+    plan[6:20, 5] = 0
+    split = painting.paint(plan)
+    assert split[20, 2].id == 1, "the larger part"
+    assert split[2, 2].id == 4 and table not in [thing.id for thing in split.values()], "no id is given twice"
+    plan[:] = 0
+    assert painting.paint(plan) == {}
+    plan[2:6, 2:20] = TABLE
+    assert painting.paint(plan)[2, 2].id == 5
+
+
+def test_neighbours_that_trade_a_few_voxels_keep_their_ids() -> None:
+    painting, plan = Painting(), np.zeros((16, 16), np.uint8)
+    plan[:8], plan[8:] = TABLE, CUP
+    before = {thing.class_name: thing.id for thing in painting.paint(plan).values()}
+    for edge in (6, 9, 7, 8):
+        plan[:edge], plan[edge:] = TABLE, CUP
+        assert {thing.class_name: thing.id for thing in painting.paint(plan).values()} == before
+    plan[:] = CUP
+    assert [thing.id for thing in painting.paint(plan).values()] == [min(before.values())]
+
+
+@settings(max_examples=50, deadline=None)
+@given(yaw=st.floats(-7, 7), seed=st.integers(0, 10**6))
+def test_the_box_of_a_turned_box_is_that_box(yaw: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    up = rng.normal(size=3)
+    up /= np.linalg.norm(up)
+    a = np.cross(up, rng.normal(size=3))
+    a /= np.linalg.norm(a)
+    R = np.stack((np.cos(yaw) * a + np.sin(yaw) * np.cross(up, a), np.zeros(3), up), axis=1)
+    R[:, 1] = np.cross(up, R[:, 0])
+    size, center = np.array([0.7, 0.4, 0.9]), np.array([3.0, -2.0, 1.0])
+    corners = np.array(np.meshgrid(*[(-0.5, 0.5)] * 3)).reshape(3, -1).T * size
+    inner = rng.uniform(-0.5, 0.5, (50, 3)) * size
+    box = upright_box(np.concatenate((corners, inner)) @ R.T + center, up)
+    np.testing.assert_allclose(box.size, size, atol=1e-5)
+    np.testing.assert_allclose(box.center, center, atol=1e-5)
+    np.testing.assert_allclose(np.abs(box.R_world_box.T @ R), np.eye(3), atol=1e-5)
+    assert np.linalg.det(box.R_world_box) == pytest.approx(1) and box.R_world_box[:, 2] == pytest.approx(up)
+
+
+def test_boxes_of_hardly_any_points() -> None:
+    up = np.array([0.0, 0.0, 1.0])
+    point = upright_box(np.array([[1.0, 2.0, 3.0]]), up)
+    np.testing.assert_allclose((point.center, point.size), ((1, 2, 3), (0, 0, 0)), atol=1e-7)
+    line = np.array([np.cos(YAW), np.sin(YAW), 0.0]) * np.linspace(0, 2, 9)[:, None]
+    np.testing.assert_allclose(upright_box(line, up).size, (2, 0, 0), atol=1e-5)
+
+
+def test_settings_that_mean_nothing_are_refused() -> None:
+    with pytest.raises(MapError, match="min_voxels must be at least 1"):
+        InstanceTracker(min_voxels=0)
+    for up in ((0, 0, 0), (0, np.nan, 1), (1, 0), ((0, 0, 1),)):
+        with pytest.raises(MapError, match="up"):
+            InstanceTracker(up=up)

@@ -1,0 +1,43 @@
+"""Distances to obstacles against a search of all voxels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from semantic_mapper.queries.occupancy import State, distance_field, occupancy
+from tests.queries.scene import BALL, RADIUS, whole
+
+LOWER, UPPER = (-0.05, -0.35, -0.1), (1.23, 0.41, 0.57)
+
+
+@pytest.mark.parametrize("unknown_is_occupied", [False, True])
+def test_distance_is_to_the_nearest_obstacle(unknown_is_occupied: bool) -> None:
+    field = distance_field(whole(), LOWER, UPPER, unknown_is_occupied=unknown_is_occupied)
+    first, last = np.ceil(np.divide(LOWER, 0.02)), np.floor(np.divide(UPPER, 0.02))
+    assert field.distance_m.shape == field.state.shape == tuple((last - first + 1).astype(int))
+    np.testing.assert_allclose(field.origin_m, first * 0.02)
+    centers = field.origin_m + np.indices(field.state.shape).reshape(3, -1).T * field.voxel_size_m
+    np.testing.assert_array_equal(field.state.ravel(), occupancy(whole(), centers))
+    assert {0, 1, 2} == set(np.unique(field.state))
+    bad = field.state.ravel() == State.OCCUPIED
+    if unknown_is_occupied:
+        bad |= field.state.ravel() == State.UNKNOWN
+    expected = KDTree(centers[bad]).query(centers)[0]
+    np.testing.assert_allclose(field.distance_m.ravel(), expected, atol=1e-6)
+
+
+def test_distance_from_the_ball_is_what_geometry_says() -> None:
+    field = distance_field(whole(), BALL - np.array([0.25, 0.2, 0.0]), BALL + np.array([0.25, 0.2, 0.4]))
+    centers = field.origin_m + np.indices(field.state.shape).reshape(3, -1).T * 0.02
+    truth = np.linalg.norm(centers - BALL, axis=1) - RADIUS
+    outside = (truth > 0.02) & (centers[:, 2] > BALL[2] + 0.1)  # nearer to the ball than to the floor
+    assert outside.sum() > 1000
+    assert np.abs(field.distance_m.ravel()[outside] - truth[outside]).max() < 0.03  # a voxel is occupied or not
+
+
+def test_a_box_without_obstacles_is_infinitely_free() -> None:
+    field = distance_field(whole(), (5, 5, 5), (5.1, 5.1, 5.1))
+    assert np.isinf(field.distance_m).all() and not field.state.any()
+    assert not distance_field(whole(), (5, 5, 5), (5.1, 5.1, 5.1), unknown_is_occupied=True).distance_m.any()

@@ -1,0 +1,75 @@
+"""Surface voxels against a search of every voxel, and against the shapes they come from."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.surface import surface_voxels
+from tests.queries.scene import CUP, FLOOR, TABLE, surface_of, truth_distance, whole
+
+
+def dense(snapshot: MapSnapshot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """TSDF and weight of the box of all blocks, a block wider all round, as [x, y, z], and its first voxel."""
+    keys = snapshot.keys
+    first = keys.min(axis=0) - 1
+    shape = tuple((keys.max(axis=0) - first + 2) * 8)
+    tsdf, weight = np.zeros(shape), np.zeros(shape, bool)
+    for (x, y, z), slot in zip((keys - first) * 8, snapshot.slots, strict=True):
+        part = (slice(x, x + 8), slice(y, y + 8), slice(z, z + 8))
+        tsdf[part] = snapshot.voxels.tsdf[slot].reshape(8, 8, 8).T
+        weight[part] = snapshot.voxels.weight[slot].reshape(8, 8, 8).T > 0
+    return tsdf, weight, first * 8
+
+
+def brute_force(snapshot: MapSnapshot) -> dict[tuple[int, ...], np.ndarray]:
+    tsdf, weight, first = dense(snapshot)
+    crossings: dict[tuple[int, ...], list[np.ndarray]] = {}
+    for axis in range(3):
+        a, b = np.moveaxis(tsdf, axis, 0)[:-1], np.moveaxis(tsdf, axis, 0)[1:]
+        both = np.moveaxis(weight, axis, 0)[:-1] & np.moveaxis(weight, axis, 0)[1:]
+        crossed = both & ((a > 0) != (b > 0)) & (np.abs(a - b) <= 120)
+        for place in np.argwhere(crossed):
+            along = a[tuple(place)] / (a[tuple(place)] - b[tuple(place)])
+            lower = np.insert(place[1:], axis, place[0])
+            step = np.eye(3, dtype=int)[axis]
+            owner = lower if along <= 0.5 else lower + step
+            crossings.setdefault(tuple((owner + first).tolist()), []).append(lower + along * step + first)
+    return {voxel: np.mean(points, axis=0) for voxel, points in crossings.items()}
+
+
+def test_every_surface_voxel_is_found_with_its_point() -> None:
+    snapshot = whole()
+    surface, expected = surface_voxels(snapshot), brute_force(snapshot)
+    within = np.stack((surface.voxel & 7, (surface.voxel >> 3) & 7, surface.voxel >> 6), axis=1)
+    voxels = snapshot.keys[surface.row] * 8 + within
+    assert len(voxels) == len(expected) > 4000
+    for voxel, point in zip(voxels.tolist(), surface.point, strict=True):
+        np.testing.assert_allclose(point, expected[tuple(voxel)], atol=1e-12)
+
+
+def test_surface_points_of_some_blocks_are_those_of_all() -> None:
+    snapshot = whole()
+    surface, rows = surface_voxels(snapshot), np.arange(3, snapshot.block_count, 5)
+    part, there = surface_voxels(snapshot, rows), np.isin(surface.row, rows)
+    for a, b in zip(part, surface, strict=True):
+        np.testing.assert_array_equal(a, b[there])
+
+
+def test_points_lie_on_the_shape_of_their_class() -> None:
+    xyz, label, confidence = surface_of(whole())
+    distance = np.abs(truth_distance(xyz))
+    for column, class_id in enumerate((FLOOR, TABLE, CUP)):
+        mine = label == class_id
+        others = np.delete(distance, column, axis=1).min(axis=1)
+        assert np.quantile(distance[mine, column], 0.9) < 0.01
+        clear = mine & (others > 0.08) & (distance.min(axis=1) < 0.01)
+        assert clear.sum() > 300
+        assert (distance[clear, column] < 0.01).mean() > 0.99 and (confidence[clear] > 100).mean() > 0.95
+
+
+def test_nothing_has_no_surface() -> None:
+    surface = surface_voxels(whole(), np.empty(0, np.int64))
+    assert [len(part) for part in surface] == list(itertools.repeat(0, 3))
