@@ -11,7 +11,16 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from semantic_mapper.errors import LabelError
-from semantic_mapper.labels import NYU40, PROVIDED, ROOMS, SCANNET20, LabelSet, label_set_named, make_label_set
+from semantic_mapper.labels import (
+    NYU40,
+    PROVIDED,
+    ROOMS,
+    SCANNET20,
+    STUFF_NAMES,
+    LabelSet,
+    label_set_named,
+    make_label_set,
+)
 
 GAPS = make_label_set("gaps", ["wall", "chair", "lamp"], ids=[9, 2, 200], ignore_id=255)
 RED = (255, 0, 0)
@@ -126,3 +135,17 @@ def test_sets_are_found_by_name_and_the_error_lists_them() -> None:
     assert label_set_named("rooms") is ROOMS
     with pytest.raises(LabelError, match=r"no label set 'room'.*kitti360.*nyu40"):
         label_set_named("room")
+
+
+def test_a_class_is_found_by_name_and_the_error_lists_them() -> None:
+    assert (GAPS.id_of("wall"), GAPS.id_of("lamp")) == (9, 200)
+    with pytest.raises(LabelError, match=r"'gaps' has no class 'lmap'; it has wall, chair, lamp"):
+        GAPS.id_of("lmap")
+
+
+def test_things_are_what_is_not_stuff() -> None:
+    assert GAPS.thing_ids(STUFF_NAMES) == (2, 200)
+    assert GAPS.thing_ids(()) == (9, 2, 200) and GAPS.thing_ids(("chair", "lamp")) == (9,)
+    names = {name for label_set in PROVIDED.values() for name in label_set.names}
+    assert names >= STUFF_NAMES, "names that no set has are misspelt"
+    assert {"chair", "car", "door"} <= names - STUFF_NAMES

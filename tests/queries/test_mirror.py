@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -20,6 +22,8 @@ from semantic_mapper.queries.snapshot import MapSnapshot
 from tests.mapping.test_paging import MEMORY_MB, walk
 from tests.mapping.views import small_map
 from tests.queries.scene import FLOOR, LABELS, TABLE, integrate, painted, poses, whole_map
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def content(snapshot: MapSnapshot) -> dict[str, np.ndarray]:
@@ -141,3 +145,18 @@ def test_queries_see_whole_versions_while_another_thread_applies() -> None:
     for thread in threads:
         thread.join()
     assert not wrong and min(asked) >= 5
+
+
+def test_a_mirror_needs_no_open3d() -> None:
+    program = (
+        "import sys, numpy as np\n"
+        "from tests.queries.scene import LABELS, TABLE, painted\n"
+        "from semantic_mapper.queries.boxes import points_in_box\n"
+        "from semantic_mapper.queries.instances import InstanceTracker\n"
+        "from semantic_mapper.queries.mirror import MapMirror\n"
+        "snapshot = MapMirror(0.02, 4.0, LABELS).apply(painted(np.full((8, 8), TABLE, np.uint8), 0, 1))\n"
+        "print(len(points_in_box(snapshot, (-1, -1, -1), (1, 1, 1)).xyz), len(InstanceTracker().update(snapshot)))\n"
+        "print('open3d' in sys.modules)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.stdout.split() == ["64", "1", "False"], done.stderr
