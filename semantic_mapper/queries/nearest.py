@@ -60,17 +60,13 @@ def _unpack(packed, axis):
 
 
 @njit(nogil=True, cache=True)
-def _search(p, class_id, packed, slots, index, voxels, xyz):
-    """Slot and voxel of the nearest surface voxel of a class, and its distance; slot -1 = none. Writes ``xyz`` (3,).
-
-    A block without a voxel of the class is left out by its ``classes``; the others are gone through in the order of
-    the least distance that one of their surface points can have, until that is more than what was found.
-    """
+def _bounds(p, class_id, packed, slots, classes):
+    """Rows of the blocks that may have surface of a class, and the square of the least distance it may have."""
     rows, bounds = np.empty(len(packed), np.int64), np.empty(len(packed), np.float64)
     count = 0
     bit = np.uint64(1) << np.uint64(class_id & 63)
     for n in range(len(packed)):
-        if voxels.classes[slots[n], class_id >> 6] & bit:
+        if classes[slots[n], class_id >> 6] & bit:
             bound = 0.0
             for axis in range(3):
                 first = _unpack(packed[n], axis) * 8.0
@@ -78,22 +74,36 @@ def _search(p, class_id, packed, slots, index, voxels, xyz):
                 bound += gap * gap
             rows[count], bounds[count] = n, bound
             count += 1
-    order = np.argsort(bounds[:count], kind="mergesort")
+    return rows[:count], bounds[:count]
+
+
+@njit(nogil=True, cache=True)
+def _search(p, class_id, packed, slots, index, voxels, xyz):
+    """Slot and voxel of the nearest surface voxel of a class, and its distance; slot -1 = none. Writes ``xyz`` (3,).
+
+    Blocks are gone through in the order of the least distance that their surface may have, until that is more than
+    what was found. The first alone leaves few of the others to be put in order.
+    """
+    rows, bounds = _bounds(p, class_id, packed, slots, voxels.classes)
     near, offset, q = np.empty(6, np.int64), np.empty(3), np.empty(3)
     best, best_slot, best_voxel = np.inf, np.int64(-1), np.int64(-1)
-    for i in order:
-        if bounds[i] > best:
-            break
-        slot, key = np.int64(slots[rows[i]]), packed[rows[i]]
-        x, y, z = _unpack(key, 0), _unpack(key, 1), _unpack(key, 2)
-        neighbour_slots(x, y, z, index, near)
-        for voxel in range(512):
-            if voxels.label[slot, voxel] != class_id or not surface_offset(slot, voxel, near, voxels, offset):
-                continue
-            q[0], q[1], q[2] = x * 8 + (voxel & 7), y * 8 + ((voxel >> 3) & 7), z * 8 + (voxel >> 6)
-            q += offset
-            d = (q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2 + (q[2] - p[2]) ** 2
-            if d < best:
-                best, best_slot, best_voxel = d, slot, np.int64(voxel)
-                xyz[:] = q
+    order = np.full(min(len(rows), 1), np.argmin(bounds) if len(rows) else 0)
+    for _ in range(2):
+        for i in order:
+            if bounds[i] > best:
+                break
+            slot, key = np.int64(slots[rows[i]]), packed[rows[i]]
+            x, y, z = _unpack(key, 0), _unpack(key, 1), _unpack(key, 2)
+            neighbour_slots(x, y, z, index, near)
+            for voxel in range(512):
+                if voxels.label[slot, voxel] != class_id or not surface_offset(slot, voxel, near, voxels, offset):
+                    continue
+                q[0], q[1], q[2] = x * 8 + (voxel & 7), y * 8 + ((voxel >> 3) & 7), z * 8 + (voxel >> 6)
+                q += offset
+                d = (q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2 + (q[2] - p[2]) ** 2
+                if d < best:
+                    best, best_slot, best_voxel = d, slot, np.int64(voxel)
+                    xyz[:] = q
+        left = np.flatnonzero(bounds <= best)
+        order = left[np.argsort(bounds[left], kind="mergesort")]
     return best_slot, best_voxel, np.sqrt(best)
