@@ -44,6 +44,10 @@ def replay(
     config: ConfigOption = None,
     quality: QualityOption = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of everything that is drawn at random.")] = None,
+    corrections: Annotated[
+        Path | None,
+        typer.Option(help="Corrected poses (TUM: stamp tx ty tz qx qy qz qw); the map moves to them at the end."),
+    ] = None,
 ) -> int:
     """Map a recorded log: writes summary.json, map.ply, map.npz and overview.png.
 
@@ -57,7 +61,7 @@ def replay(
     from nodes.summary_table import notes, result_lines, summary_table
 
     settings = mapper_config(config, voxel_size, seed, quality)
-    request = ReplayRequest(log, out, weights, settings, max_frames, eval_exclude, rerun)
+    request = ReplayRequest(log, out, weights, settings, max_frames, eval_exclude, rerun, corrections)
     with StopRequest() as stop:
         with frame_progress("replay", None) as bar:
             summary = replay_log(request, stop, bar.start, bar.set)

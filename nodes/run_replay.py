@@ -13,6 +13,7 @@ import structlog
 from nodes.finishing import finish_session
 from nodes.outputs import prepare_folder
 from nodes.process import StopRequest
+from replay.corrections import correct_session, keeping_frames, read_corrections
 from replay.log import LogReader
 from replay.session import MapSession, load_pipeline
 from semantic_mapper.config import MapperConfig, Quality, load_config
@@ -35,6 +36,7 @@ class ReplayRequest:
         max_frames: 0 = all.
         exclude: Weights whose finetuning frames are left out of the scores, beside those of ``weights``.
         rerun: Where to write a Rerun recording.
+        corrections: Trajectory file with corrected poses, which the map is moved to at the end of the log.
     """
 
     log: Path
@@ -44,6 +46,7 @@ class ReplayRequest:
     max_frames: int = 0
     exclude: Path | None = None
     rerun: Path | None = None
+    corrections: Path | None = None
 
 
 def replay_log(
@@ -64,13 +67,16 @@ def replay_log(
 
     Raises:
         LogError, WeightsError, ConfigError, MapError: nothing could be mapped; the message says why.
+        ImportSourceError: the corrections cannot be read.
     """
     prepare_folder(request.out)
+    trajectory = read_corrections(request.corrections) if request.corrections else None
     exclude = load_checkpoint(request.exclude).train_stamps_ns if request.exclude else frozenset[int]()
     with LogReader(request.log) as log:
         for notice in log.notices:
             _log.warning("log_notice", notice=notice)
-        bundle = load_pipeline(request.weights, request.config)
+        config = request.config if trajectory is None else keeping_frames(request.config, len(log))
+        bundle = load_pipeline(request.weights, config)
         clear_summary(request.out)
         session = MapSession(
             bundle,
@@ -86,6 +92,8 @@ def replay_log(
         _log.info("mapping", log=request.log.name, frames=total, weights=bundle.weights_path.name)
         try:
             done = _map_frames(session, log, total, stop, on_frame)
+            if trajectory is not None and not stop:
+                correct_session(session, trajectory)
         except SemanticMapperError:  # the map is full, for one: what is in it is worth keeping
             finish_session(session, request.out, "error")
             raise

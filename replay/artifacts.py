@@ -110,6 +110,7 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "blocks": voxel_map.block_count,
             "surface_points": len(points.xyz),
             "memory_mb": round(voxel_map.memory_bytes / 1e6, 1),
+            "corrected_poses": session.corrected_poses,
         },
         "metrics": _metrics(session, points),
         "metrics_per_image": asdict(metrics_per_image(session.per_image)) if session.scored else None,

@@ -112,6 +112,7 @@ class MapSession:
         self.dropped = 0
         self.scored = 0
         self.excluded = 0
+        self.corrected_poses = 0  # given; the map has moved with them
         self.without_depth = 0  # their geometry was rendered, not measured
         self.refusals: list[Refusal] = []  # frames that were not mapped
         self.label_refusals: list[Refusal] = []  # frames that were mapped, but whose label image cannot be used
@@ -145,6 +146,15 @@ class MapSession:
         if self._rerun is not None:
             self._rerun.log_step(frame, update)
         return update
+
+    def follow_correction(self, poses: int) -> None:
+        """Take what the scores compare with to the poses that the map has after a correction.
+
+        Args:
+            poses: That were given.
+        """
+        self.corrected_poses += poses
+        self.surface_truth.move(self.pipeline.corrector.poses())
 
     def _note_depth(self, frame: PosedFrame) -> None:
         if frame.depth_m is None:

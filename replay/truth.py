@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,12 +36,21 @@ class TruthMapper:
         return self._table[label]
 
 
+class _TruthView(NamedTuple):
+    camera_id: str
+    stamp_ns: int
+    T_world_camera: Float64
+    intrinsics: CameraIntrinsics
+    depth_m: Float32
+    label: UInt8
+
+
 class SurfaceTruth:
     """Truth labels of map points: each labelled frame that sees a point votes, the majority wins."""
 
     def __init__(self, label_set: LabelSet) -> None:
         self._label_set = label_set
-        self._frames: list[tuple[Float64, CameraIntrinsics, Float32, UInt8]] = []
+        self._frames: list[_TruthView] = []
         self._stride = 1
         self._seen = 0
 
@@ -48,19 +60,27 @@ class SurfaceTruth:
             return
         if self._seen % self._stride == 0:
             k = working_intrinsics(frame.intrinsics, TRUTH_WIDTH)
-            self._frames.append((frame.T_world_camera, k, resize_depth(frame, k), resize_label(frame.label, k)))
+            depth, label = resize_depth(frame, k), resize_label(frame.label, k)
+            self._frames.append(_TruthView(frame.camera_id, frame.stamp_ns, frame.T_world_camera, k, depth, label))
         self._seen += 1
         if len(self._frames) > MAX_FRAMES:
             self._frames = self._frames[::2]
             self._stride *= 2
 
+    def move(self, poses: Mapping[tuple[str, int], Float64]) -> None:
+        """Take frames to corrected poses, (camera_id, stamp_ns) -> T_world_camera; those not named stay."""
+        self._frames = [
+            view._replace(T_world_camera=poses.get((view.camera_id, view.stamp_ns), view.T_world_camera))
+            for view in self._frames
+        ]
+
     def labels_at(self, xyz: Float32) -> UInt8:
         """Truth ids (N,) of world points (N, 3); the ignore id where no labelled frame saw the point."""
         votes = np.zeros((len(xyz), len(self._label_set)), np.uint16)
         points = xyz.astype(np.float64)
-        for T_world_camera, k, depth, label in self._frames:
-            row, column, visible = _look_up(points, T_world_camera, k, depth)
-            channel = self._label_set.to_channels(label)[row, column]
+        for view in self._frames:
+            row, column, visible = _look_up(points, view.T_world_camera, view.intrinsics, view.depth_m)
+            channel = self._label_set.to_channels(view.label)[row, column]
             index = np.flatnonzero(visible & (channel != IGNORE_CHANNEL))
             votes[index, channel[index]] += 1
         channel = np.where(votes.any(axis=1), votes.argmax(axis=1), IGNORE_CHANNEL)

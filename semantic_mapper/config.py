@@ -136,6 +136,14 @@ class VoxelMapConfig(Config, frozen=True):
     vote_band_voxels: Positive = 2.0  # only voxels this near the surface take class votes
 
 
+class HistoryConfig(Config, frozen=True):
+    """Fused frames kept on disk, so that the map can follow corrected poses (loop closures)."""
+
+    # Corrections reach these; when it is full, the older half leaves and stays in the map where it is. 0 = keep none.
+    max_frames: NotNegative = 0
+    max_disk_mb: AtLeastOne = 4000  # in the folder for temporary files; frames leave earlier for it
+
+
 class RenderConfig(Config, frozen=True):
     """Resolution and chunking of the rendered view."""
 
@@ -165,6 +173,7 @@ class MapperConfig(Config, frozen=True):
     sampling: SamplingConfig = SamplingConfig(guided=4)
     keyframes: KeyframeConfig = KeyframeConfig()
     voxel_map: VoxelMapConfig = VoxelMapConfig()
+    history: HistoryConfig = HistoryConfig()
     render: RenderConfig = RenderConfig()
     quality: Quality = "custom"  # any other sets samples and rays; see ``with_quality``
     seed: int = 0

@@ -59,7 +59,7 @@ class TumRecording:
         self._intrinsics = self._read_intrinsics()
         self._color = self._read_list(folder / "rgb.txt")
         depth = self._read_list(folder / "depth.txt")
-        self._pose_stamps, self._poses = self._read_poses(folder / "groundtruth.txt")
+        self._pose_stamps, self._poses = read_trajectory(folder / "groundtruth.txt", self.notices)
         self._depth_of = match_nearest(
             np.array([stamp for stamp, _ in self._color], np.int64),
             np.array([stamp for stamp, _ in depth], np.int64),
@@ -138,24 +138,34 @@ class TumRecording:
             raise ValueError(f"'{name}' lies outside the recording")
         return path
 
-    def _read_poses(self, file: Path) -> tuple[NDArray[np.int64], Float64]:
-        stamps: list[int] = []
-        rows: list[list[float]] = []
-        for line, text in read_lines(file):
-            words = text.split()
-            try:
-                stamp, row = seconds_to_ns(words[0]), [float(word) for word in words[1:]]
-                if len(row) != 7 or not np.isfinite(row).all() or np.linalg.norm(row[3:]) < 0.5:
-                    raise ValueError("not 3 numbers of a position and 4 of a unit quaternion")
-            except (ValueError, IndexError) as error:
-                self.notices.append(f"{file}, line {line} is passed over: {error}")
-                continue
-            stamps.append(stamp)
-            rows.append(row)
-        if not rows:
-            raise ImportSourceError(f"{file}: holds no pose 'stamp tx ty tz qx qy qz qw'")
-        order = np.argsort(stamps, kind="stable")
-        return np.array(stamps, np.int64)[order], np.array(rows, np.float64)[order]
+
+def read_trajectory(file: Path, notices: list[str]) -> tuple[NDArray[np.int64], Float64]:
+    """Poses of a trajectory file, in order of time: stamps (N,) in nanoseconds, rows (N, 7) tx ty tz qx qy qz qw.
+
+    Args:
+        file: Lines ``stamp tx ty tz qx qy qz qw``, stamps in seconds.
+        notices: Gets a sentence for every line that is passed over.
+
+    Raises:
+        ImportSourceError: the file is missing or holds no pose.
+    """
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for line, text in read_lines(file):
+        words = text.split()
+        try:
+            stamp, row = seconds_to_ns(words[0]), [float(word) for word in words[1:]]
+            if len(row) != 7 or not np.isfinite(row).all() or np.linalg.norm(row[3:]) < 0.5:
+                raise ValueError("not 3 numbers of a position and 4 of a unit quaternion")
+        except (ValueError, IndexError) as error:
+            notices.append(f"{file}, line {line} is passed over: {error}")
+            continue
+        stamps.append(stamp)
+        rows.append(row)
+    if not rows:
+        raise ImportSourceError(f"{file}: holds no pose 'stamp tx ty tz qx qy qz qw'")
+    order = np.argsort(stamps, kind="stable")
+    return np.array(stamps, np.int64)[order], np.array(rows, np.float64)[order]
 
 
 def match_nearest(a_ns: NDArray[np.int64], b_ns: NDArray[np.int64], within_ns: int) -> list[int]:
@@ -194,12 +204,12 @@ def interpolate_pose(stamp_ns: int, stamps_ns: NDArray[np.int64], rows: Float64,
     if before >= 0 and after < len(rows) and stamps_ns[after] - stamps_ns[before] <= _POSE_GAP_NS:
         share = float(stamp_ns - stamps_ns[before]) / float(stamps_ns[after] - stamps_ns[before])
         position = (1 - share) * rows[before, :3] + share * rows[after, :3]
-        return _matrix(position, _slerp(rows[before, 3:], rows[after, 3:], share))
+        return pose_matrix(position, _slerp(rows[before, 3:], rows[after, 3:], share))
     near = [i for i in (before, after) if 0 <= i < len(rows) and abs(int(stamps_ns[i]) - stamp_ns) <= within_ns]
     if not near:
         return None
     best = min(near, key=lambda i: abs(int(stamps_ns[i]) - stamp_ns))
-    return _matrix(rows[best, :3], rows[best, 3:])
+    return pose_matrix(rows[best, :3], rows[best, 3:])
 
 
 def _slerp(a: Float64, b: Float64, share: float) -> Float64:
@@ -213,7 +223,8 @@ def _slerp(a: Float64, b: Float64, share: float) -> Float64:
     return (np.sin((1 - share) * angle) * a + np.sin(share * angle) * b) / np.sin(angle)
 
 
-def _matrix(position: Float64, quaternion: Float64) -> Float64:
+def pose_matrix(position: Float64, quaternion: Float64) -> Float64:
+    """Pose (4, 4) of a position (3,) and a quaternion (4,) as x y z w, which is normalised."""
     x, y, z, w = quaternion / np.linalg.norm(quaternion)
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3] = (

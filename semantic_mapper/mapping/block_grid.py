@@ -183,6 +183,12 @@ class BlockGrid:
         """Note that blocks with these buffer indices were changed at ``version`` of the map."""
         self._version[blocks] = version
 
+    def mark_all_changed(self, version: int) -> None:
+        """Note that every block, in memory and on disk, was changed at ``version`` of the map."""
+        self._version[:] = version
+        if self._store is not None:
+            self._store.versions.update(dict.fromkeys(self._store.versions, version))
+
     def changed_since(self, version: int) -> NDArray[np.int32]:
         """Keys (B, 3) of all blocks that were changed after ``version``, in lexicographic order."""
         return unpack_keys(self.versions_since(version)[0])

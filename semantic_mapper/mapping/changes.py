@@ -34,6 +34,7 @@ class BlockChanges:
     Args:
         since: Who has all up to this version
         version: has, with these blocks, all up to this one.
+        epoch: Of the map. Where it is another than before, these are all of its blocks, and older ones are gone.
         keys: (B, 3) int32 block coordinates in lexicographic order.
         tsdf: (B, 512) int8 signed distance over truncation, times 127; -128 where not observed.
         label: (B, 512) uint8 class ids, the ignore id where nothing voted or nothing was observed.
@@ -43,6 +44,7 @@ class BlockChanges:
 
     since: int
     version: int
+    epoch: int
     keys: NDArray[np.int32]
     tsdf: NDArray[np.int8]
     label: UInt8
@@ -77,7 +79,7 @@ def oldest_first(versions: NDArray[np.int64], limit: int, newest: int) -> tuple[
 def read_changes(
     grid: BlockGrid,
     packed: NDArray[np.int64],
-    versions: tuple[int, int],
+    versions: tuple[int, int, int],
     label_set: LabelSet,
     vote_discount: float,
     min_weight: float,
@@ -87,7 +89,7 @@ def read_changes(
     Args:
         grid: The map's storage.
         packed: (B,) sorted keys.
-        versions: ``since`` and ``version`` of the result.
+        versions: ``since``, ``version`` and ``epoch`` of the result.
         label_set: For the ids.
         vote_discount: rho, see ``readout``.
         min_weight: Voxels with fewer measurements count as not observed.

@@ -15,6 +15,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from semantic_mapper.config import VoxelMapConfig
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.mapping.allocation import Camera
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE
 from semantic_mapper.threads import parallel_kernel
@@ -41,6 +43,29 @@ class FusionLimits(NamedTuple):
     depth_max: float
     vote_band: float
     max_weight: float
+
+
+def make_limits(config: VoxelMapConfig) -> FusionLimits:
+    """Limits of a map.
+
+    Raises:
+        ConfigError: a value that no map can be built with.
+    """
+    for name in ("voxel_size_m", "truncation_voxels", "depth_max_m", "initial_blocks", "max_blocks"):
+        value = getattr(config, name)
+        if not (np.isfinite(value) and value > 0):
+            raise ConfigError(f"voxel_map.{name} must be above 0, got {value}")
+    if not config.max_weight >= 1:
+        raise ConfigError(f"voxel_map.max_weight must be at least 1, got {config.max_weight}")
+    if not (config.vote_discount >= 0 and config.vote_band_voxels >= 0):
+        raise ConfigError("voxel_map.vote_discount and vote_band_voxels must not be negative")
+    return FusionLimits(
+        voxel_size=config.voxel_size_m,
+        truncation=config.truncation_voxels * config.voxel_size_m,
+        depth_max=config.depth_max_m,
+        vote_band=config.vote_band_voxels * config.voxel_size_m,
+        max_weight=config.max_weight,
+    )
 
 
 @njit(nogil=True, cache=True, inline="always")

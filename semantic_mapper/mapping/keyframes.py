@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
 from semantic_mapper.config import KeyframeConfig
 from semantic_mapper.coverage import GUESSED_DEPTHS_M, LABELLED_VALUE, cover, sees
 from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.geometry import transform, unproject
+from semantic_mapper.geometry import invert_pose_torch, transform, unproject
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 
 COVERAGE_GRID = (12, 16)  # rows, columns of query points whose visibility decides the choice of views
@@ -27,6 +29,7 @@ class Keyframe:
         depth_m: (h, w) float32, small, 0 = none.
         encoded: One view.
         labelled: The field was finetuned on this view; such keyframes are never dropped.
+        camera_id: Of the frame.
     """
 
     seq: int
@@ -36,6 +39,7 @@ class Keyframe:
     depth_m: Float32
     encoded: EncodedViews
     labelled: bool = False
+    camera_id: str = ""
 
 
 class KeyframeStore:
@@ -66,6 +70,22 @@ class KeyframeStore:
         self._keyframes.append(keyframe)
         if len(self._keyframes) > self._config.capacity:
             self._drop_most_redundant()
+
+    def move(self, poses: Mapping[tuple[str, int], Float64]) -> int:
+        """Give keyframes other poses; what was encoded of them stays. Returns how many have moved.
+
+        Args:
+            poses: (camera_id, stamp_ns) -> T_world_camera (4, 4); keyframes that are not named stay where they are.
+        """
+        moved = 0
+        for i, keyframe in enumerate(self._keyframes):
+            pose = poses.get((keyframe.camera_id, keyframe.stamp_ns))
+            if pose is not None and not np.array_equal(pose, keyframe.T_world_camera):
+                T_camera_world = invert_pose_torch(torch.tensor(pose, dtype=torch.float32)[None])
+                encoded = replace(keyframe.encoded, T_camera_world=T_camera_world)
+                self._keyframes[i] = replace(keyframe, T_world_camera=pose, encoded=encoded)
+                moved += 1
+        return moved
 
     def choose(
         self, T_world_camera: Float64, intrinsics: CameraIntrinsics, depth_m: Float32, count: int

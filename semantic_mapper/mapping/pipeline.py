@@ -21,6 +21,8 @@ from semantic_mapper.fields.base import EncodedViews, SemanticField, stack_views
 from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
 from semantic_mapper.imaging import fill_holes, resize_depth, resize_label, resize_rgb, working_intrinsics
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.correction import CorrectedPoses, CorrectionStatus, MapCorrector
+from semantic_mapper.mapping.history import FusedFrame
 from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore
 from semantic_mapper.mapping.lifting import lift
 from semantic_mapper.mapping.view_renderer import RenderedView, ViewRenderer
@@ -67,6 +69,7 @@ class MappingPipeline:
         self.voxel_map = VoxelMap(config.voxel_map, label_set)
         self.keyframes = KeyframeStore(config.keyframes)
         self._renderer = ViewRenderer(field, config.render, config.sampling)
+        self.corrector = MapCorrector(config.history, self.voxel_map, self.keyframes, self._fuse_again)
         self._intrinsics: dict[str, CameraIntrinsics] = {}
         self._odd_sizes: dict[str, tuple[tuple[int, int], int]] = {}
         self._stage_ms: dict[str, float] = {}
@@ -82,6 +85,37 @@ class MappingPipeline:
         Raises:
             FrameError, PoseError: the frame cannot be used. The map is unchanged and the next frame is welcome.
         """
+        self.corrector.make_room()
+        with self.corrector.turn:
+            return self._map_frame(self.corrector.place(frame))
+
+    def correct_poses(self, poses: CorrectedPoses, *, until_ns: int | None = None) -> CorrectionStatus:
+        """Begin to move the map with corrected poses of frames that it was fused from, as a loop closure gives them.
+
+        The map in use stays as it is until ``advance_correction`` has brought the rebuild to its end. A call during a
+        rebuild begins it anew, with this correction upon the one under way: the outcome is that of two in a row.
+
+        Args:
+            poses: stamp_ns, or (camera_id, stamp_ns), -> T_world_camera (4, 4) float64, at least one, in the world that
+                is the right one from now on. Frames between them in time move as ``pose_correction`` says, those before
+                the first one with the first. Frames that have left the history stay where they are.
+            until_ns: By default frames later than the last given one are trusted as they come: who corrects poses
+                mostly gives the corrected world from then on. Frames up to this stamp have come in the old world and
+                move with the last given one; ``ALWAYS``: odometry goes on in the old world, and frames to come are
+                moved, too.
+
+        Raises:
+            MapError: no history is kept, a stamp is of no frame, or all given frames have left the history. Nothing has
+                changed then.
+            PoseError: a pose is not a rigid transform.
+        """
+        return self.corrector.start(poses, until_ns)
+
+    def advance_correction(self, max_frames: int = 1) -> bool:
+        """Carry a correction on by so many frames of the history; see ``MapCorrector.advance``."""
+        return self.corrector.advance(max_frames)
+
+    def _map_frame(self, frame: PosedFrame) -> MapUpdate:
         self._check(frame)
         self._stage_ms = {}
         with self._stage("encode"):
@@ -95,6 +129,9 @@ class MappingPipeline:
         table = view.probabilities.reshape(-1, len(self.label_set))
         with self._stage("fuse"):
             touched = self.voxel_map.integrate(frame, depth, table, rows=rows)
+        if self.corrector.records:
+            with self._stage("history"):
+                self.corrector.record(FusedFrame(frame, view.probabilities, view.known, view.depth_m))
         with self._stage("keyframe"):
             is_keyframe = self.keyframes.wants(frame.T_world_camera)
             if is_keyframe:
@@ -228,7 +265,14 @@ class MappingPipeline:
         ids = np.append(self.label_set.to_ids(table.argmax(axis=1)), np.uint8(self.label_set.ignore_id))
         return ids[rows], np.append(table.max(axis=1), np.float32(0))[rows]
 
+    def _fuse_again(self, voxel_map: VoxelMap, fused: FusedFrame) -> None:
+        view = RenderedView(fused.probabilities, fused.known, fused.rendered_depth_m, 0, 0)
+        depth, rows = self._lift(fused.frame, view)
+        voxel_map.integrate(fused.frame, depth, view.probabilities.reshape(-1, len(self.label_set)), rows=rows)
+
     def _make_keyframe(self, frame: PosedFrame, encoded: EncodedViews, *, labelled: bool = False) -> Keyframe:
         intrinsics = working_intrinsics(frame.intrinsics, COVERAGE_WIDTH)
         depth = resize_depth(frame, intrinsics)
-        return Keyframe(frame.seq, frame.stamp_ns, frame.T_world_camera, intrinsics, depth, encoded, labelled)
+        return Keyframe(
+            frame.seq, frame.stamp_ns, frame.T_world_camera, intrinsics, depth, encoded, labelled, frame.camera_id
+        )

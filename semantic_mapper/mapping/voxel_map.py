@@ -12,16 +12,18 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
-from semantic_mapper.errors import ConfigError, FrameError, MapError, ShapeError
-from semantic_mapper.geometry import check_pose, expect_shape
+from semantic_mapper.errors import ConfigError, FrameError, MapError
+from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.allocation import Camera, blocks_in_band, blocks_in_view, make_camera
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys
 from semantic_mapper.mapping.changes import BlockChanges, oldest_first, read_changes
 from semantic_mapper.mapping.extract import join_meshes, surface_voxels, triangle_mesh
-from semantic_mapper.mapping.fusion import FusionLimits, Votes, fuse_blocks, make_votes, no_votes
+from semantic_mapper.mapping.frame_votes import check_depth, frame_votes, probability_table
+from semantic_mapper.mapping.fusion import fuse_blocks, make_limits
 from semantic_mapper.mapping.grid_snapshot import GridSnapshot
+from semantic_mapper.mapping.map_backup import MapBackup, fill_from, take_backup
 from semantic_mapper.mapping.map_file import BlockPart, open_map, write_map
 from semantic_mapper.mapping.map_manifest import CHUNK_BLOCKS, MapManifest
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapState, MapView
@@ -46,6 +48,9 @@ class VoxelMap:
     Deterministic: the same frames in the same order give the same ``block_state``, bit for bit. Safe to call from
     several threads: calls wait for each other, and the long ones leave the GIL to others.
 
+    ``frames`` counts what is fused; ``version`` grows with every change and never falls; ``epoch`` counts how often the
+    whole map was replaced by another one (``take_over``): blocks may be gone then.
+
     Args:
         config: Voxel size, truncation, caps and limits.
         label_set: Classes; L = len(label_set) evidence channels in its channel order.
@@ -56,10 +61,12 @@ class VoxelMap:
     """
 
     def __init__(self, config: VoxelMapConfig, label_set: LabelSet) -> None:
-        _check_config(config)
+        self._limits = make_limits(config)
         self.config = config
         self.label_set = label_set
         self.frames = 0
+        self.version = 0
+        self.epoch = 0
         self.last_stamp_ns = 0
         self._grid = BlockGrid(
             config.voxel_size_m,
@@ -69,13 +76,6 @@ class VoxelMap:
             int(config.memory_mb * 1e6),
         )
         self._truncation_m = config.truncation_voxels * config.voxel_size_m
-        self._limits = FusionLimits(
-            voxel_size=config.voxel_size_m,
-            truncation=self._truncation_m,
-            depth_max=config.depth_max_m,
-            vote_band=config.vote_band_voxels * config.voxel_size_m,
-            max_weight=config.max_weight,
-        )
 
     @property
     def block_count(self) -> int:
@@ -88,12 +88,15 @@ class VoxelMap:
         return self._grid.stored_count
 
     def changed_since(self, version: int) -> NDArray[np.int32]:
-        """Coordinates (B, 3) of the blocks changed after ``frames`` was ``version``, in lexicographic order."""
+        """Coordinates (B, 3) of the blocks changed after ``version``, in lexicographic order.
+
+        After a new ``epoch`` these are all blocks of the map; whoever mirrors it drops what it had before.
+        """
         with _KERNEL_LOCK:
             return self._grid.changed_since(version)
 
     def changes(self, since: int, limit: int = 0, min_weight: float = 1.0) -> BlockChanges:
-        """The blocks changed after ``frames`` was ``since``, in compact form.
+        """The blocks changed after ``version`` was ``since``, in compact form.
 
         Args:
             since: 0 for the whole map; else the ``version`` of the changes before.
@@ -107,15 +110,15 @@ class VoxelMap:
         """
         _check_min_weight(min_weight)
         with _KERNEL_LOCK:
-            if not 0 <= since <= self.frames or limit < 0:
+            if not 0 <= since <= self.version or limit < 0:
                 raise MapError(
-                    f"changes since version {since}, limit {limit}: versions of this map go from 0 to {self.frames}, "
+                    f"changes since version {since}, limit {limit}: versions of this map go from 0 to {self.version}, "
                     "and a limit is not negative; a mirror of another map starts anew from version 0"
                 )
             packed, versions = self._grid.versions_since(since)
-            chosen, version = oldest_first(versions, limit, self.frames)
+            chosen, version = oldest_first(versions, limit, self.version)
             decision = (self.label_set, self.config.vote_discount, min_weight)
-            return read_changes(self._grid, packed[chosen], (since, version), *decision)
+            return read_changes(self._grid, packed[chosen], (since, version, self.epoch), *decision)
 
     @property
     def memory_bytes(self) -> int:
@@ -153,11 +156,13 @@ class VoxelMap:
         check_pose(frame.T_world_camera, where)
         if any(frame.intrinsics.distortion):
             raise FrameError(f"{where}: the image is not rectified (distortion {frame.intrinsics.distortion})")
-        depth = self._check_depth(frame.intrinsics, depth_m, where)
-        table = self._table(depth, probabilities, known, rows, where)
+        depth = check_depth(depth_m, frame.intrinsics, where)
+        table = None
+        if probabilities is not None:
+            table = probability_table(depth, probabilities, known, rows, len(self.label_set), where)
         camera = make_camera(frame.intrinsics, frame.T_world_camera)
         with _KERNEL_LOCK:
-            votes = self._votes(depth, table, camera, where)
+            votes = frame_votes(depth, table, camera, self.config.depth_max_m, len(self.label_set), where)
             packed = blocks_in_band(
                 depth, camera, self.config.voxel_size_m, self._truncation_m, self.config.depth_max_m
             )
@@ -165,9 +170,42 @@ class VoxelMap:
             rgb = np.ascontiguousarray(frame.rgb)
             fuse_blocks(blocks, self._grid.buffers(), camera, self._limits, depth, rgb, votes)
             self.frames += 1
+            self.version += 1
             self.last_stamp_ns = frame.stamp_ns
-            self._grid.mark_changed(blocks, self.frames)
+            self._grid.mark_changed(blocks, self.version)
         return len(blocks)
+
+    def backup(self) -> MapBackup:
+        """A copy of this map on disk; see ``take_backup``."""
+        with _KERNEL_LOCK:
+            return take_backup(self._grid, len(self.label_set), self.frames, self.last_stamp_ns)
+
+    @classmethod
+    def restore(cls, backup: MapBackup, config: VoxelMapConfig, label_set: LabelSet) -> VoxelMap:
+        """A map that is, bit for bit, what the backup was taken of; see ``fill_from``."""
+        restored = cls(config, label_set)
+        with _KERNEL_LOCK:
+            fill_from(backup, restored._grid)
+        restored.frames = restored.version = backup.frames
+        restored.last_stamp_ns = backup.last_stamp_ns
+        return restored
+
+    def take_over(self, other: VoxelMap) -> None:
+        """Become ``other``, all at once for whoever reads from another thread; ``other`` must not be used any more.
+
+        Every block counts as changed, and ``epoch`` goes up: blocks that ``other`` does not have are gone.
+
+        Raises:
+            MapError: the other map has another config or other classes.
+        """
+        if (other.config, other.label_set) != (self.config, self.label_set):
+            raise MapError("a map can only take over one of the same config and label set")
+        with _KERNEL_LOCK:
+            self._grid = other._grid
+            self.frames, self.last_stamp_ns = other.frames, other.last_stamp_ns
+            self.version += 1
+            self.epoch += 1
+            self._grid.mark_all_changed(self.version)
 
     def points(self, min_weight: float = 1.0) -> MapPoints:
         """Points of the surface, at most three a voxel, in a fixed order.
@@ -290,7 +328,8 @@ class VoxelMap:
                 with _KERNEL_LOCK:
                     blocks = loaded._grid.fill(pack_keys(keys), values)
                     loaded._grid.mark_changed(blocks, saved.frames)
-        loaded.frames, loaded.last_stamp_ns = saved.frames, saved.last_stamp_ns
+        loaded.frames = loaded.version = saved.frames
+        loaded.last_stamp_ns = saved.last_stamp_ns
         return loaded
 
     def merged(self, other: VoxelMap, T_self_other: Float64) -> VoxelMap:
@@ -311,7 +350,7 @@ class VoxelMap:
         check_fit(self.config, self.label_set, other.config, other.label_set)
         joined = VoxelMap(self.config, self.label_set)
         with _KERNEL_LOCK:
-            joined.frames = self.frames + other.frames
+            joined.frames = joined.version = self.frames + other.frames
             joined.last_stamp_ns = max(self.last_stamp_ns, other.last_stamp_ns)
             transform = voxel_transform(T_self_other, self.config.voxel_size_m)
             copy_blocks(joined._grid, self._grid, joined.frames)
@@ -340,52 +379,6 @@ class VoxelMap:
     def _read(self, grid: BlockGrid, voxels: Float64) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Float32]:
         return read_points(voxels, grid.index, grid.buffers(), self.label_set, self.config.vote_discount)
 
-    def _check_depth(self, intrinsics: CameraIntrinsics, depth_m: Float32, where: str) -> Float32:
-        expect_shape(depth_m, f"{intrinsics.height} {intrinsics.width}", f"{where}: depth_m")
-        _expect_dtype(depth_m, np.float32, f"{where}: depth_m")
-        return np.ascontiguousarray(depth_m)
-
-    def _table(
-        self,
-        depth: Float32,
-        probabilities: Float32 | None,
-        known: BoolImage | None,
-        rows: NDArray[np.int32] | None,
-        where: str,
-    ) -> tuple[Float32, NDArray[np.int32]] | None:
-        """Class probabilities (K, L) and the row of each pixel (H, W), however they were given."""
-        if probabilities is None:
-            return None
-        size, classes = f"{depth.shape[0]} {depth.shape[1]}", len(self.label_set)
-        _expect_dtype(probabilities, np.float32, f"{where}: probabilities")
-        if rows is None:
-            expect_shape(probabilities, f"{size} {classes}", f"{where}: probabilities")
-            rows = np.arange(depth.size, dtype=np.int32).reshape(depth.shape)
-            if known is not None:
-                expect_shape(known, size, f"{where}: known")
-                _expect_dtype(known, np.bool_, f"{where}: known")
-                rows[~known] = -1
-        else:
-            expect_shape(probabilities, f"K {classes}", f"{where}: probabilities")
-            expect_shape(rows, size, f"{where}: rows")
-            _expect_dtype(rows, np.int32, f"{where}: rows")
-            if known is not None or rows.min() < -1 or rows.max() >= len(probabilities):
-                raise ShapeError(f"{where}: rows must be -1 ... {len(probabilities) - 1}, and known None")
-        return np.ascontiguousarray(probabilities).reshape(-1, classes), np.ascontiguousarray(rows)
-
-    def _votes(
-        self, depth: Float32, table: tuple[Float32, NDArray[np.int32]] | None, camera: Camera, where: str
-    ) -> Votes:
-        if table is None:
-            return no_votes(depth.shape[0], depth.shape[1], len(self.label_set))
-        votes, bad = make_votes(*table, depth, camera, self.config.depth_max_m)
-        if bad:
-            raise FrameError(
-                f"{where}: {bad} known pixels hold class probabilities that are NaN, negative or do not sum to 1; "
-                "give a softmax, or mark the pixels as not known"
-            )
-        return votes
-
 
 def _parts(snapshot: GridSnapshot) -> Iterator[BlockPart]:
     while True:
@@ -396,23 +389,6 @@ def _parts(snapshot: GridSnapshot) -> Iterator[BlockPart]:
         yield part
 
 
-def _expect_dtype(array: NDArray[np.generic], dtype: type[np.generic], name: str) -> None:
-    if array.dtype != dtype:
-        raise ShapeError(f"{name}: expected dtype {np.dtype(dtype).name}, got {array.dtype.name}")
-
-
 def _check_min_weight(min_weight: float) -> None:
     if not min_weight > 0:
         raise MapError(f"min_weight must be above 0 (voxels without a measurement have no surface), got {min_weight}")
-
-
-def _check_config(config: VoxelMapConfig) -> None:
-    positive = ("voxel_size_m", "truncation_voxels", "depth_max_m", "initial_blocks", "max_blocks")
-    for name in positive:
-        value = getattr(config, name)
-        if not (np.isfinite(value) and value > 0):
-            raise ConfigError(f"voxel_map.{name} must be above 0, got {value}")
-    if not config.max_weight >= 1:
-        raise ConfigError(f"voxel_map.max_weight must be at least 1, got {config.max_weight}")
-    if not (config.vote_discount >= 0 and config.vote_band_voxels >= 0):
-        raise ConfigError("voxel_map.vote_discount and vote_band_voxels must not be negative")

@@ -39,7 +39,7 @@ class MapMirror:
         slots = np.empty(0, np.int32)
         index = make_block_index(unpack_keys(none), slots)
         self._snapshot = MapSnapshot(
-            0, voxel_size_m, truncation_voxels, label_set, none, slots, index, _new_pool(LEAST_SPARE)
+            0, 0, voxel_size_m, truncation_voxels, label_set, none, slots, index, _new_pool(LEAST_SPARE)
         )
         self._used = 0
         self._lock = threading.Lock()
@@ -77,7 +77,7 @@ class MapMirror:
                     f"changes from version {changes.since} to {changes.version} do not continue a mirror at version "
                     f"{old.version}; ask the map for its changes since {old.version}"
                 )
-            staying = ~np.isin(old.packed, packed)
+            staying = ~np.isin(old.packed, packed) & (changes.epoch == old.epoch)
             merged = np.concatenate((old.packed[staying], packed))
             pool, kept = self._make_room(old, old.slots[staying], len(packed))
             slots = np.concatenate((kept, np.arange(self._used, self._used + len(packed), dtype=np.int32)))
@@ -87,7 +87,7 @@ class MapMirror:
             merged, slots = merged[order], slots[order]
             index = make_block_index(unpack_keys(merged), slots)
             self._snapshot = dataclasses.replace(
-                old, version=changes.version, packed=merged, slots=slots, index=index, voxels=pool
+                old, version=changes.version, epoch=changes.epoch, packed=merged, slots=slots, index=index, voxels=pool
             )
             return self._snapshot
 

@@ -39,7 +39,7 @@ class MapSnapshot:
     """A map as it was at one version. Immutable, so any number of threads may query it.
 
     Args:
-        version: ``VoxelMap.frames`` of that state.
+        version, epoch: ``VoxelMap``'s of that state.
         voxel_size_m: Edge of a voxel.
         truncation_voxels: Of the TSDF.
         label_set: Of the map.
@@ -50,6 +50,7 @@ class MapSnapshot:
     """
 
     version: int
+    epoch: int
     voxel_size_m: float
     truncation_voxels: float
     label_set: LabelSet

@@ -126,3 +126,16 @@ def test_frames_that_weights_were_finetuned_on_are_never_scored(
     assert summary["frames"]["scored"] == 1
     assert summary["frames"]["excluded_from_scores"] == 2
     assert "2 frames are left out of the scores" in done.stdout
+
+
+def test_corrections_move_the_map_at_the_end_and_bad_ones_are_named_before_it_begins(
+    log: Path, weights: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "corrected.txt"
+    file.write_text("".join(f"{f.stamp_ns / 1e9:.9f} 1 2 3 0 0 0 1\n" for f in tiny_frames()[:2]))
+    done = run("replay", log, "--out", tmp_path / "out", "--weights", weights, "--corrections", file)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "out/summary.json").read_text())["map"]["corrected_poses"] == 2
+    file.write_text("no trajectory\n")
+    done = run("replay", log, "--out", tmp_path / "out", "--weights", weights, "--corrections", file)
+    assert done.returncode == 1 and "corrected.txt: holds no pose" in error_line(done.stderr)

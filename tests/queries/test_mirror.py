@@ -56,6 +56,24 @@ def test_fed_in_parts_while_the_map_grows_it_is_the_map(monkeypatch: pytest.Monk
     assert mirror.snapshot().block_count == voxel_map.block_count
 
 
+def test_a_map_that_was_replaced_by_a_corrected_one_leaves_nothing_of_the_old_one() -> None:
+    voxel_map, corrected, mirror = small_map(LABELS), small_map(LABELS), empty_mirror()
+    for seq, pose in enumerate(poses(4)):
+        integrate(voxel_map, pose, seq)
+        shifted = pose.copy()
+        shifted[:3, 3] += 0.5
+        integrate(corrected, shifted, seq)
+    mirror.apply(voxel_map.changes(0))
+    voxel_map.take_over(corrected)
+    mirror.apply(voxel_map.changes(mirror.version, limit=10))
+    assert mirror.version == voxel_map.version
+    assert mirror.snapshot().epoch == voxel_map.epoch == 1
+    assert_same(mirror.snapshot(), MapMirror.of(voxel_map).snapshot())
+    integrate(voxel_map, poses(1)[0], 9)
+    mirror.apply(voxel_map.changes(mirror.version))
+    assert_same(mirror.snapshot(), MapMirror.of(voxel_map).snapshot())
+
+
 def test_a_paged_map_has_the_same_mirror() -> None:
     free, paged = small_map(voxel_size_m=0.01), small_map(voxel_size_m=0.01, memory_mb=MEMORY_MB)
     mirror = MapMirror(0.01, 4.0, paged.label_set)

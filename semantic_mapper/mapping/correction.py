@@ -1,0 +1,337 @@
+"""A map that follows corrected poses: it is built again from its history, beside the one in use, and then swapped in.
+
+A rebuild goes on in portions (``MapCorrector.advance``), between steps or from another thread. Until it is done, steps
+and queries go on with the old map; frames that come meanwhile are in the history, too, so the rebuild catches up with
+them. The swap comes between two steps.
+
+Class probabilities are not rendered anew. They came from source views that lie near the frame in time, and a correction
+changes where these are relative to each other far less than where all of them are in the world.
+
+The history is bounded: when it is full, its older half leaves. Those frames are *frozen*: what they have put into the
+map stays, but no correction moves it any more. Every rebuild starts from a backup on disk of the map as it was after
+the last frozen frame. It is taken on the way, when the history is half full, and anew by every rebuild that comes by
+that frame, so that no frame is fused a second time for it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import structlog
+
+from semantic_mapper.config import HistoryConfig
+from semantic_mapper.errors import MapError
+from semantic_mapper.geometry import check_pose
+from semantic_mapper.mapping.history import FrameEntry, FrameHistory, FusedFrame
+from semantic_mapper.mapping.keyframes import KeyframeStore
+from semantic_mapper.mapping.map_backup import MapBackup
+from semantic_mapper.mapping.pose_correction import ALWAYS, PoseCorrection, PosePair, move
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.types import Float64, PosedFrame
+
+PORTION_WHEN_FULL = 4  # frames that a step itself rebuilds where the history is full and nothing may leave it
+
+# By stamp_ns, or by (camera_id, stamp_ns) where cameras share stamps: T_world_camera (4, 4).
+CorrectedPoses = Mapping[int, Float64] | Mapping[tuple[str, int], Float64]
+
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectionStatus:
+    """Where corrections stand.
+
+    Args:
+        running: A rebuild is under way; the map in use is still the old one.
+        done, total: Frames of the history that the rebuild has gone through, and all.
+        disk_bytes: Of the history, without its backup of the map.
+        completed: Corrections that are in the map in use.
+        frozen: Frames that have left the history; corrections do not reach them.
+        lost: Frames that could not be read from disk again, and so are in the map no more after a rebuild.
+    """
+
+    running: bool
+    done: int
+    total: int
+    disk_bytes: int
+    completed: int
+    frozen: int
+    lost: int
+
+
+class _Half(NamedTuple):
+    """The map after the frame of this number, which made the history half full."""
+
+    number: int
+    backup: MapBackup
+
+
+@dataclass(slots=True, eq=False)
+class _Rebuild:
+    """A map on its way."""
+
+    voxel_map: VoxelMap
+    corrections: tuple[PoseCorrection, ...]  # to be applied one after the other
+    first: int  # number of the history's oldest frame
+    next: int  # number of the next frame to fuse
+    half: _Half | None = None
+
+    def place(self, entry: FrameEntry) -> Float64:
+        T_world_camera = entry.T_world_camera
+        for correction in self.corrections:
+            T_world_camera = correction.place(entry.camera_id, entry.stamp_ns, T_world_camera)
+        return T_world_camera
+
+
+class MapCorrector:
+    """The history of a map, and the rebuild that is under way, if one is.
+
+    Args:
+        config: Bounds of the history; ``max_frames`` 0 = none is kept and nothing can be corrected.
+        voxel_map: In use; becomes the corrected one at a swap.
+        keyframes: Move with their frames at a swap.
+        fuse: Lifts a frame of the history and integrates it into the map given.
+
+    Raises:
+        MapError: no file can be made in the system's folder for temporary files.
+    """
+
+    def __init__(
+        self,
+        config: HistoryConfig,
+        voxel_map: VoxelMap,
+        keyframes: KeyframeStore,
+        fuse: Callable[[VoxelMap, FusedFrame], None],
+    ) -> None:
+        self.turn = threading.RLock()  # held by a step, and by a swap: one at a time
+        self._lock = threading.RLock()  # of what is below; never taken while ``turn`` is held
+        self._map = voxel_map
+        self._keyframes = keyframes
+        self._fuse = fuse
+        self._history = FrameHistory(config.max_frames, config.max_disk_mb * 1_000_000) if config.max_frames else None
+        self._why_none = "no frames are kept; set history.max_frames in the mapper's config"
+        self._rebuild: _Rebuild | None = None
+        self._half: _Half | None = None
+        self._base: MapBackup | None = None  # of the frozen frames
+        self._frozen_until: dict[str, int] = {}  # newest stamp of each camera
+        self._frozen = self._lost = self._completed = 0
+        self._motion = np.eye(4)  # of frames to come, where their odometry goes on in the world before correction
+
+    @property
+    def records(self) -> bool:
+        """Whether frames are kept."""
+        return self._history is not None
+
+    @property
+    def status(self) -> CorrectionStatus:
+        """Where corrections stand."""
+        history, rebuild = self._history, self._rebuild
+        return CorrectionStatus(
+            running=rebuild is not None,
+            done=0 if rebuild is None else rebuild.next - rebuild.first,
+            total=0 if history is None else len(history),
+            disk_bytes=0 if history is None else history.bytes,
+            completed=self._completed,
+            frozen=self._frozen,
+            lost=self._lost,
+        )
+
+    def poses(self) -> dict[tuple[str, int], Float64]:
+        """(camera_id, stamp_ns) -> T_world_camera (4, 4) of the frames that can be corrected, as the map has them."""
+        entries = [] if self._history is None else self._history.entries()
+        return {(e.camera_id, e.stamp_ns): e.T_world_camera.copy() for e in entries}
+
+    def place(self, frame: PosedFrame) -> PosedFrame:
+        """A frame that comes, at its pose in the map's world; see ``until_ns`` of ``start``."""
+        pose = move(self._motion, frame.T_world_camera)
+        return frame if pose is frame.T_world_camera else replace(frame, T_world_camera=pose)
+
+    def record(self, fused: FusedFrame) -> None:
+        """Keep a frame that the map was just given. Where the disk fails, mapping goes on and correcting ends."""
+        if self._history is None:
+            return
+        try:
+            self._history.append(fused)
+        except MapError as error:
+            self._end_history(str(error))
+
+    def make_room(self) -> None:
+        """Let the older half of a full history leave; to be called before a step, outside of ``turn``.
+
+        During a rebuild no frame leaves, as the rebuild may still need it, but the step carries the rebuild on, so that
+        it ends before the history has grown by more than a third.
+        """
+        history = self._history
+        if history is None or (not history.is_full and (self._half is not None or history.half is None)):
+            return
+        with self._lock:
+            if self._rebuild is not None and history.is_full:
+                with suppress(MapError):  # is logged, and it is not this step that has failed
+                    self.advance(PORTION_WHEN_FULL)
+            if self._rebuild is not None:
+                return
+            try:
+                with self.turn:
+                    self._turn_over(history)
+            except MapError as error:
+                self._end_history(str(error))
+
+    def start(self, poses: CorrectedPoses, until_ns: int | None = None) -> CorrectionStatus:
+        """Begin to build the map again with corrected poses; see ``MappingPipeline.correct_poses``."""
+        with self._lock:
+            history = self._history
+            if history is None:
+                raise MapError(f"poses cannot be corrected: {self._why_none}")
+            before = self._rebuild
+            pairs = self._pairs(history, poses, before)
+            last_ns = max(pair.stamp_ns for pair in pairs)
+            correction = PoseCorrection(pairs, last_ns if until_ns is None else until_ns)
+            entries = history.entries()
+            self._rebuild = _Rebuild(
+                voxel_map=self._first_map(),
+                corrections=(correction,) if before is None else (*before.corrections, correction),
+                first=entries[0].number,
+                next=entries[0].number,
+            )
+            event = "correction_begins" if before is None else "correction_begins_again"
+            _log.info(event, given=len(pairs), frames=len(entries), frozen=self._frozen)
+            return self.status
+
+    def advance(self, max_frames: int = 1) -> bool:
+        """Carry a rebuild on by so many frames and swap the maps where it has caught up; returns if it still runs.
+
+        May be called from any thread, but not from within a step. Waits for a step that is under way before a swap.
+
+        Raises:
+            MapError: the corrected map cannot be built (too large, say); the correction is given up, the map in use
+                stays as it is.
+        """
+        for _ in range(max_frames):
+            with self._lock:  # let go after every frame: a step may wait for it
+                if self._rebuild is None:
+                    return False
+                try:
+                    if self._fuse_next(self._rebuild):
+                        continue
+                    with self.turn:
+                        while self._fuse_next(self._rebuild):  # the step that was under way
+                            pass
+                        self._swap(self._rebuild)
+                except MapError as error:
+                    self._rebuild = None
+                    _log.error("correction_fails", reason=str(error))
+                    raise
+        return self._rebuild is not None
+
+    def _pairs(self, history: FrameHistory, poses: CorrectedPoses, before: _Rebuild | None) -> list[PosePair]:
+        """Old and new poses of the given frames that are in the history."""
+        pairs: list[PosePair] = []
+        frozen = 0
+        by_stamp: dict[int, list[FrameEntry]] = {}
+        for entry in history.entries():
+            by_stamp.setdefault(entry.stamp_ns, []).append(entry)
+        for key, new in poses.items():
+            camera_id, stamp_ns = key if isinstance(key, tuple) else (None, key)
+            where = f"corrected pose of stamp {stamp_ns}" + ("" if camera_id is None else f" of camera '{camera_id}'")
+            check_pose(new, where)
+            found = [e for e in by_stamp.get(stamp_ns, ()) if camera_id in (None, e.camera_id)]
+            if len({e.camera_id for e in found}) > 1:
+                names = ", ".join(sorted({e.camera_id for e in found}))
+                raise MapError(f"{where}: cameras {names} have this stamp; give (camera_id, stamp_ns)")
+            if found:
+                old = found[-1].T_world_camera if before is None else before.place(found[-1])
+                pairs.append(PosePair(found[-1].camera_id, stamp_ns, old, new.copy()))
+            elif self._is_frozen(camera_id, stamp_ns):
+                frozen += 1
+            else:
+                raise MapError(f"{where}: no frame with this stamp was mapped{_nearest(stamp_ns, list(by_stamp))}")
+        if frozen:
+            _log.warning("correction_is_partial", given=len(poses), frozen=frozen, reason="frames left the history")
+        if not pairs:
+            reason = f"all {frozen} frames given have left the history; raise history.max_frames or max_disk_mb"
+            raise MapError(f"no pose to correct: {reason if frozen else 'none was given'}")
+        return pairs
+
+    def _is_frozen(self, camera_id: str | None, stamp_ns: int) -> bool:
+        limits = self._frozen_until if camera_id is None else {camera_id: self._frozen_until.get(camera_id, -1)}
+        return any(stamp_ns <= limit for limit in limits.values())
+
+    def _fuse_next(self, rebuild: _Rebuild) -> bool:
+        """Fuse the next frame of the history; False where there is none."""
+        history = self._history
+        if history is None:
+            raise MapError(f"poses cannot be corrected: {self._why_none}")
+        entry = history.entry(rebuild.next)
+        if entry is None:
+            return False
+        self._fuse_entry(history, entry, rebuild.place(entry), rebuild.voxel_map)
+        rebuild.next += 1
+        if rebuild.half is None and entry.number == history.half:
+            rebuild.half = _Half(entry.number, rebuild.voxel_map.backup())
+        return True
+
+    def _fuse_entry(self, history: FrameHistory, entry: FrameEntry, pose: Float64, into: VoxelMap) -> None:
+        try:
+            fused = history.read(entry, pose)
+        except MapError as error:
+            self._lost += 1
+            _log.error("history_frame_lost", seq=entry.seq, camera=entry.camera_id, reason=str(error))
+            return
+        self._fuse(into, fused)
+
+    def _first_map(self) -> VoxelMap:
+        """What a rebuild starts from: the frozen frames' map, or an empty one."""
+        if self._base is None:
+            return VoxelMap(self._map.config, self._map.label_set)
+        return VoxelMap.restore(self._base, self._map.config, self._map.label_set)
+
+    def _turn_over(self, history: FrameHistory) -> None:
+        """Freeze the older half of a full history; begin the next one where it is half full."""
+        if history.is_full and self._half is not None:
+            leaving = history.drop_until(self._half.number)
+            for entry in leaving:
+                self._frozen_until[entry.camera_id] = max(entry.stamp_ns, self._frozen_until.get(entry.camera_id, 0))
+            if self._base is None:
+                _log.info("history_is_full", frozen=len(leaving), kept=len(history))
+            else:
+                self._base.store.close()
+            self._base, self._half = self._half.backup, None
+            self._frozen += len(leaving)
+        if self._half is None and history.half is not None:
+            self._half = _Half(history.entries()[-1].number, self._map.backup())
+
+    def _swap(self, rebuild: _Rebuild) -> None:
+        assert self._history is not None
+        entries = [replace(e, T_world_camera=rebuild.place(e)) for e in self._history.entries()]
+        self._map.take_over(rebuild.voxel_map)
+        moved = self._keyframes.move({(e.camera_id, e.stamp_ns): e.T_world_camera for e in entries})
+        self._history.replace(entries)
+        if self._half is not None:
+            self._half.backup.store.close()
+        self._half = rebuild.half
+        for correction in rebuild.corrections:
+            if correction.until_ns == ALWAYS:
+                self._motion = move(correction.last_motion, self._motion)
+        self._completed += len(rebuild.corrections)
+        self._rebuild = None
+        _log.info("correction_done", frames=len(entries), keyframes_moved=moved, blocks=self._map.block_count)
+
+    def _end_history(self, reason: str) -> None:
+        """Without every frame a rebuild would lose a part of the map; better none."""
+        history, self._history, self._half, self._base = self._history, None, None, None
+        self._why_none = f"the history has ended: {reason}"
+        if history is not None:
+            history.close()
+        _log.error("history_ends", reason=reason)
+
+
+def _nearest(stamp_ns: int, stamps: list[int]) -> str:
+    if not stamps:
+        return "; the history is empty"
+    nearest = min(stamps, key=lambda s: abs(s - stamp_ns))
+    return f"; the nearest is {nearest}, {abs(nearest - stamp_ns) / 1e6:g} ms away"

@@ -1,0 +1,95 @@
+"""From corrected poses of some frames to those of all frames.
+
+A pose graph gives new poses for its keyframes alone. A frame between two of them in time moves with both: with C_a and
+C_b the motions ``T_new @ T_old^-1`` of its neighbours and s its share of the time between them, its rotation is turned
+by the rotation s of the way from R_a to R_b (slerp), and its position p goes to ``(1 - s) C_a p + s C_b p``. Blending
+where the two motions take the camera, not their translations, makes the result the same wherever the world's origin is:
+blended translations would be off by (turn)^2 / 8 times the distance to the origin. A frame before the first given one
+moves with the first. A frame after the last moves with it only where the caller says so (``until_ns``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from semantic_mapper.geometry import invert_pose, transform
+from semantic_mapper.types import Float64
+
+ALWAYS = 2**63 - 1  # later than any stamp
+
+
+class PosePair(NamedTuple):
+    """The pose of one frame before and after, both T_world_camera (4, 4) float64."""
+
+    camera_id: str
+    stamp_ns: int
+    old: Float64
+    new: Float64
+
+
+class PoseCorrection:
+    """How a correction moves frames. All cameras are taken to sit on one body: they follow the same motion in time.
+
+    Args:
+        pairs: At least one. Where several cameras have the same stamp, the first by name speaks for the others.
+        until_ns: Frames later than the last pair, up to this stamp, move with the last pair; the frames after it were
+            posed in the corrected world already. ``ALWAYS``: all of them, those to come as well.
+    """
+
+    def __init__(self, pairs: Sequence[PosePair], until_ns: int) -> None:
+        self.until_ns = until_ns
+        self._given: Mapping[tuple[str, int], Float64] = {(p.camera_id, p.stamp_ns): p.new for p in pairs}
+        motions: dict[int, Float64] = {}
+        for pair in sorted(pairs, key=lambda p: (p.stamp_ns, p.camera_id)):
+            motions.setdefault(pair.stamp_ns, _motion(pair))
+        self._stamps = np.array(list(motions), np.int64)
+        self._motions = list(motions.values())
+
+    @property
+    def last_motion(self) -> Float64:
+        """(4, 4) ``T_new @ T_old^-1`` of the last given pose."""
+        return self._motions[-1]
+
+    def place(self, camera_id: str, stamp_ns: int, T_world_camera: Float64) -> Float64:
+        """The corrected pose (4, 4) of a frame; the very one that was given, where it was."""
+        given = self._given.get((camera_id, stamp_ns))
+        if given is not None:
+            return given
+        after = int(np.searchsorted(self._stamps, stamp_ns))
+        if after == len(self._stamps):
+            return T_world_camera if stamp_ns > self.until_ns else move(self._motions[-1], T_world_camera)
+        if after == 0 or self._stamps[after] == stamp_ns:
+            return move(self._motions[after], T_world_camera)
+        share = (stamp_ns - int(self._stamps[after - 1])) / int(self._stamps[after] - self._stamps[after - 1])
+        return _between(self._motions[after - 1], self._motions[after], share, T_world_camera)
+
+
+def move(motion: Float64, T_world_camera: Float64) -> Float64:
+    """``motion @ T_world_camera``; no motion leaves the pose as it is, to the bit."""
+    return T_world_camera if np.array_equal(motion, np.eye(4)) else motion @ T_world_camera
+
+
+def _motion(pair: PosePair) -> Float64:
+    """T_new @ T_old^-1, its rotation made orthonormal, so that rounding errors of poses do not add up."""
+    if np.array_equal(pair.new, pair.old):
+        return np.eye(4)
+    motion = pair.new @ invert_pose(pair.old)
+    u, _, vt = np.linalg.svd(motion[:3, :3])
+    motion[:3, :3] = u @ vt
+    motion[:3, 3] = pair.new[:3, 3] - motion[:3, :3] @ pair.old[:3, 3]
+    return motion
+
+
+def _between(a: Float64, b: Float64, share: float, T_world_camera: Float64) -> Float64:
+    if np.array_equal(a, b):
+        return move(a, T_world_camera)
+    turn = np.asarray(cv2.Rodrigues(a[:3, :3].T @ b[:3, :3])[0], np.float64)
+    out = np.eye(4)
+    out[:3, :3] = a[:3, :3] @ np.asarray(cv2.Rodrigues(turn * share)[0]) @ T_world_camera[:3, :3]
+    position = T_world_camera[:3, 3]
+    out[:3, 3] = (1 - share) * transform(a, position) + share * transform(b, position)
+    return out
