@@ -132,7 +132,7 @@ class VoxelMapConfig(Config, frozen=True):
     initial_blocks: AtLeastOne = 2000  # capacity at start; grows by half when full
     max_blocks: AtLeastOne = 200_000  # refuse to grow past this, with a clear error
     memory_mb: NotNegative = 0  # for voxels; what was used longest ago goes to disk; 0 = no limit
-    vote_discount: Share = 0.5  # rho: how much a repeated view of a voxel repeats what earlier views said
+    vote_discount: Share = 0.75  # rho: how much a repeated view of a voxel repeats what earlier views said
     vote_band_voxels: Positive = 2.0  # only voxels this near the surface take class votes
 
 

@@ -2,7 +2,8 @@
 
 With n votes of evidence e, what the votes say together is ``p = softmax(e * n_eff / n)``, where
 ``n_eff = n / (1 + rho (n - 1))`` for n > 1: views of one place repeat each other's errors, so a hundred of them are
-worth at most 1 / rho independent ones. The label is the argmax, its confidence p[label].
+worth at most 1 / rho independent ones. A vote that is trusted less, n < 1, weighs less against others, but where it is
+the only one it means what the field said: n_eff = 1. The label is the argmax, its confidence p[label].
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ def decide(evidence, votes, vote_discount):
     """Channel and confidence of one evidence vector (L,); (-1, 0) without votes."""
     if votes <= 0:
         return -1, 0.0
-    worth = 1.0 / (1.0 + vote_discount * (votes - 1.0)) if votes > 1 else 1.0  # n_eff / n
+    worth = 1.0 / (1.0 + vote_discount * (votes - 1.0)) if votes > 1 else 1.0 / votes  # n_eff / n
     best = 0
     for c in range(1, len(evidence)):
         if evidence[c] > evidence[best]:
