@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
+from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.block_index import KEY_BITS, KEY_LIMIT
 from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_point
@@ -31,22 +32,28 @@ class NearestSurface:
     confidence: float
 
 
-def nearest(snapshot: MapSnapshot, class_name: str, point: ArrayLike) -> NearestSurface | None:
+def nearest(
+    snapshot: MapSnapshot, class_name: str, point: ArrayLike, min_confidence: float = 0.0
+) -> NearestSurface | None:
     """The surface point of a class that is nearest to a point; ``None`` where the map has no surface of that class.
 
     Args:
         snapshot: The map.
         class_name: As in the map's label set.
         point: (3,) world metres.
+        min_confidence: Places that are less sure of the class do not count; 0..1.
 
     Raises:
         LabelError: no such class; lists those there are.
-        MapError: see ``checks.check_points``.
+        MapError: see ``checks.check_points``; or no such confidence.
     """
     class_id = snapshot.label_set.id_of(class_name)
     p = check_point(point, snapshot)
-    xyz = np.empty(3)
-    slot, voxel, distance = _search(p, class_id, snapshot.packed, snapshot.slots, snapshot.index, snapshot.voxels, xyz)
+    if not 0 <= min_confidence <= 1:
+        raise MapError(f"min_confidence must be 0..1, got {min_confidence}")
+    xyz, least = np.empty(3), np.uint8(np.ceil(min_confidence * CONFIDENCE_STEPS - 1e-9))
+    table = (snapshot.packed, snapshot.slots, snapshot.index, snapshot.voxels)
+    slot, voxel, distance = _search(p, class_id, least, *table, xyz)
     if slot < 0:
         return None
     confidence = float(snapshot.voxels.confidence[slot, voxel]) / CONFIDENCE_STEPS
@@ -78,7 +85,7 @@ def _bounds(p, class_id, packed, slots, classes):
 
 
 @njit(nogil=True, cache=True)
-def _search(p, class_id, packed, slots, index, voxels, xyz):
+def _search(p, class_id, least, packed, slots, index, voxels, xyz):
     """Slot and voxel of the nearest surface voxel of a class, and its distance; slot -1 = none. Writes ``xyz`` (3,).
 
     Blocks are gone through in the order of the least distance that their surface may have, until that is more than
@@ -96,7 +103,9 @@ def _search(p, class_id, packed, slots, index, voxels, xyz):
             x, y, z = _unpack(key, 0), _unpack(key, 1), _unpack(key, 2)
             neighbour_slots(x, y, z, index, near)
             for voxel in range(512):
-                if voxels.label[slot, voxel] != class_id or not surface_offset(slot, voxel, near, voxels, offset):
+                if voxels.label[slot, voxel] != class_id or voxels.confidence[slot, voxel] < least:
+                    continue
+                if not surface_offset(slot, voxel, near, voxels, offset):
                     continue
                 q[0], q[1], q[2] = x * 8 + (voxel & 7), y * 8 + ((voxel >> 3) & 7), z * 8 + (voxel >> 6)
                 q += offset

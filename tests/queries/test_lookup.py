@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semantic_mapper.errors import LabelError
+from semantic_mapper.errors import LabelError, MapError
 from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.nearest import nearest
 from semantic_mapper.queries.occupancy import State, occupancy
@@ -62,12 +62,14 @@ def test_occupancy_of_all_observed_voxels_follows_their_distance() -> None:
 
 
 @settings(max_examples=60, deadline=None)
-@given(point=POINT, name=st.sampled_from(["floor", "table", "cup"]))
-def test_nearest_is_the_nearest_of_all(point: tuple[float, float, float], name: str) -> None:
+@given(point=POINT, name=st.sampled_from(["floor", "table", "cup"]), quantile=st.sampled_from([None, 0.5, 0.9]))
+def test_nearest_is_the_nearest_of_all(point: tuple[float, float, float], name: str, quantile: float | None) -> None:
     xyz, label, confidence = surface_of(whole())
     mine = label == LABELS.id_of(name)
+    least = 0.0 if quantile is None else float(np.quantile(confidence[mine], quantile)) / 255
+    mine &= confidence >= np.ceil(least * 255 - 1e-9)
     distance = np.linalg.norm(xyz[mine] - point, axis=1)
-    hit = nearest(whole(), name, point)
+    hit = nearest(whole(), name, point, least)
     assert hit is not None
     assert hit.distance_m == pytest.approx(distance.min(), abs=1e-9)
     candidates = np.flatnonzero(distance <= distance.min() + 1e-9)
@@ -78,5 +80,8 @@ def test_nearest_is_the_nearest_of_all(point: tuple[float, float, float], name: 
 
 def test_a_class_that_is_nowhere_and_one_that_does_not_exist() -> None:
     assert nearest(whole(), "lamp", (0, 0, 0)) is None
+    assert nearest(whole(), "cup", (0, 0, 0), 1.0) is None
+    with pytest.raises(MapError, match="min_confidence"):
+        nearest(whole(), "cup", (0, 0, 0), 1.5)
     with pytest.raises(LabelError, match=r"no class 'lmap'; it has floor, table, cup, lamp"):
         nearest(whole(), "lmap", (0, 0, 0))
