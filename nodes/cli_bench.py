@@ -33,6 +33,8 @@ def bench(
     repeats: Annotated[
         int, typer.Option(min=1, help="render: best of so many runs of everything but the reference.")
     ] = 3,
+    views: Annotated[int, typer.Option(min=1, help="render: views, each of a test room or of --log.")] = 1,
+    log: Annotated[Path | None, typer.Option(help="render: labelled log to take the views from.")] = None,
     frames: Annotated[int, typer.Option(min=1, help="fusion, pipeline: frames that count.")] = 20,
     config: Annotated[Path | None, typer.Option(help="pipeline: TOML file with settings of the mapper.")] = None,
     quality: QualityOption = None,
@@ -42,10 +44,11 @@ def bench(
 ) -> None:
     """Measure speed on this machine, as ratios between things measured in one run.
 
-    render: a 320x240 view of a test room from 8 source views, by the reference renderer and by the streaming one at
-    the same weights. fusion: 640x480 frames into 2 cm voxels, our fusion with 20 and 40 classes against Open3D's own
-    without any. pipeline: whole steps, 640x480 frames with depth in, the semantic map out. Quote ratios, not seconds:
-    seconds depend on the machine and on what else it does.
+    render: views of test rooms (320x240) or of a log from 8 source views, by the reference renderer and by the
+    streaming one at the same weights. fusion: 640x480 frames into 2 cm voxels, our fusion with 20 and 40 classes
+    against Open3D's own without any. pipeline: whole steps, 640x480 frames with depth in, the semantic map out. Quote
+    ratios, not seconds: seconds depend on the machine and on what else it does. In --json the figures stand under the
+    name of the part, and those of a single part at the top, too.
 
     Example: semantic-mapper bench --json runs/bench.json
     Example: semantic-mapper bench pipeline --frames 40 --quality fast
@@ -56,14 +59,16 @@ def bench(
     wanted = [p for p in Part if p is not Part.ALL] if part is Part.ALL else [part]
     found: dict[str, Any] = {}
     if Part.RENDER in wanted:
-        from replay.bench import bench_render
+        from replay.bench import bench_render, log_scenes, room_scenes
         from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
 
-        found["render"] = bench_render(load_checkpoint(weights or default_checkpoint_path()), repeats=repeats)
+        checkpoint = load_checkpoint(weights or default_checkpoint_path())
+        scenes = room_scenes(views) if log is None else log_scenes(log, views)
+        found["render"] = bench_render(checkpoint, scenes, repeats)
         output.print(_render_table(found["render"]))
         output.print(
-            f"streaming is {found['render']['speedup']} times faster than the reference, "
-            f"{found['render']['speedup_at_equal_samples']} times at equal samples"
+            f"streaming (balanced) is {found['render']['speedup']} times faster than the reference, with all rays and "
+            f"8 samples {found['render']['speedup_all_rays']} times"
         )
     if Part.FUSION in wanted:
         from replay.bench_map import bench_fusion
@@ -76,6 +81,8 @@ def bench(
 
         found["pipeline"] = bench_pipeline(weights, mapper_config(config, None, None, quality), frames)
         output.print(_pipeline_line(found["pipeline"]))
+    if part is not Part.ALL:
+        found |= found[part.value]
     found["machine"] = {"cpu": cpu_name(), "versions": versions()}
     output.print(f"on {found['machine']['cpu']}")
     if json_file is not None:
@@ -92,12 +99,12 @@ def cpu_name() -> str:
 
 
 def _render_table(render: dict[str, Any]) -> Table:
-    table = Table(title=f"rendering {render['view']}")
-    for column in ("renderer", "rays/s", "view, wall s", "view, CPU s", "CPU s per 2048 rays"):
+    table = Table(title=f"rendering {render['view']}, {render['views']} views")
+    for column in ("renderer", "pixels/s", "view, wall s", "view, CPU s", "CPU s per 2048 pixels", "mIoU"):
         table.add_column(column, justify="left" if column == "renderer" else "right")
     for name, row in render["renderers"].items():
-        values = (row["rays_per_s"], row["view_wall_s"], row["view_cpu_s"], row["cpu_s_per_2048_rays"])
-        table.add_row(name, *(f"{v:,}" for v in values))
+        values = (row["pixels_per_s"], row["view_wall_s"], row["view_cpu_s"], row["cpu_s_per_2048_pixels"])
+        table.add_row(name, *(f"{v:,}" for v in values), f"{row['miou'] * 100:.1f} %")
     return table
 
 
