@@ -38,8 +38,8 @@ def test_voxels_are_those_of_the_map_rounded(walked: VoxelMap, min_weight: float
     assert np.abs(changes.tsdf[seen] / 127 - state["tsdf"][seen]).max() <= 1 / 127
     np.testing.assert_array_equal(changes.tsdf[seen] > 0, state["tsdf"][seen] > 0)
     np.testing.assert_allclose(changes.rgb[seen], state["color"][seen], atol=0.51)
-    votes = np.maximum(state["votes"], 1)
-    worth = 1 / (1 + 0.3 * (votes - 1))
+    votes = state["votes"]
+    worth = np.where(votes > 1, 1 / (1 + 0.3 * (votes - 1)), 1 / np.maximum(votes, 1e-9))
     p = np.exp(
         (state["evidence"] - state["evidence"].max(axis=-1, keepdims=True)) * worth[..., None].astype(np.float64)
     )
