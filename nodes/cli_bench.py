@@ -22,6 +22,10 @@ class Part(StrEnum):
     RENDER = "render"
     FUSION = "fusion"
     PIPELINE = "pipeline"
+    VIRTUAL = "virtual"
+
+
+SPEED = (Part.RENDER, Part.FUSION, Part.PIPELINE)
 
 
 @verb
@@ -33,10 +37,16 @@ def bench(
     repeats: Annotated[
         int, typer.Option(min=1, help="render: best of so many runs of everything but the reference.")
     ] = 3,
-    views: Annotated[int, typer.Option(min=1, help="render: views, each of a test room or of --log.")] = 1,
+    views: Annotated[
+        int | None,
+        typer.Option(min=1, help="render: views, of a test room or --log each (1); virtual: at most, a room (8)."),
+    ] = None,
     log: Annotated[Path | None, typer.Option(help="render: labelled log to take the views from.")] = None,
     frames: Annotated[int, typer.Option(min=1, help="fusion, pipeline: frames that count.")] = 20,
-    config: Annotated[Path | None, typer.Option(help="pipeline: TOML file with settings of the mapper.")] = None,
+    rooms: Annotated[int, typer.Option(min=1, max=8, help="virtual: validation rooms to map.")] = 4,
+    config: Annotated[
+        Path | None, typer.Option(help="pipeline, virtual: TOML file with settings of the mapper.")
+    ] = None,
     quality: QualityOption = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Also write the figures here.")
@@ -50,37 +60,33 @@ def bench(
     ratios, not seconds: seconds depend on the machine and on what else it does. In --json the figures stand under the
     name of the part, and those of a single part at the top, too.
 
+    virtual, which "all" leaves out: what virtual views bring to the maps of validation rooms, and what more rays or
+    more frames bring instead; minutes a room.
+
     Example: semantic-mapper bench --json runs/bench.json
     Example: semantic-mapper bench pipeline --frames 40 --quality fast
     """
     output = Output.guarded()
     from replay.artifacts import versions, write_json
 
-    wanted = [p for p in Part if p is not Part.ALL] if part is Part.ALL else [part]
+    wanted = SPEED if part is Part.ALL else (part,)
     found: dict[str, Any] = {}
     if Part.RENDER in wanted:
-        from replay.bench import bench_render, log_scenes, room_scenes
-        from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
-
-        checkpoint = load_checkpoint(weights or default_checkpoint_path())
-        scenes = room_scenes(views) if log is None else log_scenes(log, views)
-        found["render"] = bench_render(checkpoint, scenes, repeats)
-        output.print(_render_table(found["render"]))
-        output.print(
-            f"streaming (balanced) is {found['render']['speedup']} times faster than the reference, with all rays and "
-            f"8 samples {found['render']['speedup_all_rays']} times"
-        )
+        found["render"] = _render(weights, log, views or 1, repeats, output)
     if Part.FUSION in wanted:
-        from replay.bench_map import bench_fusion
-
-        found["fusion"] = bench_fusion(frames)
-        output.print(_fusion_line(found["fusion"]))
+        found["fusion"] = _fusion(frames, output)
     if Part.PIPELINE in wanted:
         from nodes.run_replay import mapper_config
         from replay.bench_map import bench_pipeline
 
         found["pipeline"] = bench_pipeline(weights, mapper_config(config, None, None, quality), frames)
         output.print(_pipeline_line(found["pipeline"]))
+    if Part.VIRTUAL in wanted:
+        from nodes.run_replay import mapper_config
+        from replay.bench_virtual import bench_virtual
+
+        found["virtual"] = bench_virtual(weights, mapper_config(config, None, None, quality), rooms, views or 8)
+        output.print(_virtual_table(found["virtual"]))
     if part is not Part.ALL:
         found |= found[part.value]
     found["machine"] = {"cpu": cpu_name(), "versions": versions()}
@@ -88,6 +94,28 @@ def bench(
     if json_file is not None:
         write_json(json_file, found)
         output.print(f"written to {json_file}")
+
+
+def _render(weights: Path | None, log: Path | None, views: int, repeats: int, output: Output) -> dict[str, Any]:
+    from replay.bench import bench_render, log_scenes, room_scenes
+    from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
+
+    scenes = room_scenes(views) if log is None else log_scenes(log, views)
+    render = bench_render(load_checkpoint(weights or default_checkpoint_path()), scenes, repeats)
+    output.print(_render_table(render))
+    output.print(
+        f"streaming (balanced) is {render['speedup']} times faster than the reference, with all rays and 8 samples "
+        f"{render['speedup_all_rays']} times"
+    )
+    return render
+
+
+def _fusion(frames: int, output: Output) -> dict[str, Any]:
+    from replay.bench_map import bench_fusion
+
+    fusion = bench_fusion(frames)
+    output.print(_fusion_line(fusion))
+    return fusion
 
 
 def cpu_name() -> str:
@@ -114,6 +142,19 @@ def _fusion_line(fusion: dict[str, Any]) -> str:
         f"without classes, ours {fusion['ms_20']} ms with 20 ({fusion['ratio_20']} times) and {fusion['ms_40']} ms "
         f"with 40 ({fusion['ratio_40']} times)"
     )
+
+
+def _virtual_table(virtual: dict[str, Any]) -> Table:
+    table = Table(title=f"maps of {virtual['rooms']} validation rooms, {virtual['frames']} frames each")
+    shares = ("map mIoU", "accuracy", "mIoU where plain votes", "voted", "ECE")
+    for column in ("frames", "variant", *shares, "CPU s", "views"):
+        table.add_column(column, justify="left" if column in ("frames", "variant") else "right")
+    for name, variants in virtual["coverages"].items():
+        for variant, row in variants.items():
+            values = (row[key] for key in ("miou", "accuracy", "miou_where_plain_votes", "voted", "ece"))
+            rest = (f"{row['cpu_s']:g}", str(row["views"]))
+            table.add_row(name, variant, *(f"{value * 100:.1f} %" for value in values), *rest)
+    return table
 
 
 def _pipeline_line(pipeline: dict[str, Any]) -> str:

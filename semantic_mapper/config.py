@@ -144,6 +144,17 @@ class HistoryConfig(Config, frozen=True):
     max_disk_mb: AtLeastOne = 4000  # in the folder for temporary files; frames leave earlier for it
 
 
+class VirtualViewConfig(Config, frozen=True):
+    """Views from where no camera stood, rendered from keyframes, that add class votes where the map is in doubt."""
+
+    # After every so many frames, in time that ``render.target_hz`` knows nothing of; 0 = only where asked for.
+    every_n_frames: NotNegative = 0
+    views: AtLeastOne = 1  # at a time
+    weight: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.3  # of their votes, against those of a frame
+    max_votes: Positive = 0.3  # only voxels with fewer take theirs; a frame's vote from up to 2 m, head on, is 1
+    keyframes: AtLeastTwo = 2  # that must see a surface for a virtual view to look at it
+
+
 class RenderConfig(Config, frozen=True):
     """Resolution and chunking of the rendered view."""
 
@@ -174,6 +185,7 @@ class MapperConfig(Config, frozen=True):
     keyframes: KeyframeConfig = KeyframeConfig()
     voxel_map: VoxelMapConfig = VoxelMapConfig()
     history: HistoryConfig = HistoryConfig()
+    virtual: VirtualViewConfig = VirtualViewConfig()
     render: RenderConfig = RenderConfig()
     quality: Quality = "custom"  # any other sets samples and rays; see ``with_quality``
     seed: int = 0

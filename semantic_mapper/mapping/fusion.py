@@ -158,7 +158,7 @@ def _vote_weights(depth, rows, proper, camera, depth_max):
 
 
 @njit(nogil=True, cache=True, inline="always")
-def _add_vote(evidence, votes, voxel, log_p, row, weight, cap):
+def add_vote(evidence, votes, voxel, log_p, row, weight, cap):
     """``e += w log p``; past the cap the old sum shrinks so that the map stays able to change its mind."""
     total = votes[voxel] + weight
     keep = np.float32(1.0)
@@ -188,7 +188,7 @@ def fuse_blocks(indices, buffers, camera, limits, depth, rgb, votes):
 
 
 @njit(nogil=True, cache=True, inline="always")
-def _project_row(p, step, lens, size, depth, truncation, depth_max, pixels, distances):
+def project_row(p, step, lens, size, depth, truncation, depth_max, pixels, distances):
     """Pixel that each voxel of a row projects to and its signed distance; -1 where there is nothing to fuse."""
     fx, fy, cx, cy = lens
     width, right, bottom = size
@@ -239,7 +239,7 @@ def _fuse_block(block, buffers, camera, limits, depth, rgb, frame_votes):
             np.float32(R[0, 1] * ox + R[1, 1] * y + R[2, 1] * z),
             np.float32(R[0, 2] * ox + R[1, 2] * y + R[2, 2] * z),
         )
-        if not _project_row(p, step, lens, size, flat_depth, truncation, depth_max, pixels, distances):
+        if not project_row(p, step, lens, size, flat_depth, truncation, depth_max, pixels, distances):
             continue
         for i in range(BLOCK_SIDE):
             pixel, voxel = pixels[i], row * BLOCK_SIDE + i
@@ -252,4 +252,4 @@ def _fuse_block(block, buffers, camera, limits, depth, rgb, frame_votes):
                 color[voxel, c] = (old * color[voxel, c] + colors[pixel, c]) * share
             weight[voxel] = min(old + one, cap)
             if weights[pixel] > 0 and abs(distances[i]) <= band:
-                _add_vote(evidence, votes, voxel, frame_votes.log_p, rows[pixel], weights[pixel], cap)
+                add_vote(evidence, votes, voxel, frame_votes.log_p, rows[pixel], weights[pixel], cap)

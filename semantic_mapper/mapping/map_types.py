@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.block_grid import BLOCK_SIDE
 from semantic_mapper.types import Float32, UInt8
 
 
@@ -90,3 +91,15 @@ class MapState:
     color: Float32
     evidence: Float32
     votes: Float32
+
+    def cubes(self) -> dict[str, NDArray[np.generic]]:
+        """By name: ``keys``, and the others with voxels as cubes (B, 8, 8, 8, ...)."""
+        cube = (len(self.keys), BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
+        return {
+            "keys": self.keys,
+            "tsdf": self.tsdf.reshape(cube),
+            "weight": self.weight.reshape(cube),
+            "color": self.color.reshape(*cube, 3),
+            "evidence": self.evidence.reshape(*cube, len(self.label_set)),
+            "votes": self.votes.reshape(cube),
+        }

@@ -26,13 +26,18 @@ from semantic_mapper.mapping.history import FusedFrame
 from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore
 from semantic_mapper.mapping.lifting import lift
 from semantic_mapper.mapping.view_renderer import RenderedView, ViewRenderer
+from semantic_mapper.mapping.virtual_views import ViewpointChooser, VirtualLook
+from semantic_mapper.mapping.vote_fusion import add_votes
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import CameraIntrinsics, Float32, MapUpdate, PosedFrame, SourceViews, UInt8
 
 _log = structlog.get_logger(__name__)
 
 ODD_FRAMES = 2  # frames of another size that are refused before the new size is believed
+VIRTUAL_SIZE = 2  # times the size of a coarse view: how finely the map is looked at in a virtual one
 COVERAGE_WIDTH = 80  # width of the depth image that a keyframe keeps for the choice of source views
+
+EncodedSize = tuple[tuple[int, ...], tuple[int, ...]]  # see ``EncodedViews.size``
 
 
 class MappingPipeline:
@@ -68,6 +73,8 @@ class MappingPipeline:
         self.label_set = label_set
         self.voxel_map = VoxelMap(config.voxel_map, label_set)
         self.keyframes = KeyframeStore(config.keyframes)
+        self._viewpoints = ViewpointChooser(config.virtual, config.seed)
+        self._steps = 0
         self._renderer = ViewRenderer(field, config.render, config.sampling)
         self.corrector = MapCorrector(config.history, self.voxel_map, self.keyframes, self._fuse_again)
         self._intrinsics: dict[str, CameraIntrinsics] = {}
@@ -115,15 +122,68 @@ class MappingPipeline:
         """Carry a correction on by so many frames of the history; see ``MapCorrector.advance``."""
         return self.corrector.advance(max_frames)
 
+    def look_around(self, views: int = 1) -> tuple[VirtualLook, ...]:
+        """Look at the map from where no camera stood: render the views of most gain and fuse what they say of classes.
+
+        For when there is time to spare; every view takes about that of a frame. Nothing is measured: TSDF, colours and
+        ``frames`` stay as they are. Deterministic, as part of the sequence of steps and looks.
+
+        The history keeps frames alone, so a correction of poses rebuilds the map without the votes of these views,
+        save those that were in the map when its oldest frames were frozen; afterwards all may be looked at again.
+
+        Args:
+            views: At most so many.
+
+        Returns:
+            What was looked at, empty where no view is worth its time: no frame mapped yet, too few keyframes, or all
+            that they see is clear or was looked at.
+        """
+        looks: list[VirtualLook] = []
+        with self.corrector.turn:
+            while len(looks) < views and (look := self._look_once()) is not None:
+                looks.append(look)
+        return tuple(looks)
+
+    def _look_once(self) -> VirtualLook | None:
+        known = [k for k in self.keyframes.keyframes if k.camera_id in self._intrinsics]
+        if not known:
+            return None
+        size, intrinsics = known[-1].encoded.size, self._intrinsics[known[-1].camera_id]
+        fitting = [k for k in self.keyframes.keyframes if k.encoded.size == size]
+        view = self._viewpoints.choose(self.voxel_map, fitting, intrinsics)
+        if view is None:
+            return None
+        # A ray cast of the map at full size would take longer than the rendering, and the map is no sharper.
+        share = min(1.0, VIRTUAL_SIZE * self.config.render.scale)
+        smaller = scale_intrinsics(intrinsics, round(intrinsics.width * share), round(intrinsics.height * share))
+        cast = self.voxel_map.ray_cast(view.T_world_camera, smaller)
+        frame = PosedFrame(
+            stamp_ns=known[-1].stamp_ns,
+            seq=known[-1].seq,
+            camera_id=known[-1].camera_id,
+            rgb=cast.rgb,
+            depth_m=cast.depth_m,
+            label=None,
+            intrinsics=smaller,
+            T_world_camera=view.T_world_camera,
+        )
+        sources = self._choose_sources(frame, size)
+        rendered = self._render(frame, [k.encoded for k in sources], self.config.render.scale / share)
+        depth, rows = self._lift(frame, rendered)
+        table = rendered.probabilities.reshape(-1, len(self.label_set)), rows
+        blocks = add_votes(self.voxel_map, view.T_world_camera, smaller, depth, table, self.config.virtual)
+        return VirtualLook(view, tuple(k.seq for k in sources), blocks)
+
     def _map_frame(self, frame: PosedFrame) -> MapUpdate:
         self._check(frame)
         self._stage_ms = {}
         with self._stage("encode"):
             current = self._encode(frame)
         with self._stage("choose"):
-            sources = self._choose_sources(frame, current)
+            sources = self._choose_sources(frame, current.size)
         with self._stage("render"):
-            view = self._render(frame, sources, current)
+            own = [current] if self.config.keyframes.use_current_view else []
+            view = self._render(frame, [*(k.encoded for k in sources), *own], self.config.render.scale)
         with self._stage("lift"):
             depth, rows = self._lift(frame, view)
         table = view.probabilities.reshape(-1, len(self.label_set))
@@ -141,6 +201,11 @@ class MappingPipeline:
         label, confidence = self._at_rows(table, rows)
         spent = self._stage_ms
         self._renderer.note(spent["render"], sum(spent.values()) - spent["render"])
+        self._steps += 1
+        virtual = self.config.virtual
+        if virtual.every_n_frames and self._steps % virtual.every_n_frames == 0:
+            with self._stage("virtual"):
+                self.look_around(virtual.views)
         return MapUpdate(
             stamp_ns=frame.stamp_ns,
             seq=frame.seq,
@@ -207,14 +272,14 @@ class MappingPipeline:
         with torch.inference_mode():
             return self.field.encode(views)
 
-    def _choose_sources(self, frame: PosedFrame, current: EncodedViews) -> list[Keyframe]:
+    def _choose_sources(self, frame: PosedFrame, size: EncodedSize) -> list[Keyframe]:
         config = self.config.keyframes
         intrinsics = working_intrinsics(frame.intrinsics, COVERAGE_WIDTH)
         depth = resize_depth(frame, intrinsics)
         count = config.source_views - (1 if config.use_current_view else 0)
         chosen = self.keyframes.choose(frame.T_world_camera, intrinsics, depth, count)
         # Cameras of another shape have feature maps of another size; one render takes views of one size.
-        fitting = [k for k in chosen if k.encoded.size == current.size]
+        fitting = [k for k in chosen if k.encoded.size == size]
         if len(fitting) < len(chosen) and not self._told_sizes:
             self._told_sizes = True
             _log.warning(
@@ -225,12 +290,8 @@ class MappingPipeline:
             )
         return fitting
 
-    def _render(self, frame: PosedFrame, sources: list[Keyframe], current: EncodedViews) -> RenderedView:
-        """The coarse view (h, w)."""
-        views = [k.encoded for k in sources]
-        if self.config.keyframes.use_current_view:
-            views.append(current)
-        scale = self.config.render.scale
+    def _render(self, frame: PosedFrame, views: list[EncodedViews], scale: float) -> RenderedView:
+        """The coarse view (h, w), ``scale`` times the size of the frame."""
         width, height = round(frame.intrinsics.width * scale), round(frame.intrinsics.height * scale)
         if not views:
             empty = np.zeros((height, width), np.float32)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.allocation import Camera, blocks_in_band, blocks_in_view, make_camera
-from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
+from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys
 from semantic_mapper.mapping.changes import BlockChanges, oldest_first, read_changes
 from semantic_mapper.mapping.extract import join_meshes, surface_voxels, triangle_mesh
@@ -175,6 +176,18 @@ class VoxelMap:
             self._grid.mark_changed(blocks, self.version)
         return len(blocks)
 
+    @contextmanager
+    def locked(self) -> Iterator[BlockGrid]:
+        """The storage itself, for passes over it that are no part of this class; other threads wait meanwhile."""
+        with _KERNEL_LOCK:
+            yield self._grid
+
+    def mark_changed(self, blocks: NDArray[np.int32]) -> None:
+        """Begin a new ``version``, in which blocks (B,), buffer indices, were changed by such a pass."""
+        with _KERNEL_LOCK:
+            self.version += 1
+            self._grid.mark_changed(blocks, self.version)
+
     def backup(self) -> MapBackup:
         """A copy of this map on disk; see ``take_backup``."""
         with _KERNEL_LOCK:
@@ -267,16 +280,7 @@ class VoxelMap:
             keys (B, 3) int32 in lexicographic order; tsdf, weight, votes (B, 8, 8, 8), color (B, 8, 8, 8, 3) and
             evidence (B, 8, 8, 8, L) float32, voxels in the order [z][y][x].
         """
-        state = self._state()
-        cube = (len(state.keys), BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
-        return {
-            "keys": state.keys,
-            "tsdf": state.tsdf.reshape(cube),
-            "weight": state.weight.reshape(cube),
-            "color": state.color.reshape(*cube, 3),
-            "evidence": state.evidence.reshape(*cube, len(self.label_set)),
-            "votes": state.votes.reshape(cube),
-        }
+        return self._state().cubes()
 
     def save(self, path: Path) -> None:
         """Write the map as it is now to one file (``map.npz``), whole or not at all, in memory for ``CHUNK_BLOCKS``.

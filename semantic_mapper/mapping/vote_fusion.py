@@ -1,0 +1,104 @@
+"""Class votes without a measurement: what a rendered view says of the surface that the map already has.
+
+A rendered view measures nothing, so TSDF, colour and weight stay as they are, to the bit, and no block is added.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from semantic_mapper.config import VirtualViewConfig
+from semantic_mapper.geometry import check_pose
+from semantic_mapper.mapping.allocation import Camera, blocks_in_band, make_camera
+from semantic_mapper.mapping.block_grid import BLOCK_SIDE
+from semantic_mapper.mapping.block_index import pack_keys
+from semantic_mapper.mapping.frame_votes import ProbabilityTable, check_depth, frame_votes, probability_table
+from semantic_mapper.mapping.fusion import add_vote, make_limits, project_row
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.threads import parallel_kernel
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64
+
+
+def add_votes(
+    voxel_map: VoxelMap,
+    T_world_camera: Float64,
+    intrinsics: CameraIntrinsics,
+    depth_m: Float32,
+    table: ProbabilityTable,
+    config: VirtualViewConfig,
+) -> int:
+    """Give the map's surface the class votes of one view, one a voxel; nothing else of the map changes.
+
+    A vote weighs ``config.weight`` times what that of a frame would (``fusion.make_votes``), and goes to voxels alone
+    that have fewer than ``config.max_votes``. ``frames`` does not count the view, ``version`` does.
+
+    Args:
+        voxel_map: Whose surface it is.
+        T_world_camera: (4, 4) of the view.
+        intrinsics: Of ``depth_m``.
+        depth_m: (H, W) float32, z of the map's surface in the view; 0 = none.
+        table: Probabilities (K, L) float32, and the row (H, W) int32 that each pixel takes, -1 = unknown.
+        config: Of virtual views.
+
+    Returns:
+        Blocks that were given votes to, or would have been had they had voxels near the surface.
+
+    Raises:
+        PoseError, ShapeError, FrameError: the view cannot be used; the map is as it was.
+        MapError: the blocks in view do not fit in the memory that the map may take.
+    """
+    where = "votes without a frame"
+    check_pose(T_world_camera, where)
+    depth = check_depth(depth_m, intrinsics, where)
+    limits, classes = make_limits(voxel_map.config), len(voxel_map.label_set)
+    checked = probability_table(depth, table[0], None, table[1], classes, where)
+    camera = make_camera(intrinsics, T_world_camera)
+    with voxel_map.locked() as grid:
+        votes = frame_votes(depth, checked, camera, limits.depth_max, classes, where)
+        votes = votes._replace(weights=votes.weights * np.float32(config.weight))
+        packed = blocks_in_band(depth, camera, limits.voxel_size, limits.truncation, limits.depth_max)
+        blocks = grid.activate(packed[np.isin(packed, pack_keys(grid.all_keys()))])  # existing ones alone
+        if len(blocks):
+            _vote_blocks(blocks, grid.buffers(), camera, limits, depth, votes, np.float32(config.max_votes))
+            voxel_map.mark_changed(blocks)
+    return len(blocks)
+
+
+@parallel_kernel()
+def _vote_blocks(indices, buffers, camera, limits, depth, votes, max_votes):
+    for i in prange(len(indices)):
+        _vote_block(indices[i], buffers, camera, limits, depth, votes, max_votes)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _vote_block(block, buffers, camera: Camera, limits, depth, frame_votes, max_votes):
+    """As ``fusion._fuse_block`` votes, at voxels that a frame has measured before."""
+    half = np.float32(0.5)
+    lens = (np.float32(camera.fx), np.float32(camera.fy), np.float32(camera.cx) + half, np.float32(camera.cy) + half)
+    size = (np.int32(depth.shape[1]), np.float32(depth.shape[1]), np.float32(depth.shape[0]))
+    depth_max, flat_depth = np.float32(limits.depth_max), depth.reshape(-1)
+    band, cap = np.float32(limits.vote_band), np.float32(limits.max_weight)
+    weight, evidence, votes = buffers.weight[block], buffers.evidence[block], buffers.votes[block]
+    rows, weights = frame_votes.rows.reshape(-1), frame_votes.weights.reshape(-1)
+    pixels, distances = np.empty(BLOCK_SIDE, np.int32), np.empty(BLOCK_SIDE, np.float32)
+    R, vs = camera.R, limits.voxel_size
+    ox = buffers.keys[block, 0] * BLOCK_SIDE * vs - camera.t[0]
+    oy = buffers.keys[block, 1] * BLOCK_SIDE * vs - camera.t[1]
+    oz = buffers.keys[block, 2] * BLOCK_SIDE * vs - camera.t[2]
+    step = (np.float32(R[0, 0] * vs), np.float32(R[0, 1] * vs), np.float32(R[0, 2] * vs))
+    for row in range(BLOCK_SIDE * BLOCK_SIDE):
+        y, z = oy + (row & 7) * vs, oz + (row >> 3) * vs
+        p = (
+            np.float32(R[0, 0] * ox + R[1, 0] * y + R[2, 0] * z),
+            np.float32(R[0, 1] * ox + R[1, 1] * y + R[2, 1] * z),
+            np.float32(R[0, 2] * ox + R[1, 2] * y + R[2, 2] * z),
+        )
+        if not project_row(p, step, lens, size, flat_depth, band, depth_max, pixels, distances):
+            continue
+        for i in range(BLOCK_SIDE):
+            pixel, voxel = pixels[i], row * BLOCK_SIDE + i
+            if pixel < 0 or weights[pixel] <= 0 or abs(distances[i]) > band:
+                continue
+            if weight[voxel] > 0 and votes[voxel] < max_votes:
+                add_vote(evidence, votes, voxel, frame_votes.log_p, rows[pixel], weights[pixel], cap)
