@@ -1,10 +1,10 @@
-"""``semantic-mapper query``: ask a saved map."""
+"""``semantic-mapper query``: ask a saved map, or that of a running mapper."""
 
 from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -27,7 +27,10 @@ ARGUMENTS = {Question.INFO: "", Question.AT: "X Y Z", Question.NEAREST: "CLASS X
 
 @verb
 def query(
-    map_file: Annotated[Path, typer.Argument(metavar="MAP", help="Saved map (map.npz).")],
+    source: Annotated[
+        str,
+        typer.Argument(metavar="MAP", help="Saved map (map.npz), or where a mapper answers (ipc://PATH, tcp://...)."),
+    ],
     question: Annotated[Question, typer.Argument(metavar="QUESTION", help="info, at, nearest or instances.")],
     arguments: Annotated[
         list[str] | None, typer.Argument(metavar="[CLASS] [X Y Z]", help="Class, and world coordinates in metres.")
@@ -39,7 +42,7 @@ def query(
         Path | None, typer.Option("--json", metavar="FILE", help="Also write the answer here.")
     ] = None,
 ) -> None:
-    """Ask a saved map what is where.
+    """Ask a saved map, or that of a running mapper, what is where.
 
     info: size, classes and how much surface each has. at: class and confidence of the surface at a point, and whether
     the point is free, occupied or unknown. nearest: the surface of a class that is nearest to a point. instances: all
@@ -49,31 +52,72 @@ def query(
     Example: semantic-mapper query runs/demo/map.npz at 1.2 -0.4 0.8
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1
     Example: semantic-mapper query runs/demo/map.npz instances --up 0 0 1 --json things.json
+    Example: semantic-mapper query ipc:///run/robot/query nearest chair 0 0 1
     """
     class_name, point = _read_arguments(question, arguments or [])
     output = Output.guarded()
-    from nodes import map_answers
+    from nodes.map_answers import answer_table
     from replay.artifacts import write_json
-    from semantic_mapper.mapping.voxel_map import VoxelMap
-    from semantic_mapper.queries.mirror import MapMirror
 
     if json_file is not None:
         prepare_file(json_file)
-    voxel_map = VoxelMap.load(map_file)
-    snapshot = MapMirror.of(voxel_map).snapshot()
-    if question is Question.INFO:
-        found = map_answers.describe_map(snapshot)
-    elif question is Question.AT:
-        found = map_answers.answer_at(snapshot, point)
-    elif question is Question.NEAREST:
-        found = map_answers.answer_nearest(snapshot, class_name, point)
-    else:
-        found = map_answers.answer_instances(snapshot, up)
-    found = {"map": str(map_file), **found}
-    output.print(map_answers.answer_table(found))
+    ask = ask_mapper if "://" in source else ask_file
+    found = {"map": source, **ask(source, question, class_name, point, up)}
+    output.print(answer_table(found))
     if json_file is not None:
         write_json(json_file, found)
         output.print(f"written to {json_file}")
+
+
+def ask_file(
+    source: str, question: Question, class_name: str, point: tuple[float, ...], up: tuple[float, float, float]
+) -> dict[str, Any]:
+    """Answer of a saved map.
+
+    Raises:
+        MapError, LabelError: no map file, or a question that cannot be answered.
+    """
+    from nodes import map_answers
+    from semantic_mapper.mapping.voxel_map import VoxelMap
+    from semantic_mapper.queries.instances import InstanceTracker
+    from semantic_mapper.queries.lookup import at
+    from semantic_mapper.queries.mirror import MapMirror
+    from semantic_mapper.queries.nearest import nearest
+
+    snapshot = MapMirror.of(VoxelMap.load(Path(source))).snapshot()
+    match question:
+        case Question.INFO:
+            return map_answers.describe_map(snapshot)
+        case Question.AT:
+            return map_answers.answer_at(snapshot.label_set, point, at(snapshot, [point]))
+        case Question.NEAREST:
+            return map_answers.answer_nearest(class_name, point, nearest(snapshot, class_name, point))
+        case Question.INSTANCES:
+            return map_answers.answer_instances(up, InstanceTracker(up=up).update(snapshot))
+
+
+def ask_mapper(
+    source: str, question: Question, class_name: str, point: tuple[float, ...], up: tuple[float, float, float]
+) -> dict[str, Any]:
+    """The same of a running mapper.
+
+    Raises:
+        TransportError: nobody answers there.
+        MapError, LabelError: a question that cannot be answered.
+    """
+    from nodes import map_answers
+    from semantic_mapper.client import MapClient
+
+    with MapClient(source) as client:
+        match question:
+            case Question.INFO:
+                return map_answers.describe_map(client.mirror().snapshot())
+            case Question.AT:
+                return map_answers.answer_at(client.info().label_set, point, client.at([point]))
+            case Question.NEAREST:
+                return map_answers.answer_nearest(class_name, point, client.nearest(class_name, point))
+            case Question.INSTANCES:
+                return map_answers.answer_instances(up, client.instances(up))
 
 
 def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tuple[float, ...]]:

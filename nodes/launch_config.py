@@ -57,6 +57,11 @@ class Launch(Config, frozen=True):
         """Names of the nodes that a node subscribes to."""
         return self.options[name].inputs()
 
+    def sockets(self) -> tuple[str, ...]:
+        """Names of all endpoints: those of the nodes, and those where mappers answer questions."""
+        mappers = [o for o in self.options.values() if isinstance(o, MapperOptions)]
+        return (*self.options, *(o.query for o in mappers if o.query and "://" not in o.query))
+
     def listeners(self, name: str) -> int:
         """How many nodes subscribe to the frames of a node."""
         kinds = MapperOptions | RecorderOptions
@@ -94,9 +99,16 @@ def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = Non
                 )
     if not any(isinstance(o, CameraOptions) for o in options.values()):
         raise ConfigError(f"{path}: no node of kind 'camera': nothing would ever happen")
-    return Launch(
+    launch = Launch(
         nodes=file.node, options=options, heartbeat_s=file.heartbeat_s, stop_s=file.stop_s, finish_s=file.finish_s
     )
+    sockets = launch.sockets()
+    twice = sorted({name for name in sockets if sockets.count(name) > 1})
+    if twice:
+        raise ConfigError(
+            f"{path}: {', '.join(twice)}: names two endpoints; give each mapper a `query` of its own that is no node"
+        )
+    return launch
 
 
 def _convert_options(node: NodeEntry, values: Mapping[str, Value], path: Path) -> NodeOptions:

@@ -77,7 +77,7 @@ class Launcher:
 
     def _start(self) -> None:
         _log.info("launching", nodes=len(self._launch.nodes), sockets=str(self._folder))
-        endpoints = {n.name: f"ipc://{self._folder}/{n.name}" for n in self._launch.nodes}
+        endpoints = {name: f"ipc://{self._folder}/{name}" for name in self._launch.sockets()}
         for node in self._launch.nodes:
             job = NodeJob(
                 name=node.name,

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.lookup import at
-from semantic_mapper.queries.nearest import nearest
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.queries.instances import Instance
+from semantic_mapper.queries.lookup import PointAnswers
+from semantic_mapper.queries.nearest import NearestSurface
 from semantic_mapper.queries.occupancy import State
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_voxels
@@ -40,14 +41,9 @@ def describe_map(snapshot: MapSnapshot) -> dict[str, Any]:
     }
 
 
-def answer_at(snapshot: MapSnapshot, point: Sequence[float]) -> dict[str, Any]:
-    """What is at a point.
-
-    Raises:
-        MapError: see ``lookup.at``.
-    """
-    answers = at(snapshot, [point])
-    label, labels = int(answers.label[0]), snapshot.label_set
+def answer_at(labels: LabelSet, point: Sequence[float], answers: PointAnswers) -> dict[str, Any]:
+    """What is at a point: the answers of ``lookup.at`` to it alone."""
+    label = int(answers.label[0])
     known = np.isfinite(answers.distance_m[0])
     return {
         "question": "at",
@@ -59,13 +55,8 @@ def answer_at(snapshot: MapSnapshot, point: Sequence[float]) -> dict[str, Any]:
     }
 
 
-def answer_nearest(snapshot: MapSnapshot, class_name: str, point: Sequence[float]) -> dict[str, Any]:
-    """Where the nearest surface of a class is.
-
-    Raises:
-        LabelError, MapError: see ``nearest.nearest``.
-    """
-    hit = nearest(snapshot, class_name, point)
+def answer_nearest(class_name: str, point: Sequence[float], hit: NearestSurface | None) -> dict[str, Any]:
+    """Where the nearest surface of a class is, as ``nearest.nearest`` says."""
     found: dict[str, Any] = {"question": "nearest", "class": class_name, "point": list(point), "found": hit is not None}
     if hit is not None:
         found |= {"xyz": _rounded(hit.xyz), "distance_m": round(hit.distance_m, DIGITS)}
@@ -73,12 +64,8 @@ def answer_nearest(snapshot: MapSnapshot, class_name: str, point: Sequence[float
     return found
 
 
-def answer_instances(snapshot: MapSnapshot, up: Sequence[float]) -> dict[str, Any]:
-    """The things in a map.
-
-    Raises:
-        MapError: see ``instances.InstanceTracker``.
-    """
+def answer_instances(up: Sequence[float], instances: Sequence[Instance]) -> dict[str, Any]:
+    """The things in a map, as ``instances.InstanceTracker`` finds them."""
     things = [
         {
             "id": thing.id,
@@ -92,7 +79,7 @@ def answer_instances(snapshot: MapSnapshot, up: Sequence[float]) -> dict[str, An
                 "R_world_box": np.round(thing.box.R_world_box, 6).tolist(),
             },
         }
-        for thing in InstanceTracker(up=up).update(snapshot)
+        for thing in instances
     ]
     return {"question": "instances", "up": list(up), "instances": things}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from nodes.options import MapperOptions
 from semantic_mapper.errors import SemanticMapperError
 
 if TYPE_CHECKING:
+    from nodes.query_service import QueryService
     from replay.session import MapSession, PipelineBundle
     from semantic_mapper.transport.messages import EndOfStream, NodeState, StreamInfo
     from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
@@ -30,7 +32,7 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
     Raises:
         WeightsError, ConfigError: it cannot start.
         MapError: the map is full, or cannot be written.
-        TransportError: the endpoint is taken.
+        TransportError: an endpoint is taken.
     """
     from nodes.outputs import prepare_folder
     from nodes.run_replay import mapper_config
@@ -46,9 +48,10 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
     with (
         Publisher(context.endpoint(context.name)) as publisher,
         subscribe(context.endpoint(options.input), ("info", "frame", "end")) as frames,
+        _answering(context, options, bundle) as queries,
     ):
         _log.info("ready", weights=bundle.weights_path.name, input=options.input, delivery=options.delivery)
-        mapper = _Mapper(context, options, bundle, exclude, publisher, frames)
+        mapper = _Mapper(context, options, bundle, exclude, publisher, frames, queries)
         try:
             mapper.run()
         except BaseException as error:
@@ -57,6 +60,18 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
             raise
         frames.close()  # the camera waits until all have left
         mapper.finish()
+
+
+def _answering(
+    context: NodeContext, options: MapperOptions, bundle: PipelineBundle
+) -> QueryService | nullcontext[None]:
+    """The query service, or nothing where none is wanted."""
+    from nodes.query_service import QueryService
+
+    if not options.query:
+        return nullcontext()
+    endpoint = options.query if "://" in options.query else context.endpoint(options.query)
+    return QueryService(endpoint, bundle.pipeline.voxel_map)
 
 
 class _Mapper:
@@ -70,6 +85,7 @@ class _Mapper:
         exclude: frozenset[int],
         publisher: Publisher,
         frames: LosslessSubscriber | NewestSubscriber,
+        queries: QueryService | None,
     ) -> None:
         self._context = context
         self._options = options
@@ -77,6 +93,7 @@ class _Mapper:
         self._exclude = exclude
         self._publisher = publisher
         self._frames = frames
+        self._queries = queries
         self._session: MapSession | None = None
         self._ended_by = "error"
         self._early = 0
@@ -99,6 +116,8 @@ class _Mapper:
                     return
                 case _:
                     pass
+            if self._queries is not None:
+                self._queries.follow()
             self._tell_status("running")
         self._ended_by = self._context.stop.name
 
@@ -175,7 +194,12 @@ class _Mapper:
             counters |= {"published": s.published, "fused": s.fused, "refused": len(s.refusals), "dropped": s.dropped}
         silent = self._frames.silent_s
         ages = {} if silent is None else {"frame": silent}
-        status = Status(self._context.name, state, time.monotonic_ns(), counters, ages)
+        degraded: tuple[str, ...] = ()
+        if self._queries is not None:
+            counters["answered"] = self._queries.answered
+            if not self._queries.alive:
+                degraded = ("questions about the map are no longer answered; see the log",)
+        status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, degraded)
         self._publisher.publish(encode_status(status))
 
 

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nodes.cli_query import Question, ask_file, ask_mapper
 from tests.nodes.support import run
+from tests.nodes.test_query_service import a_folder, answering
 from tests.queries.scene import BALL, BOX, HALF, RADIUS, whole_map
 
 
@@ -63,6 +65,24 @@ def test_instances(map_file: Path) -> None:
     np.testing.assert_allclose(large["table"]["box"]["center"], BOX, atol=0.03)
     assert large["table"]["box"]["R_world_box"][2][2] == -1
     assert "table" in shown and str(large["cup"]["voxels"]) in shown
+
+
+def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
+    with a_folder() as folder, answering(f"ipc://{folder / 'query'}", whole_map()) as service:
+        for question, name, point in (
+            (Question.INFO, "", ()),
+            (Question.AT, "", (*BOX[:2], 0.4)),
+            (Question.NEAREST, "cup", (0.0, 0.0, 1.0)),
+            (Question.NEAREST, "lamp", (0.0, 0.0, 1.0)),
+            (Question.INSTANCES, "", ()),
+        ):
+            live = ask_mapper(service.endpoint, question, name, point, (0.0, 0.0, 1.0))
+            assert live == ask_file(str(map_file), question, name, point, (0.0, 0.0, 1.0))
+        done = run("query", service.endpoint, "nearest", "cup", "0", "0", "1", "--json", folder / "live.json")
+        assert done.returncode == 0 and "cup" in done.stdout, done.stderr
+        assert json.loads((folder / "live.json").read_text())["map"] == service.endpoint
+        wrong = run("query", service.endpoint, "nearest", "kettle", "0", "0", "0")
+        assert wrong.returncode == 1 and "floor, table, cup, lamp" in wrong.stderr.replace("\n", " ")
 
 
 def test_what_cannot_be_asked_is_said(map_file: Path, tmp_path: Path) -> None:

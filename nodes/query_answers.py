@@ -1,0 +1,181 @@
+"""From a question's bytes to its answer's: which query is asked, and how much of it at once."""
+
+from __future__ import annotations
+
+import math
+import uuid
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import structlog
+
+from semantic_mapper.errors import MapError, SemanticMapperError
+from semantic_mapper.queries.boxes import points_in_box
+from semantic_mapper.queries.instances import Instance, InstanceTracker
+from semantic_mapper.queries.lookup import MAX_RADIUS_VOXELS, RADIUS_VOXELS, at
+from semantic_mapper.queries.nearest import nearest
+from semantic_mapper.queries.occupancy import distance_field, occupancy
+from semantic_mapper.queries.rays import cast_rays
+from semantic_mapper.queries.relay import MirrorRelay
+from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.transport import query_messages as messages
+from semantic_mapper.transport.opening import Parts
+from semantic_mapper.transport.plain import label_set_header
+from semantic_mapper.transport.query_codec import Arrays, decode_request, encode_answer, encode_error
+
+# One thread answers all: what would keep the others waiting for longer than about a second is refused.
+MAX_VISITED_VOXELS = 1e8  # of `at`
+MAX_RAY_METRES = 2e5  # of `cast_rays`, all rays together
+MAX_FIELD_VOXELS = 1 << 22  # of `distance_field`
+MAX_CHANGED_BLOCKS = 1 << 14  # of `changes`, unless one delivery has more
+_MAX_TRACKERS = 4  # one for each direction that was called up
+
+_log = structlog.get_logger(__name__)
+
+Answer = tuple[messages.AnswerHeader, Arrays]
+
+
+class Answers:
+    """Answers questions about what a mirror holds. For one thread.
+
+    Args:
+        relay: Of the mirror.
+    """
+
+    def __init__(self, relay: MirrorRelay) -> None:
+        self.map_id = uuid.uuid4().hex
+        self._relay = relay
+        self._trackers: dict[messages.Point, InstanceTracker] = {}
+        self._things: dict[messages.Point, tuple[int, tuple[Instance, ...]]] = {}  # and the version they are of
+
+    def answer(self, parts: Parts) -> list[bytes]:
+        """Parts of a question -> those of its answer, which is an error where the question is no good."""
+        try:
+            kind, header, arrays = decode_request(parts)
+            return encode_answer(kind, *self._answer(header, arrays))
+        except SemanticMapperError as error:
+            return encode_error(error)
+        except MemoryError:
+            return encode_error(MapError("the mapper has no memory left to answer this; ask for less at once"))
+        except (ArithmeticError, ValueError) as error:  # a bug of ours; it must not end the thread that all wait for
+            _log.exception("question_failed", question=bytes(parts[0]))
+            return encode_error(MapError(f"the mapper could not compute this: {error}"))
+
+    def _answer(self, header: messages.RequestHeader, arrays: Arrays) -> Answer:
+        snapshot = self._relay.snapshot()
+        match header:
+            case messages.InfoRequest():
+                return self._describe(snapshot)
+            case messages.AtRequest():
+                _bound_points(snapshot, header, len(arrays["points"]))
+                return self._plain(snapshot, "at", at(snapshot, arrays["points"], header.radius_m))
+            case messages.NearestRequest():
+                return self._nearest(snapshot, header)
+            case messages.RaysRequest():
+                _bound_rays(header, max(len(a) for a in arrays.values()))
+                hits = cast_rays(snapshot, arrays["origins"], arrays["directions"], header.max_m)
+                return self._plain(snapshot, "cast_rays", hits)
+            case messages.BoxRequest():
+                return self._plain(snapshot, "points_in_box", points_in_box(snapshot, header.lower, header.upper))
+            case messages.InstancesRequest():
+                return self._instances(snapshot, header.up)
+            case messages.OccupancyRequest():
+                return messages.AnswerHeader(**self._about(snapshot)), {"state": occupancy(snapshot, arrays["points"])}
+            case messages.DistanceRequest():
+                return self._distances(snapshot, header)
+            case messages.ChangesRequest():
+                return self._changes(snapshot, header)
+            case _:
+                raise MapError(f"{type(header).__name__}: cannot be answered")
+
+    def _about(self, snapshot: MapSnapshot) -> dict[str, Any]:
+        return {"map_id": self.map_id, "version": snapshot.version, "epoch": snapshot.epoch}
+
+    def _plain(self, snapshot: MapSnapshot, kind: str, found: object) -> Answer:
+        """The fields of a query's result are the arrays of its answer."""
+        arrays: Arrays = {name: getattr(found, name) for name in messages.QUESTIONS[kind].gives}
+        return messages.AnswerHeader(**self._about(snapshot)), arrays
+
+    def _describe(self, snapshot: MapSnapshot) -> Answer:
+        header = messages.InfoAnswer(
+            **self._about(snapshot),
+            blocks=snapshot.block_count,
+            voxel_size_m=snapshot.voxel_size_m,
+            truncation_voxels=snapshot.truncation_voxels,
+            label_set=label_set_header(snapshot.label_set),
+        )
+        return header, {}
+
+    def _nearest(self, snapshot: MapSnapshot, header: messages.NearestRequest) -> Answer:
+        hit = nearest(snapshot, header.class_name, header.point)
+        answer = messages.NearestAnswer(
+            **self._about(snapshot),
+            found=hit is not None,
+            xyz=(0.0, 0.0, 0.0) if hit is None else tuple(hit.xyz.tolist()),
+            distance_m=0.0 if hit is None else hit.distance_m,
+            confidence=0.0 if hit is None else hit.confidence,
+        )
+        return answer, {}
+
+    def _instances(self, snapshot: MapSnapshot, up: messages.Point) -> Answer:
+        tracker = self._trackers.pop(up, None) or InstanceTracker(up=up)
+        self._trackers[up] = tracker  # the last one asked stands last
+        version, things = self._things.pop(up, (-1, ()))
+        if version != snapshot.version:
+            things = tracker.update(snapshot)
+        self._things[up] = snapshot.version, things
+        for old in list(self._trackers)[:-_MAX_TRACKERS]:
+            del self._trackers[old], self._things[old]
+        return messages.AnswerHeader(**self._about(snapshot)), _thing_arrays(things)
+
+    def _distances(self, snapshot: MapSnapshot, header: messages.DistanceRequest) -> Answer:
+        sides = [(b - a) / snapshot.voxel_size_m for a, b in zip(header.lower, header.upper, strict=True)]
+        if min(sides) > 0 and math.prod(sides) > MAX_FIELD_VOXELS:
+            raise MapError(
+                f"distance_field: a box of {' x '.join(f'{s:.0f}' for s in sides)} voxels; over a socket at most "
+                f"{MAX_FIELD_VOXELS} are computed at once; keep a mirror for more"
+            )
+        found = distance_field(snapshot, header.lower, header.upper, unknown_is_occupied=header.unknown_is_occupied)
+        origin: messages.Point = tuple(found.origin_m.tolist())
+        about = self._about(snapshot)
+        answer = messages.DistanceAnswer(**about, origin_m=origin, voxel_size_m=found.voxel_size_m)
+        return answer, {"distance_m": found.distance_m, "state": found.state}
+
+    def _changes(self, snapshot: MapSnapshot, header: messages.ChangesRequest) -> Answer:
+        since = header.since if header.map_id in ("", self.map_id) else 0
+        found = self._relay.changes(since, min(header.limit or MAX_CHANGED_BLOCKS, MAX_CHANGED_BLOCKS))
+        answer = messages.ChangesAnswer(
+            map_id=self.map_id, version=found.version, epoch=found.epoch, since=found.since, newest=snapshot.version
+        )
+        return answer, {name: getattr(found, name) for name in messages.QUESTIONS["changes"].gives}
+
+
+def _thing_arrays(things: Sequence[Instance]) -> Arrays:
+    numbers = [(t.id, t.class_id, len(t.voxels)) for t in things]
+    places = [
+        np.concatenate(([t.confidence], t.centroid, t.box.center, t.box.size, t.box.R_world_box.ravel()))
+        for t in things
+    ]
+    return {
+        "numbers": np.array(numbers, np.int64).reshape(-1, 3),
+        "places": np.array(places, np.float64).reshape(-1, 19),
+        "voxels": np.concatenate([np.empty((0, 3), np.int32), *(t.voxels for t in things)]),
+    }
+
+
+def _bound_points(snapshot: MapSnapshot, header: messages.AtRequest, count: int) -> None:
+    radius = RADIUS_VOXELS if header.radius_m is None else header.radius_m / snapshot.voxel_size_m
+    if count * (2 * min(max(radius, 0), MAX_RADIUS_VOXELS) + 2) ** 3 > MAX_VISITED_VOXELS:
+        raise MapError(
+            f"at: {count} points with a radius of {radius:g} voxels are too much for one question; ask for fewer "
+            "points at once, or keep a mirror"
+        )
+
+
+def _bound_rays(header: messages.RaysRequest, count: int) -> None:
+    if count * header.max_m > MAX_RAY_METRES:
+        raise MapError(
+            f"cast_rays: {count} rays of {header.max_m:g} m are too much for one question; at most "
+            f"{MAX_RAY_METRES:g} m together, or keep a mirror"
+        )

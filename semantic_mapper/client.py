@@ -1,0 +1,220 @@
+"""Ask the map of a running mapper, from any process of this machine."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, TypeVar, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from semantic_mapper.errors import CodecError
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.changes import BlockChanges
+from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.queries.checks import as_numbers
+from semantic_mapper.queries.instances import Instance
+from semantic_mapper.queries.lookup import PointAnswers
+from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.nearest import NearestSurface
+from semantic_mapper.queries.occupancy import DistanceField
+from semantic_mapper.queries.oriented_box import OrientedBox
+from semantic_mapper.queries.rays import RayHits
+from semantic_mapper.transport import query_messages as messages
+from semantic_mapper.transport.endpoints import default_endpoint
+from semantic_mapper.transport.plain import to_label_set
+from semantic_mapper.transport.query_codec import Arrays, decode_answer, encode_request
+from semantic_mapper.transport.query_sockets import QuerySocket
+from semantic_mapper.types import UInt8
+
+UP = (0.0, 0.0, 1.0)
+MIRROR_BLOCKS = 2000  # fetched at a time: 6 MB before compression
+
+AnswerT = TypeVar("AnswerT", bound=messages.AnswerHeader)
+
+
+@dataclass(frozen=True, slots=True)
+class MapInfo:
+    """What a map is.
+
+    Args:
+        map_id: Another one after the mapper was started anew.
+        version, epoch: ``VoxelMap``'s.
+        blocks: Of 8^3 voxels.
+        voxel_size_m: Edge of a voxel.
+        truncation_voxels: Of the TSDF.
+        label_set: Its classes.
+    """
+
+    map_id: str
+    version: int
+    epoch: int
+    blocks: int
+    voxel_size_m: float
+    truncation_voxels: float
+    label_set: LabelSet
+
+
+class MapClient:
+    """The queries of ``semantic_mapper.queries`` on the map of a running mapper; a context manager.
+
+    Every call answers as the query of its name does on a snapshot, raises what that raises (``MapError``,
+    ``LabelError``), and further ``CodecError`` for what cannot be sent and ``TransportError`` where nobody answers. A
+    mapper that was restarted is found again. Any thread may call; calls wait for each other.
+
+    ``version`` is the version of the map that the last answer was about.
+
+    Args:
+        endpoint: Of the mapper's query service; by default that of a mapper of this user that was started by hand.
+        timeout_s: How long to wait for an answer before asking again.
+        attempts: How often to ask.
+
+    Raises:
+        TransportError: an endpoint that is none.
+    """
+
+    def __init__(self, endpoint: str | None = None, *, timeout_s: float = 5.0, attempts: int = 3) -> None:
+        self._socket = QuerySocket(endpoint or default_endpoint("query"), timeout_s=timeout_s, attempts=attempts)
+        self._mirror: MapMirror | None = None
+        self._mirrored = ""  # map_id of the mirror
+        self._mirror_lock = threading.Lock()
+        self._labels: tuple[str, LabelSet] | None = None
+        self.version = 0
+
+    def info(self) -> MapInfo:
+        """Size and classes of the map."""
+        h, _ = self._ask("info", messages.InfoAnswer, messages.InfoRequest())
+        labels = to_label_set(h.label_set)
+        self._labels = h.map_id, labels
+        return MapInfo(h.map_id, h.version, h.epoch, h.blocks, h.voxel_size_m, h.truncation_voxels, labels)
+
+    def at(self, points: ArrayLike, radius_m: float | None = None) -> PointAnswers:
+        """What is at points (N, 3), world metres; see ``queries.lookup.at``."""
+        request = messages.AtRequest(radius_m=radius_m)
+        _, arrays = self._ask("at", messages.AnswerHeader, request, points=points)
+        return PointAnswers(**cast(Any, arrays))
+
+    def nearest(self, class_name: str, point: ArrayLike) -> NearestSurface | None:
+        """The nearest surface of a class; see ``queries.nearest.nearest``."""
+        request = messages.NearestRequest(class_name=class_name, point=_point(point, "point"))
+        h, _ = self._ask("nearest", messages.NearestAnswer, request)
+        return NearestSurface(np.array(h.xyz, np.float64), h.distance_m, h.confidence) if h.found else None
+
+    def cast_rays(self, origins: ArrayLike, directions: ArrayLike, max_m: float = 10.0) -> RayHits:
+        """The first surface that each ray meets; see ``queries.rays.cast_rays``."""
+        rays = {"origins": np.atleast_2d(as_numbers(origins, "origins"))}
+        rays |= {"directions": np.atleast_2d(as_numbers(directions, "directions"))}
+        _, arrays = self._ask("cast_rays", messages.AnswerHeader, messages.RaysRequest(max_m=max_m), **rays)
+        return RayHits(**cast(Any, arrays))
+
+    def points_in_box(self, lower: ArrayLike, upper: ArrayLike) -> MapPoints:
+        """Surface points in a box; see ``queries.boxes.points_in_box``."""
+        request = messages.BoxRequest(lower=_point(lower, "lower"), upper=_point(upper, "upper"))
+        _, arrays = self._ask("points_in_box", messages.AnswerHeader, request)
+        return MapPoints(**cast(Any, arrays))
+
+    def instances(self, up: ArrayLike = UP) -> tuple[Instance, ...]:
+        """All things; their ids stay from call to call, for each ``up``; see ``queries.instances.InstanceTracker``."""
+        request = messages.InstancesRequest(up=_point(up, "up"))
+        header, arrays = self._ask("instances", messages.AnswerHeader, request)
+        return _things(arrays, self._label_set(header.map_id))
+
+    def occupancy(self, points: ArrayLike) -> UInt8:
+        """``State`` (N,) at points (N, 3), world metres; see ``queries.occupancy.occupancy``."""
+        _, arrays = self._ask("occupancy", messages.AnswerHeader, messages.OccupancyRequest(), points=points)
+        return cast(UInt8, arrays["state"])
+
+    def distance_field(self, lower: ArrayLike, upper: ArrayLike, *, unknown_is_occupied: bool = False) -> DistanceField:
+        """Distances to obstacles in a box; see ``queries.occupancy.distance_field``."""
+        request = messages.DistanceRequest(
+            lower=_point(lower, "lower"), upper=_point(upper, "upper"), unknown_is_occupied=unknown_is_occupied
+        )
+        h, arrays = self._ask("distance_field", messages.DistanceAnswer, request)
+        return DistanceField(np.array(h.origin_m, np.float64), h.voxel_size_m, **cast(Any, arrays))
+
+    def mirror(self) -> MapMirror:
+        """A mirror of the map in this process, brought up to the present; for many queries, or large ones.
+
+        Only what has changed since the last call is fetched. The same mirror is returned again and again, and a new
+        one after the mapper was started anew.
+        """
+        with self._mirror_lock:
+            newest = -1
+            while True:
+                since = 0 if self._mirror is None else self._mirror.version
+                request = messages.ChangesRequest(since=since, limit=MIRROR_BLOCKS, map_id=self._mirrored)
+                h, arrays = self._ask("changes", messages.ChangesAnswer, request)
+                if self._mirror is None or h.map_id != self._mirrored:
+                    info = self.info()
+                    self._mirror = MapMirror(info.voxel_size_m, info.truncation_voxels, info.label_set)
+                    self._mirrored, newest = info.map_id, -1
+                    if h.map_id != info.map_id or h.since != 0:  # restarted between the two questions
+                        continue
+                self._mirror.apply(BlockChanges(h.since, h.version, h.epoch, **cast(Any, arrays)))
+                newest = h.newest if newest < 0 else newest  # as of the first answer: the map may outrun us
+                if h.version >= newest:
+                    return self._mirror
+
+    def close(self) -> None:
+        """Free the socket. Harmless when repeated."""
+        self._socket.close()
+
+    def __enter__(self) -> MapClient:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _ask(
+        self, kind: str, answer: type[AnswerT], request: messages.RequestHeader, **arrays: ArrayLike
+    ) -> tuple[AnswerT, Arrays]:
+        numbers = {name: as_numbers(values, name) for name, values in arrays.items()}
+        header, found = decode_answer(kind, answer, self._socket.ask(encode_request(kind, request, numbers)))
+        self.version = header.version
+        return header, found
+
+    def _label_set(self, map_id: str) -> LabelSet:
+        if self._labels is None or self._labels[0] != map_id:
+            self.info()
+        assert self._labels is not None
+        return self._labels[1]
+
+
+def _point(values: ArrayLike, name: str) -> messages.Point:
+    """Three numbers; what they are worth the other side judges.
+
+    Raises:
+        CodecError: not three.
+    """
+    numbers = as_numbers(values, name)
+    if numbers.shape != (3,):
+        raise CodecError(f"{name}: expected shape (3,), got {numbers.shape}")
+    x, y, z = numbers.tolist()
+    return x, y, z
+
+
+def _things(arrays: Arrays, labels: LabelSet) -> tuple[Instance, ...]:
+    """Instances as ``instances`` answers them, see ``QUESTIONS``.
+
+    Raises:
+        CodecError: arrays that do not go together, or a class that the map does not have.
+    """
+    numbers, places = np.asarray(arrays["numbers"], np.int64), np.asarray(arrays["places"], np.float64)
+    voxels = np.asarray(arrays["voxels"], np.int32)
+    sizes = numbers[:, 2]
+    if len(places) != len(numbers) or (sizes < 0).any() or sizes.sum() != len(voxels):
+        raise CodecError(f"instances: {len(numbers)} things, {len(places)} places and {len(voxels)} voxels disagree")
+    if not np.isin(numbers[:, 1], labels.ids).all():
+        raise CodecError(f"instances: of a class that label set '{labels.name}' does not have")
+    names = dict(zip(labels.ids, labels.names, strict=True))
+    parts: Sequence[Any] = np.split(voxels, np.cumsum(sizes)[:-1]) if len(sizes) else ()
+    things: list[Instance] = []
+    for (number, class_id, _), p, part in zip(numbers.tolist(), places, parts, strict=True):
+        box = OrientedBox(p[4:7], p[7:10], p[10:19].reshape(3, 3))
+        things.append(Instance(number, class_id, names[class_id], float(p[0]), p[1:4], box, part))
+    return tuple(things)

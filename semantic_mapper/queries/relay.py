@@ -1,0 +1,67 @@
+"""A mirror that others follow as they would follow the map itself, without asking the map a second time."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.errors import MapError
+from semantic_mapper.mapping.block_index import pack_keys
+from semantic_mapper.mapping.changes import BlockChanges, oldest_first
+from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.snapshot import MapSnapshot
+
+
+class MirrorRelay:
+    """Feeds a mirror and passes its changes on. For one thread; the mirror's snapshots are for any.
+
+    Args:
+        mirror: An empty one, which is fed through this relay alone.
+    """
+
+    def __init__(self, mirror: MapMirror) -> None:
+        self._mirror = mirror
+        self._packed = np.empty(0, np.int64)
+        self._versions = np.empty(0, np.int64)  # of each block: the version that it came with
+
+    def snapshot(self) -> MapSnapshot:
+        """The present state of the mirror."""
+        return self._mirror.snapshot()
+
+    def apply(self, changes: BlockChanges) -> MapSnapshot:
+        """See ``MapMirror.apply``."""
+        epoch = self._mirror.snapshot().epoch
+        snapshot = self._mirror.apply(changes)
+        versions = np.full(snapshot.block_count, snapshot.version, np.int64)
+        if changes.epoch == epoch:
+            versions[np.searchsorted(snapshot.packed, self._packed)] = self._versions
+            versions[np.searchsorted(snapshot.packed, pack_keys(changes.keys))] = snapshot.version
+        self._packed, self._versions = snapshot.packed, versions
+        return snapshot
+
+    def changes(self, since: int, limit: int = 0) -> BlockChanges:
+        """As ``VoxelMap.changes``, as far as the mirror has come; whole deliveries take the place of whole versions.
+
+        Raises:
+            MapError: ``since`` is not a version of this map, or a negative ``limit``.
+        """
+        snapshot = self.snapshot()
+        if not 0 <= since <= snapshot.version or limit < 0:
+            raise MapError(
+                f"changes since version {since}, limit {limit}: versions go from 0 to {snapshot.version}, and a limit "
+                "is not negative; a mirror of another map starts anew from version 0"
+            )
+        later: NDArray[np.int64] = np.flatnonzero(self._versions > since)
+        chosen, version = oldest_first(self._versions[later], limit, snapshot.version)
+        rows = later[chosen]
+        slots, voxels = snapshot.slots[rows], snapshot.voxels
+        return BlockChanges(
+            since,
+            version,
+            snapshot.epoch,
+            snapshot.keys[rows],
+            voxels.tsdf[slots],
+            voxels.label[slots],
+            voxels.confidence[slots],
+            voxels.rgb[slots],
+        )

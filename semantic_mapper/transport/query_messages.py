@@ -1,0 +1,228 @@
+"""Questions about a map and their answers: one table of what each carries, as typed headers and plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from semantic_mapper.transport.headers import (
+    Count,
+    Header,
+    LabelSetHeader,
+    PartBytes,
+    Plain,
+    Sentence,
+    Word,
+)
+
+MAX_REQUEST_ROWS = 1 << 16  # points or rays of one question
+BLOCK_VOXELS = 512
+
+Point = tuple[float, float, float]
+DType = Literal["u1", "i1", "<i4", "<i8", "<f4", "<f8"]
+
+
+class ArraySpec(Plain, frozen=True, kw_only=True):
+    """One buffer: its array's shape and its size as sent."""
+
+    shape: Annotated[tuple[Annotated[int, Meta(ge=0, le=1 << 31)], ...], Meta(max_length=4)]
+    bytes: PartBytes
+
+
+ArraySpecs = Annotated[tuple[ArraySpec, ...], Meta(max_length=6)]
+
+
+class RequestHeader(Header, frozen=True, kw_only=True):
+    """Of every question; the buffers are those that ``QUESTIONS`` names, in that order."""
+
+    arrays: ArraySpecs = ()
+
+
+class AnswerHeader(Header, frozen=True, kw_only=True):
+    """Of every answer: which state of which map it is about.
+
+    ``map_id`` is another one after the mapper was started anew; versions of two maps cannot be compared.
+    """
+
+    map_id: Word
+    version: Count
+    epoch: Count
+    arrays: ArraySpecs = ()
+
+
+class InfoRequest(RequestHeader, frozen=True, kw_only=True):
+    """What the map is."""
+
+
+class InfoAnswer(AnswerHeader, frozen=True, kw_only=True):
+    """What the map is."""
+
+    blocks: Count
+    voxel_size_m: float
+    truncation_voxels: float
+    label_set: LabelSetHeader
+
+
+class AtRequest(RequestHeader, frozen=True, kw_only=True):
+    """What is at points."""
+
+    radius_m: float | None = None
+
+
+class NearestRequest(RequestHeader, frozen=True, kw_only=True):
+    """Where the nearest surface of a class is."""
+
+    class_name: Word
+    point: Point
+
+
+class NearestAnswer(AnswerHeader, frozen=True, kw_only=True):
+    """Where it is; zeros where ``found`` is false."""
+
+    found: bool
+    xyz: Point
+    distance_m: float
+    confidence: float
+
+
+class RaysRequest(RequestHeader, frozen=True, kw_only=True):
+    """What rays meet."""
+
+    max_m: float
+
+
+class BoxRequest(RequestHeader, frozen=True, kw_only=True):
+    """Surface points in a box."""
+
+    lower: Point
+    upper: Point
+
+
+class InstancesRequest(RequestHeader, frozen=True, kw_only=True):
+    """Countable things."""
+
+    up: Point
+
+
+class OccupancyRequest(RequestHeader, frozen=True, kw_only=True):
+    """Free, occupied or unknown at points."""
+
+
+class DistanceRequest(RequestHeader, frozen=True, kw_only=True):
+    """Distances to obstacles in a box."""
+
+    lower: Point
+    upper: Point
+    unknown_is_occupied: bool = False
+
+
+class DistanceAnswer(AnswerHeader, frozen=True, kw_only=True):
+    """Where its grid lies."""
+
+    origin_m: Point
+    voxel_size_m: float
+
+
+class ChangesRequest(RequestHeader, frozen=True, kw_only=True):
+    """Blocks changed since a version of the map ``map_id``; of another map, all blocks are sent."""
+
+    since: Count
+    limit: Count = 0  # blocks, see ``VoxelMap.changes``; 0 = all
+    map_id: Word = ""
+
+
+class ChangesAnswer(AnswerHeader, frozen=True, kw_only=True):
+    """Where these blocks begin; complete up to ``version``, while the map is at ``newest``."""
+
+    since: Count
+    newest: Count
+
+
+class ErrorAnswer(Header, frozen=True, kw_only=True):
+    """The name of an error class of ours, and what it says."""
+
+    error: Word
+    text: Sentence
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayForm:
+    """What an array must look like.
+
+    Args:
+        dtype: Of its elements; arrays of bytes travel compressed.
+        tail: Its last axes.
+        free: Number of axes before these, of any length.
+    """
+
+    dtype: DType
+    tail: tuple[int, ...] = ()
+    free: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """One row of the table.
+
+    Args:
+        request, answer: Types of the headers.
+        takes, gives: Arrays of question and answer.
+        aligned: Whether all arrays of the answer have the same free axes.
+    """
+
+    request: type[RequestHeader]
+    answer: type[AnswerHeader] = AnswerHeader
+    takes: dict[str, ArrayForm] = field(default_factory=dict[str, ArrayForm])
+    gives: dict[str, ArrayForm] = field(default_factory=dict[str, ArrayForm])
+    aligned: bool = True
+
+
+_POINTS = ArrayForm("<f8", (3,))
+_U8, _F32, _RGB = ArrayForm("u1"), ArrayForm("<f4"), ArrayForm("u1", (3,))
+
+QUESTIONS = {
+    "info": Question(InfoRequest, InfoAnswer),
+    "at": Question(
+        AtRequest,
+        takes={"points": _POINTS},
+        gives={"label": _U8, "confidence": _F32, "distance_m": _F32, "state": _U8},
+    ),
+    "nearest": Question(NearestRequest, NearestAnswer),
+    "cast_rays": Question(
+        RaysRequest,
+        takes={"origins": _POINTS, "directions": _POINTS},
+        gives={"distance_m": _F32, "label": _U8, "confidence": _F32, "rgb": _RGB},
+    ),
+    "points_in_box": Question(
+        BoxRequest,
+        gives={"xyz": ArrayForm("<f4", (3,)), "rgb": _RGB, "label": _U8, "confidence": _F32},
+    ),
+    "instances": Question(
+        InstancesRequest,
+        gives={
+            "numbers": ArrayForm("<i8", (3,)),  # id, class id, voxels
+            "places": ArrayForm("<f8", (19,)),  # confidence, centroid, box: center, size, R_world_box row by row
+            "voxels": ArrayForm("<i4", (3,)),  # of all things, one behind the other
+        },
+        aligned=False,
+    ),
+    "occupancy": Question(OccupancyRequest, takes={"points": _POINTS}, gives={"state": _U8}),
+    "distance_field": Question(
+        DistanceRequest,
+        DistanceAnswer,
+        gives={"distance_m": ArrayForm("<f4", free=3), "state": ArrayForm("u1", free=3)},
+    ),
+    "changes": Question(
+        ChangesRequest,
+        ChangesAnswer,
+        gives={
+            "keys": ArrayForm("<i4", (3,)),
+            "tsdf": ArrayForm("i1", (BLOCK_VOXELS,)),
+            "label": ArrayForm("u1", (BLOCK_VOXELS,)),
+            "confidence": ArrayForm("u1", (BLOCK_VOXELS,)),
+            "rgb": ArrayForm("u1", (BLOCK_VOXELS, 3)),
+        },
+    ),
+}

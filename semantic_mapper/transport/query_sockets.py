@@ -1,0 +1,178 @@
+"""The two ends of question and answer: ``QueryServer`` (ROUTER) and ``QuerySocket`` (REQ, made anew when lost)."""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+from collections.abc import Sequence
+from types import TracebackType
+
+import zmq
+
+from semantic_mapper.errors import TransportError
+from semantic_mapper.transport.endpoints import EndpointLock, check_bind
+from semantic_mapper.transport.framing import MAX_PART_BYTES, Buffer
+
+MAX_REQUEST_BYTES = 1 << 23  # of a part; who sends more is cut off
+_WAITING = 64  # questions and answers that may wait for each client
+
+
+class QueryServer:
+    """Binds an endpoint, receives questions and sends answers. One thread uses it; any thread may ``wake`` that one.
+
+    A client that does not take its answers loses them; nothing here ever waits for a client.
+
+    Args:
+        endpoint: ``ipc://PATH`` or ``tcp://127.0.0.1:PORT`` (``*`` as port: any free one, see ``endpoint``).
+
+    Raises:
+        TransportError: the endpoint is taken, cannot be bound, or could be reached from other machines.
+    """
+
+    def __init__(self, endpoint: str, *, context: zmq.Context[zmq.Socket[bytes]] | None = None) -> None:
+        check_bind(endpoint)
+        self._endpoint_lock = EndpointLock(endpoint)
+        self._socket = (context or zmq.Context.instance()).socket(zmq.ROUTER)
+        self._socket.setsockopt(zmq.LINGER, 200)
+        self._socket.setsockopt(zmq.RCVHWM, _WAITING)
+        self._socket.setsockopt(zmq.SNDHWM, _WAITING)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
+        try:
+            self._socket.bind(endpoint)
+        except zmq.ZMQError as error:
+            self._socket.close(linger=0)
+            self._endpoint_lock.release()
+            raise TransportError(f"{endpoint}: cannot be bound: {error}") from error
+        self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._poller = zmq.Poller()
+        self._poller.register(self._socket, zmq.POLLIN)
+        self._poller.register(self._wake, zmq.POLLIN)
+
+    def wake(self) -> None:
+        """End the present or the next ``wait``."""
+        os.eventfd_write(self._wake, 1)
+
+    def wait(self, timeout_s: float) -> None:
+        """Until there is a question, somebody calls ``wake``, or the time is over."""
+        ready = dict(self._poller.poll(int(timeout_s * 1000)))
+        if self._wake in ready:
+            os.eventfd_read(self._wake)
+
+    def wait_for_wake(self, timeout_s: float) -> None:
+        """As ``wait``, but questions may wait in the meantime."""
+        if select.select([self._wake], [], [], timeout_s)[0]:
+            os.eventfd_read(self._wake)
+
+    def receive(self) -> tuple[bytes, list[bytes]] | None:
+        """Who asks, and the parts of the question; None where nobody does."""
+        try:
+            sender, *parts = self._socket.recv_multipart(zmq.NOBLOCK)
+        except zmq.Again:
+            return None
+        return sender, parts[1:] if parts[:1] == [b""] else parts  # the empty part that REQ sockets put first
+
+    def send(self, client: bytes, parts: Sequence[Buffer]) -> None:
+        """Answer a client; where it is gone, the answer is, too."""
+        try:
+            self._socket.send_multipart([client, b"", *parts], zmq.NOBLOCK, copy=False)
+        except zmq.Again:
+            return
+
+    def close(self) -> None:
+        """Free the endpoint."""
+        self._socket.close()
+        os.close(self._wake)
+        self._endpoint_lock.release()
+
+
+class QuerySocket:
+    """Asks a ``QueryServer``. Any thread may ask; questions wait for each other.
+
+    Where no answer comes in time the socket is thrown away and the question asked again through a new one, so that a
+    server that was restarted is found again. Questions change nothing, so to ask twice does no harm.
+
+    Args:
+        endpoint: Where the server listens.
+        timeout_s: How long to wait for an answer each time.
+        attempts: How often to ask.
+
+    Raises:
+        TransportError: an endpoint that is none.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        *,
+        timeout_s: float,
+        attempts: int,
+        context: zmq.Context[zmq.Socket[bytes]] | None = None,
+    ) -> None:
+        self.endpoint = endpoint
+        self._timeout_s = timeout_s
+        self._attempts = attempts
+        self._context = context or zmq.Context.instance()
+        self._lock = threading.Lock()
+        self._closed = False
+        self._socket = self._connect()
+
+    def ask(self, parts: Sequence[Buffer]) -> list[bytes]:
+        """The parts of the answer.
+
+        Raises:
+            TransportError: closed, or nobody has answered.
+        """
+        with self._lock:
+            for _ in range(self._attempts):
+                if self._closed:
+                    raise TransportError(f"{self.endpoint}: the client is closed")
+                answer = self._ask_once(parts)
+                if answer is not None:
+                    return answer
+        raise TransportError(
+            f"{self.endpoint}: no answer within {self._attempts} x {self._timeout_s:g} s; is a mapper running, and "
+            "does it answer questions there (option `query`)?"
+        )
+
+    def close(self) -> None:
+        """Free the socket. Harmless when repeated."""
+        with self._lock:
+            self._closed = True
+            self._socket.close(linger=0)
+
+    def __enter__(self) -> QuerySocket:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _ask_once(self, parts: Sequence[Buffer]) -> list[bytes] | None:
+        answered = False
+        try:
+            self._socket.send_multipart(parts, copy=False)
+            answered = bool(self._socket.poll(int(self._timeout_s * 1000), zmq.POLLIN))
+            return self._socket.recv_multipart() if answered else None
+        except zmq.Again:
+            return None
+        finally:  # also after Ctrl-C: a REQ socket that has asked can only wait for that answer
+            if not answered:
+                self._socket.close(linger=0)
+                self._socket = self._connect()
+
+    def _connect(self) -> zmq.Socket[bytes]:
+        socket = self._context.socket(zmq.REQ)
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.SNDTIMEO, int(self._timeout_s * 1000))
+        socket.setsockopt(zmq.MAXMSGSIZE, MAX_PART_BYTES)
+        socket.setsockopt(zmq.RECONNECT_IVL, 50)
+        socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
+        try:
+            socket.connect(self.endpoint)
+        except zmq.ZMQError as error:
+            socket.close(linger=0)
+            raise TransportError(f"{self.endpoint}: cannot be connected to: {error}") from error
+        return socket
