@@ -95,6 +95,25 @@ def blocks_in_view(
     return pack_keys(keys[seen][order])
 
 
+def view_bounds(
+    camera: Camera, intrinsics: CameraIntrinsics, voxel_size_m: float, reach_m: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Least and greatest block coordinates (3,) that ``blocks_in_view`` may take."""
+    side = voxel_size_m * BLOCK_SIDE
+    radius = 0.5 * np.sqrt(3.0) * side
+    z = np.array([-radius, reach_m + radius])
+    ends: list[Float64] = []
+    for focal, center, size in (
+        (camera.fx, camera.cx, intrinsics.width),
+        (camera.fy, camera.cy, intrinsics.height),
+    ):
+        slopes = (np.array([-0.5, size - 0.5]) - center) / focal
+        ends.append(slopes * z[:, None] + np.array([-radius, radius]) * np.hypot(1.0, slopes))  # (2 of z, 2)
+    corners = np.array([(ends[0][k, i], ends[1][k, j], z[k]) for k in (0, 1) for i in (0, 1) for j in (0, 1)])
+    blocks = (corners @ camera.R.T + camera.t) / side
+    return np.floor(blocks.min(axis=0) - 1).astype(np.int64), np.ceil(blocks.max(axis=0)).astype(np.int64)
+
+
 @njit(nogil=True, cache=True, inline="always")
 def _remember(packed, slots, keys, count):
     """Add a key to one band's set; returns the new count, more than ``len(keys)`` where there is no room."""

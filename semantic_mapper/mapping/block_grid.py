@@ -32,7 +32,8 @@ from semantic_mapper.types import Float32
 
 BLOCK_SIDE = 8
 LEAST_RESIDENT = 256  # blocks that memory has room for, whatever the limit
-EVICTED_AT_ONCE = 32  # at least: room for the next frame's blocks, too
+EVICTED_AT_ONCE = 32  # at least, and
+EVICTED_SHARE = 32  # at least this part of what memory has room for: sorting out what to evict looks at all of it
 TILE_BLOCKS = 4096  # blocks brought together at a time to be read where some are on disk
 NEIGHBOURS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
 ATTRIBUTES = ("tsdf", "weight", "color", "evidence", "votes")
@@ -120,6 +121,11 @@ class BlockGrid:
         return 0 if self._store is None else len(self._store)
 
     @property
+    def stored_bytes(self) -> int:
+        """Bytes that the file of those on disk takes."""
+        return 0 if self._store is None else self._store.file_bytes
+
+    @property
     def capacity(self) -> int:
         """Blocks there is memory for."""
         return int(self._map.capacity())
@@ -187,7 +193,7 @@ class BlockGrid:
         """Note that every block, in memory and on disk, was changed at ``version`` of the map."""
         self._version[:] = version
         if self._store is not None:
-            self._store.versions.update(dict.fromkeys(self._store.versions, version))
+            self._store.versions.set_all(version)
 
     def changed_since(self, version: int) -> NDArray[np.int32]:
         """Keys (B, 3) of all blocks that were changed after ``version``, in lexicographic order."""
@@ -198,21 +204,26 @@ class BlockGrid:
         keys, indices = self.sorted_blocks()
         packed, versions = pack_keys(keys), self._version[indices]
         if self._store is not None:
-            stored = self._store.versions
-            packed = np.concatenate((packed, np.fromiter(stored, np.int64, len(stored))))
-            versions = np.concatenate((versions, np.fromiter(stored.values(), np.int64, len(stored))))
+            stored = self._store.versions.items()
+            packed, versions = np.concatenate((packed, stored[0])), np.concatenate((versions, stored[1]))
         newer = np.flatnonzero(versions > version)
         newer = newer[np.argsort(packed[newer])]
         return packed[newer], versions[newer]
 
     def stored_keys(self) -> NDArray[np.int32]:
         """Keys (B, 3) of the blocks on disk."""
-        versions = {} if self._store is None else self._store.versions
-        return unpack_keys(np.fromiter(versions, np.int64, len(versions)))
+        return unpack_keys(np.empty(0, np.int64) if self._store is None else self._store.versions.items()[0])
 
     def all_keys(self) -> NDArray[np.int32]:
         """Keys (B, 3) of all blocks in lexicographic order."""
         keys = np.concatenate((self.sorted_blocks()[0], self.stored_keys()))
+        return keys[np.argsort(pack_keys(keys))]
+
+    def keys_between(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Those of ``all_keys`` from ``low`` (3,) to ``high`` (3,), both included, without sorting the others."""
+        resident = self._map.key_tensor().numpy()[self._map.active_buf_indices().numpy()]
+        parts = [keys[((keys >= low) & (keys <= high)).all(axis=1)] for keys in (resident, self.stored_keys())]
+        keys = np.concatenate(parts)
         return keys[np.argsort(pack_keys(keys))]
 
     def tiles(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], BlockGrid]]:
@@ -263,7 +274,7 @@ class BlockGrid:
         return blocks
 
     def _check_room(self, packed: NDArray[np.int64], missing: NDArray[np.int64]) -> None:
-        new = len(missing) if self._store is None else sum(int(key) not in self._store for key in missing)
+        new = len(missing) - (0 if self._store is None else int(self._store.holds(missing).sum()))
         if self.block_count + new > self._max_blocks:
             raise MapError(
                 f"the map is full: {self.block_count} blocks, {new} more asked for, limit {self._max_blocks} "
@@ -284,10 +295,8 @@ class BlockGrid:
             self._evict(needed - self._max_resident, packed)
         elif needed > self.capacity:
             self._grow(needed)
-        stored = None if self._store is None else self._store
-        back = missing[:0]
-        if stored is not None and len(stored):
-            back = missing[np.fromiter((int(key) in stored for key in missing), np.bool_, len(missing))]
+        stored = self._store
+        back = missing[:0] if stored is None else missing[stored.holds(missing)]
         values = stored.get(back) if stored is not None and len(back) else None
         added = self._add(missing)
         self._zero(added)
@@ -297,7 +306,7 @@ class BlockGrid:
         indices, buffers = find_blocks(self._index, back), self.buffers()
         for name in ATTRIBUTES:
             getattr(buffers, name)[indices] = getattr(values, name)
-        self._version[indices] = [stored.versions[int(key)] for key in back]
+        self._version[indices] = stored.versions.find(back)
         stored.drop(back)
 
     def _evict(self, count: int, keep: NDArray[np.int64]) -> None:
@@ -309,7 +318,8 @@ class BlockGrid:
         packed = pack_keys(keys)
         free = ~np.isin(packed, keep)
         oldest = np.flatnonzero(free)[np.argsort(self._used[indices[free]], kind="stable")]
-        going = np.sort(oldest[: max(count, min(EVICTED_AT_ONCE, len(oldest)))])
+        count = max(count, EVICTED_AT_ONCE, self._max_resident // EVICTED_SHARE)
+        going = np.sort(oldest[:count])
         gone = packed[going]
         self._store.put(gone, self._version[indices[going]], self.read(gone))
         self._map.erase(self._o3d.core.Tensor.from_numpy(np.ascontiguousarray(keys[going])))

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.mapping.key_table import ABSENT, KeyTable
 from semantic_mapper.types import Float32
 
 BLOCK_VOXELS = 512
@@ -61,18 +62,25 @@ class BlockStore:
             )
         except sqlite3.Error as error:
             raise MapError(f"no room for blocks on disk can be made: {error}; is TMPDIR full or read-only?") from error
-        self._versions: dict[int, int] = {}
+        self._versions = KeyTable()
 
     def __len__(self) -> int:
         return len(self._versions)
 
-    def __contains__(self, key: int) -> bool:
-        return key in self._versions
-
     @property
-    def versions(self) -> dict[int, int]:
+    def versions(self) -> KeyTable:
         """Packed key -> version of every block in the store."""
         return self._versions
+
+    def holds(self, keys: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which of the blocks (B,) are in the store."""
+        return self._versions.find(keys) != ABSENT
+
+    @property
+    def file_bytes(self) -> int:
+        """Size of the database; pages of blocks that are gone are used again, never given back."""
+        (pages,), (page_bytes,) = (self._database.execute(f"PRAGMA page_{n}").fetchone() for n in ("count", "size"))
+        return pages * page_bytes
 
     def put(self, keys: NDArray[np.int64], versions: NDArray[np.int64], values: BlockValues) -> None:
         """Put blocks away.
@@ -93,7 +101,7 @@ class BlockStore:
                 f"{len(rows)} blocks cannot be put on disk: {error}; make room in the folder for temporary files "
                 "(TMPDIR), or raise voxel_map.memory_mb"
             ) from error
-        self._versions.update((row[0], row[1]) for row in rows)
+        self._versions.put(keys, versions)
 
     def get(self, keys: NDArray[np.int64]) -> BlockValues:
         """Read blocks (B,), in the order asked for; they stay in the store.
@@ -122,8 +130,7 @@ class BlockStore:
         wanted = keys.tolist()
         for part in _parts(wanted):
             self._database.execute(f"DELETE FROM blocks WHERE key IN ({','.join('?' * len(part))})", part)
-        for key in wanted:
-            del self._versions[key]
+        self._versions.remove(keys)
 
     def close(self) -> None:
         """Give the disk space back."""

@@ -48,7 +48,7 @@ class GridSnapshot:
         values = self._grid.read(part)
         kept = self._kept
         if kept is not None:
-            old = np.fromiter((int(key) in kept for key in part), np.bool_, len(part))
+            old = kept.holds(part)
             for now, then in zip(values, kept.get(part[old]), strict=True):
                 now[old] = then
             kept.drop(part[old])
@@ -70,7 +70,7 @@ class GridSnapshot:
             if self._kept is None:
                 self._kept = BlockStore(self._classes)
             kept = self._kept
-            new = found[np.fromiter((int(key) not in kept for key in found), np.bool_, len(found))]
+            new = found[~kept.holds(found)]
             for start in range(0, len(new), KEPT_AT_ONCE):
                 part = new[start : start + KEPT_AT_ONCE]
                 kept.put(part, np.zeros(len(part), np.int64), self._grid.read(part))

@@ -16,6 +16,7 @@ from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 
 COVERAGE_GRID = (12, 16)  # rows, columns of query points whose visibility decides the choice of views
 NEARNESS_VALUE = 0.05  # breaks ties towards near views
+HERE_M = 6.0  # from the newest keyframe: beyond, others are worth less, by the square of the distance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,14 +60,12 @@ class KeyframeStore:
 
     def wants(self, T_world_camera: Float64) -> bool:
         """Whether a frame at this pose has moved or turned enough, from every keyframe, to become one."""
-        for keyframe in self._keyframes:
-            moved, turned = pose_distance(keyframe.T_world_camera, T_world_camera)
-            if moved < self._config.translation_m and turned < self._config.rotation_deg:
-                return False
-        return True
+        moved, turned = pose_distances(self._poses(), T_world_camera)
+        near = (moved < self._config.translation_m) & (turned < self._config.rotation_deg)
+        return not near.any()
 
     def add(self, keyframe: Keyframe) -> None:
-        """Keep a keyframe; past capacity the most redundant unlabelled one goes."""
+        """Keep a keyframe; past capacity an unlabelled one goes: the most redundant one, far ones before near ones."""
         self._keyframes.append(keyframe)
         if len(self._keyframes) > self._config.capacity:
             self._drop_most_redundant()
@@ -108,33 +107,39 @@ class KeyframeStore:
             [sees(points, k.T_world_camera, k.intrinsics, k.depth_m, measured=False) for k in self._keyframes]
         )
         value = np.array([LABELLED_VALUE if k.labelled else 1.0 for k in self._keyframes])
-        nearness = np.array([_nearness(k.T_world_camera, T_world_camera) for k in self._keyframes])
+        nearness = np.exp(-_separations(self._poses(), T_world_camera))
         return [self._keyframes[i] for i in cover(seen, value, NEARNESS_VALUE * nearness, count)]
 
+    def _poses(self) -> Float64:
+        """(N, 4, 4), oldest first."""
+        return np.array([k.T_world_camera for k in self._keyframes]).reshape(-1, 4, 4)
+
     def _drop_most_redundant(self) -> None:
-        poses = [k.T_world_camera for k in self._keyframes]
-        spacing = np.full(len(poses), np.inf)
-        for i, pose in enumerate(poses[:-1]):  # the newest stays
-            if not self._keyframes[i].labelled:
-                spacing[i] = min(_separation(pose, p) for j, p in enumerate(poses) if j != i)
-        if np.isfinite(spacing).any():
-            del self._keyframes[int(spacing.argmin())]
+        """Drop the one nearest to another; what the camera has left behind counts as nearer than it is.
+
+        Without that, a long walk would thin out its few keyframes evenly, and leave no source views where it is.
+        """
+        poses = self._poses()
+        spacing = _separations(poses[:, None], poses[None])
+        np.fill_diagonal(spacing, np.inf)
+        left_m = np.linalg.norm(poses[:, :3, 3] - poses[-1, :3, 3], axis=1)
+        worth = spacing.min(axis=1) / np.maximum(1.0, left_m / HERE_M) ** 2
+        worth[-1] = np.inf  # the newest stays
+        worth[[k.labelled for k in self._keyframes]] = np.inf
+        if np.isfinite(worth).any():
+            del self._keyframes[int(worth.argmin())]
 
 
-def pose_distance(T_world_a: Float64, T_world_b: Float64) -> tuple[float, float]:
-    """Distance (metres) and angle (degrees) between two poses."""
-    moved = float(np.linalg.norm(T_world_a[:3, 3] - T_world_b[:3, 3]))
-    cosine = (np.trace(T_world_a[:3, :3].T @ T_world_b[:3, :3]) - 1) / 2
-    return moved, float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+def pose_distances(T_world_a: Float64, T_world_b: Float64) -> tuple[Float64, Float64]:
+    """Distances (metres) and angles (degrees) between poses (..., 4, 4); both broadcast."""
+    moved = np.linalg.norm(T_world_a[..., :3, 3] - T_world_b[..., :3, 3], axis=-1)
+    cosine = ((T_world_a[..., :3, :3] * T_world_b[..., :3, :3]).sum(axis=(-2, -1)) - 1) / 2
+    return moved, np.degrees(np.arccos(np.clip(cosine, -1, 1)))
 
 
-def _separation(T_world_a: Float64, T_world_b: Float64) -> float:
-    moved, turned = pose_distance(T_world_a, T_world_b)
+def _separations(T_world_a: Float64, T_world_b: Float64) -> Float64:
+    moved, turned = pose_distances(T_world_a, T_world_b)
     return moved + turned / 60.0  # a metre counts like 60 degrees
-
-
-def _nearness(T_world_a: Float64, T_world_b: Float64) -> float:
-    return float(np.exp(-_separation(T_world_a, T_world_b)))
 
 
 def _query_points(T_world_camera: Float64, intrinsics: CameraIntrinsics, depth_m: Float32) -> Float64:

@@ -7,9 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.config import VoxelMapConfig
-from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.block_grid import BLOCK_SIDE
 from semantic_mapper.types import Float32, UInt8
 
 
@@ -64,42 +61,3 @@ class MapView:
     rgb: UInt8
     label: UInt8
     confidence: Float32
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MapState:
-    """Everything a map is made of, blocks in lexicographic order of their keys; voxels in the order [z][y][x].
-
-    Args:
-        config: Of the map.
-        label_set: Of the map.
-        frames: Frames fused so far.
-        last_stamp_ns: Stamp of the last of them, 0 before the first.
-        keys: (B, 3) int32 block coordinates.
-        tsdf, weight, votes: (B, 512) float32.
-        color: (B, 512, 3) float32.
-        evidence: (B, 512, L) float32.
-    """
-
-    config: VoxelMapConfig
-    label_set: LabelSet
-    frames: int
-    last_stamp_ns: int
-    keys: NDArray[np.int32]
-    tsdf: Float32
-    weight: Float32
-    color: Float32
-    evidence: Float32
-    votes: Float32
-
-    def cubes(self) -> dict[str, NDArray[np.generic]]:
-        """By name: ``keys``, and the others with voxels as cubes (B, 8, 8, 8, ...)."""
-        cube = (len(self.keys), BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
-        return {
-            "keys": self.keys,
-            "tsdf": self.tsdf.reshape(cube),
-            "weight": self.weight.reshape(cube),
-            "color": self.color.reshape(*cube, 3),
-            "evidence": self.evidence.reshape(*cube, len(self.label_set)),
-            "votes": self.votes.reshape(cube),
-        }

@@ -16,8 +16,8 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.allocation import Camera, blocks_in_band, blocks_in_view, make_camera
-from semantic_mapper.mapping.block_grid import BlockGrid
+from semantic_mapper.mapping.allocation import Camera, blocks_in_band, blocks_in_view, make_camera, view_bounds
+from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys
 from semantic_mapper.mapping.changes import BlockChanges, oldest_first, read_changes
 from semantic_mapper.mapping.extract import join_meshes, surface_voxels, triangle_mesh
@@ -27,7 +27,7 @@ from semantic_mapper.mapping.grid_snapshot import GridSnapshot
 from semantic_mapper.mapping.map_backup import MapBackup, fill_from, take_backup
 from semantic_mapper.mapping.map_file import BlockPart, open_map, write_map
 from semantic_mapper.mapping.map_manifest import CHUNK_BLOCKS, MapManifest
-from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapState, MapView
+from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView
 from semantic_mapper.mapping.merge import add_blocks, check_fit, copy_blocks, voxel_transform
 from semantic_mapper.mapping.ray_casting import cast_rays
 from semantic_mapper.mapping.readout import read_points
@@ -87,6 +87,11 @@ class VoxelMap:
     def stored_blocks(self) -> int:
         """Those of them that are on disk because of ``memory_mb``."""
         return self._grid.stored_count
+
+    @property
+    def stored_bytes(self) -> int:
+        """Bytes that these take on disk."""
+        return self._grid.stored_bytes
 
     def changed_since(self, version: int) -> NDArray[np.int32]:
         """Coordinates (B, 3) of the blocks changed after ``version``, in lexicographic order.
@@ -273,14 +278,18 @@ class VoxelMap:
             )
         return MapView(depth_m, rgb, self.label_set.to_ids(channel), confidence)
 
-    def block_state(self) -> dict[str, NDArray[np.generic]]:
-        """A copy of everything, for comparisons bit by bit.
+    def block_state(self, keys: NDArray[np.int32] | None = None) -> dict[str, NDArray[np.generic]]:
+        """A copy of everything, or of some existing blocks (B, 3), for comparisons bit by bit; it pages nothing in.
 
         Returns:
-            keys (B, 3) int32 in lexicographic order; tsdf, weight, votes (B, 8, 8, 8), color (B, 8, 8, 8, 3) and
-            evidence (B, 8, 8, 8, L) float32, voxels in the order [z][y][x].
+            keys (B, 3) int32, in lexicographic order where none were given; tsdf, weight, votes (B, 8, 8, 8), color
+            (B, 8, 8, 8, 3) and evidence (B, 8, 8, 8, L) float32, voxels in the order [z][y][x].
         """
-        return self._state().cubes()
+        with _KERNEL_LOCK:
+            keys = self._grid.all_keys() if keys is None else keys
+            values = self._grid.read(pack_keys(keys))
+        cube = (len(keys), BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
+        return {"keys": keys, **{name: v.reshape(*cube, *v.shape[2:]) for name, v in values._asdict().items()}}
 
     def save(self, path: Path) -> None:
         """Write the map as it is now to one file (``map.npz``), whole or not at all, in memory for ``CHUNK_BLOCKS``.
@@ -361,23 +370,11 @@ class VoxelMap:
             add_blocks(joined._grid, other._grid, transform, self.config.max_weight, joined.frames)
         return joined
 
-    def _state(self) -> MapState:
-        with _KERNEL_LOCK:
-            keys = self._grid.all_keys()
-            return MapState(
-                self.config,
-                self.label_set,
-                self.frames,
-                self.last_stamp_ns,
-                keys,
-                **self._grid.read(pack_keys(keys))._asdict(),
-            )
-
     def _page_in_view(self, camera: Camera, intrinsics: CameraIntrinsics) -> None:
         """Bring back from disk what a camera may see; the nearest, where memory has no room for all of it."""
         if self._grid.stored_count:
             reach = self.config.depth_max_m + self._truncation_m
-            keys = self._grid.all_keys()
+            keys = self._grid.keys_between(*view_bounds(camera, intrinsics, self.config.voxel_size_m, reach))
             self._grid.page_in(blocks_in_view(camera, intrinsics, keys, self.config.voxel_size_m, reach))
 
     def _read(self, grid: BlockGrid, voxels: Float64) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Float32]:

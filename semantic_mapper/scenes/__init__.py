@@ -1,5 +1,6 @@
 """Procedural benchmark scenes: seeded furnished rooms with exact depth, labels and poses."""
 
+from semantic_mapper.scenes.building import Visit, building_frames, building_walk, room_cell
 from semantic_mapper.scenes.camera import camera_path
 from semantic_mapper.scenes.config import (
     SUITE_VERSION,
@@ -28,9 +29,13 @@ __all__ = [
     "RoomConfig",
     "RoomView",
     "Scene",
+    "Visit",
+    "building_frames",
+    "building_walk",
     "camera_path",
     "make_room",
     "render_view",
+    "room_cell",
     "room_frames",
     "room_views",
 ]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.geometry import look_at, unproject
-from semantic_mapper.mapping.allocation import blocks_in_band, blocks_in_view, make_camera
+from semantic_mapper.mapping.allocation import blocks_in_band, blocks_in_view, make_camera, view_bounds
 from semantic_mapper.mapping.block_index import pack_keys, unpack_keys
 from semantic_mapper.types import CameraIntrinsics
 from tests.mapping.views import INTRINSICS, frame, plane_depth, small_map
@@ -77,3 +77,16 @@ def test_blocks_in_view_are_all_that_a_camera_sees_the_nearest_first() -> None:
     needed = np.intersect1d(pack_keys(met), pack_keys(keys))
     assert np.isin(needed, pack_keys(found)).all(), "nothing that a ray meets is left out"
     assert len(found) < 2.5 * len(needed) < 0.2 * len(keys)
+
+
+def test_the_bounds_of_a_view_hold_all_its_blocks_and_little_more(rng: np.random.Generator) -> None:
+    grid = np.arange(-14, 15)
+    keys = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), -1).reshape(-1, 3).astype(np.int32)
+    for _ in range(30):
+        eye, target, up = rng.uniform(-1, 1, (3, 3))
+        camera = make_camera(INTRINSICS, look_at(eye, target, up))
+        low, high = view_bounds(camera, INTRINSICS, 0.02, 1.0)
+        near = keys[((keys >= low) & (keys <= high)).all(axis=1)]
+        seen = blocks_in_view(camera, INTRINSICS, keys, 0.02, 1.0)
+        np.testing.assert_array_equal(blocks_in_view(camera, INTRINSICS, near, 0.02, 1.0), seen)
+        assert (high - low <= 2 * 1.6 / 0.16 + 6).all(), "no wider than the sphere round the camera"

@@ -3,7 +3,7 @@ import torch
 
 from semantic_mapper.config import KeyframeConfig
 from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore, pose_distance
+from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore, pose_distances
 from semantic_mapper.types import CameraIntrinsics
 
 INTRINSICS = CameraIntrinsics(40.0, 40.0, 39.5, 29.5, 80, 60)
@@ -26,7 +26,7 @@ def keyframe(seq: int, T: np.ndarray, labelled: bool = False, depth: np.ndarray 
 
 
 def test_pose_distance_is_in_metres_and_degrees():
-    moved, turned = pose_distance(pose(0.0, 10), pose(0.3, 40))
+    moved, turned = pose_distances(pose(0.0, 10), pose(0.3, 40))
     assert np.isclose(moved, 0.3) and np.isclose(turned, 30)
 
 
@@ -46,6 +46,34 @@ def test_capacity_drops_the_most_redundant_and_never_a_labelled_keyframe():
     store.add(keyframe(2, pose(5.0)))
     store.add(keyframe(3, pose(10.0)))
     assert [k.seq for k in store.keyframes] == [0, 2, 3]
+
+
+def test_within_a_room_the_one_nearest_to_another_goes(rng: np.random.Generator):
+    """Against brute force over pairs, one at a time."""
+    store, truth = KeyframeStore(KeyframeConfig(capacity=12)), list[Keyframe]()
+    for seq in range(60):
+        new = keyframe(seq, pose(rng.uniform(0, 4), rng.uniform(-180, 180)), labelled=seq % 20 == 3)
+        store.add(new)
+        truth.append(new)
+        if len(truth) > 12:
+            spacing = {}
+            for k in truth[:-1]:
+                pairs = [pose_distances(k.T_world_camera, o.T_world_camera) for o in truth if o is not k]
+                spacing[k.seq] = min(float(moved + turned / 60) for moved, turned in pairs)
+            least = min((k for k in truth[:-1] if not k.labelled), key=lambda k: spacing[k.seq])
+            truth = [k for k in truth if k is not least]
+        assert [k.seq for k in store.keyframes] == [k.seq for k in truth]
+
+
+def test_what_the_camera_has_left_behind_goes_before_what_is_round_it():
+    store = KeyframeStore(KeyframeConfig(capacity=20))
+    for seq in range(200):  # ten rooms, 20 metres apart, each with twenty keyframes that are half a metre apart
+        room, place = divmod(seq, 20)
+        store.add(keyframe(seq, pose(20.0 * room + 0.5 * (place % 10), 30.0 * (place // 10))))
+        if place == 19:
+            here = sum(k.seq // 20 == room for k in store.keyframes)
+            assert here >= 12, "most of them are where the camera is, in the last room as in the first"
+    assert len({k.seq // 20 for k in store.keyframes}) > 1, "and some are left of the room before"
 
 
 def test_views_that_see_nothing_of_the_query_are_not_chosen():

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.mapping.block_grid import EVICTED_AT_ONCE, EVICTED_SHARE, BlockGrid
+from semantic_mapper.mapping.block_index import pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float64
 from tests.mapping.test_voxel_map import same
@@ -94,3 +96,22 @@ def test_a_frame_that_memory_has_no_room_for_is_refused_and_costs_nothing() -> N
     with pytest.raises(MapError, match=r"one frame touches \d+ blocks.*memory_mb"):
         voxel_map.integrate(frame(pose), plane_depth(pose, (0.0, 0.0, 1.0), 1.0), sure(0), None)
     assert voxel_map.block_count == 0 and voxel_map.frames == 0
+
+
+def test_keys_between_two_corners_are_found_in_memory_and_on_disk(both: tuple[VoxelMap, VoxelMap]) -> None:
+    free, paged = both
+    keys = free.changed_since(0)
+    for low, high in ((keys.min(axis=0), keys.max(axis=0)), (np.array([10, -3, 8]), np.array([40, 4, 12]))):
+        expected = keys[((keys >= low) & (keys <= high)).all(axis=1)]
+        assert len(expected) > 20
+        for voxel_map in (free, paged):
+            np.testing.assert_array_equal(voxel_map._grid.keys_between(low, high), expected)
+
+
+def test_a_large_share_leaves_at_once() -> None:
+    """Sorting out what to evict looks at all blocks in memory: it must not come with every frame."""
+    grid = BlockGrid(0.02, 3, 64, 10_000, memory_bytes=40_000_000)
+    grid.activate(pack_keys(np.array([[0, 0, z] for z in range(grid.capacity)], np.int32)))
+    assert grid.stored_count == 0
+    grid.activate(pack_keys(np.array([[1, 0, 0]], np.int32)))
+    assert grid.stored_count == grid.capacity // EVICTED_SHARE > EVICTED_AT_ONCE

@@ -1,0 +1,122 @@
+"""The long walk, short: rooms come back as they were left, memory keeps its limit, figures are those of the run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import replay.bench_growth as bench_growth_module
+import replay.bench_walk as bench_walk_module
+from replay.bench_growth import bench_growth
+from replay.bench_walk import WalkPlan, bench_walk, slope_percent
+from replay.walk_plot import write_walk_plot
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.mapping.block_grid import LEAST_RESIDENT
+from semantic_mapper.mapping.pipeline import MappingPipeline
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.types import MapUpdate, PosedFrame
+from tests.nodes.support import write_weights
+from tests.small import tiny_config, tiny_field
+
+PLAN = WalkPlan(rooms=3, returns=2, minutes=1.0, hz=0.5, width=96)
+MEMORY_MB = 30  # 541 blocks of 5 cm voxels, where a room has some 700
+CONFIG = tiny_config(
+    render={"encode_width": 96, "scale": 0.25},
+    voxel_map={"voxel_size_m": 0.05, "initial_blocks": 200, "memory_mb": MEMORY_MB},
+    keyframes={"source_views": 2},
+)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_weights(tmp_path_factory.mktemp("walk") / "tiny.safetensors")
+
+
+def test_rooms_come_back_unchanged_and_memory_keeps_its_limit(weights: Path, tmp_path: Path) -> None:
+    done: list[int] = []
+    found = bench_walk(weights, CONFIG, PLAN, done.append)
+    assert PLAN.frames == 30 and done == list(range(1, 31))
+    assert found["returns_unchanged"] == found["returns"] == 2
+    resident = 1e6 * MEMORY_MB / (4 * 512 * (found["classes"] + 6) + 12)
+    assert LEAST_RESIDENT < found["blocks_in_memory_at_most"] <= resident
+    assert found["blocks_on_disk"] > 500 and found["store_mb"] > 1
+    at_most = found["minute_blocks_in_memory"][-1] + found["minute_blocks_on_disk"][-1]
+    assert resident < found["blocks"] <= at_most
+    assert 0 < found["fuse_p50_ms"] < found["step_p50_ms"] <= found["step_p95_ms"]
+    assert found["rss_growth_mb"] is None and found["held_growth_mb"] is None, "too short a walk to tell"
+    assert found["return_cpu_ratio"] > 0
+    assert {len(values) for name, values in found.items() if name.startswith("minute_")} == {1}
+    write_walk_plot({**found, "minute_step_p50_ms": [1.0, 2.0, 3.0]}, tmp_path / "walk.png")
+    assert cv2.imread(str(tmp_path / "walk.png")).shape[1] > 1000
+
+
+def test_a_room_that_was_touched_meanwhile_is_told_of(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames of the last room are moved to where the first one lies."""
+    step = MappingPipeline.step
+
+    def misplaced(self: MappingPipeline, frame: PosedFrame) -> MapUpdate:
+        if frame.T_world_camera[1, 3] > 10:
+            frame.T_world_camera[1, 3] -= 13.0  # room 2 stands in the second row of cells, above room 0
+        return step(self, frame)
+
+    monkeypatch.setattr(bench_walk_module.MappingPipeline, "step", misplaced)
+    assert bench_walk(weights, CONFIG, PLAN)["returns_unchanged"] == 1
+
+
+def test_what_comes_back_is_what_a_map_without_a_limit_holds() -> None:
+    """The same walk, fused with and without paging."""
+    whole, paged = (
+        VoxelMap(tiny_config(voxel_map={"voxel_size_m": 0.05, "memory_mb": mb}).voxel_map, tiny_field().label_set)
+        for mb in (0, MEMORY_MB)
+    )
+    for visit in PLAN.visits():
+        for frame in visit.frames:
+            assert frame.depth_m is not None
+            rows = (frame.label % len(whole.label_set)).astype(np.int32) if frame.label is not None else None
+            votes = 0.9 * np.eye(len(whole.label_set), dtype=np.float32) + np.float32(0.1 / len(whole.label_set))
+            for voxel_map in (whole, paged):
+                voxel_map.integrate(frame, frame.depth_m, votes / votes.sum(axis=1, keepdims=True), rows=rows)
+        keys = whole.changed_since(0) * 0.4  # metres
+        assert (((keys > visit.low - 0.4) & (keys < visit.high)).all(axis=1)).any()
+    assert paged.stored_blocks > 500
+    one, other = whole.block_state(), paged.block_state()
+    assert all(one[name].tobytes() == other[name].tobytes() for name in one)
+    some = one["keys"][::7]
+    assert paged.block_state(some)["evidence"].tobytes() == one["evidence"][::7].tobytes()
+
+
+def test_growth_changes_one_setting_at_a_time(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    axes = {
+        "classes": (3,),
+        "voxel_cm": (10, 5),
+        "views": (2,),
+        "samples": (4,),
+        "ray_share": (0.3, 1.0),
+        "blocks": (0, 2),
+    }
+    monkeypatch.setattr(bench_growth_module, "AXES", axes)
+    done: list[int] = []
+    found = {(run["axis"], run["value"]): run for run in bench_growth(weights, CONFIG, 1, 96, done.append)}
+    assert done == list(range(1, 10)) and len(found) == 9
+    assert 2 * found["voxel_cm", 10]["blocks"] < found["voxel_cm", 5]["blocks"]
+    assert found["ray_share", 0.3]["rays"] < found["ray_share", 1.0]["rays"] == 24 * 18
+    (filled,) = (run for (axis, value), run in found.items() if axis == "blocks" and value > 0)
+    alone = found["blocks", 0]["blocks"]
+    assert filled["value"] == pytest.approx(2 * alone, rel=0.1) and filled["blocks"] == pytest.approx(
+        3 * alone, rel=0.1
+    )
+    assert all(0 < run["fuse_ms"] < run["step_ms"] for run in found.values())
+
+
+def test_slopes_are_in_percent_of_the_mean() -> None:
+    minutes = np.linspace(0, 10, 101)
+    assert slope_percent(minutes, 100 + 2 * (minutes - 5)) == pytest.approx(2.0)
+    assert slope_percent(minutes[:1], minutes[:1]) == 0.0
+
+
+def test_more_returns_than_rooms_are_refused(weights: Path) -> None:
+    with pytest.raises(ConfigError, match="returns"):
+        bench_walk(weights, CONFIG, WalkPlan(rooms=1, returns=2, minutes=0.1, width=96))
