@@ -38,6 +38,9 @@ def query(
     up: Annotated[
         tuple[float, float, float], typer.Option(metavar="X Y Z", help="instances: which way is up in the world.")
     ] = (0.0, 0.0, 1.0),
+    min_confidence: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="nearest: places less sure of the class do not count.")
+    ] = 0.0,
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Also write the answer here.")
     ] = None,
@@ -50,7 +53,7 @@ def query(
 
     Example: semantic-mapper query runs/demo/map.npz info
     Example: semantic-mapper query runs/demo/map.npz at 1.2 -0.4 0.8
-    Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1
+    Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1 --min-confidence 0.5
     Example: semantic-mapper query runs/demo/map.npz instances --up 0 0 1 --json things.json
     Example: semantic-mapper query ipc:///run/robot/query nearest chair 0 0 1
     """
@@ -62,7 +65,7 @@ def query(
     if json_file is not None:
         prepare_file(json_file)
     ask = ask_mapper if "://" in source else ask_file
-    found = {"map": source, **ask(source, question, class_name, point, up)}
+    found = {"map": source, **ask(source, question, class_name, point, up, min_confidence)}
     output.print(answer_table(found))
     if json_file is not None:
         write_json(json_file, found)
@@ -70,7 +73,12 @@ def query(
 
 
 def ask_file(
-    source: str, question: Question, class_name: str, point: tuple[float, ...], up: tuple[float, float, float]
+    source: str,
+    question: Question,
+    class_name: str,
+    point: tuple[float, ...],
+    up: tuple[float, float, float],
+    min_confidence: float,
 ) -> dict[str, Any]:
     """Answer of a saved map.
 
@@ -91,13 +99,19 @@ def ask_file(
         case Question.AT:
             return map_answers.answer_at(snapshot.label_set, point, at(snapshot, [point]))
         case Question.NEAREST:
-            return map_answers.answer_nearest(class_name, point, nearest(snapshot, class_name, point))
+            hit = nearest(snapshot, class_name, point, min_confidence)
+            return map_answers.answer_nearest(class_name, point, hit)
         case Question.INSTANCES:
             return map_answers.answer_instances(up, InstanceTracker(up=up).update(snapshot))
 
 
 def ask_mapper(
-    source: str, question: Question, class_name: str, point: tuple[float, ...], up: tuple[float, float, float]
+    source: str,
+    question: Question,
+    class_name: str,
+    point: tuple[float, ...],
+    up: tuple[float, float, float],
+    min_confidence: float,
 ) -> dict[str, Any]:
     """The same of a running mapper.
 
@@ -115,7 +129,8 @@ def ask_mapper(
             case Question.AT:
                 return map_answers.answer_at(client.info().label_set, point, client.at([point]))
             case Question.NEAREST:
-                return map_answers.answer_nearest(class_name, point, client.nearest(class_name, point))
+                hit = client.nearest(class_name, point, min_confidence)
+                return map_answers.answer_nearest(class_name, point, hit)
             case Question.INSTANCES:
                 return map_answers.answer_instances(up, client.instances(up))
 

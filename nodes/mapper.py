@@ -12,6 +12,7 @@ import structlog
 from nodes.node import NodeContext, run_node
 from nodes.options import MapperOptions
 from semantic_mapper.errors import SemanticMapperError
+from semantic_mapper.memory import give_back_freed_memory
 
 if TYPE_CHECKING:
     from nodes.query_service import QueryService
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 POLL_S = 0.1
 STATUS_PERIOD_S = 1.0
+TRIM_PERIOD_S = 60.0  # a node that runs for hours would otherwise hold more and more of what it has freed
 
 _log = structlog.get_logger(__name__)
 
@@ -98,6 +100,7 @@ class _Mapper:
         self._ended_by = "error"
         self._early = 0
         self._last_status = 0.0
+        self._last_trim = time.monotonic()
 
     def run(self) -> None:
         """Handle messages until the end of the stream or a stop request."""
@@ -119,6 +122,9 @@ class _Mapper:
             if self._queries is not None:
                 self._queries.follow()
             self._tell_status("running")
+            if time.monotonic() - self._last_trim > TRIM_PERIOD_S:
+                give_back_freed_memory()
+                self._last_trim = time.monotonic()
         self._ended_by = self._context.stop.name
 
     def finish(self) -> None:

@@ -108,7 +108,7 @@ class Answers:
         return header, {}
 
     def _nearest(self, snapshot: MapSnapshot, header: messages.NearestRequest) -> Answer:
-        hit = nearest(snapshot, header.class_name, header.point)
+        hit = nearest(snapshot, header.class_name, header.point, header.min_confidence)
         answer = messages.NearestAnswer(
             **self._about(snapshot),
             found=hit is not None,

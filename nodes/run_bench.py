@@ -112,7 +112,6 @@ def run_map(request: BenchRequest, output: Output) -> dict[str, Any]:
         f"disk; {found['rss_last_minute_mb']} MB resident"
         + ("" if growth is None else f", {growth:+g} MB since minute 5")
         + ("" if share is None else f" ({share:+g} % of the limit)")
-        + ("" if growth is None else f", {found['held_growth_mb']:+g} MB without what was freed")
     )
     output.print(f"{found['returns_unchanged']} of {found['returns']} rooms unchanged when the walk came back to them")
     return found

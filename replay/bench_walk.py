@@ -87,11 +87,11 @@ def bench_walk(
         time on the clock; ``cpu_*`` processor time of the same steps, which other programs disturb less; ``fuse_*``
         fusion alone; ``*_slope_percent_a_minute`` the least squares slope over the run, of the mean.
         ``return_cpu_ratio`` is the median step of the visits at the end over that of the very same frames the first
-        time. ``rss_*`` is resident memory of the process; its growth is that from minute 5, when all buffers have
-        their size, to the last, None of a walk too short for that; ``held_growth_mb`` the same without memory that was
-        freed and not yet returned to the system. ``blocks_*`` and ``store_mb`` are the map in memory
-        and on disk. ``returns_unchanged`` says how many of ``returns`` rooms had, bit for bit, the blocks that they had
-        when they were left. ``minute_miou`` scores the rendered labels, in rooms that the weights may have been trained
+        time. ``rss_*`` is resident memory of the process, which gives back what it has freed once a minute of the walk,
+        as the mapper node does; its growth is that from minute 5, when all buffers have their size, to the last, None
+        of a walk too short for that. ``blocks_*`` and ``store_mb`` are the map in memory and on disk.
+        ``returns_unchanged`` says how many of ``returns`` rooms had, bit for bit, the blocks that they had when they
+        were left. ``minute_miou`` scores the rendered labels, in rooms that the weights may have been trained
         on: for drift, not for rank.
     """
     began = time.perf_counter()
@@ -133,12 +133,6 @@ def resident_mb() -> float:
     return int(status.split("VmRSS:")[1].split()[0]) * 1024 / 1e6
 
 
-def _held_mb() -> float:
-    """Resident memory without what was freed already."""
-    give_back_freed_memory()
-    return resident_mb()
-
-
 def slope_percent(minutes: NDArray[np.float64], values: NDArray[np.float64]) -> float:
     """Least squares slope of values against minutes, in percent of their mean a minute; 0 of fewer than two minutes."""
     if len(values) < 2 or np.ptp(minutes) == 0:
@@ -154,7 +148,6 @@ class _StepLog:
     frames_a_visit: int
     frames: int = 0
     rows: list[tuple[float, ...]] = field(default_factory=list)  # as _COLUMNS
-    held_mb: float | None = None  # at minute 5
     confusions: list[ConfusionMatrix] = field(default_factory=list)  # of each minute
 
     def note(self, visit: Visit, frame: PosedFrame, update: MapUpdate, step_ms: float, cpu_ms: float) -> None:
@@ -162,6 +155,7 @@ class _StepLog:
         minute = (frame.stamp_ns - 1) / 60e9  # the first frame comes one period after 0
         while len(self.confusions) <= int(minute):
             self.confusions.append(ConfusionMatrix(label_set))
+            give_back_freed_memory()
         assert frame.label is not None
         truth = label_set.to_ids(label_set.channel_map_from(ROOMS)[frame.label])
         self.confusions[int(minute)].update(truth, update.label, f"frame {frame.seq}")
@@ -182,8 +176,6 @@ class _StepLog:
             )
         )
         self.frames += 1
-        if self.held_mb is None and minute >= SETTLED_MINUTE:
-            self.held_mb = _held_mb()
 
     def figures(self, memory_mb: int) -> dict[str, Any]:
         table = dict(zip(_COLUMNS, np.array(self.rows).T, strict=True))
@@ -213,7 +205,6 @@ class _StepLog:
             "rss_growth_percent_of_limit": None
             if not memory_mb or growth is None
             else round(100 * growth / memory_mb, 1),
-            "held_growth_mb": None if growth is None or self.held_mb is None else round(_held_mb() - self.held_mb, 1),
             "blocks": int(table["blocks_in_memory"][-1] + table["blocks_on_disk"][-1]),
             "blocks_in_memory_at_most": int(table["blocks_in_memory"].max()),
             "blocks_on_disk": int(table["blocks_on_disk"][-1]),
@@ -233,7 +224,7 @@ class _StepLog:
         }
 
     def _return_ratio(self, table: dict[str, NDArray[np.float64]]) -> float | None:
-        """Of the visits at the end; a visit's first frames do not count: there nothing is like the first time."""
+        """Median processor time of the visits at the end over that of the same frames the first time."""
         back = np.flatnonzero(table["returning_to"] >= 0)
         if not len(back):
             return None

@@ -97,9 +97,11 @@ class MapClient:
         _, arrays = self._ask("at", messages.AnswerHeader, request, points=points)
         return PointAnswers(**cast(Any, arrays))
 
-    def nearest(self, class_name: str, point: ArrayLike) -> NearestSurface | None:
+    def nearest(self, class_name: str, point: ArrayLike, min_confidence: float = 0.0) -> NearestSurface | None:
         """The nearest surface of a class; see ``queries.nearest.nearest``."""
-        request = messages.NearestRequest(class_name=class_name, point=_point(point, "point"))
+        request = messages.NearestRequest(
+            class_name=class_name, point=_point(point, "point"), min_confidence=min_confidence
+        )
         h, _ = self._ask("nearest", messages.NearestAnswer, request)
         return NearestSurface(np.array(h.xyz, np.float64), h.distance_m, h.confidence) if h.found else None
 

@@ -76,6 +76,7 @@ class NearestRequest(RequestHeader, frozen=True, kw_only=True):
 
     class_name: Word
     point: Point
+    min_confidence: float = 0.0
 
 
 class NearestAnswer(AnswerHeader, frozen=True, kw_only=True):

@@ -46,8 +46,8 @@ def test_rooms_come_back_unchanged_and_memory_keeps_its_limit(weights: Path, tmp
     at_most = found["minute_blocks_in_memory"][-1] + found["minute_blocks_on_disk"][-1]
     assert resident < found["blocks"] <= at_most
     assert 0 < found["fuse_p50_ms"] < found["step_p50_ms"] <= found["step_p95_ms"]
-    assert found["rss_growth_mb"] is None and found["held_growth_mb"] is None, "too short a walk to tell"
     assert found["return_cpu_ratio"] > 0
+    assert found["rss_growth_mb"] is None, "too short a walk to tell"
     assert {len(values) for name, values in found.items() if name.startswith("minute_")} == {1}
     write_walk_plot({**found, "minute_step_p50_ms": [1.0, 2.0, 3.0]}, tmp_path / "walk.png")
     assert cv2.imread(str(tmp_path / "walk.png")).shape[1] > 1000
