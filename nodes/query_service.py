@@ -21,6 +21,7 @@ PERIOD_S = 0.1  # between two deliveries, at least
 MAX_SHARE = 0.1  # of the mapper's time that deliveries may take; the pause after a dear one is longer
 ASKED_LATELY_S = 5.0  # without a question for so long, the mirror is fed no more
 CATCH_UP_S = 2.0  # how long the first question after that waits for the mirror; then it is answered as it is
+FIRST_CATCH_UP_S = 60.0  # how long the very first one waits: kernels may compile, and an empty mirror says nothing true
 MAX_BLOCKS = 2000  # of a delivery (unless one frame has more): bounds what a step may cost
 _WAIT_S = 0.5
 
@@ -116,8 +117,9 @@ class QueryService:
         if now - self._asked_at > ASKED_LATELY_S:
             self._awaited = self._map.version
         self._asked_at = now
+        patience = CATCH_UP_S if self._relay.snapshot().version else FIRST_CATCH_UP_S
         while self._relay.snapshot().version < self._awaited and not self._closed.is_set():
-            if time.monotonic() > now + CATCH_UP_S:
+            if time.monotonic() > now + patience:
                 self._awaited = 0  # the map is at rest or busy: those who ask next need not wait as well
                 return
             self._server.wait_for_wake(_WAIT_S / 10)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,21 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 # The same examples in every run, and no wall-clock limit on one: a failure must come from the code.
 settings.register_profile("project", deadline=None, derandomize=True, max_examples=60)
 settings.load_profile("project")
+
+
+def pytest_configure() -> None:
+    """Throw compiled kernels away that are older than any kernel's source.
+
+    Numba looks at the file of the outermost function alone: after a change in one that it calls it would go on running,
+    and testing, the old code.
+    """
+    folder = REPOSITORY / "semantic_mapper"
+    sources = [p for p in folder.rglob("*.py") if re.search(r"njit|parallel_kernel", p.read_text(encoding="utf-8"))]
+    newest = max(p.stat().st_mtime for p in sources)
+    compiled = list(folder.rglob("*.nb[ic]"))
+    if any(p.stat().st_mtime < newest for p in compiled):
+        for path in compiled:
+            path.unlink(missing_ok=True)
 
 
 @pytest.fixture(autouse=True)

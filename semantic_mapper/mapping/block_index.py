@@ -3,7 +3,8 @@
 Open3D has its own hash map, but only its own kernels can ask it. A block key is the block's integer coordinate
 (x, y, z); three of them packed into one int64 sort like the triple.
 
-Numba caches compiled callers by the time stamp of *their* file: after a change here, delete ``__pycache__``.
+Numba caches compiled callers by the time stamp of *their* file: after a change here, delete ``__pycache__`` (the tests
+do so themselves).
 """
 
 from __future__ import annotations

@@ -76,8 +76,8 @@ def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
             (Question.NEAREST, "lamp", (0.0, 0.0, 1.0)),
             (Question.INSTANCES, "", ()),
         ):
-            live = ask_mapper(service.endpoint, question, name, point, (0.0, 0.0, 1.0))
-            assert live == ask_file(str(map_file), question, name, point, (0.0, 0.0, 1.0))
+            asked = (question, name, point, (0.0, 0.0, 1.0), 0.0)
+            assert ask_mapper(service.endpoint, *asked) == ask_file(str(map_file), *asked)
         done = run("query", service.endpoint, "nearest", "cup", "0", "0", "1", "--json", folder / "live.json")
         assert done.returncode == 0 and "cup" in done.stdout, done.stderr
         assert json.loads((folder / "live.json").read_text())["map"] == service.endpoint

@@ -113,6 +113,9 @@ def test_nearest_and_rays(client: MapClient) -> None:
     assert hit is not None
     assert_equal_fields(hit, local)
     assert client.nearest("lamp", (0, 0, 0)) is None
+    assert client.nearest("cup", (1, 1, 1), 1.0) is None
+    with pytest.raises(MapError, match="min_confidence"):
+        client.nearest("cup", (1, 1, 1), -0.5)
     above = PLACES + np.array([0, 0, 1])
     mine = client.cast_rays(above, BALL - above, 3)
     assert_equal_fields(mine, cast_rays(whole(), above, BALL - above, 3))
