@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
@@ -23,6 +23,16 @@ class Question(StrEnum):
 
 
 ARGUMENTS = {Question.INFO: "", Question.AT: "X Y Z", Question.NEAREST: "CLASS X Y Z", Question.INSTANCES: ""}
+
+
+class Asked(NamedTuple):
+    """A question and what it may need; see the options of ``query``."""
+
+    question: Question
+    class_name: str = ""
+    point: tuple[float, ...] = ()
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    min_confidence: float = 0.0
 
 
 @verb
@@ -65,21 +75,15 @@ def query(
     if json_file is not None:
         prepare_file(json_file)
     ask = ask_mapper if "://" in source else ask_file
-    found = {"map": source, **ask(source, question, class_name, point, up, min_confidence)}
+    asked = Asked(question, class_name, point, up, min_confidence)
+    found = {"map": source, **ask(source, asked)}
     output.print(answer_table(found))
     if json_file is not None:
         write_json(json_file, found)
         output.print(f"written to {json_file}")
 
 
-def ask_file(
-    source: str,
-    question: Question,
-    class_name: str,
-    point: tuple[float, ...],
-    up: tuple[float, float, float],
-    min_confidence: float,
-) -> dict[str, Any]:
+def ask_file(source: str, asked: Asked) -> dict[str, Any]:
     """Answer of a saved map.
 
     Raises:
@@ -93,26 +97,19 @@ def ask_file(
     from semantic_mapper.queries.nearest import nearest
 
     snapshot = MapMirror.of(VoxelMap.load(Path(source))).snapshot()
-    match question:
+    match asked.question:
         case Question.INFO:
             return map_answers.describe_map(snapshot)
         case Question.AT:
-            return map_answers.answer_at(snapshot.label_set, point, at(snapshot, [point]))
+            return map_answers.answer_at(snapshot.label_set, asked.point, at(snapshot, [asked.point]))
         case Question.NEAREST:
-            hit = nearest(snapshot, class_name, point, min_confidence)
-            return map_answers.answer_nearest(class_name, point, hit)
+            hit = nearest(snapshot, asked.class_name, asked.point, asked.min_confidence)
+            return map_answers.answer_nearest(asked.class_name, asked.point, hit)
         case Question.INSTANCES:
-            return map_answers.answer_instances(up, InstanceTracker(up=up).update(snapshot))
+            return map_answers.answer_instances(asked.up, InstanceTracker(up=asked.up).update(snapshot))
 
 
-def ask_mapper(
-    source: str,
-    question: Question,
-    class_name: str,
-    point: tuple[float, ...],
-    up: tuple[float, float, float],
-    min_confidence: float,
-) -> dict[str, Any]:
+def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
     """The same of a running mapper.
 
     Raises:
@@ -123,16 +120,16 @@ def ask_mapper(
     from semantic_mapper.client import MapClient
 
     with MapClient(source) as client:
-        match question:
+        match asked.question:
             case Question.INFO:
                 return map_answers.describe_map(client.mirror().snapshot())
             case Question.AT:
-                return map_answers.answer_at(client.info().label_set, point, client.at([point]))
+                return map_answers.answer_at(client.info().label_set, asked.point, client.at([asked.point]))
             case Question.NEAREST:
-                hit = client.nearest(class_name, point, min_confidence)
-                return map_answers.answer_nearest(class_name, point, hit)
+                hit = client.nearest(asked.class_name, asked.point, asked.min_confidence)
+                return map_answers.answer_nearest(asked.class_name, asked.point, hit)
             case Question.INSTANCES:
-                return map_answers.answer_instances(up, client.instances(up))
+                return map_answers.answer_instances(asked.up, client.instances(asked.up))
 
 
 def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tuple[float, ...]]:

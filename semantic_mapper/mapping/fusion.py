@@ -188,6 +188,38 @@ def fuse_blocks(indices, buffers, camera, limits, depth, rgb, votes):
 
 
 @njit(nogil=True, cache=True, inline="always")
+def pinhole(camera, depth):
+    """Lens and image size of a frame's depth (H, W), as ``project_row`` takes them."""
+    half = np.float32(0.5)  # of a pixel more: truncation then rounds to the pixel
+    lens = (np.float32(camera.fx), np.float32(camera.fy), np.float32(camera.cx) + half, np.float32(camera.cy) + half)
+    return lens, (np.int32(depth.shape[1]), np.float32(depth.shape[1]), np.float32(depth.shape[0]))
+
+
+@njit(nogil=True, cache=True, inline="always")
+def place_block(key, camera, voxel_size):
+    """First voxel of a block relative to the camera, in world axes, and the step along x in camera axes; metres."""
+    R, t = camera.R, camera.t
+    origin = (
+        key[0] * BLOCK_SIDE * voxel_size - t[0],
+        key[1] * BLOCK_SIDE * voxel_size - t[1],
+        key[2] * BLOCK_SIDE * voxel_size - t[2],
+    )
+    step = (np.float32(R[0, 0] * voxel_size), np.float32(R[0, 1] * voxel_size), np.float32(R[0, 2] * voxel_size))
+    return origin, step
+
+
+@njit(nogil=True, cache=True, inline="always")
+def row_start(row, origin, R, voxel_size):
+    """Camera coordinates (R^T p) of the first voxel of a row; along the row they go on by ``place_block``'s step."""
+    x, y, z = origin[0], origin[1] + (row & 7) * voxel_size, origin[2] + (row >> 3) * voxel_size
+    return (
+        np.float32(R[0, 0] * x + R[1, 0] * y + R[2, 0] * z),
+        np.float32(R[0, 1] * x + R[1, 1] * y + R[2, 1] * z),
+        np.float32(R[0, 2] * x + R[1, 2] * y + R[2, 2] * z),
+    )
+
+
+@njit(nogil=True, cache=True, inline="always")
 def project_row(p, step, lens, size, depth, truncation, depth_max, pixels, distances):
     """Pixel that each voxel of a row projects to and its signed distance; -1 where there is nothing to fuse."""
     fx, fy, cx, cy = lens
@@ -216,29 +248,17 @@ def project_row(p, step, lens, size, depth, truncation, depth_max, pixels, dista
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _fuse_block(block, buffers, camera, limits, depth, rgb, frame_votes):
-    one, half = np.float32(1.0), np.float32(0.5)
-    # Half a pixel more: truncation then rounds to the pixel.
-    lens = (np.float32(camera.fx), np.float32(camera.fy), np.float32(camera.cx) + half, np.float32(camera.cy) + half)
-    size = (np.int32(depth.shape[1]), np.float32(depth.shape[1]), np.float32(depth.shape[0]))
+    one = np.float32(1.0)
+    lens, size = pinhole(camera, depth)
     depth_max, flat_depth = np.float32(limits.depth_max), depth.reshape(-1)
     truncation, band, cap = np.float32(limits.truncation), np.float32(limits.vote_band), np.float32(limits.max_weight)
     tsdf, weight, color = buffers.tsdf[block], buffers.weight[block], buffers.color[block]
     evidence, votes = buffers.evidence[block], buffers.votes[block]
     colors, rows, weights = rgb.reshape(-1, 3), frame_votes.rows.reshape(-1), frame_votes.weights.reshape(-1)
     pixels, distances = np.empty(BLOCK_SIDE, np.int32), np.empty(BLOCK_SIDE, np.float32)
-    R, vs = camera.R, limits.voxel_size
-    ox = buffers.keys[block, 0] * BLOCK_SIDE * vs - camera.t[0]
-    oy = buffers.keys[block, 1] * BLOCK_SIDE * vs - camera.t[1]
-    oz = buffers.keys[block, 2] * BLOCK_SIDE * vs - camera.t[2]
-    step = (np.float32(R[0, 0] * vs), np.float32(R[0, 1] * vs), np.float32(R[0, 2] * vs))
+    origin, step = place_block(buffers.keys[block], camera, limits.voxel_size)
     for row in range(BLOCK_SIDE * BLOCK_SIDE):
-        y, z = oy + (row & 7) * vs, oz + (row >> 3) * vs
-        # Camera coordinates of the row's first voxel (R^T p); along the row they go on by R[0] * voxel size.
-        p = (
-            np.float32(R[0, 0] * ox + R[1, 0] * y + R[2, 0] * z),
-            np.float32(R[0, 1] * ox + R[1, 1] * y + R[2, 1] * z),
-            np.float32(R[0, 2] * ox + R[1, 2] * y + R[2, 2] * z),
-        )
+        p = row_start(row, origin, camera.R, limits.voxel_size)
         if not project_row(p, step, lens, size, flat_depth, truncation, depth_max, pixels, distances):
             continue
         for i in range(BLOCK_SIDE):

@@ -14,7 +14,7 @@ from semantic_mapper.mapping.allocation import Camera, blocks_in_band, make_came
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE
 from semantic_mapper.mapping.block_index import pack_keys
 from semantic_mapper.mapping.frame_votes import ProbabilityTable, check_depth, frame_votes, probability_table
-from semantic_mapper.mapping.fusion import add_vote, make_limits, project_row
+from semantic_mapper.mapping.fusion import add_vote, make_limits, pinhole, place_block, project_row, row_start
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
@@ -74,26 +74,15 @@ def _vote_blocks(indices, buffers, camera, limits, depth, votes, max_votes):
 @njit(nogil=True, cache=True, error_model="numpy")
 def _vote_block(block, buffers, camera: Camera, limits, depth, frame_votes, max_votes):
     """As ``fusion._fuse_block`` votes, at voxels that a frame has measured before."""
-    half = np.float32(0.5)
-    lens = (np.float32(camera.fx), np.float32(camera.fy), np.float32(camera.cx) + half, np.float32(camera.cy) + half)
-    size = (np.int32(depth.shape[1]), np.float32(depth.shape[1]), np.float32(depth.shape[0]))
+    lens, size = pinhole(camera, depth)
     depth_max, flat_depth = np.float32(limits.depth_max), depth.reshape(-1)
     band, cap = np.float32(limits.vote_band), np.float32(limits.max_weight)
     weight, evidence, votes = buffers.weight[block], buffers.evidence[block], buffers.votes[block]
     rows, weights = frame_votes.rows.reshape(-1), frame_votes.weights.reshape(-1)
     pixels, distances = np.empty(BLOCK_SIDE, np.int32), np.empty(BLOCK_SIDE, np.float32)
-    R, vs = camera.R, limits.voxel_size
-    ox = buffers.keys[block, 0] * BLOCK_SIDE * vs - camera.t[0]
-    oy = buffers.keys[block, 1] * BLOCK_SIDE * vs - camera.t[1]
-    oz = buffers.keys[block, 2] * BLOCK_SIDE * vs - camera.t[2]
-    step = (np.float32(R[0, 0] * vs), np.float32(R[0, 1] * vs), np.float32(R[0, 2] * vs))
+    origin, step = place_block(buffers.keys[block], camera, limits.voxel_size)
     for row in range(BLOCK_SIDE * BLOCK_SIDE):
-        y, z = oy + (row & 7) * vs, oz + (row >> 3) * vs
-        p = (
-            np.float32(R[0, 0] * ox + R[1, 0] * y + R[2, 0] * z),
-            np.float32(R[0, 1] * ox + R[1, 1] * y + R[2, 1] * z),
-            np.float32(R[0, 2] * ox + R[1, 2] * y + R[2, 2] * z),
-        )
+        p = row_start(row, origin, camera.R, limits.voxel_size)
         if not project_row(p, step, lens, size, flat_depth, band, depth_max, pixels, distances):
             continue
         for i in range(BLOCK_SIDE):

@@ -1,6 +1,6 @@
 """Procedural benchmark scenes: seeded furnished rooms with exact depth, labels and poses."""
 
-from semantic_mapper.scenes.building import Visit, building_frames, building_walk, room_cell
+from semantic_mapper.scenes.building import Visit, building_walk, room_cell
 from semantic_mapper.scenes.camera import camera_path
 from semantic_mapper.scenes.config import (
     SUITE_VERSION,
@@ -30,7 +30,6 @@ __all__ = [
     "RoomView",
     "Scene",
     "Visit",
-    "building_frames",
     "building_walk",
     "camera_path",
     "make_room",

@@ -80,23 +80,6 @@ def building_walk(
         yield Visit(number, index, number >= rooms, low, high, _moved(own, offset, number * frames_a_room, hz))
 
 
-def building_frames(
-    rooms: int,
-    frames_a_room: int,
-    intrinsics: CameraIntrinsics,
-    *,
-    returns: int = 0,
-    hz: float = 15.0,
-    room: RoomConfig = RoomConfig(),
-    path: CameraPathConfig = CameraPathConfig(),
-    noise: NoiseConfig | None = None,
-) -> Iterator[PosedFrame]:
-    """The frames of ``building_walk``, one after the other."""
-    walk = building_walk(rooms, frames_a_room, intrinsics, returns=returns, hz=hz, room=room, path=path, noise=noise)
-    for visit in walk:
-        yield from visit.frames
-
-
 def room_cell(index: int, rooms: int, room: RoomConfig = RoomConfig()) -> tuple[Float64, Float64]:
     """Corners (3,) of the cell of one of ``rooms`` rooms, world, metres; cells are ``GAP_M`` apart."""
     side = room.max_side_m + 2 * BEYOND_M

@@ -11,6 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO
 
+import zmq
+
 from semantic_mapper.errors import TransportError
 
 _MAX_IPC_PATH = 100  # the kernel takes 107 bytes, lock suffix aside
@@ -73,6 +75,21 @@ def _is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:  # a wildcard or the name of an interface or host
         return False
+
+
+def bind(socket: zmq.Socket[bytes], endpoint: str, lock: EndpointLock) -> str:
+    """Bind a socket where ``lock`` holds the endpoint; returns the endpoint as ZeroMQ names it.
+
+    Raises:
+        TransportError: it cannot be bound; the socket is closed and the lock released then.
+    """
+    try:
+        socket.bind(endpoint)
+    except zmq.ZMQError as error:
+        socket.close(linger=0)
+        lock.release()
+        raise TransportError(f"{endpoint}: cannot be bound: {error}") from error
+    return socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
 
 class EndpointLock:

@@ -13,7 +13,7 @@ import structlog
 import zmq
 
 from semantic_mapper.errors import CodecError, TransportError
-from semantic_mapper.transport.endpoints import EndpointLock, check_bind
+from semantic_mapper.transport.endpoints import EndpointLock, bind, check_bind
 from semantic_mapper.transport.framing import Buffer
 from semantic_mapper.transport.topics import TOPICS, subscription
 
@@ -63,13 +63,7 @@ class Publisher:
         self._socket.setsockopt(zmq.MAXMSGSIZE, 1024)  # subscribers send nothing but subscriptions
         self._socket.setsockopt(zmq.XPUB_VERBOSER, 1)  # tell of every (un)subscription, so that they can be counted
         self._socket.setsockopt(zmq.XPUB_NODROP, int(policy == "block"))
-        try:
-            self._socket.bind(endpoint)
-        except zmq.ZMQError as error:
-            self._socket.close(linger=0)
-            self._endpoint_lock.release()
-            raise TransportError(f"{endpoint}: cannot be bound: {error}") from error
-        self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        self.endpoint = bind(self._socket, endpoint, self._endpoint_lock)
         self._pump_thread = threading.Thread(target=self._pump, name=f"publisher {endpoint}", daemon=True)
         self._pump_thread.start()
 

@@ -11,7 +11,7 @@ from types import TracebackType
 import zmq
 
 from semantic_mapper.errors import TransportError
-from semantic_mapper.transport.endpoints import EndpointLock, check_bind
+from semantic_mapper.transport.endpoints import EndpointLock, bind, check_bind
 from semantic_mapper.transport.framing import MAX_PART_BYTES, Buffer
 
 MAX_REQUEST_BYTES = 1 << 23  # of a part; who sends more is cut off
@@ -38,13 +38,7 @@ class QueryServer:
         self._socket.setsockopt(zmq.RCVHWM, _WAITING)
         self._socket.setsockopt(zmq.SNDHWM, _WAITING)
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
-        try:
-            self._socket.bind(endpoint)
-        except zmq.ZMQError as error:
-            self._socket.close(linger=0)
-            self._endpoint_lock.release()
-            raise TransportError(f"{endpoint}: cannot be bound: {error}") from error
-        self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        self.endpoint = bind(self._socket, endpoint, self._endpoint_lock)
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._poller = zmq.Poller()
         self._poller.register(self._socket, zmq.POLLIN)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.cli_query import Question, ask_file, ask_mapper
+from nodes.cli_query import Asked, Question, ask_file, ask_mapper
 from tests.nodes.support import run
 from tests.nodes.test_query_service import a_folder, answering
 from tests.queries.scene import BALL, BOX, HALF, RADIUS, whole_map
@@ -76,8 +76,8 @@ def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
             (Question.NEAREST, "lamp", (0.0, 0.0, 1.0)),
             (Question.INSTANCES, "", ()),
         ):
-            asked = (question, name, point, (0.0, 0.0, 1.0), 0.0)
-            assert ask_mapper(service.endpoint, *asked) == ask_file(str(map_file), *asked)
+            asked = Asked(question, name, point)
+            assert ask_mapper(service.endpoint, asked) == ask_file(str(map_file), asked)
         done = run("query", service.endpoint, "nearest", "cup", "0", "0", "1", "--json", folder / "live.json")
         assert done.returncode == 0 and "cup" in done.stdout, done.stderr
         assert json.loads((folder / "live.json").read_text())["map"] == service.endpoint

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Iterator
 from itertools import islice
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,6 @@ from semantic_mapper.scenes import (
     TRAIN_SEEDS,
     NoiseConfig,
     RoomConfig,
-    building_frames,
     building_walk,
     make_room,
     room_cell,
@@ -32,6 +33,11 @@ def seen_points(frame: PosedFrame) -> np.ndarray:
     assert frame.depth_m is not None
     points = unproject(frame.depth_m, frame.intrinsics)[frame.depth_m > 0]
     return transform(frame.T_world_camera, points)
+
+
+def building_frames(*args: Any, **options: Any) -> Iterator[PosedFrame]:
+    """The frames of a walk, one after the other."""
+    return (frame for visit in building_walk(*args, **options) for frame in visit.frames)
 
 
 def test_every_room_lies_in_its_own_cell_with_all_that_its_opening_shows() -> None:
