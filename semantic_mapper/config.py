@@ -100,6 +100,9 @@ class SamplingConfig(Config, frozen=True):
     free_space: NotNegative = 1  # of the guided samples: between the camera and the guided interval
     guided_sigma: Positive = 0.02  # half width of the guided interval: guided_sigma * z + guided_floor_m
     guided_floor_m: Positive = 0.04
+    least_weight: Share = (
+        0.0  # streaming: samples of a smaller share of their ray's weight are composited without a look
+    )
     near_m: Positive = 0.3
     far_m: Positive = 8.0
 

@@ -1,7 +1,7 @@
 """Small compiled building blocks of the streaming renderer: matrix products and softmax on a few dozen rows.
 
 Matrices of one ray (64 x 32 floats) stay in the first-level cache; that, not arithmetic, is what the eager renderer
-spends its time on. Inner loops run over contiguous output channels, four inputs at a time, so that LLVM vectorises.
+spends its time on, and sums that stay in registers are what the loops below are written for (``simd``).
 """
 
 from __future__ import annotations
@@ -13,6 +13,23 @@ import math
 import numba
 import numpy as np
 
+from semantic_mapper.fields.simd import (
+    LANES,
+    add,
+    exp_below,
+    larger,
+    largest,
+    load,
+    multiply,
+    multiply_add,
+    splat,
+    store,
+    swap_halves,
+    total,
+    totals,
+)
+
+ROWS = 4  # that ``linear`` works on at a time
 _LOG2E = np.float32(1.4426950408889634)
 _LN2 = np.float32(0.6931471805599453)
 _POWERS = np.float32(2.0) ** np.arange(-126, 1).astype(np.float32)
@@ -58,35 +75,62 @@ def softplus(x):
 
 @numba.njit(fastmath=True, nogil=True, cache=True)
 def linear(x, rows, weight, bias, out):
-    """out[:rows] = x[:rows] @ weight + bias, with weight (I, O), I a multiple of 4.
+    """out[:rows] = x[:rows] @ weight + bias.
 
-    Two rows at a time share each load of the weights.
+    Sixteen outputs of four rows at a time are summed in registers; outputs beyond a multiple of 8 one by one.
 
     Args:
-        x: (>= rows, >= I) float32. out: (>= rows, O) float32, overwritten. bias: (O,).
+        x: (>= rows up to the next multiple of 4, >= I) float32, contiguous. weight: (I, O). bias: (>= O,).
+        out: (as x, >= O) float32, contiguous, overwritten; rows beyond, up to a multiple of 4, mean nothing.
     """
     inputs, outputs = weight.shape
-    for t in range(0, rows - 1, 2):
-        x0, x1, y0, y1 = x[t], x[t + 1], out[t], out[t + 1]
-        for o in range(outputs):
-            y0[o] = bias[o]
-            y1[o] = bias[o]
-        for i in range(0, inputs, 4):
-            w0, w1, w2, w3 = weight[i], weight[i + 1], weight[i + 2], weight[i + 3]
-            a0, a1, a2, a3 = x0[i], x0[i + 1], x0[i + 2], x0[i + 3]
-            b0, b1, b2, b3 = x1[i], x1[i + 1], x1[i + 2], x1[i + 3]
-            for o in range(outputs):
-                p, q, r, s = w0[o], w1[o], w2[o], w3[o]
-                y0[o] += a0 * p + a1 * q + a2 * r + a3 * s
-                y1[o] += b0 * p + b1 * q + b2 * r + b3 * s
-    if rows % 2:
-        t = rows - 1
-        for o in range(outputs):
-            out[t, o] = bias[o]
-        for i in range(0, inputs, 4):
-            a, b, c, d = x[t, i], x[t, i + 1], x[t, i + 2], x[t, i + 3]
-            for o in range(outputs):
-                out[t, o] += a * weight[i, o] + b * weight[i + 1, o] + c * weight[i + 2, o] + d * weight[i + 3, o]
+    even = outputs // LANES * LANES
+    for o in range(0, even - LANES, 2 * LANES):
+        for t in range(0, rows, ROWS):
+            _four_rows(x, t, weight, o, bias, out)
+    if even % (2 * LANES):
+        for t in range(rows):
+            _eight_outputs(x, t, weight, even - LANES, bias, out)
+    for o in range(even, outputs):
+        for t in range(rows):
+            value = bias[o]
+            for i in range(inputs):
+                value += x[t, i] * weight[i, o]
+            out[t, o] = value
+
+
+@numba.njit(inline="always", fastmath=True)
+def _eight_outputs(x, t, weight, o, bias, out):
+    """Of one row."""
+    inputs, outputs = weight.shape
+    value = load(bias, o)
+    for i in range(inputs):
+        value = multiply_add(splat(x[t, i]), load(weight, i * outputs + o), value)
+    store(out, t * out.shape[1] + o, value)
+
+
+@numba.njit(inline="always", fastmath=True)
+def _four_rows(x, t, weight, o, bias, out):
+    """Sixteen outputs of four rows, which share each load of the weights."""
+    inputs, outputs = weight.shape
+    stride = out.shape[1]
+    a = c = e = g = load(bias, o)
+    b = d = f = h = load(bias, o + LANES)
+    for i in range(inputs):
+        near, far = load(weight, i * outputs + o), load(weight, i * outputs + o + LANES)
+        x0, x1, x2, x3 = splat(x[t, i]), splat(x[t + 1, i]), splat(x[t + 2, i]), splat(x[t + 3, i])
+        a, b = multiply_add(x0, near, a), multiply_add(x0, far, b)
+        c, d = multiply_add(x1, near, c), multiply_add(x1, far, d)
+        e, f = multiply_add(x2, near, e), multiply_add(x2, far, f)
+        g, h = multiply_add(x3, near, g), multiply_add(x3, far, h)
+    store(out, t * stride + o, a)
+    store(out, t * stride + o + LANES, b)
+    store(out, (t + 1) * stride + o, c)
+    store(out, (t + 1) * stride + o + LANES, d)
+    store(out, (t + 2) * stride + o, e)
+    store(out, (t + 2) * stride + o + LANES, f)
+    store(out, (t + 3) * stride + o, g)
+    store(out, (t + 3) * stride + o + LANES, h)
 
 
 @numba.njit(fastmath=True, nogil=True, cache=True)
@@ -98,94 +142,130 @@ def relu(x, rows, columns):
 
 
 @numba.njit(fastmath=True, nogil=True, cache=True)
-def attend(qkv, index, count, heads, head_dim, score, out):
+def attend(qkv, index, count, heads, head_dim, scratch, out):
     """Attention among the ``count`` tokens qkv[index[:count]]; the result goes to out[index[:count]].
 
     Args:
-        qkv: (T, 3 * heads * head_dim) float32, queries first, then keys, then values.
+        qkv: (T, 3 * heads * head_dim) float32, contiguous, queries first, then keys, then values.
         index: (>= count,) int64 token numbers.
-        score: (>= count * count,) float32 scratch.
-        out: (T, heads * head_dim) float32.
+        scratch: See ``make_attention_scratch``.
+        out: (T, heads * head_dim) float32, contiguous.
     """
-    inner = heads * head_dim
+    if heads == 4 and head_dim == LANES:
+        _attend_four_heads(qkv, index, count, scratch[1], out)
+    else:
+        _attend_any(qkv, index, count, heads, head_dim, scratch, out)
+
+
+@numba.njit(fastmath=True, nogil=True, cache=True)
+def _attend_any(qkv, index, count, heads, head_dim, scratch, out):
+    """A lane is a key."""
+    keys, score, beyond = scratch
+    inner, stride = heads * head_dim, keys.shape[1]
+    padded = (count + LANES - 1) // LANES * LANES
     rate = np.float32(1.0 / math.sqrt(head_dim))
+    for k in range(padded):
+        beyond[k] = np.float32(0.0) if k < count else np.float32(-1e30)
+    for c in range(inner):
+        for k in range(count):
+            keys[c, k] = qkv[index[k], inner + c] * rate
+        for k in range(count, padded):
+            keys[c, k] = np.float32(0.0)
     for base in range(0, inner, head_dim):
-        if head_dim == 8:
-            _scores_of_8(qkv, index, count, base, inner + base, rate, score)
-        else:
-            _scores(qkv, index, count, base, inner + base, head_dim, rate, score)
-        for i in range(count * count):
-            score[i] = fast_exp(score[i])
-        for qi in range(count):
-            total = np.float32(0.0)
-            for i in range(qi * count, (qi + 1) * count):
-                total += score[i]
-            share = np.float32(1.0) / total
-            if head_dim == 8:
-                _mix_8(qkv, index, count, score[qi * count :], share, 2 * inner + base, out[index[qi]], base)
-            else:
-                _mix(qkv, index, count, score[qi * count :], share, 2 * inner + base, head_dim, out[index[qi]], base)
+        for i in range(count):
+            query = index[i]
+            top = splat(np.float32(-1e30))
+            for k in range(0, padded, LANES):
+                value = load(beyond, k)
+                for c in range(base, base + head_dim):
+                    value = multiply_add(splat(qkv[query, c]), load(keys, c * stride + k), value)
+                top = larger(top, value)
+                store(score, k, value)
+            shift = splat(-largest(top))
+            summed = splat(np.float32(0.0))
+            for k in range(0, padded, LANES):
+                value = exp_below(add(load(score, k), shift))
+                summed = add(summed, value)
+                store(score, k, value)
+            share = np.float32(1.0) / total(summed)
+            _mix(qkv, index, count, score, share, 2 * inner + base, head_dim, out, query, base)
+
+
+@numba.njit(inline="always", fastmath=True)
+def _mix(qkv, index, count, weight, share, v_at, head_dim, out, row, out_at):
+    """out[row, out_at:] = share * sum of values weighted by ``weight``."""
+    even = head_dim // LANES * LANES
+    for d in range(0, even, LANES):
+        value = splat(np.float32(0.0))
+        for k in range(count):
+            value = multiply_add(splat(weight[k]), load(qkv, index[k] * qkv.shape[1] + v_at + d), value)
+        store(out, row * out.shape[1] + out_at + d, multiply(value, splat(share)))
+    for d in range(even, head_dim):
+        one = np.float32(0.0)
+        for k in range(count):
+            one += weight[k] * qkv[index[k], v_at + d]
+        out[row, out_at + d] = one * share
+
+
+@numba.njit(inline="always", fastmath=True)
+def _two_keys(q0, q1, q2, q3, qkv, near, far):
+    """Scores of one query with two keys at flat places: four heads with the first, then with the second."""
+    return totals(
+        multiply(q0, load(qkv, near)),
+        multiply(q1, load(qkv, near + 8)),
+        multiply(q2, load(qkv, near + 16)),
+        multiply(q3, load(qkv, near + 24)),
+        multiply(q0, load(qkv, far)),
+        multiply(q1, load(qkv, far + 8)),
+        multiply(q2, load(qkv, far + 16)),
+        multiply(q3, load(qkv, far + 24)),
+    )
 
 
 @numba.njit(fastmath=True, nogil=True, cache=True)
-def _scores(qkv, index, count, q_at, k_at, head_dim, rate, score):
-    """score[qi * count + ki] = rate * q . k, less the largest of the row."""
-    for qi in range(count):
-        q, at = qkv[index[qi]], qi * count
-        top = np.float32(-1e30)
-        for ki in range(count):
-            k = qkv[index[ki]]
-            s = np.float32(0.0)
-            for d in range(head_dim):
-                s += q[q_at + d] * k[k_at + d]
-            score[at + ki] = s * rate
-            top = max(top, score[at + ki])
-        for i in range(at, at + count):
-            score[i] -= top
+def _attend_four_heads(qkv, index, count, score, out):
+    """A lane is a head, of two keys at a time: groups of a few tokens leave no lane empty, and no sum goes across."""
+    width, rate = qkv.shape[1], splat(np.float32(1.0 / math.sqrt(8)))
+    for i in range(count):
+        at = index[i] * width
+        q0, q1 = multiply(load(qkv, at), rate), multiply(load(qkv, at + 8), rate)
+        q2, q3 = multiply(load(qkv, at + 16), rate), multiply(load(qkv, at + 24), rate)
+        top = splat(np.float32(-1e30))
+        for k in range(0, count - 1, 2):
+            value = _two_keys(q0, q1, q2, q3, qkv, index[k] * width + 32, index[k + 1] * width + 32)
+            top = larger(top, value)
+            store(score, 4 * k, value)
+        if count % 2:
+            last = index[count - 1] * width + 32
+            value = _two_keys(q0, q1, q2, q3, qkv, last, last)
+            top = larger(top, value)
+            store(score, 4 * (count - 1), value)
+            score[4 * count : 4 * count + 4] = np.float32(-1e30)  # no key to make the pair whole
+        shift = multiply(larger(top, swap_halves(top)), splat(np.float32(-1.0)))
+        summed = splat(np.float32(0.0))
+        for k in range(0, count, 2):
+            value = exp_below(add(load(score, 4 * k), shift))
+            summed = add(summed, value)
+            store(score, 4 * k, value)
+        sums = 4 * count + 4
+        store(score, sums, add(summed, swap_halves(summed)))
+        a = b = c = d = splat(np.float32(0.0))
+        for k in range(count):
+            v = index[k] * width + 64
+            a = multiply_add(splat(score[4 * k]), load(qkv, v), a)
+            b = multiply_add(splat(score[4 * k + 1]), load(qkv, v + 8), b)
+            c = multiply_add(splat(score[4 * k + 2]), load(qkv, v + 16), c)
+            d = multiply_add(splat(score[4 * k + 3]), load(qkv, v + 24), d)
+        one, at = np.float32(1.0), index[i] * out.shape[1]
+        store(out, at, multiply(a, splat(one / score[sums])))
+        store(out, at + 8, multiply(b, splat(one / score[sums + 1])))
+        store(out, at + 16, multiply(c, splat(one / score[sums + 2])))
+        store(out, at + 24, multiply(d, splat(one / score[sums + 3])))
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
-def _mix(qkv, index, count, weight, share, v_at, head_dim, out, out_at):
-    """out = share * sum of values weighted by ``weight``."""
-    for d in range(head_dim):
-        out[out_at + d] = 0.0
-    for ki in range(count):
-        v, w = qkv[index[ki]], weight[ki] * share
-        for d in range(head_dim):
-            out[out_at + d] += w * v[v_at + d]
-
-
-@numba.njit(fastmath=True, nogil=True, cache=True)
-def _scores_of_8(qkv, index, count, q_at, k_at, rate, score):
-    """``_scores`` for 8 dimensions held in registers: half the time of the loop."""
-    for qi in range(count):
-        q, at = qkv[index[qi]], qi * count
-        q0, q1, q2, q3 = q[q_at], q[q_at + 1], q[q_at + 2], q[q_at + 3]
-        q4, q5, q6, q7 = q[q_at + 4], q[q_at + 5], q[q_at + 6], q[q_at + 7]
-        top = np.float32(-1e30)
-        for ki in range(count):
-            k = qkv[index[ki]]
-            near = q0 * k[k_at] + q1 * k[k_at + 1] + q2 * k[k_at + 2] + q3 * k[k_at + 3]
-            far = q4 * k[k_at + 4] + q5 * k[k_at + 5] + q6 * k[k_at + 6] + q7 * k[k_at + 7]
-            score[at + ki] = rate * (near + far)
-            top = max(top, score[at + ki])
-        for i in range(at, at + count):
-            score[i] -= top
-
-
-@numba.njit(fastmath=True, nogil=True, cache=True)
-def _mix_8(qkv, index, count, weight, share, v_at, out, out_at):
-    """``_mix`` for 8 dimensions held in registers."""
-    a = b = c = d = e = f = g = h = np.float32(0.0)
-    for ki in range(count):
-        v, w = qkv[index[ki]], weight[ki] * share
-        a += w * v[v_at]
-        b += w * v[v_at + 1]
-        c += w * v[v_at + 2]
-        d += w * v[v_at + 3]
-        e += w * v[v_at + 4]
-        f += w * v[v_at + 5]
-        g += w * v[v_at + 6]
-        h += w * v[v_at + 7]
-    out[out_at], out[out_at + 1], out[out_at + 2], out[out_at + 3] = a, b, c, d
-    out[out_at + 4], out[out_at + 5], out[out_at + 6], out[out_at + 7] = e, f, g, h
+@numba.njit(nogil=True, cache=True)
+def make_attention_scratch(inner, count):
+    """Buffers of ``attend`` for ``inner`` = heads * head_dim, groups of at most ``count``: keys, scores, mask."""
+    padded = (count + LANES - 1) // LANES * LANES
+    scores = np.empty(4 * padded + 2 * LANES, np.float32)
+    return np.empty((inner, padded), np.float32), scores, np.empty(padded, np.float32)

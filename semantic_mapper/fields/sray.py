@@ -108,6 +108,10 @@ class SRay(LearnedField):
         clear = space.valid & (space.visibility >= HIDDEN)
         return replace(space, valid=torch.where(clear.any(0), clear, space.valid))
 
+    def without_faint(self, space: ContextualSpace, weights: torch.Tensor, least: float) -> ContextualSpace:
+        """M without the samples whose share of the compositing weights (R, N) of their ray is below ``least``."""
+        return replace(space, valid=space.valid & (weights >= least * weights.sum(1, keepdim=True)))
+
     def attend(self, space: ContextualSpace) -> torch.Tensor:
         """Cross-reprojection attention: M -> M'' (m, R, N, C) (Eq. 6 to 10)."""
         x = space.feature.transpose(0, 1)  # (R, m, N, C)
@@ -139,20 +143,33 @@ class SRay(LearnedField):
         s = torch.einsum("mrn,mrnc->rnc", semantic_weight, refined)
         return s, torch.einsum("mrn,mrnc->rnc", colour_weight, space.rgb)
 
+    def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
+        """As every field renders; streaming, without what ``sampling.least_weight`` calls faint."""
+        least = self.sampling.least_weight if self.sampling.mode == "streaming" else 0.0
+        return self.render_samples(rays, self.sample(rays, sources), sources, least)[0]
+
     def render_samples(
-        self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews
+        self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews, least_weight: float = 0.0
     ) -> tuple[FieldRender, torch.Tensor]:
-        """Render rays at given sample depths z (R, N) (Eq. 13); also returns the compositing weights (R, N)."""
+        """Render rays at given sample depths z (R, N) (Eq. 13); also returns the compositing weights (R, N).
+
+        The density of a sample does not depend on the attention. With ``least_weight`` samples of a smaller share of
+        their ray's weight take no part in it, and the others' semantics and colour stand for theirs.
+        """
         space = contextual_space(rays, z, sources)
-        seen = self.without_hidden(space)
-        s, colour = self.blend_views(self.attend(seen), seen)
         sigma = self.density(space.feature, space.hit, space.visibility, space.valid, space.delta)
         interval = torch.ones_like(space.delta) if self.config.parity == "published" else space.delta
         weights = compositing_weights(sigma, interval)
         opacity = weights.sum(dim=1)
         known = space.valid.flatten(2).any(2).any(0)
+        seen, looked_at = self.without_hidden(space), weights
+        if least_weight > 0:
+            seen = self.without_faint(seen, weights, least_weight)
+            looked_at = weights * seen.valid.any(0)
+            looked_at = looked_at * (opacity / looked_at.sum(1).clamp_min(1e-12))[:, None]
+        s, colour = self.blend_views(self.attend(seen), seen)
         # The classifier is linear, so logits of blended features equal blended logits: classify once a ray.
-        rendered = composite(weights, s + self.semantic(s))
+        rendered = composite(looked_at, s + self.semantic(s))
         logits = functional.linear(rendered, self.classifier.weight) + opacity[:, None] * self.classifier.bias
         if self.config.source_labels:
             logits = logits + self.label_logit * composite(weights, self.carried_labels(space))
@@ -162,7 +179,7 @@ class SRay(LearnedField):
             logits=logits,
             depth_m=composite_depth(weights, z),
             opacity=opacity,
-            rgb=composite(weights, colour),
+            rgb=composite(looked_at, colour),
             entropy=-(log_p.exp() * log_p).sum(-1),
             known=known,
         )

@@ -72,10 +72,12 @@ class StreamingSRay:
 
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
         """Render rays with guided samples; not differentiable."""
-        return self.render_samples(rays, sample_guided(rays, self.sampling), sources)
+        return self.render_samples(rays, sample_guided(rays, self.sampling), sources, self.sampling.least_weight)
 
-    def render_samples(self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews) -> FieldRender:
-        """Render rays at given sample depths z (R, N).
+    def render_samples(
+        self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews, least_weight: float = 0.0
+    ) -> FieldRender:
+        """Render rays at given sample depths z (R, N); see ``SRay.render_samples``.
 
         Raises:
             ShapeError: fewer than 2 samples a ray.
@@ -101,7 +103,13 @@ class StreamingSRay:
                 _array(poses),
                 sources.channel.numpy(),
             ),
-            (config.heads, np.float32(keep), np.float32(math.log(1 / config.tau)), config.occlusion),
+            (
+                config.heads,
+                np.float32(keep),
+                np.float32(math.log(1 / config.tau)),
+                config.occlusion,
+                np.float32(least_weight),
+            ),
             self._weights,
             TASKS_PER_THREAD * numba.get_num_threads(),
             tuple(t.numpy() for t in (rendered, colour, depth, opacity, known, carried)),
@@ -129,20 +137,21 @@ class StreamingSRay:
 
 
 def pack_weights(model: SRay) -> tuple[Any, ...]:
-    """Weights as contiguous (in, out) float32 arrays, grouped as ``sray_kernel.render_rays`` reads them."""
+    """Weights as contiguous float32 arrays, grouped as ``sray_kernel.render_rays`` reads them: (in, out), and (out, in)
+    of layers with two outputs."""
     off = np.zeros((0, 0), np.float32)
     config = model.config
     radial = (
         (_transposed(model.radial.qkv), _transposed(model.radial.out)) if config.intra_view_attention else (off, off)
     )
     cross = (_transposed(model.cross.qkv), _transposed(model.cross.out)) if config.cross_view_attention else (off, off)
-    blend = (*_pair(model.weights.net[0]), *_pair(model.weights.net[2]))
+    blend = (*_pair(model.weights.net[0]), *_rows(model.weights.net[2]))
     density = (
         *_pair(model.density.token[0]),
         *_pair(model.density.token[2]),
         _transposed(model.density.qkv),
         *_pair(model.density.out[0]),
-        *_pair(model.density.out[2]),
+        *_rows(model.density.out[2]),
     )
     semantic = (*_pair(model.semantic[0]), *_pair(model.semantic[2]))
     return (radial, cross, blend, density, semantic)
@@ -160,3 +169,8 @@ def _transposed(layer: nn.Module) -> Float32:
 def _pair(layer: nn.Module) -> tuple[Float32, Float32]:
     assert isinstance(layer, nn.Linear)
     return _transposed(layer), np.ascontiguousarray(layer.bias.detach().float().cpu().numpy())
+
+
+def _rows(layer: nn.Module) -> tuple[Float32, Float32]:
+    assert isinstance(layer, nn.Linear)
+    return _array(layer.weight), _array(layer.bias)

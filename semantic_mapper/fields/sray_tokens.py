@@ -107,10 +107,11 @@ def group_tokens(token_view, token_sample, count, by_view, view_size, by_sample,
 
 
 @numba.njit(fastmath=True, nogil=True, cache=True)
-def drop_hidden(count, hidden_below, clearest, token_view, token_sample, feature, rgb, cues):
-    """Move the tokens that ``SRay.without_hidden`` keeps to the front, in their order; return how many they are.
+def drop_tokens(count, hidden_below, share, clearest, token_view, token_sample, feature, rgb, cues):
+    """Move the tokens that ``SRay.without_hidden`` and ``without_faint`` keep to the front; return how many they are.
 
     Args:
+        share: (N,) weight of each sample, 0 = faint.
         clearest: (N,) buffer; becomes the best visibility of each sample.
     """
     clearest[:] = _ZERO
@@ -120,7 +121,7 @@ def drop_hidden(count, hidden_below, clearest, token_view, token_sample, feature
     kept = 0
     for t in range(count):
         k = token_sample[t]
-        if cues[t, 1] < hidden_below <= clearest[k]:
+        if cues[t, 1] < hidden_below <= clearest[k] or share[k] == 0:
             continue
         if kept < t:
             token_view[kept], token_sample[kept] = token_view[t], k

@@ -234,6 +234,29 @@ def test_streaming_renderer_leaves_out_the_same_hidden_views():
         torch.testing.assert_close(getattr(fast, name), getattr(reference, name), atol=1e-4, rtol=1e-4)
 
 
+@pytest.mark.parametrize("least", [0.02, 0.3])
+@pytest.mark.parametrize("occlusion", [True, False])
+def test_streaming_renderer_leaves_out_the_same_faint_samples(least: float, occlusion: bool):
+    field = small_field(4, occlusion=occlusion)
+    for p in field.parameters():
+        p.data += 0.05 * torch.randn_like(p)
+    streaming = StreamingSRay(field)
+    encoded = streaming.encode(wall_sources(POSES))
+    rays = wall_rays(pose_at(0.1), step=3, prior=WALL_M)
+    z = sample_guided(rays, SamplingConfig())
+    with torch.inference_mode():
+        whole, weights = field.render_samples(rays, z, encoded)
+        reference, _ = field.render_samples(rays, z, encoded, least)
+        faint = (weights < least * weights.sum(1, keepdim=True)).float().mean()
+        assert 0.1 < faint < 0.98
+        # All of the ray's weight still says something, and geometry is what it was.
+        assert torch.equal(reference.opacity, whole.opacity) and torch.equal(reference.depth_m, whole.depth_m)
+        assert 1e-4 < (reference.logits - whole.logits).abs().max() < 20 * least
+    fast = streaming.render_samples(rays, z, encoded, least)
+    for name in ("logits", "depth_m", "opacity", "rgb", "entropy"):
+        torch.testing.assert_close(getattr(fast, name), getattr(reference, name), atol=1e-4, rtol=1e-4)
+
+
 def test_streaming_renderer_covers_the_narrowest_features():
     torch.manual_seed(2)
     field = SRay(SRayConfig(feature_dim=4, heads=2, encoder=ONE_STAGE), LABELS).eval()
