@@ -197,23 +197,41 @@ def swap_halves(typingctx, value):
     return lanes(lanes), codegen
 
 
+def _exp_below(builder, value):
+    least = _constant(-87.0)
+    x = builder.select(builder.fcmp_ordered("<", value, least), least, value)  # NaN stays
+    finite = builder.select(builder.fcmp_ordered(">", x, least), x, least)
+    shifted = builder.fsub(builder.fmul(finite, _constant(_LOG2E), flags=_FAST), _constant(0.5), flags=_FAST)
+    k = builder.fptosi(shifted, _INTS)
+    whole = builder.sitofp(k, _FLOATS)
+    r = builder.fsub(x, builder.fmul(whole, _constant(_LN2_HIGH)), flags=_FAST)
+    r = builder.fsub(r, builder.fmul(whole, _constant(_LN2_LOW)), flags=_FAST)
+    p = _constant(1 / 720)
+    for divisor in (120, 24, 6, 2, 1, 1):
+        p = builder.fadd(builder.fmul(p, r, flags=_FAST), _constant(1 / divisor), flags=_FAST)
+    power = builder.shl(builder.add(k, ir.Constant(_INTS, [127] * LANES)), ir.Constant(_INTS, [23] * LANES))
+    return builder.fmul(p, builder.bitcast(power, _FLOATS), flags=_FAST)
+
+
 @intrinsic
 def exp_below(typingctx, value):
     """exp of each lane, for values <= 0, relative error below 1e-6; values under -87 give e^-87."""
 
     def codegen(context, builder, signature, args):
-        least = _constant(-87.0)
-        x = builder.select(builder.fcmp_ordered("<", args[0], least), least, args[0])  # NaN stays
-        finite = builder.select(builder.fcmp_ordered(">", x, least), x, least)
-        shifted = builder.fsub(builder.fmul(finite, _constant(_LOG2E), flags=_FAST), _constant(0.5), flags=_FAST)
-        k = builder.fptosi(shifted, _INTS)
-        whole = builder.sitofp(k, _FLOATS)
-        r = builder.fsub(x, builder.fmul(whole, _constant(_LN2_HIGH)), flags=_FAST)
-        r = builder.fsub(r, builder.fmul(whole, _constant(_LN2_LOW)), flags=_FAST)
-        p = _constant(1 / 720)
-        for divisor in (120, 24, 6, 2, 1, 1):
-            p = builder.fadd(builder.fmul(p, r, flags=_FAST), _constant(1 / divisor), flags=_FAST)
-        power = builder.shl(builder.add(k, ir.Constant(_INTS, [127] * LANES)), ir.Constant(_INTS, [23] * LANES))
-        return builder.fmul(p, builder.bitcast(power, _FLOATS), flags=_FAST)
+        return _exp_below(builder, args[0])
+
+    return lanes(lanes), codegen
+
+
+@intrinsic
+def logistic(typingctx, value):
+    """1 / (1 + exp(-x)) of each lane."""
+
+    def codegen(context, builder, signature, args):
+        x = args[0]
+        negative = builder.fcmp_ordered("<", x, _constant(0.0))
+        e = _exp_below(builder, builder.select(negative, x, builder.fneg(x)))
+        large = builder.fdiv(_constant(1.0), builder.fadd(_constant(1.0), e, flags=_FAST), flags=_FAST)
+        return builder.select(negative, builder.fmul(e, large, flags=_FAST), large)
 
     return lanes(lanes), codegen

@@ -224,7 +224,8 @@ def _make_scratch(views, samples, channels, classes):
             np.zeros((tokens, channels), np.float32),  # feature
             np.empty((tokens, 3), np.float32),  # colour
             np.empty((tokens, CUES), np.float32),
-            np.empty(5, np.float32),  # depth mixture of one pixel
+            np.zeros(4 * tokens, np.float32),  # arguments of the depth mixture's logistics
+            np.empty(tokens, np.float32),  # share of the first of them
         ),
         (
             np.empty((views, samples), np.int64),  # tokens by view
@@ -273,8 +274,9 @@ def _render_ray(r, rays, sources, settings, weights, scratch, out):
     origin, direction, z = rays
     heads, keep, log_ratio, occlusion, least = settings
     radial, cross, blend, density, semantic = weights
-    (token_view, token_sample, token_label), token_data, groups, attention, scoring, blending, density_scratch = scratch
-    feature, rgb, cues, mixture = token_data
+    places, token_data, groups, attention, scoring, blending, density_scratch = scratch
+    token_view, token_sample, token_label = places
+    feature, rgb, cues = token_data[:3]
     by_view, view_size, by_sample, sample_size = groups
     zero, qkv, mixed, attending = attention
     s, blended, labels, wide, refined, sigma, delta, weight, share, clearest = blending
@@ -284,20 +286,7 @@ def _render_ray(r, rays, sources, settings, weights, scratch, out):
     for k in range(samples - 1):
         delta[k] = (z[r, k + 1] - z[r, k]) * norm
     delta[samples - 1] = delta[samples - 2]
-    count = fill_tokens(
-        origin[r],
-        direction[r],
-        z[r],
-        delta,
-        sources,
-        token_view,
-        token_sample,
-        token_label,
-        feature,
-        rgb,
-        cues,
-        mixture,
-    )
+    count = fill_tokens(origin[r], direction[r], z[r], delta, sources, places, token_data)
     known[r] = count > 0
     group_tokens(token_view, token_sample, count, by_view, view_size, by_sample, sample_size)
     _carry_labels(token_label, cues, by_sample, sample_size, labels)
@@ -332,8 +321,9 @@ def render_rays(rays, sources, settings, weights, tasks, out):
 
     Args:
         rays: origin (R, 3), direction (R, 3), z (R, N) ascending.
-        sources: maps (m, h, w, C + 3) features and colour, geometry (m, h, w, 5), K (m, 4) fx fy cx cy, T (m, 3, 4),
-            known labels (m, H, W).
+        sources: maps (m, h, w, C + 3) features and colour, geometry (m, h, w, 6) with the
+            logarithm of the first scale at the end, K (m, 4) fx fy cx cy, T (m, 3, 4),
+            known labels (m, H, W), or (m, 0, 0) where there are none.
         settings: heads, weight of the residual, ln(1 / tau), whether views count by their visibility, least weight of a
             sample that is looked at.
         weights: See ``sray_streaming.pack_weights``.

@@ -93,15 +93,18 @@ class StreamingSRay:
         keep = 1.0 if config.attention_residual else 0.0
         poses = sources.T_camera_world[:, :3, :]
         maps = torch.cat((sources.feature, sources.rgb), dim=1).permute(0, 2, 3, 1)
+        # With the logarithm of the first scale, which is a cue: it is the same for all samples at a pixel.
+        geometry = torch.cat((sources.geometry, sources.geometry[:, 1:2].log()), dim=1)
+        channel = sources.channel if (sources.channel >= 0).any() else sources.channel[:, :0, :0]
         K = torch.stack((sources.K[:, 0, 0], sources.K[:, 1, 1], sources.K[:, 0, 2], sources.K[:, 1, 2]), dim=1)
         render_rays(
             (_array(rays.origin), _array(rays.direction), _array(z)),
             (
                 _array(maps),
-                _array(sources.geometry.permute(0, 2, 3, 1)),
+                _array(geometry.permute(0, 2, 3, 1)),
                 _array(K),
                 _array(poses),
-                sources.channel.numpy(),
+                channel.numpy(),
             ),
             (
                 config.heads,

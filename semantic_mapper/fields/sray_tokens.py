@@ -12,16 +12,16 @@ import math
 import numba
 import numpy as np
 
-from semantic_mapper.fields.kernel_math import sigmoid
 from semantic_mapper.fields.projection import MIN_DEPTH_M
+from semantic_mapper.fields.simd import LANES, load, logistic, multiply, multiply_add, splat, store
 
 _ZERO = np.float32(0.0)
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
-def _gather_sample(maps, geometry, j, u, v, feature, rgb, mixture):
-    """Bilinear features and colour, nearest geometry of view j at pixel (u, v), with the border repeated."""
-    height, width, channels = maps.shape[1], maps.shape[2], feature.shape[0]
+@numba.njit(inline="always", fastmath=True)
+def _gather_sample(maps, j, u, v, token, feature, rgb):
+    """Bilinear features and colour of view j at pixel (u, v), with the border repeated, as those of a token."""
+    height, width, stride, channels = maps.shape[1], maps.shape[2], maps.shape[3], feature.shape[1]
     x = min(max(u, _ZERO), np.float32(width - 1))
     y = min(max(v, _ZERO), np.float32(height - 1))
     x0, y0 = int(x), int(y)
@@ -29,34 +29,59 @@ def _gather_sample(maps, geometry, j, u, v, feature, rgb, mixture):
     fx, fy = x - np.float32(x0), y - np.float32(y0)
     w00, w01 = (1 - fx) * (1 - fy), fx * (1 - fy)
     w10, w11 = (1 - fx) * fy, fx * fy
-    for c in range(channels):
-        feature[c] = (
-            w00 * maps[j, y0, x0, c] + w01 * maps[j, y0, x1, c] + w10 * maps[j, y1, x0, c] + w11 * maps[j, y1, x1, c]
-        )
-    for c in range(3):
-        d = channels + c
-        rgb[c] = (
-            w00 * maps[j, y0, x0, d] + w01 * maps[j, y0, x1, d] + w10 * maps[j, y1, x0, d] + w11 * maps[j, y1, x1, d]
-        )
-    row = min(max(int(np.rint(v)), 0), height - 1)
-    column = min(max(int(np.rint(u)), 0), width - 1)
-    for g in range(geometry.shape[3]):
-        mixture[g] = geometry[j, row, column, g]
+    even = channels // LANES * LANES
+    upper, lower = (j * height + y0) * width, (j * height + y1) * width
+    p00, p01, p10, p11 = (upper + x0) * stride, (upper + x1) * stride, (lower + x0) * stride, (lower + x1) * stride
+    for c in range(0, even, LANES):
+        value = multiply(splat(w00), load(maps, p00 + c))
+        value = multiply_add(splat(w01), load(maps, p01 + c), value)
+        value = multiply_add(splat(w10), load(maps, p10 + c), value)
+        value = multiply_add(splat(w11), load(maps, p11 + c), value)
+        store(feature, token * channels + c, value)
+    for c in range(even, channels + 3):
+        one = w00 * maps[j, y0, x0, c] + w01 * maps[j, y0, x1, c] + w10 * maps[j, y1, x0, c] + w11 * maps[j, y1, x1, c]
+        if c < channels:
+            feature[token, c] = one
+        else:
+            rgb[token, c - channels] = one
 
 
 @numba.njit(inline="always", fastmath=True)
-def _cdf(mixture, z):
-    near = sigmoid((z - mixture[0]) / mixture[1])
-    far = sigmoid((z - mixture[2]) / mixture[3])
-    return mixture[4] * near + (1 - mixture[4]) * far
+def _nearest(place, size):
+    """Row or column of the nearest pixel, the border repeated."""
+    return min(max(int(np.rint(place)), 0), size - 1)
+
+
+@numba.njit(inline="always", fastmath=True)
+def _hits(count, ends, shares, cues):
+    """Probability that a view's ray ends in the sample, and that it gets there at all: the first two cues.
+
+    Args:
+        ends: Flat; of each token the arguments of the mixture's two logistics at the sample's near and its far end.
+        shares: (T,) of the first logistic.
+    """
+    for i in range(0, 4 * count, LANES):
+        store(ends, i, logistic(load(ends, i)))
+    for t in range(count):
+        share = shares[t]
+        near = share * ends[4 * t] + (1 - share) * ends[4 * t + 1]
+        far = share * ends[4 * t + 2] + (1 - share) * ends[4 * t + 3]
+        cues[t, 0] = far - near
+        cues[t, 1] = 1 - near
 
 
 @numba.njit(fastmath=True, nogil=True, cache=True)
-def fill_tokens(
-    origin, direction, z, delta, sources, token_view, token_sample, token_label, feature, rgb, cues, mixture
-):
-    """Reproject the samples of one ray into all views (Eq. 4, 5); return the number of tokens that some view sees."""
+def fill_tokens(origin, direction, z, delta, sources, places, data):
+    """Reproject the samples of one ray into all views (Eq. 4, 5); return the number of tokens that some view sees.
+
+    Args:
+        sources: maps, geometry, K, T and labels as ``sray_kernel.render_rays`` takes them.
+        places: View, sample and known label of each token; filled.
+        data: Features, colours and cues of each token, and two buffers of ``_hits``; filled.
+    """
     maps, geometry, K, T, labels = sources
+    token_view, token_sample, token_label = places
+    feature, rgb, cues, ends, shares = data
     count = 0
     height, width = maps.shape[1], maps.shape[2]
     rows, columns = labels.shape[1], labels.shape[2]
@@ -76,20 +101,23 @@ def fill_tokens(
             v = K[j, 1] * py / pz + K[j, 3]
             if not (u > -0.5 and u < width - 0.5 and v > -0.5 and v < height - 0.5):
                 continue
-            _gather_sample(maps, geometry, j, u, v, feature[count], rgb[count], mixture)
+            _gather_sample(maps, j, u, v, count, feature, rgb)
+            pixel = geometry[j, _nearest(v, height), _nearest(u, width)]
             half = np.float32(0.5) * delta[k]
-            cdf_near = _cdf(mixture, pz - half)
-            norm = math.sqrt(px * px + py * py + pz * pz)
-            cues[count, 0] = _cdf(mixture, pz + half) - cdf_near
-            cues[count, 1] = 1 - cdf_near
-            cues[count, 2] = (px * dx + py * dy + pz * dz) / (norm * length)
-            cues[count, 3] = math.log(mixture[1])
-            row = int(np.rint((v + np.float32(0.5)) * np.float32(rows / height) - np.float32(0.5)))
-            column = int(np.rint((u + np.float32(0.5)) * np.float32(columns / width) - np.float32(0.5)))
-            token_label[count] = labels[j, min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)]
-            token_view[count] = j
-            token_sample[count] = k
+            first, second = np.float32(1.0) / pixel[1], np.float32(1.0) / pixel[3]
+            ends[4 * count], ends[4 * count + 1] = (pz - half - pixel[0]) * first, (pz - half - pixel[2]) * second
+            ends[4 * count + 2], ends[4 * count + 3] = (pz + half - pixel[0]) * first, (pz + half - pixel[2]) * second
+            shares[count] = pixel[4]
+            cues[count, 2] = (px * dx + py * dy + pz * dz) / (math.sqrt(px * px + py * py + pz * pz) * length)
+            cues[count, 3] = pixel[5]
+            token_label[count] = -1
+            if rows > 0:
+                row = _nearest((v + np.float32(0.5)) * np.float32(rows / height) - np.float32(0.5), rows)
+                column = _nearest((u + np.float32(0.5)) * np.float32(columns / width) - np.float32(0.5), columns)
+                token_label[count] = labels[j, row, column]
+            token_view[count], token_sample[count] = j, k
             count += 1
+    _hits(count, ends, shares, cues)
     return count
 
 
