@@ -100,9 +100,7 @@ class SamplingConfig(Config, frozen=True):
     free_space: NotNegative = 1  # of the guided samples: between the camera and the guided interval
     guided_sigma: Positive = 0.02  # half width of the guided interval: guided_sigma * z + guided_floor_m
     guided_floor_m: Positive = 0.04
-    least_weight: Share = (
-        0.0  # streaming: samples of a smaller share of their ray's weight are composited without a look
-    )
+    least_weight: Share = 0.0  # streaming: samples of a smaller share of their ray's weight get no look of their own
     near_m: Positive = 0.3
     far_m: Positive = 8.0
 
@@ -164,7 +162,7 @@ class RenderConfig(Config, frozen=True):
     # Rendered rays a side, relative to the frame; lifted to full size along image edges.
     scale: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.25
     # 1 = rays for all its pixels; below, for every fourth a side and, up to this share, where these do not tell enough.
-    share: Share = 0.3
+    share: Share = 0.2
     blind_samples: AtLeastTwo = 32  # a ray, of views of which neither sensor nor map knows any depth
     target_hz: Annotated[float, msgspec.Meta(ge=0)] = (
         0.0  # hold this rate by fewer rays and samples than set; 0 = off, for maps that repeat
@@ -175,8 +173,8 @@ class RenderConfig(Config, frozen=True):
 
 Quality = Literal["custom", "fast", "balanced", "reference"]
 QUALITIES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # of ``sampling`` and of ``render``
-    "fast": ({"mode": "streaming", "guided": 2, "free_space": 0}, {"share": 0.2}),
-    "balanced": ({"mode": "streaming", "guided": 4, "free_space": 1}, {"share": 0.3}),
+    "fast": ({"mode": "streaming", "guided": 2, "free_space": 0, "least_weight": 0.05}, {"share": 0.12}),
+    "balanced": ({"mode": "streaming", "guided": 4, "free_space": 1, "least_weight": 0.02}, {"share": 0.2}),
     "reference": ({"mode": "reference", "coarse": 64, "fine": 64}, {"share": 1.0, "target_hz": 0.0}),
 }
 
@@ -184,7 +182,7 @@ QUALITIES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # of ``sampling
 class MapperConfig(Config, frozen=True):
     """Everything ``MappingPipeline`` needs. The defaults are those of the "balanced" quality."""
 
-    sampling: SamplingConfig = SamplingConfig(guided=4)
+    sampling: SamplingConfig = SamplingConfig(guided=4, least_weight=0.02)
     keyframes: KeyframeConfig = KeyframeConfig()
     voxel_map: VoxelMapConfig = VoxelMapConfig()
     history: HistoryConfig = HistoryConfig()
@@ -197,7 +195,7 @@ class MapperConfig(Config, frozen=True):
 def with_quality(config: MapperConfig) -> MapperConfig:
     """The config with the settings that its ``quality`` stands for; "custom" leaves all as they are.
 
-    "reference" renders all rays with 64 + 64 samples, "balanced" and "fast" at most 0.3 and 0.2 of them, with 4 and 2
+    "reference" renders all rays with 64 + 64 samples, "balanced" and "fast" at most 0.2 and 0.12 of them, with 4 and 2
     samples near the depth prior.
     """
     if config.quality == "custom":
