@@ -11,6 +11,9 @@ from __future__ import annotations
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportUnknownMemberType=false
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUntypedFunctionDecorator=false
 # pyright: reportUntypedClassDecorator=false, reportMissingTypeStubs=false, reportUntypedBaseClass=false
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
@@ -43,6 +46,11 @@ class _LanesModel(PrimitiveModel):
         super().__init__(dmm, fe_type, _FLOATS)
 
 
+def _operation(function: Callable[..., Any]) -> Any:
+    """An intrinsic for compiled code, which calls it without the typing context."""
+    return intrinsic(function)
+
+
 def _constant(value):
     return ir.Constant(_FLOATS, [ir.Constant(ir.FloatType(), float(np.float32(value)))] * LANES)
 
@@ -59,7 +67,7 @@ def _pointer(context, builder, array_type, array, index):
     return builder.bitcast(address, _FLOATS.as_pointer())
 
 
-@intrinsic
+@_operation
 def load(typingctx, array, index):
     """Elements index to index + 7 of a contiguous float32 array, counted flat."""
     _check(array)
@@ -70,7 +78,7 @@ def load(typingctx, array, index):
     return lanes(array, types.intp), codegen
 
 
-@intrinsic
+@_operation
 def store(typingctx, array, index, value):
     """Write the lanes to elements index to index + 7 of a contiguous float32 array, counted flat."""
     _check(array)
@@ -82,7 +90,7 @@ def store(typingctx, array, index, value):
     return types.void(array, types.intp, lanes), codegen
 
 
-@intrinsic
+@_operation
 def splat(typingctx, number):
     """One number in all lanes."""
 
@@ -94,7 +102,7 @@ def splat(typingctx, number):
     return lanes(types.float32), codegen
 
 
-@intrinsic
+@_operation
 def multiply_add(typingctx, a, b, c):
     """a * b + c."""
 
@@ -105,17 +113,17 @@ def multiply_add(typingctx, a, b, c):
     return lanes(lanes, lanes, lanes), codegen
 
 
-@intrinsic
+@_operation
 def add(typingctx, a, b):
     """a + b."""
 
     def codegen(context, builder, signature, args):
-        return builder.fadd(args[0], args[1], flags=_FAST)
+        return _sum(builder, args[0], args[1])
 
     return lanes(lanes, lanes), codegen
 
 
-@intrinsic
+@_operation
 def multiply(typingctx, a, b):
     """a * b."""
 
@@ -125,39 +133,47 @@ def multiply(typingctx, a, b):
     return lanes(lanes, lanes), codegen
 
 
-@intrinsic
+@_operation
 def larger(typingctx, a, b):
     """The larger of each two."""
 
     def codegen(context, builder, signature, args):
-        return builder.select(builder.fcmp_ordered(">", args[0], args[1]), args[0], args[1])
+        return _larger(builder, args[0], args[1])
 
     return lanes(lanes, lanes), codegen
+
+
+def _sum(builder, a, b):
+    return builder.fadd(a, b, flags=_FAST)
+
+
+def _larger(builder, a, b):
+    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
 
 
 def _reduce(builder, value, combine):
     for step in (4, 2, 1):
         order = ir.Constant(_INTS, [(i + step) % LANES for i in range(LANES)])
-        value = combine(value, builder.shuffle_vector(value, value, order))
+        value = combine(builder, value, builder.shuffle_vector(value, value, order))
     return builder.extract_element(value, cgutils.int32_t(0))
 
 
-@intrinsic
+@_operation
 def total(typingctx, value):
     """Sum of the lanes."""
 
     def codegen(context, builder, signature, args):
-        return _reduce(builder, args[0], lambda a, b: builder.fadd(a, b, flags=_FAST))
+        return _reduce(builder, args[0], _sum)
 
     return types.float32(lanes), codegen
 
 
-@intrinsic
+@_operation
 def largest(typingctx, value):
     """The largest lane."""
 
     def codegen(context, builder, signature, args):
-        return _reduce(builder, args[0], lambda a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
+        return _reduce(builder, args[0], _larger)
 
     return types.float32(lanes), codegen
 
@@ -173,7 +189,7 @@ def _add_pairs(builder, a, b):
     return builder.fadd(even, odd, flags=_FAST)
 
 
-@intrinsic
+@_operation
 def totals(typingctx, a, b, c, d, e, f, g, h):
     """Eight sums, one of each argument's lanes."""
 
@@ -187,7 +203,7 @@ def totals(typingctx, a, b, c, d, e, f, g, h):
     return lanes(*[lanes] * LANES), codegen
 
 
-@intrinsic
+@_operation
 def swap_halves(typingctx, value):
     """The upper four lanes, then the lower four."""
 
@@ -213,7 +229,7 @@ def _exp_below(builder, value):
     return builder.fmul(p, builder.bitcast(power, _FLOATS), flags=_FAST)
 
 
-@intrinsic
+@_operation
 def exp_below(typingctx, value):
     """exp of each lane, for values <= 0, relative error below 1e-6; values under -87 give e^-87."""
 
@@ -223,7 +239,7 @@ def exp_below(typingctx, value):
     return lanes(lanes), codegen
 
 
-@intrinsic
+@_operation
 def logistic(typingctx, value):
     """1 / (1 + exp(-x)) of each lane."""
 
