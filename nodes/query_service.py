@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from types import TracebackType
+from typing import Self
 
 import structlog
 
@@ -89,7 +90,7 @@ class QueryService:
         self._thread.join()
         self._server.close()
 
-    def __enter__(self) -> QueryService:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
@@ -107,9 +108,12 @@ class QueryService:
             while not self._closed.is_set() and (asked := self._server.receive()) is not None:
                 self._await_mirror()
                 client, parts = asked
-                self._server.send(client, self._answers.answer(parts))
+                self._server.send(client, self._answer(parts))
                 self.answered += 1
                 self._take_deliveries()
+
+    def _answer(self, parts: list[bytes]) -> list[bytes]:
+        return self._answers.answer(parts)
 
     def _await_mirror(self) -> None:
         """After a pause, wait until the mirror has come up to the map as it is now."""

@@ -10,12 +10,15 @@ from typing import Any
 import msgspec
 from rich.table import Table
 
+from nodes.bench_queries import bench_queries
 from nodes.console import Output, frame_progress
 from replay.bench import bench_render, log_scenes, room_scenes
 from replay.bench_growth import AXES, bench_growth
-from replay.bench_map import bench_fusion, bench_pipeline
+from replay.bench_map import bench_fusion, bench_pipeline, bench_qualities
 from replay.bench_virtual import bench_virtual
 from replay.bench_walk import WalkPlan, bench_walk
+from replay.growth_plot import write_growth_plot
+from replay.pipeline_plot import write_pipeline_plot
 from replay.walk_plot import write_walk_plot
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
@@ -31,6 +34,14 @@ class RenderRequest:
 
 
 @dataclass(frozen=True, slots=True)
+class QueriesRequest:
+    """So many questions a second, while images of this width are mapped."""
+
+    rate_hz: float
+    width: int
+
+
+@dataclass(frozen=True, slots=True)
 class BenchRequest:
     """What the options of ``bench`` ask for.
 
@@ -41,8 +52,9 @@ class BenchRequest:
         frames: That count.
         plan: Of the long walk.
         memory_mb: In the long walk, in place of what ``config`` says; None = as it says.
-        plot: Where to draw the long walk; None = nowhere.
+        plot: Where to draw the long walk, the growth, or the stages of a step; None = nowhere.
         virtual: Rooms, and virtual views at most in each.
+        queries: Of the questions.
     """
 
     weights: Path | None
@@ -53,6 +65,7 @@ class BenchRequest:
     memory_mb: int | None
     plot: Path | None
     virtual: tuple[int, int]
+    queries: QueriesRequest
 
 
 def run_render(request: BenchRequest, output: Output) -> dict[str, Any]:
@@ -87,6 +100,10 @@ def run_pipeline(request: BenchRequest, output: Output) -> dict[str, Any]:
         f"pipeline at {found['size']}: {found['hz']} frames/s, a step {found['p50_ms']} ms (p50), "
         f"{found['p95_ms']} ms (p95); mIoU {found['miou'] * 100:.1f} %; stages in ms: {stages}"
     )
+    if request.plot is not None:
+        qualities = bench_qualities(request.weights, request.config, request.frames, found)
+        write_pipeline_plot(qualities, request.plot)
+        found = {**found, "qualities": qualities}
     return found
 
 
@@ -121,9 +138,12 @@ def run_growth(request: BenchRequest, output: Output) -> list[dict[str, Any]]:
     """Measure steps as one setting grows."""
     with frame_progress("growth", sum(map(len, AXES.values())), "runs") as bar:
         found = bench_growth(request.weights, request.config, request.frames, request.plan.width, bar.set)
-    table = Table(title=f"a step as one setting grows, width {request.plan.width}")
+    if request.plot is not None:
+        size = f"{request.plan.width}x{request.plan.width * 3 // 4}"
+        write_growth_plot(found, request.plot, f"a step at {size} as one setting grows, the others as they are")
+    table = Table(title=f"ms of a step as one setting grows, width {request.plan.width}")
     for column in found[0]:
-        table.add_column(column, justify="left" if column == "axis" else "right")
+        table.add_column(column.removesuffix("_ms"), justify="left" if column == "axis" else "right")
     for row in found:
         table.add_row(*(f"{v:,}" if isinstance(v, int) else f"{v}" for v in row.values()))
     output.print(table)
@@ -134,6 +154,25 @@ def run_virtual(request: BenchRequest, output: Output) -> dict[str, Any]:
     """Measure what virtual views bring."""
     found = bench_virtual(request.weights, request.config, *request.virtual)
     output.print(_virtual_table(found))
+    return found
+
+
+def run_queries(request: BenchRequest, output: Output) -> dict[str, Any]:
+    """Measure questions to a map that is being built."""
+    asked = request.queries
+    found = bench_queries(request.weights, request.config, request.frames, asked.rate_hz, asked.width)
+    table = Table(title=f"questions while {found['size']} frames are mapped, {found['asked_hz']:g} a second")
+    for column in ("question", "asked", "p50, ms", "p95, ms"):
+        table.add_column(column, justify="left" if column == "question" else "right")
+    for kind, count in found["asked"].items():
+        table.add_row(kind, str(count), f"{found['p50_ms'][kind]:g}", f"{found['p95_ms'][kind]:g}")
+    output.print(table)
+    output.print(
+        f"a step {found['asked_step_p50_ms']} ms (p50), {found['asked_step_p95_ms']} ms (p95), with nobody asking "
+        f"{found['quiet_step_p50_ms']} and {found['quiet_step_p95_ms']} ms ({found['step_ratio']} and "
+        f"{found['step_p95_ratio']} times; processor time {found['cpu_ratio']} times); of it, handing changes over "
+        f"{found['follow_p95_ms']} ms (p95); waiting for an answer at most {found['longest_wait_ms']:g} ms"
+    )
     return found
 
 
@@ -167,4 +206,5 @@ MEASUREMENTS: dict[str, Callable[[BenchRequest, Output], Any]] = {
     "growth": run_growth,
     "map": run_map,
     "virtual": run_virtual,
+    "queries": run_queries,
 }

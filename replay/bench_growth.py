@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from replay.bench_walk import WARM_UP, wide_camera
+from replay.bench_walk import WARM_UP, timed_step, wide_camera
 from replay.session import load_pipeline, make_field
 from semantic_mapper.config import MapperConfig, convert_config, to_plain, with_quality
 from semantic_mapper.fields.sray import SRay
@@ -40,7 +39,8 @@ def bench_growth(
 ) -> list[dict[str, Any]]:
     """Step through the same frames of a test room, each time with one setting changed.
 
-    With other numbers of classes the field has random weights: it takes the time of trained ones.
+    The runs of a setting go through the frames together, in turns, so that what else the machine does meanwhile slows
+    all of them alike. With other numbers of classes the field has random weights: it takes the time of trained ones.
 
     Args:
         weights: None = those that ship with the package.
@@ -51,18 +51,20 @@ def bench_growth(
 
     Returns:
         One dict a run: ``axis`` and ``value`` (what was changed), medians ``step_ms``, ``cpu_ms`` (processor time of
-        the step), ``render_ms``, ``fuse_ms``, mean ``rays``, and ``blocks`` of the map at the end. The value of axis
-        "blocks" is how many the map held before, most of them on disk.
+        the step), ``render_ms``, ``fuse_ms``, means ``rays`` and ``views`` (source views in use, with the frame itself:
+        of those that are allowed, as many as see it), and ``blocks`` of the map at the end. The value of axis "blocks"
+        is how many the map held before, most of them on disk.
     """
-    posed = list(room_frames(TEST_SEEDS[0], frames + WARM_UP, wide_camera(width), path=CameraPathConfig(step_m=STEP_M)))
-    runs = [(axis, value) for axis, values in AXES.items() for value in values]
+    count = WARM_UP + max(SOURCE_VIEWS) + frames  # those that count have as many source views as are allowed
+    posed = list(room_frames(TEST_SEEDS[0], count, wide_camera(width), path=CameraPathConfig(step_m=STEP_M)))
     found: list[dict[str, Any]] = []
-    for axis, value in runs:
-        pipeline = _pipeline(weights, config, axis, value)
+    for axis, values in AXES.items():
+        pipelines = [_pipeline(weights, config, axis, value) for value in values]
         if axis == "blocks":
-            value = _fill(pipeline, posed, int(value))
-        found.append({"axis": axis, "value": value, **_measure(pipeline, posed)})
-        on_run(len(found))
+            values = [_fill(pipeline, posed, int(value)) for pipeline, value in zip(pipelines, values, strict=True)]
+        for value, figures in zip(values, _measure(pipelines, posed, frames), strict=True):
+            found.append({"axis": axis, "value": value, **figures})
+            on_run(len(found))
     return found
 
 
@@ -113,20 +115,28 @@ def _fill(pipeline: MappingPipeline, posed: Sequence[PosedFrame], copies: int) -
     return pipeline.voxel_map.block_count
 
 
-def _measure(pipeline: MappingPipeline, posed: Sequence[PosedFrame]) -> dict[str, Any]:
-    rows: list[tuple[float, ...]] = []
-    for frame in posed:
-        began, worked = time.perf_counter(), time.process_time()
-        update = pipeline.step(frame)
-        spent = (time.perf_counter() - began) * 1e3, (time.process_time() - worked) * 1e3
-        rows.append((*spent, update.stage_ms["render"], update.stage_ms["fuse"], update.rays))
-    counted = np.array(rows[WARM_UP:])
-    step_ms, cpu_ms, render_ms, fuse_ms = (round(float(v), 2) for v in np.median(counted[:, :4], axis=0))
-    return {
-        "step_ms": step_ms,
-        "cpu_ms": cpu_ms,
-        "render_ms": render_ms,
-        "fuse_ms": fuse_ms,
-        "rays": round(float(counted[:, 4].mean())),
-        "blocks": pipeline.voxel_map.block_count,
-    }
+def _measure(pipelines: Sequence[MappingPipeline], posed: Sequence[PosedFrame], frames: int) -> list[dict[str, Any]]:
+    """Figures of each pipeline over the last ``frames``, stepped in turns."""
+    rows = [[_timed_step(pipeline, frame) for pipeline in pipelines] for frame in posed]
+    counted = np.array(rows[-frames:])  # (frames, pipelines, figures)
+    times, means = np.median(counted[:, :, :4], axis=0), counted[:, :, 4:].mean(axis=0)
+    return [
+        {
+            **{name: round(float(ms), 2) for name, ms in zip(_TIMES, of_times, strict=True)},
+            "rays": round(float(rays)),
+            "views": round(float(views), 1),
+            "blocks": pipeline.voxel_map.block_count,
+        }
+        for pipeline, of_times, (rays, views) in zip(pipelines, times, means, strict=True)
+    ]
+
+
+_TIMES = ("step_ms", "cpu_ms", "render_ms", "fuse_ms")
+
+
+def _timed_step(pipeline: MappingPipeline, frame: PosedFrame) -> tuple[float, ...]:
+    """As ``_TIMES``, and rays and source views."""
+    update, step_ms, cpu_ms = timed_step(pipeline, frame)
+    stages = update.stage_ms
+    views = len(update.source_seqs) + pipeline.config.keyframes.use_current_view
+    return step_ms, cpu_ms, stages["render"], stages["fuse"], update.rays, views

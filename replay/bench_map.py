@@ -9,12 +9,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from replay.session import load_pipeline
-from semantic_mapper.config import MapperConfig, VoxelMapConfig
+from semantic_mapper.config import MapperConfig, Quality, VoxelMapConfig, with_quality
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import ROOMS, make_label_set
@@ -28,6 +29,7 @@ VGA = CameraIntrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
 STEP_M = 0.1  # of way between frames
 COARSE = (120, 160)  # size of the rendered view that is lifted, as the pipeline has it
 CLASSES = (20, 40)
+QUALITIES_COMPARED: tuple[Quality, ...] = ("fast", "balanced")
 WARM_UP = 3  # frames that do not count: compiling, first growth
 
 
@@ -109,6 +111,23 @@ def bench_pipeline(weights: Path | None, config: MapperConfig, frames: int = 40)
         "miou": round(score, 4),
         "quality": config.quality,
     }
+
+
+def bench_qualities(weights: Path | None, config: MapperConfig, frames: int, known: dict[str, Any]) -> dict[str, Any]:
+    """``bench_pipeline`` of the qualities in ``QUALITIES_COMPARED``, by name.
+
+    Args:
+        weights: None = those that ship with the package.
+        config: Of the mapper; its own quality does not matter.
+        frames: That count, in each.
+        known: What ``bench_pipeline`` found of ``config``, not measured again if it is one of them.
+    """
+    found: dict[str, Any] = {}
+    for quality in QUALITIES_COMPARED:
+        wanted = with_quality(msgspec.structs.replace(config, quality=quality))
+        same = msgspec.structs.replace(with_quality(config), quality=quality) == wanted
+        found[quality] = known if same else bench_pipeline(weights, wanted, frames)
+    return found
 
 
 class _Open3DFusion:

@@ -104,7 +104,7 @@ def bench_walk(
             keys, digest = left[visit.room]
             unchanged += _digest(pipeline.voxel_map, keys) == digest
         for frame in visit.frames:
-            log.note(visit, frame, *_timed_step(pipeline, frame))
+            log.note(visit, frame, *timed_step(pipeline, frame))
             on_frame(log.frames)
         if not visit.returning and visit.room < plan.returns:
             keys = pipeline.voxel_map.changed_since(entered)
@@ -138,6 +138,13 @@ def slope_percent(minutes: NDArray[np.float64], values: NDArray[np.float64]) -> 
     if len(values) < 2 or np.ptp(minutes) == 0:
         return 0.0
     return float(100 * np.polyfit(minutes, values, 1)[0] / np.mean(values))
+
+
+def timed_step(pipeline: MappingPipeline, frame: PosedFrame) -> tuple[MapUpdate, float, float]:
+    """What the step gave, and its milliseconds on the clock and of processor time."""
+    began, worked = time.perf_counter(), time.process_time()
+    update = pipeline.step(frame)
+    return update, (time.perf_counter() - began) * 1e3, (time.process_time() - worked) * 1e3
 
 
 @dataclass(slots=True)
@@ -247,13 +254,6 @@ _COLUMNS: tuple[str, ...] = (
     "keyframes",
     "source_views",
 )
-
-
-def _timed_step(pipeline: MappingPipeline, frame: PosedFrame) -> tuple[MapUpdate, float, float]:
-    """What the step gave, and its milliseconds on the clock and of processor time."""
-    began, worked = time.perf_counter(), time.process_time()
-    update = pipeline.step(frame)
-    return update, (time.perf_counter() - began) * 1e3, (time.process_time() - worked) * 1e3
 
 
 def _digest(voxel_map: VoxelMap, keys: NDArray[np.int32]) -> str:

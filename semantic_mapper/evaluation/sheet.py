@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,17 +86,20 @@ def draw_sheet(rows: Sequence[SheetRow], methods: Sequence[str], label_set: Labe
 
 
 def write_picture(path: Path, picture: UInt8) -> None:
-    """Write an RGB picture (H, W, 3) as PNG.
+    """Write an RGB picture (H, W, 3) as PNG, whole or not at all.
 
     Raises:
         SemanticMapperError: it cannot be encoded or written.
     """
-    encoded, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    small = (cv2.IMWRITE_PNG_COMPRESSION, 6)  # half the size that it has by default
+    encoded, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), small)
     if not encoded:
         raise SemanticMapperError(f"{path}: the picture could not be encoded as PNG")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data.tobytes())
+        part = path.with_name("part." + path.name)
+        part.write_bytes(data.tobytes())
+        os.replace(part, path)
     except OSError as error:
         raise SemanticMapperError(f"{path}: cannot be written: {error}") from error
 

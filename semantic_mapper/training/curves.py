@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
-
-from semantic_mapper.evaluation.canvas import GAP, MARGIN, new_canvas
-from semantic_mapper.evaluation.plot import Curve, draw_panel
-
-PANEL_WIDTH, PANEL_HEIGHT = 460, 320
+from semantic_mapper.evaluation.plot import Curve, Panel, draw_panels
+from semantic_mapper.evaluation.sheet import write_picture
 
 
 def write_curves(history: Sequence[dict[str, Any]], path: Path) -> None:
@@ -26,13 +21,8 @@ def write_curves(history: Sequence[dict[str, Any]], path: Path) -> None:
         ),
         ("learning rate", [_curve(history, "rate", "")]),
     )
-    picture = new_canvas(2 * MARGIN + 3 * PANEL_WIDTH + 2 * GAP, 2 * MARGIN + PANEL_HEIGHT)
-    for number, (title, curves) in enumerate(panels):
-        x = MARGIN + number * (PANEL_WIDTH + GAP)
-        draw_panel(picture[MARGIN : MARGIN + PANEL_HEIGHT, x : x + PANEL_WIDTH], title, [c for c in curves if c.points])
-    part = path.with_name("part." + path.name)
-    cv2.imwrite(os.fspath(part), picture[..., ::-1])
-    os.replace(part, path)
+    drawn = [Panel(title, tuple(c for c in curves if c.points), "step") for title, curves in panels]
+    write_picture(path, draw_panels("", drawn))
 
 
 def _curve(history: Sequence[dict[str, Any]], key: str, name: str, scale: float = 1.0) -> Curve:

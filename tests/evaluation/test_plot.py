@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.evaluation.canvas import PANEL
-from semantic_mapper.evaluation.plot import Curve, draw_panel, ticks
+from semantic_mapper.evaluation.plot import Bar, Curve, Panel, draw_bars, draw_panel, draw_panels, ticks
 
 
 def test_curves_are_drawn_where_their_points_are():
@@ -21,6 +21,33 @@ def test_marked_points_are_seen():
     draw_panel(marked, "", [Curve("", points, marked=True)])
     rows, columns = np.nonzero((plain != marked).any(-1))
     assert len(rows) and (columns < 300).all(), "the last point is marked in both"
+
+
+def test_the_title_of_an_axis_stands_below_its_numbers_and_nothing_is_cut():
+    plain, titled = (np.zeros((320, 460, 3), np.uint8) for _ in range(2))
+    curve = Curve("", ((0.0, 0.0), (100.0, 100.0)))
+    draw_panel(plain, "", [curve])
+    draw_panel(titled, "", [curve], "classes (gjpqy)")
+    text = np.argwhere((titled.astype(int).sum(-1) > 500) & (np.arange(320) > 285)[:, None])
+    assert len(text) and text[:, 0].max() < 318 and 180 < text[:, 1].mean() < 340
+    assert (plain[310:] == PANEL).all() and (titled[295:310] != PANEL).any()
+
+
+def test_panels_stand_in_rows_under_the_title():
+    panels = [Panel(f"{number}", (Curve("", ((0.0, 0.0), (1.0, 1.0))),)) for number in range(4)]
+    alone, three, four = (draw_panels("title", panels[:count]) for count in (1, 3, 4))
+    assert alone.shape == three.shape and four.shape[1] == three.shape[1]
+    assert four.shape[0] - three.shape[0] > 300
+    assert (four[: three.shape[0] - 24] == three[:-24]).all() and (four[-200:, 700:] == four[-1, -1]).all()
+
+
+def test_bars_are_as_long_as_their_parts():
+    picture = draw_bars("", [Bar("one", {"a": 60.0, "b": 20.0}), Bar("other", {"b": 40.0})], "ms").astype(int)
+    counts = [(np.abs(picture - color).sum(-1) < 12).sum(axis=1) for color in ((94, 180, 255), (255, 164, 92))]
+    a, b = (np.flatnonzero(count > 100) for count in counts)
+    assert len(a) == 34 and len(b) == 2 * 34, "one bar has the first part, both the second"
+    assert counts[0][a[0]] == pytest.approx(3 * counts[1][b[0]], abs=3)
+    assert counts[1][b[-1]] == pytest.approx(2 * counts[1][b[0]], abs=3)
 
 
 @pytest.mark.parametrize(

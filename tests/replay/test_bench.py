@@ -1,8 +1,11 @@
+import cv2
 import pytest
 
+import replay.bench_map as bench_map
 from replay.bench import bench_render, log_scenes, room_scenes
-from replay.bench_map import bench_fusion, bench_pipeline
+from replay.bench_map import bench_fusion, bench_pipeline, bench_qualities
 from replay.log import LogWriter
+from replay.pipeline_plot import step_parts, write_pipeline_plot
 from semantic_mapper.config import MapperConfig, with_quality
 from semantic_mapper.errors import LogError
 from semantic_mapper.fields.checkpoint import Checkpoint
@@ -41,6 +44,25 @@ def test_fusion_is_measured_against_open3d():
     assert found["ratio_20"] == pytest.approx(found["ms_20"] / found["open3d_ms"], rel=0.1)
     assert found["ratio_40"] > 0
     assert found["blocks"] >= 0.9 * found["open3d_blocks"] > 0  # Open3D looks at every fourth pixel
+
+
+def test_the_stages_of_a_step_are_drawn_by_quality(tmp_path, monkeypatch):
+    measured = []
+    stages = {"encode": 29.0, "render": 100.0, "choose": 0.2}
+
+    def bench(weights, config, frames):
+        measured.append((config.quality, config.sampling.guided, frames))
+        return {"size": "640x480", "p50_ms": 140.0, "stages_ms": stages}
+
+    monkeypatch.setattr(bench_map, "bench_pipeline", bench)
+    known = {"size": "640x480", "p50_ms": 90.0, "stages_ms": stages}
+    found = bench_qualities(None, MapperConfig(quality="fast"), 7, known)
+    assert list(found) == ["fast", "balanced"] and found["fast"] is known
+    assert measured == [("balanced", 4, 7)]
+    assert step_parts(found["balanced"]) == {"encode": 29.0, "render": 100.0, "rest": pytest.approx(11.0)}
+    assert step_parts(known) == {"encode": 29.0, "render": 100.0}, "medians may add up to more than the median"
+    write_pipeline_plot(found, tmp_path / "steps.png")
+    assert cv2.imread(str(tmp_path / "steps.png")).shape[1] > 900
 
 
 def test_pipeline_reports_its_rate_its_stages_and_what_the_labels_are_worth():

@@ -12,6 +12,7 @@ import replay.bench_growth as bench_growth_module
 import replay.bench_walk as bench_walk_module
 from replay.bench_growth import bench_growth
 from replay.bench_walk import WalkPlan, bench_walk, slope_percent
+from replay.growth_plot import AXIS_TITLES, write_growth_plot
 from replay.walk_plot import write_walk_plot
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.mapping.block_grid import LEAST_RESIDENT
@@ -92,7 +93,7 @@ def test_growth_changes_one_setting_at_a_time(weights: Path, monkeypatch: pytest
     axes = {
         "classes": (3,),
         "voxel_cm": (10, 5),
-        "views": (2,),
+        "views": (2, 6),
         "samples": (4,),
         "ray_share": (0.3, 1.0),
         "blocks": (0, 2),
@@ -100,7 +101,7 @@ def test_growth_changes_one_setting_at_a_time(weights: Path, monkeypatch: pytest
     monkeypatch.setattr(bench_growth_module, "AXES", axes)
     done: list[int] = []
     found = {(run["axis"], run["value"]): run for run in bench_growth(weights, CONFIG, 1, 96, done.append)}
-    assert done == list(range(1, 10)) and len(found) == 9
+    assert done == list(range(1, 11)) and len(found) == 10
     assert 2 * found["voxel_cm", 10]["blocks"] < found["voxel_cm", 5]["blocks"]
     assert found["ray_share", 0.3]["rays"] < found["ray_share", 1.0]["rays"] == 24 * 18
     (filled,) = (run for (axis, value), run in found.items() if axis == "blocks" and value > 0)
@@ -109,6 +110,28 @@ def test_growth_changes_one_setting_at_a_time(weights: Path, monkeypatch: pytest
         3 * alone, rel=0.1
     )
     assert all(0 < run["fuse_ms"] < run["step_ms"] for run in found.values())
+    assert all(run["cpu_ms"] > 0 and 1 <= run["views"] <= 2 for run in found.values() if run["value"] != 6)
+    assert found["views", 2]["views"] == 2 and found["views", 6]["views"] > 4, "as many as are allowed, or nearly"
+
+
+def test_growth_is_drawn_with_a_panel_for_each_setting(tmp_path: Path) -> None:
+    """A step that doubles from the first value to the last rises as high, whatever order the runs come in."""
+    assert set(AXIS_TITLES) == set(bench_growth_module.AXES)
+    times = {"cpu_ms": 3.0, "render_ms": 2.0, "fuse_ms": 1.0}
+    runs = [
+        {"axis": axis, "value": value, "step_ms": 10.0 * value, **times} for axis in AXIS_TITLES for value in (2, 1)
+    ]
+    drawn = []
+    for some in (runs, runs[::-1], runs[:-2]):
+        write_growth_plot(some, tmp_path / "growth.png", "growth")
+        drawn.append(cv2.imread(str(tmp_path / "growth.png"))[..., ::-1].astype(int))
+    assert (drawn[0] == drawn[1]).all()
+    changed = np.argwhere((drawn[0] != drawn[2]).any(axis=-1))
+    assert (changed.min(axis=0) > (350, 900)).all(), "only the panel of the last setting, at the lower right"
+    panel = drawn[0][134:384, 24:484]  # the first one, below its legend
+    cpu, step = (np.argwhere(np.abs(panel - c).sum(axis=-1) < 60) for c in ((94, 180, 255), (255, 164, 92)))
+    assert len(cpu) and np.ptp(cpu[:, 0]) < 12, "the same for all values"
+    assert step[step[:, 1].argmin(), 0] > step[step[:, 1].argmax(), 0] + 60
 
 
 def test_slopes_are_in_percent_of_the_mean() -> None:
