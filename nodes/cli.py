@@ -8,7 +8,18 @@ from typing import Annotated
 
 import typer
 
-from nodes import cli_demo, cli_doctor, cli_eval, cli_export, cli_finetune, cli_log, cli_query, cli_replay, cli_up
+from nodes import (
+    cli_correct,
+    cli_demo,
+    cli_doctor,
+    cli_eval,
+    cli_export,
+    cli_finetune,
+    cli_log,
+    cli_query,
+    cli_replay,
+    cli_up,
+)
 from nodes.verb import Settings
 from semantic_mapper import __version__
 
@@ -32,6 +43,7 @@ for _function in (
     cli_export.merge,
     cli_finetune.finetune,
     cli_eval.evaluate,
+    cli_correct.correct,
     cli_doctor.doctor,
 ):
     app.command(_function.__name__.rstrip("_").replace("evaluate", "eval"))(_function)

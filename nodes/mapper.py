@@ -15,6 +15,7 @@ from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.memory import give_back_freed_memory
 
 if TYPE_CHECKING:
+    from nodes.live_correction import LiveCorrection
     from nodes.query_service import QueryService
     from replay.session import MapSession, PipelineBundle
     from semantic_mapper.transport.messages import EndOfStream, NodeState, StreamInfo
@@ -36,6 +37,7 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
         MapError: the map is full, or cannot be written.
         TransportError: an endpoint is taken.
     """
+    from nodes.live_correction import LiveCorrection
     from nodes.outputs import prepare_folder
     from nodes.run_replay import mapper_config
     from replay.session import load_pipeline
@@ -45,15 +47,16 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
     prepare_folder(Path(options.out))
     config = mapper_config(Path(options.config) if options.config else None, options.voxel_size_m or None)
     bundle = load_pipeline(Path(options.weights) if options.weights else None, config)
+    correction = LiveCorrection(bundle.pipeline)
     exclude = load_checkpoint(Path(options.eval_exclude)).train_stamps_ns if options.eval_exclude else frozenset[int]()
     subscribe = LosslessSubscriber if options.delivery == "all" else NewestSubscriber
     with (
         Publisher(context.endpoint(context.name)) as publisher,
         subscribe(context.endpoint(options.input), ("info", "frame", "end")) as frames,
-        _answering(context, options, bundle) as queries,
+        _answering(context, options, bundle, correction) as queries,
     ):
         _log.info("ready", weights=bundle.weights_path.name, input=options.input, delivery=options.delivery)
-        mapper = _Mapper(context, options, bundle, exclude, publisher, frames, queries)
+        mapper = _Mapper(context, options, bundle, exclude, publisher, frames, queries, correction)
         try:
             mapper.run()
         except BaseException as error:
@@ -65,7 +68,7 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
 
 
 def _answering(
-    context: NodeContext, options: MapperOptions, bundle: PipelineBundle
+    context: NodeContext, options: MapperOptions, bundle: PipelineBundle, correction: LiveCorrection
 ) -> QueryService | nullcontext[None]:
     """The query service, or nothing where none is wanted."""
     from nodes.query_service import QueryService
@@ -73,7 +76,7 @@ def _answering(
     if not options.query:
         return nullcontext()
     endpoint = options.query if "://" in options.query else context.endpoint(options.query)
-    return QueryService(endpoint, bundle.pipeline.voxel_map)
+    return QueryService(endpoint, bundle.pipeline.voxel_map, correction)
 
 
 class _Mapper:
@@ -88,6 +91,7 @@ class _Mapper:
         publisher: Publisher,
         frames: LosslessSubscriber | NewestSubscriber,
         queries: QueryService | None,
+        correction: LiveCorrection,
     ) -> None:
         self._context = context
         self._options = options
@@ -96,6 +100,7 @@ class _Mapper:
         self._publisher = publisher
         self._frames = frames
         self._queries = queries
+        self._correction = correction
         self._session: MapSession | None = None
         self._ended_by = "error"
         self._early = 0
@@ -108,7 +113,7 @@ class _Mapper:
         from semantic_mapper.types import PosedFrame
 
         while not self._context.stop:
-            message = self._frames.receive(POLL_S)
+            message = self._frames.receive(0.0 if self._correction.running else POLL_S)
             match message:
                 case StreamInfo():
                     self._begin(message)
@@ -119,6 +124,7 @@ class _Mapper:
                     return
                 case _:
                     pass
+            self._correction.carry_on(self._session, mapped=isinstance(message, PosedFrame))
             if self._queries is not None:
                 self._queries.follow()
             self._tell_status("running")
@@ -135,6 +141,7 @@ class _Mapper:
             _log.warning("nothing_to_write", reason="no stream has begun")
             return
         self._tell_status("stopping", now=True)
+        self._correction.finish(self._session, lambda: bool(self._context.stop), lambda: self._tell_status("stopping"))
         out = Path(self._options.out)
         summary = finish_session(self._session, out, self._ended_by)
         _log.info("map_written", out=str(out), **summary["frames"])
@@ -200,11 +207,12 @@ class _Mapper:
             counters |= {"published": s.published, "fused": s.fused, "refused": len(s.refusals), "dropped": s.dropped}
         silent = self._frames.silent_s
         ages = {} if silent is None else {"frame": silent}
-        degraded: tuple[str, ...] = ()
+        counters |= self._correction.counters
+        degraded = self._correction.degraded
         if self._queries is not None:
             counters["answered"] = self._queries.answered
             if not self._queries.alive:
-                degraded = ("questions about the map are no longer answered; see the log",)
+                degraded += ("questions about the map are no longer answered; see the log",)
         status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, degraded)
         self._publisher.publish(encode_status(status))
 

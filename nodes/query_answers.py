@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import structlog
 
+from nodes.live_correction import LiveCorrection
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.queries.boxes import points_in_box
 from semantic_mapper.queries.instances import Instance, InstanceTracker
@@ -41,11 +42,13 @@ class Answers:
 
     Args:
         relay: Of the mirror.
+        correction: Takes corrected poses; without it they are refused.
     """
 
-    def __init__(self, relay: MirrorRelay) -> None:
+    def __init__(self, relay: MirrorRelay, correction: LiveCorrection | None = None) -> None:
         self.map_id = uuid.uuid4().hex
         self._relay = relay
+        self._correction = correction
         self._trackers: dict[messages.Point, InstanceTracker] = {}
         self._things: dict[messages.Point, tuple[int, tuple[Instance, ...]]] = {}  # and the version they are of
 
@@ -86,8 +89,23 @@ class Answers:
                 return self._distances(snapshot, header)
             case messages.ChangesRequest():
                 return self._changes(snapshot, header)
+            case messages.CorrectPosesRequest() | messages.CorrectionRequest():
+                return self._correct(snapshot, header, arrays)
             case _:
                 raise MapError(f"{type(header).__name__}: cannot be answered")
+
+    def _correct(
+        self,
+        snapshot: MapSnapshot,
+        header: messages.CorrectPosesRequest | messages.CorrectionRequest,
+        arrays: Arrays,
+    ) -> Answer:
+        correction = self._correction
+        if correction is None:
+            raise MapError("poses cannot be corrected here: this service only answers questions")
+        is_new = isinstance(header, messages.CorrectPosesRequest)
+        state = correction.begin(header, arrays) if is_new else correction.describe()
+        return messages.CorrectionAnswer(**self._about(snapshot), **state), {}
 
     def _about(self, snapshot: MapSnapshot) -> dict[str, Any]:
         return {"map_id": self.map_id, "version": snapshot.version, "epoch": snapshot.epoch}
@@ -149,6 +167,11 @@ class Answers:
             map_id=self.map_id, version=found.version, epoch=found.epoch, since=found.since, newest=snapshot.version
         )
         return answer, {name: getattr(found, name) for name in messages.QUESTIONS["changes"].gives}
+
+
+def is_about_map(parts: Parts) -> bool:
+    """Whether the answer comes from the mirror, which has to be up to date for it."""
+    return bytes(parts[0][:32]) not in (b"correct_poses", b"correction") if parts else False
 
 
 def _thing_arrays(things: Sequence[Instance]) -> Arrays:

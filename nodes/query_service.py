@@ -10,8 +10,9 @@ from typing import Self
 
 import structlog
 
-from nodes.query_answers import Answers
-from semantic_mapper.mapping.changes import BlockChanges
+from nodes.live_correction import LiveCorrection
+from nodes.query_answers import Answers, is_about_map
+from semantic_mapper.mapping.changes import CopiedChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.relay import MirrorRelay
@@ -23,7 +24,7 @@ MAX_SHARE = 0.1  # of the mapper's time that deliveries may take; the pause afte
 ASKED_LATELY_S = 5.0  # without a question for so long, the mirror is fed no more
 CATCH_UP_S = 2.0  # how long the first question after that waits for the mirror; then it is answered as it is
 FIRST_CATCH_UP_S = 60.0  # how long the very first one waits: kernels may compile, and an empty mirror says nothing true
-MAX_BLOCKS = 2000  # of a delivery (unless one frame has more): bounds what a step may cost
+MAX_BLOCKS = 600  # of a delivery (unless one frame has more): bounds what a step may cost
 _WAIT_S = 0.5
 
 _log = structlog.get_logger(__name__)
@@ -38,19 +39,20 @@ class QueryService:
     Args:
         endpoint: Where to listen.
         voxel_map: The map; only ``follow`` reads it.
+        correction: Takes corrected poses; without it they are refused.
 
     Raises:
         TransportError: the endpoint is taken or cannot be bound.
     """
 
-    def __init__(self, endpoint: str, voxel_map: VoxelMap) -> None:
+    def __init__(self, endpoint: str, voxel_map: VoxelMap, correction: LiveCorrection | None = None) -> None:
         self._map = voxel_map
         config = voxel_map.config
         self._relay = MirrorRelay(MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set))
-        self._answers = Answers(self._relay)
+        self._answers = Answers(self._relay, correction)
         self._given = 0  # version that deliveries have come to
         self._next_at = 0.0
-        self._delivered: deque[BlockChanges] = deque()
+        self._delivered: deque[CopiedChanges] = deque()
         self._asked_at = -ASKED_LATELY_S  # never; monotonic seconds
         self._awaited = 0  # version that the first question after a pause waits for
         self._closed = threading.Event()
@@ -75,7 +77,7 @@ class QueryService:
             return
         if self._given >= self._awaited and now < self._next_at:
             return
-        changes = self._map.changes(self._given, MAX_BLOCKS)
+        changes = self._map.copy_changes(self._given, MAX_BLOCKS)
         self._given = changes.version
         self._next_at = now + max(PERIOD_S, (time.monotonic() - now) / MAX_SHARE)
         self._delivered.append(changes)
@@ -106,8 +108,9 @@ class QueryService:
             self._take_deliveries()
             # One at a time: the socket takes turns between clients, so that many questions of one delay no other.
             while not self._closed.is_set() and (asked := self._server.receive()) is not None:
-                self._await_mirror()
                 client, parts = asked
+                if is_about_map(parts):
+                    self._await_mirror()
                 self._server.send(client, self._answer(parts))
                 self.answered += 1
                 self._take_deliveries()
@@ -131,5 +134,5 @@ class QueryService:
 
     def _take_deliveries(self) -> None:
         while self._delivered:
-            self._relay.apply(self._delivered[0])
+            self._relay.apply(self._delivered[0].compact())
             self._delivered.popleft()  # only now may the next one come

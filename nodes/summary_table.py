@@ -54,6 +54,8 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
         lines.append(f"{frames['labels_refused']} frames mapped, but not scored: their labels cannot be used")
     if summary.get("damaged_stretches"):
         lines.append(f"{len(summary['damaged_stretches'])} damaged stretches of the log passed over")
+    if summary.get("map", {}).get("unfinished_correction"):
+        lines.append(summary["map"]["unfinished_correction"])
     if summary.get("stopped_by"):
         lines.append(f"stopped by {summary['stopped_by']}: the results are those of the frames so far")
     return lines

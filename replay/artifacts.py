@@ -111,6 +111,7 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "surface_points": len(points.xyz),
             "memory_mb": round(voxel_map.memory_bytes / 1e6, 1),
             "corrected_poses": session.corrected_poses,
+            "unfinished_correction": session.unfinished_correction or None,
         },
         "metrics": _metrics(session, points),
         "metrics_per_image": asdict(metrics_per_image(session.per_image)) if session.scored else None,

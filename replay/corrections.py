@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -11,11 +13,13 @@ import structlog
 from numpy.typing import NDArray
 
 from replay.importers.tum import match_nearest, pose_matrix, read_trajectory
-from replay.session import MapSession
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.mapping.pose_correction import ALWAYS
 from semantic_mapper.types import Float64
+
+if TYPE_CHECKING:
+    from replay.session import MapSession
 
 MATCH_NS = 5_000_000  # trajectories are written with microseconds, or with the stamp of another picture of the rig
 _PORTION = 8  # frames
@@ -60,6 +64,22 @@ def keeping_frames(config: MapperConfig, frames: int) -> MapperConfig:
     return msgspec.structs.replace(config, history=history)
 
 
+def match_frames(
+    keys: Iterable[tuple[str, int]], stamps_ns: NDArray[np.int64], poses: Float64, within_ns: int
+) -> dict[tuple[str, int], Float64]:
+    """Poses by the frames of one camera that were taken nearest to their stamps; those without one are left out.
+
+    Args:
+        keys: (camera_id, stamp_ns) of the frames.
+        stamps_ns, poses: (N,) and (N, 4, 4) T_world_camera.
+        within_ns: Largest difference.
+    """
+    rising = sorted(keys, key=lambda key: key[1])
+    stamps = np.array([stamp_ns for _, stamp_ns in rising], np.int64)
+    frame_of = match_nearest(stamps_ns, stamps, within_ns) if rising else [-1] * len(stamps_ns)
+    return {rising[i]: pose for i, pose in zip(frame_of, poses, strict=True) if i >= 0}
+
+
 def correct_session(session: MapSession, trajectory: Trajectory) -> int:
     """Move the map to the corrected poses; frames between and after them move along. Returns how many poses were used.
 
@@ -75,21 +95,20 @@ def correct_session(session: MapSession, trajectory: Trajectory) -> int:
         raise ImportSourceError(
             f"{trajectory.path}: a trajectory is that of one camera, and this log has {', '.join(cameras)}"
         )
-    stamps = np.array([stamp_ns for _, stamp_ns in keys], np.int64)
-    frame_of = match_nearest(trajectory.stamps_ns, stamps, MATCH_NS) if keys else [-1] * len(trajectory.stamps_ns)
-    poses = {keys[i]: pose for i, pose in zip(frame_of, trajectory.poses, strict=True) if i >= 0}
+    poses = match_frames(keys, trajectory.stamps_ns, trajectory.poses, MATCH_NS)
+    given = len(trajectory.stamps_ns)
     frozen = session.pipeline.corrector.status.frozen  # frames that have left the history, whose stamps are not known
     if not poses:
         raise ImportSourceError(
-            f"{trajectory.path}: none of its {len(frame_of)} stamps is that of a mapped frame "
+            f"{trajectory.path}: none of its {given} stamps is that of a mapped frame "
             f"(within {MATCH_NS / 1e6:g} ms); the first is {trajectory.stamps_ns[0] / 1e9:.6f} s"
-            + (f", that of the frames {stamps[0] / 1e9:.6f} s" if keys else "")
+            + (f", that of the frames {keys[0][1] / 1e9:.6f} s" if keys else "")
             + (f"; {frozen} frames have left the history, raise history.max_frames or max_disk_mb" if frozen else "")
         )
-    if len(poses) < len(frame_of):
-        _log.warning("corrections_without_a_frame", left_out=len(frame_of) - len(poses), used=len(poses), frozen=frozen)
+    if len(poses) < given:
+        _log.warning("corrections_without_a_frame", left_out=given - len(poses), used=len(poses), frozen=frozen)
     session.pipeline.correct_poses(poses, until_ns=ALWAYS)  # the whole log was recorded in the old world
     while session.pipeline.advance_correction(_PORTION):
         pass
-    session.follow_correction(len(poses))
+    session.follow_correction()
     return len(poses)

@@ -113,6 +113,7 @@ class MapSession:
         self.scored = 0
         self.excluded = 0
         self.corrected_poses = 0  # given; the map has moved with them
+        self.unfinished_correction = ""  # what the map has not moved with, and why
         self.without_depth = 0  # their geometry was rendered, not measured
         self.refusals: list[Refusal] = []  # frames that were not mapped
         self.label_refusals: list[Refusal] = []  # frames that were mapped, but whose label image cannot be used
@@ -142,18 +143,15 @@ class MapSession:
             self.stage_ms.setdefault(name, []).append(value)
         self.fused += int(update.fused)
         self._note_depth(frame)
+        frame = self.pipeline.corrector.place(frame)  # where the map has it
         self._keep_snapshot(self._score(frame, update), update)
         if self._rerun is not None:
             self._rerun.log_step(frame, update)
         return update
 
-    def follow_correction(self, poses: int) -> None:
-        """Take what the scores compare with to the poses that the map has after a correction.
-
-        Args:
-            poses: That were given.
-        """
-        self.corrected_poses += poses
+    def follow_correction(self) -> None:
+        """Take what the scores compare with to the poses that the map has after a correction."""
+        self.corrected_poses = self.pipeline.corrector.status.poses
         self.surface_truth.move(self.pipeline.corrector.poses())
 
     def _note_depth(self, frame: PosedFrame) -> None:

@@ -1,8 +1,9 @@
-"""Ask the map of a running mapper, from any process of this machine."""
+"""Ask the map of a running mapper, or correct its poses, from any process of this machine."""
 
 from __future__ import annotations
 
 import threading
+import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
@@ -11,10 +12,11 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from semantic_mapper.errors import CodecError
+from semantic_mapper.errors import CodecError, ShapeError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.changes import BlockChanges
 from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.pose_correction import CorrectedPoses
 from semantic_mapper.queries.checks import as_numbers
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.lookup import PointAnswers
@@ -28,7 +30,7 @@ from semantic_mapper.transport.endpoints import default_endpoint
 from semantic_mapper.transport.plain import to_label_set
 from semantic_mapper.transport.query_codec import Arrays, decode_answer, encode_request
 from semantic_mapper.transport.query_sockets import QuerySocket
-from semantic_mapper.types import UInt8
+from semantic_mapper.types import Float64, UInt8
 
 UP = (0.0, 0.0, 1.0)
 MIRROR_BLOCKS = 2000  # fetched at a time: 6 MB before compression
@@ -56,6 +58,35 @@ class MapInfo:
     voxel_size_m: float
     truncation_voxels: float
     label_set: LabelSet
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """How far the corrections of a mapper are.
+
+    Args:
+        running: A rebuild is under way; the map in use is still the old one.
+        done, total: Frames of the history that the rebuild has gone through, and all.
+        completed: Corrections that are in the map in use.
+        poses: Given by these, all together.
+        used, left_out: Poses of the request that this answers: with a frame in the history, and without.
+        frozen: Frames that have left the history; corrections do not reach them.
+        lost: Frames that could not be read from disk again, and so are in the map no more.
+        failure: Why the last correction was given up; empty where it was not.
+        epoch: Of the map in use: answers of this or a later ``MapInfo.epoch`` are about it.
+    """
+
+    running: bool
+    done: int
+    total: int
+    completed: int
+    poses: int
+    used: int
+    left_out: int
+    frozen: int
+    lost: int
+    failure: str
+    epoch: int
 
 
 class MapClient:
@@ -160,6 +191,39 @@ class MapClient:
                 if h.version >= newest:
                     return self._mirror
 
+    def correct_poses(self, poses: CorrectedPoses, *, until_ns: int | None = None, within_ns: int = 0) -> Correction:
+        """Begin to move the map with corrected poses, as a loop closure gives them; the mapper goes on meanwhile.
+
+        Asked again where an answer is lost, the mapper begins it once all the same.
+
+        Args:
+            poses, until_ns: As of ``MappingPipeline.correct_poses``; at most 65536 at once.
+            within_ns: Poses go to the frames nearest in time, if those are so near, and are left out where none is; 0 =
+                every pose must have the stamp of a frame.
+
+        Raises:
+            MapError: the mapper keeps no history (``history.max_frames``), or no frame has such a stamp.
+            PoseError: a pose is not a rigid transform.
+            ShapeError: a pose is not of shape (4, 4).
+            In every case nothing has changed.
+        """
+        keys = [key if isinstance(key, tuple) else ("", key) for key in poses]
+        cameras = tuple(dict.fromkeys(camera for camera, _ in keys)) or ("",)
+        arrays = {
+            "stamps_ns": np.array([stamp_ns for _, stamp_ns in keys], np.int64),
+            "camera": np.array([cameras.index(camera) for camera, _ in keys], np.int64).astype(np.uint8),
+            "poses": np.array([_pose(T, stamp_ns) for (_, stamp_ns), T in zip(keys, poses.values(), strict=True)]),
+        }
+        arrays["poses"] = arrays["poses"].reshape(-1, 4, 4)
+        request = messages.CorrectPosesRequest(
+            id=uuid.uuid4().hex, cameras=cameras, until_ns=until_ns, within_ns=within_ns
+        )
+        return self._correction(encode_request("correct_poses", request, arrays), "correct_poses")
+
+    def correction(self) -> Correction:
+        """How far corrections are; ``used`` and ``left_out`` are 0."""
+        return self._correction(encode_request("correction", messages.CorrectionRequest(), {}), "correction")
+
     def close(self) -> None:
         """Free the socket. Harmless when repeated."""
         self._socket.close()
@@ -180,6 +244,22 @@ class MapClient:
         self.version = header.version
         return header, found
 
+    def _correction(self, parts: list[bytes], kind: str) -> Correction:
+        h, _ = decode_answer(kind, messages.CorrectionAnswer, self._socket.ask(parts))
+        return Correction(
+            running=h.running,
+            done=h.done,
+            total=h.total,
+            completed=h.completed,
+            poses=h.poses,
+            used=h.used,
+            left_out=h.left_out,
+            frozen=h.frozen,
+            lost=h.lost,
+            failure=h.failure,
+            epoch=h.map_epoch,
+        )
+
     def _label_set(self, map_id: str) -> LabelSet:
         if self._labels is None or self._labels[0] != map_id:
             self.info()
@@ -198,6 +278,14 @@ def _point(values: ArrayLike, name: str) -> messages.Point:
         raise CodecError(f"{name}: expected shape (3,), got {numbers.shape}")
     x, y, z = numbers.tolist()
     return x, y, z
+
+
+def _pose(T_world_camera: Float64, stamp_ns: int) -> Float64:
+    """A pose as numbers; whether it is a rigid transform the other side judges."""
+    pose = as_numbers(T_world_camera, f"corrected pose of stamp {stamp_ns}")
+    if pose.shape != (4, 4):
+        raise ShapeError(f"corrected pose of stamp {stamp_ns}: expected shape (4, 4), got {pose.shape}")
+    return pose
 
 
 def _things(arrays: Arrays, labels: LabelSet) -> tuple[Instance, ...]:

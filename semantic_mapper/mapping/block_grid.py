@@ -26,7 +26,7 @@ from semantic_mapper.mapping.block_index import (
     pack_keys,
     unpack_keys,
 )
-from semantic_mapper.mapping.block_store import BLOCK_VOXELS, BlockStore, BlockValues
+from semantic_mapper.mapping.block_store import BLOCK_VOXELS, BlockStore, BlockValues, PackedBlocks, pack_blocks
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.types import Float32
 
@@ -36,6 +36,7 @@ EVICTED_AT_ONCE = 32  # at least, and
 EVICTED_SHARE = 32  # at least this part of what memory has room for: sorting out what to evict looks at all of it
 TILE_BLOCKS = 4096  # blocks brought together at a time to be read where some are on disk
 NEIGHBOURS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
+_READ_AT_ONCE = 512  # blocks on disk, whose evidence takes much room
 ATTRIBUTES = ("tsdf", "weight", "color", "evidence", "votes")
 
 _log = structlog.get_logger(__name__)
@@ -264,6 +265,20 @@ class BlockGrid:
             for mine, theirs in zip(values, stored, strict=True):
                 mine[~here] = theirs
         return values
+
+    def pack(self, packed: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], PackedBlocks]]:
+        """A packed copy of blocks (B,) that exist, part by part: first those in memory, then those on disk.
+
+        Yields:
+            Positions in ``packed`` (P,), and the blocks there.
+        """
+        found = find_blocks(self._index, packed)
+        here, away = np.flatnonzero(found >= 0), np.flatnonzero(found < 0)
+        buffers = self.buffers()
+        yield here, pack_blocks(BlockValues(*(getattr(buffers, name) for name in ATTRIBUTES)), found[here])
+        for start in range(0, len(away), _READ_AT_ONCE):
+            part = away[start : start + _READ_AT_ONCE]
+            yield part, pack_blocks(self.read(packed[part]), np.arange(len(part), dtype=np.int32))
 
     def fill(self, packed: NDArray[np.int64], values: BlockValues) -> NDArray[np.int32]:
         """Make blocks (B,) be ``values``, new or not; returns their buffer indices."""

@@ -9,9 +9,11 @@ from __future__ import annotations
 import sqlite3
 import zlib
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
@@ -19,7 +21,7 @@ from semantic_mapper.mapping.key_table import ABSENT, KeyTable
 from semantic_mapper.types import Float32
 
 BLOCK_VOXELS = 512
-_MASK_BYTES = BLOCK_VOXELS // 8
+MASK_BYTES = BLOCK_VOXELS // 8
 _CACHE_KIB = 4096  # of SQLite's own pages
 _ASKED_AT_ONCE = 500  # keys in one query
 
@@ -38,6 +40,24 @@ class BlockValues(NamedTuple):
     color: Float32
     evidence: Float32
     votes: Float32
+
+
+class PackedBlocks(NamedTuple):
+    """B blocks one behind the other, each: which voxels are measured and which have votes, as two bit masks of 512 bits
+    (of a byte, the highest first); TSDF, weight and colour of those measured; evidence and votes of those with votes.
+
+    Args:
+        data: (N,) float32, the masks as their bits.
+        ends: (B + 1,) where blocks begin and end in it.
+    """
+
+    data: Float32
+    ends: NDArray[np.int64]
+
+    def blobs(self) -> list[memoryview]:
+        """The bytes of each block; they share memory."""
+        data: Any = self.data.view(np.uint8)
+        return [memoryview(data)[start:end] for start, end in pairwise((4 * self.ends).tolist())]
 
 
 class BlockStore:
@@ -88,10 +108,16 @@ class BlockStore:
         Raises:
             MapError: the disk is full or fails.
         """
-        rows: list[tuple[int, int, int, bytes]] = []
-        for n, (key, version) in enumerate(zip(keys.tolist(), versions.tolist(), strict=True)):
-            voxels = _pack(values, n)
-            rows.append((key, version, zlib.crc32(voxels), voxels))
+        self.put_packed(keys, versions, pack_blocks(values, np.arange(len(keys), dtype=np.int32)).blobs())
+
+    def put_packed(self, keys: NDArray[np.int64], versions: NDArray[np.int64], blocks: list[memoryview]) -> None:
+        """Put blocks away that ``pack_blocks`` has packed, as their bytes.
+
+        Raises:
+            MapError: the disk is full or fails.
+        """
+        packed = zip(keys.tolist(), versions.tolist(), blocks, strict=True)
+        rows = [(key, version, zlib.crc32(voxels), voxels) for key, version, voxels in packed]
         try:
             self._database.execute("BEGIN")
             self._database.executemany("INSERT OR REPLACE INTO blocks VALUES (?, ?, ?, ?)", rows)
@@ -148,28 +174,81 @@ def _empty(count: int, classes: int) -> BlockValues:
     return BlockValues(*(np.zeros(shape, np.float32) for shape in shapes))
 
 
-def _pack(values: BlockValues, n: int) -> bytes:
-    """Voxels of block n that hold something: two bit masks, then their values."""
-    measured, voted = values.weight[n] > 0, values.votes[n] > 0
-    parts = (
-        np.packbits(measured),
-        np.packbits(voted),
-        values.tsdf[n][measured],
-        values.weight[n][measured],
-        values.color[n][measured],
-        values.evidence[n][voted],
-        values.votes[n][voted],
-    )
-    return b"".join(part.tobytes() for part in parts)
+def pack_blocks(values: BlockValues, rows: NDArray[np.int32]) -> PackedBlocks:
+    """Copy blocks ``rows`` (B,) of ``values`` in one compiled pass, without the voxels that hold nothing."""
+    ends = _ends(values.weight, values.votes, rows, values.evidence.shape[2])
+    data = np.empty(ends[-1], np.float32)
+    _pack(values, rows, ends, data, data.view(np.uint8))
+    return PackedBlocks(data, ends)
+
+
+@njit(nogil=True, cache=True)
+def _ends(weight, votes, rows, classes):
+    """Where the packed blocks begin and end (B + 1,), in units of float32."""
+    ends = np.zeros(len(rows) + 1, np.int64)
+    for n in range(len(rows)):
+        measured, voted = 0, 0
+        for voxel in range(BLOCK_VOXELS):
+            measured += weight[rows[n], voxel] > 0
+            voted += votes[rows[n], voxel] > 0
+        ends[n + 1] = ends[n] + MASK_BYTES // 2 + 5 * measured + (classes + 1) * voted
+    return ends
+
+
+@njit(nogil=True, cache=True)
+def _pack(values, rows, ends, out, out_bytes):
+    """Write blocks as ``PackedBlocks`` says to ``out``; ``out_bytes`` is the same memory."""
+    for n in range(len(rows)):
+        block, masks, classes = rows[n], 4 * ends[n], values.evidence.shape[2]
+        out_bytes[masks : masks + 2 * MASK_BYTES] = 0
+        measured = 0
+        for voxel in range(BLOCK_VOXELS):
+            bit = np.uint8(0x80 >> (voxel & 7))
+            if values.weight[block, voxel] > 0:
+                out_bytes[masks + (voxel >> 3)] |= bit
+                measured += 1
+            if values.votes[block, voxel] > 0:
+                out_bytes[masks + MASK_BYTES + (voxel >> 3)] |= bit
+        tsdf = ends[n] + MASK_BYTES // 2
+        weight, color, evidence = tsdf + measured, tsdf + 2 * measured, tsdf + 5 * measured
+        votes = ends[n + 1] - (ends[n + 1] - evidence) // (classes + 1)
+        for voxel in range(BLOCK_VOXELS):
+            if values.weight[block, voxel] > 0:
+                out[tsdf], out[weight] = values.tsdf[block, voxel], values.weight[block, voxel]
+                for c in range(3):
+                    out[color + c] = values.color[block, voxel, c]
+                tsdf, weight, color = tsdf + 1, weight + 1, color + 3
+            if values.votes[block, voxel] > 0:
+                for c in range(classes):
+                    out[evidence + c] = values.evidence[block, voxel, c]
+                out[votes] = values.votes[block, voxel]
+                evidence, votes = evidence + classes, votes + 1
 
 
 def _unpack(voxels: bytes, values: BlockValues, n: int) -> None:
-    measured = np.unpackbits(np.frombuffer(voxels, np.uint8, _MASK_BYTES)).astype(np.bool_)
-    voted = np.unpackbits(np.frombuffer(voxels, np.uint8, _MASK_BYTES, _MASK_BYTES)).astype(np.bool_)
-    rest = np.frombuffer(voxels, np.float32, offset=2 * _MASK_BYTES)
-    a, b, classes = int(measured.sum()), int(voted.sum()), values.evidence.shape[2]
-    ends = np.cumsum((a, a, 3 * a, classes * b, b))
-    tsdf, weight, color, evidence, votes = np.split(rest, ends[:-1])
-    values.tsdf[n][measured], values.weight[n][measured] = tsdf, weight
-    values.color[n][measured] = color.reshape(-1, 3)
-    values.evidence[n][voted], values.votes[n][voted] = evidence.reshape(-1, classes), votes
+    data = np.frombuffer(voxels, np.float32)
+    _unpack_block(data, data.view(np.uint8), values, n)
+
+
+@njit(nogil=True, cache=True)
+def _unpack_block(data, data_bytes, values, n):
+    """The reverse of ``_pack`` for one block, onto voxels that are zero."""
+    classes = values.evidence.shape[2]
+    measured = 0
+    for voxel in range(BLOCK_VOXELS):
+        measured += (data_bytes[voxel >> 3] >> (7 - (voxel & 7))) & 1
+    tsdf = MASK_BYTES // 2
+    weight, color, evidence = tsdf + measured, tsdf + 2 * measured, tsdf + 5 * measured
+    votes = len(data) - (len(data) - evidence) // (classes + 1)
+    for voxel in range(BLOCK_VOXELS):
+        shift = 7 - (voxel & 7)
+        if (data_bytes[voxel >> 3] >> shift) & 1:
+            values.tsdf[n, voxel], values.weight[n, voxel] = data[tsdf], data[weight]
+            for c in range(3):
+                values.color[n, voxel, c] = data[color + c]
+            tsdf, weight, color = tsdf + 1, weight + 1, color + 3
+        if (data_bytes[MASK_BYTES + (voxel >> 3)] >> shift) & 1:
+            for c in range(classes):
+                values.evidence[n, voxel, c] = data[evidence + c]
+            values.votes[n, voxel] = data[votes]
+            evidence, votes = evidence + classes, votes + 1

@@ -8,23 +8,24 @@ probability a voxel.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numba import prange
+from numba import njit
 from numpy.typing import NDArray
 
+from semantic_mapper.errors import MapError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.block_grid import ATTRIBUTES, BLOCK_VOXELS, BlockGrid
-from semantic_mapper.mapping.block_index import find_blocks, unpack_keys
-from semantic_mapper.mapping.block_store import BlockValues
+from semantic_mapper.mapping.block_grid import BLOCK_VOXELS, BlockGrid
+from semantic_mapper.mapping.block_index import unpack_keys
+from semantic_mapper.mapping.block_store import MASK_BYTES, PackedBlocks
 from semantic_mapper.mapping.readout import decide
-from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import UInt8
 
 TSDF_STEPS = 127  # of the quantised TSDF, a truncation
 UNOBSERVED = -128  # in the quantised TSDF
 CONFIDENCE_STEPS = 255
-_READ_AT_ONCE = 512  # blocks on disk, whose evidence takes much room
+_READ_AT_ONCE = 512  # blocks copied at a time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +58,50 @@ class BlockChanges:
         return self.tsdf != UNOBSERVED
 
 
+class ChosenBlocks(NamedTuple):
+    """Which blocks are to be told of, and how.
+
+    Args:
+        packed: (B,) sorted keys of existing blocks.
+        since, version, epoch: Of the result.
+        label_set: For the ids.
+        vote_discount: rho, see ``readout``.
+        min_weight: Voxels with fewer measurements count as not observed; > 0.
+    """
+
+    packed: NDArray[np.int64]
+    since: int
+    version: int
+    epoch: int
+    label_set: LabelSet
+    vote_discount: float
+    min_weight: float
+
+
+class CopiedChanges(NamedTuple):
+    """Blocks of a map as they were, not compact yet: what a thread that must not be held up hands to another one.
+
+    Args:
+        chosen: What they are.
+        parts: Rows of the result, and the blocks there.
+    """
+
+    chosen: ChosenBlocks
+    parts: tuple[tuple[NDArray[np.int64], PackedBlocks], ...]
+
+    @property
+    def version(self) -> int:
+        """Of the result."""
+        return self.chosen.version
+
+    def compact(self) -> BlockChanges:
+        """What ``read_changes`` would have given at that moment; any thread may call it, without the map."""
+        out = _room_for(self.chosen)
+        for rows, blocks in self.parts:
+            _compact_into(out, rows, blocks, self.chosen)
+        return out
+
+
 def oldest_first(versions: NDArray[np.int64], limit: int, newest: int) -> tuple[NDArray[np.int64], int]:
     """Which of the changed blocks come first: whole versions, at least one, and else at most ``limit`` blocks.
 
@@ -76,67 +121,98 @@ def oldest_first(versions: NDArray[np.int64], limit: int, newest: int) -> tuple[
     return np.flatnonzero(versions <= version), version
 
 
-def read_changes(
-    grid: BlockGrid,
-    packed: NDArray[np.int64],
-    versions: tuple[int, int, int],
-    label_set: LabelSet,
-    vote_discount: float,
-    min_weight: float,
-) -> BlockChanges:
-    """Compact form of existing blocks, wherever they are; those on disk stay there.
+def choose_blocks(
+    grid: BlockGrid, versions: tuple[int, int, int], limit: int, decision: tuple[LabelSet, float, float]
+) -> ChosenBlocks:
+    """Which blocks have changed after a version, and how they are to be told of.
 
     Args:
         grid: The map's storage.
-        packed: (B,) sorted keys.
-        versions: ``since``, ``version`` and ``epoch`` of the result.
-        label_set: For the ids.
-        vote_discount: rho, see ``readout``.
-        min_weight: Voxels with fewer measurements count as not observed.
+        versions: ``since``, and the map's version and epoch.
+        limit: See ``VoxelMap.changes``.
+        decision: The last three of ``ChosenBlocks``.
+
+    Raises:
+        MapError: ``since`` is not a version of the map, or a negative ``limit``.
     """
-    flat = (len(packed), BLOCK_VOXELS)
-    out = BlockChanges(
-        *versions,
-        unpack_keys(packed),
+    since, newest, epoch = versions
+    if not 0 <= since <= newest or limit < 0:
+        raise MapError(
+            f"changes since version {since}, limit {limit}: versions of this map go from 0 to {newest}, and a limit "
+            "is not negative; a mirror of another map starts anew from version 0"
+        )
+    packed, changed_at = grid.versions_since(since)
+    rows, version = oldest_first(changed_at, limit, newest)
+    return ChosenBlocks(packed[rows], since, version, epoch, *decision)
+
+
+def read_changes(grid: BlockGrid, chosen: ChosenBlocks) -> BlockChanges:
+    """Compact form of existing blocks, wherever they are; those on disk stay there."""
+    out = _room_for(chosen)
+    for start in range(0, len(chosen.packed), _READ_AT_ONCE):
+        for rows, blocks in grid.pack(chosen.packed[start : start + _READ_AT_ONCE]):
+            _compact_into(out, rows + start, blocks, chosen)
+    return out
+
+
+def copy_changes(grid: BlockGrid, chosen: ChosenBlocks) -> CopiedChanges:
+    """A copy of existing blocks to be made compact later, which takes four times as long as copying."""
+    return CopiedChanges(chosen, tuple(grid.pack(chosen.packed)))
+
+
+def _room_for(chosen: ChosenBlocks) -> BlockChanges:
+    flat = (len(chosen.packed), BLOCK_VOXELS)
+    return BlockChanges(
+        chosen.since,
+        chosen.version,
+        chosen.epoch,
+        unpack_keys(chosen.packed),
         np.empty(flat, np.int8),
         np.empty(flat, np.uint8),
         np.empty(flat, np.uint8),
         np.empty((*flat, 3), np.uint8),
     )
+
+
+def _compact_into(out: BlockChanges, rows: NDArray[np.int64], blocks: PackedBlocks, chosen: ChosenBlocks) -> None:
+    labels = chosen.label_set
+    ids = np.array((*labels.ids, labels.ignore_id), np.uint8)
+    limits = (ids, chosen.vote_discount, chosen.min_weight)
     arrays = (out.tsdf, out.label, out.confidence, out.rgb)
-    ids = np.array((*label_set.ids, label_set.ignore_id), np.uint8)
-    found = find_blocks(grid.index, packed)
-    here = np.flatnonzero(found >= 0)
-    buffers = grid.buffers()
-    values = BlockValues(*(getattr(buffers, name) for name in ATTRIBUTES))
-    _compact(values, found[here], here, ids, vote_discount, min_weight, *arrays)
-    away = np.flatnonzero(found < 0)
-    for start in range(0, len(away), _READ_AT_ONCE):
-        rows = away[start : start + _READ_AT_ONCE]
-        indices = np.arange(len(rows), dtype=np.int32)
-        _compact(grid.read(packed[rows]), indices, rows, ids, vote_discount, min_weight, *arrays)
-    return out
+    _compact(blocks.data, blocks.data.view(np.uint8), blocks.ends, rows, *limits, *arrays)
 
 
-@parallel_kernel()
-def _compact(values, indices, rows, ids, vote_discount, min_weight, tsdf, label, confidence, rgb):
-    """Write blocks ``indices`` (B,) of ``values`` to ``rows`` (B,) of the output."""
-    for n in prange(len(indices)):
-        block, row = indices[n], rows[n]
+# Serial: another thread than the mapper's runs it, and numba's fallback layer allows no two parallel kernels at once.
+@njit(nogil=True, cache=True)
+def _compact(data, masks, ends, rows, ids, vote_discount, min_weight, tsdf, label, confidence, rgb):
+    """Write packed blocks (B,) to ``rows`` (B,) of the output."""
+    classes = len(ids) - 1
+    for n in range(len(rows)):
+        row, first = rows[n], 4 * ends[n]
+        measured = 0
+        for voxel in range(BLOCK_VOXELS):
+            measured += (masks[first + (voxel >> 3)] >> (7 - (voxel & 7))) & 1
+        distance = ends[n] + MASK_BYTES // 2
+        weight, color, evidence = distance + measured, distance + 2 * measured, distance + 5 * measured
+        votes = ends[n + 1] - (ends[n + 1] - evidence) // (classes + 1)
         for voxel in range(BLOCK_VOXELS):
             tsdf[row, voxel] = UNOBSERVED
             label[row, voxel] = ids[-1]
             confidence[row, voxel] = 0
-            for c in range(3):
-                rgb[row, voxel, c] = 0
-            if values.weight[block, voxel] < min_weight:
-                continue
-            distance = values.tsdf[block, voxel]
-            steps = int(np.rint(min(max(distance, -1.0), 1.0) * TSDF_STEPS))
-            tsdf[row, voxel] = max(steps, 1) if distance > 0 else steps
-            for c in range(3):
-                rgb[row, voxel, c] = np.uint8(min(max(values.color[block, voxel, c] + 0.5, 0.0), 255.0))
-            best, p = decide(values.evidence[block, voxel], values.votes[block, voxel], vote_discount)
-            if best >= 0:
-                label[row, voxel] = ids[best]
-                confidence[row, voxel] = np.uint8(p * CONFIDENCE_STEPS + 0.5)
+            rgb[row, voxel, 0] = rgb[row, voxel, 1] = rgb[row, voxel, 2] = 0
+            at, shift = first + (voxel >> 3), 7 - (voxel & 7)
+            seen = False
+            if (masks[at] >> shift) & 1:
+                seen = data[weight] >= min_weight
+                if seen:
+                    steps = int(np.rint(min(max(data[distance], -1.0), 1.0) * TSDF_STEPS))
+                    tsdf[row, voxel] = max(steps, 1) if data[distance] > 0 else steps
+                    for c in range(3):
+                        rgb[row, voxel, c] = np.uint8(min(max(data[color + c] + 0.5, 0.0), 255.0))
+                distance, weight, color = distance + 1, weight + 1, color + 3
+            if (masks[at + MASK_BYTES] >> shift) & 1:
+                if seen:
+                    best, p = decide(data[evidence : evidence + classes], data[votes], vote_discount)
+                    label[row, voxel] = ids[best]
+                    confidence[row, voxel] = np.uint8(p * CONFIDENCE_STEPS + 0.5)
+                evidence, votes = evidence + classes, votes + 1

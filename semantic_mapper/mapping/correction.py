@@ -16,7 +16,7 @@ that frame, so that no frame is fused a second time for it.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -30,14 +30,12 @@ from semantic_mapper.geometry import check_pose
 from semantic_mapper.mapping.history import FrameEntry, FrameHistory, FusedFrame
 from semantic_mapper.mapping.keyframes import KeyframeStore
 from semantic_mapper.mapping.map_backup import MapBackup
-from semantic_mapper.mapping.pose_correction import ALWAYS, PoseCorrection, PosePair, move
+from semantic_mapper.mapping.pose_correction import ALWAYS, CorrectedPoses, PoseCorrection, PosePair, move
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float64, PosedFrame
 
 PORTION_WHEN_FULL = 4  # frames that a step itself rebuilds where the history is full and nothing may leave it
-
-# By stamp_ns, or by (camera_id, stamp_ns) where cameras share stamps: T_world_camera (4, 4).
-CorrectedPoses = Mapping[int, Float64] | Mapping[tuple[str, int], Float64]
+LEAST_BACKED_UP = 64  # blocks that a step, or a frame of a rebuild, copies to disk; more only where time is short
 
 _log = structlog.get_logger(__name__)
 
@@ -51,8 +49,10 @@ class CorrectionStatus:
         done, total: Frames of the history that the rebuild has gone through, and all.
         disk_bytes: Of the history, without its backup of the map.
         completed: Corrections that are in the map in use.
+        poses: Given by these, all together.
         frozen: Frames that have left the history; corrections do not reach them.
         lost: Frames that could not be read from disk again, and so are in the map no more after a rebuild.
+        failure: Why the last correction was given up; empty where it was not.
     """
 
     running: bool
@@ -60,15 +60,34 @@ class CorrectionStatus:
     total: int
     disk_bytes: int
     completed: int
+    poses: int
     frozen: int
     lost: int
+    failure: str
+
+    @property
+    def left(self) -> int:
+        """Frames that the rebuild has still to go through."""
+        return self.total - self.done if self.running else 0
 
 
 class _Half(NamedTuple):
-    """The map after the frame of this number, which made the history half full."""
+    """The map after the frame of this number, which made the history half full.
+
+    ``portion`` blocks of it are copied at a time: all are when the history is three quarters full.
+    """
 
     number: int
     backup: MapBackup
+    portion: int
+
+    @classmethod
+    def of(cls, voxel_map: VoxelMap, number: int, frames: int) -> _Half:
+        backup = MapBackup(voxel_map)
+        return cls(number, backup, max(LEAST_BACKED_UP, -(-2 * len(backup) // frames)))
+
+    def go_on(self) -> None:
+        self.backup.go_on(self.portion)
 
 
 @dataclass(slots=True, eq=False)
@@ -79,6 +98,8 @@ class _Rebuild:
     corrections: tuple[PoseCorrection, ...]  # to be applied one after the other
     first: int  # number of the history's oldest frame
     next: int  # number of the next frame to fuse
+    restored: int = 0  # blocks of the frozen frames' map, with which it begins
+    begun: bool = False  # all of them are there
     half: _Half | None = None
 
     def place(self, entry: FrameEntry) -> Float64:
@@ -86,6 +107,10 @@ class _Rebuild:
         for correction in self.corrections:
             T_world_camera = correction.place(entry.camera_id, entry.stamp_ns, T_world_camera)
         return T_world_camera
+
+    def give_up(self) -> None:
+        if self.half is not None:
+            self.half.backup.close()
 
 
 class MapCorrector:
@@ -119,7 +144,8 @@ class MapCorrector:
         self._half: _Half | None = None
         self._base: MapBackup | None = None  # of the frozen frames
         self._frozen_until: dict[str, int] = {}  # newest stamp of each camera
-        self._frozen = self._lost = self._completed = 0
+        self._frozen = self._lost = self._completed = self._poses = 0
+        self._failure = ""
         self._motion = np.eye(4)  # of frames to come, where their odometry goes on in the world before correction
 
     @property
@@ -137,8 +163,10 @@ class MapCorrector:
             total=0 if history is None else len(history),
             disk_bytes=0 if history is None else history.bytes,
             completed=self._completed,
+            poses=self._poses,
             frozen=self._frozen,
             lost=self._lost,
+            failure=self._failure,
         )
 
     def poses(self) -> dict[tuple[str, int], Float64]:
@@ -167,7 +195,10 @@ class MapCorrector:
         it ends before the history has grown by more than a third.
         """
         history = self._history
-        if history is None or (not history.is_full and (self._half is not None or history.half is None)):
+        if history is None:
+            return
+        self._back_up()
+        if not history.is_full and (self._half is not None or history.half is None):
             return
         with self._lock:
             if self._rebuild is not None and history.is_full:
@@ -192,12 +223,15 @@ class MapCorrector:
             last_ns = max(pair.stamp_ns for pair in pairs)
             correction = PoseCorrection(pairs, last_ns if until_ns is None else until_ns)
             entries = history.entries()
+            if before is not None:
+                before.give_up()
             self._rebuild = _Rebuild(
-                voxel_map=self._first_map(),
+                voxel_map=VoxelMap(self._map.config, self._map.label_set),
                 corrections=(correction,) if before is None else (*before.corrections, correction),
                 first=entries[0].number,
                 next=entries[0].number,
             )
+            self._failure = ""
             event = "correction_begins" if before is None else "correction_begins_again"
             _log.info(event, given=len(pairs), frames=len(entries), frozen=self._frozen)
             return self.status
@@ -223,8 +257,9 @@ class MapCorrector:
                             pass
                         self._swap(self._rebuild)
                 except MapError as error:
-                    self._rebuild = None
-                    _log.error("correction_fails", reason=str(error))
+                    self._rebuild.give_up()
+                    self._rebuild, self._failure = None, str(error)
+                    _log.error("correction_fails", reason=self._failure)
                     raise
         return self._rebuild is not None
 
@@ -262,17 +297,23 @@ class MapCorrector:
         return any(stamp_ns <= limit for limit in limits.values())
 
     def _fuse_next(self, rebuild: _Rebuild) -> bool:
-        """Fuse the next frame of the history; False where there is none."""
+        """Fuse the next frame of the history, or restore a part of what it begins with; False where all is done."""
         history = self._history
         if history is None:
             raise MapError(f"poses cannot be corrected: {self._why_none}")
+        if self._base is not None and not rebuild.begun:
+            rebuild.restored = self._base.restore(rebuild.voxel_map, rebuild.restored)
+            rebuild.begun = rebuild.restored == len(self._base)
+            return True
+        if rebuild.half is not None:
+            rebuild.half.go_on()
         entry = history.entry(rebuild.next)
         if entry is None:
             return False
         self._fuse_entry(history, entry, rebuild.place(entry), rebuild.voxel_map)
         rebuild.next += 1
         if rebuild.half is None and entry.number == history.half:
-            rebuild.half = _Half(entry.number, rebuild.voxel_map.backup())
+            rebuild.half = _Half.of(rebuild.voxel_map, entry.number, entry.number - rebuild.first + 1)
         return True
 
     def _fuse_entry(self, history: FrameHistory, entry: FrameEntry, pose: Float64, into: VoxelMap) -> None:
@@ -284,26 +325,33 @@ class MapCorrector:
             return
         self._fuse(into, fused)
 
-    def _first_map(self) -> VoxelMap:
-        """What a rebuild starts from: the frozen frames' map, or an empty one."""
-        if self._base is None:
-            return VoxelMap(self._map.config, self._map.label_set)
-        return VoxelMap.restore(self._base, self._map.config, self._map.label_set)
+    def _back_up(self) -> None:
+        """Go on with the backup of the half full history, unless another thread holds what it takes."""
+        half = self._half
+        if half is None or half.backup.is_whole or not self._lock.acquire(blocking=False):
+            return
+        try:
+            half.go_on()
+        except MapError as error:
+            self._end_history(str(error))
+        finally:
+            self._lock.release()
 
     def _turn_over(self, history: FrameHistory) -> None:
         """Freeze the older half of a full history; begin the next one where it is half full."""
         if history.is_full and self._half is not None:
+            self._half.backup.go_on()
             leaving = history.drop_until(self._half.number)
             for entry in leaving:
                 self._frozen_until[entry.camera_id] = max(entry.stamp_ns, self._frozen_until.get(entry.camera_id, 0))
             if self._base is None:
                 _log.info("history_is_full", frozen=len(leaving), kept=len(history))
             else:
-                self._base.store.close()
+                self._base.close()
             self._base, self._half = self._half.backup, None
             self._frozen += len(leaving)
         if self._half is None and history.half is not None:
-            self._half = _Half(history.entries()[-1].number, self._map.backup())
+            self._half = _Half.of(self._map, history.entries()[-1].number, len(history))
 
     def _swap(self, rebuild: _Rebuild) -> None:
         assert self._history is not None
@@ -312,17 +360,21 @@ class MapCorrector:
         moved = self._keyframes.move({(e.camera_id, e.stamp_ns): e.T_world_camera for e in entries})
         self._history.replace(entries)
         if self._half is not None:
-            self._half.backup.store.close()
+            self._half.backup.close()
         self._half = rebuild.half
         for correction in rebuild.corrections:
             if correction.until_ns == ALWAYS:
                 self._motion = move(correction.last_motion, self._motion)
         self._completed += len(rebuild.corrections)
+        self._poses += sum(len(correction) for correction in rebuild.corrections)
         self._rebuild = None
         _log.info("correction_done", frames=len(entries), keyframes_moved=moved, blocks=self._map.block_count)
 
     def _end_history(self, reason: str) -> None:
         """Without every frame a rebuild would lose a part of the map; better none."""
+        for backup in (self._half and self._half.backup, self._base):
+            if backup is not None:
+                backup.close()
         history, self._history, self._half, self._base = self._history, None, None, None
         self._why_none = f"the history has ended: {reason}"
         if history is not None:

@@ -21,6 +21,9 @@ from semantic_mapper.types import Float64
 
 ALWAYS = 2**63 - 1  # later than any stamp
 
+# By stamp_ns, or by (camera_id, stamp_ns) where cameras share stamps: T_world_camera (4, 4).
+CorrectedPoses = Mapping[int, Float64] | Mapping[tuple[str, int], Float64]
+
 
 class PosePair(NamedTuple):
     """The pose of one frame before and after, both T_world_camera (4, 4) float64."""
@@ -48,6 +51,10 @@ class PoseCorrection:
             motions.setdefault(pair.stamp_ns, _motion(pair))
         self._stamps = np.array(list(motions), np.int64)
         self._motions = list(motions.values())
+
+    def __len__(self) -> int:
+        """Poses given."""
+        return len(self._given)
 
     @property
     def last_motion(self) -> Float64:

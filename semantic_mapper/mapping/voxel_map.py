@@ -19,12 +19,18 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.allocation import Camera, blocks_in_band, blocks_in_view, make_camera, view_bounds
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys
-from semantic_mapper.mapping.changes import BlockChanges, oldest_first, read_changes
+from semantic_mapper.mapping.changes import (
+    BlockChanges,
+    ChosenBlocks,
+    CopiedChanges,
+    choose_blocks,
+    copy_changes,
+    read_changes,
+)
 from semantic_mapper.mapping.extract import join_meshes, surface_voxels, triangle_mesh
 from semantic_mapper.mapping.frame_votes import check_depth, frame_votes, probability_table
 from semantic_mapper.mapping.fusion import fuse_blocks, make_limits
 from semantic_mapper.mapping.grid_snapshot import GridSnapshot
-from semantic_mapper.mapping.map_backup import MapBackup, fill_from, take_backup
 from semantic_mapper.mapping.map_file import BlockPart, open_map, write_map
 from semantic_mapper.mapping.map_manifest import CHUNK_BLOCKS, MapManifest
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView
@@ -114,17 +120,13 @@ class VoxelMap:
         Raises:
             MapError: ``since`` is not a version of this map, or a bad ``limit`` or ``min_weight``.
         """
-        _check_min_weight(min_weight)
         with _KERNEL_LOCK:
-            if not 0 <= since <= self.version or limit < 0:
-                raise MapError(
-                    f"changes since version {since}, limit {limit}: versions of this map go from 0 to {self.version}, "
-                    "and a limit is not negative; a mirror of another map starts anew from version 0"
-                )
-            packed, versions = self._grid.versions_since(since)
-            chosen, version = oldest_first(versions, limit, self.version)
-            decision = (self.label_set, self.config.vote_discount, min_weight)
-            return read_changes(self._grid, packed[chosen], (since, version, self.epoch), *decision)
+            return read_changes(self._grid, self._choose_changes(since, limit, min_weight))
+
+    def copy_changes(self, since: int, limit: int = 0, min_weight: float = 1.0) -> CopiedChanges:
+        """As ``changes``, but only copied here: another thread makes them compact, which is most of the work."""
+        with _KERNEL_LOCK:
+            return copy_changes(self._grid, self._choose_changes(since, limit, min_weight))
 
     @property
     def memory_bytes(self) -> int:
@@ -192,21 +194,6 @@ class VoxelMap:
         with _KERNEL_LOCK:
             self.version += 1
             self._grid.mark_changed(blocks, self.version)
-
-    def backup(self) -> MapBackup:
-        """A copy of this map on disk; see ``take_backup``."""
-        with _KERNEL_LOCK:
-            return take_backup(self._grid, len(self.label_set), self.frames, self.last_stamp_ns)
-
-    @classmethod
-    def restore(cls, backup: MapBackup, config: VoxelMapConfig, label_set: LabelSet) -> VoxelMap:
-        """A map that is, bit for bit, what the backup was taken of; see ``fill_from``."""
-        restored = cls(config, label_set)
-        with _KERNEL_LOCK:
-            fill_from(backup, restored._grid)
-        restored.frames = restored.version = backup.frames
-        restored.last_stamp_ns = backup.last_stamp_ns
-        return restored
 
     def take_over(self, other: VoxelMap) -> None:
         """Become ``other``, all at once for whoever reads from another thread; ``other`` must not be used any more.
@@ -369,6 +356,11 @@ class VoxelMap:
             copy_blocks(joined._grid, self._grid, joined.frames)
             add_blocks(joined._grid, other._grid, transform, self.config.max_weight, joined.frames)
         return joined
+
+    def _choose_changes(self, since: int, limit: int, min_weight: float) -> ChosenBlocks:
+        _check_min_weight(min_weight)
+        decision = (self.label_set, self.config.vote_discount, min_weight)
+        return choose_blocks(self._grid, (since, self.version, self.epoch), limit, decision)
 
     def _page_in_view(self, camera: Camera, intrinsics: CameraIntrinsics) -> None:
         """Bring back from disk what a camera may see; the nearest, where memory has no room for all of it."""

@@ -32,7 +32,9 @@ from semantic_mapper.transport.query_messages import (
 Arrays = dict[str, NDArray[np.generic]]
 ERROR = b"error"
 _ZSTD_LEVEL = 1
-_RAISED = {e.__name__: e for e in (errors.MapError, errors.LabelError, errors.CodecError, errors.ShapeError)}
+_RAISED = {
+    e.__name__: e for e in (errors.MapError, errors.LabelError, errors.CodecError, errors.ShapeError, errors.PoseError)
+}
 
 RequestT = TypeVar("RequestT", bound=RequestHeader)
 AnswerT = TypeVar("AnswerT", bound=AnswerHeader)
@@ -96,7 +98,7 @@ def decode_answer(kind: str, header_type: type[AnswerT], parts: Parts) -> tuple[
         parts: What came.
 
     Raises:
-        MapError, LabelError, CodecError, ShapeError: the other side answered with this error.
+        MapError, LabelError, CodecError, ShapeError, PoseError: the other side answered with this error.
         TransportError: it answered with another one.
         CodecError: anything that ``encode_answer`` would not have made, or an answer to another question.
     """

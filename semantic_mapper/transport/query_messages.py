@@ -14,10 +14,11 @@ from semantic_mapper.transport.headers import (
     PartBytes,
     Plain,
     Sentence,
+    Stamp,
     Word,
 )
 
-MAX_REQUEST_ROWS = 1 << 16  # points or rays of one question
+MAX_REQUEST_ROWS = 1 << 16  # points, rays or poses of one question
 BLOCK_VOXELS = 512
 
 Point = tuple[float, float, float]
@@ -141,6 +142,38 @@ class ChangesAnswer(AnswerHeader, frozen=True, kw_only=True):
     newest: Count
 
 
+class CorrectPosesRequest(RequestHeader, frozen=True, kw_only=True):
+    """Move the map to corrected poses of its frames; the one request that changes something.
+
+    ``id`` makes it safe to ask again where an answer was lost: of requests with the same one, the first counts.
+    """
+
+    id: Word
+    cameras: Annotated[tuple[Word, ...], Meta(min_length=1, max_length=256)]  # ("",) = whichever took the frame
+    until_ns: Stamp | None = None  # see ``MappingPipeline.correct_poses``
+    within_ns: Annotated[int, Meta(ge=0, le=1_000_000_000)] = 0  # how far from a stamp its frame may be
+
+
+class CorrectionRequest(RequestHeader, frozen=True, kw_only=True):
+    """How far corrections are."""
+
+
+class CorrectionAnswer(AnswerHeader, frozen=True, kw_only=True):
+    """``CorrectionStatus`` of the map itself, which is ahead of the mirror that ``version`` and ``epoch`` speak of."""
+
+    used: Count  # poses of this request; 0 where none were sent
+    left_out: Count  # those of them without a frame
+    running: bool
+    done: Count
+    total: Count
+    completed: Count
+    poses: Count
+    frozen: Count
+    lost: Count
+    failure: Sentence
+    map_epoch: Count
+
+
 class ErrorAnswer(Header, frozen=True, kw_only=True):
     """The name of an error class of ours, and what it says."""
 
@@ -226,4 +259,10 @@ QUESTIONS = {
             "rgb": ArrayForm("u1", (BLOCK_VOXELS, 3)),
         },
     ),
+    "correct_poses": Question(
+        CorrectPosesRequest,
+        CorrectionAnswer,
+        takes={"stamps_ns": ArrayForm("<i8"), "camera": _U8, "poses": ArrayForm("<f8", (4, 4))},  # index of ``cameras``
+    ),
+    "correction": Question(CorrectionRequest, CorrectionAnswer),
 }

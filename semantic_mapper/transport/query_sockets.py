@@ -85,7 +85,8 @@ class QuerySocket:
     """Asks a ``QueryServer``. Any thread may ask; questions wait for each other.
 
     Where no answer comes in time the socket is thrown away and the question asked again through a new one, so that a
-    server that was restarted is found again. Questions change nothing, so to ask twice does no harm.
+    server that was restarted is found again. Questions change nothing, so to ask twice does no harm; a request that
+    does carries an id, and a server that has seen it only answers.
 
     Args:
         endpoint: Where the server listens.

@@ -112,3 +112,20 @@ def test_a_version_of_another_map_is_refused(walked: VoxelMap) -> None:
     for since, limit in ((9, 0), (-1, 0), (0, -1)):
         with pytest.raises(MapError, match="from 0 to 8"):
             walked.changes(since, limit)
+
+
+@pytest.mark.parametrize("memory_mb", [0, MEMORY_MB])
+def test_a_copy_is_made_compact_later_and_is_of_its_moment(memory_mb: int) -> None:
+    voxel_map = small_map(voxel_size_m=0.01, memory_mb=memory_mb)
+    walk(voxel_map, 6)
+    for since, limit in ((0, 0), (2, 0), (0, 700)):
+        at_once, copied = voxel_map.changes(since, limit), voxel_map.copy_changes(since, limit)
+        walk(voxel_map, 2)
+        later = copied.compact()
+        assert (later.since, later.version, later.epoch) == (since, copied.version, 0) == (since, at_once.version, 0)
+        for name in FIELDS:
+            np.testing.assert_array_equal(getattr(later, name), getattr(at_once, name), err_msg=name)
+        assert len(later.keys) > 300
+    assert (voxel_map.stored_blocks > 0) == (memory_mb > 0)
+    with pytest.raises(MapError, match="from 0 to 12"):
+        voxel_map.copy_changes(13)

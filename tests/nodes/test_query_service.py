@@ -364,8 +364,8 @@ def test_nobody_at_home(endpoint: str) -> None:
 def test_a_mapper_that_nobody_asks_is_not_looked_at(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     voxel_map, asked = small_map(LABELS), []
     integrate(voxel_map, poses(1)[0], 0)
-    changes = VoxelMap.changes
-    monkeypatch.setattr(VoxelMap, "changes", lambda self, *a: asked.append(a) or changes(self, *a))
+    changes = VoxelMap.copy_changes
+    monkeypatch.setattr(VoxelMap, "copy_changes", lambda self, *a: asked.append(a) or changes(self, *a))
     with QueryService(endpoint, voxel_map) as service:
         for _ in range(50):
             service.follow()
