@@ -25,18 +25,23 @@ class Part(StrEnum):
     MAP = "map"
     VIRTUAL = "virtual"
     QUERIES = "queries"
+    EVIDENCE = "evidence"
+    DEPTHLESS = "depthless"
 
 
 QUICK = (Part.RENDER, Part.FUSION, Part.PIPELINE)  # what "all" stands for
 RepeatsOption = Annotated[int, typer.Option(min=1, help="render: best of so many runs of all but the reference.")]
-FramesOption = Annotated[int, typer.Option(min=1, help="fusion, pipeline, growth, queries: frames that count.")]
+FramesOption = Annotated[
+    int, typer.Option(min=1, help="fusion, pipeline, growth, queries, depthless: frames that count.")
+]
 ViewsOption = Annotated[
     int | None,
     typer.Option(min=1, help="render: views, of a test room or --log each (1); virtual: at most, a room (8)."),
 ]
 LogOption = Annotated[Path | None, typer.Option(help="render: labelled log to take the views from.")]
 RoomsOption = Annotated[
-    int | None, typer.Option(min=1, help="map: rooms of the building (30); virtual: validation rooms to map (4).")
+    int | None,
+    typer.Option(min=1, help="map: rooms of the building (30); virtual, evidence: validation rooms to map (4)."),
 ]
 ReturnsOption = Annotated[int, typer.Option(min=0, help="map: rooms, from the first on, visited again at the end.")]
 MinutesOption = Annotated[float, typer.Option(min=0.01, help="map: length of the walk, by the frames' stamps.")]
@@ -89,6 +94,8 @@ def bench(
     grows. map: a long walk through a building and back; time and memory by minute, and whether rooms that it comes back
     to are as it left them. virtual: what virtual views bring to maps, and what more rays or frames bring instead.
     queries: how long another process waits for answers while frames are mapped at full rate, and what a step pays.
+    evidence: what each voxel_map.evidence costs in memory and in the quality of maps.
+    depthless: how good a map's surface is where frames lose their depth.
 
     Quote ratios, not seconds: seconds depend on the machine and on what else it does. In --json the figures stand under
     the name of the part; of render, fusion or pipeline alone at the top, too.

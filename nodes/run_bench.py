@@ -13,6 +13,8 @@ from rich.table import Table
 from nodes.bench_queries import bench_queries
 from nodes.console import Output, frame_progress
 from replay.bench import bench_render, log_scenes, room_scenes
+from replay.bench_depthless import bench_depthless
+from replay.bench_evidence import bench_evidence
 from replay.bench_growth import AXES, bench_growth
 from replay.bench_map import bench_fusion, bench_pipeline, bench_qualities
 from replay.bench_virtual import bench_virtual
@@ -87,7 +89,8 @@ def run_fusion(request: BenchRequest, output: Output) -> dict[str, Any]:
     output.print(
         f"fusion of 640x480 into {found['voxel_size_m'] * 100:g} cm voxels: Open3D {found['open3d_ms']} ms a frame "
         f"without classes, ours {found['ms_20']} ms with 20 ({found['ratio_20']} times) and {found['ms_40']} ms "
-        f"with 40 ({found['ratio_40']} times)"
+        f"with 40 ({found['ratio_40']} times); with evidence in int16 {found['ratio_20_int16']} and "
+        f"{found['ratio_40_int16']} times"
     )
     return found
 
@@ -176,6 +179,25 @@ def run_queries(request: BenchRequest, output: Output) -> dict[str, Any]:
     return found
 
 
+def run_evidence(request: BenchRequest, output: Output) -> dict[str, Any]:
+    """Measure what each way to keep class evidence costs."""
+    found = bench_evidence(request.weights, request.config, request.virtual[0])
+    for kind, row in found["kinds"].items():
+        output.print(
+            f"{kind}: {row['block_kib']} KiB a block; map mIoU {row['miou'] * 100:.2f} %, accuracy "
+            f"{row['accuracy'] * 100:.2f} %, ECE {row['ece'] * 100:.2f} %"
+        )
+    return found
+
+
+def run_depthless(request: BenchRequest, output: Output) -> list[dict[str, Any]]:
+    """Measure the surface of maps from frames without depth."""
+    found = bench_depthless(request.weights, request.config, request.frames)
+    for row in found:
+        output.print(", ".join(f"{name} {value}" for name, value in row.items()))
+    return found
+
+
 def _render_table(render: dict[str, Any]) -> Table:
     table = Table(title=f"rendering {render['view']}, {render['views']} views")
     for column in ("renderer", "pixels/s", "view, wall s", "view, CPU s", "CPU s per 2048 pixels", "mIoU"):
@@ -207,4 +229,6 @@ MEASUREMENTS: dict[str, Callable[[BenchRequest, Output], Any]] = {
     "map": run_map,
     "virtual": run_virtual,
     "queries": run_queries,
+    "evidence": run_evidence,
+    "depthless": run_depthless,
 }

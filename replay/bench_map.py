@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import torch
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from replay.session import load_pipeline
@@ -39,34 +40,40 @@ def bench_fusion(frames: int = 20, voxel_size_m: float = 0.02) -> dict[str, Any]
     Both find their own blocks. Open3D fuses TSDF and colour; ours class evidence, too, of a quarter-size rendered view.
 
     Returns:
-        Plain data: milliseconds a frame (medians); ``ratio_20`` and ``ratio_40`` are ours over Open3D's.
+        Plain data: milliseconds a frame (medians); ``ratio_20`` and ``ratio_40`` are ours over Open3D's,
+        ``ratio_20_int16`` and ``ratio_40_int16`` those with ``voxel_map.evidence`` "int16".
     """
     posed = list(room_frames(TEST_SEEDS[0], frames + WARM_UP, VGA, path=CameraPathConfig(step_m=STEP_M)))
     config = VoxelMapConfig(voxel_size_m=voxel_size_m)
     reference = _Open3DFusion(config)
-    ours = {count: VoxelMap(config, make_label_set("bench", [f"class {c}" for c in range(count)])) for count in CLASSES}
+    ours: dict[str, VoxelMap] = {}
+    for count in CLASSES:
+        label_set = make_label_set("bench", [f"class {c}" for c in range(count)])
+        ours[f"{count}"] = VoxelMap(config, label_set)
+        ours[f"{count}_int16"] = VoxelMap(replace(config, evidence="int16"), label_set)
     votes = {count: _some_probabilities(count) for count in CLASSES}
-    spent: dict[str, list[float]] = {"open3d": [], **{str(count): [] for count in CLASSES}}
+    spent: dict[str, list[float]] = {"open3d": [], **{name: [] for name in ours}}
     height, width = COARSE  # each pixel takes the coarse one that it lies in
     rows = np.arange(VGA.height)[:, None] * height // VGA.height * width + np.arange(VGA.width) * width // VGA.width
     rows = rows.astype(np.int32)
     for frame in posed:
         depth = _depth(frame)
         spent["open3d"].append(_milliseconds(lambda f=frame, d=depth: reference.integrate(f, d)))
-        for count in CLASSES:
-            spent[str(count)].append(
-                _milliseconds(lambda f=frame, d=depth, n=count: ours[n].integrate(f, d, votes[n], rows=rows))
+        for name, voxel_map in ours.items():
+            p = votes[len(voxel_map.label_set)]
+            spent[name].append(
+                _milliseconds(lambda f=frame, d=depth, m=voxel_map, p=p: m.integrate(f, d, p, rows=rows))
             )
     median = {name: float(np.median(values[WARM_UP:])) for name, values in spent.items()}
     return {
         "frames": frames,
         "voxel_size_m": voxel_size_m,
         "threads": torch.get_num_threads(),
-        "blocks": ours[CLASSES[0]].block_count,
+        "blocks": ours["20"].block_count,
         "open3d_blocks": reference.block_count,
         "open3d_ms": round(median["open3d"], 1),
-        **{f"ms_{count}": round(median[str(count)], 1) for count in CLASSES},
-        **{f"ratio_{count}": round(median[str(count)] / median["open3d"], 2) for count in CLASSES},
+        **{f"ms_{name}": round(median[name], 1) for name in ours},
+        **{f"ratio_{name}": round(median[name] / median["open3d"], 2) for name in ours},
     }
 
 

@@ -51,7 +51,7 @@ COVERAGES = (
 
 
 @dataclass(slots=True, eq=False)
-class _Tally:
+class Tally:
     """Sums over rooms, at the maps' own surface points."""
 
     confusion: ConfusionMatrix = field(default_factory=lambda: ConfusionMatrix(ROOMS))
@@ -64,6 +64,7 @@ class _Tally:
     right: list[NDArray[np.bool_]] = field(default_factory=list)
 
     def row(self) -> dict[str, Any]:
+        """Shares, CPU seconds and the number of virtual views."""
         whole, before = self.confusion.metrics(), self.voted_before.metrics()
         found = calibration(np.concatenate(self.confidence), np.concatenate(self.right))
         return {
@@ -95,24 +96,23 @@ def bench_virtual(weights: Path | None, config: MapperConfig, rooms: int = 4, vi
         render=with_fields(config.render, share=FINER["share"]),
         sampling=with_fields(config.sampling, guided=FINER["guided"]),
     )
-    tallies: dict[str, dict[str, _Tally]] = {c.name: {} for c in COVERAGES}
+    tallies: dict[str, dict[str, Tally]] = {c.name: {} for c in COVERAGES}
     for seed in VALIDATION_SEEDS[:rooms]:
-        path = CameraPathConfig(step_m=SequenceConfig().step_m)
-        every = list(room_frames(seed, FRAMES, camera_of_width(MAP_WIDTH), path=path, noise=NoiseConfig()))
+        every = validation_frames(seed)
         if seed == VALIDATION_SEEDS[0]:  # load what is compiled, which is no part of the seconds
-            _map(weights, config, every[:4], 1)[0].look_around()
+            map_frames(weights, config, every[:4], 1)[0].look_around()
         for coverage in COVERAGES:
             frames = every[:: coverage.every]
-            judge = _Judge(seed, frames, tallies[coverage.name])
-            pipeline, seconds = _map(weights, config, frames, coverage.rendered)
+            judge = Judge(seed, frames, tallies[coverage.name])
+            pipeline, seconds = map_frames(weights, config, frames, coverage.rendered)
             judge.add("plain", pipeline.voxel_map, seconds)
             began = time.process_time()
             looks = pipeline.look_around(views)
             judge.add("virtual", pipeline.voxel_map, seconds + time.process_time() - began, len(looks))
-            pipeline, seconds = _map(weights, finer, frames, coverage.rendered)
+            pipeline, seconds = map_frames(weights, finer, frames, coverage.rendered)
             judge.add("finer", pipeline.voxel_map, seconds)
             if coverage.more:
-                pipeline, seconds = _map(weights, config, frames, coverage.more)
+                pipeline, seconds = map_frames(weights, config, frames, coverage.more)
                 judge.add("more frames", pipeline.voxel_map, seconds)
     return {
         "rooms": rooms,
@@ -122,7 +122,13 @@ def bench_virtual(weights: Path | None, config: MapperConfig, rooms: int = 4, vi
     }
 
 
-def _map(
+def validation_frames(seed: int) -> list[PosedFrame]:
+    """The frames of a validation room that its maps are made of."""
+    path = CameraPathConfig(step_m=SequenceConfig().step_m)
+    return list(room_frames(seed, FRAMES, camera_of_width(MAP_WIDTH), path=path, noise=NoiseConfig()))
+
+
+def map_frames(
     weights: Path | None, config: MapperConfig, frames: Sequence[PosedFrame], rendered: int
 ) -> tuple[MappingPipeline, float]:
     """Map frames, of which every ``rendered``-th is rendered; the seconds of CPU time that those took."""
@@ -139,10 +145,10 @@ def _map(
     return pipeline, seconds
 
 
-class _Judge:
+class Judge:
     """Compares maps of one room, all of the same surface points, with the room."""
 
-    def __init__(self, seed: int, frames: Sequence[PosedFrame], tallies: dict[str, _Tally]) -> None:
+    def __init__(self, seed: int, frames: Sequence[PosedFrame], tallies: dict[str, Tally]) -> None:
         self._surface = true_surface(make_room(seed), [f.T_world_camera for f in frames])
         self._tallies = tallies
         self._truth: UInt8 | None = None
@@ -150,7 +156,7 @@ class _Judge:
 
     def add(self, variant: str, voxel_map: VoxelMap, seconds: float, views: int = 0) -> None:
         """Count a map in; the first one says where there are votes without virtual views."""
-        tally = self._tallies.setdefault(variant, _Tally())
+        tally = self._tallies.setdefault(variant, Tally())
         points = voxel_map.points()
         label = in_rooms(points.label, voxel_map.label_set)
         voted = points.confidence > 0

@@ -1,7 +1,7 @@
 """Which blocks a depth image needs: those that its rays cross within the truncation band.
 
 Every pixel is looked at, for Open3D's own selection takes every fourth and so misses thin things; where the depth is
-smooth the corner rays of small tiles stand for the rays between them.
+smooth the ray through the middle of a small tile of pixels stands for theirs.
 """
 
 from __future__ import annotations
@@ -14,13 +14,15 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import FrameError
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE
-from semantic_mapper.mapping.block_index import KEY_LIMIT, first_slot, pack_key, pack_keys
+from semantic_mapper.mapping.block_index import KEY_LIMIT, first_slot, pack_key, pack_keys, pack_step
 from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 
 _BANDS = 8  # image bands with a key set of their own: enough to share among cores, few enough to merge at no cost
 _FIRST_CAPACITY = 1 << 13
-_TILE = 4  # pixels a side; the corners of a smooth tile speak for it, elsewhere every pixel is looked at
+_LEVELS = 3  # tiles of 1, 2 and 4 pixels a side: of the largest that is smooth one ray speaks for all pixels
+_STRIP = 1 << (_LEVELS - 1)  # rows of pixels looked at together
+_TRAIL = 8  # blocks of the rays before that are kept in mind
 
 
 class Camera(NamedTuple):
@@ -131,96 +133,138 @@ def _remember(packed, slots, keys, count):
     return count + 1
 
 
-@njit(nogil=True, cache=True)
-def _walk(a, b, slots, keys, count):
-    """Add every block on the segment a -> b (block units), in the order of crossing (Amanatides & Woo)."""
-    x, y, z = np.floor(a[0]), np.floor(a[1]), np.floor(a[2])
-    steps = int(abs(np.floor(b[0]) - x) + abs(np.floor(b[1]) - y) + abs(np.floor(b[2]) - z))
-    dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    sx, sy, sz = np.sign(dx), np.sign(dy), np.sign(dz)
-    tx = (x + (sx > 0) - a[0]) / dx if dx != 0 else np.inf
-    ty = (y + (sy > 0) - a[1]) / dy if dy != 0 else np.inf
-    tz = (z + (sz > 0) - a[2]) / dz if dz != 0 else np.inf
-    count = _remember(pack_key(x, y, z), slots, keys, count)
-    for _ in range(steps):
+@njit(nogil=True, cache=True, inline="always")
+def _first_crossing(a, d):
+    """Share of a way ``d`` from ``a`` after which the next whole number is crossed, and of every further one."""
+    every = 1.0 / abs(d) if d != 0 else 1e300
+    return (np.floor(a) + 1.0 - a if d >= 0 else a - np.floor(a)) * every, every
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _remember_ray(u, v, near, far, camera, per_block, trail, slots, keys, count):
+    """Add the blocks that the ray of a pixel crosses between two depths, in that order (Amanatides & Woo).
+
+    ``trail`` (n,) holds those of the rays before, first, second and so on: most are the same again.
+    """
+    R, t = camera.R, camera.t
+    x, y, run = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, (far - near) * per_block
+    dx, dy, dz = (
+        R[0, 0] * x + R[0, 1] * y + R[0, 2],
+        R[1, 0] * x + R[1, 1] * y + R[1, 2],
+        R[2, 0] * x + R[2, 1] * y + R[2, 2],
+    )
+    ax, ay, az = (t[0] + near * dx) * per_block, (t[1] + near * dy) * per_block, (t[2] + near * dz) * per_block
+    dx, dy, dz = dx * run, dy * run, dz * run
+    i, j, k = np.int64(np.floor(ax)), np.int64(np.floor(ay)), np.int64(np.floor(az))
+    steps = abs(np.int64(np.floor(ax + dx)) - i) + abs(np.int64(np.floor(ay + dy)) - j)
+    steps += abs(np.int64(np.floor(az + dz)) - k)
+    key = pack_key(i, j, k)
+    if key != trail[0]:
+        trail[0] = key
+        count = _remember(key, slots, keys, count)
+    (tx, every_x), (ty, every_y), (tz, every_z) = (
+        _first_crossing(ax, dx),
+        _first_crossing(ay, dy),
+        _first_crossing(az, dz),
+    )
+    step_x, step_y, step_z = pack_step(0, dx), pack_step(1, dy), pack_step(2, dz)
+    for n in range(1, steps + 1):
         if tx <= ty and tx <= tz:
-            x += sx
-            tx += sx / dx
+            key, tx = key + step_x, tx + every_x
         elif ty <= tz:
-            y += sy
-            ty += sy / dy
+            key, ty = key + step_y, ty + every_y
         else:
-            z += sz
-            tz += sz / dz
-        count = _remember(pack_key(x, y, z), slots, keys, count)
+            key, tz = key + step_z, tz + every_z
+        at = min(n, len(trail) - 1)
+        if key != trail[at]:
+            trail[at] = key
+            count = _remember(key, slots, keys, count)
     return count
 
 
-@njit(nogil=True, cache=True, inline="always")
-def _next_to(a, b):
-    """Whether the blocks of two points are the same or share a face, so that no third lies between."""
-    gap = abs(np.floor(a[0]) - np.floor(b[0])) + abs(np.floor(a[1]) - np.floor(b[1]))
-    return gap + abs(np.floor(a[2]) - np.floor(b[2])) <= 1
-
-
-@njit(nogil=True, cache=True, inline="always")
-def _remember_ray(u, v, near, far, camera, per_block, last, slots, keys, count):
-    """Add the blocks that the ray of a pixel crosses between two depths; ``last`` (2,) holds the ends seen before."""
-    R, t = camera.R, camera.t
-    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    dx = (R[0, 0] * x + R[0, 1] * y + R[0, 2]) * per_block
-    dy = (R[1, 0] * x + R[1, 1] * y + R[1, 2]) * per_block
-    dz = (R[2, 0] * x + R[2, 1] * y + R[2, 2]) * per_block
-    a = (t[0] * per_block + near * dx, t[1] * per_block + near * dy, t[2] * per_block + near * dz)
-    b = (t[0] * per_block + far * dx, t[1] * per_block + far * dy, t[2] * per_block + far * dz)
-    key_a = pack_key(np.floor(a[0]), np.floor(a[1]), np.floor(a[2]))
-    key_b = pack_key(np.floor(b[0]), np.floor(b[1]), np.floor(b[2]))
-    if key_a == last[0] and key_b == last[1] and _next_to(a, b):
-        return count  # same two blocks as the ray before, nothing in between
-    last[0], last[1] = key_a, key_b
-    return _walk(a, b, slots, keys, count)
-
-
 @njit(nogil=True, cache=True)
-def _is_smooth(depth, v0, v1, u0, u1, camera, voxel, depth_max):
-    """Nearest and farthest depth of a tile that its corners speak for; (0, 0) where every pixel has to be looked at.
+def _fill_tiles(depth, v0, depth_max, least, most):
+    """Least and greatest depth of the tiles of a strip that begins at row ``v0``.
 
-    A tile is smooth where all its pixels are measured, its depths differ by at most two voxels, and it is at most two
-    voxels wide: then no pixel's ray is farther than a voxel from the ray of a corner.
+    Args:
+        depth: (H, W) float32 metres.
+        v0: First row.
+        depth_max: Farther is not measured.
+        least, most: (levels, 4, >= W) float32 to fill: of level k only (4 >> k, W >> k); ``least`` is 0 where a pixel
+            is not measured or outside of the image.
     """
-    least, most = depth[v0, u0], depth[v0, u0]
-    for v in range(v0, v1):
-        for u in range(u0, u1):
+    height, width = depth.shape
+    least[0], most[0] = 0, 0
+    for v in range(v0, min(v0 + _STRIP, height)):
+        for u in range(width):
             z = depth[v, u]
-            if not (z > 0 and z <= depth_max):
-                return np.float32(0), np.float32(0)
-            least, most = min(least, z), max(most, z)
-    if most - least > 2 * voxel or _TILE * most > 2 * voxel * min(camera.fx, camera.fy):
-        return np.float32(0), np.float32(0)
-    return least, most
+            z = z if (z > 0) & (z <= depth_max) else np.float32(0.0)  # also for NaN
+            least[0, v - v0, u], most[0, v - v0, u] = z, z
+    for k in range(1, _LEVELS):
+        for v in range(_STRIP >> k):
+            for u in range(least.shape[2] >> k):
+                i, j = 2 * v, 2 * u
+                a, b = least[k - 1, i], least[k - 1, i + 1]
+                least[k, v, u] = min(min(a[j], a[j + 1]), min(b[j], b[j + 1]))
+                a, b = most[k - 1, i], most[k - 1, i + 1]
+                most[k, v, u] = max(max(a[j], a[j + 1]), max(b[j], b[j + 1]))
+
+
+@njit(nogil=True, cache=True, inline="always")
+def _is_smooth(least, most, flat, wide):
+    """Whether one ray speaks for a tile: all measured, depths that differ by at most ``flat``, none beyond ``wide``."""
+    return (least > 0) & (most - least <= flat) & (most <= wide)
 
 
 @parallel_kernel()
 def _collect_bands(depth, camera, voxel, truncation, depth_max, slots, keys, counts):
-    height, width = depth.shape
-    bands, rows = len(counts), (height + _TILE - 1) // _TILE
-    per_block = 1.0 / (voxel * BLOCK_SIDE)
-    for band in prange(bands):
-        count = 0
-        last = np.full(2, -1, np.int64)
-        own_slots, own_keys = slots[band], keys[band]
-        for row in range(band * rows // bands, (band + 1) * rows // bands):
-            v0, v1 = row * _TILE, min((row + 1) * _TILE, height)
-            for u0 in range(0, width, _TILE):
-                u1 = min(u0 + _TILE, width)
-                least, most = _is_smooth(depth, v0, v1, u0, u1, camera, voxel, depth_max)
-                smooth = least > 0
-                for v in range(v0, v1, max(v1 - v0 - 1, 1) if smooth else 1):
-                    for u in range(u0, u1, max(u1 - u0 - 1, 1) if smooth else 1):
-                        z = depth[v, u]
-                        if not (z > 0 and z <= depth_max):  # also false for NaN
-                            continue
-                        near = max((least if smooth else z) - truncation, 0.0)
-                        far = (most if smooth else z) + truncation
-                        count = _remember_ray(u, v, near, far, camera, per_block, last, own_slots, own_keys, count)
-        counts[band] = count
+    for band in prange(len(counts)):
+        counts[band] = _collect_band(
+            band, len(counts), depth, camera, voxel, truncation, depth_max, slots[band], keys[band]
+        )
+
+
+@njit(nogil=True, cache=True)
+def _collect_band(band, bands, depth, camera, voxel, truncation, depth_max, slots, keys):
+    """The blocks of one of the bands of an image; returns how many, more than ``len(keys)`` where there is no room.
+
+    A smooth tile is at most two voxels wide and deep. A block that none of the rays meets has then no more than a corner,
+    less than a voxel wide, between two of them: of a thousand blocks a few, often far from the surface, which the
+    next frame from elsewhere meets.
+    """
+    strips = (depth.shape[0] + _STRIP - 1) // _STRIP
+    size = (_LEVELS, _STRIP, (depth.shape[1] + _STRIP - 1) // _STRIP * _STRIP)
+    least, most, trail = np.empty(size, np.float32), np.empty(size, np.float32), np.full(_TRAIL, -1, np.int64)
+    view = (depth.shape, camera, truncation, 1.0 / (voxel * BLOCK_SIDE))
+    flat, wide, count = np.float32(2 * voxel), np.full(_LEVELS, depth_max, np.float32), 0
+    for k in range(1, _LEVELS):
+        wide[k] = 2 * voxel * min(camera.fx, camera.fy) / (1 << k)
+    for strip in range(band * strips // bands, (band + 1) * strips // bands):
+        _fill_tiles(depth, strip * _STRIP, np.float32(depth_max), least, most)
+        for k in range(_LEVELS):
+            for v in range(_STRIP >> k):
+                for u in range(size[2] >> k):
+                    low, high = least[k, v, u], most[k, v, u]
+                    if not _is_smooth(low, high, flat, wide[k]):
+                        continue
+                    i, j = v >> 1, u >> 1  # of the tile that this one is a quarter of
+                    if k + 1 < _LEVELS and _is_smooth(least[k + 1, i, j], most[k + 1, i, j], flat, wide[k + 1]):
+                        continue
+                    y = strip * _STRIP + (v << k)
+                    count = _remember_tile(u << k, y, (1 << k) - 1, low, high, view, trail, slots, keys, count)
+    return count
+
+
+@njit(nogil=True, cache=True)
+def _remember_tile(u, v, across, least, most, view, trail, slots, keys, count):
+    """Add the blocks on a tile's ray, or those of its corners at the edge of the image: nothing else is beyond them."""
+    (height, width), camera, truncation, per_block = view
+    near, far = max(least - truncation, 0.0), most + truncation
+    inside = (u > 0) & (v > 0) & (u < width - _STRIP) & (v < height - _STRIP)
+    if inside or across == 0:
+        x, y = u + 0.5 * across, v + 0.5 * across
+        return _remember_ray(x, y, near, far, camera, per_block, trail, slots, keys, count)
+    for corner in range(4):
+        x, y = u + float((corner & 1) * across), v + float((corner >> 1) * across)
+        count = _remember_ray(x, y, near, far, camera, per_block, trail, slots, keys, count)
+    return count

@@ -27,6 +27,7 @@ from semantic_mapper.mapping.block_index import (
     unpack_keys,
 )
 from semantic_mapper.mapping.block_store import BLOCK_VOXELS, BlockStore, BlockValues, PackedBlocks, pack_blocks
+from semantic_mapper.mapping.evidence import EVIDENCE_DTYPES
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.types import Float32
 
@@ -50,7 +51,7 @@ class GridBuffers(NamedTuple):
         tsdf: (capacity, 512) float32, signed distance over truncation in [-1, 1].
         weight: (capacity, 512) float32, number of depth measurements (capped).
         color: (capacity, 512, 3) float32 in 0..255.
-        evidence: (capacity, 512, L) float32, weighted sum of log probabilities.
+        evidence: (capacity, 512, L), sum (float32) or mean (int16) of log probabilities by weight; see ``evidence``.
         votes: (capacity, 512) float32, sum of vote weights.
     """
 
@@ -58,7 +59,7 @@ class GridBuffers(NamedTuple):
     tsdf: Float32
     weight: Float32
     color: Float32
-    evidence: Float32
+    evidence: NDArray[Any]
     votes: Float32
 
 
@@ -71,22 +72,31 @@ class BlockGrid:
         initial_blocks: Capacity at start.
         max_blocks: Blocks at most, in memory and on disk.
         memory_bytes: For blocks in memory; 0 = no limit.
+        evidence: Key of ``EVIDENCE_DTYPES``.
     """
 
     def __init__(
-        self, voxel_size_m: float, classes: int, initial_blocks: int, max_blocks: int, memory_bytes: int = 0
+        self,
+        voxel_size_m: float,
+        classes: int,
+        initial_blocks: int,
+        max_blocks: int,
+        memory_bytes: int = 0,
+        evidence: str = "float32",
     ) -> None:
         self._o3d = load_open3d()
         self._max_blocks = max_blocks
         self._voxel_size_m = voxel_size_m
         self._classes = classes
+        self.evidence = evidence
         channels = (1, 1, 3, classes, 1)
-        self._block_bytes = 4 * BLOCK_VOXELS * sum(channels) + 12
+        value_bytes = 4 * (1 + 1 + 3 + 1) + np.dtype(EVIDENCE_DTYPES[evidence]).itemsize * classes
+        self.block_bytes = BLOCK_VOXELS * value_bytes + 12
         self._max_resident = max_blocks
         if memory_bytes > 0:
-            self._max_resident = min(max_blocks, max(LEAST_RESIDENT, memory_bytes // self._block_bytes))
+            self._max_resident = min(max_blocks, max(LEAST_RESIDENT, memory_bytes // self.block_bytes))
             initial_blocks = self._max_resident  # at once: growing needs room for the old memory beside the new
-        self._grid = make_open3d_grid(voxel_size_m, channels, max(1, min(initial_blocks, max_blocks)))
+        self._grid = make_open3d_grid(voxel_size_m, channels, max(1, min(initial_blocks, max_blocks)), evidence)
         self._map = self._grid.hashmap()
         self._index = make_block_index(np.empty((0, 3), np.int32), np.empty(0, np.int32))
         self._store: BlockStore | None = None
@@ -134,7 +144,7 @@ class BlockGrid:
     @property
     def memory_bytes(self) -> int:
         """Bytes held for voxels and block tables, used or not."""
-        return self.capacity * self._block_bytes + self._index.slot_keys.nbytes + self._index.slot_values.nbytes
+        return self.capacity * self.block_bytes + self._index.slot_keys.nbytes + self._index.slot_values.nbytes
 
     def buffers(self) -> GridBuffers:
         """Views of the present buffers. Take them anew after every ``activate``: growth moves the memory."""
@@ -249,7 +259,7 @@ class BlockGrid:
         """A grid with these existing blocks (B,) in memory: this one where nothing is on disk, else a temporary one."""
         if not self.stored_count:
             return self
-        copy = BlockGrid(self._voxel_size_m, self._classes, len(packed), len(packed))
+        copy = BlockGrid(self._voxel_size_m, self._classes, len(packed), len(packed), evidence=self.evidence)
         copy.fill(packed, self.read(packed))
         return copy
 
@@ -293,11 +303,11 @@ class BlockGrid:
         if self.block_count + new > self._max_blocks:
             raise MapError(
                 f"the map is full: {self.block_count} blocks, {new} more asked for, limit {self._max_blocks} "
-                f"(voxel_map.max_blocks; {self._block_bytes / 1024:.0f} KiB a block). Raise the limit, use larger "
+                f"(voxel_map.max_blocks; {self.block_bytes / 1024:.0f} KiB a block). Raise the limit, use larger "
                 "voxels, or start a new map; what is in this one stays usable"
             )
         if len(packed) > self._max_resident:
-            need = len(packed) * self._block_bytes / 1e6
+            need = len(packed) * self.block_bytes / 1e6
             raise MapError(
                 f"one frame touches {len(packed)} blocks, memory has room for {self._max_resident}; raise "
                 f"voxel_map.memory_mb to {need:.0f} or more, or use larger voxels"
@@ -327,7 +337,7 @@ class BlockGrid:
     def _evict(self, count: int, keep: NDArray[np.int64]) -> None:
         """Put the ``count`` blocks that were used longest ago, and some more, on disk; those of ``keep`` stay."""
         if self._store is None:
-            self._store = BlockStore(self._classes)
+            self._store = BlockStore(self._classes, self.evidence)
             _log.info("map_pages", resident=self._max_resident, reason="voxel_map.memory_mb is used up")
         keys, indices = self.sorted_blocks()
         packed = pack_keys(keys)
@@ -369,11 +379,11 @@ class BlockGrid:
             view[added] = 0
 
 
-def make_open3d_grid(voxel_size_m: float, channels: tuple[int, ...], capacity: int) -> Any:
-    """An empty VoxelBlockGrid on the CPU with float32 attributes named as in ``ATTRIBUTES``."""
+def make_open3d_grid(voxel_size_m: float, channels: tuple[int, ...], capacity: int, evidence: str = "float32") -> Any:
+    """An empty VoxelBlockGrid on the CPU with attributes named as in ``ATTRIBUTES``, float32 but for the evidence."""
     o3d = load_open3d()
     names = ATTRIBUTES[: len(channels)]
-    dtypes = (o3d.core.float32,) * len(channels)
+    dtypes = tuple(getattr(o3d.core, evidence) if name == "evidence" else o3d.core.float32 for name in names)
     shapes = tuple((c,) for c in channels)
     device = o3d.core.Device("CPU:0")
     return o3d.t.geometry.VoxelBlockGrid(names, dtypes, shapes, voxel_size_m, BLOCK_SIDE, capacity, device)

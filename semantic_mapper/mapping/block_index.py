@@ -62,6 +62,13 @@ def pack_key(bx, by, bz):
 
 
 @njit(nogil=True, cache=True, inline="always")
+def pack_step(axis, sign):
+    """What to add to a packed key for the next block along an axis, in the direction of ``sign``."""
+    step = np.int64(1) << ((2 - axis) * KEY_BITS)
+    return step if sign > 0 else -step
+
+
+@njit(nogil=True, cache=True, inline="always")
 def first_slot(packed, slot_count):
     """Where the search for a key begins."""
     h = packed * np.int64(_HASH_FACTOR)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sqlite3
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.mapping.evidence import EVIDENCE_DTYPES
 from semantic_mapper.mapping.key_table import ABSENT, KeyTable
 from semantic_mapper.types import Float32
 
@@ -32,13 +33,13 @@ class BlockValues(NamedTuple):
     Args:
         tsdf, weight, votes: (B, 512) float32.
         color: (B, 512, 3) float32.
-        evidence: (B, 512, L) float32.
+        evidence: (B, 512, L) as the map keeps it; see ``evidence``.
     """
 
     tsdf: Float32
     weight: Float32
     color: Float32
-    evidence: Float32
+    evidence: NDArray[Any]
     votes: Float32
 
 
@@ -47,12 +48,14 @@ class PackedBlocks(NamedTuple):
     (of a byte, the highest first); TSDF, weight and colour of those measured; evidence and votes of those with votes.
 
     Args:
-        data: (N,) float32, the masks as their bits.
+        data: (N,) float32; of what is not float32, the bits, each voxel's evidence in whole ones.
         ends: (B + 1,) where blocks begin and end in it.
+        evidence: Type of the evidence.
     """
 
     data: Float32
     ends: NDArray[np.int64]
+    evidence: np.dtype[Any]
 
     def blobs(self) -> list[memoryview]:
         """The bytes of each block; they share memory."""
@@ -65,13 +68,14 @@ class BlockStore:
 
     Args:
         classes: L.
+        evidence: Key of ``EVIDENCE_DTYPES``.
 
     Raises:
         MapError: no file can be made in the system's folder for temporary files.
     """
 
-    def __init__(self, classes: int) -> None:
-        self._classes = classes
+    def __init__(self, classes: int, evidence: str = "float32") -> None:
+        self._classes, self._evidence = classes, EVIDENCE_DTYPES[evidence]
         try:
             # Calls come from whichever thread holds the map's lock.
             self._database = sqlite3.connect("", check_same_thread=False, isolation_level=None)
@@ -144,7 +148,7 @@ class BlockStore:
                 found.update((key, (crc, voxels)) for key, crc, voxels in rows)
         except sqlite3.Error as error:
             raise MapError(f"blocks on disk cannot be read: {error}") from error
-        values = _empty(len(wanted), self._classes)
+        values = _empty(len(wanted), self._classes, self._evidence)
         for n, key in enumerate(wanted):
             if key not in found or zlib.crc32(found[key][1]) != found[key][0]:
                 raise MapError(f"block {key} on disk is {'damaged' if key in found else 'missing'}; its disk fails")
@@ -168,22 +172,28 @@ def _parts(keys: list[int]) -> Iterator[list[int]]:
         yield keys[start : start + _ASKED_AT_ONCE]
 
 
-def _empty(count: int, classes: int) -> BlockValues:
+def _empty(count: int, classes: int, evidence: type[np.generic]) -> BlockValues:
     flat = (count, BLOCK_VOXELS)
-    shapes: Iterable[tuple[int, ...]] = (flat, flat, (*flat, 3), (*flat, classes), flat)
-    return BlockValues(*(np.zeros(shape, np.float32) for shape in shapes))
+    tsdf, weight, votes = (np.zeros(flat, np.float32) for _ in range(3))
+    return BlockValues(tsdf, weight, np.zeros((*flat, 3), np.float32), np.zeros((*flat, classes), evidence), votes)
 
 
 def pack_blocks(values: BlockValues, rows: NDArray[np.int32]) -> PackedBlocks:
     """Copy blocks ``rows`` (B,) of ``values`` in one compiled pass, without the voxels that hold nothing."""
-    ends = _ends(values.weight, values.votes, rows, values.evidence.shape[2])
-    data = np.empty(ends[-1], np.float32)
-    _pack(values, rows, ends, data, data.view(np.uint8))
-    return PackedBlocks(data, ends)
+    ends = _ends(values.weight, values.votes, rows, evidence_words(values.evidence.shape[2], values.evidence))
+    data = np.zeros(ends[-1], np.float32)
+    _pack(values, rows, ends, (data, data.view(np.uint8), data.view(values.evidence.dtype)))
+    return PackedBlocks(data, ends, values.evidence.dtype)
 
 
 @njit(nogil=True, cache=True)
-def _ends(weight, votes, rows, classes):
+def evidence_words(classes, evidence):
+    """How many float32 the evidence of one voxel takes up in packed blocks, for an array of its type."""
+    return (classes * evidence.itemsize + 3) // 4
+
+
+@njit(nogil=True, cache=True)
+def _ends(weight, votes, rows, width):
     """Where the packed blocks begin and end (B + 1,), in units of float32."""
     ends = np.zeros(len(rows) + 1, np.int64)
     for n in range(len(rows)):
@@ -191,16 +201,18 @@ def _ends(weight, votes, rows, classes):
         for voxel in range(BLOCK_VOXELS):
             measured += weight[rows[n], voxel] > 0
             voted += votes[rows[n], voxel] > 0
-        ends[n + 1] = ends[n] + MASK_BYTES // 2 + 5 * measured + (classes + 1) * voted
+        ends[n + 1] = ends[n] + MASK_BYTES // 2 + 5 * measured + (width + 1) * voted
     return ends
 
 
 @njit(nogil=True, cache=True)
-def _pack(values, rows, ends, out, out_bytes):
-    """Write blocks as ``PackedBlocks`` says to ``out``; ``out_bytes`` is the same memory."""
+def _pack(values, rows, ends, out_views):
+    """Write blocks as ``PackedBlocks`` says to zeros; ``out_views`` are float32, bytes, evidence of the same memory."""
+    out, out_bytes, out_evidence = out_views
+    classes, each = values.evidence.shape[2], 4 // out_evidence.itemsize
+    width = evidence_words(classes, out_evidence)
     for n in range(len(rows)):
-        block, masks, classes = rows[n], 4 * ends[n], values.evidence.shape[2]
-        out_bytes[masks : masks + 2 * MASK_BYTES] = 0
+        block, masks = rows[n], 4 * ends[n]
         measured = 0
         for voxel in range(BLOCK_VOXELS):
             bit = np.uint8(0x80 >> (voxel & 7))
@@ -211,7 +223,7 @@ def _pack(values, rows, ends, out, out_bytes):
                 out_bytes[masks + MASK_BYTES + (voxel >> 3)] |= bit
         tsdf = ends[n] + MASK_BYTES // 2
         weight, color, evidence = tsdf + measured, tsdf + 2 * measured, tsdf + 5 * measured
-        votes = ends[n + 1] - (ends[n + 1] - evidence) // (classes + 1)
+        votes = ends[n + 1] - (ends[n + 1] - evidence) // (width + 1)
         for voxel in range(BLOCK_VOXELS):
             if values.weight[block, voxel] > 0:
                 out[tsdf], out[weight] = values.tsdf[block, voxel], values.weight[block, voxel]
@@ -220,26 +232,28 @@ def _pack(values, rows, ends, out, out_bytes):
                 tsdf, weight, color = tsdf + 1, weight + 1, color + 3
             if values.votes[block, voxel] > 0:
                 for c in range(classes):
-                    out[evidence + c] = values.evidence[block, voxel, c]
+                    out_evidence[each * evidence + c] = values.evidence[block, voxel, c]
                 out[votes] = values.votes[block, voxel]
-                evidence, votes = evidence + classes, votes + 1
+                evidence, votes = evidence + width, votes + 1
 
 
 def _unpack(voxels: bytes, values: BlockValues, n: int) -> None:
     data = np.frombuffer(voxels, np.float32)
-    _unpack_block(data, data.view(np.uint8), values, n)
+    _unpack_block((data, data.view(np.uint8), data.view(values.evidence.dtype)), values, n)
 
 
 @njit(nogil=True, cache=True)
-def _unpack_block(data, data_bytes, values, n):
+def _unpack_block(views, values, n):
     """The reverse of ``_pack`` for one block, onto voxels that are zero."""
-    classes = values.evidence.shape[2]
+    data, data_bytes, said = views
+    classes, each = values.evidence.shape[2], 4 // said.itemsize
+    width = evidence_words(classes, said)
     measured = 0
     for voxel in range(BLOCK_VOXELS):
         measured += (data_bytes[voxel >> 3] >> (7 - (voxel & 7))) & 1
     tsdf = MASK_BYTES // 2
     weight, color, evidence = tsdf + measured, tsdf + 2 * measured, tsdf + 5 * measured
-    votes = len(data) - (len(data) - evidence) // (classes + 1)
+    votes = len(data) - (len(data) - evidence) // (width + 1)
     for voxel in range(BLOCK_VOXELS):
         shift = 7 - (voxel & 7)
         if (data_bytes[voxel >> 3] >> shift) & 1:
@@ -249,6 +263,6 @@ def _unpack_block(data, data_bytes, values, n):
             tsdf, weight, color = tsdf + 1, weight + 1, color + 3
         if (data_bytes[MASK_BYTES + (voxel >> 3)] >> shift) & 1:
             for c in range(classes):
-                values.evidence[n, voxel, c] = data[evidence + c]
+                values.evidence[n, voxel, c] = said[each * evidence + c]
             values.votes[n, voxel] = data[votes]
-            evidence, votes = evidence + classes, votes + 1
+            evidence, votes = evidence + width, votes + 1

@@ -18,7 +18,7 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_grid import BLOCK_VOXELS, BlockGrid
 from semantic_mapper.mapping.block_index import unpack_keys
-from semantic_mapper.mapping.block_store import MASK_BYTES, PackedBlocks
+from semantic_mapper.mapping.block_store import MASK_BYTES, PackedBlocks, evidence_words
 from semantic_mapper.mapping.readout import decide
 from semantic_mapper.types import UInt8
 
@@ -179,14 +179,18 @@ def _compact_into(out: BlockChanges, rows: NDArray[np.int64], blocks: PackedBloc
     ids = np.array((*labels.ids, labels.ignore_id), np.uint8)
     limits = (ids, chosen.vote_discount, chosen.min_weight)
     arrays = (out.tsdf, out.label, out.confidence, out.rgb)
-    _compact(blocks.data, blocks.data.view(np.uint8), blocks.ends, rows, *limits, *arrays)
+    data = (blocks.data, blocks.data.view(np.uint8), blocks.data.view(blocks.evidence))
+    _compact(data, blocks.ends, rows, *limits, *arrays)
 
 
 # Serial: another thread than the mapper's runs it, and numba's fallback layer allows no two parallel kernels at once.
 @njit(nogil=True, cache=True)
-def _compact(data, masks, ends, rows, ids, vote_discount, min_weight, tsdf, label, confidence, rgb):
+def _compact(views, ends, rows, ids, vote_discount, min_weight, tsdf, label, confidence, rgb):
     """Write packed blocks (B,) to ``rows`` (B,) of the output."""
+    data, masks, said = views
     classes = len(ids) - 1
+    each = data.itemsize // said.itemsize
+    width = evidence_words(classes, said)
     for n in range(len(rows)):
         row, first = rows[n], 4 * ends[n]
         measured = 0
@@ -194,7 +198,7 @@ def _compact(data, masks, ends, rows, ids, vote_discount, min_weight, tsdf, labe
             measured += (masks[first + (voxel >> 3)] >> (7 - (voxel & 7))) & 1
         distance = ends[n] + MASK_BYTES // 2
         weight, color, evidence = distance + measured, distance + 2 * measured, distance + 5 * measured
-        votes = ends[n + 1] - (ends[n + 1] - evidence) // (classes + 1)
+        votes = ends[n + 1] - (ends[n + 1] - evidence) // (width + 1)
         for voxel in range(BLOCK_VOXELS):
             tsdf[row, voxel] = UNOBSERVED
             label[row, voxel] = ids[-1]
@@ -212,7 +216,7 @@ def _compact(data, masks, ends, rows, ids, vote_discount, min_weight, tsdf, labe
                 distance, weight, color = distance + 1, weight + 1, color + 3
             if (masks[at + MASK_BYTES] >> shift) & 1:
                 if seen:
-                    best, p = decide(data[evidence : evidence + classes], data[votes], vote_discount)
+                    best, p = decide(said[each * evidence : each * evidence + classes], data[votes], vote_discount)
                     label[row, voxel] = ids[best]
                     confidence[row, voxel] = np.uint8(p * CONFIDENCE_STEPS + 0.5)
-                evidence, votes = evidence + classes, votes + 1
+                evidence, votes = evidence + width, votes + 1

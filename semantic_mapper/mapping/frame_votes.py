@@ -57,9 +57,15 @@ def probability_table(
 
 
 def frame_votes(
-    depth: Float32, table: ProbabilityTable | None, camera: Camera, depth_max_m: float, classes: int, where: str
+    depth: Float32,
+    table: ProbabilityTable | None,
+    camera: Camera,
+    depth_max_m: float,
+    classes: int,
+    where: str,
+    trust: Float32 | None = None,
 ) -> Votes:
-    """Votes of a frame, none without a table.
+    """Votes of a frame, none without a table; each weighs what the depth under it does, where ``trust`` says so.
 
     Raises:
         FrameError: probabilities that are none.
@@ -72,7 +78,22 @@ def frame_votes(
             f"{where}: {bad} known pixels hold class probabilities that are NaN, negative or do not sum to 1; "
             "give a softmax, or mark the pixels as not known"
         )
-    return votes
+    return votes if trust is None or not trust.size else votes._replace(weights=votes.weights * trust)
+
+
+def trusted_depth(depth: Float32, trust: Float32 | None, where: str) -> tuple[Float32, Float32]:
+    """Depth (H, W) without what is not trusted, and its weights as ``fuse_blocks`` takes them.
+
+    Raises:
+        ShapeError: the weights do not fit the depth, or are not float32 in 0..1.
+    """
+    if trust is None:
+        return depth, np.empty((0, 0), np.float32)
+    expect_shape(trust, f"{depth.shape[0]} {depth.shape[1]}", f"{where}: trust")
+    _expect_dtype(trust, np.float32, f"{where}: trust")
+    if not ((trust >= 0) & (trust <= 1)).all():
+        raise ShapeError(f"{where}: trust must be 0 ... 1 everywhere")
+    return np.where(trust > 0, depth, np.float32(0)), np.ascontiguousarray(trust)
 
 
 def _expect_dtype(array: NDArray[np.generic], dtype: type[np.generic], name: str) -> None:

@@ -19,10 +19,11 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.mapping.allocation import Camera
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE
+from semantic_mapper.mapping.block_store import BLOCK_VOXELS
+from semantic_mapper.mapping.evidence import PROBABILITY_FLOOR, add_vote, dither_seed
 from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import Float32
 
-PROBABILITY_FLOOR = 1e-4  # one confident mistake must not outweigh many modest looks: a vote moves at most ln 1e4
 FULL_TRUST_RANGE_M = 2.0  # a vote from farther counts (2 m / z)^2: a pixel covers that much more surface there
 LEAST_COSINE = 0.2  # of the angle between ray and surface normal; grazing looks count this much, never nothing
 
@@ -68,25 +69,6 @@ def make_limits(config: VoxelMapConfig) -> FusionLimits:
     )
 
 
-@njit(nogil=True, cache=True, inline="always")
-def _cosine(depth, v, u, camera):
-    """|cos| between the ray of a pixel and the surface normal from its four neighbours; the least at depth edges."""
-    height, width = depth.shape
-    if u < 1 or v < 1 or u >= width - 1 or v >= height - 1:
-        return LEAST_COSINE
-    z = depth[v, u]
-    left, right, up, down = depth[v, u - 1], depth[v, u + 1], depth[v - 1, u], depth[v + 1, u]
-    if not (left > 0 and right > 0 and up > 0 and down > 0):
-        return LEAST_COSINE
-    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    # With slopes dz/du, dz/dv the normal is (fx dz/du, fy dz/dv, -(z + x fx dz/du + y fy dz/dv)), unnormalised.
-    nx, ny = camera.fx * 0.5 * (right - left), camera.fy * 0.5 * (down - up)
-    nz = -(z + x * nx + y * ny)
-    dot = x * nx + y * ny + nz  # = -z for the ray (x, y, 1)
-    norm = np.sqrt((nx * nx + ny * ny + nz * nz) * (x * x + y * y + 1.0))
-    return max(abs(dot) / norm, LEAST_COSINE)
-
-
 class Votes(NamedTuple):
     """What a frame says of classes.
 
@@ -114,10 +96,9 @@ def make_votes(
     Returns:
         The votes, and how many known pixels hold probabilities that are not finite, negative or do not sum to 1.
     """
-    proper = _proper(probabilities)
+    log_p, proper = _log_rows(probabilities)
     weights, bad = _vote_weights(depth, rows, proper, camera, depth_max)
-    log_p = np.maximum(probabilities, np.float32(PROBABILITY_FLOOR))
-    return Votes(np.log(log_p, out=log_p), rows, weights), bad
+    return Votes(log_p, rows, weights), bad
 
 
 def no_votes(height: int, width: int, classes: int) -> Votes:
@@ -127,16 +108,19 @@ def no_votes(height: int, width: int, classes: int) -> Votes:
 
 
 @parallel_kernel()
-def _proper(probabilities):
-    """Whether each row (K,) is of numbers that are not negative and sum to 1."""
-    out = np.empty(len(probabilities), np.bool_)
+def _log_rows(probabilities):
+    """Floored log of rows (K, L), and whether each is of numbers that are not negative and sum to 1."""
+    logs, proper = np.empty_like(probabilities), np.empty(len(probabilities), np.bool_)
+    floor = np.float32(PROBABILITY_FLOOR)
     for n in prange(len(probabilities)):
         total, least = 0.0, np.float32(0.0)
         for c in range(probabilities.shape[1]):
-            total += probabilities[n, c]
-            least = min(least, probabilities[n, c])
-        out[n] = abs(total - 1.0) < 1e-2 and least >= 0
-    return out
+            p = probabilities[n, c]
+            total += p
+            least = min(least, p)
+            logs[n, c] = np.log(max(p, floor))
+        proper[n] = abs(total - 1.0) < 1e-2 and least >= 0
+    return logs, proper
 
 
 @parallel_kernel()
@@ -145,33 +129,44 @@ def _vote_weights(depth, rows, proper, camera, depth_max):
     weights = np.zeros((height, width), np.float32)
     bad = 0
     for v in prange(height):
+        up, down = depth[max(v - 1, 0)], depth[min(v + 1, height - 1)]
+        _weigh_row(v, 0 < v < height - 1, up, depth[v], down, camera, depth_max, weights[v])
         for u in range(width):
-            z = depth[v, u]
-            if rows[v, u] < 0 or not (z > 0 and z <= depth_max):
-                continue
-            if not proper[rows[v, u]]:
+            row = rows[v, u]
+            if row < 0:
+                weights[v, u] = 0
+            elif not proper[row] and weights[v, u] > 0:
+                weights[v, u] = 0
                 bad += 1
-                continue
-            near = FULL_TRUST_RANGE_M / z
-            weights[v, u] = _cosine(depth, v, u, camera) * min(1.0, near * near)
     return weights, bad
 
 
-@njit(nogil=True, cache=True, inline="always")
-def add_vote(evidence, votes, voxel, log_p, row, weight, cap):
-    """``e += w log p``; past the cap the old sum shrinks so that the map stays able to change its mind."""
-    total = votes[voxel] + weight
-    keep = np.float32(1.0)
-    if total > cap:
-        keep = (cap - weight) / votes[voxel]
-        total = cap
-    votes[voxel] = total
-    for c in range(log_p.shape[1]):
-        evidence[voxel, c] = evidence[voxel, c] * keep + weight * log_p[row, c]
+@njit(nogil=True, cache=True, error_model="numpy")
+def _weigh_row(v, inside, up, depth, down, camera, depth_max, weights):
+    """Vote weights of a row of pixels: |cos| between ray and surface normal, from four neighbours, and nearness."""
+    last, one, half = len(depth) - 1, np.float32(1.0), np.float32(0.5)
+    fx, fy, cx = np.float32(camera.fx), np.float32(camera.fy), np.float32(camera.cx)
+    least, full, far = np.float32(LEAST_COSINE), np.float32(FULL_TRUST_RANGE_M), np.float32(depth_max)
+    y = (np.float32(v) - np.float32(camera.cy)) / fy
+    for u in range(1, last):  # without branches, for eight at a time
+        z, left, right = depth[u], depth[u - 1], depth[u + 1]
+        x = (np.float32(u) - cx) / fx
+        # With slopes dz/du, dz/dv the normal is (fx dz/du, fy dz/dv, -(z + x fx dz/du + y fy dz/dv)), unnormalised;
+        # its product with the ray (x, y, 1) is -z.
+        nx, ny = fx * half * (right - left), fy * half * (down[u] - up[u])
+        nz = z + x * nx + y * ny
+        cosine = z / np.sqrt((nx * nx + ny * ny + nz * nz) * (x * x + y * y + one))
+        known = inside & (left > 0) & (right > 0) & (up[u] > 0) & (down[u] > 0) & (cosine > least)
+        near = full / z
+        weights[u] = (cosine if known else least) * min(near * near, one) if (z > 0) & (z <= far) else np.float32(0.0)
+    for u in (0, last):
+        z = depth[u]
+        near = full / z
+        weights[u] = least * min(near * near, one) if (z > 0) & (z <= far) else np.float32(0.0)
 
 
 @parallel_kernel()
-def fuse_blocks(indices, buffers, camera, limits, depth, rgb, votes):
+def fuse_blocks(indices, buffers, camera, limits, depth, rgb, trust, votes, moment):
     """Fuse one frame into the blocks with buffer ``indices`` (B,), in place.
 
     Args:
@@ -181,95 +176,88 @@ def fuse_blocks(indices, buffers, camera, limits, depth, rgb, votes):
         limits: ``FusionLimits``.
         depth: (H, W) float32 metres.
         rgb: (H, W, 3) uint8.
+        trust: (H, W) float32 weight of each depth, or (0, 0) where all are measured: 1.
         votes: ``Votes`` of the frame.
+        moment: A number that changes from frame to frame; see ``evidence``.
     """
+    offsets = voxel_offsets(camera, limits.voxel_size)
     for i in prange(len(indices)):
-        _fuse_block(indices[i], buffers, camera, limits, depth, rgb, votes)
+        _fuse_block(indices[i], offsets, buffers, camera, limits, depth, rgb, trust, votes, moment)
 
 
-@njit(nogil=True, cache=True, inline="always")
-def pinhole(camera, depth):
-    """Lens and image size of a frame's depth (H, W), as ``project_row`` takes them."""
-    half = np.float32(0.5)  # of a pixel more: truncation then rounds to the pixel
-    lens = (np.float32(camera.fx), np.float32(camera.fy), np.float32(camera.cx) + half, np.float32(camera.cy) + half)
-    return lens, (np.int32(depth.shape[1]), np.float32(depth.shape[1]), np.float32(depth.shape[0]))
-
-
-@njit(nogil=True, cache=True, inline="always")
-def place_block(key, camera, voxel_size):
-    """First voxel of a block relative to the camera, in world axes, and the step along x in camera axes; metres."""
-    R, t = camera.R, camera.t
-    origin = (
-        key[0] * BLOCK_SIDE * voxel_size - t[0],
-        key[1] * BLOCK_SIDE * voxel_size - t[1],
-        key[2] * BLOCK_SIDE * voxel_size - t[2],
-    )
-    step = (np.float32(R[0, 0] * voxel_size), np.float32(R[0, 1] * voxel_size), np.float32(R[0, 2] * voxel_size))
-    return origin, step
-
-
-@njit(nogil=True, cache=True, inline="always")
-def row_start(row, origin, R, voxel_size):
-    """Camera coordinates (R^T p) of the first voxel of a row; along the row they go on by ``place_block``'s step."""
-    x, y, z = origin[0], origin[1] + (row & 7) * voxel_size, origin[2] + (row >> 3) * voxel_size
-    return (
-        np.float32(R[0, 0] * x + R[1, 0] * y + R[2, 0] * z),
-        np.float32(R[0, 1] * x + R[1, 1] * y + R[2, 1] * z),
-        np.float32(R[0, 2] * x + R[1, 2] * y + R[2, 2] * z),
-    )
-
-
-@njit(nogil=True, cache=True, inline="always")
-def project_row(p, step, lens, size, depth, truncation, depth_max, pixels, distances):
-    """Pixel that each voxel of a row projects to and its signed distance; -1 where there is nothing to fuse."""
-    fx, fy, cx, cy = lens
-    width, right, bottom = size
-    px, py, pz = p
-    sx, sy, sz = step
-    for i in range(BLOCK_SIDE):  # without branches, for eight at a time
-        n = np.float32(i)
-        zc = pz + n * sz
-        inverse = np.float32(1.0) / zc
-        u, v = fx * (px + n * sx) * inverse + cx, fy * (py + n * sy) * inverse + cy
-        inside = (zc > 0) & (u >= 0) & (v >= 0) & (u < right) & (v < bottom)
-        pixels[i] = np.int32(v) * width + np.int32(u) if inside else np.int32(-1)
-        distances[i] = zc
-    any_left = False
-    for i in range(BLOCK_SIDE):
-        if pixels[i] >= 0:
-            d = depth[pixels[i]]
-            distances[i] = d - distances[i]
-            if d > 0 and d <= depth_max and distances[i] >= -truncation:
-                any_left = True
-            else:
-                pixels[i] = -1
-    return any_left
+@njit(nogil=True, cache=True)
+def voxel_offsets(camera, voxel_size):
+    """(3, 512) float32: camera coordinates (R^T p) of the voxels of a block from its first one; metres."""
+    R, offsets = camera.R, np.empty((3, BLOCK_VOXELS), np.float32)
+    for n in range(BLOCK_VOXELS):
+        x, y, z = (n & 7) * voxel_size, ((n >> 3) & 7) * voxel_size, (n >> 6) * voxel_size
+        for axis in range(3):
+            offsets[axis, n] = R[0, axis] * x + R[1, axis] * y + R[2, axis] * z
+    return offsets
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _fuse_block(block, buffers, camera, limits, depth, rgb, frame_votes):
-    one = np.float32(1.0)
-    lens, size = pinhole(camera, depth)
-    depth_max, flat_depth = np.float32(limits.depth_max), depth.reshape(-1)
-    truncation, band, cap = np.float32(limits.truncation), np.float32(limits.vote_band), np.float32(limits.max_weight)
+def look_up_voxels(key, offsets, camera, voxel_size, depth, behind, depth_max):
+    """Which voxels of a block a frame says something of: inside the image, where there is depth, not far behind it.
+
+    Args:
+        key: (3,) block coordinates.
+        offsets: Of ``voxel_offsets``.
+        camera: ``Camera`` of the frame.
+        voxel_size: Metres.
+        depth: (H, W) float32 metres.
+        behind: Metres that a voxel may lie behind the surface.
+        depth_max: Farther depth is ignored.
+
+    Returns:
+        How many there are, and of each, at the start of arrays (512,): the voxel in the block and the pixel that it
+        projects to, int32, and its signed distance along z, float32, positive in front of the surface.
+    """
+    R, side, zero = camera.R, BLOCK_SIDE * voxel_size, np.float32(0.0)
+    x, y, z = key[0] * side - camera.t[0], key[1] * side - camera.t[1], key[2] * side - camera.t[2]
+    x0 = np.float32(R[0, 0] * x + R[1, 0] * y + R[2, 0] * z)
+    y0 = np.float32(R[0, 1] * x + R[1, 1] * y + R[2, 1] * z)
+    z0 = np.float32(R[0, 2] * x + R[1, 2] * y + R[2, 2] * z)
+    half = np.float32(0.5)  # of a pixel more: truncation then rounds to the pixel
+    fx, fy, cx, cy = np.float32(camera.fx), np.float32(camera.fy), np.float32(camera.cx), np.float32(camera.cy)
+    width, right, bottom = np.int32(depth.shape[1]), np.float32(depth.shape[1]), np.float32(depth.shape[0])
+    at, depths = np.empty(BLOCK_VOXELS, np.int32), np.empty(BLOCK_VOXELS, np.float32)
+    for n in range(BLOCK_VOXELS):  # without branches, for eight at a time
+        zc = z0 + offsets[2, n]
+        inverse = np.float32(1.0) / zc
+        u, v = fx * (x0 + offsets[0, n]) * inverse + (cx + half), fy * (y0 + offsets[1, n]) * inverse + (cy + half)
+        inside = (zc > zero) & (u >= zero) & (v >= zero) & (u < right) & (v < bottom)
+        at[n] = np.int32(v) * width + np.int32(u) if inside else np.int32(-1)
+        depths[n] = zc
+    flat, count = depth.reshape(-1), 0
+    voxels, pixels = np.empty(BLOCK_VOXELS, np.int32), np.empty(BLOCK_VOXELS, np.int32)
+    distances = np.empty(BLOCK_VOXELS, np.float32)
+    for n in range(BLOCK_VOXELS):  # what counts stays, what does not is written over by the next
+        d = flat[max(at[n], 0)]
+        distance = d - depths[n]
+        voxels[count], pixels[count], distances[count] = n, at[n], distance
+        count += (at[n] >= 0) & (d > 0) & (d <= depth_max) & (distance >= -behind)
+    return count, voxels, pixels, distances
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _fuse_block(block, offsets, buffers, camera, limits, depth, rgb, trust, frame_votes, moment):
+    one, truncation = np.float32(1.0), np.float32(limits.truncation)
+    band, cap = np.float32(limits.vote_band), np.float32(limits.max_weight)
+    depth_max, place = np.float32(limits.depth_max), (buffers.keys[block], offsets, camera, limits.voxel_size)
+    count, voxels, pixels, distances = look_up_voxels(*place, depth, truncation, depth_max)
     tsdf, weight, color = buffers.tsdf[block], buffers.weight[block], buffers.color[block]
     evidence, votes = buffers.evidence[block], buffers.votes[block]
+    weighs = trust.reshape(-1)
     colors, rows, weights = rgb.reshape(-1, 3), frame_votes.rows.reshape(-1), frame_votes.weights.reshape(-1)
-    pixels, distances = np.empty(BLOCK_SIDE, np.int32), np.empty(BLOCK_SIDE, np.float32)
-    origin, step = place_block(buffers.keys[block], camera, limits.voxel_size)
-    for row in range(BLOCK_SIDE * BLOCK_SIDE):
-        p = row_start(row, origin, camera.R, limits.voxel_size)
-        if not project_row(p, step, lens, size, flat_depth, truncation, depth_max, pixels, distances):
-            continue
-        for i in range(BLOCK_SIDE):
-            pixel, voxel = pixels[i], row * BLOCK_SIDE + i
-            if pixel < 0:
-                continue
-            old = weight[voxel]
-            share = one / (old + one)
-            tsdf[voxel] = (old * tsdf[voxel] + min(distances[i] / truncation, one)) * share
-            for c in range(3):
-                color[voxel, c] = (old * color[voxel, c] + colors[pixel, c]) * share
-            weight[voxel] = min(old + one, cap)
-            if weights[pixel] > 0 and abs(distances[i]) <= band:
-                add_vote(evidence, votes, voxel, frame_votes.log_p, rows[pixel], weights[pixel], cap)
+    seed = dither_seed(buffers.keys[block], moment)
+    for k in range(count):
+        voxel, pixel = voxels[k], pixels[k]
+        old, new = weight[voxel], weighs[pixel] if len(weighs) else one
+        share = one / (old + new)
+        tsdf[voxel] = (old * tsdf[voxel] + new * min(distances[k] / truncation, one)) * share
+        for c in range(3):
+            color[voxel, c] = (old * color[voxel, c] + new * colors[pixel, c]) * share
+        weight[voxel] = min(old + new, cap)
+        if weights[pixel] > 0 and abs(distances[k]) <= band:
+            add_vote(evidence, votes, voxel, frame_votes.log_p, rows[pixel], weights[pixel], cap, seed)

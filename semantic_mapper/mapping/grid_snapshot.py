@@ -68,7 +68,7 @@ class GridSnapshot:
         found = packed[self._waiting[slots] == packed]
         try:
             if self._kept is None:
-                self._kept = BlockStore(self._classes)
+                self._kept = BlockStore(self._classes, self._grid.evidence)
             kept = self._kept
             new = found[~kept.holds(found)]
             for start in range(0, len(new), KEPT_AT_ONCE):

@@ -31,7 +31,7 @@ class MapBackup:
 
     def __init__(self, voxel_map: VoxelMap) -> None:
         self._map = voxel_map
-        self._store = BlockStore(len(voxel_map.label_set))
+        self._store = BlockStore(len(voxel_map.label_set), voxel_map.config.evidence)
         self._aside: list[tuple[int, memoryview]] = []
         self._failure: MapError | None = None
         with voxel_map.locked() as grid:

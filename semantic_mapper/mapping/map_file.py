@@ -52,9 +52,10 @@ _ARRAYS = {  # name -> dtype; in the order of the file
     "tsdf": "<f4",  # (M,)
     "weight": "<f4",  # (M,)
     "color": "<f4",  # (M, 3)
-    "evidence": "<f4",  # (V, L)
+    "evidence": "<f4",  # (V, L); of ``voxel_map.evidence`` "int16" "<i2"
     "votes": "<f4",  # (V,)
 }
+_EVIDENCE = {"float32": "<f4", "int16": "<i2"}
 _UNREADABLE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError, OSError)
 
 
@@ -74,12 +75,13 @@ def write_map(path: Path, manifest: MapManifest, parts: Iterable[BlockPart]) -> 
     """
     chunks: list[MapChunk] = []
     corners: list[NDArray[np.int32]] = []
+    dtypes = _dtypes(manifest)
     with (
         replacing(path) as file,
         zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=_COMPRESSION_LEVEL) as archive,
     ):
         for keys, values in parts:
-            chunks.append(_write_chunk(archive, len(chunks), keys, values))
+            chunks.append(_write_chunk(archive, len(chunks), keys, values, dtypes))
             corners += [keys.min(axis=0), keys.max(axis=0) + 1]
         blocks = sum(chunk.blocks for chunk in chunks)
         bounds = _bounds_m(corners, manifest.config.voxel_size_m)
@@ -151,25 +153,31 @@ class MapReader:
 
     def _read_chunk(self, n: int, chunk: MapChunk, where: str) -> dict[str, NDArray[Any]]:
         arrays: dict[str, NDArray[Any]] = {}
-        hashed = hashlib.sha256()
+        hashed, dtypes = hashlib.sha256(), _dtypes(self.manifest)
         for name, shape in _shapes(chunk, len(self.manifest.label_set)).items():
-            head = _npy_head(_ARRAYS[name], shape)
-            size = len(head) + int(np.prod(shape)) * np.dtype(_ARRAYS[name]).itemsize
+            head = _npy_head(dtypes[name], shape)
+            size = len(head) + int(np.prod(shape)) * np.dtype(dtypes[name]).itemsize
             content = _read_member(self._archive, _member(n, name), size, f"{where}: {name}")
             if not content.startswith(head):
-                raise MapError(f"{where}: {name} is not an array {_ARRAYS[name]} of shape {shape}. {MEND}")
+                raise MapError(f"{where}: {name} is not an array {dtypes[name]} of shape {shape}. {MEND}")
             hashed.update(content)
-            arrays[name] = np.frombuffer(content, _ARRAYS[name], offset=len(head)).reshape(shape)
+            arrays[name] = np.frombuffer(content, dtypes[name], offset=len(head)).reshape(shape)
         if hashed.hexdigest() != chunk.sha256:
             raise MapError(f"{where} is damaged: its SHA-256 is not the manifest's. {MEND}")
         return arrays
+
+
+def _dtypes(manifest: MapManifest) -> dict[str, str]:
+    return {**_ARRAYS, "evidence": _EVIDENCE[manifest.config.evidence]}
 
 
 def _member(n: int, name: str) -> str:
     return f"{n:06d}/{name}.npy"
 
 
-def _write_chunk(archive: zipfile.ZipFile, n: int, keys: NDArray[np.int32], values: BlockValues) -> MapChunk:
+def _write_chunk(
+    archive: zipfile.ZipFile, n: int, keys: NDArray[np.int32], values: BlockValues, dtypes: dict[str, str]
+) -> MapChunk:
     measured, voted = values.weight > 0, values.votes > 0
     arrays = {
         "keys": keys,
@@ -182,7 +190,7 @@ def _write_chunk(archive: zipfile.ZipFile, n: int, keys: NDArray[np.int32], valu
         "votes": values.votes[voted],
     }
     hashed = hashlib.sha256()
-    for name, dtype in _ARRAYS.items():
+    for name, dtype in dtypes.items():
         array = np.ascontiguousarray(arrays[name], dtype)
         with archive.open(_member(n, name), "w") as member:
             for content in (_npy_head(dtype, array.shape), array.reshape(-1).view(np.uint8).data):
@@ -196,10 +204,10 @@ def _unpack(arrays: dict[str, NDArray[Any]], chunk: MapChunk, where: str) -> Blo
     voted = np.unpackbits(arrays["voted"], axis=1).astype(np.bool_)
     if (int(measured.sum()), int(voted.sum())) != (chunk.measured, chunk.voted):
         raise MapError(f"{where}: its masks and its values do not fit each other. {MEND}")
-    full: dict[str, NDArray[np.float32]] = {}
+    full: dict[str, NDArray[Any]] = {}
     for name in BlockValues._fields:
         mask = voted if name in ("evidence", "votes") else measured
-        full[name] = np.zeros((*mask.shape, *arrays[name].shape[1:]), np.float32)
+        full[name] = np.zeros((*mask.shape, *arrays[name].shape[1:]), arrays[name].dtype)
         full[name][mask] = arrays[name]
     return arrays["keys"], BlockValues(**full)
 

@@ -24,6 +24,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.block_index import find_block, pack_key, pack_keys, unpack_keys
 from semantic_mapper.mapping.block_store import BLOCK_VOXELS, BlockValues
+from semantic_mapper.mapping.evidence import evidence_scale, stored_evidence
 from semantic_mapper.mapping.extract import LARGEST_STEP
 from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import Float64
@@ -245,7 +246,8 @@ def _blend_votes(count, blocks, voxels, shares, total, buffers, moved, n, voxel)
         evidence = 0.0
         for i in range(count):
             if buffers.votes[blocks[i], voxels[i]] > 0:
-                evidence += shares[i] * buffers.evidence[blocks[i], voxels[i], c]
+                scale = evidence_scale(buffers.evidence, buffers.votes[blocks[i], voxels[i]])
+                evidence += shares[i] * scale * buffers.evidence[blocks[i], voxels[i], c]
         moved.evidence[n, voxel, c] = evidence / voted
 
 
@@ -268,8 +270,8 @@ def _add_block(b, buffers, n, added, cap):
             buffers.weight[b, v] = min(weight, cap)
         votes = np.float64(buffers.votes[b, v]) + np.float64(added.votes[n, v])
         if added.votes[n, v] > 0:
-            keep = min(1.0, cap / votes)
+            keep, scale = min(1.0, cap / votes), evidence_scale(buffers.evidence, buffers.votes[b, v])
             buffers.votes[b, v] = votes * keep
             for c in range(buffers.evidence.shape[2]):
-                said = np.float64(buffers.evidence[b, v, c]) + np.float64(added.evidence[n, v, c])
-                buffers.evidence[b, v, c] = said * keep
+                said = scale * buffers.evidence[b, v, c] + np.float64(added.evidence[n, v, c])
+                buffers.evidence[b, v, c] = stored_evidence(buffers.evidence, said, votes, keep)

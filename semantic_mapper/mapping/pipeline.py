@@ -22,6 +22,7 @@ from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
 from semantic_mapper.imaging import fill_holes, resize_depth, resize_label, resize_rgb, working_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.correction import CorrectedPoses, CorrectionStatus, MapCorrector
+from semantic_mapper.mapping.depth_trust import depth_trust
 from semantic_mapper.mapping.history import FusedFrame
 from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore
 from semantic_mapper.mapping.lifting import lift
@@ -169,7 +170,7 @@ class MappingPipeline:
         )
         sources = self._choose_sources(frame, size)
         rendered = self._render(frame, [k.encoded for k in sources], self.config.render.scale / share)
-        depth, rows = self._lift(frame, rendered)
+        depth, rows, _ = self._lift(frame, rendered, self.voxel_map)
         table = rendered.probabilities.reshape(-1, len(self.label_set)), rows
         blocks = add_votes(self.voxel_map, view.T_world_camera, smaller, depth, table, self.config.virtual)
         return VirtualLook(view, tuple(k.seq for k in sources), blocks)
@@ -185,10 +186,10 @@ class MappingPipeline:
             own = [current] if self.config.keyframes.use_current_view else []
             view = self._render(frame, [*(k.encoded for k in sources), *own], self.config.render.scale)
         with self._stage("lift"):
-            depth, rows = self._lift(frame, view)
+            depth, rows, trust = self._lift(frame, view, self.voxel_map)
         table = view.probabilities.reshape(-1, len(self.label_set))
         with self._stage("fuse"):
-            touched = self.voxel_map.integrate(frame, depth, table, rows=rows)
+            touched = self.voxel_map.integrate(frame, depth, table, rows=rows, trust=trust)
         if self.corrector.records:
             with self._stage("history"):
                 self.corrector.record(FusedFrame(frame, view.probabilities, view.known, view.depth_m))
@@ -310,16 +311,21 @@ class MappingPipeline:
             depth = self.voxel_map.ray_cast(frame.T_world_camera, intrinsics).depth_m
         return fill_holes(depth)
 
-    def _lift(self, frame: PosedFrame, view: RenderedView) -> tuple[Float32, NDArray[np.int32]]:
-        """Full-size depth to fuse, and which coarse pixel each pixel takes its probabilities from."""
+    def _lift(
+        self, frame: PosedFrame, view: RenderedView, voxel_map: VoxelMap
+    ) -> tuple[Float32, NDArray[np.int32], Float32 | None]:
+        """Full-size depth to fuse, which coarse pixel each pixel takes its probabilities from, and trust in depth."""
         size = (frame.intrinsics.width, frame.intrinsics.height)
         low = scale_intrinsics(frame.intrinsics, view.known.shape[1], view.known.shape[0])
         rgb_low, depth_low = resize_rgb(frame, low), resize_depth(frame, low)
         if frame.depth_m is None:
+            map_depth = voxel_map.ray_cast(frame.T_world_camera, low).depth_m
+            low_trust = depth_trust(view.depth_m, map_depth, voxel_map.truncation_m)
+            trust = np.asarray(cv2.resize(low_trust, size, interpolation=cv2.INTER_NEAREST), np.float32)
             depth = np.asarray(cv2.resize(view.depth_m, size, interpolation=cv2.INTER_LINEAR), np.float32)
         else:
-            depth = resize_depth(frame, frame.intrinsics)
-        return depth, lift(view.probabilities, view.known, rgb_low, depth_low, frame.rgb, depth)
+            depth, trust = resize_depth(frame, frame.intrinsics), None
+        return depth, lift(view.probabilities, view.known, rgb_low, depth_low, frame.rgb, depth), trust
 
     def _at_rows(self, table: Float32, rows: NDArray[np.int32]) -> tuple[UInt8, Float32]:
         """Class ids and confidence (H, W) of what the pixels take from a table (K, L); row -1 is unknown."""
@@ -328,8 +334,9 @@ class MappingPipeline:
 
     def _fuse_again(self, voxel_map: VoxelMap, fused: FusedFrame) -> None:
         view = RenderedView(fused.probabilities, fused.known, fused.rendered_depth_m, 0, 0)
-        depth, rows = self._lift(fused.frame, view)
-        voxel_map.integrate(fused.frame, depth, view.probabilities.reshape(-1, len(self.label_set)), rows=rows)
+        depth, rows, trust = self._lift(fused.frame, view, voxel_map)
+        table = view.probabilities.reshape(-1, len(self.label_set))
+        voxel_map.integrate(fused.frame, depth, table, rows=rows, trust=trust)
 
     def _make_keyframe(self, frame: PosedFrame, encoded: EncodedViews, *, labelled: bool = False) -> Keyframe:
         intrinsics = working_intrinsics(frame.intrinsics, COVERAGE_WIDTH)

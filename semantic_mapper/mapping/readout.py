@@ -14,6 +14,7 @@ from numba import njit, prange
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_grid import GridBuffers
 from semantic_mapper.mapping.block_index import BlockIndex, find_block, pack_key
+from semantic_mapper.mapping.evidence import evidence_scale
 from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import Float32, Float64, UInt8
 
@@ -88,8 +89,9 @@ def _gather(p, index, buffers, color, evidence):
         if buffers.votes[block, voxel] > 0:
             vote_sum += share
             votes += share * buffers.votes[block, voxel]
+            scale = share * evidence_scale(buffers.evidence, buffers.votes[block, voxel])
             for c in range(len(evidence)):
-                evidence[c] += share * buffers.evidence[block, voxel, c]
+                evidence[c] += scale * buffers.evidence[block, voxel, c]
     if color_sum > 0:
         color /= color_sum
     if vote_sum > 0:
@@ -100,10 +102,11 @@ def _gather(p, index, buffers, color, evidence):
 
 @njit(nogil=True, cache=True)
 def decide(evidence, votes, vote_discount):
-    """Channel and confidence of one evidence vector (L,); (-1, 0) without votes."""
+    """Channel and confidence of one evidence vector (L,), as it is stored or a sum; (-1, 0) without votes."""
     if votes <= 0:
         return -1, 0.0
     worth = 1.0 / (1.0 + vote_discount * (votes - 1.0)) if votes > 1 else 1.0 / votes  # n_eff / n
+    worth *= evidence_scale(evidence, votes)
     best = 0
     for c in range(1, len(evidence)):
         if evidence[c] > evidence[best]:

@@ -11,10 +11,10 @@ from numba import njit, prange
 from semantic_mapper.config import VirtualViewConfig
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.mapping.allocation import Camera, blocks_in_band, make_camera
-from semantic_mapper.mapping.block_grid import BLOCK_SIDE
 from semantic_mapper.mapping.block_index import pack_keys
+from semantic_mapper.mapping.evidence import add_vote, dither_seed
 from semantic_mapper.mapping.frame_votes import ProbabilityTable, check_depth, frame_votes, probability_table
-from semantic_mapper.mapping.fusion import add_vote, make_limits, pinhole, place_block, project_row, row_start
+from semantic_mapper.mapping.fusion import look_up_voxels, make_limits, voxel_offsets
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
@@ -60,34 +60,31 @@ def add_votes(
         packed = blocks_in_band(depth, camera, limits.voxel_size, limits.truncation, limits.depth_max)
         blocks = grid.activate(packed[np.isin(packed, pack_keys(grid.all_keys()))])  # existing ones alone
         if len(blocks):
-            _vote_blocks(blocks, grid.buffers(), camera, limits, depth, votes, np.float32(config.max_votes))
+            max_votes = np.float32(config.max_votes)
+            _vote_blocks(blocks, grid.buffers(), camera, limits, depth, votes, max_votes, voxel_map.version)
             voxel_map.mark_changed(blocks)
     return len(blocks)
 
 
 @parallel_kernel()
-def _vote_blocks(indices, buffers, camera, limits, depth, votes, max_votes):
+def _vote_blocks(indices, buffers, camera, limits, depth, votes, max_votes, moment):
+    offsets = voxel_offsets(camera, limits.voxel_size)
     for i in prange(len(indices)):
-        _vote_block(indices[i], buffers, camera, limits, depth, votes, max_votes)
+        _vote_block(indices[i], offsets, buffers, camera, limits, depth, votes, max_votes, moment)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _vote_block(block, buffers, camera: Camera, limits, depth, frame_votes, max_votes):
+@njit(nogil=True, cache=True)
+def _vote_block(block, offsets, buffers, camera: Camera, limits, depth, frame_votes, max_votes, moment):
     """As ``fusion._fuse_block`` votes, at voxels that a frame has measured before."""
-    lens, size = pinhole(camera, depth)
-    depth_max, flat_depth = np.float32(limits.depth_max), depth.reshape(-1)
     band, cap = np.float32(limits.vote_band), np.float32(limits.max_weight)
+    depth_max, place = np.float32(limits.depth_max), (buffers.keys[block], offsets, camera, limits.voxel_size)
+    count, voxels, pixels, distances = look_up_voxels(*place, depth, band, depth_max)
     weight, evidence, votes = buffers.weight[block], buffers.evidence[block], buffers.votes[block]
     rows, weights = frame_votes.rows.reshape(-1), frame_votes.weights.reshape(-1)
-    pixels, distances = np.empty(BLOCK_SIDE, np.int32), np.empty(BLOCK_SIDE, np.float32)
-    origin, step = place_block(buffers.keys[block], camera, limits.voxel_size)
-    for row in range(BLOCK_SIDE * BLOCK_SIDE):
-        p = row_start(row, origin, camera.R, limits.voxel_size)
-        if not project_row(p, step, lens, size, flat_depth, band, depth_max, pixels, distances):
+    seed = dither_seed(buffers.keys[block], moment)
+    for k in range(count):
+        voxel, pixel = voxels[k], pixels[k]
+        if weights[pixel] <= 0 or abs(distances[k]) > band:
             continue
-        for i in range(BLOCK_SIDE):
-            pixel, voxel = pixels[i], row * BLOCK_SIDE + i
-            if pixel < 0 or weights[pixel] <= 0 or abs(distances[i]) > band:
-                continue
-            if weight[voxel] > 0 and votes[voxel] < max_votes:
-                add_vote(evidence, votes, voxel, frame_votes.log_p, rows[pixel], weights[pixel], cap)
+        if weight[voxel] > 0 and votes[voxel] < max_votes:
+            add_vote(evidence, votes, voxel, frame_votes.log_p, rows[pixel], weights[pixel], cap, seed)

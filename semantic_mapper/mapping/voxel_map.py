@@ -28,7 +28,7 @@ from semantic_mapper.mapping.changes import (
     read_changes,
 )
 from semantic_mapper.mapping.extract import join_meshes, surface_voxels, triangle_mesh
-from semantic_mapper.mapping.frame_votes import check_depth, frame_votes, probability_table
+from semantic_mapper.mapping.frame_votes import check_depth, frame_votes, probability_table, trusted_depth
 from semantic_mapper.mapping.fusion import fuse_blocks, make_limits
 from semantic_mapper.mapping.grid_snapshot import GridSnapshot
 from semantic_mapper.mapping.map_file import BlockPart, open_map, write_map
@@ -81,8 +81,9 @@ class VoxelMap:
             config.initial_blocks,
             config.max_blocks,
             int(config.memory_mb * 1e6),
+            config.evidence,
         )
-        self._truncation_m = config.truncation_voxels * config.voxel_size_m
+        self.truncation_m = config.truncation_voxels * config.voxel_size_m
 
     @property
     def block_count(self) -> int:
@@ -141,6 +142,7 @@ class VoxelMap:
         known: BoolImage | None = None,
         *,
         rows: NDArray[np.int32] | None = None,
+        trust: Float32 | None = None,
     ) -> int:
         """Fuse one frame.
 
@@ -151,6 +153,7 @@ class VoxelMap:
             known: (H, W) bool, where ``probabilities`` mean something; None = everywhere.
             rows: (H, W) int32, where several pixels share their probabilities: these are (K, L) then, and this says
                 which row is a pixel's, -1 = unknown. ``known`` is None then.
+            trust: (H, W) float32 0..1, weight of each depth and its vote; None = 1, as of what was measured.
 
         Returns:
             Blocks touched, 0 where the depth image holds no measurement.
@@ -164,19 +167,17 @@ class VoxelMap:
         check_pose(frame.T_world_camera, where)
         if any(frame.intrinsics.distortion):
             raise FrameError(f"{where}: the image is not rectified (distortion {frame.intrinsics.distortion})")
-        depth = check_depth(depth_m, frame.intrinsics, where)
+        depth, weights = trusted_depth(check_depth(depth_m, frame.intrinsics, where), trust, where)
         table = None
         if probabilities is not None:
             table = probability_table(depth, probabilities, known, rows, len(self.label_set), where)
         camera = make_camera(frame.intrinsics, frame.T_world_camera)
         with _KERNEL_LOCK:
-            votes = frame_votes(depth, table, camera, self.config.depth_max_m, len(self.label_set), where)
-            packed = blocks_in_band(
-                depth, camera, self.config.voxel_size_m, self._truncation_m, self.config.depth_max_m
-            )
+            votes = frame_votes(depth, table, camera, self.config.depth_max_m, len(self.label_set), where, weights)
+            packed = blocks_in_band(depth, camera, self.config.voxel_size_m, self.truncation_m, self.config.depth_max_m)
             blocks = self._grid.activate(packed)
             rgb = np.ascontiguousarray(frame.rgb)
-            fuse_blocks(blocks, self._grid.buffers(), camera, self._limits, depth, rgb, votes)
+            fuse_blocks(blocks, self._grid.buffers(), camera, self._limits, depth, rgb, weights, votes, self.frames)
             self.frames += 1
             self.version += 1
             self.last_stamp_ns = frame.stamp_ns
@@ -270,7 +271,7 @@ class VoxelMap:
 
         Returns:
             keys (B, 3) int32, in lexicographic order where none were given; tsdf, weight, votes (B, 8, 8, 8), color
-            (B, 8, 8, 8, 3) and evidence (B, 8, 8, 8, L) float32, voxels in the order [z][y][x].
+            (B, 8, 8, 8, 3) float32 and evidence (B, 8, 8, 8, L) as it is stored, voxels in the order [z][y][x].
         """
         with _KERNEL_LOCK:
             keys = self._grid.all_keys() if keys is None else keys
@@ -365,7 +366,7 @@ class VoxelMap:
     def _page_in_view(self, camera: Camera, intrinsics: CameraIntrinsics) -> None:
         """Bring back from disk what a camera may see; the nearest, where memory has no room for all of it."""
         if self._grid.stored_count:
-            reach = self.config.depth_max_m + self._truncation_m
+            reach = self.config.depth_max_m + self.truncation_m
             keys = self._grid.keys_between(*view_bounds(camera, intrinsics, self.config.voxel_size_m, reach))
             self._grid.page_in(blocks_in_view(camera, intrinsics, keys, self.config.voxel_size_m, reach))
 
