@@ -228,9 +228,9 @@ def _collect_bands(depth, camera, voxel, truncation, depth_max, slots, keys, cou
 def _collect_band(band, bands, depth, camera, voxel, truncation, depth_max, slots, keys):
     """The blocks of one of the bands of an image; returns how many, more than ``len(keys)`` where there is no room.
 
-    A smooth tile is at most two voxels wide and deep. A block that none of the rays meets has then no more than a corner,
-    less than a voxel wide, between two of them: of a thousand blocks a few, often far from the surface, which the
-    next frame from elsewhere meets.
+    A smooth tile is at most two voxels wide and deep. A block that none of the rays meets has then no more than a
+    corner, less than a voxel wide, between two of them: of a thousand blocks a few, often far from the surface, which
+    the next frame from elsewhere meets.
     """
     strips = (depth.shape[0] + _STRIP - 1) // _STRIP
     size = (_LEVELS, _STRIP, (depth.shape[1] + _STRIP - 1) // _STRIP * _STRIP)

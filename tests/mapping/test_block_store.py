@@ -9,7 +9,7 @@ from semantic_mapper.mapping.block_store import BLOCK_VOXELS, BlockStore, BlockV
 CLASSES = 3
 
 
-def some_blocks(count: int, seed: int = 0) -> BlockValues:
+def some_blocks(count: int, seed: int = 0, evidence: str = "float32") -> BlockValues:
     """Blocks as a map has them: what holds no measurement (or no vote) is zero."""
     rng = np.random.default_rng(seed)
     measured = rng.random((count, BLOCK_VOXELS)) < 0.6
@@ -20,13 +20,13 @@ def some_blocks(count: int, seed: int = 0) -> BlockValues:
         return np.where(mask.reshape(*mask.shape, *(1 for _ in tail)), values, np.float32(0))
 
     weight, votes = np.abs(of(measured)) + measured, np.abs(of(voted)) + voted
-    return BlockValues(
-        of(measured), weight.astype(np.float32), of(measured, 3), of(voted, CLASSES), votes.astype(np.float32)
-    )
+    said = (of(voted, CLASSES) * (1 if evidence == "float32" else 1000)).astype(evidence)
+    return BlockValues(of(measured), weight.astype(np.float32), of(measured, 3), said, votes.astype(np.float32))
 
 
-def test_blocks_come_back_equal_to_the_bit_in_any_order():
-    store, blocks = BlockStore(CLASSES), some_blocks(1200)
+@pytest.mark.parametrize("evidence", ["float32", "int16"])
+def test_blocks_come_back_equal_to_the_bit_in_any_order(evidence: str):
+    store, blocks = BlockStore(CLASSES, evidence), some_blocks(1200, evidence=evidence)
     keys = np.arange(1200, dtype=np.int64) * 7 + 3000
     store.put(keys, np.arange(1200), blocks)
     order = np.random.default_rng(1).permutation(1200)

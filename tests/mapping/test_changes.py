@@ -114,9 +114,9 @@ def test_a_version_of_another_map_is_refused(walked: VoxelMap) -> None:
             walked.changes(since, limit)
 
 
-@pytest.mark.parametrize("memory_mb", [0, MEMORY_MB])
-def test_a_copy_is_made_compact_later_and_is_of_its_moment(memory_mb: int) -> None:
-    voxel_map = small_map(voxel_size_m=0.01, memory_mb=memory_mb)
+@pytest.mark.parametrize(("memory_mb", "evidence"), [(0, "float32"), (MEMORY_MB, "float32"), (0, "int16")])
+def test_a_copy_is_made_compact_later_and_is_of_its_moment(memory_mb: int, evidence: str) -> None:
+    voxel_map = small_map(voxel_size_m=0.01, memory_mb=memory_mb, evidence=evidence)
     walk(voxel_map, 6)
     for since, limit in ((0, 0), (2, 0), (0, 700)):
         at_once, copied = voxel_map.changes(since, limit), voxel_map.copy_changes(since, limit)

@@ -29,13 +29,13 @@ def restored(backup: MapBackup, like: VoxelMap) -> VoxelMap:
     return voxel_map
 
 
-@pytest.mark.parametrize("memory_mb", [0, MEMORY_MB])
+@pytest.mark.parametrize(("memory_mb", "evidence"), [(0, "float32"), (MEMORY_MB, "float32"), (0, "int16")])
 @pytest.mark.parametrize("most_aside", [10, 10**6])
 def test_it_is_of_its_moment_although_frames_go_on(
-    memory_mb: int, most_aside: int, monkeypatch: pytest.MonkeyPatch
+    memory_mb: int, evidence: str, most_aside: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(map_backup, "_MOST_ASIDE", most_aside)
-    voxel_map = small_map(voxel_size_m=0.01, memory_mb=memory_mb)
+    voxel_map = small_map(voxel_size_m=0.01, memory_mb=memory_mb, evidence=evidence)
     walk(voxel_map, 6)
     before = state(voxel_map)
     backup = MapBackup(voxel_map)
