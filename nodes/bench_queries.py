@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from nodes.bench_asker import ASK, ASKING, KINDS, READY, REST, Asked, ask_when_told
+from nodes.query_answers import Question
 from nodes.query_service import QueryService
 from replay.bench_map import STEP_M, WARM_UP
 from replay.bench_walk import wide_camera
@@ -139,12 +140,12 @@ class _HoldingService(QueryService):
         self.withheld = threading.Event()
         super().__init__(endpoint, voxel_map)
 
-    def _answer(self, parts: list[bytes]) -> list[bytes]:
+    def _answer(self, question: Question) -> list[bytes]:
         if not self.may_answer.is_set():
             self.withheld.set()
             self.may_answer.wait(PATIENCE_S)
             self.may_answer.set()
-        return super()._answer(parts)
+        return super()._answer(question)
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import uuid
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import structlog
@@ -25,11 +25,16 @@ from semantic_mapper.transport.opening import Parts
 from semantic_mapper.transport.plain import label_set_header
 from semantic_mapper.transport.query_codec import Arrays, decode_request, encode_answer, encode_error
 
-# One thread answers all: what would keep the others waiting for longer than about a second is refused.
+# One thread answers all that takes long: what would keep the others waiting for more than about a second is refused.
 MAX_VISITED_VOXELS = 1e8  # of `at`
 MAX_RAY_METRES = 2e5  # of `cast_rays`, all rays together
 MAX_FIELD_VOXELS = 1 << 22  # of `distance_field`
 MAX_CHANGED_BLOCKS = 1 << 14  # of `changes`, unless one delivery has more
+# What takes more than a few milliseconds takes long; the rest never waits for it.
+LONG_VISITED_VOXELS = 1e5  # of `at`
+LONG_RAY_METRES = 500.0  # of `cast_rays`
+LONG_POINTS = 1 << 14  # of `occupancy`
+LONG_BOX_VOXELS = 1 << 13  # of `distance_field` and `points_in_box`
 _MAX_TRACKERS = 4  # one for each direction that was called up
 
 _log = structlog.get_logger(__name__)
@@ -37,8 +42,22 @@ _log = structlog.get_logger(__name__)
 Answer = tuple[messages.AnswerHeader, Arrays]
 
 
+class Question(NamedTuple):
+    """One question, ready to be answered.
+
+    Args:
+        answer: Gives the parts of its answer, which is an error where the question is no good; raises nothing.
+        takes_long: Whether that may take more than a few milliseconds.
+        about_map: Whether the answer comes from the mirror, which has to be up to date for it.
+    """
+
+    answer: Callable[[], list[bytes]]
+    takes_long: bool
+    about_map: bool
+
+
 class Answers:
-    """Answers questions about what a mirror holds. For one thread.
+    """Answers questions about what a mirror holds. Those that take long are for one thread, all others for any.
 
     Args:
         relay: Of the mirror.
@@ -52,17 +71,24 @@ class Answers:
         self._trackers: dict[messages.Point, InstanceTracker] = {}
         self._things: dict[messages.Point, tuple[int, tuple[Instance, ...]]] = {}  # and the version they are of
 
-    def answer(self, parts: Parts) -> list[bytes]:
-        """Parts of a question -> those of its answer, which is an error where the question is no good."""
+    def read(self, parts: Parts) -> Question:
+        """Parts of a question -> what answers it."""
         try:
             kind, header, arrays = decode_request(parts)
+            takes_long = _takes_long(self._relay.snapshot(), header, arrays)
+        except (SemanticMapperError, MemoryError) as error:
+            refusal = encode_error(_told(error))
+            return Question(lambda: refusal, takes_long=False, about_map=False)
+        about_map = not isinstance(header, messages.CorrectPosesRequest | messages.CorrectionRequest)
+        return Question(lambda: self._encoded(kind, header, arrays), takes_long, about_map)
+
+    def _encoded(self, kind: str, header: messages.RequestHeader, arrays: Arrays) -> list[bytes]:
+        try:
             return encode_answer(kind, *self._answer(header, arrays))
-        except SemanticMapperError as error:
-            return encode_error(error)
-        except MemoryError:
-            return encode_error(MapError("the mapper has no memory left to answer this; ask for less at once"))
-        except (ArithmeticError, ValueError) as error:  # a bug of ours; it must not end the thread that all wait for
-            _log.exception("question_failed", question=bytes(parts[0]))
+        except (SemanticMapperError, MemoryError) as error:
+            return encode_error(_told(error))
+        except Exception as error:  # noqa: BLE001 -- a bug of ours must not end a thread that all wait for
+            _log.exception("question_failed", question=kind)
             return encode_error(MapError(f"the mapper could not compute this: {error}"))
 
     def _answer(self, header: messages.RequestHeader, arrays: Arrays) -> Answer:
@@ -148,7 +174,7 @@ class Answers:
         return messages.AnswerHeader(**self._about(snapshot)), _thing_arrays(things)
 
     def _distances(self, snapshot: MapSnapshot, header: messages.DistanceRequest) -> Answer:
-        sides = [(b - a) / snapshot.voxel_size_m for a, b in zip(header.lower, header.upper, strict=True)]
+        sides = _box_sides(snapshot, header)
         if min(sides) > 0 and math.prod(sides) > MAX_FIELD_VOXELS:
             raise MapError(
                 f"distance_field: a box of {' x '.join(f'{s:.0f}' for s in sides)} voxels; over a socket at most "
@@ -169,9 +195,10 @@ class Answers:
         return answer, {name: getattr(found, name) for name in messages.QUESTIONS["changes"].gives}
 
 
-def is_about_map(parts: Parts) -> bool:
-    """Whether the answer comes from the mirror, which has to be up to date for it."""
-    return bytes(parts[0][:32]) not in (b"correct_poses", b"correction") if parts else False
+def _told(error: SemanticMapperError | MemoryError) -> SemanticMapperError:
+    if isinstance(error, MemoryError):
+        return MapError("the mapper has no memory left to answer this; ask for less at once")
+    return error
 
 
 def _thing_arrays(things: Sequence[Instance]) -> Arrays:
@@ -187,11 +214,35 @@ def _thing_arrays(things: Sequence[Instance]) -> Arrays:
     }
 
 
-def _bound_points(snapshot: MapSnapshot, header: messages.AtRequest, count: int) -> None:
+def _takes_long(snapshot: MapSnapshot, header: messages.RequestHeader, arrays: Arrays) -> bool:
+    match header:
+        case messages.AtRequest():
+            return _visited_voxels(snapshot, header, len(arrays["points"])) > LONG_VISITED_VOXELS
+        case messages.RaysRequest():
+            return max(len(a) for a in arrays.values()) * header.max_m > LONG_RAY_METRES
+        case messages.OccupancyRequest():
+            return len(arrays["points"]) > LONG_POINTS
+        case messages.BoxRequest() | messages.DistanceRequest():
+            return math.prod(_box_sides(snapshot, header)) > LONG_BOX_VOXELS
+        case messages.InstancesRequest() | messages.ChangesRequest():
+            return True
+        case _:
+            return False
+
+
+def _box_sides(snapshot: MapSnapshot, header: messages.BoxRequest | messages.DistanceRequest) -> list[float]:
+    return [(b - a) / snapshot.voxel_size_m for a, b in zip(header.lower, header.upper, strict=True)]
+
+
+def _visited_voxels(snapshot: MapSnapshot, header: messages.AtRequest, count: int) -> float:
     radius = RADIUS_VOXELS if header.radius_m is None else header.radius_m / snapshot.voxel_size_m
-    if count * (2 * min(max(radius, 0), MAX_RADIUS_VOXELS) + 2) ** 3 > MAX_VISITED_VOXELS:
+    return count * (2 * min(max(radius, 0), MAX_RADIUS_VOXELS) + 2) ** 3
+
+
+def _bound_points(snapshot: MapSnapshot, header: messages.AtRequest, count: int) -> None:
+    if _visited_voxels(snapshot, header, count) > MAX_VISITED_VOXELS:
         raise MapError(
-            f"at: {count} points with a radius of {radius:g} voxels are too much for one question; ask for fewer "
+            f"at: {count} points with a radius of {header.radius_m} m are too much for one question; ask for fewer "
             "points at once, or keep a mirror"
         )
 

@@ -1,22 +1,30 @@
-"""The query service of a mapper: a thread that answers questions from a mirror, which the mapper's thread feeds."""
+"""The query service of a mapper: threads that answer questions from a mirror, which the mapper's thread feeds.
+
+One has the socket and answers what is quick, one answers what takes long, one feeds the mirror. So a quick answer waits
+for none but quick ones.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import deque
+from functools import partial
 from types import TracebackType
 from typing import Self
 
 import structlog
 
 from nodes.live_correction import LiveCorrection
-from nodes.query_answers import Answers, is_about_map
+from nodes.long_questions import LongQuestions
+from nodes.query_answers import Answers, Question
+from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.changes import CopiedChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.relay import MirrorRelay
 from semantic_mapper.queries.warm_up import warm_up
+from semantic_mapper.transport.query_codec import encode_error
 from semantic_mapper.transport.query_sockets import QueryServer
 
 PERIOD_S = 0.1  # between two deliveries, at least
@@ -26,6 +34,8 @@ CATCH_UP_S = 2.0  # how long the first question after that waits for the mirror;
 FIRST_CATCH_UP_S = 60.0  # how long the very first one waits: kernels may compile, and an empty mirror says nothing true
 MAX_BLOCKS = 600  # of a delivery (unless one frame has more): bounds what a step may cost
 _WAIT_S = 0.5
+_NOT_READY = "the mapper has not handed its map over to its query service yet: it is busy, or ending; ask again"
+_TOO_MANY = "too many questions that take long wait for an answer; ask again later, and await each answer"
 
 _log = structlog.get_logger(__name__)
 
@@ -53,19 +63,26 @@ class QueryService:
         self._given = 0  # version that deliveries have come to
         self._next_at = 0.0
         self._delivered: deque[CopiedChanges] = deque()
+        self._delivery_came = threading.Event()
         self._asked_at = -ASKED_LATELY_S  # never; monotonic seconds
         self._awaited = 0  # version that the first question after a pause waits for
+        self._overdue = False  # somebody has waited in vain
         self._closed = threading.Event()
         self.answered = 0
         self._server = QueryServer(endpoint)
         self.endpoint = self._server.endpoint
-        self._thread = threading.Thread(target=self._serve, name=f"queries {endpoint}", daemon=True)
-        self._thread.start()
+        self._long = LongQuestions(f"long queries {endpoint}", self._server.wake)
+        self._threads = (
+            threading.Thread(target=self._serve, name=f"queries {endpoint}", daemon=True),
+            threading.Thread(target=self._feed, name=f"mirror {endpoint}", daemon=True),
+        )
+        for thread in self._threads:
+            thread.start()
 
     @property
     def alive(self) -> bool:
-        """Whether the thread runs; it ends before ``close`` only by a bug."""
-        return self._thread.is_alive()
+        """Whether the threads run; they end before ``close`` only by a bug."""
+        return self._long.alive and all(thread.is_alive() for thread in self._threads)
 
     def follow(self) -> None:
         """Hand what has changed over to the service; for the thread that changes the map, after each step.
@@ -81,15 +98,18 @@ class QueryService:
         self._given = changes.version
         self._next_at = now + max(PERIOD_S, (time.monotonic() - now) / MAX_SHARE)
         self._delivered.append(changes)
-        self._server.wake()
+        self._delivery_came.set()
 
     def close(self) -> None:
-        """End the thread and free the endpoint. Harmless when repeated."""
+        """End the threads and free the endpoint. Harmless when repeated."""
         if self._closed.is_set():
             return
         self._closed.set()
         self._server.wake()
-        self._thread.join()
+        self._delivery_came.set()
+        for thread in self._threads:
+            thread.join()
+        self._long.close()
         self._server.close()
 
     def __enter__(self) -> Self:
@@ -105,21 +125,33 @@ class QueryService:
         _log.info("questions_welcome", endpoint=self.endpoint)
         while not self._closed.is_set():
             self._server.wait(_WAIT_S)
-            self._take_deliveries()
+            self._send_long_ones()
             # One at a time: the socket takes turns between clients, so that many questions of one delay no other.
             while not self._closed.is_set() and (asked := self._server.receive()) is not None:
                 client, parts = asked
-                if is_about_map(parts):
-                    self._await_mirror()
-                self._server.send(client, self._answer(parts))
-                self.answered += 1
-                self._take_deliveries()
+                question = self._answers.read(parts)
+                if question.about_map and not self._mirror_is_there():
+                    self._send(client, encode_error(MapError(_NOT_READY)))
+                    continue
+                if not question.takes_long and not self._long.holds(client):
+                    self._send(client, self._answer(question))
+                elif not self._long.put(client, partial(self._answer, question)):
+                    self._send(client, encode_error(MapError(_TOO_MANY)))
+                self._send_long_ones()
 
-    def _answer(self, parts: list[bytes]) -> list[bytes]:
-        return self._answers.answer(parts)
+    def _answer(self, question: Question) -> list[bytes]:
+        return question.answer()
 
-    def _await_mirror(self) -> None:
-        """After a pause, wait until the mirror has come up to the map as it is now."""
+    def _send(self, client: bytes, parts: list[bytes]) -> None:
+        self._server.send(client, parts)
+        self.answered += 1
+
+    def _send_long_ones(self) -> None:
+        for client, parts in self._long.collect():
+            self._send(client, parts)
+
+    def _mirror_is_there(self) -> bool:
+        """After a pause, wait until the mirror has come up to the map as it is now; False where it has had nothing yet."""
         now = time.monotonic()
         if now - self._asked_at > ASKED_LATELY_S:
             self._awaited = self._map.version
@@ -127,10 +159,18 @@ class QueryService:
         patience = CATCH_UP_S if self._relay.snapshot().version else FIRST_CATCH_UP_S
         while self._relay.snapshot().version < self._awaited and not self._closed.is_set():
             if time.monotonic() > now + patience:
-                self._awaited = 0  # the map is at rest or busy: those who ask next need not wait as well
-                return
+                # The map is at rest or busy: those who ask next need not wait as well.
+                self._awaited, self._overdue = 0, True
+                break
             self._server.wait_for_wake(_WAIT_S / 10)
+        return self._relay.snapshot().version > 0 or not (self._overdue or self._closed.is_set())
+
+    def _feed(self) -> None:
+        while not self._closed.is_set():
+            self._delivery_came.wait()
+            self._delivery_came.clear()
             self._take_deliveries()
+            self._server.wake()
 
     def _take_deliveries(self) -> None:
         while self._delivered:

@@ -73,7 +73,7 @@ class Tally:
             "miou_where_plain_votes": before.miou,
             "voted": self.voted / self.points,
             "ece": found.ece,
-            "cpu_s": round(self.cpu_s, 1),
+            "cpu_s": round(self.cpu_s, 2),
             "views": self.views,
         }
 

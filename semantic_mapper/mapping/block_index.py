@@ -69,6 +69,12 @@ def pack_step(axis, sign):
 
 
 @njit(nogil=True, cache=True, inline="always")
+def key_part(packed, axis):
+    """One coordinate of a packed key."""
+    return ((packed >> ((2 - axis) * KEY_BITS)) & _KEY_MASK) - KEY_LIMIT
+
+
+@njit(nogil=True, cache=True, inline="always")
 def first_slot(packed, slot_count):
     """Where the search for a key begins."""
     h = packed * np.int64(_HASH_FACTOR)

@@ -5,14 +5,18 @@ from __future__ import annotations
 import threading
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.labels import STUFF_NAMES
+from semantic_mapper.mapping.block_index import unpack_keys
 from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_direction
+from semantic_mapper.queries.class_surface import ClassSurface, class_surface
 from semantic_mapper.queries.components import Components, find_components
 from semantic_mapper.queries.oriented_box import OrientedBox, upright_box
 from semantic_mapper.queries.snapshot import MapSnapshot
@@ -44,13 +48,23 @@ class Instance:
     voxels: NDArray[np.int32]
 
 
+class _Found(NamedTuple):
+    """What one update has found; ``ids`` (C,), ``sizes`` (C,) in voxels and ``things`` go with the components."""
+
+    surface: ClassSurface
+    components: Components
+    ids: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+    things: tuple[Instance, ...]
+
+
 class InstanceTracker:
     """Finds the instances of one map again and again.
 
     An instance is what an earlier one became where it holds the most of that one's voxels, and at least a tenth. Of
     several that became one, the oldest id stays; of a split, the part with the most voxels keeps the id. Matching looks
-    at the last update alone: a thing that was not found in it comes back under a new id. Safe to call from several
-    threads.
+    at the last update alone: a thing that was not found in it comes back under a new id. What has not changed since
+    then is not computed again. Safe to call from several threads.
 
     Args:
         stuff: Names of classes that are no things; by default ``labels.STUFF_NAMES``.
@@ -75,58 +89,74 @@ class InstanceTracker:
         if self._up.shape != (3,):
             raise MapError(f"up: expected shape (3,), got {np.shape(up)}")
         self._next_id = 1
-        self._packed = np.empty(0, np.int64)  # blocks with instances at the last update, sorted
-        self._owner = np.empty((0, 512), np.int64)  # id of each of their voxels, 0 = none
+        self._last: _Found | None = None
         self._lock = threading.Lock()
 
     def update(self, snapshot: MapSnapshot) -> tuple[Instance, ...]:
         """The instances of the map as it is now, by ascending id."""
-        found = find_components(snapshot, snapshot.label_set.thing_ids(self._stuff), self._min_voxels)
+        wanted = np.zeros(256, np.bool_)
+        wanted[list(snapshot.label_set.thing_ids(self._stuff))] = True
         with self._lock:
-            ids = self._match(snapshot, found)
-            self._remember(snapshot, found, ids)
-        order = np.argsort(found.component, kind="stable")
-        ends = np.cumsum(np.bincount(found.component, minlength=len(ids)))
-        parts = np.split(order, ends[:-1]) if len(ids) else []
-        things = [self._describe(snapshot, found, part, int(i)) for part, i in zip(parts, ids, strict=True)]
+            last = self._last
+            surface = class_surface(snapshot, wanted, last.surface if last else None)
+            found = find_components(surface, self._min_voxels)
+            sizes = np.diff(found.ends, prepend=0)
+            ids, same = np.zeros(len(sizes), np.int64), np.full(len(sizes), -1, np.int64)
+            if last:
+                self._match(last, surface, found, ids, same)
+            new = np.flatnonzero(ids == 0)
+            ids[new] = self._next_id + np.arange(len(new))
+            self._next_id += len(new)
+            row = np.repeat(np.arange(len(surface.packed)), np.diff(surface.start))
+            parts = np.split(found.order, found.ends[:-1]) if len(ids) else []
+            things = tuple(
+                last.things[kept] if last and kept >= 0 else self._describe(snapshot, surface, row, part, int(number))
+                for part, number, kept in zip(parts, ids, same, strict=True)
+            )
+            self._last = _Found(surface, found, ids, sizes, things)
         return tuple(sorted(things, key=lambda thing: thing.id))
 
-    def _match(self, snapshot: MapSnapshot, found: Components) -> NDArray[np.int64]:
-        """Id (C,) of each component."""
-        old = self._owners(snapshot, found)
-        sizes = np.bincount(self._owner[self._owner > 0])
-        ids = np.zeros(int(found.component.max(initial=-1)) + 1, np.int64)
-        pairs, counts = np.unique(np.stack((old, found.component)), axis=1, return_counts=True)
-        for i in np.unique(old[old > 0]):  # ascending, so that the oldest of several has its component first
-            overlaps = np.where(pairs[0] == i, counts, 0)
-            best = int(np.argmax(overlaps))
-            successor = pairs[1, best]
-            if overlaps[best] >= LEAST_OVERLAP * sizes[i] and ids[successor] == 0:
-                ids[successor] = i
-        new = np.flatnonzero(ids == 0)
-        ids[new] = self._next_id + np.arange(len(new))
-        self._next_id += len(new)
-        return ids
+    def _match(
+        self,
+        last: _Found,
+        surface: ClassSurface,
+        found: Components,
+        ids: NDArray[np.int64],
+        same: NDArray[np.int64],
+    ) -> None:
+        """Write the id that each component had, and which component of the last update it still is, bit for bit."""
+        sizes, count = np.diff(found.ends, prepend=0), len(found.ends)
+        held = _overlaps(
+            (last.surface.packed, last.surface.start, last.surface.voxel, last.components.component),
+            (surface.packed, surface.start, surface.voxel, found.component),
+            count,
+        )
+        pairs, overlaps = np.unique(held, return_counts=True)
+        changed = _changed(surface.fresh, surface.start, found.component, count)
+        ends = np.searchsorted(pairs, count * np.arange(len(last.ids) + 1))
+        for old in np.argsort(last.ids):  # so that the oldest of several has its component first
+            part = slice(ends[old], ends[old + 1])
+            if part.start == part.stop:
+                continue
+            best = int(np.argmax(overlaps[part]))
+            overlap, successor = overlaps[part][best], pairs[part][best] % count
+            if overlap >= LEAST_OVERLAP * last.sizes[old] and ids[successor] == 0:
+                ids[successor] = last.ids[old]
+                if overlap == last.sizes[old] == sizes[successor] and not changed[successor]:
+                    same[successor] = old
 
-    def _owners(self, snapshot: MapSnapshot, found: Components) -> NDArray[np.int64]:
-        """Id that each voxel (N,) had at the last update, 0 = none."""
-        if not len(self._packed):
-            return np.zeros(len(found.voxel), np.int64)
-        packed = snapshot.packed[found.row]
-        at = np.minimum(np.searchsorted(self._packed, packed), len(self._packed) - 1)
-        return np.where(self._packed[at] == packed, self._owner[at, found.voxel], 0)
-
-    def _remember(self, snapshot: MapSnapshot, found: Components, ids: NDArray[np.int64]) -> None:
-        used, block = np.unique(found.row, return_inverse=True)
-        self._packed = snapshot.packed[used]
-        self._owner = np.zeros((len(used), 512), np.int64)
-        self._owner[block, found.voxel] = ids[found.component]
-
-    def _describe(self, snapshot: MapSnapshot, found: Components, part: NDArray[np.int64], number: int) -> Instance:
-        row, voxel = found.row[part], found.voxel[part]
-        class_id = int(found.label[part[0]])
-        xyz = found.point[part] * snapshot.voxel_size_m
-        confidence = snapshot.voxels.confidence[snapshot.slots[row], voxel].mean(dtype=np.float64) / CONFIDENCE_STEPS
+    def _describe(
+        self,
+        snapshot: MapSnapshot,
+        surface: ClassSurface,
+        row: NDArray[np.int64],
+        part: NDArray[np.int64],
+        number: int,
+    ) -> Instance:
+        """The thing with the voxels ``part``; ``row`` (N,) of the block of each of all voxels."""
+        voxel, class_id = surface.voxel[part], int(surface.label[part[0]])
+        xyz = surface.point[part] * snapshot.voxel_size_m
+        confidence = surface.confidence[part].mean(dtype=np.float64) / CONFIDENCE_STEPS
         within = np.stack((voxel & 7, (voxel >> 3) & 7, voxel >> 6), axis=1)
         labels = snapshot.label_set
         return Instance(
@@ -136,5 +166,43 @@ class InstanceTracker:
             float(confidence),
             xyz.mean(axis=0),
             upright_box(xyz, self._up),
-            snapshot.keys[row] * 8 + within.astype(np.int32),
+            unpack_keys(surface.packed[row[part]]) * 8 + within,
         )
+
+
+@njit(nogil=True, cache=True)
+def _overlaps(old, new, count):
+    """``old component * count + new component`` of every voxel (M,) that has both.
+
+    Args:
+        old, new: ``packed``, ``start`` and ``voxel`` of a ``ClassSurface``, and ``component``.
+        count: Of new components.
+    """
+    old_packed, old_start, old_voxel, old_component = old
+    packed, start, voxel, component = new
+    pairs = np.empty(len(voxel), np.int64)
+    at, old_row = 0, 0
+    for row in range(len(packed)):
+        while old_row < len(old_packed) and old_packed[old_row] < packed[row]:
+            old_row += 1
+        if old_row == len(old_packed) or old_packed[old_row] != packed[row]:
+            continue
+        j, end = old_start[old_row], old_start[old_row + 1]
+        for i in range(start[row], start[row + 1]):
+            while j < end and old_voxel[j] < voxel[i]:
+                j += 1
+            if j < end and old_voxel[j] == voxel[i] and old_component[j] >= 0 and component[i] >= 0:
+                pairs[at] = old_component[j] * count + component[i]
+                at += 1
+    return pairs[:at]
+
+
+@njit(nogil=True, cache=True)
+def _changed(fresh, start, component, count):
+    """Whether each component (C,) has voxels in blocks that were computed anew."""
+    changed = np.zeros(count, np.bool_)
+    for row in np.flatnonzero(fresh):
+        for i in range(start[row], start[row + 1]):
+            if component[i] >= 0:
+                changed[component[i]] = True
+    return changed

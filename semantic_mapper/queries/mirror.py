@@ -8,6 +8,7 @@ one with only the living blocks; the old pool goes when its last snapshot does.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import threading
 
 import numpy as np
@@ -25,6 +26,8 @@ from semantic_mapper.queries.surface import NEAREST_STEPS
 
 LEAST_SPARE = 256  # blocks that a new pool has room for beyond the living ones; or half of these, if that is more
 
+_deliveries = itertools.count()  # that mirrors of this process have taken over; counting takes no lock
+
 
 class MapMirror:
     """Follows a map by its changes and hands out snapshots of it. Safe to use from several threads.
@@ -39,7 +42,7 @@ class MapMirror:
         slots = np.empty(0, np.int32)
         index = make_block_index(unpack_keys(none), slots)
         self._snapshot = MapSnapshot(
-            0, 0, voxel_size_m, truncation_voxels, label_set, none, slots, index, _new_pool(LEAST_SPARE)
+            0, 0, voxel_size_m, truncation_voxels, label_set, none, slots, none, index, _new_pool(LEAST_SPARE)
         )
         self._used = 0
         self._lock = threading.Lock()
@@ -83,11 +86,20 @@ class MapMirror:
             slots = np.concatenate((kept, np.arange(self._used, self._used + len(packed), dtype=np.int32)))
             _write(pool, self._used, changes, old.label_set.ignore_id)
             self._used += len(packed)
+            fresh = (next(_deliveries) << 32) + np.arange(len(packed))
+            serials = np.concatenate((old.serials[staying], fresh))
             order = np.argsort(merged)
-            merged, slots = merged[order], slots[order]
+            merged, slots, serials = merged[order], slots[order], serials[order]
             index = make_block_index(unpack_keys(merged), slots)
             self._snapshot = dataclasses.replace(
-                old, version=changes.version, epoch=changes.epoch, packed=merged, slots=slots, index=index, voxels=pool
+                old,
+                version=changes.version,
+                epoch=changes.epoch,
+                packed=merged,
+                slots=slots,
+                serials=serials,
+                index=index,
+                voxels=pool,
             )
             return self._snapshot
 

@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.mapping.block_index import KEY_BITS, KEY_LIMIT
+from semantic_mapper.mapping.block_index import key_part
 from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_point
 from semantic_mapper.queries.snapshot import MapSnapshot
@@ -60,12 +60,6 @@ def nearest(
     return NearestSurface(xyz * snapshot.voxel_size_m, float(distance) * snapshot.voxel_size_m, confidence)
 
 
-@njit(nogil=True, cache=True, inline="always")
-def _unpack(packed, axis):
-    """One coordinate of a packed block key."""
-    return ((packed >> ((2 - axis) * KEY_BITS)) & ((1 << KEY_BITS) - 1)) - KEY_LIMIT
-
-
 @njit(nogil=True, cache=True)
 def _bounds(p, class_id, packed, slots, classes):
     """Rows of the blocks that may have surface of a class, and the square of the least distance it may have."""
@@ -76,7 +70,7 @@ def _bounds(p, class_id, packed, slots, classes):
         if classes[slots[n], class_id >> 6] & bit:
             bound = 0.0
             for axis in range(3):
-                first = _unpack(packed[n], axis) * 8.0
+                first = key_part(packed[n], axis) * 8.0
                 gap = max(first - 0.5 - p[axis], p[axis] - first - 7.5, 0.0)
                 bound += gap * gap
             rows[count], bounds[count] = n, bound
@@ -100,7 +94,7 @@ def _search(p, class_id, least, packed, slots, index, voxels, xyz):
             if bounds[i] > best:
                 break
             slot, key = np.int64(slots[rows[i]]), packed[rows[i]]
-            x, y, z = _unpack(key, 0), _unpack(key, 1), _unpack(key, 2)
+            x, y, z = key_part(key, 0), key_part(key, 1), key_part(key, 2)
             neighbour_slots(x, y, z, index, near)
             for voxel in range(512):
                 if voxels.label[slot, voxel] != class_id or voxels.confidence[slot, voxel] < least:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 
 from semantic_mapper.types import Float64
 
@@ -36,11 +37,7 @@ def upright_box(xyz: Float64, up: Float64) -> OrientedBox:
     middle = xyz.mean(axis=0)
     plan = (xyz - middle) @ frame
     hull = cv2.convexHull(plan[:, :2].astype(np.float32)).reshape(-1, 2).astype(np.float64)
-    edges = np.roll(hull, -1, axis=0) - hull
-    edges = edges[np.linalg.norm(edges, axis=1) > 0]
-    yaws = np.unique(np.arctan2(edges[:, 1], edges[:, 0]) % (np.pi / 2)) if len(edges) else np.zeros(1)
-    areas = [float(np.prod(np.ptp(hull @ _turn(yaw), axis=0))) for yaw in yaws]
-    yaw = float(yaws[int(np.argmin(areas))])
+    yaw = _best_yaw(hull)
     if np.diff(np.ptp(plan[:, :2] @ _turn(yaw), axis=0))[0] > 0:
         yaw += np.pi / 2
     R = frame.copy()
@@ -52,11 +49,30 @@ def upright_box(xyz: Float64, up: Float64) -> OrientedBox:
 
 def _level_frame(up: Float64) -> Float64:
     """A right-handed rotation (3, 3) whose third column is ``up``; the identity for up = z."""
-    x = np.cross((0.0, 1.0, 0.0) if abs(up[1]) < 0.9 else (0.0, 0.0, 1.0), up)
+    ux, uy, uz = up
+    x = np.array((uz, 0.0, -ux) if abs(uy) < 0.9 else (-uy, ux, 0.0))
     x /= np.linalg.norm(x)
-    return np.stack((x, np.cross(up, x), up), axis=1)
+    y = np.array((uy * x[2] - uz * x[1], uz * x[0] - ux * x[2], ux * x[1] - uy * x[0]))
+    return np.stack((x, y, up), axis=1)
 
 
 def _turn(yaw: float) -> Float64:
     """(2, 2) whose columns are the axes turned by ``yaw``."""
     return np.array(((np.cos(yaw), -np.sin(yaw)), (np.sin(yaw), np.cos(yaw))))
+
+
+@njit(nogil=True, cache=True)
+def _best_yaw(hull):
+    """Of the directions of a hull's (N, 2) sides, below 90 degrees, the one with the least area; the smaller of two."""
+    best, least = 0.0, np.inf
+    for i in range(len(hull)):
+        x, y = hull[(i + 1) % len(hull)] - hull[i]
+        if x == 0 and y == 0:
+            continue
+        yaw = np.arctan2(y, x) % (np.pi / 2)
+        c, s = np.cos(yaw), np.sin(yaw)
+        along, across = hull[:, 0] * c + hull[:, 1] * s, hull[:, 1] * c - hull[:, 0] * s
+        area = (along.max() - along.min()) * (across.max() - across.min())
+        if area < least or (area == least and yaw < best):
+            best, least = yaw, area
+    return best

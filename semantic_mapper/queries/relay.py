@@ -13,7 +13,7 @@ from semantic_mapper.queries.snapshot import MapSnapshot
 
 
 class MirrorRelay:
-    """Feeds a mirror and passes its changes on. For one thread; the mirror's snapshots are for any.
+    """Feeds a mirror and passes its changes on. One thread may ``apply``; all else is for any thread.
 
     Args:
         mirror: An empty one, which is fed through this relay alone.
@@ -21,22 +21,22 @@ class MirrorRelay:
 
     def __init__(self, mirror: MapMirror) -> None:
         self._mirror = mirror
-        self._packed = np.empty(0, np.int64)
-        self._versions = np.empty(0, np.int64)  # of each block: the version that it came with
+        # And of each block the version that it came with. Replaced as one, since other threads read both.
+        self._state = mirror.snapshot(), np.empty(0, np.int64)
 
     def snapshot(self) -> MapSnapshot:
         """The present state of the mirror."""
-        return self._mirror.snapshot()
+        return self._state[0]
 
     def apply(self, changes: BlockChanges) -> MapSnapshot:
         """See ``MapMirror.apply``."""
-        epoch = self._mirror.snapshot().epoch
+        old, old_versions = self._state
         snapshot = self._mirror.apply(changes)
         versions = np.full(snapshot.block_count, snapshot.version, np.int64)
-        if changes.epoch == epoch:
-            versions[np.searchsorted(snapshot.packed, self._packed)] = self._versions
+        if changes.epoch == old.epoch:
+            versions[np.searchsorted(snapshot.packed, old.packed)] = old_versions
             versions[np.searchsorted(snapshot.packed, pack_keys(changes.keys))] = snapshot.version
-        self._packed, self._versions = snapshot.packed, versions
+        self._state = snapshot, versions
         return snapshot
 
     def changes(self, since: int, limit: int = 0) -> BlockChanges:
@@ -45,14 +45,14 @@ class MirrorRelay:
         Raises:
             MapError: ``since`` is not a version of this map, or a negative ``limit``.
         """
-        snapshot = self.snapshot()
+        snapshot, versions = self._state
         if not 0 <= since <= snapshot.version or limit < 0:
             raise MapError(
                 f"changes since version {since}, limit {limit}: versions go from 0 to {snapshot.version}, and a limit "
                 "is not negative; a mirror of another map starts anew from version 0"
             )
-        later: NDArray[np.int64] = np.flatnonzero(self._versions > since)
-        chosen, version = oldest_first(self._versions[later], limit, snapshot.version)
+        later: NDArray[np.int64] = np.flatnonzero(versions > since)
+        chosen, version = oldest_first(versions[later], limit, snapshot.version)
         rows = later[chosen]
         slots, voxels = snapshot.slots[rows], snapshot.voxels
         return BlockChanges(

@@ -45,6 +45,7 @@ class MapSnapshot:
         label_set: Of the map.
         packed: (B,) int64 sorted packed keys of the blocks.
         slots: (B,) int32 where each of them lies in ``voxels``.
+        serials: (B,) int64; in this process no two contents of a block have the same, in whichever mirror.
         index: The same as a table for compiled code.
         voxels: Memory shared with other snapshots; only ``slots`` of it belong to this one.
     """
@@ -56,6 +57,7 @@ class MapSnapshot:
     label_set: LabelSet
     packed: NDArray[np.int64]
     slots: NDArray[np.int32]
+    serials: NDArray[np.int64]
     index: BlockIndex
     voxels: BlockVoxels
 

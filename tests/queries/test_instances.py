@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,8 +12,9 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.queries.class_surface import class_surface
 from semantic_mapper.queries.components import find_components
-from semantic_mapper.queries.instances import Instance, InstanceTracker
+from semantic_mapper.queries.instances import Instance, InstanceTracker, _Found
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.oriented_box import upright_box
 from semantic_mapper.types import UInt8
@@ -53,10 +57,15 @@ def test_components_are_those_of_scipy(seed: int, share: float, least: int) -> N
     rng = np.random.default_rng(seed)
     plan = np.where(rng.random((32, 24)) < share, rng.choice([TABLE, CUP, FLOOR], (32, 24)), 0).astype(np.uint8)
     mirror = MapMirror(0.02, 4.0, LABELS)
-    found = find_components(mirror.apply(painted(plan, 0, 1)), (TABLE, CUP), least)
-    x, y = np.divmod(found.row, 3)
+    surface = class_surface(mirror.apply(painted(plan, 0, 1)), np.isin(np.arange(256), (TABLE, CUP)))
+    found = find_components(surface, least)
+    x, y = np.divmod(np.repeat(np.arange(12), np.diff(surface.start)), 3)
     mine = np.full(plan.shape, -1)
-    mine[x * 8 + (found.voxel & 7), y * 8 + ((found.voxel >> 3) & 7)] = found.component
+    mine[x * 8 + (surface.voxel & 7), y * 8 + ((surface.voxel >> 3) & 7)] = found.component
+    parts = np.split(found.order, found.ends)
+    assert len(parts.pop()) == 0
+    for number, part in enumerate(parts):
+        np.testing.assert_array_equal(part, np.flatnonzero(found.component == number))
     pairs = set()
     for class_id in (TABLE, CUP):
         theirs, count = ndimage.label(plan == class_id, np.ones((3, 3)))
@@ -135,6 +144,67 @@ def test_neighbours_that_trade_a_few_voxels_keep_their_ids() -> None:
         assert {thing.class_name: thing.id for thing in painting.paint(plan).values()} == before
     plan[:] = CUP
     assert [thing.id for thing in painting.paint(plan).values()] == [min(before.values())]
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.3, 0.95))
+def test_what_did_not_change_is_not_computed_again_and_nothing_is_missed(seed: int, share: float) -> None:
+    """Maps grow in pieces, blocks change shape and class and go; all is as if it were computed anew each time."""
+    rng = np.random.default_rng(seed)
+    mirror, tracker, anew = MapMirror(0.02, 4.0, LABELS), InstanceTracker(min_voxels=3), InstanceTracker(min_voxels=3)
+    for version in range(6):
+        plan = np.where(rng.random((48, 24)) < share, rng.choice([TABLE, CUP, FLOOR]), 0).astype(np.uint8)
+        whole_plan = painted(plan, version, version + 1)
+        chosen = np.sort(rng.choice(18, rng.integers(0, 9), replace=False))
+        tsdf = whole_plan.tsdf[chosen]
+        tsdf[rng.random(tsdf.shape) < 0.05] = rng.integers(-128, 128)
+        changes = dataclasses.replace(
+            whole_plan,
+            epoch=int(version > 4),
+            tsdf=tsdf,
+            **{name: getattr(whole_plan, name)[chosen] for name in ("keys", "label", "confidence", "rgb")},
+        )
+        snapshot = mirror.apply(changes)
+        anew._last = anew._last and with_nothing_kept(anew._last)
+        things, others = tracker.update(snapshot), anew.update(snapshot)
+        assert_same_things(things, others)
+        assert_same_things(InstanceTracker(min_voxels=3).update(snapshot), sorted(others, key=first_voxel), ids=False)
+
+
+def test_a_thing_far_from_all_changes_is_the_same_object() -> None:
+    plan = np.zeros((64, 16), np.uint8)
+    plan[2:12, 2:12] = plan[50:60, 2:12] = TABLE
+    painting = Painting()
+    before = painting.paint(plan)
+    plan[2:4, 2:12] = 0
+    version, changed = painting.mirror.version, painted(plan, painting.mirror.version, painting.mirror.version + 1)
+    near = changed.keys[:, 0] < 2
+    arrays = {name: getattr(changed, name)[near] for name in ("keys", "tsdf", "label", "confidence", "rgb")}
+    painting.mirror.apply(dataclasses.replace(changed, **arrays))
+    one, two = painting.tracker.update(painting.mirror.snapshot())
+    assert painting.mirror.version == version + 1 and (len(one.voxels), len(two.voxels)) == (80, 100)
+    assert one.id == before[2, 2].id and two is before[50, 2]
+
+
+def assert_same_things(things: Sequence[Instance], others: Sequence[Instance], *, ids: bool = True) -> None:
+    assert len(things) == len(others)
+    for mine, other in zip(things, others, strict=True):
+        assert mine.id == other.id or not ids
+        assert (mine.class_id, mine.class_name, mine.confidence) == (other.class_id, other.class_name, other.confidence)
+        np.testing.assert_array_equal(mine.voxels, other.voxels)
+        np.testing.assert_array_equal(mine.centroid, other.centroid)
+        for name in ("center", "size", "R_world_box"):
+            np.testing.assert_array_equal(getattr(mine.box, name), getattr(other.box, name))
+
+
+def first_voxel(thing: Instance) -> tuple[list[int], list[int]]:
+    """Where it comes in the order of blocks and voxels."""
+    return (thing.voxels[0] >> 3).tolist(), (thing.voxels[0] & 7)[::-1].tolist()
+
+
+def with_nothing_kept(found: _Found) -> _Found:
+    """The last update as if every block had changed since."""
+    return found._replace(surface=found.surface._replace(serials=np.full_like(found.surface.serials, -1)))
 
 
 @settings(max_examples=50, deadline=None)

@@ -1,0 +1,130 @@
+"""Questions that take long hold up none but each other, whatever becomes of them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import msgpack
+import numpy as np
+import pytest
+
+from nodes import long_questions, query_answers
+from nodes.long_questions import MAX_OF_CLIENT
+from nodes.query_answers import Answer, Answers
+from semantic_mapper.client import MapClient
+from semantic_mapper.errors import MapError
+from semantic_mapper.queries.instances import InstanceTracker
+from semantic_mapper.queries.lookup import at
+from semantic_mapper.queries.occupancy import occupancy
+from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.transport import query_messages as messages
+from semantic_mapper.transport.query_codec import encode_request
+from tests.nodes.test_query_service import PLACES, Stranger, a_folder, answering, assert_equal_fields, good_questions
+from tests.queries.scene import whole, whole_map
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[MapClient]:
+    """Of a map that nobody changes."""
+    with (
+        a_folder() as folder,
+        answering(f"ipc://{folder / 'query'}", whole_map()) as service,
+        MapClient(service.endpoint, timeout_s=60) as client,
+    ):
+        yield client
+
+
+@pytest.fixture
+def held(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[threading.Event, threading.Event]]:
+    """`instances` hangs: set once it does, and to be set to let it go on."""
+    hangs, may_go_on = threading.Event(), threading.Event()
+    answer = Answers._instances
+
+    def hang(self: Answers, snapshot: MapSnapshot, up: messages.Point) -> Answer:
+        hangs.set()
+        assert may_go_on.wait(60)
+        return answer(self, snapshot, up)
+
+    monkeypatch.setattr(Answers, "_instances", hang)
+    yield hangs, may_go_on
+    may_go_on.set()
+
+
+def long_question(up: tuple[float, float, float]) -> list[bytes]:
+    return [b"", *encode_request("instances", messages.InstancesRequest(up=up), {})]
+
+
+def test_a_question_that_takes_long_holds_up_no_short_one(
+    client: MapClient, held: tuple[threading.Event, threading.Event]
+) -> None:
+    hangs, may_go_on = held
+    first, second = Stranger(client._socket.endpoint), Stranger(client._socket.endpoint)
+    first.socket.send_multipart(long_question((0.0, 0.1, 1.0)))
+    assert hangs.wait(60)
+    second.socket.send_multipart(long_question((0.0, 0.2, 1.0)))
+    for _ in range(3):
+        assert_equal_fields(client.at(PLACES[:9]), at(whole(), PLACES[:9]))
+        assert client.nearest("cup", (1, 1, 1)) is not None
+        assert client.cast_rays((0, 0, 2), (0, 0, -1)).distance_m > 0
+        np.testing.assert_array_equal(client.occupancy(PLACES), occupancy(whole(), PLACES))
+    first.socket.send_multipart([b"", *good_questions()[0]])  # of the same client: not before the long one
+    assert not first.socket.poll(200) and not second.socket.poll(0)
+    may_go_on.set()
+    for stranger, kinds in ((first, [b"instances", b"info"]), (second, [b"instances"])):
+        for kind in kinds:
+            assert stranger.socket.poll(60_000)
+            assert stranger.socket.recv_multipart()[1] == kind
+        stranger.socket.close()
+
+
+def test_who_asks_too_much_that_takes_long_is_told_so(
+    client: MapClient, held: tuple[threading.Event, threading.Event]
+) -> None:
+    hangs, may_go_on = held
+    greedy, modest = Stranger(client._socket.endpoint), Stranger(client._socket.endpoint)
+    for _ in range(MAX_OF_CLIENT):
+        greedy.socket.send_multipart(long_question((0.3, 0.1, 1.0)))
+    assert hangs.wait(60)
+    kind, header = greedy.ask(long_question((0.3, 0.1, 1.0)))
+    assert kind == b"error" and "too many questions that take long" in msgpack.unpackb(header)["text"]
+    modest.socket.send_multipart(long_question((0.3, 0.2, 1.0)))
+    assert client.info().version == 14
+    may_go_on.set()
+    assert modest.socket.poll(60_000)  # in its turn, which is the second
+    for _ in range(MAX_OF_CLIENT):
+        assert greedy.socket.poll(60_000)
+        assert greedy.socket.recv_multipart()[1] == b"instances"
+    for stranger in (greedy, modest):
+        stranger.socket.close()
+
+
+def test_a_bug_in_an_answer_ends_nothing(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    def wrong(*arguments: object) -> None:
+        raise KeyError("a bug")
+
+    monkeypatch.setattr(InstanceTracker, "update", wrong)
+    monkeypatch.setattr(query_answers, "nearest", wrong)
+    for ask in (lambda: client.instances((0.5, 0.5, 1)), lambda: client.nearest("cup", (0, 0, 0))):
+        with pytest.raises(MapError, match="could not compute this: 'a bug'"):
+            ask()
+    monkeypatch.undo()
+    assert client.nearest("cup", (0, 0, 0)) is not None and len(client.instances((0.5, 0.5, 1))) >= 2
+
+
+def test_it_closes_while_questions_wait(
+    held: tuple[threading.Event, threading.Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(long_questions, "CLOSE_S", 0.1)
+    hangs, _ = held
+    with a_folder() as folder:
+        endpoint = f"ipc://{folder / 'query'}"
+        with answering(endpoint, whole_map()) as service:
+            stranger = Stranger(endpoint)
+            for _ in range(2):
+                stranger.socket.send_multipart(long_question((0.0, 0.0, 1.0)))
+            assert hangs.wait(60) and service.alive
+        assert not service.alive
+        with answering(endpoint, whole_map()), MapClient(endpoint, timeout_s=60) as late:
+            assert late.info().version == 14
+    stranger.socket.close()
