@@ -151,7 +151,7 @@ class QueryService:
             self._send(client, parts)
 
     def _mirror_is_there(self) -> bool:
-        """After a pause, wait until the mirror has come up to the map as it is now; False where it has had nothing yet."""
+        """After a pause, wait until the mirror has come up to the map as it is now; False where it had nothing yet."""
         now = time.monotonic()
         if now - self._asked_at > ASKED_LATELY_S:
             self._awaited = self._map.version
