@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from replay.log import LogReader
 from semantic_mapper.config import MapperConfig, Quality, SamplingConfig, with_quality
@@ -17,6 +18,8 @@ from semantic_mapper.errors import ConfigError, LabelError, LogError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.fields.device_field import DeviceField
+from semantic_mapper.fields.render import render_view
 from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sparse_render import render_sparse_view
 from semantic_mapper.fields.sray import SRay
@@ -26,7 +29,7 @@ from semantic_mapper.imaging import fill_holes, resize_depth
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.scenes import TEST_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.training.views import stack_sources, view_from_frame
-from semantic_mapper.types import CameraIntrinsics, FieldRender, PosedFrame, RayBatch, UInt8
+from semantic_mapper.types import CameraIntrinsics, FieldRender, PosedFrame, RayBatch, SourceViews, UInt8
 
 VIEW = CameraIntrinsics(220.6, 220.6, 159.5, 119.5, 320, 240)
 SOURCE_VIEWS = 8
@@ -38,6 +41,8 @@ LONG_NAMES = {
     "streaming": "streaming, 8 guided samples",
     "balanced": "streaming, rays and samples of quality balanced",
     "fast": "streaming, rays and samples of quality fast",
+    "gpu": "GPU, all rays, 8 guided samples",
+    "gpu_bfloat16": "GPU, all rays, 8 guided samples, networks in bfloat16",
 }
 
 
@@ -98,8 +103,9 @@ def bench_render(
     """Time novel views from 8 source views each, and score their labels.
 
     At the same weights: the eager reference with 64 + 64 samples a ray, the eager renderer and the compiled one with 8
-    guided samples, and the compiled one with the rays and samples of the mapper's "balanced" and "fast" quality. The
-    reference is timed on 2,048 rays spread over each view and scaled; all are scored at the pixels of these rays.
+    guided samples, and the compiled one with the rays and samples of the mapper's "balanced" and "fast" quality; with a
+    GPU, the eager one there. The reference is timed on 2,048 rays spread over each view and scaled; all are scored at
+    the pixels of these rays.
 
     Returns:
         Plain data; ``speedup`` is wall time of the reference over that of "balanced" for the same views, and
@@ -179,12 +185,41 @@ def _bench_scene(
         "eager": (eager.scaled_to(len(pixels)), _ids(eager_render, labels), truth),
         "streaming": (fast, _ids(few_render, labels), truth),
     }
+    if (gpu := find_gpu()) is not None:
+        renders |= _bench_device(gpu, reference, views, query, repeats, (some.numpy(), truth))
     for quality in ("balanced", "fast"):
         (p, known, _, _), timing = _timed(lambda q=quality: _sparse(q, streaming, sources, query), len(pixels), repeats)
         predicted = labels.to_ids(np.where(known, p.argmax(axis=2), -1)).reshape(-1)[some.numpy()]
         renders[quality] = (timing, predicted, truth)
     difference = float((eager_render.logits - few_render.logits).abs().max())
     return _SceneBench(renders, difference, encode.wall_s)
+
+
+def find_gpu() -> torch.device | None:
+    """The first GPU, if there is one."""
+    return torch.device("cuda") if torch.cuda.is_available() else None
+
+
+def _bench_device(
+    device: torch.device,
+    model: SRay,
+    views: SourceViews,
+    query: PosedFrame,
+    repeats: int,
+    scored: tuple[NDArray[np.int64], UInt8],
+) -> dict[str, tuple[Timing, UInt8, UInt8]]:
+    """As ``_SceneBench.renders``: the whole view with a ray for every pixel; ``scored`` pixels and their true ids."""
+    some, truth = scored
+    sampling = SamplingConfig()
+    prior = fill_holes(resize_depth(query, query.intrinsics))
+    renders: dict[str, tuple[Timing, UInt8, UInt8]] = {}
+    for name, bfloat16 in (("gpu", False), ("gpu_bfloat16", True)):
+        field = DeviceField(model, device, sampling, bfloat16=bfloat16)
+        scene = (field, field.encode(views), query.intrinsics, query.T_world_camera, prior, sampling, 0)
+        (p, known, _), timing = _timed(lambda s=scene: render_view(*s), prior.size, repeats)
+        predicted = model.label_set.to_ids(np.where(known, p.argmax(axis=2), -1)).reshape(-1)[some]
+        renders[name] = (timing, predicted, truth)
+    return renders
 
 
 def _sparse(quality: Quality, streaming: StreamingSRay, sources: EncodedViews, query: PosedFrame) -> Any:

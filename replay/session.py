@@ -20,6 +20,8 @@ from semantic_mapper.errors import FrameError, LabelError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, confusion_of
 from semantic_mapper.fields.base import SemanticField
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint
+from semantic_mapper.fields.device import choose_device
+from semantic_mapper.fields.device_field import DeviceField
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_streaming import StreamingSRay, compiled_covers
@@ -48,9 +50,10 @@ def load_pipeline(weights: Path | None, config: MapperConfig) -> PipelineBundle:
     """Load weights (None = those that ship with the package) and build the pipeline round them.
 
     The map's classes are those of the weights. With ``sampling.mode = "streaming"`` and a model that the compiled
-    renderer covers, that renderer is used; the eager reference otherwise.
+    renderer covers, that renderer is used; the eager reference otherwise, and on a GPU.
 
     Raises:
+        ConfigError: a GPU is asked for that is not there.
         WeightsError: missing, damaged or foreign weights.
     """
     config = with_quality(config)
@@ -67,7 +70,13 @@ def load_pipeline(weights: Path | None, config: MapperConfig) -> PipelineBundle:
 
 
 def make_field(model: LearnedField, config: MapperConfig) -> SemanticField:
-    """The renderer that a config asks for, over given weights."""
+    """The renderer that a config asks for, over given weights.
+
+    Raises:
+        ConfigError: ``render.device = "cuda"`` where torch sees no GPU.
+    """
+    if config.render.device == "cuda":
+        return DeviceField(model, choose_device("cuda", 0), config.sampling, bfloat16=config.render.bfloat16)
     if isinstance(model, SRay) and config.sampling.mode == "streaming" and compiled_covers(model):
         return StreamingSRay(model, config.sampling)
     model.sampling = config.sampling

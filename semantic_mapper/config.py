@@ -169,7 +169,13 @@ class RenderConfig(Config, frozen=True):
         0.0  # hold this rate by fewer rays and samples than set; 0 = off, for maps that repeat
     )
     encode_width: NotNegative = 0  # of the source images when they are encoded; 0 = what the weights were trained at
-    rays_per_chunk: AtLeastOne = 2048
+    rays_per_chunk: NotNegative = 0  # 0 = 2,048 on a CPU, 32,768 on a GPU
+    device: Literal["cpu", "cuda"] = "cpu"  # where views are encoded and rendered; the map is always the CPU's
+    bfloat16: bool = False  # on a GPU: networks compute in bfloat16; geometry and logits never do
+
+    def __post_init__(self) -> None:
+        if self.bfloat16 and self.device == "cpu":
+            raise ValueError('bfloat16 is for device = "cuda"')
 
 
 Quality = Literal["custom", "fast", "balanced", "reference"]

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from semantic_mapper.benchmark.config import TierConfig
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.fields.base import SemanticField
+from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.render import render_image
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_streaming import StreamingSRay, compiled_covers
 from semantic_mapper.imaging import fill_holes, resize_depth
 from semantic_mapper.labels import IGNORE_CHANNEL, ROOMS, LabelSet
-from semantic_mapper.training.views import stack_sources, to_device, view_from_frame
+from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import FieldRender, Float32, PosedFrame, UInt8
 
 

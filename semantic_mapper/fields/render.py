@@ -15,6 +15,14 @@ from semantic_mapper.fields.base import EncodedViews, SemanticField
 from semantic_mapper.geometry import pixel_grid, pixel_rays
 from semantic_mapper.types import CameraIntrinsics, FieldRender, Float32, Float64
 
+CPU_CHUNK = 2048  # rays rendered at once: what fits in a core's cache
+GPU_CHUNK = 32768  # enough to fill one
+
+
+def chunk_size(rays_per_chunk: int, device: torch.device) -> int:
+    """Rays to render at once; 0 = what suits the device."""
+    return rays_per_chunk or (CPU_CHUNK if device.type == "cpu" else GPU_CHUNK)
+
 
 def render_image(
     field: SemanticField,
@@ -33,6 +41,7 @@ def render_image(
         T_world_camera: (4, 4).
         prior_depth_m: (H, W), 0 = no prior.
         sampling: Near and far bounds.
+        rays_per_chunk: Rays rendered at once; 0 = what suits the device.
         on_chunk: Told the number of rays done after each chunk.
 
     Returns:
@@ -43,6 +52,7 @@ def render_image(
     prior = torch.from_numpy(np.ascontiguousarray(prior_depth_m)).to(device).flatten()
     pose = torch.tensor(T_world_camera, device=device, dtype=torch.float32)
     parts: list[FieldRender] = []
+    rays_per_chunk = chunk_size(rays_per_chunk, device)
     with torch.inference_mode():
         for start in range(0, len(pixels), rays_per_chunk):
             rays = pixel_rays(

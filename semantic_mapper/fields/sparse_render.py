@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.fields.base import EncodedViews, SemanticField
+from semantic_mapper.fields.render import chunk_size
 from semantic_mapper.geometry import pixel_rays
 from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
@@ -51,6 +52,7 @@ def render_sparse_view(
     probabilities = np.zeros((height, width, len(field.label_set)), np.float32)
     known, depth_m = np.zeros((height, width), np.bool_), np.zeros((height, width), np.float32)
     pose = torch.tensor(T_world_camera, device=sources.feature.device, dtype=torch.float32)
+    rays_per_chunk = chunk_size(rays_per_chunk, pose.device)
 
     def trace(rows: NDArray[np.int64], columns: NDArray[np.int64]) -> None:
         for start in range(0, len(rows), rays_per_chunk):

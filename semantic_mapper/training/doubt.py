@@ -9,9 +9,10 @@ from dataclasses import replace
 import torch
 from torch.nn import functional
 
+from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.training.losses import IGNORE
-from semantic_mapper.training.views import LabelledView, stack_sources, to_device
+from semantic_mapper.training.views import LabelledView, stack_sources
 
 LEAST = 0.02  # doubt of a pixel that the field is sure of and right about: it may still be drawn
 

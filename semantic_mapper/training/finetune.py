@@ -22,12 +22,12 @@ from semantic_mapper.config import AtLeastOne, AtLeastZero, Config, NotNegative,
 from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, anchor_from_frame
+from semantic_mapper.fields.device import DeviceName, choose_device, encoder_in_bfloat16, to_device
 from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.training.device import DeviceName, choose_device, encoder_in_bfloat16
 from semantic_mapper.training.doubt import with_doubt
 from semantic_mapper.training.head_start import fit_class_rows
 from semantic_mapper.training.losses import IGNORE, Loss, semantic_loss
@@ -41,7 +41,6 @@ from semantic_mapper.training.views import (
     draw_pixels,
     query_rays,
     stack_sources,
-    to_device,
     view_from_frame,
 )
 from semantic_mapper.types import PosedFrame

@@ -13,11 +13,12 @@ import torch
 
 from semantic_mapper.config import AtLeastOne, Config, Positive, Share
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.training.losses import Loss, image_loss
 from semantic_mapper.training.rooms import RoomViews
-from semantic_mapper.training.views import jitter_colours, mirrored_view, stack_sources, to_device, withhold_depth
+from semantic_mapper.training.views import jitter_colours, mirrored_view, stack_sources, withhold_depth
 from semantic_mapper.types import SourceViews
 
 

@@ -8,10 +8,11 @@ from dataclasses import replace
 import torch
 
 from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.training.losses import IGNORE, Loss, image_loss, ray_loss
 from semantic_mapper.training.step import StepConfig, draw_rays
-from semantic_mapper.training.views import LabelledView, stack_sources, to_device
+from semantic_mapper.training.views import LabelledView, stack_sources
 
 
 def encode_once(model: LearnedField, views: Sequence[LabelledView], *, with_labels: bool) -> EncodedViews:

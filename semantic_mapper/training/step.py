@@ -12,6 +12,7 @@ import torch
 
 from semantic_mapper.config import AtLeastOne, AtLeastTwo, AtLeastZero, Config, SamplingConfig, Share
 from semantic_mapper.fields.base import MAX_SOURCE_VIEWS, EncodedViews
+from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided, sample_inverse_depth
 from semantic_mapper.training.losses import IGNORE, Loss, LossConfig, image_loss, mean_loss, ray_loss
@@ -26,7 +27,6 @@ from semantic_mapper.training.views import (
     query_rays,
     select_sources,
     stack_sources,
-    to_device,
     withhold_depth,
     withhold_labels,
 )

@@ -20,12 +20,12 @@ from torch.nn.parallel import DistributedDataParallel
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
+from semantic_mapper.fields.device import bfloat16_is_fast, choose_device, compute_in_bfloat16
 from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes import SUITE_VERSION
-from semantic_mapper.training.device import bfloat16_is_fast, choose_device, compute_in_bfloat16
 from semantic_mapper.training.folder_lock import sole_use_of
 from semantic_mapper.training.images import ImageBatch, draw_images, images_loss
 from semantic_mapper.training.optimiser import make_optimiser, set_rates

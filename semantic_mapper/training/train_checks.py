@@ -7,14 +7,13 @@ from pathlib import Path
 import torch
 
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.device import check_parts, to_device
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.scenes import TRAIN_SEEDS
-from semantic_mapper.training.device import check_parts
 from semantic_mapper.training.images import encoder_for_images
 from semantic_mapper.training.step import encodes_views_separately
 from semantic_mapper.training.train_config import TrainConfig
 from semantic_mapper.training.train_state import unfinished_step
-from semantic_mapper.training.views import to_device
 from semantic_mapper.types import SourceViews
 
 

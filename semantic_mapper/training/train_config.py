@@ -7,7 +7,7 @@ from typing import Any, Literal
 import msgspec
 
 from semantic_mapper.config import AtLeastOne, Config, Share
-from semantic_mapper.training.device import DeviceName
+from semantic_mapper.fields.device import DeviceName
 from semantic_mapper.training.images import ImageStepConfig
 from semantic_mapper.training.losses import LossConfig
 from semantic_mapper.training.rooms import RoomPoolConfig

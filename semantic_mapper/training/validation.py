@@ -10,13 +10,14 @@ import torch
 
 from semantic_mapper.config import Config
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided, sample_inverse_depth
 from semantic_mapper.scenes import VALIDATION_SEEDS
 from semantic_mapper.training.ranks import Ranks
 from semantic_mapper.training.rooms import RoomPoolConfig, RoomViews, render_room
 from semantic_mapper.training.step import StepConfig
-from semantic_mapper.training.views import LabelledView, query_rays, stack_sources, to_device
+from semantic_mapper.training.views import LabelledView, query_rays, stack_sources
 
 
 class ValidationConfig(Config, frozen=True):

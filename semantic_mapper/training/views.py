@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,8 +12,6 @@ from semantic_mapper.geometry import camera_matrix, pixel_rays
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, working_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import CameraIntrinsics, PosedFrame, RayBatch, SourceViews
-
-BatchT = TypeVar("BatchT", SourceViews, RayBatch, "RayTargets")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,12 +71,6 @@ def mirrored_view(view: LabelledView) -> LabelledView:
         CameraIntrinsics(k.fx, k.fy, k.width - 1 - k.cx, k.cy, k.width, k.height),
         mirror @ view.T_world_camera @ mirror,
     )
-
-
-def to_device(batch: BatchT, device: torch.device) -> BatchT:
-    """A copy of a dataclass of tensors (``SourceViews``, ``RayBatch``, ``RayTargets``) on another device."""
-    values = {f.name: getattr(batch, f.name) for f in fields(batch)}
-    return replace(batch, **{name: value if value is None else value.to(device) for name, value in values.items()})
 
 
 def stack_sources(views: Sequence[LabelledView], *, with_labels: bool = False) -> SourceViews:

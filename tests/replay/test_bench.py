@@ -1,6 +1,8 @@
 import cv2
 import pytest
+import torch
 
+import replay.bench as bench
 import replay.bench_map as bench_map
 from replay.bench import bench_render, log_scenes, room_scenes
 from replay.bench_map import bench_fusion, bench_pipeline, bench_qualities
@@ -19,12 +21,20 @@ def test_bench_reports_ratios_of_renderers_that_agree():
     assert found["views"] == 2
     assert found["max_logit_difference_at_equal_samples"] < 1e-3
     renderers = found["renderers"]
-    assert len(renderers) == 5
+    assert len(renderers) == (5 if bench.find_gpu() is None else 7)
     assert all(row["pixels_per_s"] > 0 and 0 <= row["miou"] <= 1 for row in renderers.values())
     assert renderers["eager, 8 guided samples"]["miou"] == renderers["streaming, 8 guided samples"]["miou"]
     assert found["miou_reference"] == renderers["reference, 64 + 64 samples"]["miou"]
     wall = {name.split(",")[-1].split()[-1]: row["view_wall_s"] for name, row in renderers.items()}
     assert found["speedup_fast"] > found["speedup_all_rays"] > 0 and wall["fast"] > 0
+
+
+def test_a_gpu_has_rows_of_its_own(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(bench, "find_gpu", lambda: torch.device("cpu"))
+    found = bench_render(Checkpoint(tiny_field()), room_scenes(1, INTRINSICS), repeats=1, reference_rays=640)
+    gpu, rounded, cpu = (found["renderers"][bench.LONG_NAMES[name]] for name in ("gpu", "gpu_bfloat16", "streaming"))
+    assert gpu["miou"] == pytest.approx(cpu["miou"], abs=0.02)
+    assert rounded["miou"] == pytest.approx(cpu["miou"], abs=0.1) and rounded["pixels_per_s"] > 0
 
 
 def test_views_of_a_log_are_rendered_from_the_frames_round_them(tmp_path):

@@ -8,11 +8,11 @@ import torch
 import semantic_mapper.training.finetune as finetuning
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, FrameError
+from semantic_mapper.fields import device
 from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.training import device
 from semantic_mapper.training.doubt import LEAST, with_doubt
 from semantic_mapper.training.finetune import FinetuneConfig, finetune
 from semantic_mapper.training.select import Candidate, candidate_from_frame, choose_keyframes

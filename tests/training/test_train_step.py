@@ -5,8 +5,8 @@ import torch
 
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.device import choose_device, compute_in_bfloat16
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.training.device import choose_device, compute_in_bfloat16
 from semantic_mapper.training.losses import LossConfig
 from semantic_mapper.training.step import (
     StepBatch,

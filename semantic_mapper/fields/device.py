@@ -1,16 +1,24 @@
-"""Where training computes, and which parts of a field compute in bfloat16 there."""
+"""Where a field computes, and which of its parts compute in bfloat16 there."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from typing import Any, Literal
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import torch
 from torch import nn
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.learned import LearnedField
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+BatchT = TypeVar("BatchT", bound="DataclassInstance")
 
 DeviceName = Literal["auto", "cpu", "cuda"]
 
@@ -31,6 +39,12 @@ def choose_device(name: DeviceName, local_rank: int) -> torch.device:
         )
     torch.cuda.set_device(local_rank)
     return torch.device("cuda", local_rank)
+
+
+def to_device(batch: BatchT, device: torch.device) -> BatchT:
+    """A copy of a dataclass of tensors (``SourceViews``, ``RayBatch``, ``RayTargets``) on another device."""
+    values = {f.name: getattr(batch, f.name) for f in fields(batch)}
+    return replace(batch, **{name: value if value is None else value.to(device) for name, value in values.items()})
 
 
 def bfloat16_is_fast(device: torch.device) -> bool:
@@ -68,7 +82,7 @@ def check_parts(model: nn.Module, names: Sequence[str]) -> None:
 
 
 @contextmanager
-def encoder_in_bfloat16(model: LearnedField, device: torch.device) -> Iterator[None]:
+def encoder_in_bfloat16(model: LearnedField, device: torch.device) -> Generator[None]:
     """Meanwhile the image encoder computes in bfloat16, where that is fast; see ``compute_in_bfloat16``."""
     encoder: Any = model.image_encoder
     if encoder is None or not bfloat16_is_fast(device):
