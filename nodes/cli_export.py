@@ -83,6 +83,7 @@ def merge(
     output = Output.guarded()
     from nodes.outputs import prepare_file
     from nodes.saved_maps import map_path, parse_transform, refuse_overwriting
+    from semantic_mapper.mapping.merge import count_empty
     from semantic_mapper.mapping.voxel_map import VoxelMap
 
     T_a_b = parse_transform(transform)
@@ -92,5 +93,11 @@ def merge(
     one, other = map(VoxelMap.load, sources)
     joined = one.merged(other, T_a_b)
     joined.save(out)
+    empty = 0
+    for source in (one, other):
+        with source.locked() as grid:
+            empty += count_empty(grid)
     blocks = f"{one.block_count} and {other.block_count} made {joined.block_count} blocks"
+    if empty:
+        blocks += f"; {empty} empty blocks of the two, in which nothing was measured, are left out"
     output.print(f"{out}: {joined.frames} frames; {blocks}")

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 POLL_S = 0.1
 STATUS_PERIOD_S = 1.0
+HAND_OVER_S = 10.0  # for the whole map, before it is written: questions are answered meanwhile
 TRIM_PERIOD_S = 60.0  # a node that runs for hours would otherwise hold more and more of what it has freed
 
 _log = structlog.get_logger(__name__)
@@ -141,11 +142,18 @@ class _Mapper:
             _log.warning("nothing_to_write", reason="no stream has begun")
             return
         self._tell_status("stopping", now=True)
-        self._correction.finish(self._session, lambda: bool(self._context.stop), lambda: self._tell_status("stopping"))
+        self._correction.finish(self._session, lambda: bool(self._context.stop), self._while_stopping)
+        if self._queries is not None and not self._queries.hand_over_all(HAND_OVER_S):
+            _log.warning("questions_lag_behind", reason=f"the map could not be handed over in {HAND_OVER_S:g} s")
         out = Path(self._options.out)
         summary = finish_session(self._session, out, self._ended_by)
         _log.info("map_written", out=str(out), **summary["frames"])
         self._tell_status("ended", now=True)
+
+    def _while_stopping(self) -> None:
+        self._tell_status("stopping")
+        if self._queries is not None:
+            self._queries.follow()
 
     def finish_after(self, error: BaseException) -> None:
         """Write what there is, and let no second failure hide the first."""

@@ -34,6 +34,7 @@ CATCH_UP_S = 2.0  # how long the first question after that waits for the mirror;
 FIRST_CATCH_UP_S = 60.0  # how long the very first one waits: kernels may compile, and an empty mirror says nothing true
 MAX_BLOCKS = 600  # of a delivery (unless one frame has more): bounds what a step may cost
 _WAIT_S = 0.5
+_HANDING_OVER_S = 0.005  # between two looks at whether a delivery has been taken
 _NOT_READY = "the mapper has not handed its map over to its query service yet: it is busy, or ending; ask again"
 _TOO_MANY = "too many questions that take long wait for an answer; ask again later, and await each answer"
 
@@ -66,7 +67,7 @@ class QueryService:
         self._delivery_came = threading.Event()
         self._asked_at = -ASKED_LATELY_S  # never; monotonic seconds
         self._awaited = 0  # version that the first question after a pause waits for
-        self._overdue = False  # somebody has waited in vain
+        self._overdue = False  # somebody has waited in vain, or would
         self._closed = threading.Event()
         self.answered = 0
         self._server = QueryServer(endpoint)
@@ -94,11 +95,27 @@ class QueryService:
             return
         if self._given >= self._awaited and now < self._next_at:
             return
-        changes = self._map.copy_changes(self._given, MAX_BLOCKS)
-        self._given = changes.version
+        self._deliver()
         self._next_at = now + max(PERIOD_S, (time.monotonic() - now) / MAX_SHARE)
-        self._delivered.append(changes)
-        self._delivery_came.set()
+
+    def hand_over_all(self, within_s: float) -> bool:
+        """Hand all of the map over where somebody has ever asked: before its thread does something that takes long.
+
+        Returns:
+            Whether the service has it; False where that was not to be done in ``within_s`` seconds.
+        """
+        if not self.answered:
+            self._overdue = True  # whoever asks first from now on is told so at once
+            return True
+        deadline = time.monotonic() + within_s
+        while self._delivered or self._given != self._map.version:
+            if time.monotonic() > deadline or not self.alive:
+                return False
+            if self._delivered:
+                time.sleep(_HANDING_OVER_S)
+            else:
+                self._deliver()
+        return True
 
     def close(self) -> None:
         """End the threads and free the endpoint. Harmless when repeated."""
@@ -119,6 +136,12 @@ class QueryService:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def _deliver(self) -> None:
+        changes = self._map.copy_changes(self._given, MAX_BLOCKS)
+        self._given = changes.version
+        self._delivered.append(changes)
+        self._delivery_came.set()
 
     def _serve(self) -> None:
         warm_up()
@@ -158,7 +181,7 @@ class QueryService:
         self._asked_at = now
         patience = CATCH_UP_S if self._relay.snapshot().version else FIRST_CATCH_UP_S
         while self._relay.snapshot().version < self._awaited and not self._closed.is_set():
-            if time.monotonic() > now + patience:
+            if time.monotonic() > now + patience or (self._overdue and not self._relay.snapshot().version):
                 # The map is at rest or busy: those who ask next need not wait as well.
                 self._awaited, self._overdue = 0, True
                 break

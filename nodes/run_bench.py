@@ -18,7 +18,7 @@ from replay.bench_evidence import bench_evidence
 from replay.bench_growth import AXES, bench_growth
 from replay.bench_map import bench_fusion, bench_pipeline, bench_qualities
 from replay.bench_virtual import bench_virtual
-from replay.bench_walk import WalkPlan, bench_walk
+from replay.bench_walk import SLOPE_MINUTES, WalkPlan, bench_walk
 from replay.growth_plot import write_growth_plot
 from replay.pipeline_plot import write_pipeline_plot
 from replay.walk_plot import write_walk_plot
@@ -123,18 +123,26 @@ def run_map(request: BenchRequest, output: Output) -> dict[str, Any]:
         write_walk_plot(found, request.plot)
     output.print(
         f"{found['rooms']} rooms, {found['minutes']:g} minutes at {found['hz']:g} Hz: a step {found['step_p50_ms']} ms "
-        f"(p50), {found['step_p95_ms']} ms (p95), {found['cpu_p50_ms']} ms of processor time; their slopes "
-        f"{found['step_slope_percent_a_minute']:+g} and {found['cpu_slope_percent_a_minute']:+g} % a minute"
+        f"(p50), {found['step_p95_ms']} ms (p95), {found['cpu_p50_ms']} ms of processor time; {_slopes(found)}"
     )
     growth, share = found["rss_growth_mb"], found["rss_growth_percent_of_limit"]
     output.print(
         f"{found['blocks']} blocks, at most {found['blocks_in_memory_at_most']} in memory; {found['store_mb']} MB on "
-        f"disk; {found['rss_last_minute_mb']} MB resident"
+        f"disk; {found['rss_last_minute_mb']} MB resident, at most {found['rss_max_mb']}"
         + ("" if growth is None else f", {growth:+g} MB since minute 5")
         + ("" if share is None else f" ({share:+g} % of the limit)")
     )
     output.print(f"{found['returns_unchanged']} of {found['returns']} rooms unchanged when the walk came back to them")
     return found
+
+
+def _slopes(found: dict[str, Any]) -> str:
+    step, cpu = found["step_slope_percent_a_minute"], found["cpu_slope_percent_a_minute"]
+    if step is None:
+        return f"too short for a slope (less than {SLOPE_MINUTES} minutes)"
+    first, last = found["step_p50_first_ten_minutes_ms"], found["step_p50_last_ten_minutes_ms"]
+    compared = "" if first is None else f"; {first} ms (p50) in minutes 5 to 15, {last} ms in the last ten"
+    return f"their slopes {step:+g} and {cpu:+g} % a minute{compared}"
 
 
 def run_growth(request: BenchRequest, output: Output) -> list[dict[str, Any]]:

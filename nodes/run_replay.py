@@ -16,7 +16,7 @@ from nodes.process import StopRequest
 from replay.corrections import correct_session, keeping_frames, read_corrections
 from replay.log import LogReader
 from replay.session import MapSession, load_pipeline
-from semantic_mapper.config import MapperConfig, Quality, load_config
+from semantic_mapper.config import MapperConfig, Quality, check_quality, convert_config, read_toml
 from semantic_mapper.errors import LogError, SemanticMapperError
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.types import PosedFrame
@@ -136,9 +136,11 @@ def mapper_config(
     """The mapper's config from a TOML file (None = defaults) with what the command line says on top.
 
     Raises:
-        ConfigError: see ``load_config``.
+        ConfigError: see ``load_config`` and ``check_quality``.
     """
-    config = load_config(path, MapperConfig) if path else MapperConfig()
+    data = read_toml(path) if path else {}
+    config = convert_config(data, MapperConfig, str(path))
+    check_quality(data, quality or config.quality, str(path))
     if voxel_size_m is not None:
         voxel_map = msgspec.structs.replace(config.voxel_map, voxel_size_m=voxel_size_m)
         config = msgspec.structs.replace(config, voxel_map=voxel_map)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from semantic_mapper import __version__
+from semantic_mapper.config import to_plain
 from semantic_mapper.evaluation.metrics import confusion_of, metrics_per_image
 from semantic_mapper.evaluation.report import ViewStrip, write_overview
 from semantic_mapper.evaluation.upright import camera_up
@@ -134,6 +135,8 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "finetuned_frames": len(bundle.checkpoint.train_stamps_ns),
         },
         "seed": pipeline.config.seed,
+        "quality": pipeline.config.quality,
+        "config": to_plain(pipeline.config),  # as it was in force: with what the quality sets
         "refusals": [
             {"seq": r.seq, "stamp_ns": r.stamp_ns, "reason": r.reason}
             for r in sorted(session.refusals + session.label_refusals, key=lambda r: r.seq)[:MAX_LISTED_REFUSALS]

@@ -25,6 +25,8 @@ from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
 WARM_UP = 5  # frames that do not count: compiling
 SETTLED_MINUTE = 5  # by then every buffer has its size; memory that grows later is lost
+SLOPE_MINUTES = 10  # a slope over less of a walk is noise
+COMPARED_MINUTES = 10  # at the beginning, from the settled minute on, and at the end
 _READ_AT_ONCE = 512  # blocks
 
 
@@ -85,11 +87,14 @@ def bench_walk(
     Returns:
         Plain data, flat. Lists named ``minute_*`` have one value for each minute of the walk (by stamps). ``step_*`` is
         time on the clock; ``cpu_*`` processor time of the same steps, which other programs disturb less; ``fuse_*``
-        fusion alone; ``*_slope_percent_a_minute`` the least squares slope over the run, of the mean.
+        fusion alone; ``*_slope_percent_a_minute`` the least squares slope over the run, of the mean, None of a walk of
+        less than ``SLOPE_MINUTES``. ``*_p50_first_ten_minutes_ms`` are medians from minute 5 to 15, to compare with
+        ``*_p50_last_ten_minutes_ms``, None where the walk is too short for both.
         ``return_cpu_ratio`` is the median step of the visits at the end over that of the very same frames the first
         time. ``rss_*`` is resident memory of the process, which gives back what it has freed once a minute of the walk,
-        as the mapper node does; its growth is that from minute 5, when all buffers have their size, to the last, None
-        of a walk too short for that. ``blocks_*`` and ``store_mb`` are the map in memory and on disk.
+        as the mapper node does: at most in the first and last minute, in minute 5, when all buffers have their size, in
+        any later one and in any at all; its growth is that from minute 5 to the last, None of a walk too short for
+        that. ``blocks_*`` and ``store_mb`` are the map in memory and on disk.
         ``returns_unchanged`` says how many of ``returns`` rooms had, bit for bit, the blocks that they had when they
         were left. ``minute_miou`` scores the rendered labels, in rooms that the weights may have been trained
         on: for drift, not for rank.
@@ -133,11 +138,21 @@ def resident_mb() -> float:
     return int(status.split("VmRSS:")[1].split()[0]) * 1024 / 1e6
 
 
-def slope_percent(minutes: NDArray[np.float64], values: NDArray[np.float64]) -> float:
-    """Least squares slope of values against minutes, in percent of their mean a minute; 0 of fewer than two minutes."""
-    if len(values) < 2 or np.ptp(minutes) == 0:
-        return 0.0
-    return float(100 * np.polyfit(minutes, values, 1)[0] / np.mean(values))
+def slope_percent(minutes: NDArray[np.float64], values: NDArray[np.float64]) -> float | None:
+    """Least squares slope of values against minutes, in percent of their mean a minute; None of a short run."""
+    if round(float(np.ptp(minutes))) < SLOPE_MINUTES:
+        return None
+    return round(float(100 * np.polyfit(minutes, values, 1)[0] / np.mean(values)), 3)
+
+
+def first_and_last(minutes: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[float | None, float | None]:
+    """Medians of the first ``COMPARED_MINUTES`` from the settled one on, and of the last; None where these overlap."""
+    end = float(minutes.max())
+    if round(end) < SETTLED_MINUTE + 2 * COMPARED_MINUTES:
+        return None, None
+    first = (minutes >= SETTLED_MINUTE) & (minutes < SETTLED_MINUTE + COMPARED_MINUTES)
+    last = minutes > end - COMPARED_MINUTES
+    return round(float(np.median(values[first])), 1), round(float(np.median(values[last])), 1)
 
 
 def timed_step(pipeline: MappingPipeline, frame: PosedFrame) -> tuple[MapUpdate, float, float]:
@@ -190,7 +205,6 @@ class _StepLog:
         by_minute = [counted["minute"].astype(int) == m for m in range(int(table["minute"][-1]) + 1)]
         by_minute = [of for of in by_minute if of.any()]
         rss = [float(counted["rss_mb"][of].max()) for of in by_minute]
-        growth = rss[-1] - rss[SETTLED_MINUTE] if len(rss) > SETTLED_MINUTE + 1 else None
         scores = [confusion.metrics().miou for confusion in self.confusions]
 
         def minutely(name: str, of: Callable[[NDArray[np.float64]], Any], digits: int = 1) -> list[float]:
@@ -201,17 +215,9 @@ class _StepLog:
             "step_p95_ms": round(float(np.percentile(counted["step_ms"], 95)), 1),
             "cpu_p50_ms": round(float(np.percentile(counted["cpu_ms"], 50)), 1),
             "fuse_p50_ms": round(float(np.percentile(counted["fuse_ms"], 50)), 2),
-            **{
-                f"{name}_slope_percent_a_minute": round(slope_percent(counted["minute"], counted[f"{name}_ms"]), 3)
-                for name in ("step", "cpu", "fuse")
-            },
+            **_drift(counted),
             "return_cpu_ratio": self._return_ratio(table),
-            "rss_first_minute_mb": round(rss[0], 1),
-            "rss_last_minute_mb": round(rss[-1], 1),
-            "rss_growth_mb": None if growth is None else round(growth, 1),
-            "rss_growth_percent_of_limit": None
-            if not memory_mb or growth is None
-            else round(100 * growth / memory_mb, 1),
+            **_memory(rss, memory_mb),
             "blocks": int(table["blocks_in_memory"][-1] + table["blocks_on_disk"][-1]),
             "blocks_in_memory_at_most": int(table["blocks_in_memory"].max()),
             "blocks_on_disk": int(table["blocks_on_disk"][-1]),
@@ -239,6 +245,32 @@ class _StepLog:
         first = (table["returning_to"][back] * self.frames_a_visit + within).astype(int)
         ratio = np.median(table["cpu_ms"][back]) / np.median(table["cpu_ms"][first])
         return round(float(ratio), 3)
+
+
+def _drift(counted: dict[str, NDArray[np.float64]]) -> dict[str, float | None]:
+    """What tells whether steps get dearer as the walk goes on."""
+    minutes, found = counted["minute"], {}
+    for name in ("step", "cpu", "fuse"):
+        found[f"{name}_slope_percent_a_minute"] = slope_percent(minutes, counted[f"{name}_ms"])
+    for name in ("step", "cpu"):
+        first, last = first_and_last(minutes, counted[f"{name}_ms"])
+        found |= {f"{name}_p50_first_ten_minutes_ms": first, f"{name}_p50_last_ten_minutes_ms": last}
+    return found
+
+
+def _memory(rss: list[float], memory_mb: int) -> dict[str, float | None]:
+    """Figures of resident memory, from the most of each minute, MB."""
+    settled = rss[SETTLED_MINUTE] if len(rss) > SETTLED_MINUTE + 1 else None
+    growth = None if settled is None else rss[-1] - settled
+    return {
+        "rss_first_minute_mb": round(rss[0], 1),
+        "rss_minute_5_mb": None if settled is None else round(settled, 1),
+        "rss_max_after_minute_5_mb": None if settled is None else round(max(rss[SETTLED_MINUTE + 1 :]), 1),
+        "rss_last_minute_mb": round(rss[-1], 1),
+        "rss_max_mb": round(max(rss), 1),
+        "rss_growth_mb": None if growth is None else round(growth, 1),
+        "rss_growth_percent_of_limit": None if not memory_mb or growth is None else round(100 * growth / memory_mb, 1),
+    }
 
 
 _COLUMNS: tuple[str, ...] = (

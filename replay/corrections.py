@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from replay.importers.tum import match_nearest, pose_matrix, read_trajectory
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import ImportSourceError
+from semantic_mapper.mapping.history import SEGMENTS
 from semantic_mapper.mapping.pose_correction import ALWAYS
 from semantic_mapper.types import Float64
 
@@ -59,8 +60,8 @@ def keeping_frames(config: MapperConfig, frames: int) -> MapperConfig:
     """The config with a history that holds a log of so many frames, where it says nothing else."""
     if config.history.max_frames:
         return config
-    # Twice as many: a history that gets half full makes ready to let frames go.
-    history = msgspec.structs.replace(config.history, max_frames=2 * frames + 1)
+    # One segment for all: none will leave, and so nothing has to be kept of what the map was before.
+    history = msgspec.structs.replace(config.history, max_frames=SEGMENTS * (frames + 1))
     return msgspec.structs.replace(config, history=history)
 
 

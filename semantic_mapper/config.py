@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -141,9 +142,12 @@ class VoxelMapConfig(Config, frozen=True):
 class HistoryConfig(Config, frozen=True):
     """Fused frames kept on disk, so that the map can follow corrected poses (loop closures)."""
 
-    # Corrections reach these; when it is full, the older half leaves and stays in the map where it is. 0 = keep none.
+    # Corrections reach the last so many frames, and at times up to an eighth more; older ones stay in the map where
+    # they are. 0 = keep none.
     max_frames: NotNegative = 0
-    max_disk_mb: AtLeastOne = 4000  # in the folder for temporary files; frames leave earlier for it
+    # In the folder for temporary files: frames leave earlier for it, an eighth of it at a time. What the map was before
+    # the kept frames takes room there, too: for each eighth of them, the blocks that changed (``mapping/map_journal``).
+    max_disk_mb: AtLeastOne = 4000
 
 
 class VirtualViewConfig(Config, frozen=True):
@@ -203,7 +207,7 @@ def with_quality(config: MapperConfig) -> MapperConfig:
     """The config with the settings that its ``quality`` stands for; "custom" leaves all as they are.
 
     "reference" renders all rays with 64 + 64 samples, "balanced" and "fast" at most 0.2 and 0.12 of them, with 4 and 2
-    samples near the depth prior.
+    samples near the depth prior. Whatever the config says of these settings is replaced; see ``check_quality``.
     """
     if config.quality == "custom":
         return config
@@ -216,6 +220,32 @@ def with_quality(config: MapperConfig) -> MapperConfig:
     )
 
 
+def check_quality(data: Mapping[str, Any], quality: Quality, where: str) -> None:
+    """Refuse what a file says of settings that a quality sets otherwise: one of the two would be without effect.
+
+    Args:
+        data: The mapper's config as the file has it, of the right form.
+        quality: In force, whether the file asks for it or somebody else.
+        where: The file's name.
+
+    Raises:
+        ConfigError: names the settings.
+    """
+    if quality == "custom":
+        return
+    clashes = [
+        f"{section}.{name} = {data[section][name]!r} ({quality}: {value!r})"
+        for section, settings in zip(("sampling", "render"), QUALITIES[quality], strict=True)
+        for name, value in settings.items()
+        if data.get(section, {}).get(name, value) != value
+    ]
+    if clashes:
+        raise ConfigError(
+            f'{where}: quality "{quality}" sets these settings of the file otherwise: {", ".join(clashes)}; leave them '
+            'out, or the quality, or ask for quality "custom"'
+        )
+
+
 ConfigT = TypeVar("ConfigT", bound=msgspec.Struct)
 
 
@@ -225,13 +255,21 @@ def load_config(path: Path, kind: type[ConfigT]) -> ConfigT:
     Raises:
         ConfigError: file missing, not TOML, unknown key (with the nearest valid one), or a value of the wrong type.
     """
+    return convert_config(read_toml(path), kind, str(path))
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """A TOML file as plain data.
+
+    Raises:
+        ConfigError: file missing, or not TOML.
+    """
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
-    return convert_config(data, kind, str(path))
 
 
 def convert_config(data: Any, kind: type[ConfigT], where: str) -> ConfigT:

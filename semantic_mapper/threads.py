@@ -1,4 +1,4 @@
-"""One thread pool for torch and the compiled kernels, which share OpenMP's."""
+"""One thread pool for torch and the compiled kernels, which share OpenMP's; and word of kernels being compiled."""
 
 from __future__ import annotations
 
@@ -8,10 +8,32 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numba
+import structlog
 import torch
 from numba.core import config as numba_config
+from numba.core import event as numba_event
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
+
+_log = structlog.get_logger(__name__)
+
+
+class _CompileNotice(numba_event.Listener):
+    """Tells once in the log why nothing seems to happen. Kernels that come from numba's cache are no such event."""
+
+    def __init__(self) -> None:
+        self._told = False
+
+    def on_start(self, event: Any) -> None:
+        if not self._told:
+            self._told = True
+            _log.info("compiling_kernels", note="once on this machine; all of them take about two minutes")
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+numba_event.register("numba:compile", _CompileNotice())
 
 
 @functools.cache

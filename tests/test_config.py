@@ -6,10 +6,12 @@ from typing import Any
 import msgspec
 import pytest
 
+from nodes.run_replay import mapper_config
 from semantic_mapper.config import (
     Config,
     EncoderConfig,
     MapperConfig,
+    Quality,
     SRayConfig,
     VoxelMapConfig,
     convert_config,
@@ -51,6 +53,35 @@ def test_an_unknown_key_is_refused_with_the_nearest_valid_one(tmp_path: Path, te
         load_config(path, MapperConfig)
     assert str(path) in str(caught.value)
     assert f"did you mean `{nearest}`?" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("quality", "text", "clash"),
+    [
+        ("fast", "[sampling]\nguided = 4", r"sampling\.guided = 4 \(fast: 2\)"),
+        (
+            "fast",
+            "[sampling]\nfree_space = 0\n[render]\nshare = 0.5",
+            r"otherwise: render\.share = 0\.5 \(fast: 0\.12\);",
+        ),
+        ("reference", "[render]\ntarget_hz = 5", r"render\.target_hz = 5 \(reference: 0\.0\)"),
+        ("balanced", "[sampling]\nguided = 4\n[render]\nscale = 0.5", None),
+        ("custom", "[sampling]\nguided = 4\n[render]\nshare = 0.5", None),
+    ],
+)
+def test_what_a_quality_would_override_is_refused(
+    tmp_path: Path, quality: Quality, text: str, clash: str | None
+) -> None:
+    """Whether the file asks for the quality itself or the command line does."""
+    plain, own = write(tmp_path, text), tmp_path / "own.toml"
+    own.write_text(f'quality = "{quality}"\n{text}', encoding="utf-8")
+    for path, asked in ((plain, quality), (own, None)):
+        if clash is None:
+            assert mapper_config(path, None, quality=asked).quality == quality
+        else:
+            with pytest.raises(ConfigError, match=rf"{path.name}: .*{clash}"):
+                mapper_config(path, None, quality=asked)
+    assert mapper_config(own, None, quality="custom").quality == "custom"
 
 
 def test_an_unknown_key_like_no_other_is_answered_with_the_valid_ones(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,6 +31,36 @@ def test_kernels_leave_torch_the_threads_that_it_believes_in(asked: int) -> None
     )
     found = COUNT.search(done.stdout)
     assert found and int(found[1]) == asked, done.stdout
+
+
+NOTICE = """
+import sys
+import numpy as np
+sys.path.insert(0, sys.argv[1])
+from kernels import add
+print("first", add(np.ones(3)))
+print("second", add(np.ones(3, np.float32)))
+"""
+KERNELS = """
+from numba import njit
+import semantic_mapper.threads
+
+@njit(cache=True)
+def add(x):
+    return x.sum()
+"""
+
+
+def test_it_is_told_once_that_kernels_are_compiled_and_not_where_they_are_cached(tmp_path: Path) -> None:
+    (tmp_path / "kernels.py").write_text(KERNELS, encoding="utf-8")
+    said: list[list[str]] = []
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", NOTICE, str(tmp_path)], capture_output=True, text=True, timeout=200, check=True
+        )
+        said.append([line for line in done.stdout.splitlines() if "compiling_kernels" in line or "first" in line])
+    assert ["compiling_kernels" in line for line in said[0]] == [True, False], "once, and before the kernel runs"
+    assert len(said[1]) == 1 and said[1][0].startswith("first")
 
 
 def test_kernels_use_as_many_threads_as_torch_at_most() -> None:

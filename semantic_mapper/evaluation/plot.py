@@ -141,8 +141,9 @@ def draw_panel(panel: UInt8, title: str, curves: Sequence[Curve], x_title: str =
 
 
 def ticks(low: float, high: float, wanted: int = 5) -> list[float]:
-    """About ``wanted`` round numbers, evenly spaced, from at most ``low`` to at least ``high``."""
-    span = max(high - low, 1e-12)
+    """About ``wanted`` round numbers, evenly spaced, from ``low`` or below to ``high`` or above (1 more, if equal)."""
+    high = high if high > low else low + 1
+    span = high - low
     rough = span / wanted
     base = 10.0 ** math.floor(math.log10(rough))
     step = next(m * base for m in (1, 2, 2.5, 5, 10) if m * base >= rough * 0.999)

@@ -7,10 +7,10 @@ them. The swap comes between two steps.
 Class probabilities are not rendered anew. They came from source views that lie near the frame in time, and a correction
 changes where these are relative to each other far less than where all of them are in the world.
 
-The history is bounded: when it is full, its older half leaves. Those frames are *frozen*: what they have put into the
-map stays, but no correction moves it any more. Every rebuild starts from a backup on disk of the map as it was after
-the last frozen frame. It is taken on the way, when the history is half full, and anew by every rebuild that comes by
-that frame, so that no frame is fused a second time for it.
+The history is bounded: when it is full, its oldest segment leaves (``history``). Those frames are *frozen*: what they
+have put into the map stays, but no correction moves it any more. Every rebuild starts from the map as it was after the
+last frozen frame. A journal (``map_journal``) has it, as it has the map at the end of each segment; a rebuild writes
+one of its own, so that no frame is fused a second time for it.
 """
 
 from __future__ import annotations
@@ -19,23 +19,25 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import structlog
+from numpy.typing import NDArray
 
 from semantic_mapper.config import HistoryConfig
 from semantic_mapper.errors import MapError
-from semantic_mapper.geometry import check_pose
+from semantic_mapper.mapping.given_poses import FrozenFrames, pair_poses
 from semantic_mapper.mapping.history import FrameEntry, FrameHistory, FusedFrame
 from semantic_mapper.mapping.keyframes import KeyframeStore
-from semantic_mapper.mapping.map_backup import MapBackup
-from semantic_mapper.mapping.pose_correction import ALWAYS, CorrectedPoses, PoseCorrection, PosePair, move
+from semantic_mapper.mapping.map_journal import MapJournal
+from semantic_mapper.mapping.pose_correction import ALWAYS, CorrectedPoses, PoseCorrection, move
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float64, PosedFrame
 
 PORTION_WHEN_FULL = 4  # frames that a step itself rebuilds where the history is full and nothing may leave it
-LEAST_BACKED_UP = 64  # blocks that a step, or a frame of a rebuild, copies to disk; more only where time is short
+RESTORED_AT_ONCE = 256  # blocks of the frozen frames' map, in the time of a frame
+LEAST_WRITTEN = 64  # blocks that a step, or a frame of a rebuild, puts on disk for the journal, as long as some wait;
+WRITTEN_SHARE = 8  # and at least this part of them
 
 _log = structlog.get_logger(__name__)
 
@@ -47,7 +49,7 @@ class CorrectionStatus:
     Args:
         running: A rebuild is under way; the map in use is still the old one.
         done, total: Frames of the history that the rebuild has gone through, and all.
-        disk_bytes: Of the history, without its backup of the map.
+        disk_bytes: Of the history, without the journal of the map.
         completed: Corrections that are in the map in use.
         poses: Given by these, all together.
         frozen: Frames that have left the history; corrections do not reach them.
@@ -71,25 +73,6 @@ class CorrectionStatus:
         return self.total - self.done if self.running else 0
 
 
-class _Half(NamedTuple):
-    """The map after the frame of this number, which made the history half full.
-
-    ``portion`` blocks of it are copied at a time: all are when the history is three quarters full.
-    """
-
-    number: int
-    backup: MapBackup
-    portion: int
-
-    @classmethod
-    def of(cls, voxel_map: VoxelMap, number: int, frames: int) -> _Half:
-        backup = MapBackup(voxel_map)
-        return cls(number, backup, max(LEAST_BACKED_UP, -(-2 * len(backup) // frames)))
-
-    def go_on(self) -> None:
-        self.backup.go_on(self.portion)
-
-
 @dataclass(slots=True, eq=False)
 class _Rebuild:
     """A map on its way."""
@@ -98,9 +81,8 @@ class _Rebuild:
     corrections: tuple[PoseCorrection, ...]  # to be applied one after the other
     first: int  # number of the history's oldest frame
     next: int  # number of the next frame to fuse
-    restored: int = 0  # blocks of the frozen frames' map, with which it begins
-    begun: bool = False  # all of them are there
-    half: _Half | None = None
+    waiting: NDArray[np.int64] | None = None  # blocks of the frozen frames' map, with which it begins; None = all
+    journal: MapJournal | None = None  # from where these are there
 
     def place(self, entry: FrameEntry) -> Float64:
         T_world_camera = entry.T_world_camera
@@ -109,8 +91,8 @@ class _Rebuild:
         return T_world_camera
 
     def give_up(self) -> None:
-        if self.half is not None:
-            self.half.backup.close()
+        if self.journal is not None:
+            self.journal.close()
 
 
 class MapCorrector:
@@ -141,10 +123,9 @@ class MapCorrector:
         self._history = FrameHistory(config.max_frames, config.max_disk_mb * 1_000_000) if config.max_frames else None
         self._why_none = "no frames are kept; set history.max_frames in the mapper's config"
         self._rebuild: _Rebuild | None = None
-        self._half: _Half | None = None
-        self._base: MapBackup | None = None  # of the frozen frames
-        self._frozen_until: dict[str, int] = {}  # newest stamp of each camera
-        self._frozen = self._lost = self._completed = self._poses = 0
+        self._journal = MapJournal(voxel_map, 0) if config.max_frames else None  # of each segment's beginning
+        self._frozen = FrozenFrames()
+        self._lost = self._completed = self._poses = 0
         self._failure = ""
         self._motion = np.eye(4)  # of frames to come, where their odometry goes on in the world before correction
 
@@ -164,7 +145,7 @@ class MapCorrector:
             disk_bytes=0 if history is None else history.bytes,
             completed=self._completed,
             poses=self._poses,
-            frozen=self._frozen,
+            frozen=len(self._frozen),
             lost=self._lost,
             failure=self._failure,
         )
@@ -189,16 +170,16 @@ class MapCorrector:
             self._end_history(str(error))
 
     def make_room(self) -> None:
-        """Let the older half of a full history leave; to be called before a step, outside of ``turn``.
+        """Let the oldest segment of a full history leave; to be called before a step, outside of ``turn``.
 
         During a rebuild no frame leaves, as the rebuild may still need it, but the step carries the rebuild on, so that
-        it ends before the history has grown by more than a third.
+        it ends before the history has grown by half.
         """
         history = self._history
         if history is None:
             return
-        self._back_up()
-        if not history.is_full and (self._half is not None or history.half is None):
+        self._write_journal()
+        if not history.is_full and (self._rebuild is not None or not self._segment_ends(history)):
             return
         with self._lock:
             if self._rebuild is not None and history.is_full:
@@ -219,10 +200,10 @@ class MapCorrector:
             if history is None:
                 raise MapError(f"poses cannot be corrected: {self._why_none}")
             before = self._rebuild
-            pairs = self._pairs(history, poses, before)
+            entries = history.entries()
+            pairs = pair_poses(poses, entries, self._frozen, _own_pose if before is None else before.place)
             last_ns = max(pair.stamp_ns for pair in pairs)
             correction = PoseCorrection(pairs, last_ns if until_ns is None else until_ns)
-            entries = history.entries()
             if before is not None:
                 before.give_up()
             self._rebuild = _Rebuild(
@@ -233,7 +214,7 @@ class MapCorrector:
             )
             self._failure = ""
             event = "correction_begins" if before is None else "correction_begins_again"
-            _log.info(event, given=len(pairs), frames=len(entries), frozen=self._frozen)
+            _log.info(event, given=len(pairs), frames=len(entries), frozen=len(self._frozen))
             return self.status
 
     def advance(self, max_frames: int = 1) -> bool:
@@ -263,57 +244,26 @@ class MapCorrector:
                     raise
         return self._rebuild is not None
 
-    def _pairs(self, history: FrameHistory, poses: CorrectedPoses, before: _Rebuild | None) -> list[PosePair]:
-        """Old and new poses of the given frames that are in the history."""
-        pairs: list[PosePair] = []
-        frozen = 0
-        by_stamp: dict[int, list[FrameEntry]] = {}
-        for entry in history.entries():
-            by_stamp.setdefault(entry.stamp_ns, []).append(entry)
-        for key, new in poses.items():
-            camera_id, stamp_ns = key if isinstance(key, tuple) else (None, key)
-            where = f"corrected pose of stamp {stamp_ns}" + ("" if camera_id is None else f" of camera '{camera_id}'")
-            check_pose(new, where)
-            found = [e for e in by_stamp.get(stamp_ns, ()) if camera_id in (None, e.camera_id)]
-            if len({e.camera_id for e in found}) > 1:
-                names = ", ".join(sorted({e.camera_id for e in found}))
-                raise MapError(f"{where}: cameras {names} have this stamp; give (camera_id, stamp_ns)")
-            if found:
-                old = found[-1].T_world_camera if before is None else before.place(found[-1])
-                pairs.append(PosePair(found[-1].camera_id, stamp_ns, old, new.copy()))
-            elif self._is_frozen(camera_id, stamp_ns):
-                frozen += 1
-            else:
-                raise MapError(f"{where}: no frame with this stamp was mapped{_nearest(stamp_ns, list(by_stamp))}")
-        if frozen:
-            _log.warning("correction_is_partial", given=len(poses), frozen=frozen, reason="frames left the history")
-        if not pairs:
-            reason = f"all {frozen} frames given have left the history; raise history.max_frames or max_disk_mb"
-            raise MapError(f"no pose to correct: {reason if frozen else 'none was given'}")
-        return pairs
-
-    def _is_frozen(self, camera_id: str | None, stamp_ns: int) -> bool:
-        limits = self._frozen_until if camera_id is None else {camera_id: self._frozen_until.get(camera_id, -1)}
-        return any(stamp_ns <= limit for limit in limits.values())
-
     def _fuse_next(self, rebuild: _Rebuild) -> bool:
         """Fuse the next frame of the history, or restore a part of what it begins with; False where all is done."""
-        history = self._history
-        if history is None:
+        history, journal = self._history, self._journal
+        if history is None or journal is None:
             raise MapError(f"poses cannot be corrected: {self._why_none}")
-        if self._base is not None and not rebuild.begun:
-            rebuild.restored = self._base.restore(rebuild.voxel_map, rebuild.restored)
-            rebuild.begun = rebuild.restored == len(self._base)
-            return True
-        if rebuild.half is not None:
-            rebuild.half.go_on()
+        if rebuild.journal is None:
+            waiting = journal.oldest_keys() if rebuild.waiting is None else rebuild.waiting
+            journal.restore(rebuild.voxel_map, waiting[:RESTORED_AT_ONCE])
+            rebuild.waiting = waiting[RESTORED_AT_ONCE:]
+            if len(rebuild.waiting):
+                return True
+            rebuild.journal = MapJournal(rebuild.voxel_map, rebuild.first)
+        _write_some(rebuild.journal)
         entry = history.entry(rebuild.next)
         if entry is None:
             return False
+        if history.is_segment(rebuild.journal.numbers[-1], entry.number):
+            rebuild.journal.mark(entry.number)
         self._fuse_entry(history, entry, rebuild.place(entry), rebuild.voxel_map)
         rebuild.next += 1
-        if rebuild.half is None and entry.number == history.half:
-            rebuild.half = _Half.of(rebuild.voxel_map, entry.number, entry.number - rebuild.first + 1)
         return True
 
     def _fuse_entry(self, history: FrameHistory, entry: FrameEntry, pose: Float64, into: VoxelMap) -> None:
@@ -325,33 +275,34 @@ class MapCorrector:
             return
         self._fuse(into, fused)
 
-    def _back_up(self) -> None:
-        """Go on with the backup of the half full history, unless another thread holds what it takes."""
-        half = self._half
-        if half is None or half.backup.is_whole or not self._lock.acquire(blocking=False):
+    def _write_journal(self) -> None:
+        """Put some of what the journal holds in memory on disk, unless another thread holds what that takes."""
+        if not self._lock.acquire(blocking=False):
             return
         try:
-            half.go_on()
+            if self._journal is not None:
+                _write_some(self._journal)
         except MapError as error:
             self._end_history(str(error))
         finally:
             self._lock.release()
 
+    def _segment_ends(self, history: FrameHistory) -> bool:
+        journal = self._journal
+        return journal is not None and history.is_segment(journal.numbers[-1], history.next_number)
+
     def _turn_over(self, history: FrameHistory) -> None:
-        """Freeze the older half of a full history; begin the next one where it is half full."""
-        if history.is_full and self._half is not None:
-            self._half.backup.go_on()
-            leaving = history.drop_until(self._half.number)
-            for entry in leaving:
-                self._frozen_until[entry.camera_id] = max(entry.stamp_ns, self._frozen_until.get(entry.camera_id, 0))
-            if self._base is None:
-                _log.info("history_is_full", frozen=len(leaving), kept=len(history))
-            else:
-                self._base.close()
-            self._base, self._half = self._half.backup, None
-            self._frozen += len(leaving)
-        if self._half is None and history.half is not None:
-            self._half = _Half.of(self._map, history.entries()[-1].number, len(history))
+        """Begin the history's next segment where the last one is whole; freeze the oldest ones while it is full."""
+        journal = self._journal
+        if journal is None:
+            return
+        if self._segment_ends(history):
+            journal.mark(history.next_number)
+        while history.is_full and len(journal.numbers) > 1:
+            if not len(self._frozen):
+                _log.info("history_is_full", frames=len(history), mb=round(history.bytes / 1e6))
+            self._frozen.add(history.drop_before(journal.numbers[1]))
+            journal.forget_oldest()
 
     def _swap(self, rebuild: _Rebuild) -> None:
         assert self._history is not None
@@ -359,9 +310,11 @@ class MapCorrector:
         self._map.take_over(rebuild.voxel_map)
         moved = self._keyframes.move({(e.camera_id, e.stamp_ns): e.T_world_camera for e in entries})
         self._history.replace(entries)
-        if self._half is not None:
-            self._half.backup.close()
-        self._half = rebuild.half
+        if self._journal is not None:
+            self._journal.close()
+        self._journal = rebuild.journal
+        if self._journal is not None:
+            self._journal.belong_to(self._map)
         for correction in rebuild.corrections:
             if correction.until_ns == ALWAYS:
                 self._motion = move(correction.last_motion, self._motion)
@@ -372,18 +325,19 @@ class MapCorrector:
 
     def _end_history(self, reason: str) -> None:
         """Without every frame a rebuild would lose a part of the map; better none."""
-        for backup in (self._half and self._half.backup, self._base):
-            if backup is not None:
-                backup.close()
-        history, self._history, self._half, self._base = self._history, None, None, None
+        journal, self._journal = self._journal, None
+        if journal is not None:
+            journal.close()
+        history, self._history = self._history, None
         self._why_none = f"the history has ended: {reason}"
         if history is not None:
             history.close()
         _log.error("history_ends", reason=reason)
 
 
-def _nearest(stamp_ns: int, stamps: list[int]) -> str:
-    if not stamps:
-        return "; the history is empty"
-    nearest = min(stamps, key=lambda s: abs(s - stamp_ns))
-    return f"; the nearest is {nearest}, {abs(nearest - stamp_ns) / 1e6:g} ms away"
+def _own_pose(entry: FrameEntry) -> Float64:
+    return entry.T_world_camera
+
+
+def _write_some(journal: MapJournal) -> None:
+    journal.go_on(max(LEAST_WRITTEN, journal.waiting // WRITTEN_SHARE))

@@ -28,6 +28,7 @@ from semantic_mapper.mapping.packing import (
 )
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 
+SEGMENTS = 8  # a full history lets its oldest frames go by about an eighth of what it has room for
 _CACHE_KIB = 4096  # of SQLite's own pages
 _PAGE_BYTES = 32768  # frames are large
 _ERASED_AT_ONCE = 2  # frames that have left, for each that comes: all at once would take a second
@@ -61,6 +62,7 @@ class FrameEntry:
         shape: (h, w, L) of the class probabilities.
         has_depth: Whether the frame has depth of its own.
         bytes: On disk.
+        offset: Bytes of all frames that were kept before it.
     """
 
     number: int
@@ -72,13 +74,17 @@ class FrameEntry:
     shape: tuple[int, int, int]
     has_depth: bool
     bytes: int
+    offset: int
 
 
 class FrameHistory:
     """Frames in the order in which they were fused; only the oldest can leave. Safe to call from several threads.
 
+    Frames leave by segments, of an eighth of ``max_frames`` or of ``max_bytes``, whichever is reached first. So the
+    last ``max_frames`` frames are always here, and at most an eighth more, as long as they have room on disk.
+
     Args:
-        max_frames: Frames that there is room for.
+        max_frames: Frames that are here at least.
         max_bytes: Room on disk; the last frame may go beyond it.
 
     Raises:
@@ -88,10 +94,12 @@ class FrameHistory:
     def __init__(self, max_frames: int, max_bytes: int) -> None:
         self._max_frames = max_frames
         self._max_bytes = max_bytes
+        self._segment_frames = -(-max_frames // SEGMENTS)
         self._lock = threading.Lock()
         self._entries: dict[int, FrameEntry] = {}  # in order
         self._next = 0
         self._bytes = 0
+        self._bytes_ever = 0
         self._erased = 0  # frames that have left have no bytes on disk below this number
         try:
             self._database = sqlite3.connect("", check_same_thread=False, isolation_level=None)
@@ -117,18 +125,21 @@ class FrameHistory:
 
     @property
     def is_full(self) -> bool:
-        """Whether frames have to leave before the next one comes."""
-        return len(self._entries) >= self._max_frames or self._bytes >= self._max_bytes
+        """Whether a segment has to leave before the next frame comes."""
+        return len(self._entries) >= self._max_frames + self._segment_frames or self._bytes >= self._max_bytes
 
     @property
-    def half(self) -> int | None:
-        """Number of the frame that made the history half full; None while it is not."""
-        size = 0
-        for count, entry in enumerate(self.entries(), 1):
-            size += entry.bytes
-            if 2 * count >= self._max_frames or 2 * size >= self._max_bytes:
-                return entry.number
-        return None
+    def next_number(self) -> int:
+        """Of the frame that comes next."""
+        return self._next
+
+    def is_segment(self, first: int, end: int) -> bool:
+        """Whether the frames from number ``first`` to before ``end``, both here or to come, are a whole segment."""
+        begin, until = self._entries.get(first), self._entries.get(end)
+        if begin is None:
+            return False
+        size = (self._bytes_ever if until is None else until.offset) - begin.offset
+        return end - first >= self._segment_frames or size >= self._max_bytes // SEGMENTS
 
     def entries(self) -> list[FrameEntry]:
         """All frames, oldest first."""
@@ -171,10 +182,12 @@ class FrameHistory:
             shape=(fused.probabilities.shape[0], fused.probabilities.shape[1], fused.probabilities.shape[2]),
             has_depth=frame.depth_m is not None,
             bytes=sum(len(blob) for blob in blobs),
+            offset=self._bytes_ever,
         )
         with self._lock:
             self._entries[number] = entry
             self._bytes += entry.bytes
+            self._bytes_ever += entry.bytes
             self._next += 1
 
     def read(self, entry: FrameEntry, T_world_camera: Float64) -> FusedFrame:
@@ -195,10 +208,10 @@ class FrameHistory:
             raise MapError(f"{where} is {'missing' if row is None else 'damaged'}; its disk fails")
         return _unpack(entry, T_world_camera, row[1:])
 
-    def drop_until(self, number: int) -> list[FrameEntry]:
-        """Forget the frames up to this number and give their room on disk to the next ones; returns them."""
+    def drop_before(self, number: int) -> list[FrameEntry]:
+        """Forget the frames before this number and give their room on disk to the next ones; returns them."""
         with self._lock:
-            leaving = [entry for entry in self._entries.values() if entry.number <= number]
+            leaving = [entry for entry in self._entries.values() if entry.number < number]
             for entry in leaving:
                 del self._entries[entry.number]
                 self._bytes -= entry.bytes

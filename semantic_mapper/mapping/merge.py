@@ -76,7 +76,7 @@ def check_fit(config_a: VoxelMapConfig, labels_a: LabelSet, config_b: VoxelMapCo
 
 
 def add_blocks(target: BlockGrid, source: BlockGrid, T_target_source: VoxelTransform, cap: float, version: int) -> None:
-    """Add all that ``source`` holds to ``target``.
+    """Add all that ``source`` holds to ``target``; blocks without a measurement are left out.
 
     Args:
         target: Is changed; of the same voxel size and classes.
@@ -115,6 +115,16 @@ def copy_blocks(target: BlockGrid, source: BlockGrid, version: int) -> None:
             holds = (values.weight > 0).any(axis=1)
             blocks = target.fill(part[holds], BlockValues(*(array[holds] for array in values)))
             target.mark_changed(blocks, version)
+
+
+def count_empty(source: BlockGrid) -> int:
+    """Blocks of a grid that hold no measurement: the band of truncation touched them, and no depth fell into it."""
+    empty = 0
+    for _, blocks, grid in source.tiles():
+        weight = grid.buffers().weight
+        for start in range(0, len(blocks), MERGED_AT_ONCE):
+            empty += int((weight[blocks[start : start + MERGED_AT_ONCE]] == 0).all(axis=1).sum())
+    return empty
 
 
 def _overlaps(sources: NDArray[np.int64], T_target_source: VoxelTransform) -> NDArray[np.int64]:

@@ -227,6 +227,12 @@ class MappingPipeline:
     def _check(self, frame: PosedFrame) -> None:
         where = f"frame seq={frame.seq} of camera '{frame.camera_id}'"
         check_pose(frame.T_world_camera, where)
+        size, scale = (frame.intrinsics.width, frame.intrinsics.height), self.config.render.scale
+        if round(min(size) * scale) < 1:
+            raise FrameError(
+                f"{where}: {size[0]}x{size[1]} pixels are too few: at render.scale {scale:g} no ray is left to render; "
+                "send larger images, or raise render.scale"
+            )
         expected = self._intrinsics.get(frame.camera_id, frame.intrinsics)
         if (expected.width, expected.height) != (frame.intrinsics.width, frame.intrinsics.height):
             if self._is_new_size(frame):

@@ -52,7 +52,12 @@ def test_bars_are_as_long_as_their_parts():
 
 @pytest.mark.parametrize(
     ("low", "high", "expected"),
-    [(0, 10, [0, 2, 4, 6, 8, 10]), (0, 0.98, [0, 0.2, 0.4, 0.6, 0.8, 1.0]), (0, 0, None), (-1, 1, None)],
+    [
+        (0, 10, [0, 2, 4, 6, 8, 10]),
+        (0, 0.98, [0, 0.2, 0.4, 0.6, 0.8, 1.0]),
+        (0, 0, [0, 0.2, 0.4, 0.6, 0.8, 1]),
+        (-1, 1, None),
+    ],
 )
 def test_ticks_are_round_and_span_the_range(low: float, high: float, expected: list[float] | None):
     found = ticks(low, high)

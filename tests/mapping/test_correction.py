@@ -275,45 +275,6 @@ def test_blocks_on_disk_count_as_changed_too():
     assert len(voxel_map.changed_since(6)) == voxel_map.block_count and len(voxel_map.changed_since(7)) == 0
 
 
-def test_the_history_is_bounded_and_steps_carry_on_a_rebuild_that_nobody_else_does():
-    frames = tiny_frames(14)
-    pipeline = mapped(frames[:8], max_frames=6)
-    assert pipeline.corrector.status.total == 5 and pipeline.corrector.status.frozen == 3
-    pipeline.correct_poses({frames[7].stamp_ns: drift(0.5) @ frames[7].T_world_camera})
-    longest = 0
-    for frame in frames[8:]:
-        pipeline.step(frame)
-        longest = max(longest, pipeline.corrector.status.total)
-    status = pipeline.corrector.status
-    assert status.completed == 1 and not status.running
-    assert status.disk_bytes == sum(e.bytes for e in pipeline.corrector._history.entries()) > 10_000
-    assert longest <= 8 and status.total <= 6 and status.total + status.frozen == pipeline.voxel_map.frames == 14
-
-
-def test_frozen_frames_stay_where_they_are_and_a_correction_of_them_is_told_to_be_partial():
-    frames = tiny_frames(9)
-    late = drifted(frames)
-    pipeline = mapped(late[:5], max_frames=4)
-    with structlog.testing.capture_logs() as logs:
-        pipeline.correct_poses(true_poses(frames[:5], 1))
-    partial = [e for e in logs if e["event"] == "correction_is_partial"]
-    assert len(partial) == 1 and (partial[0]["given"], partial[0]["frozen"]) == (5, 2)
-    finish(pipeline)
-    with pytest.raises(MapError, match="all 1 frames given have left the history"):
-        pipeline.correct_poses({frames[0].stamp_ns: frames[0].T_world_camera})
-    for frame in late[5:]:  # freezes frames 2 to 5, the first of them where the correction has put them
-        pipeline.step(frame)
-    assert [stamp for _, stamp in pipeline.corrector.poses()] == [f.stamp_ns for f in frames[6:]]
-    pipeline.correct_poses(true_poses(frames[6:], 1))
-    finish(pipeline)
-    by_hand = VoxelMap(pipeline.config.voxel_map, ROOMS)
-    for frame in (*late[:2], *frames[2:5], late[5], *frames[6:]):
-        by_hand.integrate(frame, frame.depth_m, None, None)
-    ours, expected = pipeline.voxel_map.block_state(), by_hand.block_state()
-    for name in ("keys", "tsdf", "weight", "color"):
-        assert ours[name].tobytes() == expected[name].tobytes(), name
-
-
 def test_a_damaged_frame_is_left_out_counted_and_logged():
     frames = tiny_frames()
     pipeline = mapped(drifted(frames))

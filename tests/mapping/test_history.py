@@ -75,14 +75,16 @@ def test_frames_leave_oldest_first_and_their_bytes_go_when_others_come():
     for seq in range(3):
         assert not history.is_full
         history.append(fused(seq))
+    assert not history.is_full, "3 are to be kept, so the first may leave once there are 4"
     history.append(fused(3, camera_id="other"))
     assert history.is_full and [e.seq for e in history.entries()] == [0, 1, 2, 3]
     size = history.bytes
     first = history.entries()[0]
-    assert [e.number for e in history.drop_until(0)] == [0]
+    assert [e.number for e in history.drop_before(1)] == [0]
     assert [e.number for e in history.entries()] == [1, 2, 3] and history.bytes == size - first.bytes
     last = history.entry(3)
     assert history.entry(0) is None and last is not None and (last.camera_id, last.stamp_ns) == ("other", 1003)
+    assert not history.is_full and history.next_number == 4
     history.append(fused(4))
     with pytest.raises(MapError, match="seq=0 of camera 'test' in the history is missing"):
         history.read(first, first.T_world_camera)
@@ -96,29 +98,29 @@ def test_room_on_disk_is_a_bound_too():
     assert len(history) == -(-300_000 // each) > 1
 
 
+def test_a_segment_is_an_eighth_of_the_frames_or_of_the_bytes_whichever_comes_first():
+    frames, room = FrameHistory(20, 10**9), FrameHistory(1000, 1_200_000)
+    for seq in range(8):
+        frames.append(fused(seq))
+        room.append(fused(seq))
+    assert [frames.is_segment(2, end) for end in range(2, 9)] == [False] * 3 + [True] * 4
+    sizes = np.cumsum([entry.bytes for entry in room.entries()[2:]])
+    assert 50_000 < sizes[0] < sizes[1] < sizes[2] - 10_000
+    assert [room.is_segment(2, 2 + n) for n in range(1, 7)] == [bool(size >= 150_000) for size in sizes]
+    assert room.is_segment(2, 8) and not room.is_segment(2, 3)
+
+
 def test_the_file_does_not_grow_however_many_frames_come_and_go():
     history = FrameHistory(8, 10**9)
     pages: list[int] = []
     for seq in range(60):
         if history.is_full:
-            assert len(history.drop_until(history.entries()[3].number)) == 4
+            assert len(history.drop_before(history.entries()[4].number)) == 4
         history.append(fused(seq))
         pages.append(history._database.execute("PRAGMA page_count").fetchone()[0])
     assert max(pages[10:]) <= pages[7] * 1.2
     kept = history._database.execute("SELECT number FROM frames").fetchall()
     assert {e.number for e in history.entries()} <= {number for (number,) in kept} and len(kept) <= 8
-
-
-def test_the_frame_that_makes_it_half_full_stays_the_same_as_more_come():
-    frames, room = FrameHistory(6, 10**9), FrameHistory(1000, 500_000)
-    seen: list[int | None] = []
-    for seq in range(5):
-        frames.append(fused(seq))
-        room.append(fused(seq))
-        seen.append(frames.half)
-    assert seen == [None, None, 2, 2, 2]
-    sizes = np.cumsum([entry.bytes for entry in room.entries()])
-    assert room.half == int(np.searchsorted(sizes, 250_000)) > 0
 
 
 @pytest.mark.parametrize("column", ["color", "depth", "probabilities", "known"])

@@ -11,8 +11,10 @@ from semantic_mapper.errors import MapError, PoseError
 from semantic_mapper.geometry import invert_pose, look_at
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.mapping.block_index import pack_keys
+from semantic_mapper.mapping.merge import count_empty
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float64
+from tests.mapping.test_paging import MEMORY_MB, walk
 from tests.mapping.test_voxel_map import CENTER, same
 from tests.mapping.views import LABELS, around, frame, plane_depth, small_map, sphere_depth, sure
 
@@ -68,6 +70,16 @@ def test_two_halves_make_the_map_of_the_whole(halves: tuple[VoxelMap, VoxelMap])
         np.testing.assert_allclose(state[name], whole[name], atol=tolerance, err_msg=name)
     assert same(before[0], a.block_state()) and same(before[1], b.block_state()), "merging changes neither"
     assert len(joined.changed_since(0)) == joined.block_count
+
+
+@pytest.mark.parametrize("memory_mb", [0, MEMORY_MB])
+def test_empty_blocks_are_counted_in_memory_and_on_disk(memory_mb: int) -> None:
+    voxel_map = small_map(voxel_size_m=0.01, memory_mb=memory_mb)
+    walk(voxel_map, 5)
+    assert bool(voxel_map.stored_blocks) == bool(memory_mb)
+    joined = voxel_map.merged(voxel_map, np.eye(4))
+    with voxel_map.locked() as grid, joined.locked() as clean:
+        assert count_empty(grid) == voxel_map.block_count - joined.block_count > 0 == count_empty(clean)
 
 
 def test_the_order_of_two_maps_does_not_matter(halves: tuple[VoxelMap, VoxelMap]) -> None:

@@ -8,6 +8,7 @@ from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_chec
 from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapping.pipeline import MappingPipeline
+from semantic_mapper.types import PosedFrame
 from tests.small import tiny_config, tiny_field, tiny_frames
 
 
@@ -51,6 +52,24 @@ def test_ground_truth_labels_have_no_influence():
         a.step(frame)
         b.step(replace(frame, label=None))
     assert same_map(a, b)
+
+
+def test_too_small_a_frame_is_refused_by_the_size_that_it_has():
+    pipeline, frame = make_pipeline(render={"scale": 0.25}), tiny_frames()[0]
+
+    def corner(size: int) -> PosedFrame:
+        return replace(
+            frame,
+            rgb=frame.rgb[:size, :size].copy(),
+            depth_m=frame.depth_m[:size, :size].copy(),
+            label=None,
+            intrinsics=replace(frame.intrinsics, width=size, height=size),
+        )
+
+    for size in (1, 2):
+        with pytest.raises(FrameError, match=rf"seq=0 of camera 'rooms': {size}x{size} pixels .*render\.scale 0\.25"):
+            pipeline.step(corner(size))
+    assert pipeline.voxel_map.frames == 0 and pipeline.step(corner(3)).fused
 
 
 def test_bad_frames_are_refused_and_leave_the_map_as_it_was():

@@ -16,6 +16,7 @@ def test_a_small_walk_is_measured_written_and_drawn(tmp_path: Path, weights: Pat
     done = run("bench", "map", *SMALL, *options)
     assert done.returncode == 0, done.stderr
     assert "1 of 1 rooms unchanged" in done.stdout
+    assert "too short for a slope" in done.stdout.replace("\n", " ") and "% a minute" not in done.stdout
     found = json.loads(file.read_text(encoding="utf-8"))
     assert found["map"]["frames"] == 12 and found["map"]["memory_mb"] == 30
     assert found["map"]["step_p50_ms"] > 0 and found["machine"]["cpu"]

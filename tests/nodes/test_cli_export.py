@@ -56,6 +56,18 @@ def test_two_maps_become_one(results: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(np.sort(second, axis=0), np.sort(moved, axis=0), atol=1e-5)
 
 
+def test_merging_a_map_with_itself_says_where_its_blocks_have_gone(results: Path, tmp_path: Path) -> None:
+    voxel_map = VoxelMap.load(results / "map.npz")
+    measured = int((voxel_map.block_state()["weight"] > 0).any(axis=(1, 2, 3)).sum())
+    count, empty = voxel_map.block_count, voxel_map.block_count - measured
+    assert empty > 0
+    done = run("merge", results, results, "--out", tmp_path / "twice.npz")
+    assert done.returncode == 0, done.stderr
+    said = " ".join(done.stdout.split())
+    assert f"{count} and {count} made {measured} blocks; {2 * empty} empty blocks of the two" in said
+    assert VoxelMap.load(tmp_path / "twice.npz").block_count == measured
+
+
 def test_a_transform_is_four_numbers_or_a_file(tmp_path: Path) -> None:
     T = parse_transform("1, 2 3 -90")
     np.testing.assert_allclose(T @ (1, 0, 0, 1), (1, 1, 3, 1), atol=1e-12)

@@ -236,7 +236,12 @@ def test_what_is_refused_says_why_and_changes_nothing(bundle_of):
             ({stamp: skewed}, {}, PoseError, f"corrected pose of stamp {stamp}"),
             ({stamp: np.full((4, 4), np.nan)}, {}, PoseError, "NaN"),
             ({stamp: np.eye(3)}, {}, ShapeError, r"expected shape \(4, 4\)"),
-            ({stamp + 2_000_000: pose}, {}, MapError, "no frame with this stamp was mapped; the nearest is"),
+            (
+                {stamp + 2_000_000: pose},
+                {},
+                MapError,
+                "no frame with this stamp was mapped; of those in the history the nearest",
+            ),
             ({("side", stamp): pose}, {}, MapError, "of camera 'side': no frame"),
             ({frames[3].stamp_ns: pose}, {}, MapError, "cameras rear, rooms have this stamp"),
             ({stamp: pose}, {"within_ns": 1000}, MapError, "cameras rear, rooms; name one"),

@@ -11,7 +11,7 @@ import pytest
 import replay.bench_growth as bench_growth_module
 import replay.bench_walk as bench_walk_module
 from replay.bench_growth import bench_growth
-from replay.bench_walk import WalkPlan, bench_walk, slope_percent
+from replay.bench_walk import WalkPlan, bench_walk, first_and_last, slope_percent
 from replay.growth_plot import AXIS_TITLES, write_growth_plot
 from replay.walk_plot import write_walk_plot
 from semantic_mapper.errors import ConfigError
@@ -48,7 +48,9 @@ def test_rooms_come_back_unchanged_and_memory_keeps_its_limit(weights: Path, tmp
     assert resident < found["blocks"] <= at_most
     assert 0 < found["fuse_p50_ms"] < found["step_p50_ms"] <= found["step_p95_ms"]
     assert found["return_cpu_ratio"] > 0
-    assert found["rss_growth_mb"] is None, "too short a walk to tell"
+    short = ("rss_growth_mb", "rss_minute_5_mb", "step_slope_percent_a_minute", "cpu_p50_last_ten_minutes_ms")
+    assert all(found[name] is None for name in short), "too short a walk to tell"
+    assert found["rss_max_mb"] >= found["rss_last_minute_mb"] > 50
     assert {len(values) for name, values in found.items() if name.startswith("minute_")} == {1}
     write_walk_plot({**found, "minute_step_p50_ms": [1.0, 2.0, 3.0]}, tmp_path / "walk.png")
     assert cv2.imread(str(tmp_path / "walk.png")).shape[1] > 1000
@@ -137,7 +139,33 @@ def test_growth_is_drawn_with_a_panel_for_each_setting(tmp_path: Path) -> None:
 def test_slopes_are_in_percent_of_the_mean() -> None:
     minutes = np.linspace(0, 10, 101)
     assert slope_percent(minutes, 100 + 2 * (minutes - 5)) == pytest.approx(2.0)
-    assert slope_percent(minutes[:1], minutes[:1]) == 0.0
+    assert slope_percent(minutes[:90], minutes[:90]) is None, "less than ten minutes"
+
+
+def test_the_first_ten_minutes_that_count_stand_beside_the_last_ten() -> None:
+    minutes = np.linspace(0, 30, 3001)
+    times = np.where(minutes < 5, 999.0, np.where(minutes < 15, 20.0, np.where(minutes > 20, 30.0, 500.0)))
+    assert first_and_last(minutes, times) == (20.0, 30.0)
+    assert first_and_last(minutes[:2400], times[:2400]) == (None, None), "they would overlap"
+
+
+def test_memory_is_told_where_it_has_settled_and_where_it_was_most(tmp_path: Path) -> None:
+    rss = [300.0, 310, 320, 330, 340, 400, 410, 450, 430]
+    found = bench_walk_module._memory(rss, 100)
+    levels = ("rss_minute_5_mb", "rss_max_after_minute_5_mb", "rss_max_mb")
+    assert [found[name] for name in levels] == [400, 450, 450]
+    assert (found["rss_growth_mb"], found["rss_growth_percent_of_limit"]) == (30, 30)
+    assert bench_walk_module._memory([500.0, *rss], 0)["rss_max_mb"] == 500
+    figures = {name: [1.0] * 9 for name in ("step_p95_ms", "step_p50_ms", "fuse_p50_ms")}
+    figures |= {name: [0.0] * 9 for name in ("blocks_on_disk", "blocks_in_memory")}
+    walk = {"rooms": 1, "minutes": 9.0, "hz": 1.0, "size": "96x72", "minute_rss_mb": rss, **found}
+    walk |= {f"minute_{name}": values for name, values in figures.items()}
+    drawn = []
+    for most in (450.0, 420.0):
+        write_walk_plot({**walk, "rss_max_after_minute_5_mb": most}, tmp_path / "walk.png")
+        drawn.append(cv2.imread(str(tmp_path / "walk.png")).astype(int))
+    columns = np.nonzero((drawn[0] != drawn[1]).any(axis=-1))[1]
+    assert columns.min() > 500 and columns.max() < 980, "the level in the second panel"
 
 
 def test_more_returns_than_rooms_are_refused(weights: Path) -> None:

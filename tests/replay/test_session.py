@@ -8,6 +8,7 @@ import pytest
 from replay.evaluate import baseline_predictors, evaluate_frames, sray_predictors
 from replay.session import SNAPSHOTS, MapSession, load_pipeline, make_field
 from replay.truth import SurfaceTruth, TruthMapper
+from semantic_mapper.config import MapperConfig, convert_config
 from semantic_mapper.errors import LabelError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, anchor_from_frame, save_checkpoint
 from semantic_mapper.fields.sray import SRay
@@ -52,6 +53,17 @@ def test_a_session_leaves_summary_map_points_and_picture(tmp_path, weights):
     assert (tmp_path / "run.rrd").read_bytes()[:4] in (b"RRF2", b"RRIO", b"RRF3") and (
         tmp_path / "run.rrd"
     ).stat().st_size > 10_000
+
+
+def test_the_summary_has_the_settings_that_were_in_force(tmp_path, weights):
+    config = tiny_config(quality="fast", render={"scale": 0.5})
+    session = MapSession(load_pipeline(weights, config), stream_labels=None)
+    summary = session.finish(tmp_path / "out")
+    assert summary["quality"] == "fast"
+    assert (summary["config"]["sampling"]["guided"], summary["config"]["render"]["share"]) == (2, 0.12)
+    assert summary["config"]["render"]["encode_width"] == 96, "that of the weights"
+    again = convert_config(summary["config"], MapperConfig, "summary")
+    assert again == session.pipeline.config and again.voxel_map == config.voxel_map
 
 
 def test_the_first_frame_which_may_compile_kernels_does_not_count_in_the_percentiles(tmp_path, weights):
