@@ -15,6 +15,7 @@ from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.memory import give_back_freed_memory
 
 if TYPE_CHECKING:
+    from nodes.autosave import Autosave
     from nodes.live_correction import LiveCorrection
     from nodes.query_service import QueryService
     from replay.session import MapSession, PipelineBundle
@@ -56,8 +57,9 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
         subscribe(context.endpoint(options.input), ("info", "frame", "end")) as frames,
         _answering(context, options, bundle, correction) as queries,
     ):
+        autosave = _saving(options, bundle)
         _log.info("ready", weights=bundle.weights_path.name, input=options.input, delivery=options.delivery)
-        mapper = _Mapper(context, options, bundle, exclude, publisher, frames, queries, correction)
+        mapper = _Mapper(context, options, bundle, exclude, publisher, frames, queries, correction, autosave)
         try:
             mapper.run()
         except BaseException as error:
@@ -80,6 +82,15 @@ def _answering(
     return QueryService(endpoint, bundle.pipeline.voxel_map, correction)
 
 
+def _saving(options: MapperOptions, bundle: PipelineBundle) -> Autosave | None:
+    from nodes.autosave import Autosave
+    from nodes.saved_maps import MAP_NAME
+
+    if not options.save_every_s:
+        return None
+    return Autosave(bundle.pipeline.voxel_map, Path(options.out) / MAP_NAME, options.save_every_s)
+
+
 class _Mapper:
     """State between two messages."""
 
@@ -93,6 +104,7 @@ class _Mapper:
         frames: LosslessSubscriber | NewestSubscriber,
         queries: QueryService | None,
         correction: LiveCorrection,
+        autosave: Autosave | None,
     ) -> None:
         self._context = context
         self._options = options
@@ -102,6 +114,7 @@ class _Mapper:
         self._frames = frames
         self._queries = queries
         self._correction = correction
+        self._autosave = autosave
         self._session: MapSession | None = None
         self._ended_by = "error"
         self._early = 0
@@ -128,6 +141,8 @@ class _Mapper:
             self._correction.carry_on(self._session, mapped=isinstance(message, PosedFrame))
             if self._queries is not None:
                 self._queries.follow()
+            if self._autosave is not None:
+                self._autosave.follow()
             self._tell_status("running")
             if time.monotonic() - self._last_trim > TRIM_PERIOD_S:
                 give_back_freed_memory()
@@ -142,6 +157,8 @@ class _Mapper:
             _log.warning("nothing_to_write", reason="no stream has begun")
             return
         self._tell_status("stopping", now=True)
+        if self._autosave is not None:
+            self._autosave.close()
         self._correction.finish(self._session, lambda: bool(self._context.stop), self._while_stopping)
         if self._queries is not None and not self._queries.hand_over_all(HAND_OVER_S):
             _log.warning("questions_lag_behind", reason=f"the map could not be handed over in {HAND_OVER_S:g} s")
@@ -188,7 +205,7 @@ class _Mapper:
             return
         update = self._session.process(frame)
         if update is None:
-            reason = self._session.refusals[-1].reason
+            reason = self._session.refusals.last.reason
             refused = FrameRefused(frame.stamp_ns, frame.seq, frame.camera_id, reason)
             self._publisher.publish(encode_refused(refused))
         else:
@@ -221,6 +238,10 @@ class _Mapper:
             counters["answered"] = self._queries.answered
             if not self._queries.alive:
                 degraded += ("questions about the map are no longer answered; see the log",)
+        if self._autosave is not None:
+            counters["saves"] = self._autosave.saves
+            if self._autosave.failure:
+                degraded += (f"the map was not saved: {self._autosave.failure}",)
         status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, degraded)
         self._publisher.publish(encode_status(status))
 

@@ -132,6 +132,11 @@ def run_map(request: BenchRequest, output: Output) -> dict[str, Any]:
         + ("" if growth is None else f", {growth:+g} MB since minute 5")
         + ("" if share is None else f" ({share:+g} % of the limit)")
     )
+    limit = f"it has {found['memory_mb']} MB" if found["memory_mb"] else "it has no limit"
+    output.print(
+        f"one frame touches up to {found['frame_mb_at_most']} MB of the map; voxel_map.memory_mb should be "
+        f"{found['memory_advised_mb']} or more ({limit})"
+    )
     output.print(f"{found['returns_unchanged']} of {found['returns']} rooms unchanged when the walk came back to them")
     return found
 

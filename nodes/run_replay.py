@@ -99,7 +99,7 @@ def replay_log(
             raise
         summary = finish_session(session, request.out, stop.name)
     if not session.fused:
-        reason = session.refusals[0].reason if session.refusals else "no frame has depth or finds a source view"
+        reason = session.refusals.first[0].reason if session.refusals else "no frame has depth or finds a source view"
         raise LogError(f"{request.log}: none of {done} frames could be mapped; the first: {reason}")
     return summary
 

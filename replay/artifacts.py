@@ -15,7 +15,7 @@ import numpy as np
 
 from semantic_mapper import __version__
 from semantic_mapper.config import to_plain
-from semantic_mapper.evaluation.metrics import confusion_of, metrics_per_image
+from semantic_mapper.evaluation.metrics import confusion_of
 from semantic_mapper.evaluation.report import ViewStrip, write_overview
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.mapping.formats.ply import write_ply
@@ -23,11 +23,12 @@ from semantic_mapper.mapping.map_types import MapPoints
 
 if TYPE_CHECKING:  # session imports this module
     from replay.rerun_log import RerunLog
-    from replay.session import MapSession
+    from replay.session import MapSession, Refusal
+    from replay.tallies import StepTimes
 
 ItemT = TypeVar("ItemT")
 OVERVIEW_FRAMES = 2
-MAX_LISTED_REFUSALS = 50
+MAX_LISTED = 50  # refused frames, refused labels and damages: the first ones are told in the summary
 PACKAGES = ("torch", "open3d", "numpy", "numba", "opencv-contrib-python-headless", "pyzmq", "msgpack", "mcap")
 
 
@@ -104,8 +105,8 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "without_depth": session.without_depth,
             "excluded_from_scores": session.excluded,
         },
-        "latency_ms": {**percentiles(session.step_ms[1:] or session.step_ms), "first": _first(session.step_ms)},
-        "stages_ms": {name: percentiles(values[1:] or values) for name, values in session.stage_ms.items()},
+        "latency_ms": {**_percentiles(session.step_ms), "first": _rounded(session.step_ms.first)},
+        "stages_ms": {name: _percentiles(times) for name, times in session.stage_ms.items()},
         "map": {
             "voxel_size_m": voxel_map.config.voxel_size_m,
             "blocks": voxel_map.block_count,
@@ -115,7 +116,7 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "unfinished_correction": session.unfinished_correction or None,
         },
         "metrics": _metrics(session, points),
-        "metrics_per_image": asdict(metrics_per_image(session.per_image)) if session.scored else None,
+        "metrics_per_image": asdict(session.per_image.metrics()) if session.scored else None,
         "labels": {str(i): name for i, name in zip(label_set.ids, label_set.names, strict=True)},
         "label_set": {
             "name": label_set.name,
@@ -137,11 +138,8 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
         "seed": pipeline.config.seed,
         "quality": pipeline.config.quality,
         "config": to_plain(pipeline.config),  # as it was in force: with what the quality sets
-        "refusals": [
-            {"seq": r.seq, "stamp_ns": r.stamp_ns, "reason": r.reason}
-            for r in sorted(session.refusals + session.label_refusals, key=lambda r: r.seq)[:MAX_LISTED_REFUSALS]
-        ],
-        "damaged_stretches": session.damages[:MAX_LISTED_REFUSALS],
+        "refusals": [{"seq": r.seq, "stamp_ns": r.stamp_ns, "reason": r.reason} for r in _first_refusals(session)],
+        "damaged_stretches": session.damages.first,
         "versions": versions(),
     }
 
@@ -155,17 +153,17 @@ def _metrics(session: MapSession, points: MapPoints) -> dict[str, Any]:
     return {**scores, "map_miou": surface.metrics().miou}
 
 
-def _first(values: Sequence[float]) -> float | None:
-    """The first frame stands by itself: it may compile kernels, once on a machine."""
-    return round(values[0], 2) if values else None
+def _first_refusals(session: MapSession) -> list[Refusal]:
+    return sorted(session.refusals.first + session.label_refusals.first, key=lambda r: r.seq)[:MAX_LISTED]
 
 
-def percentiles(values: Sequence[float]) -> dict[str, float | None]:
+def _percentiles(times: StepTimes) -> dict[str, float | None]:
     """Median and 95th percentile, null for nothing."""
-    if not values:
-        return {"p50": None, "p95": None}
-    p50, p95 = np.percentile(np.asarray(values), (50, 95))
-    return {"p50": round(float(p50), 2), "p95": round(float(p95), 2)}
+    return {"p50": _rounded(times.percentile(50)), "p95": _rounded(times.percentile(95))}
+
+
+def _rounded(ms: float | None) -> float | None:
+    return None if ms is None else round(ms, 2)
 
 
 def versions() -> dict[str, str]:

@@ -17,6 +17,7 @@ from replay.session import load_pipeline
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapping.block_grid import advised_mb
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.memory import give_back_freed_memory
@@ -94,7 +95,9 @@ def bench_walk(
         time. ``rss_*`` is resident memory of the process, which gives back what it has freed once a minute of the walk,
         as the mapper node does: at most in the first and last minute, in minute 5, when all buffers have their size, in
         any later one and in any at all; its growth is that from minute 5 to the last, None of a walk too short for
-        that. ``blocks_*`` and ``store_mb`` are the map in memory and on disk.
+        that. ``blocks_*`` and ``store_mb`` are the map in memory and on disk;
+        ``frame_mb_at_most`` is what the blocks take that one frame touches: with a smaller limit on memory than
+        ``memory_advised_mb`` frames push the blocks of the last one to disk, with a smaller one than this their own.
         ``returns_unchanged`` says how many of ``returns`` rooms had, bit for bit, the blocks that they had when they
         were left. ``minute_miou`` scores the rendered labels, in rooms that the weights may have been trained
         on: for drift, not for rank.
@@ -195,6 +198,7 @@ class _StepLog:
                 voxel_map.stored_bytes / 1e6,
                 len(self.pipeline.keyframes),
                 len(update.source_seqs),
+                update.blocks_touched,
             )
         )
         self.frames += 1
@@ -206,6 +210,7 @@ class _StepLog:
         by_minute = [of for of in by_minute if of.any()]
         rss = [float(counted["rss_mb"][of].max()) for of in by_minute]
         scores = [confusion.metrics().miou for confusion in self.confusions]
+        most_touched, block_bytes = int(table["blocks_touched"].max()), self.pipeline.voxel_map.block_bytes
 
         def minutely(name: str, of: Callable[[NDArray[np.float64]], Any], digits: int = 1) -> list[float]:
             return [round(float(of(counted[name][rows])), digits) for rows in by_minute]
@@ -218,6 +223,8 @@ class _StepLog:
             **_drift(counted),
             "return_cpu_ratio": self._return_ratio(table),
             **_memory(rss, memory_mb),
+            "frame_mb_at_most": round(most_touched * block_bytes / 1e6, 1),
+            "memory_advised_mb": advised_mb(most_touched, block_bytes),
             "blocks": int(table["blocks_in_memory"][-1] + table["blocks_on_disk"][-1]),
             "blocks_in_memory_at_most": int(table["blocks_in_memory"].max()),
             "blocks_on_disk": int(table["blocks_on_disk"][-1]),
@@ -285,6 +292,7 @@ _COLUMNS: tuple[str, ...] = (
     "store_mb",
     "keyframes",
     "source_views",
+    "blocks_touched",
 )
 
 

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import structlog
 
-from replay.artifacts import write_artifacts
+from replay.artifacts import MAX_LISTED, write_artifacts
+from replay.tallies import FirstAndLast, StepTimes
 from replay.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.config import MapperConfig, convert_config, to_plain, with_quality
 from semantic_mapper.errors import FrameError, LabelError
-from semantic_mapper.evaluation.metrics import ConfusionMatrix, confusion_of
+from semantic_mapper.evaluation.metrics import ConfusionMatrix, ImageMeans, confusion_of
 from semantic_mapper.fields.base import SemanticField
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint
 from semantic_mapper.fields.device import choose_device
@@ -124,13 +125,14 @@ class MapSession:
         self.corrected_poses = 0  # given; the map has moved with them
         self.unfinished_correction = ""  # what the map has not moved with, and why
         self.without_depth = 0  # their geometry was rendered, not measured
-        self.refusals: list[Refusal] = []  # frames that were not mapped
-        self.label_refusals: list[Refusal] = []  # frames that were mapped, but whose label image cannot be used
-        self.damages: list[str] = []  # stretches of a log in which no frame can be made out
-        self.step_ms: list[float] = []
-        self.stage_ms: dict[str, list[float]] = {}
+        # Frames that were not mapped, those that were but whose label image cannot be used, and stretches of a log in
+        # which no frame can be made out:
+        self.refusals, self.label_refusals = FirstAndLast[Refusal](MAX_LISTED), FirstAndLast[Refusal](MAX_LISTED)
+        self.damages = FirstAndLast[str](MAX_LISTED)
+        self.step_ms = StepTimes()
+        self.stage_ms: dict[str, StepTimes] = {}
         self.confusion = ConfusionMatrix(self.pipeline.label_set)
-        self.per_image: list[ConfusionMatrix] = []
+        self.per_image = ImageMeans()
         self.truth = None if stream_labels is None else TruthMapper(stream_labels, self.pipeline.label_set)
         self.surface_truth = SurfaceTruth(self.pipeline.label_set)
         self.snapshots: list[tuple[PosedFrame, MapUpdate]] = []
@@ -147,9 +149,9 @@ class MapSession:
             self.refusals.append(Refusal(frame.seq, frame.stamp_ns, str(error)))
             _log.error("frame_refused", seq=frame.seq, camera=frame.camera_id, reason=str(error))
             return None
-        self.step_ms.append((time.perf_counter() - began) * 1e3)
+        self.step_ms.add((time.perf_counter() - began) * 1e3)
         for name, value in update.stage_ms.items():
-            self.stage_ms.setdefault(name, []).append(value)
+            self.stage_ms.setdefault(name, StepTimes()).add(value)
         self.fused += int(update.fused)
         self._note_depth(frame)
         frame = self.pipeline.corrector.place(frame)  # where the map has it
@@ -205,7 +207,7 @@ class MapSession:
         self.scored += 1
         image = confusion_of(truth, update.label, self.pipeline.label_set, f"frame seq={frame.seq}")
         self.confusion += image
-        self.per_image.append(image)
+        self.per_image.add(image)
         self.surface_truth.add(replace(frame, label=truth))
         return frame
 

@@ -134,16 +134,40 @@ def metrics_per_image(images: Iterable[ConfusionMatrix]) -> SegmentationMetrics:
 
     Images without a labelled pixel are left out; a class's figure is the mean over the images that show it.
     """
-    each = [m for m in (image.metrics() for image in images) if m.pixels > 0]
-    names = dict.fromkeys(name for m in each for name in m.per_class)
-    return SegmentationMetrics(
-        miou=_mean([m.miou for m in each]),
-        total_accuracy=_mean([m.total_accuracy for m in each]),
-        average_accuracy=_mean([m.average_accuracy for m in each]),
-        coverage=_mean([m.coverage for m in each]),
-        per_class={name: float(np.mean([m.per_class[name] for m in each if name in m.per_class])) for name in names},
-        pixels=sum(m.pixels for m in each),
-    )
+    means = ImageMeans()
+    for image in images:
+        means.add(image)
+    return means.metrics()
+
+
+class ImageMeans:
+    """``metrics_per_image`` of images that come one by one and are not kept."""
+
+    def __init__(self) -> None:
+        self._sums = np.zeros(4)  # of the figures of an image
+        self._class_sums: dict[str, float] = {}
+        self._class_images: dict[str, int] = {}
+        self._images = self._pixels = 0
+
+    def add(self, image: ConfusionMatrix) -> None:
+        """Count one more image."""
+        m = image.metrics()
+        if not m.pixels:
+            return
+        self._images += 1
+        self._pixels += m.pixels
+        self._sums += np.array([m.miou, m.total_accuracy, m.average_accuracy, m.coverage], np.float64)
+        for name, value in m.per_class.items():
+            self._class_sums[name] = self._class_sums.get(name, 0.0) + value
+            self._class_images[name] = self._class_images.get(name, 0) + 1
+
+    def metrics(self) -> SegmentationMetrics:
+        """Of the images so far."""
+        if not self._images:
+            return SegmentationMetrics(None, None, None, None)
+        means = (float(value) / self._images for value in self._sums)
+        per_class = {name: value / self._class_images[name] for name, value in self._class_sums.items()}
+        return SegmentationMetrics(*means, per_class=per_class, pixels=self._pixels)
 
 
 def nearest_labels(
@@ -280,8 +304,3 @@ def calibration_of_bins(count: NDArray[np.int64], confidence_sum: Float64, right
     total = int(count.sum())
     ece = float((count[filled] * np.abs(accuracy - mean_p)[filled]).sum() / total) if total else None
     return Calibration(ece, mean_p, accuracy, count)
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [v for v in values if v is not None]
-    return float(np.mean(known)) if known else None

@@ -79,10 +79,10 @@ def blocks_in_view(
 ) -> NDArray[np.int64]:
     """Packed keys of those blocks of ``keys`` (B, 3) that a camera may see up to ``reach_m`` of z, the nearest first.
 
-    A block counts whose bounding sphere touches the frustum.
+    A block counts whose bounding sphere touches the frustum; the sphere is that of the block and a voxel more on each
+    side, for a point between two blocks is interpolated from both.
     """
-    side = voxel_size_m * BLOCK_SIDE
-    radius = 0.5 * np.sqrt(3.0) * side
+    side, radius = voxel_size_m * BLOCK_SIDE, _block_radius_m(voxel_size_m)
     p = ((keys + 0.5) * side - camera.t) @ camera.R
     z = p[:, 2]
     seen = (z > -radius) & (z < reach_m + radius)
@@ -101,8 +101,7 @@ def view_bounds(
     camera: Camera, intrinsics: CameraIntrinsics, voxel_size_m: float, reach_m: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Least and greatest block coordinates (3,) that ``blocks_in_view`` may take."""
-    side = voxel_size_m * BLOCK_SIDE
-    radius = 0.5 * np.sqrt(3.0) * side
+    side, radius = voxel_size_m * BLOCK_SIDE, _block_radius_m(voxel_size_m)
     z = np.array([-radius, reach_m + radius])
     ends: list[Float64] = []
     for focal, center, size in (
@@ -114,6 +113,10 @@ def view_bounds(
     corners = np.array([(ends[0][k, i], ends[1][k, j], z[k]) for k in (0, 1) for i in (0, 1) for j in (0, 1)])
     blocks = (corners @ camera.R.T + camera.t) / side
     return np.floor(blocks.min(axis=0) - 1).astype(np.int64), np.ceil(blocks.max(axis=0)).astype(np.int64)
+
+
+def _block_radius_m(voxel_size_m: float) -> float:
+    return float(np.sqrt(3.0)) * (0.5 * BLOCK_SIDE + 1) * voxel_size_m
 
 
 @njit(nogil=True, cache=True, inline="always")

@@ -9,8 +9,9 @@ A block holds 8 x 8 x 8 voxels in the order [z][y][x]; voxel (i, j, k) of block 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import structlog
@@ -28,39 +29,19 @@ from semantic_mapper.mapping.block_index import (
 )
 from semantic_mapper.mapping.block_store import BLOCK_VOXELS, BlockStore, BlockValues, PackedBlocks, pack_blocks
 from semantic_mapper.mapping.evidence import EVIDENCE_DTYPES
+from semantic_mapper.mapping.grid_buffers import ATTRIBUTES, GridBuffers, view_buffers
 from semantic_mapper.mapping.open3d_loader import load_open3d
-from semantic_mapper.types import Float32
 
 BLOCK_SIDE = 8
 LEAST_RESIDENT = 256  # blocks that memory has room for, whatever the limit
 EVICTED_AT_ONCE = 32  # at least, and
 EVICTED_SHARE = 32  # at least this part of what memory has room for: sorting out what to evict looks at all of it
+SPARE_SHARE = 1.5  # of what one frame touches, where memory is to have room for it without pushing the last one out
 TILE_BLOCKS = 4096  # blocks brought together at a time to be read where some are on disk
 NEIGHBOURS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
 _READ_AT_ONCE = 512  # blocks on disk, whose evidence takes much room
-ATTRIBUTES = ("tsdf", "weight", "color", "evidence", "votes")
 
 _log = structlog.get_logger(__name__)
-
-
-class GridBuffers(NamedTuple):
-    """Zero-copy views of the grid's memory, valid until the next ``BlockGrid.activate``.
-
-    Args:
-        keys: (capacity, 3) int32 block coordinates.
-        tsdf: (capacity, 512) float32, signed distance over truncation in [-1, 1].
-        weight: (capacity, 512) float32, number of depth measurements (capped).
-        color: (capacity, 512, 3) float32 in 0..255.
-        evidence: (capacity, 512, L), sum (float32) or mean (int16) of log probabilities by weight; see ``evidence``.
-        votes: (capacity, 512) float32, sum of vote weights.
-    """
-
-    keys: NDArray[np.int32]
-    tsdf: Float32
-    weight: Float32
-    color: Float32
-    evidence: NDArray[Any]
-    votes: Float32
 
 
 class BlockGrid:
@@ -100,6 +81,7 @@ class BlockGrid:
         self._map = self._grid.hashmap()
         self._index = make_block_index(np.empty((0, 3), np.int32), np.empty(0, np.int32))
         self._store: BlockStore | None = None
+        self._told_of_portions = False
         self._clock = 0
         self._used = np.zeros(self.capacity, np.int64)  # by buffer index: when last asked for
         self._version = np.zeros(self.capacity, np.int64)  # by buffer index: see ``mark_changed``
@@ -146,18 +128,14 @@ class BlockGrid:
         """Bytes held for voxels and block tables, used or not."""
         return self.capacity * self.block_bytes + self._index.slot_keys.nbytes + self._index.slot_values.nbytes
 
+    @property
+    def room(self) -> int:
+        """Blocks that memory may ever hold."""
+        return self._max_resident
+
     def buffers(self) -> GridBuffers:
         """Views of the present buffers. Take them anew after every ``activate``: growth moves the memory."""
-        tsdf, weight, color, evidence, votes = (self._map.value_tensor(i).numpy() for i in range(len(ATTRIBUTES)))
-        n = len(tsdf)
-        return GridBuffers(
-            keys=self._map.key_tensor().numpy(),
-            tsdf=tsdf.reshape(n, BLOCK_VOXELS),
-            weight=weight.reshape(n, BLOCK_VOXELS),
-            color=color.reshape(n, BLOCK_VOXELS, 3),
-            evidence=evidence.reshape(n, BLOCK_VOXELS, -1),
-            votes=votes.reshape(n, BLOCK_VOXELS),
-        )
+        return view_buffers(self._map)
 
     def sorted_blocks(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Keys (B, 3) in lexicographic order and their buffer indices (B,)."""
@@ -172,8 +150,8 @@ class BlockGrid:
         New ones are zero; those on disk come back as they were.
 
         Raises:
-            MapError: where the map would exceed ``max_blocks``, or these blocks alone the memory; nothing has changed
-                then. Or the disk fails.
+            MapError: where the map would exceed ``max_blocks``, or these blocks alone the memory (``portions`` takes
+                any number of them), or the disk fails; no block has changed then.
         """
         self._clock += 1
         for watcher in self.watchers:
@@ -181,11 +159,30 @@ class BlockGrid:
         found = find_blocks(self._index, packed)
         missing = packed[found < 0]
         if len(missing):
-            self._check_room(packed, missing)
+            self._check_room(missing)
+            if len(packed) > self._max_resident:
+                raise MapError(f"{len(packed)} blocks at once, memory has room for {self._max_resident} of them")
             self._bring_in(packed, missing)
             found = find_blocks(self._index, packed)
         self._used[found] = self._clock
         return found
+
+    def portions(self, packed: NDArray[np.int64]) -> Iterator[NDArray[np.int32]]:
+        """``activate`` unique packed keys (B,) so many at a time as memory has room for.
+
+        Yields:
+            Buffer indices of a part of them, valid until the next; one empty part where there are no keys.
+
+        Raises:
+            MapError: where the map would exceed ``max_blocks``, before the first part; or the disk fails.
+        """
+        if len(packed) > self._max_resident:
+            found = find_blocks(self._index, packed)
+            self._check_room(packed[found < 0])
+            self._tell_of_portions(len(packed))
+            packed = packed[np.argsort(found < 0, kind="stable")]  # first those in memory: they need not come back
+        for start in range(0, max(len(packed), 1), self._max_resident):
+            yield self.activate(packed[start : start + self._max_resident])
 
     def reserve(self, blocks: int) -> None:
         """Make room for so many blocks at once, as far as the limit on memory goes."""
@@ -298,7 +295,7 @@ class BlockGrid:
             getattr(buffers, name)[blocks] = getattr(values, name)
         return blocks
 
-    def _check_room(self, packed: NDArray[np.int64], missing: NDArray[np.int64]) -> None:
+    def _check_room(self, missing: NDArray[np.int64]) -> None:
         new = len(missing) - (0 if self._store is None else int(self._store.holds(missing).sum()))
         if self.block_count + new > self._max_blocks:
             raise MapError(
@@ -306,12 +303,16 @@ class BlockGrid:
                 f"(voxel_map.max_blocks; {self.block_bytes / 1024:.0f} KiB a block). Raise the limit, use larger "
                 "voxels, or start a new map; what is in this one stays usable"
             )
-        if len(packed) > self._max_resident:
-            need = len(packed) * self.block_bytes / 1e6
-            raise MapError(
-                f"one frame touches {len(packed)} blocks, memory has room for {self._max_resident}; raise "
-                f"voxel_map.memory_mb to {need:.0f} or more, or use larger voxels"
-            )
+
+    def _tell_of_portions(self, blocks: int) -> None:
+        if self._told_of_portions:
+            return
+        self._told_of_portions = True
+        reason = (
+            "a frame touches more blocks than memory has room for: it goes through the disk part by part, which is "
+            f"slow; raise voxel_map.memory_mb to {advised_mb(blocks, self.block_bytes)} or more, or use larger voxels"
+        )
+        _log.warning("memory_is_short", blocks=blocks, room=self._max_resident, reason=reason)
 
     def _bring_in(self, packed: NDArray[np.int64], missing: NDArray[np.int64]) -> None:
         """Make room for the missing blocks, add them, and read those that were on disk."""
@@ -322,17 +323,16 @@ class BlockGrid:
             self._grow(needed)
         stored = self._store
         back = missing[:0] if stored is None else missing[stored.holds(missing)]
-        values = stored.get(back) if stored is not None and len(back) else None
-        added = self._add(missing)
-        self._zero(added)
-        self._version[added] = 0
-        if stored is None or values is None:
+        if stored is None or not len(back):
+            self._add(missing)
             return
+        values, versions = stored.get(back), stored.versions.find(back)
+        stored.drop(back)  # may fail, and then the block is there still; what comes now does not
+        self._add(missing)
         indices, buffers = find_blocks(self._index, back), self.buffers()
         for name in ATTRIBUTES:
             getattr(buffers, name)[indices] = getattr(values, name)
-        self._version[indices] = stored.versions.find(back)
-        stored.drop(back)
+        self._version[indices] = versions
 
     def _evict(self, count: int, keep: NDArray[np.int64]) -> None:
         """Put the ``count`` blocks that were used longest ago, and some more, on disk; those of ``keep`` stay."""
@@ -361,7 +361,7 @@ class BlockGrid:
         self._used, self._version = np.zeros(self.capacity, np.int64), np.zeros(self.capacity, np.int64)
         self._used[indices], self._version[indices] = used, version
 
-    def _add(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
+    def _add(self, packed: NDArray[np.int64]) -> None:
         keys = np.ascontiguousarray(unpack_keys(packed))
         indices, inserted = self._map.activate(self._o3d.core.Tensor.from_numpy(keys))
         if not bool(inserted.numpy().all()):  # the index says that they were not there: the two tables disagree
@@ -371,12 +371,14 @@ class BlockGrid:
             self._index = make_block_index(*self.sorted_blocks())
         else:
             insert_blocks(self._index, packed, added)
-        return added
-
-    def _zero(self, added: NDArray[np.int32]) -> None:
-        """Open3D hands out memory as its last user left it."""
-        for view in self.buffers()[1:]:
+        for view in self.buffers()[1:]:  # Open3D hands out memory as its last user left it
             view[added] = 0
+        self._version[added] = 0
+
+
+def advised_mb(blocks: int, block_bytes: int) -> int:
+    """The ``voxel_map.memory_mb`` that so many blocks of one frame, and some of the frames before, fit in."""
+    return math.ceil(SPARE_SHARE * blocks * block_bytes / 1e6)
 
 
 def make_open3d_grid(voxel_size_m: float, channels: tuple[int, ...], capacity: int, evidence: str = "float32") -> Any:

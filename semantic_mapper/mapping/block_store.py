@@ -1,7 +1,8 @@
 """Blocks that do not fit in memory: a private SQLite database on disk, each block with its checksum.
 
 The database is scratch space of one running map: SQLite takes its file out of the folder as soon as it is open, so
-that nothing stays behind, however the process ends. What is to outlive the process is saved (``map_file``).
+that nothing stays behind, however the process ends. What is to outlive the process is saved (``map_file``). A write
+that fails is taken back, with SQLite's journal in memory: what was there before is there still.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import sqlite3
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -80,7 +82,7 @@ class BlockStore:
             # Calls come from whichever thread holds the map's lock.
             self._database = sqlite3.connect("", check_same_thread=False, isolation_level=None)
             self._database.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
-            self._database.execute("PRAGMA journal_mode = OFF")
+            self._database.execute("PRAGMA journal_mode = MEMORY")
             self._database.execute(
                 "CREATE TABLE blocks (key INTEGER PRIMARY KEY, version INTEGER, crc INTEGER, voxels BLOB)"
             )
@@ -110,7 +112,7 @@ class BlockStore:
         """Put blocks away.
 
         Raises:
-            MapError: the disk is full or fails.
+            MapError: the disk is full or fails; the store is as it was, and can be used again once there is room.
         """
         self.put_packed(keys, versions, pack_blocks(values, np.arange(len(keys), dtype=np.int32)).blobs())
 
@@ -118,19 +120,12 @@ class BlockStore:
         """Put blocks away that ``pack_blocks`` has packed, as their bytes.
 
         Raises:
-            MapError: the disk is full or fails.
+            MapError: see ``put``.
         """
         packed = zip(keys.tolist(), versions.tolist(), blocks, strict=True)
         rows = [(key, version, zlib.crc32(voxels), voxels) for key, version, voxels in packed]
-        try:
-            self._database.execute("BEGIN")
+        with self._all_or_nothing(f"{len(rows)} blocks cannot be put on disk"):
             self._database.executemany("INSERT OR REPLACE INTO blocks VALUES (?, ?, ?, ?)", rows)
-            self._database.execute("COMMIT")
-        except sqlite3.Error as error:
-            raise MapError(
-                f"{len(rows)} blocks cannot be put on disk: {error}; make room in the folder for temporary files "
-                "(TMPDIR), or raise voxel_map.memory_mb"
-            ) from error
         self._versions.put(keys, versions)
 
     def get(self, keys: NDArray[np.int64]) -> BlockValues:
@@ -152,19 +147,40 @@ class BlockStore:
         for n, key in enumerate(wanted):
             if key not in found or zlib.crc32(found[key][1]) != found[key][0]:
                 raise MapError(f"block {key} on disk is {'damaged' if key in found else 'missing'}; its disk fails")
-            _unpack(found[key][1], values, n)
+            unpack_block(found[key][1], values, n)
         return values
 
     def drop(self, keys: NDArray[np.int64]) -> None:
-        """Forget blocks that are back in memory."""
-        wanted = keys.tolist()
-        for part in _parts(wanted):
-            self._database.execute(f"DELETE FROM blocks WHERE key IN ({','.join('?' * len(part))})", part)
+        """Forget blocks that are back in memory.
+
+        Raises:
+            MapError: see ``put``.
+        """
+        with self._all_or_nothing(f"{len(keys)} blocks cannot be taken off the disk"):
+            for part in _parts(keys.tolist()):
+                self._database.execute(f"DELETE FROM blocks WHERE key IN ({','.join('?' * len(part))})", part)
         self._versions.remove(keys)
 
     def close(self) -> None:
         """Give the disk space back."""
         self._database.close()
+
+    @contextmanager
+    def _all_or_nothing(self, failure: str) -> Iterator[None]:
+        """One transaction; what SQLite finds wrong is an error of ours."""
+        try:
+            self._database.execute("BEGIN")
+            try:
+                yield
+                self._database.execute("COMMIT")
+            finally:
+                if self._database.in_transaction:  # some failures end it by themselves
+                    self._database.execute("ROLLBACK")
+        except sqlite3.Error as error:
+            raise MapError(
+                f"{failure}: {error}; make room in the folder for temporary files (TMPDIR), or raise "
+                "voxel_map.memory_mb"
+            ) from error
 
 
 def _parts(keys: list[int]) -> Iterator[list[int]]:
@@ -237,7 +253,8 @@ def _pack(values, rows, ends, out_views):
                 evidence, votes = evidence + width, votes + 1
 
 
-def _unpack(voxels: bytes, values: BlockValues, n: int) -> None:
+def unpack_block(voxels: bytes | memoryview, values: BlockValues, n: int) -> None:
+    """Fill block ``n``, whose voxels are all zero, with what ``pack_blocks`` has packed of one."""
     data = np.frombuffer(voxels, np.float32)
     _unpack_block((data, data.view(np.uint8), data.view(values.evidence.dtype)), values, n)
 

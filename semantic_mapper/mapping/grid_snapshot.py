@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys, unpack_keys
-from semantic_mapper.mapping.block_store import BlockStore, BlockValues
+from semantic_mapper.mapping.block_store import BlockStore, BlockValues, unpack_block
 
-KEPT_AT_ONCE = 256  # blocks copied in memory
+MOST_ASIDE = 2048  # blocks in memory that frames have changed, some 20 KB each; of more, the first go to disk
 
 
 class GridSnapshot:
-    """Copy on write: blocks that may be about to change are put on disk first, unless they have been read already.
+    """Copy on write: blocks that may be about to change are put aside first, unless they have been read already.
 
-    That costs a copy of each block that frames touch meanwhile, once. Whoever calls ``read``, ``close`` or a method of
-    the grid holds the lock of the map.
+    That costs a copy of each block that frames touch meanwhile, once: in memory, packed, which takes a fifth of the
+    time that the disk would. Whoever calls ``read``, ``close`` or a method of the grid holds the lock of the map.
 
     Args:
         grid: To be read; the snapshot is of now.
@@ -28,6 +30,7 @@ class GridSnapshot:
         self._grid = grid
         self._classes = classes
         self._waiting = pack_keys(grid.all_keys())  # not read yet, sorted
+        self._aside: dict[int, memoryview] = {}
         self._kept: BlockStore | None = None
         self._failure: MapError | None = None
         grid.watchers.append(self._keep)
@@ -52,11 +55,18 @@ class GridSnapshot:
             for now, then in zip(values, kept.get(part[old]), strict=True):
                 now[old] = then
             kept.drop(part[old])
+        for n, key in enumerate(part.tolist()):
+            voxels = self._aside.pop(key, None)
+            if voxels is not None:
+                for now in values:
+                    now[n] = 0
+                unpack_block(voxels, values, n)
         return unpack_keys(part), values
 
     def close(self) -> None:
         """Let the grid change without being watched."""
         self._grid.watchers.remove(self._keep)
+        self._aside.clear()
         if self._kept is not None:
             self._kept.close()
 
@@ -66,13 +76,35 @@ class GridSnapshot:
             return
         slots = np.minimum(np.searchsorted(self._waiting, packed), len(self._waiting) - 1)
         found = packed[self._waiting[slots] == packed]
+        kept = self._kept
+        new = found if kept is None else found[~kept.holds(found)]
+        new = new[[key not in self._aside for key in new.tolist()]]
         try:
-            if self._kept is None:
-                self._kept = BlockStore(self._classes, self._grid.evidence)
-            kept = self._kept
-            new = found[~kept.holds(found)]
-            for start in range(0, len(new), KEPT_AT_ONCE):
-                part = new[start : start + KEPT_AT_ONCE]
-                kept.put(part, np.zeros(len(part), np.int64), self._grid.read(part))
+            for part, blocks in self._grid.pack(new):
+                self._aside.update(zip(new[part].tolist(), blocks.blobs(), strict=True))
+            if len(self._aside) > MOST_ASIDE:
+                self._put_on_disk(len(self._aside) - MOST_ASIDE)
         except MapError as error:
             self._failure = error
+
+    def _put_on_disk(self, count: int) -> None:
+        if self._kept is None:
+            self._kept = BlockStore(self._classes, self._grid.evidence)
+        keys = np.array(list(islice(self._aside, count)), np.int64)
+        self._kept.put_packed(keys, np.zeros(count, np.int64), [self._aside.pop(key) for key in keys.tolist()])
+
+
+def warm_up(classes: int, evidence: str) -> None:
+    """Load what a snapshot needs once in a process, which would else be the first frame's to wait for.
+
+    Args:
+        classes: L.
+        evidence: Key of ``EVIDENCE_DTYPES``.
+    """
+    grid = BlockGrid(1.0, classes, 1, 2, evidence=evidence)
+    key = pack_keys(np.zeros((1, 3), np.int32))
+    grid.activate(key)
+    snapshot = GridSnapshot(grid, classes)
+    grid.activate(key)
+    snapshot.read(1)
+    snapshot.close()

@@ -6,17 +6,43 @@ block to block, steps by the TSDF and finds the zero crossing on the interpolate
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit, prange
+from numpy.typing import NDArray
 
-from semantic_mapper.mapping.block_index import find_block, pack_key
+from semantic_mapper.config import VoxelMapConfig
+from semantic_mapper.mapping.allocation import Camera, blocks_in_view, view_bounds
+from semantic_mapper.mapping.block_grid import BlockGrid
+from semantic_mapper.mapping.block_index import find_block, pack_key, unpack_keys
 from semantic_mapper.mapping.readout import read_point, sample_tsdf
 from semantic_mapper.threads import parallel_kernel
+from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
 
 _STEP_SHARE = 0.7  # of the TSDF's distance: it is measured along other rays, so it may be too long for this one
 _REFINEMENTS = 5
 _WIDENINGS = 3
 _CLOSE_ENOUGH = 2e-3  # of the truncation: 0.16 mm at 2 cm voxels
+
+
+class Window(NamedTuple):
+    """Part of an image: first row and column, rows and columns."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+    def halves(self) -> tuple[Window, Window]:
+        """Both halves of its longer side."""
+        if self.height > self.width:
+            half = self.height // 2
+            return self._replace(height=half), self._replace(top=self.top + half, height=self.height - half)
+        half = self.width // 2
+        return self._replace(width=half), self._replace(left=self.left + half, width=self.width - half)
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -111,24 +137,63 @@ def march(origin, d, truncation_voxels, z_max, index, buffers, p):
     return 0.0
 
 
-@parallel_kernel()
-def cast_rays(camera, height, width, voxel_size, truncation_voxels, z_max, index, buffers, vote_discount):
-    """See the map through a camera.
+def cast_view(
+    grid: BlockGrid, camera: Camera, intrinsics: CameraIntrinsics, config: VoxelMapConfig
+) -> tuple[Float32, UInt8, NDArray[np.int64], Float32]:
+    """See the map through a camera, up to ``depth_max_m`` away.
+
+    What it may see and is on disk comes back into memory; where there is no room for all of it, for a part of the image
+    after the other. (Where even what one pixel may see does not fit, its ray meets the nearest of that.)
 
     Returns:
         depth (H, W) float32 metres (0 = miss), rgb (H, W, 3) uint8, channel (H, W) int64 (-1 = no votes),
         confidence (H, W) float32.
     """
-    depth = np.zeros((height, width), np.float32)
-    rgb = np.zeros((height, width, 3), np.uint8)
-    channel = np.full((height, width), -1, np.int64)
-    confidence = np.zeros((height, width), np.float32)
+    size = (intrinsics.height, intrinsics.width)
+    depth, confidence = np.zeros(size, np.float32), np.zeros(size, np.float32)
+    rgb, channel = np.zeros((*size, 3), np.uint8), np.full(size, -1, np.int64)
+    limits = (config.voxel_size_m, config.truncation_voxels, config.depth_max_m, config.vote_discount)
+    for window, seen in _windows(grid, camera, intrinsics, config):
+        if len(seen):
+            grid.page_in(seen)
+        _cast_rays(camera, window, limits, grid.index, grid.buffers(), depth, rgb, channel, confidence)
+    return depth, rgb, channel, confidence
+
+
+def _windows(
+    grid: BlockGrid, camera: Camera, intrinsics: CameraIntrinsics, config: VoxelMapConfig
+) -> Iterator[tuple[Window, NDArray[np.int64]]]:
+    """Parts of an image that together are all of it, each with packed keys (B,) of what it may see, nearest first.
+
+    One part, and no keys, where nothing is on disk.
+    """
+    whole = Window(0, 0, intrinsics.height, intrinsics.width)
+    if not grid.stored_count:
+        yield whole, np.empty(0, np.int64)
+        return
+    voxel, reach = config.voxel_size_m, config.depth_max_m + config.truncation_voxels * config.voxel_size_m
+    waiting = [(whole, grid.keys_between(*view_bounds(camera, intrinsics, voxel, reach)))]
+    while waiting:
+        window, keys = waiting.pop()
+        of_window = replace(intrinsics, height=window.height, width=window.width)
+        moved = camera._replace(cx=camera.cx - window.left, cy=camera.cy - window.top)
+        seen = blocks_in_view(moved, of_window, keys, voxel, reach)
+        if len(seen) <= grid.room or window.height * window.width == 1:
+            yield window, seen
+        else:
+            waiting += [(half, unpack_keys(seen)) for half in reversed(window.halves())]
+
+
+@parallel_kernel()
+def _cast_rays(camera, window, limits, index, buffers, depth, rgb, channel, confidence):
+    """Fill a window of what ``cast_view`` returns."""
+    voxel_size, truncation_voxels, z_max, vote_discount = limits
     classes = buffers.evidence.shape[2]
-    for v in prange(height):
+    for v in prange(window.top, window.top + window.height):
         origin, d, p = np.empty(3), np.empty(3), np.empty(3)
         color, evidence = np.empty(3, np.float64), np.empty(classes, np.float64)
         y = (v - camera.cy) / camera.fy
-        for u in range(width):
+        for u in range(window.left, window.left + window.width):
             x = (u - camera.cx) / camera.fx
             for axis in range(3):
                 origin[axis] = camera.t[axis] / voxel_size
@@ -142,4 +207,3 @@ def cast_rays(camera, height, width, voxel_size, truncation_voxels, z_max, index
             depth[v, u] = z
             channel[v, u] = best
             confidence[v, u] = confident
-    return depth, rgb, channel, confidence

@@ -12,9 +12,9 @@ import numpy as np
 from numba import njit, prange
 
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.block_grid import GridBuffers
 from semantic_mapper.mapping.block_index import BlockIndex, find_block, pack_key
 from semantic_mapper.mapping.evidence import evidence_scale
+from semantic_mapper.mapping.grid_buffers import GridBuffers
 from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import Float32, Float64, UInt8
 

@@ -46,7 +46,7 @@ def add_votes(
 
     Raises:
         PoseError, ShapeError, FrameError: the view cannot be used; the map is as it was.
-        MapError: the blocks in view do not fit in the memory that the map may take.
+        MapError: the disk fails.
     """
     where = "votes without a frame"
     check_pose(T_world_camera, where)
@@ -58,12 +58,11 @@ def add_votes(
         votes = frame_votes(depth, checked, camera, limits.depth_max, classes, where)
         votes = votes._replace(weights=votes.weights * np.float32(config.weight))
         packed = blocks_in_band(depth, camera, limits.voxel_size, limits.truncation, limits.depth_max)
-        blocks = grid.activate(packed[np.isin(packed, pack_keys(grid.all_keys()))])  # existing ones alone
-        if len(blocks):
-            max_votes = np.float32(config.max_votes)
-            _vote_blocks(blocks, grid.buffers(), camera, limits, depth, votes, max_votes, voxel_map.version)
-            voxel_map.mark_changed(blocks)
-    return len(blocks)
+        packed = packed[np.isin(packed, pack_keys(grid.all_keys()))]  # existing ones alone
+        max_votes, moment = np.float32(config.max_votes), voxel_map.version
+        for blocks in voxel_map.changing(packed) if len(packed) else ():
+            _vote_blocks(blocks, grid.buffers(), camera, limits, depth, votes, max_votes, moment)
+    return len(packed)
 
 
 @parallel_kernel()

@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import structlog
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
@@ -16,7 +15,7 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.allocation import Camera, blocks_in_band, blocks_in_view, make_camera, view_bounds
+from semantic_mapper.mapping.allocation import blocks_in_band, make_camera
 from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys
 from semantic_mapper.mapping.changes import (
@@ -30,16 +29,14 @@ from semantic_mapper.mapping.changes import (
 from semantic_mapper.mapping.extract import join_meshes, surface_voxels, triangle_mesh
 from semantic_mapper.mapping.frame_votes import check_depth, frame_votes, probability_table, trusted_depth
 from semantic_mapper.mapping.fusion import fuse_blocks, make_limits
-from semantic_mapper.mapping.grid_snapshot import GridSnapshot
-from semantic_mapper.mapping.map_file import BlockPart, open_map, write_map
-from semantic_mapper.mapping.map_manifest import CHUNK_BLOCKS, MapManifest
+from semantic_mapper.mapping.map_file import open_map
+from semantic_mapper.mapping.map_manifest import MapManifest
+from semantic_mapper.mapping.map_saving import MapSaving
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView
 from semantic_mapper.mapping.merge import add_blocks, check_fit, copy_blocks, voxel_transform
-from semantic_mapper.mapping.ray_casting import cast_rays
+from semantic_mapper.mapping.ray_casting import cast_view
 from semantic_mapper.mapping.readout import read_points
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
-
-_log = structlog.get_logger(__name__)
 
 # One lock for all maps of a process: growth moves the memory that readers look at, and numba's fallback threading
 # layer ends the process when two threads enter parallel kernels at once.
@@ -89,6 +86,11 @@ class VoxelMap:
     def block_count(self) -> int:
         """Blocks of 8^3 voxels in the map."""
         return self._grid.block_count
+
+    @property
+    def block_bytes(self) -> int:
+        """Bytes that each takes in memory."""
+        return self._grid.block_bytes
 
     @property
     def stored_blocks(self) -> int:
@@ -160,8 +162,9 @@ class VoxelMap:
 
         Raises:
             PoseError, FrameError, ShapeError: the frame cannot be used.
-            MapError: the map would grow past ``max_blocks``.
-            In every case the map is as it was, and the next frame is welcome.
+            MapError: the map would grow past ``max_blocks``, or the disk fails.
+            In every case the map is as it was, and the next frame is welcome; save where the disk fails in the midst of
+            a frame that ``memory_mb`` has no room for: a part of its blocks has been fused then.
         """
         where = f"frame seq={frame.seq} of camera '{frame.camera_id}'"
         check_pose(frame.T_world_camera, where)
@@ -175,14 +178,12 @@ class VoxelMap:
         with _KERNEL_LOCK:
             votes = frame_votes(depth, table, camera, self.config.depth_max_m, len(self.label_set), where, weights)
             packed = blocks_in_band(depth, camera, self.config.voxel_size_m, self.truncation_m, self.config.depth_max_m)
-            blocks = self._grid.activate(packed)
             rgb = np.ascontiguousarray(frame.rgb)
-            fuse_blocks(blocks, self._grid.buffers(), camera, self._limits, depth, rgb, weights, votes, self.frames)
+            for blocks in self.changing(packed):
+                fuse_blocks(blocks, self._grid.buffers(), camera, self._limits, depth, rgb, weights, votes, self.frames)
             self.frames += 1
-            self.version += 1
             self.last_stamp_ns = frame.stamp_ns
-            self._grid.mark_changed(blocks, self.version)
-        return len(blocks)
+        return len(packed)
 
     @contextmanager
     def locked(self) -> Iterator[BlockGrid]:
@@ -190,11 +191,20 @@ class VoxelMap:
         with _KERNEL_LOCK:
             yield self._grid
 
-    def mark_changed(self, blocks: NDArray[np.int32]) -> None:
-        """Begin a new ``version``, in which blocks (B,), buffer indices, were changed by such a pass."""
-        with _KERNEL_LOCK:
-            self.version += 1
-            self._grid.mark_changed(blocks, self.version)
+    def changing(self, packed: NDArray[np.int64]) -> Iterator[NDArray[np.int32]]:
+        """Bring blocks with unique packed keys (B,) into memory for a pass that changes them; hold the lock meanwhile.
+
+        Yields:
+            Buffer indices of those that memory has room for at a time. Together they are one new ``version``.
+
+        Raises:
+            MapError: see ``BlockGrid.portions``.
+        """
+        version = self.version + 1
+        for blocks in self._grid.portions(packed):
+            yield blocks
+            self._grid.mark_changed(blocks, version)
+            self.version = version
 
     def take_over(self, other: VoxelMap) -> None:
         """Become ``other``, all at once for whoever reads from another thread; ``other`` must not be used any more.
@@ -252,18 +262,7 @@ class VoxelMap:
         check_pose(T_world_camera, "ray_cast")
         camera = make_camera(intrinsics, T_world_camera)
         with _KERNEL_LOCK:
-            self._page_in_view(camera, intrinsics)
-            depth_m, rgb, channel, confidence = cast_rays(
-                camera,
-                intrinsics.height,
-                intrinsics.width,
-                self.config.voxel_size_m,
-                self.config.truncation_voxels,
-                self.config.depth_max_m,
-                self._grid.index,
-                self._grid.buffers(),
-                self.config.vote_discount,
-            )
+            depth_m, rgb, channel, confidence = cast_view(self._grid, camera, intrinsics, self.config)
         return MapView(depth_m, rgb, self.label_set.to_ids(channel), confidence)
 
     def block_state(self, keys: NDArray[np.int32] | None = None) -> dict[str, NDArray[np.generic]]:
@@ -283,25 +282,23 @@ class VoxelMap:
         """Write the map as it is now to one file (``map.npz``), whole or not at all, in memory for ``CHUNK_BLOCKS``.
 
         Other threads may go on integrating: they wait for a copy of ``CHUNK_BLOCKS`` at most, and what they change
-        before it is written is first put aside in the folder for temporary files.
+        before it is written is first put aside, in memory or in the folder for temporary files.
 
         Raises:
             MapError: the file cannot be written; one that was there before is as it was.
         """
+        self.begin_save().write(path)
+
+    def begin_save(self) -> MapSaving:
+        """The map as it is now, for another thread to write; see ``save``."""
         with _KERNEL_LOCK:
-            snapshot = GridSnapshot(self._grid, len(self.label_set))
             manifest = MapManifest(
                 config=self.config,
                 label_set=self.label_set,
                 frames=self.frames,
                 last_stamp_ns=self.last_stamp_ns,
             )
-        try:
-            manifest = write_map(path, manifest, _parts(snapshot))
-        finally:
-            with _KERNEL_LOCK:
-                snapshot.close()
-        _log.info("map_saved", path=str(path), blocks=manifest.blocks, bytes=path.stat().st_size)
+            return MapSaving(self.locked, manifest)
 
     @classmethod
     def load(cls, path: Path, memory_mb: int | None = None) -> VoxelMap:
@@ -363,24 +360,8 @@ class VoxelMap:
         decision = (self.label_set, self.config.vote_discount, min_weight)
         return choose_blocks(self._grid, (since, self.version, self.epoch), limit, decision)
 
-    def _page_in_view(self, camera: Camera, intrinsics: CameraIntrinsics) -> None:
-        """Bring back from disk what a camera may see; the nearest, where memory has no room for all of it."""
-        if self._grid.stored_count:
-            reach = self.config.depth_max_m + self.truncation_m
-            keys = self._grid.keys_between(*view_bounds(camera, intrinsics, self.config.voxel_size_m, reach))
-            self._grid.page_in(blocks_in_view(camera, intrinsics, keys, self.config.voxel_size_m, reach))
-
     def _read(self, grid: BlockGrid, voxels: Float64) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Float32]:
         return read_points(voxels, grid.index, grid.buffers(), self.label_set, self.config.vote_discount)
-
-
-def _parts(snapshot: GridSnapshot) -> Iterator[BlockPart]:
-    while True:
-        with _KERNEL_LOCK:
-            if not len(snapshot):
-                return
-            part = snapshot.read(CHUNK_BLOCKS)
-        yield part
 
 
 def _check_min_weight(min_weight: float) -> None:

@@ -1,4 +1,7 @@
 import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from resource import RLIMIT_FSIZE, getrlimit, setrlimit
 
 import numpy as np
 import pytest
@@ -82,3 +85,72 @@ def test_a_closed_store_says_so():
         store.put(np.array([1], np.int64), np.array([0]), some_blocks(1))
     with pytest.raises(MapError, match="cannot be read"):
         store.get(np.array([1], np.int64))
+
+
+@contextmanager
+def files_at_most(size: int) -> Iterator[None]:
+    """Writing beyond so many bytes of any file fails meanwhile, as on a disk that is full."""
+    before = getrlimit(RLIMIT_FSIZE)
+    setrlimit(RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        setrlimit(RLIMIT_FSIZE, before)
+
+
+def expect(store: BlockStore, held: dict[int, int]) -> None:
+    """The store holds these keys, each with the block of ``some_blocks(1, seed)``."""
+    assert len(store) == len(held) and store.holds(np.array(list(held), np.int64)).all()
+    back = store.get(np.array(list(held), np.int64))
+    for n, seed in enumerate(held.values()):
+        for name, mine in some_blocks(1, seed)._asdict().items():
+            assert getattr(back, name)[n].tobytes() == mine.tobytes(), (n, name)
+
+
+def put(store: BlockStore, held: dict[int, int], keys: range, seed: int) -> None:
+    blocks = [some_blocks(1, seed + key) for key in keys]
+    joined = BlockValues(*(np.concatenate([getattr(b, name) for b in blocks]) for name in BlockValues._fields))
+    store.put(np.array(keys, np.int64), np.full(len(keys), seed), joined)
+    held.update((key, seed + key) for key in keys)
+
+
+def test_a_full_disk_takes_nothing_from_the_store_and_room_mends_it():
+    """Some 10 KB a block, where SQLite keeps 4 MB in memory: the disk is full in the midst of a transaction."""
+    store, held = BlockStore(CLASSES), dict[int, int]()
+    put(store, held, range(600), 1)
+    with files_at_most(store.file_bytes + 100_000):
+        for keys in (range(600, 1600), range(300, 1300), range(2000, 2900)):
+            with pytest.raises(MapError, match=r"\d+ blocks cannot be put on disk: disk I/O error; make room"):
+                put(store, dict(held), keys, 5)
+        expect(store, held)
+        store.drop(np.arange(100))
+        put(store, held, range(5000, 5050), 7)  # there is room again
+        for key in range(100):
+            del held[key]
+        expect(store, held)
+    put(store, held, range(400, 1500), 9)
+    expect(store, held)
+    assert store._database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+
+
+def test_a_database_that_may_not_grow_takes_nothing_from_the_store():
+    store, held = BlockStore(CLASSES), dict[int, int]()
+    put(store, held, range(50), 1)
+    (pages,) = store._database.execute("PRAGMA page_count").fetchone()
+    store._database.execute(f"PRAGMA max_page_count = {pages + 5}")
+    with pytest.raises(MapError, match="60 blocks cannot be put on disk: database or disk is full"):
+        put(store, dict(held), range(20, 80), 5)
+    expect(store, held)
+    store._database.execute(f"PRAGMA max_page_count = {1 << 30}")
+    put(store, held, range(20, 80), 5)
+    expect(store, held)
+
+
+def test_a_drop_that_fails_forgets_nothing():
+    store, held = BlockStore(CLASSES), dict[int, int]()
+    put(store, held, range(40), 1)
+    store._database.execute("PRAGMA query_only = ON")
+    with pytest.raises(MapError, match="10 blocks cannot be taken off the disk: attempt to write a readonly"):
+        store.drop(np.arange(10))
+    store._database.execute("PRAGMA query_only = OFF")
+    expect(store, held)

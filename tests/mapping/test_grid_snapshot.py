@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.mapping import block_store
+from semantic_mapper.mapping import block_store, grid_snapshot
 from semantic_mapper.mapping.block_grid import LEAST_RESIDENT, BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys
 from semantic_mapper.mapping.block_store import BlockValues
@@ -43,8 +43,12 @@ def read_all(snapshot: GridSnapshot, between: list[np.ndarray], grid: BlockGrid)
     return BlockValues(*(np.concatenate([getattr(part, name) for part in parts]) for name in BlockValues._fields))
 
 
+@pytest.mark.parametrize("most_aside", [grid_snapshot.MOST_ASIDE, 30], ids=["aside in memory", "aside on disk"])
 @pytest.mark.parametrize("memory_bytes", [0, 1], ids=["in memory", "most blocks on disk"])
-def test_a_snapshot_does_not_change_with_the_grid(memory_bytes: int, rng: np.random.Generator) -> None:
+def test_a_snapshot_does_not_change_with_the_grid(
+    memory_bytes: int, most_aside: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(grid_snapshot, "MOST_ASIDE", most_aside)
     grid = filled_grid(memory_bytes)
     assert grid.stored_count >= BLOCKS - LEAST_RESIDENT if memory_bytes else grid.stored_count == 0
     before = grid.read(KEYS)
@@ -71,6 +75,7 @@ def test_a_full_disk_fails_the_snapshot_and_not_the_frame(monkeypatch: pytest.Mo
         return database
 
     connect = sqlite3.connect
+    monkeypatch.setattr(grid_snapshot, "MOST_ASIDE", 20)
     monkeypatch.setattr(block_store.sqlite3, "connect", tiny)
     changed = some_blocks(100, 5)
     grid.fill(KEYS[300:400], changed)

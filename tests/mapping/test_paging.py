@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from structlog.testing import capture_logs
 
+from semantic_mapper.config import VirtualViewConfig
 from semantic_mapper.errors import MapError
+from semantic_mapper.geometry import look_at
 from semantic_mapper.mapping.block_grid import EVICTED_AT_ONCE, EVICTED_SHARE, BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys
+from semantic_mapper.mapping.block_store import BlockStore
+from semantic_mapper.mapping.vote_fusion import add_votes
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float64
+from tests.mapping.test_block_store import files_at_most
 from tests.mapping.test_voxel_map import same
 from tests.mapping.views import INTRINSICS, frame, plane_depth, small_map, sure
 
@@ -90,12 +98,149 @@ def test_a_paged_map_is_saved_whole_and_goes_on(both: tuple[VoxelMap, VoxelMap],
     assert same(again.block_state(), loaded.block_state())
 
 
-def test_a_frame_that_memory_has_no_room_for_is_refused_and_costs_nothing() -> None:
-    voxel_map = small_map(voxel_size_m=0.01, memory_mb=1)  # LEAST_RESIDENT blocks, which is more
+WIDE = 256  # least room for blocks; the frames below touch more than that
+
+
+def look_wide(voxel_map: VoxelMap) -> None:
+    """Frames that touch more blocks than the least memory holds, the second one mostly the same."""
+    for n, x in enumerate((0.0, 0.1, 3.0, 0.05)):
+        pose = along_the_wall(x)
+        voxel_map.integrate(frame(pose, seq=n), plane_depth(pose, (0.2, 0.1, 1.0), 1.0), sure(n % 3, 0.6), None)
+
+
+@pytest.fixture(scope="module", params=["float32", "int16"])
+def wide(request: pytest.FixtureRequest) -> tuple[VoxelMap, VoxelMap]:
+    """Of the same frames, without a limit and with far too low a one."""
+    kind = {"voxel_size_m": 0.01, "evidence": request.param}
+    free, paged = small_map(**kind), small_map(**kind, memory_mb=1)
+    look_wide(free)
+    with capture_logs() as logs:
+        look_wide(paged)
+    told = [log for log in logs if log["event"] == "memory_is_short"]
+    assert len(told) == 1 and told[0]["room"] == WIDE < told[0]["blocks"] / 1.2
+    advised = int(re.search(r"memory_mb to (\d+) or more", told[0]["reason"]).group(1))  # type: ignore[union-attr]
+    roomy = small_map(**kind, memory_mb=advised)
+    with capture_logs() as logs:
+        look_wide(roomy)
+    assert [log["event"] for log in logs if log["event"] != "map_grows"] in ([], ["map_pages"])
+    return free, paged
+
+
+def test_frames_that_memory_has_no_room_for_make_the_same_map(wide: tuple[VoxelMap, VoxelMap]) -> None:
+    free, paged = wide
+    assert paged.memory_bytes < 0.5 * free.memory_bytes and free.block_count > 2 * WIDE
+    assert (paged.frames, paged.version, paged.last_stamp_ns) == (free.frames, free.version, free.last_stamp_ns)
+    assert same(free.block_state(), paged.block_state())
+    for version in range(free.version + 1):
+        np.testing.assert_array_equal(free.changed_since(version), paged.changed_since(version))
+
+
+def test_a_view_that_memory_has_no_room_for_is_the_same(wide: tuple[VoxelMap, VoxelMap]) -> None:
+    free, paged = wide
+    oblique = look_at(np.array([-0.5, 0.4, -0.2]), np.array([0.6, -0.1, 1.0]), np.array([0.1, -1.0, 0.0]))
+    for pose in (along_the_wall(0.0), along_the_wall(2.8), oblique):
+        a, b = free.ray_cast(pose, INTRINSICS), paged.ray_cast(pose, INTRINSICS)
+        assert (a.depth_m > 0).mean() > 0.3
+        for name in a.__slots__:
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+def test_votes_that_memory_has_no_room_for_are_the_same(wide: tuple[VoxelMap, VoxelMap]) -> None:
+    pose, config = along_the_wall(0.3), VirtualViewConfig(max_votes=5.0)
+    depth = plane_depth(pose, (0.2, 0.1, 1.0), 1.0)
+    rows = np.arange(depth.size, dtype=np.int32).reshape(depth.shape)
+    table, before = (sure(1).reshape(-1, 3), rows), wide[0].block_state()
+    touched = [add_votes(voxel_map, pose, INTRINSICS, depth, table, config) for voxel_map in wide]
+    assert touched[0] == touched[1] > WIDE and wide[0].version == wide[1].version == 5
+    assert same(wide[0].block_state(), wide[1].block_state()) and not same(wide[0].block_state(), before)
+    np.testing.assert_array_equal(wide[0].changed_since(4), wide[1].changed_since(4))
+
+
+def test_a_frame_past_the_limit_on_blocks_is_refused_before_a_part_of_it_is_fused() -> None:
+    voxel_map = small_map(voxel_size_m=0.01, memory_mb=1, max_blocks=WIDE + 10)
     pose = along_the_wall(0.0)
-    with pytest.raises(MapError, match=r"one frame touches \d+ blocks.*memory_mb"):
+    with pytest.raises(MapError, match="the map is full: 0 blocks"):
         voxel_map.integrate(frame(pose), plane_depth(pose, (0.0, 0.0, 1.0), 1.0), sure(0), None)
-    assert voxel_map.block_count == 0 and voxel_map.frames == 0
+    assert voxel_map.block_count == voxel_map.frames == voxel_map.version == 0
+
+
+def test_a_full_disk_costs_no_block_and_mapping_goes_on_once_there_is_room() -> None:
+    """The frame that has no room is refused whole; what was in the map is read and saved while the disk is full."""
+    free, paged = (small_map(voxel_size_m=0.01, memory_mb=mb) for mb in (0, MEMORY_MB))
+    for station in range(6):
+        walk(free, 1, first=station)
+        walk(paged, 1, first=station)
+    before = paged.stored_bytes
+    with files_at_most(before + 200_000):
+        for station in range(6, 30):
+            try:
+                walk(paged, 1, first=station)
+            except MapError:
+                break
+            walk(free, 1, first=station)
+        else:
+            pytest.fail("the disk was never full")
+        with pytest.raises(MapError, match="cannot be put on disk"):
+            walk(paged, 1, first=station)
+        assert paged.frames == free.frames == station and paged.version == free.version
+        assert same(free.block_state(), paged.block_state())
+        assert len(paged.points().xyz) == len(free.points().xyz)
+    for voxel_map in (free, paged):
+        walk(voxel_map, 2, first=station)
+        walk(voxel_map, 2)
+    assert same(free.block_state(), paged.block_state())
+
+
+def test_a_disk_that_fails_in_the_midst_of_a_wide_frame_leaves_a_map_that_says_what_changed() -> None:
+    paged = small_map(voxel_size_m=0.01, memory_mb=1)
+    look_wide(paged)
+    before, version, frames = paged.block_state(), paged.version, paged.frames
+    pose = along_the_wall(0.02)
+
+    def look_again(times: int) -> None:
+        for _ in range(times):
+            paged.integrate(frame(pose, seq=9), plane_depth(pose, (0.2, 0.1, 1.0), 1.0), sure(1), None)
+
+    with files_at_most(paged.stored_bytes), pytest.raises(MapError, match="cannot be put on disk"):
+        look_again(20)
+    assert paged.version > version and paged.frames >= frames
+    after = paged.block_state()
+    differs = [
+        key
+        for key, old, new in zip(
+            before["keys"].tolist(), before["weight"], weights_at(after, before["keys"]), strict=True
+        )
+        if (old != new).any()
+    ]
+    assert differs and set(map(tuple, differs)) <= set(map(tuple, paged.changed_since(version).tolist()))
+    frames = paged.frames
+    look_again(1)
+    assert paged.frames == frames + 1
+
+
+def weights_at(state: dict[str, NDArray[np.generic]], keys: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Weights of these blocks, which are all in the state."""
+    rows = {tuple(key): n for n, key in enumerate(state["keys"].tolist())}
+    return state["weight"][[rows[tuple(key)] for key in keys.tolist()]]
+
+
+def test_a_block_that_cannot_be_taken_off_the_disk_is_in_the_map_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    free, paged = (small_map(voxel_size_m=0.01, memory_mb=mb) for mb in (0, MEMORY_MB))
+    for voxel_map in (free, paged):
+        walk(voxel_map, 6)
+    with monkeypatch.context() as patched:
+        patched.setattr(BlockStore, "drop", failing_drop)
+        with pytest.raises(MapError, match="no drop"):
+            walk(paged, 1)
+    assert paged.block_count == free.block_count
+    assert same(free.block_state(), paged.block_state())
+    for voxel_map in (free, paged):
+        walk(voxel_map, 1)
+    assert same(free.block_state(), paged.block_state())
+
+
+def failing_drop(store: BlockStore, keys: object) -> None:
+    raise MapError("no drop")
 
 
 def test_keys_between_two_corners_are_found_in_memory_and_on_disk(both: tuple[VoxelMap, VoxelMap]) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 import replay.bench_growth as bench_growth_module
 import replay.bench_walk as bench_walk_module
@@ -46,6 +47,9 @@ def test_rooms_come_back_unchanged_and_memory_keeps_its_limit(weights: Path, tmp
     assert found["blocks_on_disk"] > 500 and found["store_mb"] > 1
     at_most = found["minute_blocks_in_memory"][-1] + found["minute_blocks_on_disk"][-1]
     assert resident < found["blocks"] <= at_most
+    block_mb = 4e-6 * 512 * (found["classes"] + 6)
+    assert 100 * block_mb < found["frame_mb_at_most"] < resident * block_mb, "this walk's frames fit"
+    assert found["memory_advised_mb"] == pytest.approx(1.5 * found["frame_mb_at_most"], abs=1.1)
     assert 0 < found["fuse_p50_ms"] < found["step_p50_ms"] <= found["step_p95_ms"]
     assert found["return_cpu_ratio"] > 0
     short = ("rss_growth_mb", "rss_minute_5_mb", "step_slope_percent_a_minute", "cpu_p50_last_ten_minutes_ms")
@@ -54,6 +58,23 @@ def test_rooms_come_back_unchanged_and_memory_keeps_its_limit(weights: Path, tmp
     assert {len(values) for name, values in found.items() if name.startswith("minute_")} == {1}
     write_walk_plot({**found, "minute_step_p50_ms": [1.0, 2.0, 3.0]}, tmp_path / "walk.png")
     assert cv2.imread(str(tmp_path / "walk.png")).shape[1] > 1000
+
+
+def test_a_walk_with_less_memory_than_one_frame_takes_comes_to_its_end(weights: Path) -> None:
+    config = tiny_config(
+        render={"encode_width": 96, "scale": 0.25},
+        voxel_map={"voxel_size_m": 0.02, "memory_mb": 1},
+        keyframes={"source_views": 2},
+    )
+    plan = WalkPlan(rooms=1, returns=1, minutes=0.1, hz=0.5, width=160)
+    found = bench_walk(weights, config, plan)
+    assert found["frame_mb_at_most"] > 4 * LEAST_RESIDENT * 4e-6 * 512 * found["classes"]
+    assert found["memory_advised_mb"] >= found["frame_mb_at_most"]
+    assert found["blocks_in_memory_at_most"] == LEAST_RESIDENT
+    assert (
+        found["blocks"]
+        == bench_walk(weights, replace(config, voxel_map=replace(config.voxel_map, memory_mb=0)), plan)["blocks"]
+    )
 
 
 def test_a_room_that_was_touched_meanwhile_is_told_of(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,5 @@
 import json
+import pickle
 from dataclasses import replace
 
 import cv2
@@ -7,9 +8,11 @@ import pytest
 
 from replay.evaluate import baseline_predictors, evaluate_frames, sray_predictors
 from replay.session import SNAPSHOTS, MapSession, load_pipeline, make_field
+from replay.tallies import StepTimes
 from replay.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.config import MapperConfig, convert_config
 from semantic_mapper.errors import LabelError, WeightsError
+from semantic_mapper.evaluation.metrics import confusion_of
 from semantic_mapper.fields.checkpoint import Checkpoint, anchor_from_frame, save_checkpoint
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_streaming import StreamingSRay
@@ -68,7 +71,9 @@ def test_the_summary_has_the_settings_that_were_in_force(tmp_path, weights):
 
 def test_the_first_frame_which_may_compile_kernels_does_not_count_in_the_percentiles(tmp_path, weights):
     session = run(weights, tiny_frames())
-    session.step_ms[:] = [9000.0, *[10.0] * 5]
+    session.step_ms = StepTimes()
+    for ms in [9000.0, *[10.0] * 5]:
+        session.step_ms.add(ms)
     latency = session.finish(tmp_path / "out")["latency_ms"]
     assert latency == {"p50": 10.0, "p95": 10.0, "first": 9000.0}
 
@@ -111,6 +116,32 @@ def test_refused_frames_are_counted_with_their_reason_and_the_rest_is_mapped(tmp
     assert (summary["frames"]["published"], summary["frames"]["fused"]) == (10, 5)
     assert (summary["frames"]["refused"], summary["frames"]["dropped"]) == (2, 3)
     assert "seq=2" in summary["refusals"][0]["reason"] and "NaN or infinity" in summary["refusals"][0]["reason"]
+
+
+def test_a_session_of_days_keeps_count_in_memory_that_does_not_grow(tmp_path, weights):
+    """A camera that sends every second frame without a usable pose, for as long as it takes."""
+    frames = tiny_frames()
+    lost = replace(frames[2], T_world_camera=np.full((4, 4), np.nan))
+    session = run(weights, frames)
+    for n in range(500):  # a step beside what is counted would take too long for as many
+        session.process(replace(lost, seq=6 + n))
+        session.refuse(6 + n, 0, "message: checksum is wrong")
+        session.note_damage(f"at {n}")
+    before = len(pickle.dumps((session.refusals, session.damages, session.step_ms, session.stage_ms)))
+    for n in range(500, 1500):
+        session.process(replace(lost, seq=6 + n))
+        session.note_damage(f"at {n}")
+        session.step_ms.add(10.0 + n)
+        session.per_image.add(confusion_of(frames[0].label, frames[0].label, ROOMS))
+    grown = len(pickle.dumps((session.refusals, session.damages, session.step_ms, session.stage_ms))) - before
+    assert abs(grown) < 2000
+    summary = session.finish(tmp_path / "out")
+    assert summary["frames"]["refused"] == 2000 and summary["frames"]["published"] == 2006
+    assert session.refusals.last.seq == 1505
+    assert [r["seq"] for r in summary["refusals"]] == [6 + n // 2 for n in range(50)]
+    assert summary["damaged_stretches"] == [f"at {n}" for n in range(50)]
+    assert summary["latency_ms"]["p95"] == pytest.approx(1459, rel=0.005)
+    assert summary["metrics_per_image"]["miou"] > 0.95, "of some thousand images, all but five right"
 
 
 @pytest.mark.parametrize("bad", [0, 1, 2])  # 1 is a frame that the weights were finetuned on

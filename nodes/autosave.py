@@ -1,0 +1,85 @@
+"""Saves a running mapper's map every so often, so that a killed process or a power cut does not take all of it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import structlog
+
+from semantic_mapper.errors import MapError
+from semantic_mapper.mapping.grid_snapshot import warm_up
+from semantic_mapper.mapping.map_saving import MapSaving
+from semantic_mapper.mapping.voxel_map import VoxelMap
+
+REST_SHARE = 1.0  # rests as long as it works, so that the next frame finds the processor free half of the time
+
+_log = structlog.get_logger(__name__)
+
+
+class _GivenUpError(Exception):
+    """The mapper ends, and writes its map itself."""
+
+
+class Autosave:
+    """Takes the map between two frames, and writes it in a thread while the next ones are mapped.
+
+    The file is always whole, and of one frame: the map before or the one after, whenever the process is killed.
+
+    Args:
+        voxel_map: To be saved, where it has changed.
+        path: The file; replaced each time.
+        every_s: From the beginning of one save to the next.
+    """
+
+    def __init__(self, voxel_map: VoxelMap, path: Path, every_s: float) -> None:
+        self.saves = 0
+        self.failure = ""  # of the last save; empty where it went well
+        self._map = voxel_map
+        self._path = path
+        self._every_s = every_s
+        self._begun = time.monotonic()
+        self._saved_version = voxel_map.version
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
+        warm_up(len(voxel_map.label_set), voxel_map.config.evidence)  # else the first save's frame compiles
+
+    def follow(self) -> None:
+        """Begin a save if it is time; to be called between two frames."""
+        version = self._map.version
+        if time.monotonic() - self._begun < self._every_s or self._saved_version == version:
+            return
+        if self._thread is not None and self._thread.is_alive():
+            return
+        self._begun = time.monotonic()
+        saving = self._map.begin_save()
+        self._thread = threading.Thread(target=self._save, args=(saving, version), name="autosave", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Give up what is being written; the file is as it was before."""
+        self._ending.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _save(self, saving: MapSaving, version: int) -> None:
+        worked_since = time.monotonic()
+
+        def rest() -> None:
+            nonlocal worked_since
+            if self._ending.wait(REST_SHARE * (time.monotonic() - worked_since)):
+                raise _GivenUpError
+            worked_since = time.monotonic()
+
+        try:
+            saving.write(self._path, rest)
+        except _GivenUpError:
+            _log.info("autosave_given_up", reason="the mapper ends")
+        except MapError as error:
+            self.failure = str(error)
+            _log.error("autosave_fails", reason=self.failure, again_s=self._every_s)
+        else:
+            self._saved_version = version
+            self.saves += 1
+            self.failure = ""
