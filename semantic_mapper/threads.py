@@ -64,3 +64,13 @@ def parallel_kernel(*, fastmath: bool = False) -> Callable[[FunctionT], Function
     share_threads()
     decorate: Any = numba.njit(parallel=True, nogil=True, cache=True, fastmath=fastmath)
     return decorate
+
+
+def inlined_kernel(function: FunctionT) -> FunctionT:
+    """``numba.njit`` with fast mathematics for a part of a kernel, compiled into every kernel that calls it.
+
+    Fast mathematics rounds otherwise where LLVM inlines a part than where it calls it, and which of both it did hung on
+    what had been compiled before: a machine's first run differed from its second in the last digits.
+    """
+    decorate: Any = numba.njit(fastmath=True, nogil=True, forceinline=True)
+    return decorate(function)

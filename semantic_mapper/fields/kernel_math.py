@@ -28,6 +28,7 @@ from semantic_mapper.fields.simd import (
     total,
     totals,
 )
+from semantic_mapper.threads import inlined_kernel
 
 ROWS = 4  # that ``linear`` works on at a time
 _LOG2E = np.float32(1.4426950408889634)
@@ -73,7 +74,7 @@ def softplus(x):
     return max(x, np.float32(0.0)) + np.float32(math.log1p(fast_exp(-abs(x))))
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def linear(x, rows, weight, bias, out):
     """out[:rows] = x[:rows] @ weight + bias.
 
@@ -133,7 +134,7 @@ def _four_rows(x, t, weight, o, bias, out):
     store(out, (t + 3) * stride + o + LANES, h)
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def relu(x, rows, columns):
     """In place."""
     for t in range(rows):
@@ -141,7 +142,7 @@ def relu(x, rows, columns):
             x[t, o] = max(x[t, o], np.float32(0.0))
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def attend(qkv, index, count, heads, head_dim, scratch, out):
     """Attention among the ``count`` tokens qkv[index[:count]]; the result goes to out[index[:count]].
 
@@ -157,7 +158,7 @@ def attend(qkv, index, count, heads, head_dim, scratch, out):
         _attend_any(qkv, index, count, heads, head_dim, scratch, out)
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def _attend_any(qkv, index, count, heads, head_dim, scratch, out):
     """A lane is a key."""
     keys, score, beyond = scratch
@@ -222,7 +223,7 @@ def _two_keys(q0, q1, q2, q3, qkv, near, far):
     )
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def _attend_four_heads(qkv, index, count, score, out):
     """A lane is a head, of two keys at a time: groups of a few tokens leave no lane empty, and no sum goes across."""
     width, rate = qkv.shape[1], splat(np.float32(1.0 / math.sqrt(8)))

@@ -27,14 +27,14 @@ from semantic_mapper.fields.kernel_math import (
 )
 from semantic_mapper.fields.sray import DOUBT, HIDDEN
 from semantic_mapper.fields.sray_tokens import drop_tokens, fill_tokens, group_tokens
-from semantic_mapper.threads import parallel_kernel
+from semantic_mapper.threads import inlined_kernel, parallel_kernel
 
 CUES = 4
 SCORE_HIDDEN = 16  # hidden width of ViewWeightNet
 _ZERO = np.float32(0.0)
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def _attention_layer(x, groups, sizes, count, qkv_weight, out_weight, zero_bias, heads, keep, qkv, mixed, scratch):
     """x <- keep * x + f(x), attention within each group of tokens (Eq. 6 to 8)."""
     inner = out_weight.shape[0]
@@ -49,7 +49,7 @@ def _attention_layer(x, groups, sizes, count, qkv_weight, out_weight, zero_bias,
             x[t, c] = keep * x[t, c] + qkv[t, c]
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def _score_views(x, cues, count, weights, log_ratio, occlusion, scratch):
     """Of each token its weight in the semantic ray, not yet normalised, and the logit of its weight in the colour."""
     joined, hidden, score = scratch
@@ -74,7 +74,7 @@ def _score_views(x, cues, count, weights, log_ratio, occlusion, scratch):
         score[t, 0], score[t, 1] = weight, colour_score
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def _blend(x, rgb, by_sample, sizes, score, s, colour):
     """Semantic ray s and colour of each sample (Eq. 11, 12); the logits in ``score`` become weights."""
     channels = s.shape[1]
@@ -100,7 +100,7 @@ def _blend(x, rgb, by_sample, sizes, score, s, colour):
                 colour[k, c] += wc * rgb[t, c]
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def _carry_labels(token_label, cues, by_sample, sizes, out):
     """Known labels that the views carry over to each sample, (N, L); see ``SRay.carried_labels``."""
     for k in range(by_sample.shape[0]):
@@ -116,7 +116,7 @@ def _carry_labels(token_label, cues, by_sample, sizes, out):
             out[k, c] /= total
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def _density(feature, cues, by_sample, sizes, delta, weights, zero, scratch, sigma):
     """Density of each sample of one ray from what all views say about it; see ``DensityNet``."""
     w1, b1, w2, b2, wqkv, v1, c1, v2, c2 = weights
@@ -172,7 +172,7 @@ def _density(feature, cues, by_sample, sizes, delta, weights, zero, scratch, sig
         sigma[k] = sigma[k] * math.exp(gain) + softplus(own - np.float32(OWN_DENSITY_OFFSET))
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def _weigh(sigma, delta, z, least, weight, share):
     """Compositing weights (N,) of one ray, and those of the samples that are looked at, 0 for the faint ones.
 
@@ -195,7 +195,7 @@ def _weigh(sigma, delta, z, least, weight, share):
     return opacity, (depth / max(opacity, np.float32(1e-6)) if opacity > 1e-3 else _ZERO)
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def _composite(s, colour, labels, weight, share, out, rendered_colour, carried):
     """Eq. 13 over one ray: fills out (C,), rendered_colour (3,), carried (L,)."""
     for c in range(out.shape[0]):
@@ -213,7 +213,7 @@ def _composite(s, colour, labels, weight, share, out, rendered_colour, carried):
             carried[c] += weight[k] * labels[k, c]
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def _make_scratch(views, samples, channels, classes):
     """Buffers of one thread: tokens, their groups, attention, samples, density."""
     tokens = -(-views * samples // ROWS) * ROWS
@@ -268,7 +268,7 @@ def _make_scratch(views, samples, channels, classes):
     )
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def _render_ray(r, rays, sources, settings, weights, scratch, out):
     """One ray, from reprojection to the composited feature."""
     origin, direction, z = rays

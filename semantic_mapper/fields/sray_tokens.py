@@ -14,6 +14,7 @@ import numpy as np
 
 from semantic_mapper.fields.projection import MIN_DEPTH_M
 from semantic_mapper.fields.simd import LANES, load, logistic, multiply, multiply_add, splat, store
+from semantic_mapper.threads import inlined_kernel
 
 _ZERO = np.float32(0.0)
 
@@ -70,7 +71,7 @@ def _hits(count, ends, shares, cues):
         cues[t, 1] = 1 - near
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def fill_tokens(origin, direction, z, delta, sources, places, data):
     """Reproject the samples of one ray into all views (Eq. 4, 5); return the number of tokens that some view sees.
 
@@ -121,7 +122,7 @@ def fill_tokens(origin, direction, z, delta, sources, places, data):
     return count
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def group_tokens(token_view, token_sample, count, by_view, view_size, by_sample, sample_size):
     """List the tokens of each view and of each sample."""
     view_size[:] = 0
@@ -134,7 +135,7 @@ def group_tokens(token_view, token_sample, count, by_view, view_size, by_sample,
         sample_size[k] += 1
 
 
-@numba.njit(fastmath=True, nogil=True, cache=True)
+@inlined_kernel
 def drop_tokens(count, hidden_below, share, clearest, token_view, token_sample, feature, rgb, cues):
     """Move the tokens that ``SRay.without_hidden`` and ``without_faint`` keep to the front; return how many they are.
 

@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+RENDER = """
+import hashlib
+from semantic_mapper.config import SamplingConfig
+from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
+from semantic_mapper.fields.render import render_image
+from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.training.views import stack_sources, view_from_frame
+from tests.small import tiny_frames
+
+frames = tiny_frames(4)
+field = StreamingSRay(load_checkpoint(default_checkpoint_path()).model, SamplingConfig(guided=4, least_weight=0.02))
+sources = field.encode(stack_sources([view_from_frame(frame, field.label_set, 96) for frame in frames[:3]]))
+asked = frames[3]
+seen = render_image(field, sources, asked.intrinsics, asked.T_world_camera, asked.depth_m, field.sampling, 0)
+for name in ("logits", "depth_m", "rgb", "opacity"):
+    value = getattr(seen, name).numpy()
+    print(name, value.std() > 0, hashlib.sha256(value.tobytes()).hexdigest())
+"""
+
+
+def test_kernels_compiled_anew_render_the_same_bits_as_those_on_disk(tmp_path: Path) -> None:
+    """A machine's first run, which compiles, and its second must not differ: maps and tests are compared to the bit."""
+    said: list[list[str]] = []
+    for run in range(2):
+        assert run == 0 or list(tmp_path.rglob("*.nbc"))
+        done = subprocess.run(
+            [sys.executable, "-c", RENDER],
+            capture_output=True,
+            text=True,
+            timeout=900,
+            env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
+        )
+        assert done.returncode == 0, done.stderr
+        said.append(done.stdout.splitlines()[-4:])  # after the log
+    assert [line.split()[1] for line in said[0]] == ["True"] * 4, said[0]
+    assert said[0] == said[1]
