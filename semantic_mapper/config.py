@@ -145,8 +145,8 @@ class HistoryConfig(Config, frozen=True):
     # Corrections reach the last so many frames, and at times up to an eighth more; older ones stay in the map where
     # they are. 0 = keep none.
     max_frames: NotNegative = 0
-    # In the folder for temporary files: frames leave earlier for it, an eighth of it at a time. What the map was before
-    # the kept frames takes room there, too: for each eighth of them, the blocks that changed (``mapping/map_journal``).
+    # In the folder for temporary files, for frames and for what the map was before each eighth of them (the blocks that
+    # changed, ``mapping/map_journal``, some three times as large): the oldest eighth leaves earlier for it.
     max_disk_mb: AtLeastOne = 4000
 
 

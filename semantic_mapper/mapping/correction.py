@@ -49,7 +49,7 @@ class CorrectionStatus:
     Args:
         running: A rebuild is under way; the map in use is still the old one.
         done, total: Frames of the history that the rebuild has gone through, and all.
-        disk_bytes: Of the history, without the journal of the map.
+        disk_bytes: Of the history's frames, and of the journal of the map.
         completed: Corrections that are in the map in use.
         poses: Given by these, all together.
         frozen: Frames that have left the history; corrections do not reach them.
@@ -124,6 +124,7 @@ class MapCorrector:
         self._why_none = "no frames are kept; set history.max_frames in the mapper's config"
         self._rebuild: _Rebuild | None = None
         self._journal = MapJournal(voxel_map, 0) if config.max_frames else None  # of each segment's beginning
+        self._journal_bytes = 0  # on disk, when last looked at
         self._frozen = FrozenFrames()
         self._lost = self._completed = self._poses = 0
         self._failure = ""
@@ -142,7 +143,7 @@ class MapCorrector:
             running=rebuild is not None,
             done=0 if rebuild is None else rebuild.next - rebuild.first,
             total=0 if history is None else len(history),
-            disk_bytes=0 if history is None else history.bytes,
+            disk_bytes=0 if history is None else history.bytes + self._journal_bytes,
             completed=self._completed,
             poses=self._poses,
             frozen=len(self._frozen),
@@ -179,10 +180,10 @@ class MapCorrector:
         if history is None:
             return
         self._write_journal()
-        if not history.is_full and (self._rebuild is not None or not self._segment_ends(history)):
+        if not self._is_full(history) and (self._rebuild is not None or not self._segment_ends(history)):
             return
         with self._lock:
-            if self._rebuild is not None and history.is_full:
+            if self._rebuild is not None and self._is_full(history):
                 with suppress(MapError):  # is logged, and it is not this step that has failed
                     self.advance(PORTION_WHEN_FULL)
             if self._rebuild is not None:
@@ -282,10 +283,14 @@ class MapCorrector:
         try:
             if self._journal is not None:
                 _write_some(self._journal)
+                self._journal_bytes = self._journal.disk_bytes
         except MapError as error:
             self._end_history(str(error))
         finally:
             self._lock.release()
+
+    def _is_full(self, history: FrameHistory) -> bool:
+        return history.is_full(self._journal_bytes)
 
     def _segment_ends(self, history: FrameHistory) -> bool:
         journal = self._journal
@@ -298,11 +303,12 @@ class MapCorrector:
             return
         if self._segment_ends(history):
             journal.mark(history.next_number)
-        while history.is_full and len(journal.numbers) > 1:
+        while self._is_full(history) and len(journal.numbers) > 1:
             if not len(self._frozen):
-                _log.info("history_is_full", frames=len(history), mb=round(history.bytes / 1e6))
+                _log.info("history_is_full", frames=len(history), mb=round(self.status.disk_bytes / 1e6))
             self._frozen.add(history.drop_before(journal.numbers[1]))
             journal.forget_oldest()
+            self._journal_bytes = journal.disk_bytes
 
     def _swap(self, rebuild: _Rebuild) -> None:
         assert self._history is not None
@@ -329,6 +335,7 @@ class MapCorrector:
         if journal is not None:
             journal.close()
         history, self._history = self._history, None
+        self._journal_bytes = 0
         self._why_none = f"the history has ended: {reason}"
         if history is not None:
             history.close()

@@ -85,7 +85,7 @@ class FrameHistory:
 
     Args:
         max_frames: Frames that are here at least.
-        max_bytes: Room on disk; the last frame may go beyond it.
+        max_bytes: Room on disk, with what others keep for these frames; the last frame may go beyond it.
 
     Raises:
         MapError: no file can be made in the system's folder for temporary files.
@@ -123,10 +123,9 @@ class FrameHistory:
         """On disk, all frames together."""
         return self._bytes
 
-    @property
-    def is_full(self) -> bool:
-        """Whether a segment has to leave before the next frame comes."""
-        return len(self._entries) >= self._max_frames + self._segment_frames or self._bytes >= self._max_bytes
+    def is_full(self, beside: int = 0) -> bool:
+        """Whether a segment has to leave before the next frame comes; ``beside`` bytes of others share the room."""
+        return len(self._entries) >= self._max_frames + self._segment_frames or self._bytes + beside >= self._max_bytes
 
     @property
     def next_number(self) -> int:

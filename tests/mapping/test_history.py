@@ -73,18 +73,18 @@ def test_sensor_units_take_less_room_than_floats():
 def test_frames_leave_oldest_first_and_their_bytes_go_when_others_come():
     history = FrameHistory(3, 10**9)
     for seq in range(3):
-        assert not history.is_full
+        assert not history.is_full()
         history.append(fused(seq))
-    assert not history.is_full, "3 are to be kept, so the first may leave once there are 4"
+    assert not history.is_full(), "3 are to be kept, so the first may leave once there are 4"
     history.append(fused(3, camera_id="other"))
-    assert history.is_full and [e.seq for e in history.entries()] == [0, 1, 2, 3]
+    assert history.is_full() and [e.seq for e in history.entries()] == [0, 1, 2, 3]
     size = history.bytes
     first = history.entries()[0]
     assert [e.number for e in history.drop_before(1)] == [0]
     assert [e.number for e in history.entries()] == [1, 2, 3] and history.bytes == size - first.bytes
     last = history.entry(3)
     assert history.entry(0) is None and last is not None and (last.camera_id, last.stamp_ns) == ("other", 1003)
-    assert not history.is_full and history.next_number == 4
+    assert not history.is_full() and history.next_number == 4
     history.append(fused(4))
     with pytest.raises(MapError, match="seq=0 of camera 'test' in the history is missing"):
         history.read(first, first.T_world_camera)
@@ -92,10 +92,17 @@ def test_frames_leave_oldest_first_and_their_bytes_go_when_others_come():
 
 def test_room_on_disk_is_a_bound_too():
     history = FrameHistory(1000, 300_000)
-    while not history.is_full:
+    while not history.is_full():
         history.append(fused(len(history)))
     each = history.entries()[0].bytes
     assert len(history) == -(-300_000 // each) > 1
+
+
+def test_room_on_disk_is_shared_with_what_is_kept_beside_the_frames():
+    history = FrameHistory(1000, 300_000)
+    history.append(fused(0))
+    left = 300_000 - history.bytes
+    assert not history.is_full(left - 1) and history.is_full(left)
 
 
 def test_a_segment_is_an_eighth_of_the_frames_or_of_the_bytes_whichever_comes_first():
@@ -114,7 +121,7 @@ def test_the_file_does_not_grow_however_many_frames_come_and_go():
     history = FrameHistory(8, 10**9)
     pages: list[int] = []
     for seq in range(60):
-        if history.is_full:
+        if history.is_full():
             assert len(history.drop_before(history.entries()[4].number)) == 4
         history.append(fused(seq))
         pages.append(history._database.execute("PRAGMA page_count").fetchone()[0])
