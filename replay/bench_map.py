@@ -20,7 +20,7 @@ from semantic_mapper.config import MapperConfig, Quality, VoxelMapConfig, with_q
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import ROOMS, make_label_set
-from semantic_mapper.mapping.block_grid import make_open3d_grid
+from semantic_mapper.mapping.grid_buffers import make_open3d_grid
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.scenes import TEST_SEEDS, CameraPathConfig, room_frames

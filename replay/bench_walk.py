@@ -17,7 +17,7 @@ from replay.session import load_pipeline
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.mapping.block_grid import advised_mb
+from semantic_mapper.mapping.grid_buffers import advised_mb
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.memory import give_back_freed_memory

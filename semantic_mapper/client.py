@@ -186,9 +186,9 @@ class MapClient:
                     self._mirrored, newest = info.map_id, -1
                     if h.map_id != info.map_id or h.since != 0:  # restarted between the two questions
                         continue
-                self._mirror.apply(BlockChanges(h.since, h.version, h.epoch, **cast(Any, arrays)))
+                self._mirror.apply(BlockChanges(h.since, h.version, h.newest, h.epoch, **cast(Any, arrays)))
                 newest = h.newest if newest < 0 else newest  # as of the first answer: the map may outrun us
-                if h.version >= newest:
+                if h.version >= newest and self._mirror.is_whole:
                     return self._mirror
 
     def correct_poses(self, poses: CorrectedPoses, *, until_ns: int | None = None, within_ns: int = 0) -> Correction:

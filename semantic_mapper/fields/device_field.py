@@ -22,7 +22,7 @@ class DeviceField:
     """Inference-only field on a device. Satisfies ``SemanticField`` and ``Sampled``.
 
     Weights and the features of keyframes stay on the device; rays are made there, and callers fetch what is rendered,
-    a chunk at a time.
+    a chunk at a time. Sums on a GPU come in no fixed order: its renders repeat but for the last digits.
 
     Args:
         model: Trained field; it is copied.
@@ -37,6 +37,7 @@ class DeviceField:
         self.model = copy.deepcopy(model).to(device).eval()
         self.device = device
         self.sampling = sampling
+        torch.backends.cudnn.allow_tf32 = False  # torch's default rounds convolutions to 10 bits, those of depths, too
         if bfloat16:
             parts = dict(self.model.named_children())
             compute_in_bfloat16(self.model, [name for name in BFLOAT16_PARTS if name in parts], device.type)

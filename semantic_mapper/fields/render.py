@@ -16,12 +16,16 @@ from semantic_mapper.geometry import pixel_grid, pixel_rays
 from semantic_mapper.types import CameraIntrinsics, FieldRender, Float32, Float64
 
 CPU_CHUNK = 2048  # rays rendered at once: what fits in a core's cache
-GPU_CHUNK = 32768  # enough to fill one
+GPU_CHUNK = 32768  # enough to fill one, as long as
+GPU_PAIRS = GPU_CHUNK * 16**2  # pairs of samples that attend to each other are no more: 1 GB of scores for 8 views
 
 
-def chunk_size(rays_per_chunk: int, device: torch.device) -> int:
+def chunk_size(rays_per_chunk: int, device: torch.device, sampling: SamplingConfig) -> int:
     """Rays to render at once; 0 = what suits the device."""
-    return rays_per_chunk or (CPU_CHUNK if device.type == "cpu" else GPU_CHUNK)
+    if rays_per_chunk or device.type == "cpu":
+        return rays_per_chunk or CPU_CHUNK
+    samples = sampling.guided if sampling.mode == "streaming" else sampling.coarse + sampling.fine
+    return max(1, min(GPU_CHUNK, GPU_PAIRS // samples**2))
 
 
 def render_image(
@@ -52,7 +56,7 @@ def render_image(
     prior = torch.from_numpy(np.ascontiguousarray(prior_depth_m)).to(device).flatten()
     pose = torch.tensor(T_world_camera, device=device, dtype=torch.float32)
     parts: list[FieldRender] = []
-    rays_per_chunk = chunk_size(rays_per_chunk, device)
+    rays_per_chunk = chunk_size(rays_per_chunk, device, sampling)
     with torch.inference_mode():
         for start in range(0, len(pixels), rays_per_chunk):
             rays = pixel_rays(

@@ -52,7 +52,7 @@ def render_sparse_view(
     probabilities = np.zeros((height, width, len(field.label_set)), np.float32)
     known, depth_m = np.zeros((height, width), np.bool_), np.zeros((height, width), np.float32)
     pose = torch.tensor(T_world_camera, device=sources.feature.device, dtype=torch.float32)
-    rays_per_chunk = chunk_size(rays_per_chunk, pose.device)
+    rays_per_chunk = chunk_size(rays_per_chunk, pose.device, sampling)
 
     def trace(rows: NDArray[np.int64], columns: NDArray[np.int64]) -> None:
         for start in range(0, len(rows), rays_per_chunk):

@@ -13,8 +13,8 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import FrameError
-from semantic_mapper.mapping.block_grid import BLOCK_SIDE
 from semantic_mapper.mapping.block_index import KEY_LIMIT, first_slot, pack_key, pack_keys, pack_step
+from semantic_mapper.mapping.grid_buffers import BLOCK_SIDE
 from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 

@@ -9,7 +9,6 @@ A block holds 8 x 8 x 8 voxels in the order [z][y][x]; voxel (i, j, k) of block 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -29,17 +28,15 @@ from semantic_mapper.mapping.block_index import (
 )
 from semantic_mapper.mapping.block_store import BLOCK_VOXELS, BlockStore, BlockValues, PackedBlocks, pack_blocks
 from semantic_mapper.mapping.evidence import EVIDENCE_DTYPES
-from semantic_mapper.mapping.grid_buffers import ATTRIBUTES, GridBuffers, view_buffers
+from semantic_mapper.mapping.grid_buffers import ATTRIBUTES, GridBuffers, advised_mb, make_open3d_grid, view_buffers
 from semantic_mapper.mapping.open3d_loader import load_open3d
 
-BLOCK_SIDE = 8
 LEAST_RESIDENT = 256  # blocks that memory has room for, whatever the limit
 EVICTED_AT_ONCE = 32  # at least, and
 EVICTED_SHARE = 32  # at least this part of what memory has room for: sorting out what to evict looks at all of it
-SPARE_SHARE = 1.5  # of what one frame touches, where memory is to have room for it without pushing the last one out
 TILE_BLOCKS = 4096  # blocks brought together at a time to be read where some are on disk
 NEIGHBOURS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
-_READ_AT_ONCE = 512  # blocks on disk, whose evidence takes much room
+_READ_AT_ONCE = 256  # blocks between memory and disk: a copy of them takes room beside both
 
 _log = structlog.get_logger(__name__)
 
@@ -85,7 +82,7 @@ class BlockGrid:
         self._clock = 0
         self._used = np.zeros(self.capacity, np.int64)  # by buffer index: when last asked for
         self._version = np.zeros(self.capacity, np.int64)  # by buffer index: see ``mark_changed``
-        # Called with the packed keys that ``activate`` was asked for, before anything is done about them.
+        # Called with the packed keys that ``activate`` was asked for, before anything is done with them.
         self.watchers: list[Callable[[NDArray[np.int64]], None]] = []
 
     @property
@@ -145,7 +142,7 @@ class BlockGrid:
         return keys[order], indices[order]
 
     def activate(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Make sure that the blocks of unique packed keys (B,) exist in memory; return buffer indices (B,).
+        """Make sure that the blocks of unique packed keys (B,), about to change, are in memory; return indices (B,).
 
         New ones are zero; those on disk come back as they were.
 
@@ -153,9 +150,12 @@ class BlockGrid:
             MapError: where the map would exceed ``max_blocks``, or these blocks alone the memory (``portions`` takes
                 any number of them), or the disk fails; no block has changed then.
         """
-        self._clock += 1
         for watcher in self.watchers:
             watcher(packed)
+        return self._bring_together(packed)
+
+    def _bring_together(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
+        self._clock += 1
         found = find_blocks(self._index, packed)
         missing = packed[found < 0]
         if len(missing):
@@ -190,18 +190,23 @@ class BlockGrid:
             self._grow(blocks)
 
     def page_in(self, packed: NDArray[np.int64]) -> None:
-        """Make sure that the first of these existing blocks (B,) are in memory: as many as it has room for."""
-        self.activate(packed[: self._max_resident])
+        """Make sure that the first of these existing blocks (B,) are in memory to be read: as many as have room."""
+        self._bring_together(packed[: self._max_resident])
 
     def mark_changed(self, blocks: NDArray[np.int32], version: int) -> None:
         """Note that blocks with these buffer indices were changed at ``version`` of the map."""
         self._version[blocks] = version
 
-    def mark_all_changed(self, version: int) -> None:
-        """Note that every block, in memory and on disk, was changed at ``version`` of the map."""
-        self._version[:] = version
+    def mark_all_changed(self, version: int, each: int) -> int:
+        """Note that all blocks were changed, ``each`` of them at a version, from ``version`` on; returns the last."""
+        _, indices = self.sorted_blocks()
+        count = self.block_count
+        versions = version + np.arange(count) // each
+        self._version[indices] = versions[: len(indices)]
         if self._store is not None:
-            self._store.versions.set_all(version)
+            stored = self._store.versions
+            stored.put(stored.items()[0], versions[len(indices) :])
+        return version + max(count - 1, 0) // each
 
     def changed_since(self, version: int) -> NDArray[np.int32]:
         """Keys (B, 3) of all blocks that were changed after ``version``, in lexicographic order."""
@@ -326,13 +331,17 @@ class BlockGrid:
         if stored is None or not len(back):
             self._add(missing)
             return
-        values, versions = stored.get(back), stored.versions.find(back)
-        stored.drop(back)  # may fail, and then the block is there still; what comes now does not
-        self._add(missing)
-        indices, buffers = find_blocks(self._index, back), self.buffers()
-        for name in ATTRIBUTES:
-            getattr(buffers, name)[indices] = getattr(values, name)
-        self._version[indices] = versions
+        new = missing[~stored.holds(missing)]
+        for start in range(0, len(back), _READ_AT_ONCE):
+            part = back[start : start + _READ_AT_ONCE]
+            values, versions = stored.get(part), stored.versions.find(part)
+            stored.drop(part)  # may fail, and then the blocks are there still; what comes now does not
+            self._add(part)
+            indices, buffers = find_blocks(self._index, part), self.buffers()
+            for name in ATTRIBUTES:
+                getattr(buffers, name)[indices] = getattr(values, name)
+            self._version[indices] = versions
+        self._add(new)
 
     def _evict(self, count: int, keep: NDArray[np.int64]) -> None:
         """Put the ``count`` blocks that were used longest ago, and some more, on disk; those of ``keep`` stay."""
@@ -345,10 +354,16 @@ class BlockGrid:
         oldest = np.flatnonzero(free)[np.argsort(self._used[indices[free]], kind="stable")]
         count = max(count, EVICTED_AT_ONCE, self._max_resident // EVICTED_SHARE)
         going = np.sort(oldest[:count])
-        gone = packed[going]
-        self._store.put(gone, self._version[indices[going]], self.read(gone))
-        self._map.erase(self._o3d.core.Tensor.from_numpy(np.ascontiguousarray(keys[going])))
-        self._index = make_block_index(*self.sorted_blocks())
+        buffers = self.buffers()
+        values = BlockValues(*(getattr(buffers, name) for name in ATTRIBUTES))
+        try:
+            for start in range(0, len(going), _READ_AT_ONCE):
+                part = going[start : start + _READ_AT_ONCE]
+                blobs = pack_blocks(values, indices[part]).blobs()
+                self._store.put_packed(packed[part], self._version[indices[part]], blobs)
+                self._map.erase(self._o3d.core.Tensor.from_numpy(np.ascontiguousarray(keys[part])))
+        finally:  # also where the disk is full: blocks that are there have left memory
+            self._index = make_block_index(*self.sorted_blocks())
 
     def _grow(self, needed: int) -> None:
         capacity = min(max(needed, self.capacity + self.capacity // 2), self._max_resident)
@@ -374,18 +389,3 @@ class BlockGrid:
         for view in self.buffers()[1:]:  # Open3D hands out memory as its last user left it
             view[added] = 0
         self._version[added] = 0
-
-
-def advised_mb(blocks: int, block_bytes: int) -> int:
-    """The ``voxel_map.memory_mb`` that so many blocks of one frame, and some of the frames before, fit in."""
-    return math.ceil(SPARE_SHARE * blocks * block_bytes / 1e6)
-
-
-def make_open3d_grid(voxel_size_m: float, channels: tuple[int, ...], capacity: int, evidence: str = "float32") -> Any:
-    """An empty VoxelBlockGrid on the CPU with attributes named as in ``ATTRIBUTES``, float32 but for the evidence."""
-    o3d = load_open3d()
-    names = ATTRIBUTES[: len(channels)]
-    dtypes = tuple(getattr(o3d.core, evidence) if name == "evidence" else o3d.core.float32 for name in names)
-    shapes = tuple((c,) for c in channels)
-    device = o3d.core.Device("CPU:0")
-    return o3d.t.geometry.VoxelBlockGrid(names, dtypes, shapes, voxel_size_m, BLOCK_SIDE, capacity, device)

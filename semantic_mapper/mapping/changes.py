@@ -35,7 +35,8 @@ class BlockChanges:
     Args:
         since: Who has all up to this version
         version: has, with these blocks, all up to this one.
-        epoch: Of the map. Where it is another than before, these are all of its blocks, and older ones are gone.
+        newest: Version of the map: where it is ``version``, nothing is missing.
+        epoch: Of the map. Where it is another than before, blocks of before are gone: those of the new epoch come all.
         keys: (B, 3) int32 block coordinates in lexicographic order.
         tsdf: (B, 512) int8 signed distance over truncation, times 127; -128 where not observed.
         label: (B, 512) uint8 class ids, the ignore id where nothing voted or nothing was observed.
@@ -45,6 +46,7 @@ class BlockChanges:
 
     since: int
     version: int
+    newest: int
     epoch: int
     keys: NDArray[np.int32]
     tsdf: NDArray[np.int8]
@@ -63,7 +65,7 @@ class ChosenBlocks(NamedTuple):
 
     Args:
         packed: (B,) sorted keys of existing blocks.
-        since, version, epoch: Of the result.
+        since, version, newest, epoch: Of the result.
         label_set: For the ids.
         vote_discount: rho, see ``readout``.
         min_weight: Voxels with fewer measurements count as not observed; > 0.
@@ -72,6 +74,7 @@ class ChosenBlocks(NamedTuple):
     packed: NDArray[np.int64]
     since: int
     version: int
+    newest: int
     epoch: int
     label_set: LabelSet
     vote_discount: float
@@ -143,7 +146,7 @@ def choose_blocks(
         )
     packed, changed_at = grid.versions_since(since)
     rows, version = oldest_first(changed_at, limit, newest)
-    return ChosenBlocks(packed[rows], since, version, epoch, *decision)
+    return ChosenBlocks(packed[rows], since, version, newest, epoch, *decision)
 
 
 def read_changes(grid: BlockGrid, chosen: ChosenBlocks) -> BlockChanges:
@@ -165,6 +168,7 @@ def _room_for(chosen: ChosenBlocks) -> BlockChanges:
     return BlockChanges(
         chosen.since,
         chosen.version,
+        chosen.newest,
         chosen.epoch,
         unpack_keys(chosen.packed),
         np.empty(flat, np.int8),

@@ -25,7 +25,7 @@ import structlog
 from numpy.typing import NDArray
 
 from semantic_mapper.config import HistoryConfig
-from semantic_mapper.errors import MapError
+from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.mapping.given_poses import FrozenFrames, pair_poses
 from semantic_mapper.mapping.history import FrameEntry, FrameHistory, FusedFrame
 from semantic_mapper.mapping.keyframes import KeyframeStore
@@ -224,8 +224,8 @@ class MapCorrector:
         May be called from any thread, but not from within a step. Waits for a step that is under way before a swap.
 
         Raises:
-            MapError: the corrected map cannot be built (too large, say); the correction is given up, the map in use
-                stays as it is.
+            MapError: the corrected map cannot be built (too large, or a frame out of reach of any voxel, say); the
+                correction is given up, the map in use stays as it is.
         """
         for _ in range(max_frames):
             with self._lock:  # let go after every frame: a step may wait for it
@@ -238,11 +238,11 @@ class MapCorrector:
                         while self._fuse_next(self._rebuild):  # the step that was under way
                             pass
                         self._swap(self._rebuild)
-                except MapError as error:
+                except SemanticMapperError as error:  # a frame's too: at its new pose it may be out of reach, say
                     self._rebuild.give_up()
                     self._rebuild, self._failure = None, str(error)
                     _log.error("correction_fails", reason=self._failure)
-                    raise
+                    raise MapError(f"the correction is given up, the map stays as it is: {error}") from error
         return self._rebuild is not None
 
     def _fuse_next(self, rebuild: _Rebuild) -> bool:

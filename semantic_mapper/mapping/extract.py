@@ -9,9 +9,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid, make_open3d_grid
+from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.block_index import BlockIndex, find_block, find_blocks, pack_key, pack_keys, unpack_keys
-from semantic_mapper.mapping.grid_buffers import GridBuffers
+from semantic_mapper.mapping.grid_buffers import BLOCK_SIDE, GridBuffers, make_open3d_grid
 from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.threads import parallel_kernel

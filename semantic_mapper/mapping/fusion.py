@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.mapping.allocation import Camera
-from semantic_mapper.mapping.block_grid import BLOCK_SIDE
 from semantic_mapper.mapping.block_store import BLOCK_VOXELS
 from semantic_mapper.mapping.evidence import PROBABILITY_FLOOR, add_vote, dither_seed
+from semantic_mapper.mapping.grid_buffers import BLOCK_SIDE
 from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import Float32
 

@@ -1,15 +1,19 @@
-"""The memory of Open3D's block hash map as numpy arrays, without a copy."""
+"""The memory of Open3D's block hash map: made, measured, and as numpy arrays without a copy."""
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.mapping.block_store import BLOCK_VOXELS
+from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.types import Float32
 
+BLOCK_SIDE = 8
+SPARE_SHARE = 1.5  # of what one frame touches, where memory is to have room for it without pushing the last one out
 ATTRIBUTES = ("tsdf", "weight", "color", "evidence", "votes")
 
 
@@ -45,3 +49,18 @@ def view_buffers(hash_map: Any) -> GridBuffers:
         evidence=evidence.reshape(n, BLOCK_VOXELS, -1),
         votes=votes.reshape(n, BLOCK_VOXELS),
     )
+
+
+def advised_mb(blocks: int, block_bytes: int) -> int:
+    """The ``voxel_map.memory_mb`` that so many blocks of one frame, and some of the frames before, fit in."""
+    return math.ceil(SPARE_SHARE * blocks * block_bytes / 1e6)
+
+
+def make_open3d_grid(voxel_size_m: float, channels: tuple[int, ...], capacity: int, evidence: str = "float32") -> Any:
+    """An empty VoxelBlockGrid on the CPU with attributes named as in ``ATTRIBUTES``, float32 but for the evidence."""
+    o3d = load_open3d()
+    names = ATTRIBUTES[: len(channels)]
+    dtypes = tuple(getattr(o3d.core, evidence) if name == "evidence" else o3d.core.float32 for name in names)
+    shapes = tuple((c,) for c in channels)
+    device = o3d.core.Device("CPU:0")
+    return o3d.t.geometry.VoxelBlockGrid(names, dtypes, shapes, voxel_size_m, BLOCK_SIDE, capacity, device)

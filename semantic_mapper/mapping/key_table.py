@@ -39,10 +39,6 @@ class KeyTable:
             _put(self._keys, self._versions, *held)
         self._count += _put(self._keys, self._versions, keys, versions)
 
-    def set_all(self, version: int) -> None:
-        """Give every key this version."""
-        self._versions[self._keys != ABSENT] = version
-
     def remove(self, keys: NDArray[np.int64]) -> None:
         """Forget keys (B,); those that are not there do no harm."""
         self._count -= _remove(self._keys, self._versions, keys)

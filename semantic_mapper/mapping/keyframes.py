@@ -80,7 +80,8 @@ class KeyframeStore:
         for i, keyframe in enumerate(self._keyframes):
             pose = poses.get((keyframe.camera_id, keyframe.stamp_ns))
             if pose is not None and not np.array_equal(pose, keyframe.T_world_camera):
-                T_camera_world = invert_pose_torch(torch.tensor(pose, dtype=torch.float32)[None])
+                like = keyframe.encoded.T_camera_world
+                T_camera_world = invert_pose_torch(torch.tensor(pose, dtype=like.dtype, device=like.device)[None])
                 encoded = replace(keyframe.encoded, T_camera_world=T_camera_world)
                 self._keyframes[i] = replace(keyframe, T_world_camera=pose, encoded=encoded)
                 moved += 1

@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.mapping.block_grid import BLOCK_SIDE
 from semantic_mapper.mapping.block_index import KEY_LIMIT, pack_keys
 from semantic_mapper.mapping.block_store import BLOCK_VOXELS, BlockValues
+from semantic_mapper.mapping.grid_buffers import BLOCK_SIDE
 from semantic_mapper.mapping.map_manifest import (
     MEND,
     MapChunk,

@@ -52,12 +52,14 @@ class _Moment:
 
     def write(self, count: int) -> int:
         """Put so many blocks on disk, or as many as there are; returns how many."""
-        part, self.aside = self.aside[:count], self.aside[count:]
-        for start in range(0, len(part), _WRITTEN_AT_ONCE):
-            some = part[start : start + _WRITTEN_AT_ONCE]
+        count = written = min(count, len(self.aside))
+        while written:
+            some = self.aside[: min(written, _WRITTEN_AT_ONCE)]
             keys = np.array([key for key, _ in some], np.int64)
             self.store.put_packed(keys, np.full(len(some), self.frames), [voxels for _, voxels in some])
-        return len(part)
+            del self.aside[: len(some)]  # only now: a full disk loses none
+            written -= len(some)
+        return count
 
     def _slots(self, packed: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Where these blocks (B,) are, or would be, among the keys, and whether they are."""

@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import MapError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
+from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.block_index import find_block, pack_key, pack_keys, unpack_keys
 from semantic_mapper.mapping.block_store import BLOCK_VOXELS, BlockValues
 from semantic_mapper.mapping.evidence import evidence_scale, stored_evidence
 from semantic_mapper.mapping.extract import LARGEST_STEP
+from semantic_mapper.mapping.grid_buffers import BLOCK_SIDE
 from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import Float64
 

@@ -8,8 +8,9 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BLOCK_VOXELS
+from semantic_mapper.mapping.block_grid import BLOCK_VOXELS
 from semantic_mapper.mapping.block_index import pack_keys
+from semantic_mapper.mapping.grid_buffers import BLOCK_SIDE
 from semantic_mapper.mapping.readout import decide
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.threads import parallel_kernel

@@ -16,7 +16,7 @@ from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.allocation import blocks_in_band, make_camera
-from semantic_mapper.mapping.block_grid import BLOCK_SIDE, BlockGrid
+from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys
 from semantic_mapper.mapping.changes import (
     BlockChanges,
@@ -29,6 +29,7 @@ from semantic_mapper.mapping.changes import (
 from semantic_mapper.mapping.extract import join_meshes, surface_voxels, triangle_mesh
 from semantic_mapper.mapping.frame_votes import check_depth, frame_votes, probability_table, trusted_depth
 from semantic_mapper.mapping.fusion import fuse_blocks, make_limits
+from semantic_mapper.mapping.grid_buffers import BLOCK_SIDE
 from semantic_mapper.mapping.map_file import open_map
 from semantic_mapper.mapping.map_manifest import MapManifest
 from semantic_mapper.mapping.map_saving import MapSaving
@@ -43,6 +44,7 @@ from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 _KERNEL_LOCK = threading.RLock()
 
 BoolImage = NDArray[np.bool_]
+BLOCKS_A_VERSION = 256  # of a map that takes over another one
 POINT_FIELDS = ("xyz", "rgb", "label", "confidence")
 
 
@@ -105,7 +107,7 @@ class VoxelMap:
     def changed_since(self, version: int) -> NDArray[np.int32]:
         """Coordinates (B, 3) of the blocks changed after ``version``, in lexicographic order.
 
-        After a new ``epoch`` these are all blocks of the map; whoever mirrors it drops what it had before.
+        After a new ``epoch`` these are all blocks of the map, and those of before are gone.
         """
         with _KERNEL_LOCK:
             return self._grid.changed_since(version)
@@ -209,7 +211,8 @@ class VoxelMap:
     def take_over(self, other: VoxelMap) -> None:
         """Become ``other``, all at once for whoever reads from another thread; ``other`` must not be used any more.
 
-        Every block counts as changed, and ``epoch`` goes up: blocks that ``other`` does not have are gone.
+        Every block counts as changed, and ``epoch`` goes up: blocks that ``other`` does not have are gone. For
+        ``changes`` with a limit, ``version`` grows by one for each ``BLOCKS_A_VERSION`` of them.
 
         Raises:
             MapError: the other map has another config or other classes.
@@ -219,9 +222,8 @@ class VoxelMap:
         with _KERNEL_LOCK:
             self._grid = other._grid
             self.frames, self.last_stamp_ns = other.frames, other.last_stamp_ns
-            self.version += 1
+            self.version = self._grid.mark_all_changed(self.version + 1, BLOCKS_A_VERSION)
             self.epoch += 1
-            self._grid.mark_all_changed(self.version)
 
     def points(self, min_weight: float = 1.0) -> MapPoints:
         """Points of the surface, at most three a voxel, in a fixed order.

@@ -44,6 +44,7 @@ class MapMirror:
         self._snapshot = MapSnapshot(
             0, 0, voxel_size_m, truncation_voxels, label_set, none, slots, none, index, _new_pool(LEAST_SPARE)
         )
+        self._next = self._snapshot  # ahead of it while a new epoch of the map is not complete
         self._used = 0
         self._lock = threading.Lock()
 
@@ -56,15 +57,22 @@ class MapMirror:
 
     @property
     def version(self) -> int:
-        """The mirror is complete up to here; what to ask the map's next ``changes`` with."""
-        return self._snapshot.version
+        """What to ask the map's next ``changes`` with."""
+        return self._next.version
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the snapshot has all that was applied: not while blocks of a new epoch of the map are missing."""
+        return self._next is self._snapshot
 
     def snapshot(self) -> MapSnapshot:
         """The present state; stays as it is whatever is applied later."""
         return self._snapshot
 
     def apply(self, changes: BlockChanges) -> MapSnapshot:
-        """Take over changes and return the new state.
+        """Take over changes and return the present state.
+
+        After a new epoch, that is the last one of the old epoch until changes have come up to the map's newest version.
 
         Raises:
             MapError: changes are missing between the mirror's version and these, these are older than the mirror, or
@@ -74,7 +82,7 @@ class MapMirror:
         """
         packed = _check(changes, self._snapshot.label_set)
         with self._lock:
-            old = self._snapshot
+            old = self._next
             if not changes.since <= old.version <= changes.version:
                 raise MapError(
                     f"changes from version {changes.since} to {changes.version} do not continue a mirror at version "
@@ -91,7 +99,7 @@ class MapMirror:
             order = np.argsort(merged)
             merged, slots, serials = merged[order], slots[order], serials[order]
             index = make_block_index(unpack_keys(merged), slots)
-            self._snapshot = dataclasses.replace(
+            self._next = dataclasses.replace(
                 old,
                 version=changes.version,
                 epoch=changes.epoch,
@@ -101,6 +109,8 @@ class MapMirror:
                 index=index,
                 voxels=pool,
             )
+            if changes.epoch == self._snapshot.epoch or changes.version >= changes.newest:
+                self._snapshot = self._next
             return self._snapshot
 
     def _make_room(self, old: MapSnapshot, kept: NDArray[np.int32], more: int) -> tuple[BlockVoxels, NDArray[np.int32]]:

@@ -32,8 +32,12 @@ class MirrorRelay:
         """See ``MapMirror.apply``."""
         old, old_versions = self._state
         snapshot = self._mirror.apply(changes)
-        versions = np.full(snapshot.block_count, snapshot.version, np.int64)
-        if changes.epoch == old.epoch:
+        if snapshot is old:  # a new epoch is not complete yet
+            return snapshot
+        count = snapshot.block_count
+        # Of a new epoch as many versions as there are, so that ``limit`` finds some to stop at.
+        versions = old.version + 1 + np.arange(count) * (snapshot.version - old.version) // max(count, 1)
+        if snapshot.epoch == old.epoch:
             versions[np.searchsorted(snapshot.packed, old.packed)] = old_versions
             versions[np.searchsorted(snapshot.packed, pack_keys(changes.keys))] = snapshot.version
         self._state = snapshot, versions
@@ -58,6 +62,7 @@ class MirrorRelay:
         return BlockChanges(
             since,
             version,
+            snapshot.version,
             snapshot.epoch,
             snapshot.keys[rows],
             voxels.tsdf[slots],

@@ -20,7 +20,7 @@ def warm_up() -> None:
     tsdf = np.full((1, 512), UNOBSERVED, np.int8)
     tsdf[0, :256], tsdf[0, 256:320] = -30, 30  # a level surface between its fourth and fifth layer
     flat = np.ones((1, 512), np.uint8)
-    changes = BlockChanges(0, 1, 0, np.zeros((1, 3), np.int32), tsdf, flat, flat, np.zeros((1, 512, 3), np.uint8))
+    changes = BlockChanges(0, 1, 1, 0, np.zeros((1, 3), np.int32), tsdf, flat, flat, np.zeros((1, 512, 3), np.uint8))
     snapshot = MapMirror(0.1, 4.0, make_label_set("warm-up", ("thing",))).apply(changes)
     points, down = np.array([[0.1, 0.1, 0.3], [0.2, 0.2, 0.6]]), np.array([[0.0, 0.0, -1.0]] * 2)
     at(snapshot, points)

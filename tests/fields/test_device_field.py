@@ -7,7 +7,7 @@ from semantic_mapper.config import MapperConfig, SamplingConfig, convert_config
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
 from semantic_mapper.fields.device_field import DeviceField
-from semantic_mapper.fields.render import render_view
+from semantic_mapper.fields.render import chunk_size, render_view
 from semantic_mapper.fields.sparse_render import render_sparse_view
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.training.views import stack_sources, view_from_frame
@@ -79,3 +79,13 @@ def test_settings_of_a_gpu_where_there_is_none():
             make_field(tiny_field(), config)
     with pytest.raises(ConfigError, match="bfloat16 is for device"):
         convert_config({"render": {"bfloat16": True}}, MapperConfig, "test")
+
+
+def test_a_chunk_is_bounded_by_the_pairs_of_samples_that_attend_to_each_other():
+    gpu, cpu = torch.device("cuda"), torch.device("cpu")
+    assert chunk_size(0, gpu, SamplingConfig(guided=8)) == 32768
+    for sampling in (SamplingConfig(guided=32), SamplingConfig(mode="reference", coarse=64, fine=64)):
+        samples = 32 if sampling.mode == "streaming" else 128
+        size = chunk_size(0, gpu, sampling)
+        assert 2**30 / 2 < size * 8 * 4 * samples**2 * 4 <= 2**30 * 1.01  # bytes of the scores of 8 views and 4 heads
+        assert chunk_size(0, cpu, sampling) == 2048 and chunk_size(77, gpu, sampling) == 77

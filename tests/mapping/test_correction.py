@@ -18,7 +18,7 @@ from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.pose_correction import ALWAYS
-from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.mapping.voxel_map import BLOCKS_A_VERSION, VoxelMap
 from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 from tests.mapping.test_history import damage
@@ -67,6 +67,10 @@ def drifted(frames: tuple[PosedFrame, ...]) -> list[PosedFrame]:
 def true_poses(frames: tuple[PosedFrame, ...], stride: int) -> dict[int, Float64]:
     chosen = {*range(0, len(frames), stride), len(frames) - 1}
     return {frames[i].stamp_ns: frames[i].T_world_camera for i in sorted(chosen)}
+
+
+def bits(voxel_map: VoxelMap) -> dict[str, bytes]:
+    return {name: values.tobytes() for name, values in voxel_map.block_state().items()}
 
 
 def same(a: VoxelMap, b: VoxelMap) -> bool:
@@ -264,6 +268,37 @@ def test_mirrors_see_every_block_as_changed_and_a_new_epoch_after_a_swap():
     assert len(voxel_map.changed_since(version + 1)) == update.blocks_touched and voxel_map.version == version + 2
 
 
+def test_a_pose_out_of_reach_of_any_voxel_is_given_up_and_mapping_goes_on():
+    frames = tiny_frames(8)
+    pipeline = mapped(frames[:6], max_frames=20)
+    before = bits(pipeline.voxel_map)
+    far = frames[3].T_world_camera.copy()
+    far[0, 3] = 1e7
+    assert pipeline.correct_poses({frames[3].stamp_ns: far}).running
+    with pytest.raises(MapError, match="given up, the map stays as it is"):
+        finish(pipeline)
+    status = pipeline.corrector.status
+    assert not status.running and "beyond" in status.failure and bits(pipeline.voxel_map) == before
+    assert pipeline.step(frames[6]).fused
+    pipeline.correct_poses({frames[3].stamp_ns: drift(0.5) @ frames[3].T_world_camera})
+    finish(pipeline)
+    assert pipeline.corrector.status.completed == 1 and pipeline.corrector.status.failure == ""
+
+
+def test_a_new_epoch_is_told_in_parts_too():
+    frames = tiny_frames()
+    pipeline = mapped(drifted(frames), voxel_map={"voxel_size_m": 0.01, "initial_blocks": 200})
+    pipeline.correct_poses(true_poses(frames, 1))
+    finish(pipeline)
+    voxel_map, since, told = pipeline.voxel_map, 6, 0
+    assert voxel_map.block_count > 1000
+    while since < voxel_map.version:
+        changes = voxel_map.changes(since, limit=300)
+        assert 0 < len(changes.keys) <= 300 and changes.epoch == 1 and changes.newest == voxel_map.version
+        since, told = changes.version, told + len(changes.keys)
+    assert told == voxel_map.block_count
+
+
 def test_blocks_on_disk_count_as_changed_too():
     frames = tiny_frames()
     settings = {"voxel_size_m": 0.01, "initial_blocks": 200, "depth_max_m": 2.0, "memory_mb": 110}
@@ -272,7 +307,10 @@ def test_blocks_on_disk_count_as_changed_too():
     finish(pipeline)
     voxel_map = pipeline.voxel_map
     assert voxel_map.stored_blocks > 0
-    assert len(voxel_map.changed_since(6)) == voxel_map.block_count and len(voxel_map.changed_since(7)) == 0
+    assert len(voxel_map.changed_since(6)) == voxel_map.block_count > BLOCKS_A_VERSION
+    assert voxel_map.version == 6 + -(-voxel_map.block_count // BLOCKS_A_VERSION)
+    assert len(voxel_map.changed_since(7)) == voxel_map.block_count - BLOCKS_A_VERSION
+    assert len(voxel_map.changed_since(voxel_map.version)) == 0
 
 
 def test_a_damaged_frame_is_left_out_counted_and_logged():

@@ -13,8 +13,8 @@ from semantic_mapper.mapping.block_store import BlockStore
 from semantic_mapper.mapping.map_journal import MapJournal
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.test_correction import drift, drifted, finish, make_pipeline, mapped, same
-from tests.mapping.test_paging import MEMORY_MB, walk
-from tests.mapping.views import LABELS, small_map
+from tests.mapping.test_paging import MEMORY_MB, STEP_M, along_the_wall, walk
+from tests.mapping.views import INTRINSICS, LABELS, small_map
 from tests.small import tiny_frames
 
 
@@ -102,6 +102,33 @@ def test_a_disk_that_fails_is_told_to_the_journal_and_not_to_the_frame(monkeypat
         journal.go_on(1)
     journal.close()
     assert not voxel_map._grid.watchers and voxel_map.frames == 4
+
+
+def test_a_disk_that_is_full_for_a_while_takes_nothing_from_the_journal() -> None:
+    voxel_map = small_map(voxel_size_m=0.01)
+    walk(voxel_map, 3)
+    journal, before = MapJournal(voxel_map, 0), state(voxel_map)
+    walk(voxel_map, 3)
+    database, waiting = journal._moments[0].store._database, journal.waiting
+    (pages,) = database.execute("PRAGMA page_count").fetchone()
+    database.execute(f"PRAGMA max_page_count = {pages + 1}")
+    with pytest.raises(MapError, match="disk is full"):
+        restored(journal, voxel_map)
+    assert journal.waiting == waiting > 300
+    database.execute("PRAGMA max_page_count = 1000000")
+    assert state(restored(journal, voxel_map)) == before
+
+
+def test_looking_at_a_map_on_disk_is_no_change_of_it() -> None:
+    voxel_map = small_map(voxel_size_m=0.01, memory_mb=MEMORY_MB)
+    walk(voxel_map, 8)
+    journal = MapJournal(voxel_map, 0)
+    stored = set(map(tuple, voxel_map._grid.stored_keys().tolist()))
+    for n in range(2):
+        assert (voxel_map.ray_cast(along_the_wall(n * STEP_M), INTRINSICS).depth_m > 0).any()
+    assert stored - set(map(tuple, voxel_map._grid.stored_keys().tolist()))  # came back to be looked at
+    journal.go_on()
+    assert len(journal._moments[0].store) == 0
 
 
 def test_a_step_puts_a_bounded_part_on_disk(monkeypatch: pytest.MonkeyPatch) -> None:

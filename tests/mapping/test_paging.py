@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -237,6 +238,24 @@ def test_a_block_that_cannot_be_taken_off_the_disk_is_in_the_map_once(monkeypatc
     for voxel_map in (free, paged):
         walk(voxel_map, 1)
     assert same(free.block_state(), paged.block_state())
+
+
+def test_going_to_disk_and_back_takes_a_bounded_part_of_memory_beside_the_voxels() -> None:
+    grid = BlockGrid(0.02, 20, 64, 10**6, memory_bytes=200_000_000)
+    along_x = np.zeros((2 * grid.room, 3), np.int32)
+    along_x[:, 0] = np.arange(len(along_x))
+
+    def touch_all() -> None:
+        for blocks in grid.portions(pack_keys(along_x)):
+            for values in grid.buffers()[1:]:
+                values[blocks] = 1
+
+    touch_all()
+    tracemalloc.start()
+    touch_all()
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert grid.stored_count > 1000 and peak < 0.4 * grid.memory_bytes
 
 
 def failing_drop(store: BlockStore, keys: object) -> None:

@@ -111,5 +111,5 @@ def painted(plan: UInt8, since: int, version: int) -> BlockChanges:
     label_rows = cut(label)
     confidence = np.where(label_rows > 0, 204, 0).astype(np.uint8)  # 0.8
     return BlockChanges(
-        since, version, 0, keys, cut(tsdf), label_rows, confidence, np.zeros((len(keys), 512, 3), np.uint8)
+        since, version, version, 0, keys, cut(tsdf), label_rows, confidence, np.zeros((len(keys), 512, 3), np.uint8)
     )

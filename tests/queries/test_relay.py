@@ -49,10 +49,16 @@ def test_after_a_new_epoch_nothing_of_the_old_one_is_left() -> None:
     relay.apply(voxel_map.changes(0))
     follow(early, relay, 0)
     voxel_map.take_over(corrected)
-    relay.apply(voxel_map.changes(relay.snapshot().version))
     integrate(voxel_map, poses(1)[0], 9)
+    first = voxel_map.changes(relay.snapshot().version, limit=10)
+    assert relay.apply(first).epoch == relay.changes(0).epoch == 0 and first.version < voxel_map.version
+    relay.apply(voxel_map.changes(first.version))
+    assert relay.snapshot().epoch == 1
+    most = max(len(relay.changes(v, 10).keys) for v in range(4, relay.snapshot().version))
+    assert most < relay.snapshot().block_count / 2 and follow(early, relay, 10) > 2
+    integrate(voxel_map, poses(2)[1], 10)
     relay.apply(voxel_map.changes(relay.snapshot().version))
-    assert follow(early, relay, 10) == 2
+    assert follow(early, relay, 10) == 1
     follow(late, relay, 10)
     whole = MapMirror.of(voxel_map).snapshot()
     for mirror in (early, late):
