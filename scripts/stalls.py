@@ -1,4 +1,4 @@
-"""How long the map's upkeep holds the mapper's thread: the history's backup, and handing changes to those who ask.
+"""How long upkeep holds the mapper's thread: the history, its journal, and handing changes to those who ask.
 
 A room is mapped geometry and random votes alone (no field), so that nothing else takes time. Times are those of the
 thread's processor, since other work on the machine does not count there.
