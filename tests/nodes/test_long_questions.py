@@ -14,7 +14,7 @@ from nodes.long_questions import MAX_OF_CLIENT
 from nodes.query_answers import Answer, Answers
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import MapError
-from semantic_mapper.queries.instances import InstanceTracker
+from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.occupancy import occupancy
 from semantic_mapper.queries.snapshot import MapSnapshot
@@ -110,6 +110,31 @@ def test_a_bug_in_an_answer_ends_nothing(client: MapClient, monkeypatch: pytest.
             ask()
     monkeypatch.undo()
     assert client.nearest("cup", (0, 0, 0)) is not None and len(client.instances((0.5, 0.5, 1))) >= 2
+
+
+def test_an_update_of_things_that_fails_spoils_no_later_one(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    ups = [(0.7, 0.1 * n, 1.0) for n in range(6)]  # more directions than trackers are kept
+    update, failed = InstanceTracker.update, []
+    client.info()  # the service has compiled its kernels
+
+    def half_way(tracker: InstanceTracker, snapshot: MapSnapshot) -> None:
+        update(tracker, snapshot)
+        failed.append(tracker)
+        raise MemoryError
+
+    monkeypatch.setattr(InstanceTracker, "update", half_way)
+    with pytest.raises(MapError, match="no memory left"):
+        client.instances(ups[0])
+    asked: list[InstanceTracker] = []
+
+    def noted(tracker: InstanceTracker, snapshot: MapSnapshot) -> tuple[Instance, ...]:
+        asked.append(tracker)
+        return update(tracker, snapshot)
+
+    monkeypatch.setattr(InstanceTracker, "update", noted)
+    for up in (*ups[1:], *ups):
+        assert len(client.instances(up)) >= 2
+    assert len(asked) == len(ups[1:]) + len(ups) and not set(failed) & set(asked)
 
 
 def test_it_closes_while_questions_wait(
