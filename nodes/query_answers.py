@@ -230,7 +230,7 @@ def _takes_long(snapshot: MapSnapshot, header: messages.RequestHeader, arrays: A
             return len(arrays["points"]) > LONG_POINTS
         case messages.BoxRequest() | messages.DistanceRequest():
             return math.prod(_box_sides(snapshot, header)) > LONG_BOX_VOXELS
-        case messages.InstancesRequest() | messages.ChangesRequest():
+        case messages.InstancesRequest() | messages.ChangesRequest() | messages.CorrectPosesRequest():
             return True
         case _:
             return False
