@@ -86,11 +86,11 @@ def test_who_waits_for_the_first_answer_when_the_mapper_ends_gets_it(tmp_path: P
     voxel_map = small_map(LABELS)
     integrate(voxel_map, poses(1)[0], 0)
     with QueryService(f"ipc://{tmp_path}/query", voxel_map) as service:
-        with MapClient(service.endpoint, timeout_s=60) as client:
+        with MapClient(service.endpoint, timeout_s=20, attempts=1) as client:
             answers: list[int] = []
             asking = threading.Thread(target=lambda: answers.append(client.info().blocks))
             asking.start()
-            assert eventually(lambda: service.asked) and not service.answered
+            assert eventually(lambda: service.asked, 20) and not service.answered
             assert service.hand_over_all(10.0) and service._relay.snapshot().version == voxel_map.version
             asking.join(20)
         assert answers == [voxel_map.block_count]
