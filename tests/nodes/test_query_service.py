@@ -15,7 +15,7 @@ import zmq
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nodes import query_answers, query_service
+from nodes import query_answers
 from nodes.query_service import QueryService
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import CodecError, LabelError, MapError, TransportError
@@ -31,7 +31,6 @@ from semantic_mapper.transport import query_messages as messages
 from semantic_mapper.transport.query_codec import encode_request
 from semantic_mapper.transport.query_sockets import MAX_REQUEST_BYTES
 from tests.mapping.views import small_map
-from tests.nodes.support import eventually
 from tests.queries.scene import BALL, LABELS, integrate, poses, whole, whole_map
 from tests.queries.test_mirror import assert_same
 
@@ -369,52 +368,6 @@ def test_nobody_at_home(endpoint: str) -> None:
         QueryService("tcp://0.0.0.0:5555", small_map(LABELS))
     with pytest.raises(TransportError, match="cannot be connected"):
         MapClient("nowhere")
-
-
-def slow_map() -> VoxelMap:
-    """Every block is of a version of its own, so that small deliveries need many steps."""
-    voxel_map = whole_map()
-    _, index = voxel_map._grid.sorted_blocks()
-    voxel_map._grid._version[index] = np.arange(1, len(index) + 1)
-    voxel_map.version = len(index)
-    return voxel_map
-
-
-def test_the_first_question_waits_for_all_of_a_large_map_and_others_do_not_wait_for_it(
-    endpoint: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(query_service, "MAX_BLOCKS", 50)
-    monkeypatch.setattr(query_service, "ASKED_LATELY_S", 0.2)  # less than the deliveries take
-    voxel_map = slow_map()
-    with QueryService(endpoint, voxel_map) as service, MapClient(endpoint, timeout_s=60) as client:
-        stranger = Stranger(endpoint)
-        with pytest.raises(MapError, match="only answers questions"):  # it listens
-            client.correction()
-        assert not service.asked
-        stranger.socket.send_multipart([b"", *good_questions()[0]])
-        assert eventually(lambda: service.asked)
-        with pytest.raises(MapError, match="only answers questions"):
-            client.correct_poses({1: np.eye(4)})
-        assert eventually(lambda: service.follow() or bool(stranger.socket.poll(0)), 20)
-        header = msgpack.unpackb(stranger.socket.recv_multipart()[2])
-        assert header["version"] == voxel_map.version > 500
-        stranger.socket.close()
-
-
-def test_who_waits_in_vain_for_a_mirror_is_told_so(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(query_service, "FIRST_CATCH_UP_S", 0.2)
-    with QueryService(endpoint, whole_map()) as service, MapClient(endpoint, timeout_s=60) as client:
-        for _ in range(2):
-            with pytest.raises(MapError, match="busy, or ending"):
-                client.info()
-        assert service.answered == 2 and service.abandoned == 0
-        monkeypatch.setattr(query_service, "ASKED_LATELY_S", 0.0)
-        stranger = Stranger(endpoint)
-        for n in range(2):
-            stranger.socket.send_multipart([b"", *good_questions()[n]])
-            assert stranger.socket.poll(20_000)
-            assert b"busy, or ending" in stranger.socket.recv_multipart()[2]
-        stranger.socket.close()
 
 
 def test_a_mapper_that_nobody_asks_is_not_looked_at(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
