@@ -60,7 +60,7 @@ def test_who_waits_in_vain_for_a_mirror_is_told_so(endpoint: str, monkeypatch: p
         for _ in range(2):
             with pytest.raises(MapError, match="busy, or ending"):
                 client.info()
-        assert service.answered == 2 and service.abandoned == 0
+        assert eventually(lambda: service.answered == 2, 10) and service.abandoned == 0
         monkeypatch.setattr(query_service, "ASKED_LATELY_S", 0.0)
         stranger = Stranger(endpoint)
         for n in range(2):

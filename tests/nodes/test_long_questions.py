@@ -134,7 +134,7 @@ def test_what_nobody_waits_for_any_more_is_not_computed(
             assert socket.poll(20_000) and socket.recv_multipart()[1] == b"instances"
         assert computed == [(0.0, 0.1, 1.0), (0.0, 0.5, 1.0), (0.0, 0.3, 1.0)]
         assert not any(socket.poll(100) for socket in (under_way, first, silent))
-        assert eventually(lambda: service.abandoned == 2, 10) and service.answered == 3
+        assert eventually(lambda: (service.abandoned, service.answered) == (2, 3), 10)
         for stranger in sockets:
             stranger.socket.close()
 
