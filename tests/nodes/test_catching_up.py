@@ -13,9 +13,10 @@ from nodes.query_service import QueryService
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from tests.mapping.views import small_map
 from tests.nodes.support import eventually
 from tests.nodes.test_query_service import Stranger, a_folder, good_questions
-from tests.queries.scene import whole_map
+from tests.queries.scene import LABELS, integrate, poses, whole_map
 
 
 @pytest.fixture
@@ -26,7 +27,9 @@ def endpoint() -> Iterator[str]:
 
 def slow_map() -> VoxelMap:
     """Every block is of a version of its own, so that small deliveries need many steps."""
-    voxel_map = whole_map()
+    voxel_map = small_map(LABELS)
+    for seq, pose in enumerate(poses(6)):
+        integrate(voxel_map, pose, seq)
     _, index = voxel_map._grid.sorted_blocks()
     voxel_map._grid._version[index] = np.arange(1, len(index) + 1)
     voxel_map.version = len(index)
@@ -50,7 +53,7 @@ def test_the_first_question_waits_for_all_of_a_large_map_and_others_do_not_wait_
             client.correct_poses({1: np.eye(4)})
         assert eventually(lambda: service.follow() or bool(stranger.socket.poll(0)), 20)
         header = msgpack.unpackb(stranger.socket.recv_multipart()[2])
-        assert header["version"] == voxel_map.version > 500
+        assert header["version"] == voxel_map.version > 300
         stranger.socket.close()
 
 
