@@ -77,9 +77,15 @@ class Autosave:
         except _GivenUpError:
             _log.info("autosave_given_up", reason="the mapper ends")
         except MapError as error:
-            self.failure = str(error)
-            _log.error("autosave_fails", reason=self.failure, again_s=self._every_s)
+            self._fail(str(error))
+        except Exception as error:  # noqa: BLE001 -- whatever it is, it must be told, and the next save tried
+            _log.exception("autosave_dies")
+            self._fail(f"{type(error).__name__}: {error}")
         else:
             self._saved_version = version
             self.saves += 1
             self.failure = ""
+
+    def _fail(self, reason: str) -> None:
+        self.failure = reason
+        _log.error("autosave_fails", reason=reason, again_s=self._every_s)

@@ -3,37 +3,38 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 
 import structlog
 
-MAX_WAITING = 64  # of all clients together
-MAX_OF_CLIENT = 8  # of one client; who awaits each answer has one
+from nodes.query_answers import Question
+from nodes.waiting_questions import Asked, WaitingQuestions
+
 CLOSE_S = 5.0  # what a question under way may still take at the end
 
 _log = structlog.get_logger(__name__)
 
-Answer = Callable[[], list[bytes]]
-
 
 class LongQuestions:
-    """Answers questions one after another, of each client in the order in which they came; clients take turns.
+    """Answers questions one after another, see ``WaitingQuestions``.
 
     One thread asks and collects; it is woken when an answer is there.
 
     Args:
         name: Of the thread.
+        answer: Gives the answer to a question; must not raise.
         wake: Wakes the thread that collects; not called after ``close``.
     """
 
-    def __init__(self, name: str, wake: Callable[[], None]) -> None:
+    def __init__(self, name: str, answer: Callable[[Question], list[bytes]], wake: Callable[[], None]) -> None:
+        self._answer = answer
         self._wake = wake
-        self._lanes: dict[bytes, deque[Answer]] = {}  # of clients with questions that wait; the first has its turn
-        self._finished: deque[tuple[bytes, list[bytes]]] = deque()
-        self._pending: Counter[bytes] = Counter()  # not collected yet
+        self._waiting = WaitingQuestions()
+        self._under_way: Asked | None = None
+        self._finished: deque[tuple[Asked, list[bytes]]] = deque()
         self._closed = False
-        self._changed = threading.Condition()
+        self._changed = threading.Condition()  # guards all of these
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
@@ -42,34 +43,34 @@ class LongQuestions:
         """Whether the thread runs; it ends before ``close`` only by a bug."""
         return self._thread.is_alive()
 
-    def holds(self, client: bytes) -> bool:
-        """Whether an answer for this client is still to be collected; what it asks next must wait its turn here."""
-        return client in self._pending
+    @property
+    def abandoned(self) -> int:
+        """Questions that were dropped unanswered, since nobody waited for them any more."""
+        return self._waiting.abandoned
 
-    def put(self, client: bytes, answer: Answer) -> bool:
-        """Have a question answered; False where too many wait already.
-
-        Args:
-            client: Who asks.
-            answer: Gives the answer; must not raise.
-        """
-        if self._pending.total() >= MAX_WAITING or self._pending[client] >= MAX_OF_CLIENT:
-            return False
-        self._pending[client] += 1
+    def holds(self, lane: bytes) -> bool:
+        """Whether an answer for this asker is still to be collected; what it asks next must wait its turn here."""
         with self._changed:
-            self._lanes.setdefault(client, deque()).append(answer)
+            return self._waiting.holds(lane)
+
+    def put(self, asked: Asked) -> bool:
+        """Have a question answered; False where too many wait already. One that is under way is not begun again."""
+        with self._changed:
+            if self._under_way is not None and asked.repeats(self._under_way):
+                self._under_way = asked  # to where the answer is awaited now
+                return True
+            if not self._waiting.put(asked):
+                return False
             self._changed.notify()
-        return True
+            return True
 
     def collect(self) -> list[tuple[bytes, list[bytes]]]:
         """Answers that are there, and whom they are for."""
-        collected: list[tuple[bytes, list[bytes]]] = []
-        while self._finished:
-            client, parts = self._finished.popleft()
-            self._pending[client] -= 1
-            if not self._pending[client]:
-                del self._pending[client]
-            collected.append((client, parts))
+        with self._changed:
+            collected = [(asked.client, parts) for asked, parts in self._finished]
+            for asked, _ in self._finished:
+                self._waiting.done(asked)
+            self._finished.clear()
         return collected
 
     def close(self) -> None:
@@ -82,23 +83,20 @@ class LongQuestions:
             _log.warning("question_left_behind", waited_s=CLOSE_S)
 
     def _run(self) -> None:
-        while (turn := self._next()) is not None:
-            client, answer = turn
-            parts = answer()
+        while (asked := self._next()) is not None:
+            parts = self._answer(asked.question)
             with self._changed:  # so that nobody is woken after `close`
                 if self._closed:
                     return
-                self._finished.append((client, parts))
+                self._finished.append((self._under_way or asked, parts))
+                self._under_way = None
                 self._wake()
 
-    def _next(self) -> tuple[bytes, Answer] | None:
+    def _next(self) -> Asked | None:
         with self._changed:
-            self._changed.wait_for(lambda: self._lanes or self._closed)
-            if self._closed:
-                return None
-            client = next(iter(self._lanes))
-            lane = self._lanes.pop(client)
-            answer = lane.popleft()
-            if lane:
-                self._lanes[client] = lane  # behind all others
-            return client, answer
+            while not self._closed:
+                if (asked := self._waiting.pop()) is not None:
+                    self._under_way = asked
+                    return asked
+                self._changed.wait()
+            return None

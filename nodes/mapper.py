@@ -160,7 +160,7 @@ class _Mapper:
         if self._autosave is not None:
             self._autosave.close()
         self._correction.finish(self._session, lambda: bool(self._context.stop), self._while_stopping)
-        if self._queries is not None and not self._queries.hand_over_all(HAND_OVER_S):
+        if self._queries is not None and not self._queries.hand_over_all(HAND_OVER_S) and self._queries.asked:
             _log.warning("questions_lag_behind", reason=f"the map could not be handed over in {HAND_OVER_S:g} s")
         out = Path(self._options.out)
         summary = finish_session(self._session, out, self._ended_by)
@@ -235,7 +235,7 @@ class _Mapper:
         counters |= self._correction.counters
         degraded = self._correction.degraded
         if self._queries is not None:
-            counters["answered"] = self._queries.answered
+            counters |= {"answered": self._queries.answered, "abandoned": self._queries.abandoned}
             if not self._queries.alive:
                 degraded += ("questions about the map are no longer answered; see the log",)
         if self._autosave is not None:

@@ -56,6 +56,14 @@ class Question(NamedTuple):
     about_map: bool
 
 
+class _Tracked(NamedTuple):
+    """A tracker, and what it found last: in which version of the map."""
+
+    tracker: InstanceTracker
+    version: int
+    things: tuple[Instance, ...]
+
+
 class Answers:
     """Answers questions about what a mirror holds. Those that take long are for one thread, all others for any.
 
@@ -68,8 +76,7 @@ class Answers:
         self.map_id = uuid.uuid4().hex
         self._relay = relay
         self._correction = correction
-        self._trackers: dict[messages.Point, InstanceTracker] = {}
-        self._things: dict[messages.Point, tuple[int, tuple[Instance, ...]]] = {}  # and the version they are of
+        self._tracked: dict[messages.Point, _Tracked] = {}  # by direction; the last one asked stands last
 
     def read(self, parts: Parts) -> Question:
         """Parts of a question -> what answers it."""
@@ -163,15 +170,14 @@ class Answers:
         return answer, {}
 
     def _instances(self, snapshot: MapSnapshot, up: messages.Point) -> Answer:
-        tracker = self._trackers.pop(up, None) or InstanceTracker(up=up)
-        self._trackers[up] = tracker  # the last one asked stands last
-        version, things = self._things.pop(up, (-1, ()))
-        if version != snapshot.version:
-            things = tracker.update(snapshot)
-        self._things[up] = snapshot.version, things
-        for old in list(self._trackers)[:-_MAX_TRACKERS]:
-            del self._trackers[old], self._things[old]
-        return messages.AnswerHeader(**self._about(snapshot)), _thing_arrays(things)
+        tracked = self._tracked.pop(up, None)  # out of here while it updates: one that fails half way is not used again
+        if tracked is None or tracked.version != snapshot.version:
+            tracker = tracked.tracker if tracked else InstanceTracker(up=up)
+            tracked = _Tracked(tracker, snapshot.version, tracker.update(snapshot))
+        self._tracked[up] = tracked
+        for old in list(self._tracked)[:-_MAX_TRACKERS]:
+            del self._tracked[old]
+        return messages.AnswerHeader(**self._about(snapshot)), _thing_arrays(tracked.things)
 
     def _distances(self, snapshot: MapSnapshot, header: messages.DistanceRequest) -> Answer:
         sides = _box_sides(snapshot, header)
@@ -224,7 +230,7 @@ def _takes_long(snapshot: MapSnapshot, header: messages.RequestHeader, arrays: A
             return len(arrays["points"]) > LONG_POINTS
         case messages.BoxRequest() | messages.DistanceRequest():
             return math.prod(_box_sides(snapshot, header)) > LONG_BOX_VOXELS
-        case messages.InstancesRequest() | messages.ChangesRequest():
+        case messages.InstancesRequest() | messages.ChangesRequest() | messages.CorrectPosesRequest():
             return True
         case _:
             return False

@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from functools import partial
 from types import TracebackType
 from typing import Self
 
@@ -18,7 +17,9 @@ import structlog
 from nodes.live_correction import LiveCorrection
 from nodes.long_questions import LongQuestions
 from nodes.query_answers import Answers, Question
-from semantic_mapper.errors import MapError
+from nodes.waiting_questions import Asked, WaitingQuestions
+from semantic_mapper.client import open_asked
+from semantic_mapper.errors import CodecError, MapError
 from semantic_mapper.mapping.changes import CopiedChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.mirror import MapMirror
@@ -30,9 +31,10 @@ from semantic_mapper.transport.query_sockets import QueryServer
 PERIOD_S = 0.1  # between two deliveries, at least
 MAX_SHARE = 0.1  # of the mapper's time that deliveries may take; the pause after a dear one is longer
 ASKED_LATELY_S = 5.0  # without a question for so long, the mirror is fed no more
-CATCH_UP_S = 2.0  # how long the first question after that waits for the mirror; then it is answered as it is
-FIRST_CATCH_UP_S = 60.0  # how long the very first one waits: kernels may compile, and an empty mirror says nothing true
+CATCH_UP_S = 2.0  # how long questions after that wait for the mirror; then they are answered as it is
+FIRST_CATCH_UP_S = 60.0  # how long the very first ones wait: kernels may compile, and an empty mirror says nothing true
 MAX_BLOCKS = 600  # of a delivery (unless one frame has more): bounds what a step may cost
+GRACE_S = 0.5  # in which a client that has waited in vain asks again, and keeps its turn
 _WAIT_S = 0.5
 _HANDING_OVER_S = 0.005  # between two looks at whether a delivery has been taken
 _NOT_READY = "the mapper has not handed its map over to its query service yet: it is busy, or ending; ask again"
@@ -66,13 +68,15 @@ class QueryService:
         self._delivered: deque[CopiedChanges] = deque()
         self._delivery_came = threading.Event()
         self._asked_at = -ASKED_LATELY_S  # never; monotonic seconds
-        self._awaited = 0  # version that the first question after a pause waits for
+        self._awaited = 0  # version that questions after a pause wait for
+        self._patient_until = 0.0
+        self._parked = WaitingQuestions()  # for the mirror; nobody else waits for these
         self._overdue = False  # somebody has waited in vain, or would
         self._closed = threading.Event()
         self.answered = 0
         self._server = QueryServer(endpoint)
         self.endpoint = self._server.endpoint
-        self._long = LongQuestions(f"long queries {endpoint}", self._server.wake)
+        self._long = LongQuestions(f"long queries {endpoint}", self._answer, self._server.wake)
         self._threads = (
             threading.Thread(target=self._serve, name=f"queries {endpoint}", daemon=True),
             threading.Thread(target=self._feed, name=f"mirror {endpoint}", daemon=True),
@@ -84,6 +88,16 @@ class QueryService:
     def alive(self) -> bool:
         """Whether the threads run; they end before ``close`` only by a bug."""
         return self._long.alive and all(thread.is_alive() for thread in self._threads)
+
+    @property
+    def asked(self) -> bool:
+        """Whether anybody has ever asked about the map."""
+        return self._asked_at >= 0
+
+    @property
+    def abandoned(self) -> int:
+        """Questions that were dropped unanswered, since nobody waited for them any more."""
+        return self._long.abandoned + self._parked.abandoned
 
     def follow(self) -> None:
         """Hand what has changed over to the service; for the thread that changes the map, after each step.
@@ -102,11 +116,11 @@ class QueryService:
         """Hand all of the map over where somebody has ever asked: before its thread does something that takes long.
 
         Returns:
-            Whether the service has it; False where that was not to be done in ``within_s`` seconds.
+            Whether the service has it; False where nobody has asked, or it was not to be done in ``within_s`` seconds.
         """
-        if not self.answered:
+        if not self.asked:
             self._overdue = True  # whoever asks first from now on is told so at once
-            return True
+            return False
         deadline = time.monotonic() + within_s
         while self._delivered or self._given != self._map.version:
             if time.monotonic() > deadline or not self.alive:
@@ -147,20 +161,53 @@ class QueryService:
         warm_up()
         _log.info("questions_welcome", endpoint=self.endpoint)
         while not self._closed.is_set():
-            self._server.wait(_WAIT_S)
+            self._server.wait(_WAIT_S / 10 if self._parked else _WAIT_S)
             self._send_long_ones()
+            self._let_in()
             # One at a time: the socket takes turns between clients, so that many questions of one delay no other.
-            while not self._closed.is_set() and (asked := self._server.receive()) is not None:
-                client, parts = asked
-                question = self._answers.read(parts)
-                if question.about_map and not self._mirror_is_there():
-                    self._send(client, encode_error(MapError(_NOT_READY)))
-                    continue
-                if not question.takes_long and not self._long.holds(client):
-                    self._send(client, self._answer(question))
-                elif not self._long.put(client, partial(self._answer, question)):
-                    self._send(client, encode_error(MapError(_TOO_MANY)))
+            while not self._closed.is_set() and (came := self._server.receive()) is not None:
+                self._take(*came)
                 self._send_long_ones()
+        while (asked := self._parked.pop()) is not None:
+            self._send(asked.client, encode_error(MapError(_NOT_READY)))
+
+    def _take(self, client: bytes, parts: list[bytes]) -> None:
+        """Answer a question, or let it wait: for the mirror, or because it takes long."""
+        try:
+            asker, waits_s, parts = open_asked(parts)
+        except CodecError as error:
+            self._send(client, encode_error(error))
+            return
+        question = self._answers.read(parts)
+        asked = Asked(client, asker, time.monotonic() + waits_s + GRACE_S, parts, question)
+        if question.about_map:
+            self._note_question()
+        if self._parked.holds(asked.lane) or (question.about_map and self._mirror_lags()):
+            if not self._parked.put(asked):
+                self._send(client, encode_error(MapError(_TOO_MANY)))
+        else:
+            self._pass_on(asked)
+
+    def _let_in(self) -> None:
+        """Answer what has waited for the mirror, once it is there or will not come in time."""
+        self._parked.drop_late()
+        if not self._parked:
+            return
+        self._asked_at = time.monotonic()  # so that the mirror is fed as long as somebody waits for it
+        if self._mirror_lags():
+            return
+        while (asked := self._parked.pop()) is not None:
+            self._parked.done(asked)
+            self._pass_on(asked)
+
+    def _pass_on(self, asked: Asked) -> None:
+        question = asked.question
+        if question.about_map and self._overdue and not self._relay.snapshot().version:
+            self._send(asked.client, encode_error(MapError(_NOT_READY)))
+        elif not question.takes_long and not self._long.holds(asked.lane):
+            self._send(asked.client, self._answer(question))
+        elif not self._long.put(asked):
+            self._send(asked.client, encode_error(MapError(_TOO_MANY)))
 
     def _answer(self, question: Question) -> list[bytes]:
         return question.answer()
@@ -173,20 +220,23 @@ class QueryService:
         for client, parts in self._long.collect():
             self._send(client, parts)
 
-    def _mirror_is_there(self) -> bool:
-        """After a pause, wait until the mirror has come up to the map as it is now; False where it had nothing yet."""
+    def _note_question(self) -> None:
+        """After a pause, questions wait until the mirror has come up to the map as it is now."""
         now = time.monotonic()
         if now - self._asked_at > ASKED_LATELY_S:
             self._awaited = self._map.version
+            self._patient_until = now + (CATCH_UP_S if self._relay.snapshot().version else FIRST_CATCH_UP_S)
         self._asked_at = now
-        patience = CATCH_UP_S if self._relay.snapshot().version else FIRST_CATCH_UP_S
-        while self._relay.snapshot().version < self._awaited and not self._closed.is_set():
-            if time.monotonic() > now + patience or (self._overdue and not self._relay.snapshot().version):
-                # The map is at rest or busy: those who ask next need not wait as well.
-                self._awaited, self._overdue = 0, True
-                break
-            self._server.wait_for_wake(_WAIT_S / 10)
-        return self._relay.snapshot().version > 0 or not (self._overdue or self._closed.is_set())
+
+    def _mirror_lags(self) -> bool:
+        version = self._relay.snapshot().version
+        if version >= self._awaited:
+            return False
+        if time.monotonic() > self._patient_until or (self._overdue and not version):
+            # The map is at rest or busy: those who ask next need not wait as well.
+            self._awaited, self._overdue = 0, True
+            return False
+        return True
 
     def _feed(self) -> None:
         while not self._closed.is_set():

@@ -7,9 +7,10 @@ import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, TypeVar, cast
+from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import CodecError, ShapeError
@@ -27,15 +28,42 @@ from semantic_mapper.queries.oriented_box import OrientedBox
 from semantic_mapper.queries.rays import RayHits
 from semantic_mapper.transport import query_messages as messages
 from semantic_mapper.transport.endpoints import default_endpoint
+from semantic_mapper.transport.framing import Buffer
+from semantic_mapper.transport.headers import Header, Word, pack_header, unpack_header
 from semantic_mapper.transport.plain import to_label_set
 from semantic_mapper.transport.query_codec import Arrays, decode_answer, encode_request
 from semantic_mapper.transport.query_sockets import QuerySocket
 from semantic_mapper.types import Float64, UInt8
 
 UP = (0.0, 0.0, 1.0)
+ASKED = b"asked"  # first part of a question that says who asks
 MIRROR_BLOCKS = 2000  # fetched at a time: 6 MB before compression
 
 AnswerT = TypeVar("AnswerT", bound=messages.AnswerHeader)
+
+
+class AskedHeader(Header, frozen=True, kw_only=True):
+    """Second part of such a question; its own parts follow.
+
+    ``asker`` is the same for all questions of a client, which has one at a time, and waits ``waits_s`` for each answer.
+    """
+
+    asker: Word
+    waits_s: Annotated[float, Meta(ge=0)]
+
+
+def open_asked(parts: list[bytes]) -> tuple[bytes, float, list[bytes]]:
+    """Who asks, how many seconds it waits for the answer, and the parts of its question.
+
+    Who does not say is b"", and waits for ever.
+
+    Raises:
+        CodecError: a bad header.
+    """
+    if parts[:1] != [ASKED]:
+        return b"", float("inf"), parts
+    header = unpack_header(parts[1] if len(parts) > 1 else b"", AskedHeader, "who asks")
+    return header.asker.encode(), header.waits_s, parts[2:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +136,8 @@ class MapClient:
     """
 
     def __init__(self, endpoint: str | None = None, *, timeout_s: float = 5.0, attempts: int = 3) -> None:
+        asked = AskedHeader(asker=uuid.uuid4().hex, waits_s=float(timeout_s))
+        self._asked: list[Buffer] = [ASKED, pack_header(asked, "who asks")]
         self._socket = QuerySocket(endpoint or default_endpoint("query"), timeout_s=timeout_s, attempts=attempts)
         self._mirror: MapMirror | None = None
         self._mirrored = ""  # map_id of the mirror
@@ -240,12 +270,14 @@ class MapClient:
         self, kind: str, answer: type[AnswerT], request: messages.RequestHeader, **arrays: ArrayLike
     ) -> tuple[AnswerT, Arrays]:
         numbers = {name: as_numbers(values, name) for name, values in arrays.items()}
-        header, found = decode_answer(kind, answer, self._socket.ask(encode_request(kind, request, numbers)))
+        header, found = decode_answer(
+            kind, answer, self._socket.ask([*self._asked, *encode_request(kind, request, numbers)])
+        )
         self.version = header.version
         return header, found
 
     def _correction(self, parts: list[bytes], kind: str) -> Correction:
-        h, _ = decode_answer(kind, messages.CorrectionAnswer, self._socket.ask(parts))
+        h, _ = decode_answer(kind, messages.CorrectionAnswer, self._socket.ask([*self._asked, *parts]))
         return Correction(
             running=h.running,
             done=h.done,

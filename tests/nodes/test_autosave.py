@@ -112,3 +112,24 @@ def test_a_save_that_fails_is_told_and_tried_again_though_nothing_has_changed(tm
     assert eventually(lambda: autosave.follow() or autosave.saves == 1) and not autosave.failure
     assert describe_map(path).frames == 1
     autosave.close()
+
+
+@pytest.mark.parametrize("error", [MemoryError("a chunk"), KeyError("a bug")], ids=repr)
+def test_a_save_that_dies_of_anything_is_told_and_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    voxel_map, path = small_map(voxel_size_m=0.02), tmp_path / "map.npz"
+    autosave = Autosave(voxel_map, path, ALWAYS)
+    walk(voxel_map, 1)
+
+    def fail(*arguments: object) -> None:
+        raise error
+
+    monkeypatch.setattr(map_file, "_write_chunk", fail)
+    autosave.follow()
+    assert eventually(lambda: autosave.failure == f"{type(error).__name__}: {error}", 20)
+    assert autosave.saves == 0
+    monkeypatch.undo()
+    assert eventually(lambda: autosave.follow() or autosave.saves == 1) and not autosave.failure
+    assert describe_map(path).frames == 1
+    autosave.close()

@@ -9,17 +9,19 @@ import msgpack
 import numpy as np
 import pytest
 
-from nodes import long_questions, query_answers
-from nodes.long_questions import MAX_OF_CLIENT
+from nodes import long_questions, query_answers, query_service
 from nodes.query_answers import Answer, Answers
-from semantic_mapper.client import MapClient
+from nodes.waiting_questions import MAX_OF_ASKER
+from semantic_mapper.client import ASKED, AskedHeader, MapClient
 from semantic_mapper.errors import MapError
-from semantic_mapper.queries.instances import InstanceTracker
+from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.occupancy import occupancy
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.transport import query_messages as messages
+from semantic_mapper.transport.headers import pack_header
 from semantic_mapper.transport.query_codec import encode_request
+from tests.nodes.support import eventually
 from tests.nodes.test_query_service import PLACES, Stranger, a_folder, answering, assert_equal_fields, good_questions
 from tests.queries.scene import whole, whole_map
 
@@ -83,7 +85,7 @@ def test_who_asks_too_much_that_takes_long_is_told_so(
 ) -> None:
     hangs, may_go_on = held
     greedy, modest = Stranger(client._socket.endpoint), Stranger(client._socket.endpoint)
-    for _ in range(MAX_OF_CLIENT):
+    for _ in range(MAX_OF_ASKER):
         greedy.socket.send_multipart(long_question((0.3, 0.1, 1.0)))
     assert hangs.wait(60)
     kind, header = greedy.ask(long_question((0.3, 0.1, 1.0)))
@@ -92,10 +94,93 @@ def test_who_asks_too_much_that_takes_long_is_told_so(
     assert client.info().version == 14
     may_go_on.set()
     assert modest.socket.poll(60_000)  # in its turn, which is the second
-    for _ in range(MAX_OF_CLIENT):
+    for _ in range(MAX_OF_ASKER):
         assert greedy.socket.poll(60_000)
         assert greedy.socket.recv_multipart()[1] == b"instances"
     for stranger in (greedy, modest):
+        stranger.socket.close()
+
+
+def asked_by(name: str, waits_s: float, question: list[bytes]) -> list[bytes]:
+    header = AskedHeader(asker=name, waits_s=waits_s)
+    return [b"", ASKED, pack_header(header, "who asks"), *question[1:]]
+
+
+def test_what_nobody_waits_for_any_more_is_not_computed(
+    held: tuple[threading.Event, threading.Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two that give up, one asks the same again, which keeps its turn; the other says no more."""
+    hangs, may_go_on = held
+    monkeypatch.setattr(query_service, "GRACE_S", 0.0)
+    computed: list[messages.Point] = []
+    hang = Answers._instances
+    monkeypatch.setattr(Answers, "_instances", lambda self, s, up: computed.append(up) or hang(self, s, up))
+    with a_folder() as folder, answering(f"ipc://{folder / 'query'}", whole_map()) as service:
+        sockets = [Stranger(service.endpoint) for _ in range(6)]
+        under_way, under_way_again, first, second, again, silent = (s.socket for s in sockets)
+        under_way.send_multipart(asked_by("u", 60.0, long_question((0.0, 0.1, 1.0))))
+        assert hangs.wait(60)
+        first.send_multipart(asked_by("a", 60.0, long_question((0.0, 0.2, 1.0))))
+        assert eventually(lambda: service._long.holds(b"a"), 10)
+        second.send_multipart(asked_by("b", 60.0, long_question((0.0, 0.3, 1.0))))
+        silent.send_multipart(asked_by("c", 0.1, long_question((0.0, 0.4, 1.0))))
+        assert eventually(lambda: service._long.holds(b"b") and service._long.holds(b"c"), 10)
+        again.send_multipart(asked_by("a", 60.0, long_question((0.0, 0.5, 1.0))))
+        under_way_again.send_multipart(asked_by("u", 60.0, long_question((0.0, 0.1, 1.0))))
+        assert eventually(lambda: service.abandoned == 1, 10)
+        threading.Event().wait(0.2)
+        may_go_on.set()
+        for socket in (under_way_again, again, second):
+            assert socket.poll(20_000) and socket.recv_multipart()[1] == b"instances"
+        assert computed == [(0.0, 0.1, 1.0), (0.0, 0.5, 1.0), (0.0, 0.3, 1.0)]
+        assert not any(socket.poll(100) for socket in (under_way, first, silent))
+        assert eventually(lambda: (service.abandoned, service.answered) == (2, 3), 10)
+        for stranger in sockets:
+            stranger.socket.close()
+
+
+def test_clients_that_time_out_are_answered_in_their_turn(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An answer takes longer than a client waits each time; without turns kept, none would ever come."""
+    answer, computed = Answers._instances, []
+
+    def slow(self: Answers, snapshot: MapSnapshot, up: messages.Point) -> Answer:
+        computed.append(up)
+        threading.Event().wait(0.4)
+        return answer(self, snapshot, up)
+
+    client.instances()
+    monkeypatch.setattr(Answers, "_instances", slow)
+    ups, found = [(0.9, 0.1 * n, 1.0) for n in range(3)], []
+
+    def ask(up: messages.Point) -> None:
+        with MapClient(client._socket.endpoint, timeout_s=0.3, attempts=50) as impatient:
+            found.append(len(impatient.instances(up)))
+
+    threads = [threading.Thread(target=ask, args=(up,)) for up in ups]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert len(found) == 3 and min(found) >= 2 and sorted(computed) == ups
+
+
+def test_checking_corrected_poses_holds_up_no_short_question(
+    client: MapClient, held: tuple[threading.Event, threading.Event]
+) -> None:
+    hangs, may_go_on = held
+    first, second = Stranger(client._socket.endpoint), Stranger(client._socket.endpoint)
+    first.socket.send_multipart(long_question((0.0, 0.1, 1.0)))
+    assert hangs.wait(60)
+    poses = {"stamps_ns": np.ones(1), "camera": np.zeros(1), "poses": np.eye(4)[None]}
+    request = messages.CorrectPosesRequest(id="a", cameras=("",))
+    second.socket.send_multipart([b"", *encode_request("correct_poses", request, poses)])
+    second.socket.send_multipart([b"", *encode_request("info", messages.InfoRequest(), {})])
+    assert client.info().version == 14
+    assert not second.socket.poll(200)  # nor is its own next question answered before it
+    may_go_on.set()
+    for kind in (b"error", b"info"):
+        assert second.socket.poll(60_000) and second.socket.recv_multipart()[1] == kind
+    for stranger in (first, second):
         stranger.socket.close()
 
 
@@ -110,6 +195,31 @@ def test_a_bug_in_an_answer_ends_nothing(client: MapClient, monkeypatch: pytest.
             ask()
     monkeypatch.undo()
     assert client.nearest("cup", (0, 0, 0)) is not None and len(client.instances((0.5, 0.5, 1))) >= 2
+
+
+def test_an_update_of_things_that_fails_spoils_no_later_one(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    ups = [(0.7, 0.1 * n, 1.0) for n in range(6)]  # more directions than trackers are kept
+    update, failed = InstanceTracker.update, []
+    client.info()  # the service has compiled its kernels
+
+    def half_way(tracker: InstanceTracker, snapshot: MapSnapshot) -> None:
+        update(tracker, snapshot)
+        failed.append(tracker)
+        raise MemoryError
+
+    monkeypatch.setattr(InstanceTracker, "update", half_way)
+    with pytest.raises(MapError, match="no memory left"):
+        client.instances(ups[0])
+    asked: list[InstanceTracker] = []
+
+    def noted(tracker: InstanceTracker, snapshot: MapSnapshot) -> tuple[Instance, ...]:
+        asked.append(tracker)
+        return update(tracker, snapshot)
+
+    monkeypatch.setattr(InstanceTracker, "update", noted)
+    for up in (*ups[1:], *ups):
+        assert len(client.instances(up)) >= 2
+    assert len(asked) == len(ups[1:]) + len(ups) and not set(failed) & set(asked)
 
 
 def test_it_closes_while_questions_wait(

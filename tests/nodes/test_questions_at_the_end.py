@@ -73,10 +73,24 @@ def test_who_asks_first_of_a_map_that_is_being_written_is_told_so(tmp_path: Path
         assert service.hand_over_all(10.0)
     with QueryService(endpoint, voxel_map) as service, MapClient(endpoint, timeout_s=60) as client:
         integrate(voxel_map, poses(1)[0], 0)
-        assert service.hand_over_all(10.0)
+        assert not service.hand_over_all(10.0) and not service.asked
         for _ in range(2):
             with pytest.raises(MapError, match="busy, or ending"):
                 client.info()
         service.follow()
         assert eventually(lambda: service._relay.snapshot().version == 1)
         assert client.info().blocks == voxel_map.block_count > 0
+
+
+def test_who_waits_for_the_first_answer_when_the_mapper_ends_gets_it(tmp_path: Path) -> None:
+    voxel_map = small_map(LABELS)
+    integrate(voxel_map, poses(1)[0], 0)
+    with QueryService(f"ipc://{tmp_path}/query", voxel_map) as service:
+        with MapClient(service.endpoint, timeout_s=20, attempts=1) as client:
+            answers: list[int] = []
+            asking = threading.Thread(target=lambda: answers.append(client.info().blocks))
+            asking.start()
+            assert eventually(lambda: service.asked, 20) and not service.answered
+            assert service.hand_over_all(10.0) and service._relay.snapshot().version == voxel_map.version
+            asking.join(20)
+        assert answers == [voxel_map.block_count]
