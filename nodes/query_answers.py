@@ -47,11 +47,13 @@ class Question(NamedTuple):
 
     Args:
         answer: Gives the parts of its answer, which is an error where the question is no good; raises nothing.
+        header: What it says of itself and of who asks.
         takes_long: Whether that may take more than a few milliseconds.
         about_map: Whether the answer comes from the mirror, which has to be up to date for it.
     """
 
     answer: Callable[[], list[bytes]]
+    header: messages.RequestHeader
     takes_long: bool
     about_map: bool
 
@@ -85,9 +87,9 @@ class Answers:
             takes_long = _takes_long(self._relay.snapshot(), header, arrays)
         except (SemanticMapperError, MemoryError) as error:
             refusal = encode_error(_told(error))
-            return Question(lambda: refusal, takes_long=False, about_map=False)
+            return Question(lambda: refusal, messages.RequestHeader(), takes_long=False, about_map=False)
         about_map = not isinstance(header, messages.CorrectPosesRequest | messages.CorrectionRequest)
-        return Question(lambda: self._encoded(kind, header, arrays), takes_long, about_map)
+        return Question(lambda: self._encoded(kind, header, arrays), header, takes_long, about_map)
 
     def _encoded(self, kind: str, header: messages.RequestHeader, arrays: Arrays) -> list[bytes]:
         try:

@@ -18,8 +18,7 @@ from nodes.live_correction import LiveCorrection
 from nodes.long_questions import LongQuestions
 from nodes.query_answers import Answers, Question
 from nodes.waiting_questions import Asked, WaitingQuestions
-from semantic_mapper.client import open_asked
-from semantic_mapper.errors import CodecError, MapError
+from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.changes import CopiedChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.mirror import MapMirror
@@ -173,13 +172,10 @@ class QueryService:
 
     def _take(self, client: bytes, parts: list[bytes]) -> None:
         """Answer a question, or let it wait: for the mirror, or because it takes long."""
-        try:
-            asker, waits_s, parts = open_asked(parts)
-        except CodecError as error:
-            self._send(client, encode_error(error))
-            return
         question = self._answers.read(parts)
-        asked = Asked(client, asker, time.monotonic() + waits_s + GRACE_S, parts, question)
+        header = question.header
+        until = time.monotonic() + header.waits_s + GRACE_S
+        asked = Asked(client, header.asker.encode(), until, parts, question)
         if question.about_map:
             self._note_question()
         if self._parked.holds(asked.lane) or (question.about_map and self._mirror_lags()):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import threading
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Annotated, Any, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
-from msgspec import Meta
-from numpy.typing import ArrayLike
+from msgspec.structs import replace
+from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import CodecError, ShapeError
 from semantic_mapper.labels import LabelSet
@@ -28,42 +28,15 @@ from semantic_mapper.queries.oriented_box import OrientedBox
 from semantic_mapper.queries.rays import RayHits
 from semantic_mapper.transport import query_messages as messages
 from semantic_mapper.transport.endpoints import default_endpoint
-from semantic_mapper.transport.framing import Buffer
-from semantic_mapper.transport.headers import Header, Word, pack_header, unpack_header
 from semantic_mapper.transport.plain import to_label_set
 from semantic_mapper.transport.query_codec import Arrays, decode_answer, encode_request
 from semantic_mapper.transport.query_sockets import QuerySocket
 from semantic_mapper.types import Float64, UInt8
 
 UP = (0.0, 0.0, 1.0)
-ASKED = b"asked"  # first part of a question that says who asks
 MIRROR_BLOCKS = 2000  # fetched at a time: 6 MB before compression
 
 AnswerT = TypeVar("AnswerT", bound=messages.AnswerHeader)
-
-
-class AskedHeader(Header, frozen=True, kw_only=True):
-    """Second part of such a question; its own parts follow.
-
-    ``asker`` is the same for all questions of a client, which has one at a time, and waits ``waits_s`` for each answer.
-    """
-
-    asker: Word
-    waits_s: Annotated[float, Meta(ge=0)]
-
-
-def open_asked(parts: list[bytes]) -> tuple[bytes, float, list[bytes]]:
-    """Who asks, how many seconds it waits for the answer, and the parts of its question.
-
-    Who does not say is b"", and waits for ever.
-
-    Raises:
-        CodecError: a bad header.
-    """
-    if parts[:1] != [ASKED]:
-        return b"", float("inf"), parts
-    header = unpack_header(parts[1] if len(parts) > 1 else b"", AskedHeader, "who asks")
-    return header.asker.encode(), header.waits_s, parts[2:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,8 +109,7 @@ class MapClient:
     """
 
     def __init__(self, endpoint: str | None = None, *, timeout_s: float = 5.0, attempts: int = 3) -> None:
-        asked = AskedHeader(asker=uuid.uuid4().hex, waits_s=float(timeout_s))
-        self._asked: list[Buffer] = [ASKED, pack_header(asked, "who asks")]
+        self._asker, self._timeout_s = uuid.uuid4().hex, timeout_s
         self._socket = QuerySocket(endpoint or default_endpoint("query"), timeout_s=timeout_s, attempts=attempts)
         self._mirror: MapMirror | None = None
         self._mirrored = ""  # map_id of the mirror
@@ -248,11 +220,11 @@ class MapClient:
         request = messages.CorrectPosesRequest(
             id=uuid.uuid4().hex, cameras=cameras, until_ns=until_ns, within_ns=within_ns
         )
-        return self._correction(encode_request("correct_poses", request, arrays), "correct_poses")
+        return self._correction("correct_poses", request, arrays)
 
     def correction(self) -> Correction:
         """How far corrections are; ``used`` and ``left_out`` are 0."""
-        return self._correction(encode_request("correction", messages.CorrectionRequest(), {}), "correction")
+        return self._correction("correction", messages.CorrectionRequest(), {})
 
     def close(self) -> None:
         """Free the socket. Harmless when repeated."""
@@ -270,14 +242,20 @@ class MapClient:
         self, kind: str, answer: type[AnswerT], request: messages.RequestHeader, **arrays: ArrayLike
     ) -> tuple[AnswerT, Arrays]:
         numbers = {name: as_numbers(values, name) for name, values in arrays.items()}
-        header, found = decode_answer(
-            kind, answer, self._socket.ask([*self._asked, *encode_request(kind, request, numbers)])
-        )
+        header, found = decode_answer(kind, answer, self._send(kind, request, numbers))
         self.version = header.version
         return header, found
 
-    def _correction(self, parts: list[bytes], kind: str) -> Correction:
-        h, _ = decode_answer(kind, messages.CorrectionAnswer, self._socket.ask([*self._asked, *parts]))
+    def _send(
+        self, kind: str, request: messages.RequestHeader, arrays: Mapping[str, NDArray[np.generic]]
+    ) -> list[bytes]:
+        request = replace(request, asker=self._asker, waits_s=min(self._timeout_s, messages.MAX_WAIT_S))
+        return self._socket.ask(encode_request(kind, request, arrays))
+
+    def _correction(
+        self, kind: str, request: messages.RequestHeader, arrays: Mapping[str, NDArray[np.generic]]
+    ) -> Correction:
+        h, _ = decode_answer(kind, messages.CorrectionAnswer, self._send(kind, request, arrays))
         return Correction(
             running=h.running,
             done=h.done,

@@ -20,6 +20,7 @@ from semantic_mapper.transport.headers import (
 
 MAX_REQUEST_ROWS = 1 << 16  # points, rays or poses of one question
 BLOCK_VOXELS = 512
+MAX_WAIT_S = 3600.0  # for an answer, of who does not say
 
 Point = tuple[float, float, float]
 DType = Literal["u1", "i1", "<i4", "<i8", "<f4", "<f8"]
@@ -36,9 +37,15 @@ ArraySpecs = Annotated[tuple[ArraySpec, ...], Meta(max_length=6)]
 
 
 class RequestHeader(Header, frozen=True, kw_only=True):
-    """Of every question; the buffers are those that ``QUESTIONS`` names, in that order."""
+    """Of every question; the buffers are those that ``QUESTIONS`` names, in that order.
+
+    ``asker`` is the same for all questions of a client that has one at a time, through whichever socket; empty = a
+    stranger. Nobody waits for the answer after ``waits_s``.
+    """
 
     arrays: ArraySpecs = ()
+    asker: Word = ""
+    waits_s: Annotated[float, Meta(ge=0, le=MAX_WAIT_S)] = MAX_WAIT_S
 
 
 class AnswerHeader(Header, frozen=True, kw_only=True):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import select
 import threading
 from collections.abc import Sequence
 from types import TracebackType
@@ -52,11 +51,6 @@ class QueryServer:
         """Until there is a question, somebody calls ``wake``, or the time is over."""
         ready = dict(self._poller.poll(int(timeout_s * 1000)))
         if self._wake in ready:
-            os.eventfd_read(self._wake)
-
-    def wait_for_wake(self, timeout_s: float) -> None:
-        """As ``wait``, but questions may wait in the meantime."""
-        if select.select([self._wake], [], [], timeout_s)[0]:
             os.eventfd_read(self._wake)
 
     def receive(self) -> tuple[bytes, list[bytes]] | None:

@@ -12,14 +12,13 @@ import pytest
 from nodes import long_questions, query_answers, query_service
 from nodes.query_answers import Answer, Answers
 from nodes.waiting_questions import MAX_OF_ASKER
-from semantic_mapper.client import ASKED, AskedHeader, MapClient
+from semantic_mapper.client import MapClient
 from semantic_mapper.errors import MapError
 from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.occupancy import occupancy
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.transport import query_messages as messages
-from semantic_mapper.transport.headers import pack_header
 from semantic_mapper.transport.query_codec import encode_request
 from tests.nodes.support import eventually
 from tests.nodes.test_query_service import PLACES, Stranger, a_folder, answering, assert_equal_fields, good_questions
@@ -102,8 +101,8 @@ def test_who_asks_too_much_that_takes_long_is_told_so(
 
 
 def asked_by(name: str, waits_s: float, question: list[bytes]) -> list[bytes]:
-    header = AskedHeader(asker=name, waits_s=waits_s)
-    return [b"", ASKED, pack_header(header, "who asks"), *question[1:]]
+    header = msgpack.unpackb(question[2]) | {"asker": name, "waits_s": waits_s}
+    return [*question[:2], msgpack.packb(header), *question[3:]]
 
 
 def test_what_nobody_waits_for_any_more_is_not_computed(
