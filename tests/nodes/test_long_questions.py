@@ -56,13 +56,21 @@ def long_question(up: tuple[float, float, float]) -> list[bytes]:
     return [b"", *encode_request("instances", messages.InstancesRequest(up=up), {})]
 
 
-def test_a_question_that_takes_long_holds_up_no_short_one(
+def two_askers(
     client: MapClient, held: tuple[threading.Event, threading.Event]
-) -> None:
+) -> tuple[Stranger, Stranger, threading.Event]:
+    """The first has asked what takes long, which is under way; set the event to let it go on."""
     hangs, may_go_on = held
     first, second = Stranger(client._socket.endpoint), Stranger(client._socket.endpoint)
     first.socket.send_multipart(long_question((0.0, 0.1, 1.0)))
     assert hangs.wait(60)
+    return first, second, may_go_on
+
+
+def test_a_question_that_takes_long_holds_up_no_short_one(
+    client: MapClient, held: tuple[threading.Event, threading.Event]
+) -> None:
+    first, second, may_go_on = two_askers(client, held)
     second.socket.send_multipart(long_question((0.0, 0.2, 1.0)))
     for _ in range(3):
         assert_equal_fields(client.at(PLACES[:9]), at(whole(), PLACES[:9]))
@@ -166,10 +174,7 @@ def test_clients_that_time_out_are_answered_in_their_turn(client: MapClient, mon
 def test_checking_corrected_poses_holds_up_no_short_question(
     client: MapClient, held: tuple[threading.Event, threading.Event]
 ) -> None:
-    hangs, may_go_on = held
-    first, second = Stranger(client._socket.endpoint), Stranger(client._socket.endpoint)
-    first.socket.send_multipart(long_question((0.0, 0.1, 1.0)))
-    assert hangs.wait(60)
+    first, second, may_go_on = two_askers(client, held)
     poses = {"stamps_ns": np.ones(1), "camera": np.zeros(1), "poses": np.eye(4)[None]}
     request = messages.CorrectPosesRequest(id="a", cameras=("",))
     second.socket.send_multipart([b"", *encode_request("correct_poses", request, poses)])
