@@ -31,6 +31,7 @@ from semantic_mapper.transport.endpoints import default_endpoint
 from semantic_mapper.transport.plain import to_label_set
 from semantic_mapper.transport.query_codec import Arrays, decode_answer, encode_request
 from semantic_mapper.transport.query_sockets import QuerySocket
+from semantic_mapper.transport.security import ServerIdentity
 from semantic_mapper.types import Float64, UInt8
 
 UP = (0.0, 0.0, 1.0)
@@ -90,6 +91,27 @@ class Correction:
     epoch: int
 
 
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """Which weights a mapper uses, and what became of those that it was offered.
+
+    Args:
+        in_use: Version; 0 = those that it was started with.
+        before: In use before these; None where there were none.
+        wanted: About to be in use; None = nothing changes.
+        taken, refused, rolled_back: How often that has happened.
+        versions: All that it knows of, the oldest first.
+    """
+
+    in_use: int
+    before: int | None
+    wanted: int | None
+    taken: int
+    refused: int
+    rolled_back: int
+    versions: tuple[messages.WeightsEntry, ...]
+
+
 class MapClient:
     """The queries of ``semantic_mapper.queries`` on the map of a running mapper; a context manager.
 
@@ -103,14 +125,24 @@ class MapClient:
         endpoint: Of the mapper's query service; by default that of a mapper of this user that was started by hand.
         timeout_s: How long to wait for an answer before asking again.
         attempts: How often to ask.
+        identity: Of a mapper that has keys (``transport.security``), as those on other machines have.
 
     Raises:
-        TransportError: an endpoint that is none.
+        TransportError: an endpoint that is none, or a mapper that is not among the peers.
     """
 
-    def __init__(self, endpoint: str | None = None, *, timeout_s: float = 5.0, attempts: int = 3) -> None:
+    def __init__(
+        self,
+        endpoint: str | None = None,
+        *,
+        timeout_s: float = 5.0,
+        attempts: int = 3,
+        identity: ServerIdentity | None = None,
+    ) -> None:
         self._asker, self._timeout_s = uuid.uuid4().hex, timeout_s
-        self._socket = QuerySocket(endpoint or default_endpoint("query"), timeout_s=timeout_s, attempts=attempts)
+        self._socket = QuerySocket(
+            endpoint or default_endpoint("query"), timeout_s=timeout_s, attempts=attempts, identity=identity
+        )
         self._mirror: MapMirror | None = None
         self._mirrored = ""  # map_id of the mirror
         self._mirror_lock = threading.Lock()
@@ -226,6 +258,18 @@ class MapClient:
         """How far corrections are; ``used`` and ``left_out`` are 0."""
         return self._correction("correction", messages.CorrectionRequest(), {})
 
+    def weights(self) -> Weights:
+        """Which weights the mapper uses; ``MapError`` where it takes none while it runs (option `learner`)."""
+        return self._weights(messages.WeightsRequest())
+
+    def return_to_weights(self, version: int) -> Weights:
+        """Ask the mapper to go back to weights that it has used before; it does so a moment later.
+
+        Raises:
+            MapError: it has never used these, or keeps them no longer.
+        """
+        return self._weights(messages.WeightsRequest(to=version))
+
     def close(self) -> None:
         """Free the socket. Harmless when repeated."""
         self._socket.close()
@@ -268,6 +312,18 @@ class MapClient:
             lost=h.lost,
             failure=h.failure,
             epoch=h.map_epoch,
+        )
+
+    def _weights(self, request: messages.WeightsRequest) -> Weights:
+        h, _ = decode_answer("weights", messages.WeightsAnswer, self._send("weights", request, {}))
+        return Weights(
+            in_use=h.in_use,
+            before=h.before,
+            wanted=h.wanted,
+            taken=h.weights_taken,
+            refused=h.weights_refused,
+            rolled_back=h.weights_rolled_back,
+            versions=h.entries,
         )
 
     def _label_set(self, map_id: str) -> LabelSet:

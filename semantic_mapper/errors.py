@@ -55,5 +55,9 @@ class DependencyError(SemanticMapperError, ImportError):
     """A package or system library that a feature needs cannot be loaded."""
 
 
+class CameraError(SemanticMapperError, OSError):
+    """A camera, or what tells its pose, is not there, cannot be opened, or does not do what is asked of it."""
+
+
 class NodeError(SemanticMapperError, RuntimeError):
     """A node process could not start, or ended when it should not have."""

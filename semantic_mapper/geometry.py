@@ -57,6 +57,19 @@ def check_pose(T_world_camera: Float64, where: str) -> None:
         )
 
 
+def pose_matrix(position: Float64, quaternion: Float64) -> Float64:
+    """Pose (4, 4) of a position (3,) and a quaternion (4,) as x y z w, which is normalised."""
+    x, y, z, w = quaternion / np.linalg.norm(quaternion)
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    T_world_camera[:3, 3] = position
+    return T_world_camera
+
+
 def invert_pose(T_a_b: Float64) -> Float64:
     """Return ``T_b_a`` of a rigid transform (..., 4, 4)."""
     R_b_a = np.swapaxes(T_a_b[..., :3, :3], -1, -2)

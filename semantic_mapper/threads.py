@@ -13,6 +13,8 @@ import torch
 from numba.core import config as numba_config
 from numba.core import event as numba_event
 
+from semantic_mapper.kernel_cache import kernel
+
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
 _log = structlog.get_logger(__name__)
@@ -60,10 +62,9 @@ def follow_torch_threads() -> None:
 
 
 def parallel_kernel(*, fastmath: bool = False) -> Callable[[FunctionT], FunctionT]:
-    """``numba.njit`` for a kernel with ``prange`` loops: cached on disk, without the GIL, on the shared threads."""
+    """A `kernel` with ``prange`` loops, on the shared threads."""
     share_threads()
-    decorate: Any = numba.njit(parallel=True, nogil=True, cache=True, fastmath=fastmath)
-    return decorate
+    return kernel(parallel=True, fastmath=fastmath)
 
 
 def inlined_kernel(function: FunctionT) -> FunctionT:

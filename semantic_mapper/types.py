@@ -7,12 +7,15 @@ Depth is z in metres, 0 = no measurement. Pixel centres have integer coordinates
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import FrameError
+
+if TYPE_CHECKING:
+    import torch  # loads for seconds and takes half a gigabyte: a camera, a recorder and the launcher need none of it
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

@@ -24,7 +24,8 @@ from semantic_mapper.evaluation.canvas import (
     paste,
     shorten,
 )
-from semantic_mapper.evaluation.splat import draw_points, from_above, from_angle, hides_the_room
+from semantic_mapper.evaluation.legend import draw_legend, legend_rows
+from semantic_mapper.evaluation.splat import draw_points, from_above, from_angle, hides_the_room, open_side
 from semantic_mapper.evaluation.upright import ceiling_height, upright_rotation
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Float32, Float64, UInt8
@@ -133,7 +134,7 @@ def draw_overview(
         ShapeError: the arrays of ``points`` do not fit together.
     """
     _check(points)
-    rows = [_draw_strip(strip, label_set) for strip in strips]
+    rows = [draw_strip(strip, label_set) for strip in strips]
     height = HEADER + sum(len(row) + GAP for row in rows) + CAPTION + MAP_HEIGHT + MARGIN
     canvas = new_canvas(WIDTH, height)
     draw_text(canvas, shorten(title, WIDTH - 2 * MARGIN, 24), (MARGIN, 16), 24, TEXT)
@@ -162,7 +163,8 @@ def _check(points: LabelledPoints) -> None:
         raise ShapeError(f"map points: expected xyz (N, 3), rgb (N, 3), label (N,), confidence (N,), got {shapes}")
 
 
-def _draw_strip(strip: ViewStrip, label_set: LabelSet) -> UInt8:
+def draw_strip(strip: ViewStrip, label_set: LabelSet) -> UInt8:
+    """One frame as a row of tiles with captions, (h, 1600, 3)."""
     tiles = [(f"{strip.name}: camera", strip.rgb, cv2.INTER_AREA)]
     tiles.append(("rendered semantics", class_colors(strip.rendered, label_set), cv2.INTER_NEAREST))
     if strip.truth is not None:
@@ -205,7 +207,7 @@ def _draw_map(canvas: UInt8, y: int, points: LabelledPoints, label_set: LabelSet
 
     above, scale = draw_points(from_above(upright), colors, size, PANEL)
     _draw_scale_bar(above, scale)
-    azimuth = _open_side(upright, colors)
+    azimuth = open_side(upright, ELEVATION)
     seen = ~hides_the_room(upright, azimuth)
     angled, _ = draw_points(from_angle(upright[seen], azimuth, ELEVATION), colors[seen], size, PANEL)
     cut = "" if inside.all() else ", ceiling cut away"
@@ -237,25 +239,6 @@ def _without_ceiling(upright: Float64, label: UInt8, label_set: LabelSet) -> NDA
     return inside if inside.any() else ~inside
 
 
-def _open_side(upright: Float64, colors: UInt8) -> float:
-    """Azimuth of the corner from which most of the map is seen."""
-    if not len(upright):
-        return 0.0
-    step = max(1, len(upright) // 60_000)
-    few = upright[::step]
-    low_half = few[:, 2] < np.percentile(few[:, 2], 60)  # furniture and floor count, walls in front of them do not
-    marks = np.where(low_half[:, None], np.uint8(255), np.uint8(0)) * np.ones((1, 3), np.uint8)
-    best, most = 0.0, -1.0
-    for degrees in (35, 55, 125, 145, 215, 235, 305, 325):
-        azimuth = float(np.deg2rad(degrees))
-        seen = ~hides_the_room(few, azimuth)
-        picture, _ = draw_points(from_angle(few[seen], azimuth, ELEVATION), marks[seen], (160, 120), (0, 0, 0))
-        visible = float((picture[..., 0] > 60).mean())
-        if visible > most:
-            best, most = azimuth, visible
-    return best
-
-
 def _draw_scale_bar(picture: UInt8, scale: float) -> None:
     """A bar of 1 m (or of the power of ten that fits) in the lower left corner."""
     metres = 1.0
@@ -273,25 +256,8 @@ def _draw_scale_bar(picture: UInt8, scale: float) -> None:
 def _draw_legend(canvas: UInt8, y: int, map_label: UInt8, shown: list[UInt8], label_set: LabelSet) -> None:
     """Classes of the map and of the pictures, with the share of the map's points."""
     x = WIDTH - MARGIN - LEGEND_WIDTH
-    counts = np.bincount(map_label.ravel(), minlength=256).astype(np.float64)
-    present = counts > 0
-    for label in shown:
-        present |= np.bincount(label.ravel(), minlength=256) > 0
-    rows = [
-        (name, color, class_id)
-        for name, color, class_id in zip(label_set.names, label_set.colors, label_set.ids, strict=True)
-        if present[class_id]
-    ]
-    rows.sort(key=lambda row: -counts[row[2]])
-    if present[label_set.ignore_id]:
-        rows.append(("unknown", UNKNOWN, label_set.ignore_id))
+    rows = legend_rows(map_label, label_set, tuple(shown))
     draw_text(canvas, "class, share of the map", (x, y + 4), 15, DIM_TEXT)
-    pitch = int(np.clip((MAP_HEIGHT - 30) // max(len(rows), 1), 14, 27))
     top = y + CAPTION
-    for row, (name, color, class_id) in enumerate(rows[: (MAP_HEIGHT - 30) // pitch]):
-        at = top + row * pitch
-        cv2.rectangle(canvas, (x, at + 2), (x + 18, at + pitch - 5), color, -1)
-        share = counts[class_id] / max(counts.sum(), 1)
-        draw_text(canvas, shorten(name, LEGEND_WIDTH - 90, 15), (x + 28, at + pitch // 2 - 9), 15, TEXT)
-        draw_text(canvas, f"{share:.1%}" if share else "-", (x + LEGEND_WIDTH - 58, at + pitch // 2 - 9), 15, DIM_TEXT)
+    draw_legend(canvas, rows, (x, top), (LEGEND_WIDTH, MAP_HEIGHT - 30))
     draw_text(canvas, "paler in the map = less sure", (x, top + MAP_HEIGHT - 20), 13, DIM_TEXT)

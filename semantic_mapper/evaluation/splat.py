@@ -139,3 +139,22 @@ def _spacing(xyz: Float64) -> float:
     asking = xyz[:: max(1, len(xyz) // 500)]
     distances, _ = KDTree(xyz).query(asking, k=5)
     return float(np.percentile(distances[:, 4], 75))
+
+
+def open_side(xyz_upright: Float64, elevation: float) -> float:
+    """Azimuth of the corner from which most of upright points (N, 3) is seen, at an elevation, in radians."""
+    if not len(xyz_upright):
+        return 0.0
+    step = max(1, len(xyz_upright) // 60_000)
+    few = xyz_upright[::step]
+    low_half = few[:, 2] < np.percentile(few[:, 2], 60)  # furniture and floor count, walls in front of them do not
+    marks = np.where(low_half[:, None], np.uint8(255), np.uint8(0)) * np.ones((1, 3), np.uint8)
+    best, most = 0.0, -1.0
+    for degrees in (35, 55, 125, 145, 215, 235, 305, 325):
+        azimuth = float(np.deg2rad(degrees))
+        seen = ~hides_the_room(few, azimuth)
+        picture, _ = draw_points(from_angle(few[seen], azimuth, elevation), marks[seen], (160, 120), (0, 0, 0))
+        visible = float((picture[..., 0] > 60).mean())
+        if visible > most:
+            best, most = azimuth, visible
+    return best

@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import torch
 
 from semantic_mapper.config import SamplingConfig
-from semantic_mapper.errors import ShapeError
+from semantic_mapper.errors import ShapeError, WeightsError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
@@ -99,3 +99,16 @@ class Sampled(Protocol):
     """A field whose ``render`` draws its samples as a setting says, which may change between two renders."""
 
     sampling: SamplingConfig
+
+
+def check_classes(field: SemanticField, label_set: LabelSet) -> None:
+    """Refuse a field for a map of other classes.
+
+    Raises:
+        WeightsError: naming both.
+    """
+    if field.label_set != label_set:
+        raise WeightsError(
+            f"the field renders label set '{field.label_set.name}' ({len(field.label_set)} classes), "
+            f"the map holds '{label_set.name}' ({len(label_set)}); use weights made for this label set"
+        )

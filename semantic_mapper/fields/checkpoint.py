@@ -153,6 +153,28 @@ def load_checkpoint(path: Path) -> Checkpoint:
     return Checkpoint(model.eval(), anchors, recipe)
 
 
+def check_same_shape(path: Path, like: Checkpoint) -> None:
+    """Make sure that a file holds weights of the same network and classes, before anything is made as it says.
+
+    Raises:
+        WeightsError: no weights file, or one of another network or of other classes.
+    """
+    try:
+        with safe_open(path, framework="pt") as stored:
+            metadata = dict(stored.metadata() or {})
+        label_set = _label_set_from_plain(json.loads(metadata["label_set"]))
+        shape = metadata.get("field", SRay.kind), json.loads(metadata["model_config"])
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError, SemanticMapperError) as error:
+        raise WeightsError(f"{path.name}: not readable as weights of this project ({error})") from error
+    if shape != (like.model.kind, json.loads(json.dumps(to_plain(like.model.config)))):
+        raise WeightsError(f"{path.name}: of another network than those in use; finetune these, not others")
+    if label_set != like.label_set:
+        raise WeightsError(
+            f"{path.name}: of label set '{label_set.name}' ({len(label_set)} classes), those in use are of "
+            f"'{like.label_set.name}' ({len(like.label_set)})"
+        )
+
+
 def adapt_model(model: LearnedField, label_set: LabelSet) -> LearnedField:
     """A copy of a field for another label set: all weights kept, classifier rows carried over by class name.
 

@@ -28,6 +28,7 @@ from semantic_mapper.fields.simd import (
     total,
     totals,
 )
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.threads import inlined_kernel
 
 ROWS = 4  # that ``linear`` works on at a time
@@ -264,7 +265,7 @@ def _attend_four_heads(qkv, index, count, score, out):
         store(out, at + 24, multiply(d, splat(one / score[sums + 3])))
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel()
 def make_attention_scratch(inner, count):
     """Buffers of ``attend`` for ``inner`` = heads * head_dim, groups of at most ``count``: keys, scores, mask."""
     padded = (count + LANES - 1) // LANES * LANES

@@ -33,6 +33,7 @@ class LearnedField(nn.Module, ABC):
     kind: ClassVar[str]
     needs_own_view: ClassVar[bool] = False  # whether it can render only views whose image is among the sources
     class_rows: ClassVar[tuple[str, ...]] = ()  # names of the parameters with one row a class, in channel order
+    encoding_parts: ClassVar[tuple[str, ...]] = ()  # names of the modules that ``encode`` uses; none = not known
 
     def __init__(self, config: Config, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
         super().__init__()
@@ -86,3 +87,12 @@ class LearnedField(nn.Module, ABC):
         """Render rays from encoded source views; differentiable."""
         render, _ = self.render_samples(rays, self.sample(rays, sources), sources)
         return render
+
+
+def encode_alike(a: LearnedField, b: LearnedField) -> bool:
+    """Whether what one of two fields has encoded is, to the bit, what the other one would have made of it."""
+    if a.kind != b.kind or a.config != b.config or not a.encoding_parts:
+        return False
+    theirs = b.state_dict()
+    shared = {name: t for name, t in a.state_dict().items() if name.split(".")[0] in a.encoding_parts}
+    return all(torch.equal(tensor, theirs[name]) for name, tensor in shared.items())

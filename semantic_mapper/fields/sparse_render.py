@@ -11,13 +11,14 @@ from __future__ import annotations
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportUntypedFunctionDecorator=false
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.fields.base import EncodedViews, SemanticField
 from semantic_mapper.fields.render import chunk_size
 from semantic_mapper.geometry import pixel_rays
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
@@ -98,7 +99,7 @@ def _fill_between(step, probabilities, known, depth, prior, rgb, doubt):  # prag
                 _fill_pixel(v, u, step, probabilities, known, depth, prior, rgb, doubt)
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _fill_pixel(v, u, step, probabilities, known, depth, prior, rgb, doubt):  # pragma: no cover - compiled
     height, width, classes = probabilities.shape
     count, first, differs = 0, -2, False

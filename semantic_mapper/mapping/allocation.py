@@ -9,10 +9,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import FrameError
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.mapping.block_index import KEY_LIMIT, first_slot, pack_key, pack_keys, pack_step
 from semantic_mapper.mapping.grid_buffers import BLOCK_SIDE
 from semantic_mapper.threads import parallel_kernel
@@ -119,7 +120,7 @@ def _block_radius_m(voxel_size_m: float) -> float:
     return float(np.sqrt(3.0)) * (0.5 * BLOCK_SIDE + 1) * voxel_size_m
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def _remember(packed, slots, keys, count):
     """Add a key to one band's set; returns the new count, more than ``len(keys)`` where there is no room."""
     if count > len(keys):
@@ -136,14 +137,14 @@ def _remember(packed, slots, keys, count):
     return count + 1
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def _first_crossing(a, d):
     """Share of a way ``d`` from ``a`` after which the next whole number is crossed, and of every further one."""
     every = 1.0 / abs(d) if d != 0 else 1e300
     return (np.floor(a) + 1.0 - a if d >= 0 else a - np.floor(a)) * every, every
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _remember_ray(u, v, near, far, camera, per_block, trail, slots, keys, count):
     """Add the blocks that the ray of a pixel crosses between two depths, in that order (Amanatides & Woo).
 
@@ -185,7 +186,7 @@ def _remember_ray(u, v, near, far, camera, per_block, trail, slots, keys, count)
     return count
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _fill_tiles(depth, v0, depth_max, least, most):
     """Least and greatest depth of the tiles of a strip that begins at row ``v0``.
 
@@ -213,7 +214,7 @@ def _fill_tiles(depth, v0, depth_max, least, most):
                 most[k, v, u] = max(max(a[j], a[j + 1]), max(b[j], b[j + 1]))
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def _is_smooth(least, most, flat, wide):
     """Whether one ray speaks for a tile: all measured, depths that differ by at most ``flat``, none beyond ``wide``."""
     return (least > 0) & (most - least <= flat) & (most <= wide)
@@ -227,7 +228,7 @@ def _collect_bands(depth, camera, voxel, truncation, depth_max, slots, keys, cou
         )
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _collect_band(band, bands, depth, camera, voxel, truncation, depth_max, slots, keys):
     """The blocks of one of the bands of an image; returns how many, more than ``len(keys)`` where there is no room.
 
@@ -258,7 +259,7 @@ def _collect_band(band, bands, depth, camera, voxel, truncation, depth_max, slot
     return count
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _remember_tile(u, v, across, least, most, view, trail, slots, keys, count):
     """Add the blocks on a tile's ray, or those of its corners at the edge of the image: nothing else is beyond them."""
     (height, width), camera, truncation, per_block = view

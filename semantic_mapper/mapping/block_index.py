@@ -12,8 +12,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from semantic_mapper.kernel_cache import kernel
 
 KEY_BITS = 21
 KEY_LIMIT = 1 << (KEY_BITS - 1)  # |coordinate| must stay below: 167 km at 2 cm voxels
@@ -54,34 +55,34 @@ def unpack_keys(packed: NDArray[np.int64]) -> NDArray[np.int32]:
     return (np.stack(parts, axis=1) - KEY_LIMIT).astype(np.int32)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def pack_key(bx, by, bz):
     """One packed key of integer coordinates."""
     limit = np.int64(KEY_LIMIT)
     return ((np.int64(bx) + limit) << (2 * KEY_BITS)) | ((np.int64(by) + limit) << KEY_BITS) | (np.int64(bz) + limit)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def pack_step(axis, sign):
     """What to add to a packed key for the next block along an axis, in the direction of ``sign``."""
     step = np.int64(1) << ((2 - axis) * KEY_BITS)
     return step if sign > 0 else -step
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def key_part(packed, axis):
     """One coordinate of a packed key."""
     return ((packed >> ((2 - axis) * KEY_BITS)) & _KEY_MASK) - KEY_LIMIT
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def first_slot(packed, slot_count):
     """Where the search for a key begins."""
     h = packed * np.int64(_HASH_FACTOR)
     return (h ^ (h >> np.int64(29))) & np.int64(slot_count - 1)
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def find_block(index, packed):
     """Buffer index of a packed key, -1 where there is no such block."""
     slots = len(index.slot_keys)
@@ -95,7 +96,7 @@ def find_block(index, packed):
         slot = (slot + 1) & (slots - 1)
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def find_blocks(index, packed):
     """Buffer indices (B,) int32 of packed keys (B,), -1 where there is no such block."""
     found = np.empty(len(packed), np.int32)
@@ -104,7 +105,7 @@ def find_blocks(index, packed):
     return found
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def insert_blocks(index, packed, values):
     """Add keys that are not in the table yet."""
     slots = len(index.slot_keys)

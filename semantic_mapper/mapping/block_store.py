@@ -15,10 +15,10 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.mapping.evidence import EVIDENCE_DTYPES
 from semantic_mapper.mapping.key_table import ABSENT, KeyTable
 from semantic_mapper.types import Float32
@@ -202,13 +202,13 @@ def pack_blocks(values: BlockValues, rows: NDArray[np.int32]) -> PackedBlocks:
     return PackedBlocks(data, ends, values.evidence.dtype)
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def evidence_words(classes, evidence):
     """How many float32 the evidence of one voxel takes up in packed blocks, for an array of its type."""
     return (classes * evidence.itemsize + 3) // 4
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _ends(weight, votes, rows, width):
     """Where the packed blocks begin and end (B + 1,), in units of float32."""
     ends = np.zeros(len(rows) + 1, np.int64)
@@ -221,7 +221,7 @@ def _ends(weight, votes, rows, width):
     return ends
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _pack(values, rows, ends, out_views):
     """Write blocks as ``PackedBlocks`` says to zeros; ``out_views`` are float32, bytes, evidence of the same memory."""
     out, out_bytes, out_evidence = out_views
@@ -259,7 +259,7 @@ def unpack_block(voxels: bytes | memoryview, values: BlockValues, n: int) -> Non
     _unpack_block((data, data.view(np.uint8), data.view(values.evidence.dtype)), values, n)
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _unpack_block(views, values, n):
     """The reverse of ``_pack`` for one block, onto voxels that are zero."""
     data, data_bytes, said = views

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_grid import BLOCK_VOXELS, BlockGrid
 from semantic_mapper.mapping.block_index import unpack_keys
@@ -188,7 +188,7 @@ def _compact_into(out: BlockChanges, rows: NDArray[np.int64], blocks: PackedBloc
 
 
 # Serial: another thread than the mapper's runs it, and numba's fallback layer allows no two parallel kernels at once.
-@njit(nogil=True, cache=True)
+@kernel()
 def _compact(views, ends, rows, ids, vote_discount, min_weight, tsdf, label, confidence, rgb):
     """Write packed blocks (B,) to ``rows`` (B,) of the output."""
     data, masks, said = views

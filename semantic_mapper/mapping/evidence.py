@@ -13,7 +13,8 @@ the same frames give the same bits.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from semantic_mapper.kernel_cache import kernel
 
 EVIDENCE_DTYPES: dict[str, type[np.generic]] = {"float32": np.float32, "int16": np.int16}
 PROBABILITY_FLOOR = 1e-4  # one confident mistake must not outweigh many modest looks: a vote moves at most ln 1e4
@@ -25,26 +26,26 @@ _order = np.random.default_rng(0).permutation(_DITHERS)
 _DITHER = ((np.append(_order, _order[:_MOST_CLASSES]) + 0.5) / _DITHERS).astype(np.float32)  # in 0..1
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def evidence_scale(evidence, votes):
     """What stored evidence of a voxel with so many votes is multiplied with to be the sum of log probabilities."""
     return np.float64(votes) / STEPS_PER_NAT if evidence.itemsize == 2 else 1.0
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def stored_evidence(evidence, said, votes, keep):
     """What to store for a sum of log probabilities of so many votes that are about to fade to ``keep`` of them."""
     return np.rint(said / votes * STEPS_PER_NAT) if evidence.itemsize == 2 else said * keep
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def dither_seed(key, moment):
     """For the votes of one block (3,) at one moment, which is any number that changes from frame to frame."""
     seed = np.int64(key[0]) * np.int64(73856093) + np.int64(key[1]) * np.int64(19349663)
     return seed + np.int64(key[2]) * np.int64(83492791) + np.int64(moment) * np.int64(2654435761)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def _dither_at(seed, voxel):
     """Where in the table the numbers of a voxel begin."""
     mixed = (seed + np.int64(voxel) * np.int64(668265263)) * np.int64(-7046029254386353131)
@@ -52,7 +53,7 @@ def _dither_at(seed, voxel):
     return (mixed >> np.int64(32)) & np.int64(_DITHERS - 1)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def add_vote(evidence, votes, voxel, log_p, row, weight, cap, seed):
     """``e += w log p``; past the cap the old sum shrinks so that the map stays able to change its mind."""
     total = votes[voxel] + weight

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.block_index import BlockIndex, find_block, find_blocks, pack_key, pack_keys, unpack_keys
 from semantic_mapper.mapping.grid_buffers import BLOCK_SIDE, GridBuffers, make_open3d_grid
@@ -37,7 +38,7 @@ def surface_voxels(keys: NDArray[np.int32], blocks: NDArray[np.int32], grid: Blo
     return points
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _neighbours(key, block, index, found):
     """Buffer indices of the blocks at +x, +y, +z of ``key``."""
     x, y, z = key[0], key[1], key[2]
@@ -46,7 +47,7 @@ def _neighbours(key, block, index, found):
     found[2] = find_block(index, pack_key(x, y, z + 1))
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def _crossing(buffers, block, voxel, axis, neighbours, min_weight):
     """Where along the edge from ``voxel`` to the next along ``axis`` the TSDF is zero, in [0, 1); -1 = nowhere."""
     step = 1 << (3 * axis)
@@ -74,7 +75,7 @@ def _write_crossings(keys, blocks, index, buffers, min_weight, starts, points):
         _block_crossings(keys[n], blocks[n], index, buffers, min_weight, points[starts[n] : starts[n + 1]])
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _block_crossings(key, block, index, buffers, min_weight, points):
     """Number of crossings of one block; writes as many of them as ``points`` has room for."""
     neighbours = np.empty(3, np.int64)

@@ -12,11 +12,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.mapping.allocation import Camera
 from semantic_mapper.mapping.block_store import BLOCK_VOXELS
 from semantic_mapper.mapping.evidence import PROBABILITY_FLOOR, add_vote, dither_seed
@@ -141,7 +142,7 @@ def _vote_weights(depth, rows, proper, camera, depth_max):
     return weights, bad
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _weigh_row(v, inside, up, depth, down, camera, depth_max, weights):
     """Vote weights of a row of pixels: |cos| between ray and surface normal, from four neighbours, and nearness."""
     last, one, half = len(depth) - 1, np.float32(1.0), np.float32(0.5)
@@ -185,7 +186,7 @@ def fuse_blocks(indices, buffers, camera, limits, depth, rgb, trust, votes, mome
         _fuse_block(indices[i], offsets, buffers, camera, limits, depth, rgb, trust, votes, moment)
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def voxel_offsets(camera, voxel_size):
     """(3, 512) float32: camera coordinates (R^T p) of the voxels of a block from its first one; metres."""
     R, offsets = camera.R, np.empty((3, BLOCK_VOXELS), np.float32)
@@ -196,7 +197,7 @@ def voxel_offsets(camera, voxel_size):
     return offsets
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def look_up_voxels(key, offsets, camera, voxel_size, depth, behind, depth_max):
     """Which voxels of a block a frame says something of: inside the image, where there is depth, not far behind it.
 
@@ -240,7 +241,7 @@ def look_up_voxels(key, offsets, camera, voxel_size, depth, behind, depth_max):
     return count, voxels, pixels, distances
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _fuse_block(block, offsets, buffers, camera, limits, depth, rgb, trust, frame_votes, moment):
     one, truncation = np.float32(1.0), np.float32(limits.truncation)
     band, cap = np.float32(limits.vote_band), np.float32(limits.max_weight)

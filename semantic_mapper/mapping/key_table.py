@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.mapping.block_index import first_slot
 
 ABSENT = -1  # packed keys and versions are never negative
@@ -48,7 +48,7 @@ def _slots(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return np.full(count, ABSENT, np.int64), np.full(count, ABSENT, np.int64)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def _slot_of(slot_keys, key):
     """Where a key is, or where it would go."""
     last = len(slot_keys) - 1
@@ -58,7 +58,7 @@ def _slot_of(slot_keys, key):
     return slot
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _find(slot_keys, slot_versions, keys):
     found = np.empty(len(keys), np.int64)
     for i in range(len(keys)):
@@ -66,7 +66,7 @@ def _find(slot_keys, slot_versions, keys):
     return found
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _put(slot_keys, slot_versions, keys, versions):
     """Returns how many are new."""
     new = 0
@@ -78,7 +78,7 @@ def _put(slot_keys, slot_versions, keys, versions):
     return new
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _remove(slot_keys, slot_versions, keys):
     """Returns how many were there. What comes after a gap moves up, so that no search ends too early."""
     gone, last = 0, len(slot_keys) - 1

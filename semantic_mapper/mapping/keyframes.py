@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 
 COVERAGE_GRID = (12, 16)  # rows, columns of query points whose visibility decides the choice of views
 NEARNESS_VALUE = 0.05  # breaks ties towards near views
+EncodedSize = tuple[tuple[int, ...], tuple[int, ...]]  # see ``EncodedViews.size``
 HERE_M = 6.0  # from the newest keyframe: beyond, others are worth less, by the square of the distance
 
 
@@ -58,9 +59,15 @@ class KeyframeStore:
         """All keyframes, oldest first."""
         return tuple(self._keyframes)
 
-    def wants(self, T_world_camera: Float64) -> bool:
-        """Whether a frame at this pose has moved or turned enough, from every keyframe, to become one."""
-        moved, turned = pose_distances(self._poses(), T_world_camera)
+    def wants(self, T_world_camera: Float64, size: EncodedSize | None = None) -> bool:
+        """Whether a frame at this pose has moved or turned enough, from every keyframe, to become one.
+
+        Args:
+            T_world_camera: (4, 4).
+            size: Of its encoded view: keyframes of another size are no source views for it; None = all count.
+        """
+        own = np.array([size in (None, k.encoded.size) for k in self._keyframes], bool)
+        moved, turned = pose_distances(self._poses()[own], T_world_camera)
         near = (moved < self._config.translation_m) & (turned < self._config.rotation_deg)
         return not near.any()
 
@@ -69,6 +76,12 @@ class KeyframeStore:
         self._keyframes.append(keyframe)
         if len(self._keyframes) > self._config.capacity:
             self._drop_most_redundant()
+
+    def exchange_labelled(self, keyframes: Sequence[Keyframe]) -> None:
+        """Put these in the place of those that the field was finetuned on before."""
+        self._keyframes = [*keyframes, *(k for k in self._keyframes if not k.labelled)]
+        while len(self._keyframes) > self._config.capacity and self._drop_most_redundant():
+            pass
 
     def move(self, poses: Mapping[tuple[str, int], Float64]) -> int:
         """Give keyframes other poses; what was encoded of them stays. Returns how many have moved.
@@ -88,7 +101,12 @@ class KeyframeStore:
         return moved
 
     def choose(
-        self, T_world_camera: Float64, intrinsics: CameraIntrinsics, depth_m: Float32, count: int
+        self,
+        T_world_camera: Float64,
+        intrinsics: CameraIntrinsics,
+        depth_m: Float32,
+        count: int,
+        size: EncodedSize | None = None,
     ) -> list[Keyframe]:
         """Up to ``count`` keyframes that together cover the query frustum; none that see nothing of it.
 
@@ -99,36 +117,42 @@ class KeyframeStore:
             T_world_camera: (4, 4) pose of the query.
             intrinsics: Of ``depth_m``.
             depth_m: (H, W) float32, 0 = none.
+            count: At most so many.
+            size: Only those whose encoded view is of this size; None = all.
         """
-        if not self._keyframes or count <= 0:
+        fitting = [k for k in self._keyframes if size in (None, k.encoded.size)]
+        if not fitting or count <= 0:
             return []
         points = _query_points(T_world_camera, intrinsics, depth_m)
         # A keyframe's depth is small and the query's may be guessed: only what stands before a point hides it.
-        seen = np.stack(
-            [sees(points, k.T_world_camera, k.intrinsics, k.depth_m, measured=False) for k in self._keyframes]
-        )
-        value = np.array([LABELLED_VALUE if k.labelled else 1.0 for k in self._keyframes])
-        nearness = np.exp(-_separations(self._poses(), T_world_camera))
-        return [self._keyframes[i] for i in cover(seen, value, NEARNESS_VALUE * nearness, count)]
+        seen = np.stack([sees(points, k.T_world_camera, k.intrinsics, k.depth_m, measured=False) for k in fitting])
+        value = np.array([LABELLED_VALUE if k.labelled else 1.0 for k in fitting])
+        nearness = np.exp(-_separations(np.array([k.T_world_camera for k in fitting]), T_world_camera))
+        return [fitting[i] for i in cover(seen, value, NEARNESS_VALUE * nearness, count)]
 
     def _poses(self) -> Float64:
         """(N, 4, 4), oldest first."""
         return np.array([k.T_world_camera for k in self._keyframes]).reshape(-1, 4, 4)
 
-    def _drop_most_redundant(self) -> None:
-        """Drop the one nearest to another; what the camera has left behind counts as nearer than it is.
+    def _drop_most_redundant(self) -> bool:
+        """Drop the one nearest to another; what the camera has left behind counts as nearer than it is. False where
+        there is none to drop.
 
         Without that, a long walk would thin out its few keyframes evenly, and leave no source views where it is.
         """
         poses = self._poses()
         spacing = _separations(poses[:, None], poses[None])
         np.fill_diagonal(spacing, np.inf)
+        sizes = [k.encoded.size for k in self._keyframes]
+        spacing[np.array([[a != b for b in sizes] for a in sizes])] = np.inf  # the one is no source view for the other
         left_m = np.linalg.norm(poses[:, :3, 3] - poses[-1, :3, 3], axis=1)
         worth = spacing.min(axis=1) / np.maximum(1.0, left_m / HERE_M) ** 2
         worth[-1] = np.inf  # the newest stays
         worth[[k.labelled for k in self._keyframes]] = np.inf
-        if np.isfinite(worth).any():
-            del self._keyframes[int(worth.argmin())]
+        if not np.isfinite(worth).any():
+            return False
+        del self._keyframes[int(worth.argmin())]
+        return True
 
 
 def pose_distances(T_world_a: Float64, T_world_b: Float64) -> tuple[Float64, Float64]:

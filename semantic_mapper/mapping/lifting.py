@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.fields.kernel_math import fast_exp
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.threads import parallel_kernel
 from semantic_mapper.types import Float32, UInt8
 
@@ -68,7 +69,7 @@ def _lift(probabilities, channel, one_class, look, rgb, depth, out):
         _lift_row(v, probabilities, channel, one_class, look, rgb, depth, out)
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel()
 def _lift_row(v, probabilities, channel, one_class, look, rgb, depth, out):
     """One row of full pixels; a function of its own for each pixel would cost more than what it does."""
     (height, width), half = channel.shape, np.float32(0.5)

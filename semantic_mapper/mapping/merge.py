@@ -15,11 +15,12 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import MapError
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.block_index import find_block, pack_key, pack_keys, unpack_keys
@@ -180,7 +181,7 @@ def _resample(keys, R, t, index, buffers, moved):
             _blend_votes(count, blocks, voxels, shares, total, buffers, moved, n, voxel)
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _corners(x, y, z, index, blocks, voxels, shares):
     """The voxels around a point that lie in blocks of the map, with their shares; returns how many."""
     x0, y0, z0 = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
@@ -202,7 +203,7 @@ def _corners(x, y, z, index, blocks, voxels, shares):
     return count
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _nearest_at_edges(count, blocks, voxels, shares, buffers):
     """Across a depth edge, take all share from all but the nearest observed voxel; returns what they then sum up to.
 
@@ -223,7 +224,7 @@ def _nearest_at_edges(count, blocks, voxels, shares, buffers):
     return shares[nearest]
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _blend_geometry(count, blocks, voxels, shares, total, buffers, moved, n, voxel):
     tsdf, weight, red, green, blue, observed = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(count):
@@ -243,7 +244,7 @@ def _blend_geometry(count, blocks, voxels, shares, total, buffers, moved, n, vox
         moved.color[n, voxel, 2] = blue / observed
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _blend_votes(count, blocks, voxels, shares, total, buffers, moved, n, voxel):
     votes, voted = 0.0, 0.0
     for i in range(count):
@@ -269,7 +270,7 @@ def _add(blocks, buffers, added, cap):
         _add_block(blocks[n], buffers, n, added, cap)  # numba drops what is written to a tuple's arrays right here
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _add_block(b, buffers, n, added, cap):
     for v in range(BLOCK_VOXELS):
         mine, theirs = np.float64(buffers.weight[b, v]), np.float64(added.weight[n, v])

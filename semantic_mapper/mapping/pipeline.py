@@ -16,15 +16,15 @@ import torch
 from numpy.typing import NDArray
 
 from semantic_mapper.config import MapperConfig, with_quality
-from semantic_mapper.errors import FrameError, WeightsError
-from semantic_mapper.fields.base import EncodedViews, SemanticField, stack_views
+from semantic_mapper.errors import FrameError
+from semantic_mapper.fields.base import EncodedViews, SemanticField, check_classes, stack_views
 from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
 from semantic_mapper.imaging import fill_holes, resize_depth, resize_label, resize_rgb, working_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.correction import CorrectedPoses, CorrectionStatus, MapCorrector
 from semantic_mapper.mapping.depth_trust import depth_trust
 from semantic_mapper.mapping.history import FusedFrame
-from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore
+from semantic_mapper.mapping.keyframes import EncodedSize, Keyframe, KeyframeStore
 from semantic_mapper.mapping.lifting import lift
 from semantic_mapper.mapping.view_renderer import RenderedView, ViewRenderer
 from semantic_mapper.mapping.virtual_views import ViewpointChooser, VirtualLook
@@ -36,9 +36,8 @@ _log = structlog.get_logger(__name__)
 
 ODD_FRAMES = 2  # frames of another size that are refused before the new size is believed
 VIRTUAL_SIZE = 2  # times the size of a coarse view: how finely the map is looked at in a virtual one
+SURE = 0.8  # confidence from which on the map is believed where another field is compared with it
 COVERAGE_WIDTH = 80  # width of the depth image that a keyframe keeps for the choice of source views
-
-EncodedSize = tuple[tuple[int, ...], tuple[int, ...]]  # see ``EncodedViews.size``
 
 
 class MappingPipeline:
@@ -64,11 +63,7 @@ class MappingPipeline:
         *,
         anchors: Sequence[PosedFrame] = (),
     ) -> None:
-        if field.label_set != label_set:
-            raise WeightsError(
-                f"the field renders label set '{field.label_set.name}' ({len(field.label_set)} classes), "
-                f"the map holds '{label_set.name}' ({len(label_set)}); use weights made for this label set"
-            )
+        check_classes(field, label_set)
         self.config = config = with_quality(config)
         self.field = field
         self.label_set = label_set
@@ -83,9 +78,7 @@ class MappingPipeline:
         self._stage_ms: dict[str, float] = {}
         self._told_sizes = False
         for anchor in anchors:
-            self.keyframes.add(
-                self._make_keyframe(anchor, self._encode(anchor, self._known_channel(anchor)), labelled=True)
-            )
+            self.keyframes.add(self.encode_anchor(anchor))
 
     def step(self, frame: PosedFrame) -> MapUpdate:
         """Render the semantics of one frame, fuse it, and maybe keep it as a source view.
@@ -145,6 +138,47 @@ class MappingPipeline:
                 looks.append(look)
         return tuple(looks)
 
+    def encode_anchor(self, anchor: PosedFrame) -> Keyframe:
+        """A labelled keyframe that a field was finetuned on, as ``exchange_field`` takes it."""
+        return self._make_keyframe(anchor, self._encode(anchor, self._known_channel(anchor)), labelled=True)
+
+    def exchange_field(self, field: SemanticField, anchors: Sequence[Keyframe]) -> None:
+        """Go on with other weights. What is in the map stays, with the weight that it has.
+
+        Args:
+            field: Encodes as the present one does (``fields.learned.encode_alike``): keyframes keep their features.
+            anchors: Of ``encode_anchor``; they take the place of those of the weights before.
+
+        Raises:
+            WeightsError: it renders other classes than the map holds; nothing has changed.
+        """
+        check_classes(field, self.label_set)
+        self.field = field
+        self._renderer.exchange_field(field)
+        self.keyframes.exchange_labelled(anchors)
+
+    def agreement(self, frame: PosedFrame, renderer: ViewRenderer, keyframes: KeyframeStore) -> tuple[int, int]:
+        """How far another field agrees with the map where that is sure of itself. Changes nothing.
+
+        Args:
+            frame: One that was mapped.
+            renderer: Of a field that encodes as the present one does.
+            keyframes: It renders from these and, where the config says so, the frame itself.
+
+        Returns:
+            Pixels of the coarse view that it names as the map does, and those that are compared.
+        """
+        frame = self.corrector.place(frame)
+        current = self._encode(frame)
+        own = [current] if self.config.keyframes.use_current_view else []
+        sources = [k.encoded for k in self._choose_sources(frame, current.size, keyframes)]
+        view = self._render(frame, [*sources, *own], self.config.render.scale, renderer)
+        low = scale_intrinsics(frame.intrinsics, view.known.shape[1], view.known.shape[0])
+        seen = self.voxel_map.ray_cast(frame.T_world_camera, low)
+        sure = view.known & (seen.confidence >= SURE)
+        same = self.label_set.to_ids(view.probabilities.argmax(axis=2)) == seen.label
+        return int((same & sure).sum()), int(sure.sum())
+
     def _look_once(self) -> VirtualLook | None:
         known = [k for k in self.keyframes.keyframes if k.camera_id in self._intrinsics]
         if not known:
@@ -194,7 +228,7 @@ class MappingPipeline:
             with self._stage("history"):
                 self.corrector.record(FusedFrame(frame, view.probabilities, view.known, view.depth_m))
         with self._stage("keyframe"):
-            is_keyframe = self.keyframes.wants(frame.T_world_camera)
+            is_keyframe = self.keyframes.wants(frame.T_world_camera, current.size)
             if is_keyframe:
                 self.keyframes.add(self._make_keyframe(frame, current))
         self._intrinsics[frame.camera_id] = frame.intrinsics
@@ -279,25 +313,30 @@ class MappingPipeline:
         with torch.inference_mode():
             return self.field.encode(views)
 
-    def _choose_sources(self, frame: PosedFrame, size: EncodedSize) -> list[Keyframe]:
+    def _choose_sources(
+        self, frame: PosedFrame, size: EncodedSize, keyframes: KeyframeStore | None = None
+    ) -> list[Keyframe]:
         config = self.config.keyframes
         intrinsics = working_intrinsics(frame.intrinsics, COVERAGE_WIDTH)
         depth = resize_depth(frame, intrinsics)
         count = config.source_views - (1 if config.use_current_view else 0)
-        chosen = self.keyframes.choose(frame.T_world_camera, intrinsics, depth, count)
+        store = self.keyframes if keyframes is None else keyframes
         # Cameras of another shape have feature maps of another size; one render takes views of one size.
-        fitting = [k for k in chosen if k.encoded.size == size]
-        if len(fitting) < len(chosen) and not self._told_sizes:
+        chosen = store.choose(frame.T_world_camera, intrinsics, depth, count, size)
+        others = sum(k.encoded.size != size for k in store.keyframes)
+        if others and not self._told_sizes:
             self._told_sizes = True
             _log.warning(
                 "source_views_left_out",
                 reason="keyframes were encoded at another size than this frame",
-                left_out=len(chosen) - len(fitting),
+                left_out=others,
                 seq=frame.seq,
             )
-        return fitting
+        return chosen
 
-    def _render(self, frame: PosedFrame, views: list[EncodedViews], scale: float) -> RenderedView:
+    def _render(
+        self, frame: PosedFrame, views: list[EncodedViews], scale: float, renderer: ViewRenderer | None = None
+    ) -> RenderedView:
         """The coarse view (h, w), ``scale`` times the size of the frame."""
         width, height = round(frame.intrinsics.width * scale), round(frame.intrinsics.height * scale)
         if not views:
@@ -306,7 +345,7 @@ class MappingPipeline:
         intrinsics = scale_intrinsics(frame.intrinsics, width, height)
         prior = self._depth_prior(frame, intrinsics)
         rgb = resize_rgb(frame, intrinsics)
-        return self._renderer.render(stack_views(views), intrinsics, frame.T_world_camera, prior, rgb)
+        return (renderer or self._renderer).render(stack_views(views), intrinsics, frame.T_world_camera, prior, rgb)
 
     def _depth_prior(self, frame: PosedFrame, intrinsics: CameraIntrinsics) -> Float32:
         """Where the surface is expected: the sensor's depth with its holes filled, else the map's own ray cast."""

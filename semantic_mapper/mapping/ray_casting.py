@@ -11,10 +11,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.mapping.allocation import Camera, blocks_in_view, view_bounds
 from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.block_index import find_block, pack_key, unpack_keys
@@ -45,7 +46,7 @@ class Window(NamedTuple):
         return self._replace(width=half), self._replace(left=self.left + half, width=self.width - half)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def _block_exit(p, d, x, y, z):
     """How far along ``d`` the point ``p`` leaves block (x, y, z); voxels end half a voxel beyond their centres."""
     nearest = np.inf
@@ -58,14 +59,14 @@ def _block_exit(p, d, x, y, z):
     return max(nearest, 0.0)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def _value_at(z, origin, d, index, buffers, p):
     for axis in range(3):
         p[axis] = origin[axis] + z * d[axis]
     return sample_tsdf(p, index, buffers)
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _refine(origin, d, near, far, step, index, buffers, p):
     """Zero of the interpolated TSDF round an interval whose nearest voxels change sign, by regula falsi (Illinois).
 
@@ -101,7 +102,7 @@ def _refine(origin, d, near, far, step, index, buffers, p):
     return z
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def march(origin, d, truncation_voxels, z_max, index, buffers, p):
     """z of the first surface that the ray meets from its front, 0 where there is none.
 

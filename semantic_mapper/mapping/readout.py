@@ -9,8 +9,9 @@ the only one it means what the field said: n_eff = 1. The label is the argmax, i
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_index import BlockIndex, find_block, pack_key
 from semantic_mapper.mapping.evidence import evidence_scale
@@ -39,7 +40,7 @@ def read_points(
     return rgb, label_set.to_ids(channel), confidence
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def sample_tsdf(p, index, buffers):
     """Interpolated TSDF at a point (voxel units) over its observed corners; 2.0 where none was observed."""
     x0, y0, z0 = int(np.floor(p[0])), int(np.floor(p[1])), int(np.floor(p[2]))
@@ -64,7 +65,7 @@ def sample_tsdf(p, index, buffers):
     return total / share_sum if share_sum > 0 else 2.0
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _gather(p, index, buffers, color, evidence):
     """Interpolate colour (3,) and evidence (L,) at a point; returns the interpolated votes."""
     color[:] = 0
@@ -100,7 +101,7 @@ def _gather(p, index, buffers, color, evidence):
     return votes
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def decide(evidence, votes, vote_discount):
     """Channel and confidence of one evidence vector (L,), as it is stored or a sum; (-1, 0) without votes."""
     if votes <= 0:
@@ -117,7 +118,7 @@ def decide(evidence, votes, vote_discount):
     return best, 1.0 / total
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def read_point(p, index, buffers, vote_discount, rgb, color, evidence):
     """Channel and confidence of a point, its colour written to ``rgb`` (3,); ``color``, ``evidence`` are scratch."""
     votes = _gather(p, index, buffers, color, evidence)

@@ -61,6 +61,10 @@ class ViewRenderer:
             self._pace = Pace(config.target_hz, config.share, sampling)
         self._last = (0, 0)  # rays and samples of the last view, where its time tells of the next one's
 
+    def exchange_field(self, field: SemanticField) -> None:
+        """Render from another field, of the same kind, from now on."""
+        self._field = field
+
     def note(self, render_ms: float, other_ms: float) -> None:
         """What the frame of the last view took: its rendering, and all else."""
         if self._pace is not None:

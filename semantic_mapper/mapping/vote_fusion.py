@@ -6,10 +6,11 @@ A rendered view measures nothing, so TSDF, colour and weight stay as they are, t
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from semantic_mapper.config import VirtualViewConfig
 from semantic_mapper.geometry import check_pose
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.mapping.allocation import Camera, blocks_in_band, make_camera
 from semantic_mapper.mapping.block_index import pack_keys
 from semantic_mapper.mapping.evidence import add_vote, dither_seed
@@ -72,7 +73,7 @@ def _vote_blocks(indices, buffers, camera, limits, depth, votes, max_votes, mome
         _vote_block(indices[i], offsets, buffers, camera, limits, depth, votes, max_votes, moment)
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _vote_block(block, offsets, buffers, camera: Camera, limits, depth, frame_votes, max_votes, moment):
     """As ``fusion._fuse_block`` votes, at voxels that a frame has measured before."""
     band, cap = np.float32(limits.vote_band), np.float32(limits.max_weight)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.block_index import find_blocks
 from semantic_mapper.mapping.block_store import BlockValues
@@ -15,7 +15,7 @@ from semantic_mapper.mapping.map_types import MapMesh, MapPoints
 from semantic_mapper.queries.checks import check_box, rows_in_box
 from semantic_mapper.queries.rays import speaker
 from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.queries.surface import surface_voxels
+from semantic_mapper.queries.surface import SurfaceVoxels, surface_points, surface_voxels
 
 
 def points_in_box(snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike) -> MapPoints:
@@ -31,10 +31,7 @@ def points_in_box(snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike) -> 
     low, high = check_box(lower, upper, snapshot)
     surface = surface_voxels(snapshot, rows_in_box(snapshot, low, high))
     inside = ((surface.point >= low) & (surface.point <= high)).all(axis=1)
-    label, confidence, rgb = snapshot.read(
-        snapshot.slots[surface.row[inside]].astype(np.int64), surface.voxel[inside].astype(np.int64)
-    )
-    return MapPoints((surface.point[inside] * snapshot.voxel_size_m).astype(np.float32), rgb, label, confidence)
+    return surface_points(snapshot, SurfaceVoxels(surface.row[inside], surface.voxel[inside], surface.point[inside]))
 
 
 def mesh_in_box(snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike) -> MapMesh:
@@ -79,7 +76,7 @@ def _values(snapshot: MapSnapshot, rows: NDArray[np.int64]) -> BlockValues:
     )
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _speakers(points, index, voxels, ignore_id):
     slots, chosen = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for n in range(len(points)):  # vertices lie between observed voxels: there always is one

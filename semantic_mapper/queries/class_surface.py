@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.mapping.block_index import key_part
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import neighbour_slots, surface_offset
@@ -66,7 +66,7 @@ def _nothing() -> ClassSurface:
     return ClassSurface(none, none, np.empty(0, np.bool_), start, voxel, np.empty((0, 3)), byte, byte)
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _find_sources(packed, serials, index, row_of, old_packed, old_serials):
     """Row (B,) of each block in the earlier state, -1 where it or one of its six neighbours is not what it was."""
     source = np.full(len(packed), -1, np.int64)
@@ -94,7 +94,7 @@ def _find_sources(packed, serials, index, row_of, old_packed, old_serials):
     return source
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _collect(packed, slots, source, index, voxels, wanted, before):
     """``start``, ``voxel``, ``point``, ``label`` and ``confidence`` of a ``ClassSurface``."""
     start = np.zeros(len(packed) + 1, np.int64)
@@ -130,7 +130,7 @@ def _collect(packed, slots, source, index, voxels, wanted, before):
     return start, voxel[:at].copy(), point[:at].copy(), label[:at].copy(), confidence[:at].copy()
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _grown(values: Any, room: int) -> Any:
     more = np.empty((room, *values.shape[1:]), values.dtype)
     more[: len(values)] = values

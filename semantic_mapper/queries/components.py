@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.mapping.block_index import key_part, pack_key
 from semantic_mapper.queries.class_surface import ClassSurface
 
@@ -31,7 +31,7 @@ def find_components(surface: ClassSurface, min_voxels: int) -> Components:
     return Components(*_components(surface.packed, surface.start, surface.voxel, surface.label, min_voxels))
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def _root(parent, i):
     while parent[i] != i:
         parent[i] = parent[parent[i]]
@@ -39,7 +39,7 @@ def _root(parent, i):
     return i
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _find_rows(packed, start, row, near):
     """Rows (3, 3, 3) of the blocks round one that come before it in order and have voxels, -1 = none; and its own."""
     key = packed[row]
@@ -52,7 +52,7 @@ def _find_rows(packed, start, row, near):
         near[dx + 1, dy + 1, dz + 1] = at if found else -1
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _connect(packed, start, voxel, label):
     """Union-find over 26 neighbours: for each voxel (N,) the first voxel of its component."""
     parent = np.arange(len(voxel))
@@ -81,7 +81,7 @@ def _connect(packed, start, voxel, label):
     return parent
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _components(packed, start, voxel, label, min_voxels):
     component = _connect(packed, start, voxel, label)
     sizes = np.zeros(len(voxel), np.int64)

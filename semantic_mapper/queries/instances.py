@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.labels import STUFF_NAMES
 from semantic_mapper.mapping.block_index import unpack_keys
 from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
@@ -170,7 +170,7 @@ class InstanceTracker:
         )
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _overlaps(old, new, count):
     """``old component * count + new component`` of every voxel (M,) that has both.
 
@@ -197,7 +197,7 @@ def _overlaps(old, new, count):
     return pairs[:at]
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _changed(fresh, start, component, count):
     """Whether each component (C,) has voxels in blocks that were computed anew."""
     changed = np.zeros(count, np.bool_)

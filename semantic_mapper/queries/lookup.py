@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.mapping.block_index import find_block, pack_key
 from semantic_mapper.queries.checks import check_points, check_positive
 from semantic_mapper.queries.occupancy import read_states
@@ -64,7 +64,7 @@ def at(snapshot: MapSnapshot, points: ArrayLike, radius_m: float | None = None) 
     return PointAnswers(label, confidence, (distance * snapshot.voxel_size_m).astype(np.float32), state)
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _nearest_voxels(points, radius, index, voxels):
     """Slot and voxel (N,) of the nearest surface point within ``radius`` (voxels), slot -1 = none; distances (N,)."""
     slots, chosen = np.full(len(points), -1, np.int64), np.zeros(len(points), np.int64)

@@ -12,10 +12,10 @@ import itertools
 import threading
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import LabelError, MapError
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_index import KEY_LIMIT, make_block_index, pack_keys, unpack_keys
 from semantic_mapper.mapping.block_store import BLOCK_VOXELS
@@ -142,7 +142,7 @@ def _write(pool: BlockVoxels, start: int, changes: BlockChanges, ignore_id: int)
     _collect_classes(pool.tsdf[part], pool.weight[part], pool.label[part], ignore_id, pool.classes[part])
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _collect_classes(tsdf, weight, label, ignore_id, classes):
     """Classes (B, 4) of the voxels that lie near enough to a surface to be one of its own (``surface_offset``)."""
     for block in range(len(tsdf)):

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.mapping.block_index import key_part
 from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_point
@@ -60,7 +60,7 @@ def nearest(
     return NearestSurface(xyz * snapshot.voxel_size_m, float(distance) * snapshot.voxel_size_m, confidence)
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _bounds(p, class_id, packed, slots, classes):
     """Rows of the blocks that may have surface of a class, and the square of the least distance it may have."""
     rows, bounds = np.empty(len(packed), np.int64), np.empty(len(packed), np.float64)
@@ -78,7 +78,7 @@ def _bounds(p, class_id, packed, slots, classes):
     return rows[:count], bounds[:count]
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _search(p, class_id, least, packed, slots, index, voxels, xyz):
     """Slot and voxel of the nearest surface voxel of a class, and its distance; slot -1 = none. Writes ``xyz`` (3,).
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.mapping.block_index import find_block, pack_key
 from semantic_mapper.queries.checks import check_box, check_points
 from semantic_mapper.queries.snapshot import MapSnapshot
@@ -94,7 +94,7 @@ def distance_field(
     return DistanceField(origin, snapshot.voxel_size_m, np.asarray(distance, np.float32), state)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def _state(slot, x, y, z, voxels, voxels_per_step):
     """``State`` of voxel (x, y, z), which lies in block ``slot``."""
     voxel = ((z & 7) << 6) | ((y & 7) << 3) | (x & 7)
@@ -103,7 +103,7 @@ def _state(slot, x, y, z, voxels, voxels_per_step):
     return 2 if voxels.tsdf[slot, voxel] * voxels_per_step <= 0.5 else 1
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def read_states(places, index, voxels, voxels_per_step):
     """``State`` (N,) uint8 of voxels with integer coordinates (N, 3)."""
     states = np.zeros(len(places), np.uint8)
@@ -115,7 +115,7 @@ def read_states(places, index, voxels, voxels_per_step):
     return states
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _fill_box(first, states, index, voxels, voxels_per_step):
     """Write ``State`` of all voxels (X, Y, Z) from ``first`` (3,) on; what is unknown stays as it is."""
     for i in range(states.shape[0]):

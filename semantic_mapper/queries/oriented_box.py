@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.types import Float64
 
 
@@ -61,7 +61,7 @@ def _turn(yaw: float) -> Float64:
     return np.array(((np.cos(yaw), -np.sin(yaw)), (np.sin(yaw), np.cos(yaw))))
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _best_yaw(hull):
     """Of the directions of a hull's (N, 2) sides, below 90 degrees, the one with the least area; the smaller of two."""
     best, least = 0.0, np.inf

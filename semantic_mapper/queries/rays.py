@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import check_pose
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.mapping.block_index import find_block, pack_key
 from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.ray_casting import march
@@ -109,7 +109,7 @@ def _cast(snapshot: MapSnapshot, origin: Float64, direction: Float64, max_m: flo
     return RayHits(distance, label, confidence, rgb)
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _march_all(origins, directions, voxels_per_step, max_m, index, voxels, ignore_id):
     """Distance (N,) float32, 0 = miss, and slot (-1 = none) and voxel (N,) that speak for the place that was hit."""
     count = len(origins)
@@ -126,7 +126,7 @@ def _march_all(origins, directions, voxels_per_step, max_m, index, voxels, ignor
     return distance, slots, chosen
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def speaker(p, index, voxels, ignore_id):
     """Slot (-1 = none) and voxel of the observed corner nearest to a point; of those with a class if any is."""
     x0, y0, z0 = int(np.floor(p[0])), int(np.floor(p[1])), int(np.floor(p[2]))

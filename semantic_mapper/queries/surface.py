@@ -10,10 +10,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.mapping.block_index import find_block, pack_key
+from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.types import Float64
 
@@ -46,7 +47,14 @@ def surface_voxels(snapshot: MapSnapshot, rows: NDArray[np.int64] | None = None)
     return SurfaceVoxels(np.repeat(rows, counts).astype(np.int32), voxel, point)
 
 
-@njit(nogil=True, cache=True)
+def surface_points(snapshot: MapSnapshot, surface: SurfaceVoxels) -> MapPoints:
+    """Surface points with class, confidence and colour, in the order of ``surface``."""
+    slots = snapshot.slots[surface.row].astype(np.int64)
+    label, confidence, rgb = snapshot.read(slots, surface.voxel.astype(np.int64))
+    return MapPoints((surface.point * snapshot.voxel_size_m).astype(np.float32), rgb, label, confidence)
+
+
+@kernel()
 def neighbour_slots(x, y, z, index, near):
     """Slots of the blocks at -x, +x, -y, +y, -z, +z of block (x, y, z), -1 where there is none."""
     near[0], near[1] = find_block(index, pack_key(x - 1, y, z)), find_block(index, pack_key(x + 1, y, z))
@@ -54,13 +62,13 @@ def neighbour_slots(x, y, z, index, near):
     near[4], near[5] = find_block(index, pack_key(x, y, z - 1)), find_block(index, pack_key(x, y, z + 1))
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def may_be_surface(slot, voxel, voxels):
     """Whether a voxel is observed and near enough to the surface to ask ``surface_offset``, which costs much more."""
     return voxels.weight[slot, voxel] != 0 and abs(np.int64(voxels.tsdf[slot, voxel])) <= NEAREST_STEPS
 
 
-@njit(nogil=True, cache=True, inline="always")
+@kernel(inline=True)
 def surface_offset(slot, voxel, near, voxels, offset):
     """Whether a voxel is one of the surface; ``offset`` (3,) then leads from its centre to its surface point.
 
@@ -95,7 +103,7 @@ def surface_offset(slot, voxel, near, voxels, offset):
     return crossings > 0
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _count(keys, slots, index, voxels):
     counts = np.zeros(len(keys), np.int64)
     near, offset = np.empty(6, np.int64), np.empty(3)
@@ -107,7 +115,7 @@ def _count(keys, slots, index, voxels):
     return counts
 
 
-@njit(nogil=True, cache=True)
+@kernel()
 def _collect(keys, slots, counts, index, voxels, voxel, point):
     near, offset = np.empty(6, np.int64), np.empty(3)
     at = 0

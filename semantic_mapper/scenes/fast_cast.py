@@ -6,14 +6,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from semantic_mapper.kernel_cache import kernel
 
 NEAR_M = 0.02  # nothing nearer than this is seen
 
 _INF = np.inf
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def cast_pixels(shape, center, half, rotation, origin, camera_axes, fx, fy, cx, cy, width, height):  # type: ignore[no-untyped-def]
     """Depth along the camera's z (H, W) float64 (inf = miss) and number of the primitive (H, W) int32 (-1 = miss).
 
@@ -52,7 +53,7 @@ def cast_pixels(shape, center, half, rotation, origin, camera_axes, fx, fy, cx, 
     return depth, index
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def first_hit(shape, center, half, rotation, origin, ray):  # type: ignore[no-untyped-def]
     """Ray parameter (inf = miss) and number of the primitive (-1 = miss) of one ray, for the few that mirrors send."""
     nearest, index = _INF, -1
@@ -75,7 +76,7 @@ def first_hit(shape, center, half, rotation, origin, ray):  # type: ignore[no-un
     return nearest, index
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(error_model="numpy", inline=True)
 def _hit(shape, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Where a ray enters a unit shape (``primitives.Shape``); inf where it does not, or starts inside."""
     if shape == 0:
@@ -89,12 +90,12 @@ def _hit(shape, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     return t
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(error_model="numpy", inline=True)
 def _entry(near, far):  # type: ignore[no-untyped-def]
     return near if (near <= far and near > NEAR_M) else _INF
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(error_model="numpy", inline=True)
 def _hit_box(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     ix, iy, iz = 1.0 / dx, 1.0 / dy, 1.0 / dz
     ax, bx = (-1.0 - ox) * ix, (1.0 - ox) * ix
@@ -105,7 +106,7 @@ def _hit_box(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     return _entry(near, far)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(error_model="numpy", inline=True)
 def _hit_cylinder(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     a = dx * dx + dy * dy
     b = ox * dx + oy * dy
@@ -121,7 +122,7 @@ def _hit_cylinder(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     return _entry(near, far)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(error_model="numpy", inline=True)
 def _hit_sphere(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     a = dx * dx + dy * dy + dz * dz
     b = ox * dx + oy * dy + oz * dz
@@ -133,7 +134,7 @@ def _hit_sphere(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     return _entry((-b - root) / a, (-b + root) / a)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _hit_frustum(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Radius 0.8 - 0.2 z between z = -1 and 1: a slice of the lower half of a double cone with its tip at z = 4."""
     radius, slope = 0.8 - 0.2 * oz, -0.2 * dz
@@ -158,7 +159,7 @@ def _hit_frustum(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     return _entry(max(near, min(az, bz)), min(far, max(az, bz)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _screen_rectangle(center, half, rotation, origin, camera_axes, fx, fy, cx, cy, width, height):  # type: ignore[no-untyped-def]
     """Pixels [u0, u1) x [v0, v1) that the box round a primitive can cover; its edges are clipped at the near plane."""
     corner = np.empty((8, 3))

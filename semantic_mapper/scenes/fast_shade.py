@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.scenes.fast_cast import first_hit
 from semantic_mapper.scenes.fast_textures import texture
 from semantic_mapper.types import Float32
@@ -29,7 +29,7 @@ def shade_pixels(  # type: ignore[no-untyped-def]
     return _shade_all(depth, index, origin, camera_axes, fx, fy, cx, cy, *prims, *materials, *lights)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _shade_all(  # type: ignore[no-untyped-def]
     depth, index, origin, camera_axes, fx, fy, cx, cy,
     shape, center, half, rotation, material,
@@ -85,7 +85,7 @@ def _shade_all(  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(error_model="numpy", inline=True)
 def _mirror_ray(view, normal, ray):  # type: ignore[no-untyped-def]
     """Writes the unit vector into which a mirror sends what is seen along ``view``."""
     length = np.sqrt(view[0] * view[0] + view[1] * view[1] + view[2] * view[2])
@@ -94,7 +94,7 @@ def _mirror_ray(view, normal, ray):  # type: ignore[no-untyped-def]
         ray[i] = 2.0 * facing * normal[i] - view[i] / length
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(error_model="numpy", inline=True)
 def _normal(p, world, shape, center, half, rotation, local, own, normal):  # type: ignore[no-untyped-def]
     """Writes the point ``world`` in primitive p's own axes and the unit normal there; its dominant own axis."""
     for i in range(3):
@@ -107,7 +107,7 @@ def _normal(p, world, shape, center, half, rotation, local, own, normal):  # typ
     return axis
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(error_model="numpy", inline=True)
 def _own_normal(shape, local, p, half, own):  # type: ignore[no-untyped-def]
     """Writes the unit normal in the primitive's own axes; returns its dominant axis."""
     own[0], own[1], own[2] = 0.0, 0.0, 0.0
@@ -138,7 +138,7 @@ def _own_normal(shape, local, p, half, own):  # type: ignore[no-untyped-def]
     return 1 if abs(own[1]) >= abs(own[2]) else 2
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(error_model="numpy", inline=True)
 def _lighting(  # type: ignore[no-untyped-def]
     world, normal, view, gloss, position, light_color, shadow, softness, ambient, room, low, high, out
 ):
@@ -173,7 +173,7 @@ def _lighting(  # type: ignore[no-untyped-def]
             out[i] += strength * light_color[k, i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(error_model="numpy", inline=True)
 def _openness(world, normal, room):  # type: ignore[no-untyped-def]
     """Share of the ambient light that reaches a point: less near the room's walls, floor and ceiling."""
     share = 1.0
@@ -184,7 +184,7 @@ def _openness(world, normal, room):  # type: ignore[no-untyped-def]
     return share
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(error_model="numpy", inline=True)
 def _visible(shadow, low, high, k, softness, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Share of the light that reaches a point at (dx, dy, dz) from it: four spots of the shadow map, ``softness``
     pixels off the middle each way, each the weighted mean of four pixels. ``low`` and ``high`` are the map's extremes

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from semantic_mapper.kernel_cache import kernel
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline=True)
 def _hash(i, j, seed):  # type: ignore[no-untyped-def]
     """Two integers and a seed -> [0, 1), the same on every machine."""
     h = (i * 374761393 + j * 668265263 + seed * 974634777) & 0xFFFFFFFF
@@ -15,7 +16,7 @@ def _hash(i, j, seed):  # type: ignore[no-untyped-def]
     return ((h ^ (h >> 15)) & 0xFFFFFF) / 16777216.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _noise(x, y, seed):  # type: ignore[no-untyped-def]
     """Smooth value noise in [0, 1]."""
     fx, fy = np.floor(x), np.floor(y)
@@ -27,7 +28,7 @@ def _noise(x, y, seed):  # type: ignore[no-untyped-def]
     return top * (1 - b) + low * b
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def texture(pattern, m, color_a, color_b, scale, seed, local, p, half, axis, out):  # type: ignore[no-untyped-def]
     """Writes the albedo. (s, t) are the two own axes across the normal; for wood and planks t is the longer side."""
     first, second = (1, 2) if axis == 0 else ((0, 2) if axis == 1 else (0, 1))
@@ -64,7 +65,7 @@ def texture(pattern, m, color_a, color_b, scale, seed, local, p, half, axis, out
         out[i] = base * (1 - third) + third * (0.5 * color_a[m, 2 - i] + 0.3 * color_b[m, i])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(error_model="numpy", inline=True)
 def _planks(s, t, seed):  # type: ignore[no-untyped-def]
     """Boards one unit wide and eight long, each of its own shade, with grain and dark joints."""
     row = int(np.floor(s))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 
 from semantic_mapper.geometry import invert_pose
+from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.scenes.config import NoiseConfig
 from semantic_mapper.scenes.shots import Shot
 from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
@@ -61,7 +61,7 @@ def blur_motion(linear: Float32, depth_m: Float32, intrinsics: CameraIntrinsics,
     return _blur(linear, depth_m, invert_pose(shot.T_open_close), i.fx, i.fy, i.cx, i.cy)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _blur(linear, depth_m, T_close_open, fx, fy, cx, cy):  # type: ignore[no-untyped-def]
     height, width = depth_m.shape
     out = linear.copy()
@@ -91,7 +91,7 @@ def _blur(linear, depth_m, T_close_open, fx, fy, cx, cy):  # type: ignore[no-unt
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _develop(linear, grain, gain, corner, saturation, shot_noise, read_noise, table):  # type: ignore[no-untyped-def]
     height, width, _ = linear.shape
     out = np.empty((height, width, 3), np.uint8)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import msgspec
 import numpy as np
 
 from semantic_mapper.errors import CodecError
@@ -22,7 +23,14 @@ from semantic_mapper.transport.buffers import (
 )
 from semantic_mapper.transport.headers import pack_header
 from semantic_mapper.transport.images import decode_rgb, encode_rgb
-from semantic_mapper.transport.messages import FrameRefused, Message, Status
+from semantic_mapper.transport.learning_messages import (
+    decode_in_use,
+    decode_weights,
+    encode_in_use,
+    encode_weights,
+    open_weights,
+)
+from semantic_mapper.transport.messages import FrameRefused, LabelledKeyframe, Message, Status
 from semantic_mapper.transport.opening import (
     Parts,
     check_source,
@@ -31,7 +39,7 @@ from semantic_mapper.transport.opening import (
     open_header,
     topic_name,
 )
-from semantic_mapper.transport.plain import intrinsics_header, to_intrinsics
+from semantic_mapper.transport.plain import intrinsics_header, label_set_header, to_intrinsics, to_label_set
 from semantic_mapper.transport.small_messages import (
     decode_end,
     decode_info,
@@ -53,17 +61,24 @@ __all__ = [
     "decode",
     "decode_end",
     "decode_frame",
+    "decode_in_use",
     "decode_info",
+    "decode_keyframe",
     "decode_map_update",
     "decode_refused",
     "decode_status",
+    "decode_weights",
     "encode_end",
     "encode_frame",
+    "encode_in_use",
     "encode_info",
+    "encode_keyframe",
     "encode_map_update",
     "encode_refused",
     "encode_status",
+    "encode_weights",
     "read_envelope",
+    "repack_rgb",
 ]
 
 _DEFAULTS = CodecOptions()
@@ -86,6 +101,8 @@ class Envelope:
         stamp_ns, seq: 0 where the message has none.
         T_world_camera: Of a frame, 16 numbers row by row; else empty.
         has_depth, has_label: Of a frame.
+        rgb_encoding: Of a frame: "png", "jpeg" or "raw".
+        depth_scale: Units a metre of a frame's depth where it is packed as uint16, else 0.
     """
 
     topic: str
@@ -95,6 +112,8 @@ class Envelope:
     T_world_camera: tuple[float, ...] = ()
     has_depth: bool = False
     has_label: bool = False
+    rgb_encoding: str = ""
+    depth_scale: float = 0.0
 
 
 def encode_frame(
@@ -170,6 +189,56 @@ def decode_frame(parts: Parts) -> PosedFrame:
         pose_source=header.pose_source,
         pose_sigma=header.pose_sigma,
     )
+
+
+def repack_rgb(parts: Parts, options: CodecOptions) -> list[bytes]:
+    """A frame with its colour image packed as ``options`` say; all else, and an image that is so already, stays.
+
+    Raises:
+        CodecError: no frame, or its colour image is damaged.
+    """
+    header, buffers = _open_frame(parts)
+    if header.rgb.encoding == options.rgb:
+        return [bytes(part) for part in parts]
+    what = message_name("frame", header.camera_id, header.seq)
+    try:
+        rgb = decode_rgb(buffers[0], header.rgb.encoding, header.intrinsics.height, header.intrinsics.width)
+    except CodecError as error:
+        raise CodecError(f"{what}: rgb: {error}") from error
+    data = encode_rgb(rgb, options.rgb, options.jpeg_quality)
+    header = msgspec.structs.replace(header, rgb=headers.RgbSpec(encoding=options.rgb, bytes=len(data)))
+    return [bytes(parts[0]), pack_header(header, what), data, *(bytes(buffer) for buffer in buffers[1:])]
+
+
+def encode_keyframe(keyframe: LabelledKeyframe, options: CodecOptions = _DEFAULTS) -> list[bytes]:
+    """Labelled keyframe -> parts; its frame as ``encode_frame`` packs it.
+
+    Raises:
+        CodecError: a frame without labels, or one that cannot be sent.
+    """
+    frame = keyframe.frame
+    what = message_name("keyframe", frame.camera_id, frame.seq)
+    if frame.label is None:
+        raise CodecError(f"{what}: has no label image, so that there is nothing to learn from it")
+    header = headers.KeyframeHeader(
+        camera_id=frame.camera_id, teacher=keyframe.teacher[:128], label_set=label_set_header(keyframe.label_set)
+    )
+    k = frame.intrinsics
+    headers.check_keyframe_size(k.width, k.height, (), what)
+    topic = topic_bytes("keyframe", frame.camera_id)
+    parts = [topic, pack_header(header, what), *encode_frame(frame, options)[1:]]
+    headers.check_keyframe_size(k.width, k.height, [len(p) for p in parts], what)
+    return parts
+
+
+def decode_keyframe(parts: Parts) -> LabelledKeyframe:
+    """Parts -> labelled keyframe.
+
+    Raises:
+        CodecError: anything that ``encode_keyframe`` would not have made.
+    """
+    header, inner = _open_keyframe(parts)
+    return LabelledKeyframe(decode_frame(inner), to_label_set(header.label_set), header.teacher)
 
 
 def encode_map_update(update: MapUpdate, options: CodecOptions = _DEFAULTS) -> list[bytes]:
@@ -256,8 +325,23 @@ def read_envelope(parts: Parts) -> Envelope:
     if name == "frame":
         h, _ = _open_frame(parts)
         return Envelope(
-            name, h.camera_id, h.stamp_ns, h.seq, h.T_world_camera, h.depth is not None, h.label is not None
+            topic=name,
+            source=h.camera_id,
+            stamp_ns=h.stamp_ns,
+            seq=h.seq,
+            T_world_camera=h.T_world_camera,
+            has_depth=h.depth is not None,
+            has_label=h.label is not None,
+            rgb_encoding=h.rgb.encoding,
+            depth_scale=h.depth.scale if h.depth is not None and h.depth.encoding == "u16_delta_planes_zstd" else 0.0,
         )
+    if name == "keyframe":
+        _, inner = _open_keyframe(parts)
+        h, _ = _open_frame(inner)
+        return Envelope(name, h.camera_id, h.stamp_ns, h.seq, h.T_world_camera, h.depth is not None, has_label=True)
+    if name == "weights":
+        h, _ = open_weights(parts)
+        return Envelope(name, h.node)
     if name == "map":
         h, _ = _open_map_update(parts)
         return Envelope(name, h.camera_id, h.stamp_ns, h.seq)
@@ -275,6 +359,9 @@ _DECODERS = {
     "status": decode_status,
     "info": decode_info,
     "end": decode_end,
+    "keyframe": decode_keyframe,
+    "weights": decode_weights,
+    "in_use": decode_in_use,
 }
 
 
@@ -285,6 +372,21 @@ def _open_frame(parts: Parts) -> tuple[headers.FrameHeader, Parts]:
     headers.check_image_size(header.intrinsics.width, header.intrinsics.height, what)
     specs = [s for s in (header.rgb, header.depth, header.label) if s is not None]
     return header, open_buffers(parts, [s.bytes for s in specs], what)
+
+
+def _open_keyframe(parts: Parts) -> tuple[headers.KeyframeHeader, Parts]:
+    """Its header, and its frame as the parts of a message of its own."""
+    header = open_header(parts, "keyframe", headers.KeyframeHeader)
+    check_source(parts, header.camera_id)
+    inner = [topic_bytes("frame", header.camera_id), *parts[2:]]
+    if len(inner) < 2:
+        raise CodecError(f"keyframe of camera '{header.camera_id}': has no frame")
+    frame, _ = _open_frame(inner)
+    what = message_name("keyframe", frame.camera_id, frame.seq)
+    if frame.label is None:
+        raise CodecError(f"{what}: has no label image")
+    headers.check_keyframe_size(frame.intrinsics.width, frame.intrinsics.height, [len(p) for p in parts], what)
+    return header, inner
 
 
 def _open_map_update(parts: Parts) -> tuple[headers.MapUpdateHeader, Parts]:

@@ -1,4 +1,7 @@
-"""Where sockets listen: ``ipc://`` in a folder of the user by default; what other machines could reach is refused."""
+"""Where sockets listen, ``ipc://`` in a folder of the user by default, and where they may connect to.
+
+Beyond this machine nothing is bound, and nothing connected to, without keys.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,7 @@ from typing import IO
 import zmq
 
 from semantic_mapper.errors import TransportError
+from semantic_mapper.transport.security import Keys, ServerIdentity
 
 _MAX_IPC_PATH = 100  # the kernel takes 107 bytes, lock suffix aside
 
@@ -47,28 +51,58 @@ def default_endpoint(name: str, namespace: str = "default") -> str:
     return f"ipc://{folder}/{name}"
 
 
-def check_bind(endpoint: str) -> None:
-    """Refuse to listen where other machines could connect: messages are neither encrypted nor authenticated yet.
+def check_bind(endpoint: str, keys: Keys | None = None) -> None:
+    """Refuse to listen where other machines could connect, unless there are keys, and peers to be let in.
 
     Raises:
-        TransportError: an address beyond this machine, or a transport other than ipc, inproc and tcp.
+        TransportError: an address beyond this machine without these, or a transport other than ipc, inproc and tcp.
     """
     transport, _, address = endpoint.partition("://")
     if transport == "ipc":
         if address.startswith("@") or len(os.fsencode(address)) > _MAX_IPC_PATH or not address:
             raise TransportError(f"{endpoint}: an ipc address is a path of 1 to {_MAX_IPC_PATH} bytes")
     elif transport == "tcp":
-        host = address.rpartition(":")[0].strip("[]")
-        if not _is_loopback(host):
-            raise TransportError(
-                f"{endpoint}: only loopback addresses (tcp://127.0.0.1:PORT) can be bound, as messages are not "
-                "encrypted yet; tunnel it (ssh -L) to reach another machine"
-            )
+        if not _is_loopback(address):
+            _check_keys(endpoint, keys)
     elif transport != "inproc":
         raise TransportError(f"{endpoint}: use ipc://PATH or tcp://127.0.0.1:PORT")
 
 
-def _is_loopback(host: str) -> bool:
+def check_connect(endpoint: str, identity: ServerIdentity | None = None) -> None:
+    """Refuse to take the word of another machine, unless it is known by its key.
+
+    Raises:
+        TransportError: an address beyond this machine without the server's identity, or a transport other than ipc,
+            inproc and tcp.
+    """
+    transport, _, address = endpoint.partition("://")
+    if transport not in ("ipc", "inproc", "tcp"):
+        raise TransportError(f"{endpoint}: no endpoint; endpoints read ipc://PATH or tcp://HOST:PORT")
+    if transport == "tcp" and identity is None and not _is_loopback(address):
+        raise TransportError(
+            f"{endpoint}: is on another machine, and without keys anybody in the network could answer in its place. "
+            "Make keys on both sides and tell each the other's (`semantic-mapper keys make`, `keys allow NAME KEY`), "
+            "then name that machine (--server NAME, or the option `server`); or tunnel it (ssh -L) and connect to "
+            "tcp://127.0.0.1:PORT"
+        )
+
+
+def _check_keys(endpoint: str, keys: Keys | None) -> None:
+    if keys is None:
+        raise TransportError(
+            f"{endpoint}: other machines could connect, which needs keys on both sides (`semantic-mapper keys make`, "
+            "then the option `keys`); without them bind tcp://127.0.0.1:PORT, and tunnel it (ssh -L) from elsewhere"
+        )
+    if not keys.peers():
+        raise TransportError(
+            f"{endpoint}: nobody could connect, as {keys.folder} has no peers; add their public keys with "
+            "`semantic-mapper keys allow NAME KEY`"
+        )
+
+
+def _is_loopback(address: str) -> bool:
+    """Of ``HOST:PORT``, or of what else ZeroMQ takes for one (``SOURCE;HOST:PORT``): that is never one of loopback."""
+    host = address.rpartition(":")[0].strip("[]")
     if host == "localhost":
         return True
     try:

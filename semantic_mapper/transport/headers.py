@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, TypeVar, cast
 
 import msgpack
@@ -10,7 +11,7 @@ import msgspec
 from msgspec import Meta
 
 from semantic_mapper.errors import CodecError
-from semantic_mapper.transport.framing import MAX_PART_BYTES, MAX_PIXELS, Buffer
+from semantic_mapper.transport.framing import MAX_KEYFRAME_PIXELS, MAX_PART_BYTES, MAX_PIXELS, Buffer
 from semantic_mapper.transport.images import ImageEncoding
 from semantic_mapper.transport.messages import EndReason, NodeState
 from semantic_mapper.transport.topics import SOURCE_PATTERN
@@ -18,6 +19,8 @@ from semantic_mapper.transport.topics import SOURCE_PATTERN
 MAX_DAMAGES = 50  # damaged places of a recording that its end tells of
 PROTOCOL_VERSION = 1  # raise it when a header changes its meaning; readers refuse what they do not know
 MAX_HEADER_BYTES = 1 << 18
+MAX_KEYFRAME_BYTES = 8 * MAX_KEYFRAME_PIXELS + 2 * MAX_HEADER_BYTES  # raw colour, float32 depth, labels: all of it
+MAX_WEIGHTS_BYTES = 1 << 26  # of a weights file on the wire: five times the shipped one
 
 _MAX_SIDE = 1 << 14
 _MAX_ENTRIES = 1024
@@ -32,6 +35,8 @@ Sentence = Annotated[str, Meta(max_length=4096)]
 ClassId = Annotated[int, Meta(ge=0, le=255)]
 Pose = Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)]
 Milliseconds = dict[Word, float]
+Digest = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]  # SHA-256
+UnitInterval = Annotated[float, Meta(ge=0, le=1)]
 
 
 class Plain(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -178,6 +183,42 @@ class EndOfStreamHeader(Header, frozen=True, kw_only=True):
     damages: Annotated[tuple[Sentence, ...], Meta(max_length=MAX_DAMAGES)] = ()
 
 
+class KeyframeHeader(Header, frozen=True, kw_only=True):
+    """Header of ``LabelledKeyframe``; then come header and buffers of its frame."""
+
+    camera_id: Source
+    teacher: Word
+    label_set: LabelSetHeader
+
+
+class WeightsHeader(Header, frozen=True, kw_only=True):
+    """Header of ``WeightsUpdate``; buffer: the file."""
+
+    node: Source
+    version: Annotated[int, Meta(ge=1, le=2**31)]
+    bytes: Annotated[int, Meta(ge=1, le=MAX_WEIGHTS_BYTES)]
+    digest: Digest
+    parent: Digest
+    score: UnitInterval
+    parent_score: UnitInterval
+    keyframes: Count
+    held_out: Count
+
+
+class WeightsInUseHeader(Header, frozen=True, kw_only=True):
+    """Header of ``WeightsInUse``; no buffers."""
+
+    node: Source
+    version: Count
+    digest: Digest
+    newest: Count
+    judged: Count
+    accepted: bool
+    reason: Sentence
+    rolled_back: Count
+    contradicts: bool
+
+
 HeaderT = TypeVar("HeaderT", bound=Header)
 
 
@@ -233,6 +274,22 @@ def check_image_size(width: int, height: int, what: str) -> None:
     """
     if width * height > MAX_PIXELS:
         raise CodecError(f"{what}: image of {width}x{height}; at most {MAX_PIXELS} pixels are accepted")
+
+
+def check_keyframe_size(width: int, height: int, sizes: Sequence[int], what: str) -> None:
+    """Refuse a keyframe that is too large as a whole, packed or unpacked: learners keep dozens of them.
+
+    Args:
+        width, height: Of its images.
+        sizes: Of the parts of its message, bytes.
+
+    Raises:
+        CodecError: more than ``MAX_KEYFRAME_PIXELS``, or more than ``MAX_KEYFRAME_BYTES``.
+    """
+    if width * height > MAX_KEYFRAME_PIXELS:
+        raise CodecError(f"{what}: image of {width}x{height}; a keyframe has at most {MAX_KEYFRAME_PIXELS} pixels")
+    if sum(sizes) > MAX_KEYFRAME_BYTES:
+        raise CodecError(f"{what}: {sum(sizes)} bytes in all; a keyframe has at most {MAX_KEYFRAME_BYTES}")
 
 
 def _check_version(data: object, what: str) -> None:

@@ -15,7 +15,7 @@ from semantic_mapper.types import UInt8
 ImageEncoding = Literal["raw", "png", "jpeg"]
 
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-_PNG_END = b"IEND\xaeB`\x82"
+_PNG_ANIMATION = (b"acTL", b"fcTL", b"fdAT")
 _JPEG_MAGIC = b"\xff\xd8\xff"
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start-of-frame marks; the three are tables
 _JPEG_SCAN, _JPEG_END = 0xDA, b"\xff\xd9"
@@ -78,12 +78,24 @@ def sniff_image(data: bytes) -> tuple[Literal["png", "jpeg"], tuple[int, int]]:
     """
     if data.startswith(_PNG_MAGIC) and len(data) >= 33 and data[12:16] == b"IHDR":
         width, height = struct.unpack(">II", data[16:24])
-        if data.rfind(_PNG_END) < 0:
-            raise CodecError("PNG image is cut off: it has no end chunk")
+        _check_png(data)
         return "png", (height, width)
     if data.startswith(_JPEG_MAGIC):
         return "jpeg", _jpeg_size(data)
     raise CodecError(f"neither a PNG nor a JPEG image (starts with {data[:8].hex(' ')})")
+
+
+def _check_png(data: bytes) -> None:
+    """Walk the chunks: one head, no animation (OpenCV allocates what later heads and frames announce), one end."""
+    at = len(_PNG_MAGIC)
+    while at + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        if (kind == b"IHDR") != (at == len(_PNG_MAGIC)) or kind in _PNG_ANIMATION:
+            raise CodecError(f"PNG image has a chunk {kind!r} where none may stand")
+        at += 12 + length
+        if kind == b"IEND" and at <= len(data):
+            return
+    raise CodecError("PNG image is cut off: it has no end chunk")
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:

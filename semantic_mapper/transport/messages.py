@@ -84,4 +84,81 @@ class EndOfStream:
     damages: tuple[str, ...] = ()
 
 
-Message = PosedFrame | MapUpdate | FrameRefused | Status | StreamInfo | EndOfStream
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelledKeyframe:
+    """A frame with labels to learn from.
+
+    Args:
+        frame: With a label image.
+        label_set: What its ids mean.
+        teacher: Who labelled it, for people ("label tool", "log kitchen.mcap").
+    """
+
+    frame: PosedFrame
+    label_set: LabelSet
+    teacher: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class WeightsUpdate:
+    """Weights that a learner offers to a mapper.
+
+    Args:
+        node: The learner.
+        version: Higher than that of all before it.
+        data: A whole weights file (safetensors), never a pickle.
+        digest: SHA-256 of ``data``, hexadecimal.
+        parent: Digest of the weights that it was found better than; a mapper that uses others does not take it.
+        score, parent_score: mIoU over rays of the held-out keyframes, in 0..1, with these weights and with the parent.
+        keyframes, held_out: How many it learned from, and how many it was judged by.
+    """
+
+    node: str
+    version: int
+    data: bytes
+    digest: str
+    parent: str
+    score: float
+    parent_score: float
+    keyframes: int
+    held_out: int
+
+
+@dataclass(frozen=True, slots=True)
+class WeightsInUse:
+    """What weights a mapper uses, and what became of the last ones that it was offered.
+
+    Args:
+        node: The mapper.
+        version: In use; 0 = those that it was started with.
+        digest: SHA-256 of the file in use, hexadecimal.
+        newest: The highest version that it has been offered.
+        judged: The version that it was offered last; 0 = none yet.
+        accepted: Whether that one was taken.
+        reason: Why it was not, for people.
+        rolled_back: How often somebody has asked for other weights.
+        contradicts: Whether it was not taken because it contradicts the map, rather than for any other reason.
+    """
+
+    node: str
+    version: int
+    digest: str
+    newest: int = 0
+    judged: int = 0
+    accepted: bool = False
+    reason: str = ""
+    rolled_back: int = 0
+    contradicts: bool = False
+
+
+Message = (
+    PosedFrame
+    | MapUpdate
+    | FrameRefused
+    | Status
+    | StreamInfo
+    | EndOfStream
+    | LabelledKeyframe
+    | WeightsUpdate
+    | WeightsInUse
+)

@@ -9,6 +9,7 @@ from msgspec import Meta
 
 from semantic_mapper.transport.headers import (
     Count,
+    Digest,
     Header,
     LabelSetHeader,
     PartBytes,
@@ -181,6 +182,36 @@ class CorrectionAnswer(AnswerHeader, frozen=True, kw_only=True):
     map_epoch: Count
 
 
+class WeightsRequest(RequestHeader, frozen=True, kw_only=True):
+    """Which weights there are; with ``to``, go back to these. To ask twice is as to ask once."""
+
+    to: Count | None = None
+
+
+class WeightsEntry(Plain, frozen=True, kw_only=True):
+    """Weights that a mapper was started with (version 0) or was offered."""
+
+    version: Count
+    digest: Digest
+    state: Literal["in use", "earlier", "refused", "rolled back"]
+    score: float
+    parent_score: float
+    keyframes: Count
+    reason: Sentence
+
+
+class WeightsAnswer(AnswerHeader, frozen=True, kw_only=True):
+    """Which weights there are; ``before`` were in use before, ``wanted`` are about to be."""
+
+    in_use: Count
+    before: Count | None
+    wanted: Count | None
+    weights_taken: Count
+    weights_refused: Count
+    weights_rolled_back: Count
+    entries: Annotated[tuple[WeightsEntry, ...], Meta(max_length=256)]
+
+
 class ErrorAnswer(Header, frozen=True, kw_only=True):
     """The name of an error class of ours, and what it says."""
 
@@ -272,4 +303,5 @@ QUESTIONS = {
         takes={"stamps_ns": ArrayForm("<i8"), "camera": _U8, "poses": ArrayForm("<f8", (4, 4))},  # index of ``cameras``
     ),
     "correction": Question(CorrectionRequest, CorrectionAnswer),
+    "weights": Question(WeightsRequest, WeightsAnswer),
 }

@@ -9,11 +9,15 @@ from types import TracebackType
 
 import zmq
 
-from semantic_mapper.errors import TransportError
-from semantic_mapper.transport.endpoints import EndpointLock, bind, check_bind
-from semantic_mapper.transport.framing import MAX_PART_BYTES, Buffer
+from semantic_mapper.errors import CodecError, TransportError
+from semantic_mapper.transport.endpoints import EndpointLock, bind, check_bind, check_connect
+from semantic_mapper.transport.framing import MAX_PART_BYTES, MAX_PARTS, Buffer
+from semantic_mapper.transport.query_codec import encode_error
+from semantic_mapper.transport.receiving import receive_bounded
+from semantic_mapper.transport.security import Keys, ServerIdentity, secure_client, secure_server
 
-MAX_REQUEST_BYTES = 1 << 23  # of a part; who sends more is cut off
+MAX_REQUEST_BYTES = 1 << 23  # of a part; who sends more is cut off. Twice that of all parts
+_ENVELOPE_PARTS = 2  # who asks, and the empty part that REQ sockets put first
 _WAITING = 64  # questions and answers that may wait for each client
 
 
@@ -23,20 +27,26 @@ class QueryServer:
     A client that does not take its answers loses them; nothing here ever waits for a client.
 
     Args:
-        endpoint: ``ipc://PATH`` or ``tcp://127.0.0.1:PORT`` (``*`` as port: any free one, see ``endpoint``).
+        endpoint: ``ipc://PATH`` or ``tcp://ADDRESS:PORT`` (``*`` as port: any free one, see ``endpoint``).
+        keys: Encrypt, and let in only their peers; needed where other machines could connect.
 
     Raises:
-        TransportError: the endpoint is taken, cannot be bound, or could be reached from other machines.
+        TransportError: the endpoint is taken, cannot be bound, or could be reached from other machines and there are
+            no keys.
     """
 
-    def __init__(self, endpoint: str, *, context: zmq.Context[zmq.Socket[bytes]] | None = None) -> None:
-        check_bind(endpoint)
+    def __init__(
+        self, endpoint: str, *, keys: Keys | None = None, context: zmq.Context[zmq.Socket[bytes]] | None = None
+    ) -> None:
+        check_bind(endpoint, keys)
         self._endpoint_lock = EndpointLock(endpoint)
         self._socket = (context or zmq.Context.instance()).socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 200)
         self._socket.setsockopt(zmq.RCVHWM, _WAITING)
         self._socket.setsockopt(zmq.SNDHWM, _WAITING)
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
+        if keys is not None:
+            secure_server(self._socket, keys)
         self.endpoint = bind(self._socket, endpoint, self._endpoint_lock)
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._poller = zmq.Poller()
@@ -54,12 +64,20 @@ class QueryServer:
             os.eventfd_read(self._wake)
 
     def receive(self) -> tuple[bytes, list[bytes]] | None:
-        """Who asks, and the parts of the question; None where nobody does."""
+        """Who asks, and the parts of the question; None where nobody does, or one that is too large was refused."""
         try:
-            sender, *parts = self._socket.recv_multipart(zmq.NOBLOCK)
+            (sender, *parts), trouble = receive_bounded(
+                self._socket,
+                max_parts=MAX_PARTS + _ENVELOPE_PARTS,
+                max_bytes=2 * MAX_REQUEST_BYTES,
+                flags=zmq.NOBLOCK,
+            )
         except zmq.Again:
             return None
-        return sender, parts[1:] if parts[:1] == [b""] else parts  # the empty part that REQ sockets put first
+        if trouble:
+            self.send(sender, encode_error(CodecError(trouble)))
+            return None
+        return sender, parts[1:] if parts[:1] == [b""] else parts
 
     def send(self, client: bytes, parts: Sequence[Buffer]) -> None:
         """Answer a client; where it is gone, the answer is, too."""
@@ -86,9 +104,11 @@ class QuerySocket:
         endpoint: Where the server listens.
         timeout_s: How long to wait for an answer each time.
         attempts: How often to ask.
+        identity: Of a server that has keys.
 
     Raises:
-        TransportError: an endpoint that is none.
+        TransportError: an endpoint that is none, or of another machine whose identity is not given, or a server that
+            is not among the peers.
     """
 
     def __init__(
@@ -97,11 +117,14 @@ class QuerySocket:
         *,
         timeout_s: float,
         attempts: int,
+        identity: ServerIdentity | None = None,
         context: zmq.Context[zmq.Socket[bytes]] | None = None,
     ) -> None:
+        check_connect(endpoint, identity)
         self.endpoint = endpoint
         self._timeout_s = timeout_s
         self._attempts = attempts
+        self._identity = identity
         self._context = context or zmq.Context.instance()
         self._lock = threading.Lock()
         self._closed = False
@@ -111,7 +134,7 @@ class QuerySocket:
         """The parts of the answer.
 
         Raises:
-            TransportError: closed, or nobody has answered.
+            TransportError: closed, nobody has answered, or the answer is beyond all limits.
         """
         with self._lock:
             for _ in range(self._attempts):
@@ -123,6 +146,7 @@ class QuerySocket:
         raise TransportError(
             f"{self.endpoint}: no answer within {self._attempts} x {self._timeout_s:g} s; is a mapper running, and "
             "does it answer questions there (option `query`)?"
+            + ("" if self._identity is None else " Does it know this machine's key, and is its own the one we have?")
         )
 
     def close(self) -> None:
@@ -144,7 +168,12 @@ class QuerySocket:
         try:
             self._socket.send_multipart(parts, copy=False)
             answered = bool(self._socket.poll(int(self._timeout_s * 1000), zmq.POLLIN))
-            return self._socket.recv_multipart() if answered else None
+            if not answered:
+                return None
+            answer, trouble = receive_bounded(self._socket, max_bytes=MAX_PARTS * MAX_PART_BYTES)
+            if trouble:
+                raise TransportError(f"{self.endpoint}: {trouble}")
+            return answer
         except zmq.Again:
             return None
         finally:  # also after Ctrl-C: a REQ socket that has asked can only wait for that answer
@@ -160,7 +189,12 @@ class QuerySocket:
         socket.setsockopt(zmq.RECONNECT_IVL, 50)
         socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
         try:
+            if self._identity is not None:
+                secure_client(socket, self._identity)
             socket.connect(self.endpoint)
+        except TransportError:
+            socket.close(linger=0)
+            raise
         except zmq.ZMQError as error:
             socket.close(linger=0)
             raise TransportError(f"{self.endpoint}: cannot be connected to: {error}") from error

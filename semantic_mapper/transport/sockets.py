@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from semantic_mapper.transport.publisher import Publisher
-from semantic_mapper.transport.subscribers import Heartbeat, LosslessSubscriber, NewestSubscriber
+from semantic_mapper.transport.subscribers import LosslessSubscriber, NewestSubscriber
 
-__all__ = ["Heartbeat", "LosslessSubscriber", "NewestSubscriber", "Publisher"]
+__all__ = ["LosslessSubscriber", "NewestSubscriber", "Publisher"]

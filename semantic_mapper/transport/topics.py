@@ -7,7 +7,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 from semantic_mapper.errors import CodecError
-from semantic_mapper.transport.messages import EndOfStream, FrameRefused, Message, Status, StreamInfo
+from semantic_mapper.transport.messages import (
+    EndOfStream,
+    FrameRefused,
+    LabelledKeyframe,
+    Message,
+    Status,
+    StreamInfo,
+    WeightsInUse,
+    WeightsUpdate,
+)
 from semantic_mapper.types import MapUpdate, PosedFrame
 
 SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # camera ids and node names, as they stand in topics
@@ -25,6 +34,7 @@ class Topic:
         nominal_hz: Usual rate, 0 = now and then.
         queue: "newest": an unread message gives way to a newer one of the same source; "all": nothing is dropped.
         latched: The last one is sent again to every new subscriber.
+        closes: Topic of what it ends: its latched message comes after that one's, and holds until there is a new one.
     """
 
     name: str
@@ -33,6 +43,7 @@ class Topic:
     nominal_hz: float
     queue: Literal["newest", "all"]
     latched: bool = False
+    closes: str = ""
 
 
 TOPICS = {
@@ -40,10 +51,13 @@ TOPICS = {
     for topic in (
         Topic("info", StreamInfo, logged=True, nominal_hz=0, queue="all", latched=True),
         Topic("frame", PosedFrame, logged=True, nominal_hz=15, queue="newest"),
-        Topic("end", EndOfStream, logged=False, nominal_hz=0, queue="all"),
+        Topic("end", EndOfStream, logged=False, nominal_hz=0, queue="all", latched=True, closes="info"),
         Topic("map", MapUpdate, logged=False, nominal_hz=5, queue="newest"),
         Topic("refused", FrameRefused, logged=True, nominal_hz=0, queue="all"),
         Topic("status", Status, logged=True, nominal_hz=1, queue="newest", latched=True),
+        Topic("keyframe", LabelledKeyframe, logged=False, nominal_hz=0, queue="all"),
+        Topic("weights", WeightsUpdate, logged=False, nominal_hz=0, queue="all", latched=True),
+        Topic("in_use", WeightsInUse, logged=False, nominal_hz=0, queue="all", latched=True),
     )
 }
 

@@ -1,0 +1,233 @@
+"""One round of learning beside a mapper: finetune on the keyframes so far, and judge by those that were held out.
+
+The image encoder rests, so that whatever a mapper has encoded of its own keyframes stays valid, and new weights can be
+put in the place of old ones at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from semantic_mapper.config import AtLeastOne, AtLeastTwo, AtLeastZero, Config, NotNegative, Share
+from semantic_mapper.errors import FrameError, WeightsError
+from semantic_mapper.evaluation.metrics import ConfusionMatrix
+from semantic_mapper.fields.base import EncodedViews, stack_views
+from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.fields.device import DeviceName
+from semantic_mapper.fields.learned import LearnedField, encode_alike
+from semantic_mapper.fields.sampling import sample_guided
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, finetune
+from semantic_mapper.training.keyframe_pool import Key, Lessons, key_of
+from semantic_mapper.training.losses import IGNORE
+from semantic_mapper.training.overlap import view_overlap
+from semantic_mapper.training.step import StepConfig
+from semantic_mapper.training.views import LabelledView, draw_pixels, query_rays, stack_sources, view_from_frame
+from semantic_mapper.types import PosedFrame
+
+SOURCES = 7  # keyframes that a held-out ray is rendered from, beside its own image
+
+
+class RoundConfig(FinetuneConfig, frozen=True):
+    """As ``FinetuneConfig``, with other defaults: short rounds on a share of a core."""
+
+    seconds: AtLeastZero = 0.0  # steps count: how long they take is for whoever holds the budget to say
+    steps: NotNegative = 60
+    resting_share: Share = 1.0  # cannot be less
+    held_out_rays: AtLeastOne = 128
+    evaluations: AtLeastOne = 3
+    patience: NotNegative = 0
+    device: DeviceName = "cpu"  # "cuda" where a GPU has time to spare beside the mapper
+    step: StepConfig = StepConfig(rays=512)
+
+    def __post_init__(self) -> None:
+        if self.resting_share < 1:
+            raise ValueError("resting_share must be 1: the mapper's keyframes are not encoded anew")
+
+
+class OnlineConfig(Config, frozen=True):
+    """When a learner learns, and when it finds new weights better."""
+
+    new_keyframes: AtLeastOne = 4  # so many must have come since the last round
+    held_out_every: AtLeastTwo = 4  # of so many keyframes, the last is never learned from: it judges
+    max_keyframes: AtLeastTwo = 32  # kept; past it the oldest goes
+    least_gain: Share = 0.01  # mIoU that new weights must gain on the held-out keyframes
+    least_score: Share = 0.2  # mIoU that they must reach there: labels without any sense are learned worse
+    # Accuracy that they may lose on those held-out keyframes with which the weights in use were found good.
+    tolerance: Share = 0.02
+    rays: AtLeastOne = 1024  # of each held-out keyframe
+    finetune: RoundConfig = RoundConfig()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lesson:
+    """What came of a round.
+
+    Args:
+        checkpoint: The new weights.
+        score, parent_score: mIoU on all held-out keyframes, new and in use.
+        proved, parent_proved: Accuracy on those among them that the weights in use were found good with; None = none.
+        keys: Keyframes that took part.
+        refusal: Why the new weights are not worth offering; empty = they are.
+        worse: Whether they are refused because they do worse: then the labels are to blame. Others may only be too few.
+    """
+
+    checkpoint: Checkpoint
+    score: float
+    parent_score: float
+    proved: float | None
+    parent_proved: float | None
+    keys: frozenset[Key]
+    refusal: str = ""
+    worse: bool = False
+
+
+def learn(
+    lessons: Lessons,
+    current: Checkpoint,
+    config: OnlineConfig,
+    on_progress: Callable[[FinetuneProgress], None] | None = None,
+    on_judged: Callable[[], None] = lambda: None,
+) -> Lesson:
+    """Finetune ``current`` on the keyframes, and compare both on those held out.
+
+    Each is judged as the mapper would use it: with the labels of the keyframes that it was finetuned on known.
+
+    Args:
+        lessons: At least two to learn from and one to judge by.
+        current: Weights in use.
+        config: Of the round.
+        on_progress: Called after every step.
+        on_judged: Called after each held-out keyframe. What either raises ends the round.
+
+    Raises:
+        FrameError: too few keyframes, or those held out have nothing to judge by.
+        WeightsError: a kind of field whose encoder cannot rest, or one that is not trained yet.
+    """
+    if len(lessons.train) < 2 or not lessons.held_out:
+        raise FrameError(
+            f"learning needs 2 keyframes, and 1 to judge by, got {len(lessons.train)} and {len(lessons.held_out)}"
+        )
+    encoder = current.model.image_encoder
+    if not encode_alike(current.model, current.model) or encoder is None or encoder.uncalibrated:
+        raise WeightsError(
+            f"these weights (kind '{current.model.kind}') cannot be finetuned with an encoder that rests: start from "
+            "trained S-Ray weights"
+        )
+    held_out = lessons.held_out
+    seen = current.train_stamps_ns | {f.stamp_ns for f in held_out}  # judged by: not to be scored on either
+    made = finetune(lessons.train, current.label_set, current.model, config.finetune, on_progress, seen_stamps_ns=seen)
+    known_before, trained = {key_of(a) for a in current.anchors}, {key_of(f) for f in lessons.train}
+    others = [replace(f, label=None) for f in lessons.train if key_of(f) not in known_before]
+    before = judge(current.model, (*current.anchors, *others), held_out, config, on_judged)
+    after = judge(made.model, lessons.train, held_out, config, on_judged)
+    if not any(matrix.counts.any() for matrix in after):
+        raise FrameError("none of the held-out keyframes has a labelled pixel to judge by at this width")
+    old = [i for i, f in enumerate(held_out) if key_of(f) in lessons.proved]
+    lesson = Lesson(
+        checkpoint=made,
+        score=_miou(after),
+        parent_score=_miou(before),
+        proved=_accuracy(after[i] for i in old),
+        parent_proved=_accuracy(before[i] for i in old),
+        keys=frozenset(trained | {key_of(f) for f in held_out}),
+    )
+    made.recipe.update(
+        kind="online",
+        held_out_keyframes=len(held_out),
+        score=lesson.score,
+        parent_score=lesson.parent_score,
+        teacher_proved=len(lessons.proved),
+    )
+    refusal, worse = _refusal(lesson, config)
+    return replace(lesson, refusal=refusal, worse=worse and _shares_views(lessons, current.label_set, config))
+
+
+def judge(
+    model: LearnedField,
+    sources: Sequence[PosedFrame],
+    held_out: Sequence[PosedFrame],
+    config: OnlineConfig,
+    on_judged: Callable[[], None] = lambda: None,
+) -> list[ConfusionMatrix]:
+    """What a field says of the held-out keyframes against their labels, at the same rays whatever the field.
+
+    Each is rendered as a mapper would: from the keyframes that see most of it, and from its own image without labels.
+
+    Args:
+        sources: Keyframes to render from, with the labels that are known to the field.
+    """
+    width, sampling = config.finetune.width, config.finetune.step.sampling
+    label_set = model.label_set
+    views = [view_from_frame(f, label_set, width) for f in (*sources, *held_out)]
+    overlap = view_overlap(views)
+    generator = torch.Generator().manual_seed(config.finetune.seed)
+    matrices: list[ConfusionMatrix] = []
+    model.eval()
+    with torch.inference_mode():
+        encoded = [_encode(model, view, known=True) for view in views[: len(sources)]]
+        for i, view in enumerate(views[len(sources) :], len(sources)):
+            matrix = ConfusionMatrix(label_set)
+            matrices.append(matrix)
+            best = overlap[i, : len(sources)].argsort(descending=True, stable=True)[:SOURCES]
+            flat = draw_pixels(view.channel, config.rays, 0.5, generator, len(label_set))
+            if len(flat) == 0:
+                continue
+            looked_on = stack_views([*(encoded[j] for j in best.tolist()), _encode(model, view, known=False)])
+            prior = view.depth_m.flatten()[flat]
+            rays, targets = query_rays(view, flat, near_m=sampling.near_m, far_m=sampling.far_m, prior=prior)
+            render, _ = model.render_samples(rays, sample_guided(rays, sampling), looked_on)
+            said = torch.where(render.known, render.logits.argmax(1), IGNORE)
+            matrix.update(label_set.to_ids(targets.channel.numpy()), label_set.to_ids(said.numpy()))
+            on_judged()
+    return matrices
+
+
+def _encode(model: LearnedField, view: LabelledView, *, known: bool) -> EncodedViews:
+    return model.encode(stack_sources([view], with_labels=known))
+
+
+def _shares_views(lessons: Lessons, label_set: LabelSet, config: OnlineConfig) -> bool:
+    """Whether anything held out is seen by keyframes that are learned from, so that one can speak of the other."""
+    views = [view_from_frame(f, label_set, config.finetune.width) for f in (*lessons.held_out, *lessons.train)]
+    held_out = len(lessons.held_out)
+    return bool(view_overlap(views)[:held_out, held_out:].any())
+
+
+def _refusal(lesson: Lesson, config: OnlineConfig) -> tuple[str, bool]:
+    """Why the weights are refused (empty: they are not), and whether they do worse than those in use."""
+    worse = lesson.score < lesson.parent_score
+    if not lesson.score >= config.least_score:
+        return f"mIoU on held-out keyframes {lesson.score:.3f}: less than {config.least_score:g} (least_score)", worse
+    if not lesson.score >= lesson.parent_score + config.least_gain:
+        return (
+            f"mIoU on held-out keyframes {lesson.score:.3f}, with the weights in use {lesson.parent_score:.3f}: less "
+            f"than {config.least_gain:g} gained"
+        ), worse
+    proved, parent_proved = lesson.proved, lesson.parent_proved
+    if proved is not None and parent_proved is not None and proved < parent_proved - config.tolerance:
+        return (
+            f"accuracy {proved:.3f} on held-out keyframes that have proved right, with the weights in use "
+            f"{parent_proved:.3f}: the new labels contradict the old ones"
+        ), True
+    return "", False
+
+
+def _total(matrices: Iterable[ConfusionMatrix]) -> ConfusionMatrix | None:
+    total: ConfusionMatrix | None = None
+    for matrix in matrices:
+        total = matrix if total is None else total + matrix
+    return total
+
+
+def _miou(matrices: Iterable[ConfusionMatrix]) -> float:
+    total = _total(matrices)
+    return 0.0 if total is None else total.metrics().miou or 0.0
+
+
+def _accuracy(matrices: Iterable[ConfusionMatrix]) -> float | None:
+    total = _total(matrices)
+    return None if total is None else total.metrics().total_accuracy

@@ -1,0 +1,96 @@
+"""The message by which a robot tells where it is: small, documented, msgpack or JSON, so that any program can send it.
+
+One ZeroMQ message of one part, or of two: ``[topic, payload]``. The payload is a map, as msgpack or as JSON::
+
+    {"v": 1, "stamp_ns": 123456789, "position": [x, y, z], "quaternion": [x, y, z, w],
+     "sigma": 0.02, "parent": "odom", "child": "base"}
+
+``stamp_ns`` is the moment of the pose, in nanoseconds on the clock that stamps the images (CLOCK_MONOTONIC of one
+machine). Position, in metres, and quaternion are of frame ``child`` in frame ``parent``: ``p_parent = T @ p_child``.
+``sigma`` is the position's one-sigma uncertainty in metres; 0 or left out: not known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, cast
+
+import msgpack
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from semantic_mapper.errors import CodecError
+from semantic_mapper.geometry import pose_matrix
+from semantic_mapper.transport.framing import Buffer
+from semantic_mapper.transport.headers import Header, Stamp, pack_header, unpack_header
+from semantic_mapper.types import Float64
+
+MAX_POSE_BYTES = 2048
+QUATERNION_TOLERANCE = 1e-2  # of its length from 1: what is further off is no rounding error
+
+_WHAT = "pose message"
+FrameName = Annotated[str, Meta(max_length=64)]
+Three = Annotated[tuple[float, ...], Meta(min_length=3, max_length=3)]
+Four = Annotated[tuple[float, ...], Meta(min_length=4, max_length=4)]
+
+
+class PoseMessage(Header, frozen=True, kw_only=True):
+    """Where frame ``child`` was in frame ``parent`` at ``stamp_ns``; fields as in the module's words."""
+
+    stamp_ns: Stamp
+    position: Three
+    quaternion: Four  # x y z w
+    sigma: Annotated[float, Meta(ge=0)] = 0.0
+    parent: FrameName = ""
+    child: FrameName = ""
+
+    @property
+    def matrix(self) -> Float64:
+        """``T_parent_child`` (4, 4) float64."""
+        return pose_matrix(np.array(self.position, np.float64), np.array(self.quaternion, np.float64))
+
+
+def encode_pose(message: PoseMessage, topic: str = "pose") -> list[bytes]:
+    """Message -> [topic, msgpack].
+
+    Raises:
+        CodecError: a value that cannot be sent, such as NaN or a quaternion that is not of unit length.
+    """
+    _check_quaternion(message)
+    return [topic.encode(), pack_header(message, _WHAT)]
+
+
+def decode_pose(parts: Sequence[Buffer]) -> PoseMessage:
+    """Inverse of ``encode_pose``; takes JSON, and a payload without topic, too.
+
+    Raises:
+        CodecError: not such a message, or longer than ``MAX_POSE_BYTES``.
+    """
+    if not 1 <= len(parts) <= 2:
+        raise CodecError(f"{_WHAT}: has one part, or topic and payload; got {len(parts)} parts")
+    payload = bytes(parts[-1]) if len(parts[-1]) <= MAX_POSE_BYTES else b""
+    if not payload:
+        raise CodecError(f"{_WHAT}: of {len(parts[-1])} bytes; 1 to {MAX_POSE_BYTES} are accepted")
+    if payload.lstrip()[:1] == b"{":  # no msgpack map begins like that
+        payload = _json_to_msgpack(payload)
+    message = unpack_header(payload, PoseMessage, _WHAT)
+    _check_quaternion(message)
+    return message
+
+
+def _json_to_msgpack(payload: bytes) -> bytes:
+    """So that the same limits and checks hold for both."""
+    try:
+        data: Any = msgspec.json.decode(payload)
+        return cast(bytes, msgpack.packb(data, use_bin_type=True))
+    except (ValueError, TypeError, RecursionError, OverflowError) as error:
+        raise CodecError(f"{_WHAT}: not JSON: {error}") from error
+
+
+def _check_quaternion(message: PoseMessage) -> None:
+    length = float(np.linalg.norm(message.quaternion))
+    if abs(length - 1) > QUATERNION_TOLERANCE:
+        raise CodecError(
+            f"{_WHAT}: the quaternion [x, y, z, w] has length {length:.3g}, not 1; what it turns by is not defined"
+        )
