@@ -1,13 +1,14 @@
-"""The one protocol behind which every source of frames stands: cameras, rigs, and logs being played."""
+"""The protocols of sources: of frames, of camera images that have no pose yet, and of poses for them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol, Self, runtime_checkable
 
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import PosedFrame
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 
 
 @runtime_checkable
@@ -35,4 +36,101 @@ class FrameSource(Protocol):
 
     def __iter__(self) -> Iterator[PosedFrame]:
         """Frames in the order of capture."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseEstimate:
+    """Where a camera was.
+
+    Args:
+        T_world_camera: (4, 4) float64; of sources that tell where a rig is (``tells_of_rig``), T_world_rig.
+        source: What says so ("odometry", "board", "vio", ...); becomes ``PosedFrame.pose_source``.
+        sigma: One-sigma position uncertainty in metres; 0 = not known.
+    """
+
+    T_world_camera: Float64
+    source: str
+    sigma: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraImage:
+    """What a camera has captured, rectified: all of a ``PosedFrame`` but where the camera was.
+
+    Args:
+        stamp_ns, seq, camera_id, rgb, depth_m, intrinsics: As of ``PosedFrame``.
+        own_pose: Of a device that tracks itself (visual-inertial odometry); None of all others, and while it is lost.
+        tracks_itself: Whether the device does.
+    """
+
+    stamp_ns: int
+    seq: int
+    camera_id: str
+    rgb: UInt8
+    depth_m: Float32 | None
+    intrinsics: CameraIntrinsics
+    own_pose: PoseEstimate | None = None
+    tracks_itself: bool = False
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """A device that gives images; otherwise as ``FrameSource``.
+
+    A device that goes away and may come back is waited for within the driver: iteration goes on after a gap in
+    ``seq``, and ``troubles`` says what is the matter meanwhile.
+    """
+
+    @property
+    def info(self) -> StreamInfo:
+        """As of ``FrameSource``; known once it is open."""
+        ...
+
+    @property
+    def troubles(self) -> tuple[str, ...]:
+        """One sentence for each thing that does not work as it should now; any thread may ask."""
+        ...
+
+    @property
+    def turned_at(self) -> float:
+        """When the driver last came round (``time.monotonic``), with an image or without: while it waits for a device
+        that is away or gives nothing, too, but not while a call into the device hangs. Any thread may ask."""
+        ...
+
+    def __enter__(self) -> Self:
+        """Open it."""
+        ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Free it."""
+        ...
+
+    def __iter__(self) -> Iterator[CameraImage]:
+        """Images in the order of capture."""
+        ...
+
+    def stop(self) -> None:
+        """End the iteration soon, from any thread or signal handler."""
+        ...
+
+
+@runtime_checkable
+class PoseSource(Protocol):
+    """Something that knows where a camera was; used as a context manager."""
+
+    def __enter__(self) -> Self:
+        """Open it."""
+        ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Free it."""
+        ...
+
+    def pose(self, image: CameraImage) -> PoseEstimate | None:
+        """Pose of an image, in the order of capture; None where it is not known (lost, too old): no frame then."""
         ...

@@ -1,0 +1,1 @@
+"""Calibration of cameras and rigs from images of a printed board."""

@@ -1,0 +1,56 @@
+"""Settings of an OAK camera."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+
+import semantic_mapper.config
+from semantic_mapper.config import AtLeastOne, Positive, Share
+
+Socket = Literal["CAM_A", "CAM_B", "CAM_C", "CAM_D", "CAM_E", "CAM_F"]
+Preset = Literal["default", "face", "high_detail", "robotics", "accuracy", "density", "fast_accuracy", "fast_density"]
+Width = Annotated[int, msgspec.Meta(ge=64, multiple_of=16)]  # what the device's warp engine writes
+Height = Annotated[int, msgspec.Meta(ge=48, multiple_of=2)]
+
+
+class Config(semantic_mapper.config.Config, frozen=True):
+    """An OAK: one colour camera, depth of a stereo pair aligned to it, odometry where it is asked for."""
+
+    # Its id (MXID), its IP address (PoE), or its USB path, as ``semantic-mapper cameras`` shows them. Empty = the only
+    # one that is connected.
+    device: str = ""
+    rgb: Socket = "CAM_A"  # the camera that gives the images; depth and intrinsics are its
+    left: Socket = "CAM_B"  # of the stereo pair
+    right: Socket = "CAM_C"
+    width: Width = 640  # of the images, undistorted; another ratio than the sensor's crops
+    height: Height = 480
+    fps: Annotated[float, msgspec.Meta(gt=0, le=120)] = 20.0
+    depth: bool = True  # False for boards without a stereo pair
+    stereo_width: Width = 640  # of the images that depth and odometry are computed from
+    stereo_height: Height = 400
+    # DepthAI's preset of the stereo matcher. This one would rather leave a pixel without depth than guess: a map has
+    # other views of it.
+    stereo_preset: Preset = "fast_accuracy"
+    ir_dots: Share = 0.0  # power of the dot projector ("Pro" boards): depth on bare walls; disturbs odometry
+    # Visual-inertial odometry (DepthAI's Basalt, on this machine; needs the stereo pair and an IMU) as the images' own
+    # pose.
+    odometry: bool = False
+    odometry_wait_s: Positive = 0.3  # how long an image waits for its pose; then it goes without
+    # Where a camera with odometry was away: go on with images that have no pose, or end the node, so that whoever
+    # watches over the launch starts it anew with a new map.
+    other_world: Literal["no-poses", "end"] = "no-poses"
+    # JSON file (as DepthAI writes it) in place of the calibration that is stored on the device.
+    calibration: str = ""
+    search_s: Positive = 2.0  # how long the device is looked for before it counts as missing
+    start_s: Positive = 20.0  # how long the first image may take after the device has been opened
+    stall_s: Positive = 3.0  # without images for so long, the device is closed and opened again
+    retry_s: Positive = 1.0  # between two attempts to find a device that has gone
+    queue: AtLeastOne = 4  # images that wait where the reader is slow; the oldest gives way, which is a gap
+
+    def __post_init__(self) -> None:
+        if self.odometry and not self.depth:
+            raise ValueError("odometry needs the stereo pair: set depth = true, or odometry = false")
+        if len({self.left, self.right}) < 2:
+            raise ValueError(f"left and right are the same socket ({self.left})")

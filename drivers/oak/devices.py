@@ -1,0 +1,141 @@
+"""Which OAK cameras are connected, and why one cannot be had."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from pathlib import Path
+from typing import Any
+
+from drivers.oak.library import load_depthai
+from drivers.registry import FoundCamera
+from semantic_mapper.errors import CameraError
+
+USB_VENDOR = "03e7"
+SYSFS_USB = Path("/sys/bus/usb/devices")
+USB_NODES = Path("/dev/bus/usb")
+UDEV_RULE = (
+    """echo 'SUBSYSTEM=="usb", ATTRS{idVendor}=="03e7", MODE="0666"' | sudo tee /etc/udev/rules.d/80-movidius.rules """
+    "&& sudo udevadm control --reload-rules && sudo udevadm trigger"
+)
+_BUSY = ("X_LINK_BOOTED", "X_LINK_GATE_BOOTED")
+_IP = re.compile(r"\d{1,3}(\.\d{1,3}){3}\Z")
+_SEARCH_STEP_S = 0.2
+
+
+def list_devices() -> list[FoundCamera]:
+    """OAK cameras on USB and in the networks of this machine, by name.
+
+    Raises:
+        DependencyError: DepthAI cannot be loaded.
+        CameraError: DepthAI cannot search.
+    """
+    return sorted((_describe(info) for info in _search()), key=lambda device: (device.name, device.address))
+
+
+def find_device(address: str, search_s: float) -> Any:
+    """Look for one device until it is there.
+
+    Args:
+        address: Id, IP address or USB path; empty for the only one that is connected.
+        search_s: How long to look.
+
+    Returns:
+        DepthAI's ``DeviceInfo``.
+
+    Raises:
+        CameraError: there is none, several where one should be, or another process has it; and how to mend it.
+    """
+    deadline = time.monotonic() + search_s
+    while True:
+        found = _matching(address)
+        if len(found) > 1:
+            names = ", ".join(f"{d.getDeviceId()} ({d.name})" for d in found)
+            raise CameraError(f"several OAK cameras are connected: {names}; say which one by `device`")
+        if found and found[0].state.name not in _BUSY:
+            return found[0]
+        if time.monotonic() > deadline:
+            raise CameraError(_busy(found[0]) if found else missing(address))
+        time.sleep(_SEARCH_STEP_S)
+
+
+def missing(address: str, sysfs: Path = SYSFS_USB, nodes: Path = USB_NODES) -> str:
+    """Why no OAK can be found, as far as this machine can tell, and how to mend it.
+
+    Args:
+        address: What was looked for; empty = any.
+        sysfs, nodes: Where the kernel lists USB devices, and their device files.
+    """
+    if _IP.match(address):
+        return (
+            f"no OAK answers at {address}: check that it has power (its switch port or injector must give PoE), that "
+            f"this machine has an address in its network (`ping {address}`), and that no firewall stops UDP and TCP "
+            "ports 11490 and 11491"
+        )
+    what = f"the OAK '{address}' is not connected" if address else "no OAK camera is connected"
+    boards = _usb_boards(sysfs, nodes)
+    locked = [str(node) for node in boards if node.exists() and not os.access(node, os.W_OK)]
+    if locked:
+        return f"{what}, or this user may not open it ({', '.join(locked)}): {UDEV_RULE}; then plug it in again"
+    if boards:
+        return (
+            f"{what}, though there is one on USB ({', '.join(map(str, boards))}): plug it in again, with its own "
+            "cable, into a USB 3 port; `semantic-mapper cameras` shows the names of those that answer"
+        )
+    return (
+        f"{what}: check its cable and power (USB: a USB 3 port, and `lsusb | grep {USB_VENDOR}` shows it; PoE: "
+        "`device` may be its IP address, which also works through a router). Without permission it does not show "
+        f"either: {UDEV_RULE}"
+    )
+
+
+def _usb_boards(sysfs: Path, nodes: Path) -> list[Path]:
+    """Device files of the vendor's boards on USB."""
+    boards: list[Path] = []
+    for vendor in sorted(sysfs.glob("*/idVendor")):
+        try:
+            if vendor.read_text().strip() != USB_VENDOR:
+                continue
+            bus, device = (int((vendor.parent / name).read_text()) for name in ("busnum", "devnum"))
+        except (OSError, ValueError):  # it has been unplugged meanwhile
+            continue
+        boards.append(nodes / f"{bus:03d}" / f"{device:03d}")
+    return boards
+
+
+def _search() -> list[Any]:
+    dai = load_depthai()
+    try:
+        return list(dai.Device.getAllConnectedDevices())
+    except RuntimeError as error:
+        raise CameraError(f"DepthAI cannot search for cameras: {error}") from error
+
+
+def _matching(address: str) -> list[Any]:
+    if not address:
+        return _search()
+    dai = load_depthai()
+    try:
+        found, info = dai.Device.getDeviceByIdOrName(address)
+    except RuntimeError as error:
+        raise CameraError(f"DepthAI cannot search for the OAK '{address}': {error}") from error
+    return [info] if found else []
+
+
+def _describe(info: Any) -> FoundCamera:
+    state = info.state.name.removeprefix("X_LINK_").lower().replace("_", " ")
+    notes = [f"{info.protocol.name.removeprefix('X_LINK_').lower().replace('_', '/')} {info.name}", state]
+    if info.state.name in _BUSY:
+        notes.append("another process has it")
+    if "PERMISSION" in info.status.name:
+        notes.append(f"no permission: {UDEV_RULE}")
+    name = info.getDeviceId() or info.name  # not every state tells the id
+    return FoundCamera(kind="oak", name=name, address=name, note=", ".join(notes))
+
+
+def _busy(info: Any) -> str:
+    return (
+        f"the OAK {info.getDeviceId()} ({info.name}) is in use by another process, and takes one only: end that one, "
+        "or name another device"
+    )

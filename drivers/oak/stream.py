@@ -1,0 +1,181 @@
+"""Everything behind the sources of one connection: what is synced, waited for, and told when it ends.
+
+A pipeline has two parts. The sources are the device's (``device.py``), or files and nodes of the host (tests); what is
+here is the same for both. No Python runs in DepthAI's own threads, where an exception would end the process.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import timedelta
+from typing import Any
+
+from drivers.oak.config import Config
+from drivers.oak.library import load_depthai
+from semantic_mapper.errors import CameraError
+from semantic_mapper.types import Float64
+
+_SLICE_S = 0.1  # how soon a stop is noticed
+
+
+class StreamEnded(Exception):  # noqa: N818 -- an event, not an error: the camera is gone and may come back
+    """The device has gone, or gives nothing any more; the text says which."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryPorts:
+    """Where odometry takes its images and gives its poses.
+
+    Args:
+        left_out, right_out: ``dai.Node.Output`` of the stereo pair.
+        left_in, right_in: ``dai.Node.Input`` of the odometry node.
+        pose_out: ``dai.Node.Output`` of its poses (``dai.TransformData``), in the order of the images.
+        T_left_rgb: (4, 4) from the colour camera to the left one, metres.
+    """
+
+    left_out: Any
+    right_out: Any
+    left_in: Any
+    right_in: Any
+    pose_out: Any
+    T_left_rgb: Float64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sources:
+    """What a pipeline gets its messages from.
+
+    Args:
+        pipeline: ``dai.Pipeline`` that holds the source nodes; not started yet.
+        device: ``dai.Device`` to close at the end; None on the host alone.
+        rgb, depth: ``dai.Node.Output`` of the colour images and of their depth; None without depth.
+        calibration: ``dai.CalibrationHandler`` of the device.
+        name: What people call it; ``address``: by which it is found again.
+        metadata: For the stream's information.
+        notes: What does not work as it should, as far as one can tell at once.
+        odometry: None without.
+    """
+
+    pipeline: Any
+    device: Any | None
+    rgb: Any
+    depth: Any | None
+    calibration: Any
+    name: str
+    address: str
+    metadata: Mapping[str, str] = field(default_factory=dict[str, str])
+    notes: tuple[str, ...] = ()
+    odometry: OdometryPorts | None = None
+
+    def close(self) -> None:
+        """Free the device; one that has gone already is no error."""
+        if self.device is not None:
+            with suppress(RuntimeError):  # the link is dead: there is nothing to close
+                self.device.close()
+
+
+class Stream:
+    """The synced images of one connection, from ``start`` to ``close``.
+
+    Args:
+        sources: Of a pipeline that is not started yet.
+        config: Of the camera.
+
+    Raises:
+        CameraError: the pipeline cannot be built.
+    """
+
+    def __init__(self, sources: Sources, config: Config) -> None:
+        self.sources = sources
+        self._stall_s = config.stall_s
+        self._patience_s = config.start_s
+        outputs = {"rgb": sources.rgb} if sources.depth is None else {"rgb": sources.rgb, "depth": sources.depth}
+        self._groups = synced_queue(sources.pipeline, outputs, 0.5 / config.fps, config.queue)
+        self._first: tuple[Any, Any | None] | None = None
+        self._heard = time.monotonic()
+
+    def start(self) -> None:
+        """Let the images come.
+
+        Raises:
+            CameraError: the device refuses the pipeline.
+        """
+        try:
+            self.sources.pipeline.start()
+        except RuntimeError as error:
+            raise CameraError(
+                f"{self.sources.name} does not start: {error}; try a smaller `width`, `height` or `fps`"
+            ) from error
+        self._heard = time.monotonic()
+
+    def first(self, stopped: threading.Event) -> tuple[Any, Any | None] | None:
+        """The first messages, which ``read`` gives once more; None where a stop comes before them.
+
+        Raises:
+            StreamEnded: as ``read``.
+        """
+        while self._first is None and not stopped.is_set():
+            self._first = self.read(_SLICE_S)
+        return self._first
+
+    def read(self, timeout_s: float) -> tuple[Any, Any | None] | None:
+        """The next colour message and its depth; None where there is none within the time.
+
+        Raises:
+            StreamEnded: the device has gone, or has given nothing for ``stall_s`` (``start_s`` before the first).
+        """
+        if self._first is not None:
+            messages, self._first = self._first, None
+            return messages
+        group = take(self._groups, timeout_s)
+        now = time.monotonic()
+        if group is not None:
+            self._heard, self._patience_s = now, self._stall_s
+            return group["rgb"], None if self.sources.depth is None else group["depth"]
+        if not self.sources.pipeline.isRunning():
+            raise StreamEnded("it has gone (unplugged, without power, or its firmware has crashed)")
+        if now - self._heard > self._patience_s:
+            what = "image" if self.sources.depth is None else "image with depth"
+            raise StreamEnded(f"it has given no {what} for {self._patience_s:g} s")
+        return None
+
+    def close(self) -> None:
+        """Stop the pipeline and free the device; a device that has gone already is no error."""
+        with suppress(RuntimeError):  # the link is dead: there is nothing to stop
+            if self.sources.pipeline.isRunning():
+                self.sources.pipeline.stop()
+            self.sources.pipeline.wait()
+        self.sources.close()
+
+
+def synced_queue(pipeline: Any, outputs: Mapping[str, Any], within_s: float, size: int) -> Any:
+    """Queue of groups (``dai.MessageGroup``) of messages of one moment, by the names of their outputs.
+
+    Args:
+        pipeline: ``dai.Pipeline``.
+        outputs: ``dai.Node.Output`` by name.
+        within_s: How far the stamps of a group may lie apart; what has no partner is left out.
+        size: Groups that wait; the oldest gives way.
+    """
+    sync = pipeline.create(load_depthai().node.Sync)
+    sync.setRunOnHost(True)
+    sync.setSyncThreshold(timedelta(seconds=within_s))
+    for name, output in outputs.items():
+        output.link(sync.inputs[name])
+    return sync.out.createOutputQueue(maxSize=size, blocking=False)
+
+
+def take(queue: Any, timeout_s: float) -> Any | None:
+    """The next message of a queue; None where there is none within the time.
+
+    Raises:
+        StreamEnded: the pipeline has ended.
+    """
+    try:
+        return queue.get(timedelta(seconds=timeout_s))
+    except load_depthai().MessageQueue.QueueException as error:
+        raise StreamEnded("it has gone (unplugged, without power, or its firmware has crashed)") from error

@@ -1,0 +1,111 @@
+"""Motion between poses, and poses kept by time: interpolation, and extrapolation for a bounded while."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import deque
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from semantic_mapper.types import Float64
+
+_BASELINE_NS = 20_000_000  # velocities are those over at least so long, where there are such poses
+
+Miss = Literal["empty", "before", "gap", "stale"]
+
+
+def turn_between(T_world_a: Float64, T_world_b: Float64) -> Float64:
+    """Rotation vector (3,) in radians, in the axes of a, that turns a's axes into b's."""
+    return np.asarray(cv2.Rodrigues(T_world_a[:3, :3].T @ T_world_b[:3, :3])[0], np.float64)[:, 0]
+
+
+def along(T_world_a: Float64, T_world_b: Float64, share: float) -> Float64:
+    """The pose (4, 4) at a share of the way from a to b: rotations by slerp, positions on a line.
+
+    Below 0 and above 1 the same motion goes on.
+    """
+    T = np.eye(4)
+    T[:3, :3] = T_world_a[:3, :3] @ np.asarray(cv2.Rodrigues(turn_between(T_world_a, T_world_b) * share)[0])
+    T[:3, 3] = (1 - share) * T_world_a[:3, 3] + share * T_world_b[:3, 3]
+    return T
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StampedPose:
+    """One sample: T_parent_child (4, 4) at ``stamp_ns``, position uncertainty in metres (0 = not known)."""
+
+    stamp_ns: int
+    T: Float64
+    sigma: float = 0.0
+
+
+class PoseTrack:
+    """The last poses of something that moves, asked for at any time in between. Not for several threads at once.
+
+    Args:
+        keep: Samples kept.
+        max_gap_ns: Between two samples further apart than this nothing is interpolated.
+        max_ahead_ns: How far beyond the last sample its motion is taken to go on.
+    """
+
+    def __init__(self, keep: int, max_gap_ns: int, max_ahead_ns: int) -> None:
+        self._samples: deque[StampedPose] = deque(maxlen=keep)
+        self._max_gap_ns = max_gap_ns
+        self._max_ahead_ns = max_ahead_ns
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the last sample; None without any."""
+        return self._samples[-1].stamp_ns if self._samples else None
+
+    def add(self, sample: StampedPose) -> bool:
+        """Append a sample; False, and nothing done, where it is not later than the last one."""
+        if self._samples and sample.stamp_ns <= self._samples[-1].stamp_ns:
+            return False
+        self._samples.append(sample)
+        return True
+
+    def clear(self) -> None:
+        """Forget all samples."""
+        self._samples.clear()
+
+    def at(self, stamp_ns: int) -> StampedPose | Miss:
+        """The pose at a moment, or why there is none.
+
+        Returns:
+            "empty": no samples; "before": earlier than the first one that is kept; "gap": between two that are too far
+            apart; "stale": too long after the last one.
+        """
+        if not self._samples:
+            return "empty"
+        stamps = [s.stamp_ns for s in self._samples]
+        after = bisect_left(stamps, stamp_ns)
+        if after < len(stamps) and stamps[after] == stamp_ns:
+            return self._samples[after]
+        if after == 0:
+            return "before"
+        if after == len(stamps):
+            return self._ahead(stamp_ns)
+        a, b = self._samples[after - 1], self._samples[after]
+        if b.stamp_ns - a.stamp_ns > self._max_gap_ns:
+            return "gap"
+        share = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
+        return StampedPose(stamp_ns, along(a.T, b.T, share), max(a.sigma, b.sigma))
+
+    def _ahead(self, stamp_ns: int) -> StampedPose | Miss:
+        last = self._samples[-1]
+        if stamp_ns - last.stamp_ns > self._max_ahead_ns:
+            return "stale"
+        if len(self._samples) < 2 or last.stamp_ns - self._samples[-2].stamp_ns > self._max_gap_ns:
+            return "stale"  # one pose alone tells no motion
+        # From poses that are not close together: of two that are, the noise would be taken for motion.
+        earlier = [s for s in self._samples if last.stamp_ns - s.stamp_ns <= self._max_gap_ns][:-1]
+        before = next((s for s in reversed(earlier) if last.stamp_ns - s.stamp_ns >= _BASELINE_NS), earlier[0])
+        share = (stamp_ns - before.stamp_ns) / (last.stamp_ns - before.stamp_ns)
+        T = along(before.T, last.T, share)
+        # That the motion goes on is a guess, as wrong as the motion could have changed: half of what it adds.
+        guessed = 0.5 * float(np.linalg.norm(T[:3, 3] - last.T[:3, 3]))
+        return StampedPose(stamp_ns, T, float(np.hypot(last.sigma, guessed)) if last.sigma > 0 else 0.0)

@@ -1,0 +1,249 @@
+"""RGB-D odometry: where a camera with depth went, from its images alone.
+
+Each view is aligned to keyframes, not to the view before, so that errors add up from keyframe to keyframe only, and not
+at all where the camera comes back to old ones. The first guess goes on with the last motion; where that leads nowhere,
+corners that view and keyframe share give another. A view that lies on no keyframe is lost: no pose, until its corners
+are found in a keyframe again.
+
+Open3D sums over points in an order that its threads decide, so poses of two runs differ in their last digits (some
+micrometres); a log keeps the poses that were used.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+import cv2
+import numpy as np
+import structlog
+
+from drivers.base import CameraImage, PoseEstimate
+from drivers.poses.alignment import Aligner, Fit, Target, fit
+from drivers.poses.config import OdometryPoses, matrix
+from drivers.poses.depth_view import Level, make_levels, thin_depth, thinned
+from drivers.poses.features import Features, find_features, pose_from_features
+from drivers.poses.keyframe_map import KeyframeMap, OdometryKeyframe
+from drivers.poses.motion import StampedPose, along, turn_between
+from drivers.poses.still import WAYS_OUT
+from semantic_mapper.errors import CameraError
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
+
+_LEAST_DEPTH = 0.05  # share of the pixels that need depth
+_POINTS_A_VOTE = 50  # neighbouring points have the same error: so many tell as much as one
+_RECENT_NS = 700_000_000  # after so long without a pose the last motion says nothing any more
+
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(slots=True, eq=False)
+class _View:
+    """An image, thinned out; its corners are found when somebody asks."""
+
+    stamp_ns: int
+    rgb: UInt8
+    depth_m: Float32
+    intrinsics: CameraIntrinsics
+    levels: tuple[Level, ...]
+    found: Features | None = None
+
+    def features(self, count: int) -> Features:
+        if self.found is None:
+            self.found = find_features(self.rgb, self.depth_m, count)
+        return self.found
+
+
+class OdometryPoseSource:
+    """Follows one RGB-D camera. Not for several threads at once, but any may read ``counters`` and ``troubles``.
+
+    Args:
+        config: How.
+
+    Attributes:
+        counters: "tracked" images; "lost" ones; how often the camera was "relocalised"; "keyframes" made.
+
+    Raises:
+        DependencyError: Open3D cannot be loaded.
+    """
+
+    def __init__(self, config: OdometryPoses) -> None:
+        self._config = config
+        self._aligner = Aligner(config)
+        self._map = KeyframeMap(config.max_keyframes)
+        self._camera: tuple[str, CameraIntrinsics] | None = None
+        self._past: list[StampedPose] = []  # the last two poses
+        self._lost = False
+        self._next_try = 0  # keyframe that is tried next while lost
+        self._troubles: tuple[str, ...] = ()
+        self.counters: Counter[str] = Counter()
+
+    @property
+    def troubles(self) -> tuple[str, ...]:
+        """One sentence while the camera is lost."""
+        return self._troubles
+
+    @property
+    def keyframe_poses(self) -> list[Float64]:
+        """T_world_camera (4, 4) of the keyframes that are kept, in the order they were made."""
+        return [k.target.T_world_camera for k in self._map.frames]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        pass
+
+    def pose(self, image: CameraImage) -> PoseEstimate | None:
+        """Pose of the next image; None while lost.
+
+        Raises:
+            CameraError: the camera has no depth, or images of another camera come in between.
+        """
+        self._check(image)
+        view = self._view(image)
+        if view is None:
+            return self._lose("it has hardly any depth")
+        if not len(self._map):
+            return self._begin(view)
+        guesses = self._guesses_while_lost(view) if self._lost else self._guesses(view)
+        for guess, targets in guesses:
+            found = self._try(view, guess, targets)
+            if found is not None:
+                return self._accept(view, *found)
+        return self._lose("it lies on no keyframe")
+
+    def _check(self, image: CameraImage) -> None:
+        camera = (image.camera_id, image.intrinsics)
+        if self._camera is None:
+            if image.depth_m is None:
+                raise CameraError(
+                    f"camera '{image.camera_id}' has no depth: from its images alone the scale of its motion cannot be "
+                    f"known, and no map be made; {WAYS_OUT}"
+                )
+            self._camera = camera
+        if camera != self._camera:
+            raise CameraError(
+                f"odometry follows camera '{self._camera[0]}' at {self._camera[1].width}x{self._camera[1].height}; an "
+                f"image of '{image.camera_id}' at {image.intrinsics.width}x{image.intrinsics.height} came: give each "
+                "camera a pose source of its own, and do not change its resolution"
+            )
+
+    def _view(self, image: CameraImage) -> _View | None:
+        """None without enough depth."""
+        stride = max(1, round(image.intrinsics.width / self._config.width))
+        if image.depth_m is None:
+            return None
+        intrinsics = thinned(image.intrinsics, stride, stride // 2)
+        depth = thin_depth(image.depth_m, stride, self._config.depth_max_m)
+        if float((depth > 0).mean()) < _LEAST_DEPTH:
+            return None
+        size = (intrinsics.width, intrinsics.height)
+        rgb = np.asarray(cv2.resize(image.rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+        levels = make_levels(depth, intrinsics, len(self._config.iterations))
+        return _View(image.stamp_ns, rgb, depth, intrinsics, levels)
+
+    def _begin(self, view: _View) -> PoseEstimate:
+        pose = matrix(self._config.T_world_start)
+        self._add_keyframe(view, pose, 0.0)
+        self._past = [StampedPose(view.stamp_ns, pose)]
+        self.counters["tracked"] += 1
+        return PoseEstimate(pose, "odometry", 0.0)
+
+    def _guesses(self, view: _View) -> list[tuple[Float64, list[OdometryKeyframe]]]:
+        """The last motion gone on with, and what corners say; that first which lies better on the nearest keyframe."""
+        guess = self._past[-1].T
+        if len(self._past) > 1:
+            a, b = self._past
+            guess = along(a.T, b.T, min((view.stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns), 3.0))
+        near = self._map.near(guess, self._config.neighbours)
+        guesses = [(guess, near), *self._guesses_of_features(view, near)]
+        return sorted(guesses, key=lambda g: fit(view.levels, g[1][0].target, g[0], self._config.outlier_m).cost_m)
+
+    def _guesses_while_lost(self, view: _View) -> list[tuple[Float64, list[OdometryKeyframe]]]:
+        """What corners say of keyframes near the last pose, then of the others, so many an image in turn."""
+        last = self._past[-1]
+        near = self._map.near(last.T, self._config.neighbours)
+        guesses: list[tuple[Float64, list[OdometryKeyframe]]] = []
+        if view.stamp_ns - last.stamp_ns < _RECENT_NS:
+            guesses.append((last.T, near))
+        count = min(len(self._map), self._config.relocalise_keyframes)
+        turn = [self._map.frames[(self._next_try + i) % len(self._map)] for i in range(count)]
+        self._next_try = (self._next_try + count) % len(self._map)
+        return guesses + self._guesses_of_features(view, near + [k for k in turn if k not in near])
+
+    def _guesses_of_features(
+        self, view: _View, keyframes: list[OdometryKeyframe]
+    ) -> list[tuple[Float64, list[OdometryKeyframe]]]:
+        """Those with the most corners in agreement first."""
+        features = view.features(self._config.features)
+        found: list[tuple[int, Float64, OdometryKeyframe]] = []
+        for keyframe in keyframes:
+            match = pose_from_features(features, keyframe.features, view.intrinsics, self._config.min_matches)
+            if match is not None:
+                found.append((match[1], keyframe.target.T_world_camera @ match[0], keyframe))
+        found.sort(key=lambda item: -item[0])
+        return [(pose, self._map.near(pose, self._config.neighbours)) for _, pose, _ in found]
+
+    def _try(self, view: _View, guess: Float64, keyframes: list[OdometryKeyframe]) -> tuple[Float64, list[Fit]] | None:
+        """Align a view to keyframes; None where the result cannot be believed."""
+        fits = [fit(view.levels, k.target, guess, self._config.outlier_m) for k in keyframes]
+        targets = [
+            k.target
+            for number, (k, f) in enumerate(zip(keyframes, fits, strict=True))
+            if number == 0 or f.overlap >= self._config.min_overlap
+        ]
+        pose = self._aligner.align(view.levels, targets, guess)
+        if pose is None or not self._is_near(guess, pose):
+            return None
+        fits = [fit(view.levels, t, pose, self._config.outlier_m) for t in targets]
+        return (pose, fits) if self._lies_on(fits[0]) else None
+
+    def _is_near(self, guess: Float64, pose: Float64) -> bool:
+        moved = float(np.linalg.norm(pose[:3, 3] - guess[:3, 3]))
+        turned = float(np.rad2deg(np.linalg.norm(turn_between(guess, pose))))
+        return moved <= self._config.max_step_m and turned <= self._config.max_step_deg
+
+    def _lies_on(self, found: Fit) -> bool:
+        return (
+            found.overlap >= self._config.min_overlap
+            and found.fitness >= self._config.min_fitness
+            and found.rmse_m <= self._config.max_rmse_m
+        )
+
+    def _accept(self, view: _View, pose: Float64, fits: list[Fit]) -> PoseEstimate:
+        if self._lost:
+            self.counters["relocalised"] += 1
+            _log.info("odometry_relocalised", stamp_ns=view.stamp_ns)
+            self._past = []
+        self._lost, self._troubles = False, ()
+        self.counters["tracked"] += 1
+        self._past = [*self._past[-1:], StampedPose(view.stamp_ns, pose)]
+        way, turn = self._map.distances(pose)
+        reach = np.maximum(way / self._config.keyframe_m, np.rad2deg(turn) / self._config.keyframe_deg)
+        way_m = float(min(k.way_m + d for k, d in zip(self._map.frames, way, strict=True)))
+        if reach.min() > 1 or fits[0].overlap < self._config.keyframe_overlap:
+            self._add_keyframe(view, pose, way_m)
+        return PoseEstimate(pose, "odometry", _sigma(fits, self._config.drift * way_m))
+
+    def _add_keyframe(self, view: _View, pose: Float64, way_m: float) -> None:
+        features = view.features(self._config.features)
+        self._map.add(OdometryKeyframe(Target(view.levels, pose), features, way_m))
+        self.counters["keyframes"] += 1
+
+    def _lose(self, reason: str) -> None:
+        if not self._lost:
+            _log.warning("odometry_lost", reason=reason)
+        self._lost = True
+        self._troubles = (f"the odometry is lost ({reason}); show the camera a place that it has seen before",)
+        self.counters["lost"] += 1
+
+
+def _sigma(fits: list[Fit], drift_m: float) -> float:
+    """One-sigma uncertainty of the position in metres: of the points' noise, and of the keyframes' own poses."""
+    total = sum((f.normal_matrix / max(f.rmse_m, 1e-3) ** 2 for f in fits), np.zeros((6, 6))) / _POINTS_A_VOTE
+    covariance = np.linalg.pinv(total)[3:, 3:]
+    return float(np.hypot(np.sqrt(max(np.trace(covariance), 0.0) / 3), drift_m))

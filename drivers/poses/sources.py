@@ -1,0 +1,95 @@
+"""From settings to a pose source; what a kind needs is loaded with it."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from typing import Any
+
+from drivers.calibration import rigid_matrix
+from drivers.poses.config import (
+    KINDS,
+    BoardPoses,
+    DevicePoses,
+    FixedPose,
+    Matrix,
+    OdometryPoses,
+    PoseConfig,
+    TopicPoses,
+)
+from drivers.poses.posed_camera import TellingPoseSource
+from semantic_mapper.config import convert_config
+from semantic_mapper.errors import ConfigError
+
+
+def open_poses(config: Mapping[str, Any], where: str = "poses") -> TellingPoseSource:
+    """A pose source as a launch file tells of it, ready to be entered.
+
+    Args:
+        config: ``kind`` ("device", "fixed", "topic", "board", "rgbd") and its settings, see ``config.py``.
+        where: Names the file or section in errors.
+
+    Raises:
+        ConfigError: no such kind, an unknown or bad setting, or a matrix that is no rigid transform.
+        DependencyError: "rgbd", and Open3D cannot be loaded.
+    """
+    return make_poses(read_pose_config(config, where))
+
+
+def read_pose_config(config: Mapping[str, Any], where: str = "poses") -> PoseConfig:
+    """Plain data -> checked settings of one kind; opens nothing. See ``open_poses``."""
+    kind = config.get("kind")
+    if not isinstance(kind, str) or kind not in KINDS:
+        near = difflib.get_close_matches(str(kind), KINDS, n=1)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
+        raise ConfigError(f"{where}: kind must be one of {', '.join(KINDS)}, got {kind!r}{hint}")
+    checked = convert_config(dict(config), KINDS[kind], where)
+    for name, rows in _matrices(checked).items():
+        rigid_matrix(rows, f"{where}: {name}")
+    return checked
+
+
+def make_poses(config: PoseConfig) -> TellingPoseSource:
+    """The source that checked settings stand for."""
+    match config:
+        case DevicePoses():
+            from drivers.poses.still import DevicePoseSource
+
+            return DevicePoseSource(config)
+        case FixedPose():
+            from drivers.poses.still import FixedPoseSource
+
+            return FixedPoseSource(config)
+        case TopicPoses():
+            from drivers.poses.topic import TopicPoseSource
+
+            return TopicPoseSource(config)
+        case BoardPoses():
+            from drivers.poses.board import BoardPoseSource
+
+            return BoardPoseSource(config)
+        case OdometryPoses():
+            from drivers.poses.odometry import OdometryPoseSource
+
+            return OdometryPoseSource(config)
+
+
+def _matrices(config: PoseConfig) -> dict[str, Matrix]:
+    """All matrices of a config, by the name of their setting."""
+    match config:
+        case FixedPose():
+            return {"T_world_camera": config.T_world_camera} | _given("T_world_rig", config.T_world_rig)
+        case TopicPoses():
+            mounts = {f"cameras.{name}": rows for name, rows in config.cameras.items()}
+            rig = _given("T_base_rig", config.T_base_rig)
+            return {"T_base_camera": config.T_base_camera, **mounts} | rig
+        case BoardPoses():
+            return {"T_world_board": config.T_world_board}
+        case OdometryPoses():
+            return {"T_world_start": config.T_world_start}
+        case DevicePoses():
+            return {}
+
+
+def _given(name: str, rows: Matrix | None) -> dict[str, Matrix]:
+    return {} if rows is None else {name: rows}

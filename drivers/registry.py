@@ -1,0 +1,112 @@
+"""Kinds of cameras by name. Each is a package ``drivers.<kind>`` that is loaded when it is asked for.
+
+A package offers ``Config``, ``open_camera(config, camera_id)`` and ``list_devices()``; see ``Driver``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, cast
+
+import msgspec
+
+from drivers.base import Camera
+from semantic_mapper.config import convert_config
+from semantic_mapper.errors import ConfigError, DependencyError, SemanticMapperError
+
+KINDS = ("v4l2", "opencv", "oak")
+
+
+@dataclass(frozen=True, slots=True)
+class FoundCamera:
+    """A camera that is connected.
+
+    Args:
+        kind: Of ``KINDS``.
+        name: As the device calls itself.
+        address: What its driver's config takes: a path, a serial number, an IP address.
+        note: What else is worth knowing, for people.
+    """
+
+    kind: str
+    name: str
+    address: str
+    note: str = ""
+
+
+class Driver(Protocol):
+    """What a package of a kind offers."""
+
+    Config: type[msgspec.Struct]
+
+    def open_camera(self, config: Any, camera_id: str) -> Camera:
+        """A camera that is not open yet; what the config lacks is refused here.
+
+        Raises:
+            CameraError, ConfigError: it cannot work with this config.
+        """
+        ...
+
+    def list_devices(self) -> Sequence[FoundCamera]:
+        """What is connected now; opens nothing for longer than a question.
+
+        Raises:
+            CameraError, DependencyError: nobody can tell.
+        """
+        ...
+
+
+def load_driver(kind: str) -> Driver:
+    """The package of a kind.
+
+    Raises:
+        ConfigError: no such kind.
+        DependencyError: it needs something that is not installed.
+    """
+    if kind not in KINDS:
+        near = difflib.get_close_matches(kind, KINDS, n=1, cutoff=0.5)
+        hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(KINDS)}"
+        raise ConfigError(f"no kind of camera is called '{kind}'; {hint}")
+    try:
+        return cast(Driver, importlib.import_module(f"drivers.{kind}"))
+    except ImportError as error:
+        raise DependencyError(f"cameras of kind '{kind}' cannot be used here: {error}") from error
+
+
+def open_camera(kind: str, config: Mapping[str, Any], camera_id: str, where: str) -> Camera:
+    """A camera of a kind, not open yet.
+
+    Args:
+        kind: Of ``KINDS``.
+        config: Plain data, checked against the ``Config`` of the kind.
+        camera_id: What its images will be called.
+        where: The config comes from, for messages.
+
+    Raises:
+        ConfigError: no such kind, an unknown key (with the nearest valid one), a value of the wrong type.
+        CameraError: the driver cannot work with this config.
+        DependencyError: the kind needs something that is not installed.
+    """
+    driver = load_driver(kind)
+    return driver.open_camera(convert_config(dict(config), driver.Config, where), camera_id)
+
+
+def find_cameras(kinds: Sequence[str] = KINDS) -> tuple[list[FoundCamera], dict[str, str]]:
+    """All cameras that are connected, and why a kind could not be asked.
+
+    Raises:
+        ConfigError: no such kind.
+    """
+    found: list[FoundCamera] = []
+    unknown: dict[str, str] = {}
+    for kind in kinds:
+        try:
+            found += load_driver(kind).list_devices()
+        except ConfigError:
+            raise
+        except SemanticMapperError as error:
+            unknown[kind] = str(error)
+    return found, unknown

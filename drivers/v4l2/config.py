@@ -1,0 +1,35 @@
+"""Settings of a V4L2 camera."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+
+from semantic_mapper import config
+from semantic_mapper.config import AtLeastZero, NotNegative, Positive
+
+
+class Config(config.Config, frozen=True):
+    """One camera. The size of its images is that of its calibration."""
+
+    device: str = ""  # /dev/v4l/by-id/..., as `semantic-mapper cameras` lists it; has to be given
+    calibration: str = ""  # file; see drivers/calibration.py
+    uncalibrated: bool = False  # images as the lens gives them, for calibrating only
+    width: NotNegative = 0  # uncalibrated: of the images asked for; 0 = as the device has it
+    height: NotNegative = 0
+    fps: Positive = 30.0  # asked for; what the device gives instead is told
+    # Pixel format asked for, four letters. MJPG passes through USB at full rate; YUYV is without artefacts. Empty = as
+    # the device has it.
+    fourcc: Annotated[str, msgspec.Meta(pattern=r"^(.{4}|)\Z")] = "MJPG"
+    exposure_ms: AtLeastZero = 0.0  # 0 = automatic; a short one blurs less while the robot moves
+    white_balance_k: NotNegative = 0  # colour temperature in kelvin; 0 = automatic
+    gain: Annotated[int, msgspec.Meta(ge=-1)] = -1  # in the device's own units; -1 = as it is
+    # Any other control by the name that the device gives it, in small letters with _ (focus_absolute); see
+    # `v4l2-ctl --list-ctrls`. A lens that focuses by itself changes its focal length: fix it.
+    controls: dict[str, int] = msgspec.field(default_factory=dict)
+    stall_s: Positive = 2.0  # without an image for so long, the stream counts as stalled and is started anew
+
+    def __post_init__(self) -> None:
+        if bool(self.width) != bool(self.height):
+            raise ValueError("give both width and height, or neither")

@@ -1,0 +1,202 @@
+"""What the kernel says of a video device beyond what OpenCV asks: who it is, its formats, its controls.
+
+Layouts and numbers are those of linux/videodev2.h, the same on all 64 bit machines.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import fcntl
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+EXPOSURE_AUTO = 0x009A0901
+EXPOSURE_ABSOLUTE = 0x009A0902  # in 100 microseconds
+AUTO_WHITE_BALANCE = 0x0098090C
+WHITE_BALANCE_TEMPERATURE = 0x0098091A
+AUTOGAIN = 0x00980912
+GAIN = 0x00980913
+EXPOSURE_MANUAL = 1  # of EXPOSURE_AUTO
+
+_CAP_VIDEO_CAPTURE = 0x00000001
+_CAP_DEVICE_CAPS = 0x80000000
+_BUF_TYPE_VIDEO_CAPTURE = 1
+_CTRL_FLAG_DISABLED = 0x0001
+_CTRL_FLAG_NEXT = 0x80000000
+_FOURCC_BIG_ENDIAN = 1 << 31
+_MAX_ROWS = 1024  # a driver that never says that it is at the end shall not hang us
+
+
+class _Capability(ctypes.Structure):
+    _fields_ = (
+        ("driver", ctypes.c_char * 16),
+        ("card", ctypes.c_char * 32),
+        ("bus_info", ctypes.c_char * 32),
+        ("version", ctypes.c_uint32),
+        ("capabilities", ctypes.c_uint32),
+        ("device_caps", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32 * 3),
+    )
+
+
+class _Format(ctypes.Structure):
+    _fields_ = (
+        ("index", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+        ("description", ctypes.c_char * 32),
+        ("pixelformat", ctypes.c_uint32),
+        ("mbus_code", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32 * 3),
+    )
+
+
+class _QueryControl(ctypes.Structure):
+    _fields_ = (
+        ("id", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("name", ctypes.c_char * 32),
+        ("minimum", ctypes.c_int32),
+        ("maximum", ctypes.c_int32),
+        ("step", ctypes.c_int32),
+        ("default_value", ctypes.c_int32),
+        ("flags", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32 * 2),
+    )
+
+
+class _ControlValue(ctypes.Structure):
+    _fields_ = (("id", ctypes.c_uint32), ("value", ctypes.c_int32))
+
+
+def _number(direction: int, number: int, kind: type[ctypes.Structure]) -> int:
+    return direction << 30 | ctypes.sizeof(kind) << 16 | ord("V") << 8 | number
+
+
+_READ, _WRITE = 2, 1
+QUERYCAP = _number(_READ, 0, _Capability)
+ENUM_FMT = _number(_READ | _WRITE, 2, _Format)
+G_CTRL = _number(_READ | _WRITE, 27, _ControlValue)
+S_CTRL = _number(_READ | _WRITE, 28, _ControlValue)
+QUERYCTRL = _number(_READ | _WRITE, 36, _QueryControl)
+
+
+@dataclass(frozen=True, slots=True)
+class Capability:
+    """Who a device is; ``captures`` is False for the nodes of a camera that carry its metadata."""
+
+    card: str
+    driver: str
+    bus: str
+    captures: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """A setting of the device, ``name`` in small letters with _."""
+
+    id: int
+    name: str
+    minimum: int
+    maximum: int
+    default: int
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[int]:
+    """A file descriptor of a device, for questions and controls beside whoever streams.
+
+    Raises:
+        OSError: it cannot be opened.
+    """
+    fd = os.open(path, os.O_RDWR | os.O_NONBLOCK)
+    try:
+        yield fd
+    finally:
+        os.close(fd)
+
+
+def query_capability(fd: int) -> Capability:
+    """Who it is.
+
+    Raises:
+        OSError: no video device.
+    """
+    told = _Capability()
+    fcntl.ioctl(fd, QUERYCAP, told)
+    of_node = told.device_caps if told.capabilities & _CAP_DEVICE_CAPS else told.capabilities
+    return Capability(_text(told.card), _text(told.driver), _text(told.bus_info), bool(of_node & _CAP_VIDEO_CAPTURE))
+
+
+def list_formats(fd: int) -> tuple[str, ...]:
+    """FOURCC of each pixel format that it offers.
+
+    Raises:
+        OSError: it does not answer.
+    """
+    found: list[str] = []
+    for index in range(_MAX_ROWS):
+        told = _Format(index=index, type=_BUF_TYPE_VIDEO_CAPTURE)
+        if not _ask(fd, ENUM_FMT, told):
+            break
+        found.append(fourcc_text(told.pixelformat))
+    return tuple(found)
+
+
+def list_controls(fd: int) -> dict[str, Control]:
+    """Its controls by name.
+
+    Raises:
+        OSError: it does not answer.
+    """
+    found: dict[str, Control] = {}
+    last = 0
+    for _ in range(_MAX_ROWS):
+        told = _QueryControl(id=last | _CTRL_FLAG_NEXT)
+        if not _ask(fd, QUERYCTRL, told):
+            break
+        last = told.id
+        name = re.sub(r"[^a-z0-9]+", "_", _text(told.name).lower()).strip("_")
+        if not told.flags & _CTRL_FLAG_DISABLED:
+            found[name] = Control(told.id, name, told.minimum, told.maximum, told.default_value)
+    return found
+
+
+def get_control(fd: int, control: int) -> int:
+    """Value of a control. Raises ``OSError`` where it cannot be read."""
+    told = _ControlValue(id=control)
+    fcntl.ioctl(fd, G_CTRL, told)
+    return told.value
+
+
+def set_control(fd: int, control: int, value: int) -> None:
+    """Set a control. Raises ``OSError`` where the device refuses."""
+    fcntl.ioctl(fd, S_CTRL, _ControlValue(id=control, value=value))
+
+
+def fourcc_text(code: int) -> str:
+    """Four letters of a pixel format, as v4l2-ctl shows them; what cannot be printed becomes "."."""
+    letters = [chr(code >> shift & 0x7F) for shift in (0, 8, 16, 24)]
+    text = "".join(letter if letter.isprintable() else "." for letter in letters)
+    return f"{text}-BE" if code & _FOURCC_BIG_ENDIAN else text
+
+
+def _ask(fd: int, request: int, told: Any) -> bool:
+    """Whether there is such a row of a list."""
+    try:
+        fcntl.ioctl(fd, request, told)
+    except OSError as error:
+        if error.errno in (errno.EINVAL, errno.ENOTTY):
+            return False
+        raise
+    return True
+
+
+def _text(raw: bytes) -> str:
+    return raw.decode("utf-8", errors="replace").strip()
