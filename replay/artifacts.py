@@ -48,23 +48,28 @@ def write_artifacts(session: MapSession, out: Path, rerun: RerunLog | None) -> d
 
 def _draw_overview(session: MapSession, points: MapPoints, path: Path) -> None:
     label_set = session.pipeline.label_set
-    strips: list[ViewStrip] = []
-    for frame, update in _spread(session.snapshots, OVERVIEW_FRAMES):
-        truth = None
-        if session.truth is not None and frame.label is not None:
-            truth = session.truth.to_map_ids(frame.label, f"frame seq={frame.seq}")
-        strips.append(ViewStrip(f"frame {frame.seq}", frame.rgb, update.label, truth, update.depth_m))
     poses = [f.T_world_camera for f, _ in session.snapshots]
     size = f"{session.pipeline.voxel_map.config.voxel_size_m * 100:g} cm voxels"
     write_overview(
         path,
-        strips,
+        view_strips(session, OVERVIEW_FRAMES),
         points,
         label_set,
         title=f"{session.source or 'session'}: {session.fused} frames, {len(points.xyz):,} surface points, {size}",
         subtitle=_scores_line(session),
         up=camera_up(np.stack(poses)) if poses else None,
     )
+
+
+def view_strips(session: MapSession, count: int) -> list[ViewStrip]:
+    """Frames of a session with what was rendered for them, at most ``count``, evenly spread."""
+    strips: list[ViewStrip] = []
+    for frame, update in _spread(session.snapshots, count):
+        truth = None
+        if session.truth is not None and frame.label is not None:
+            truth = session.truth.to_map_ids(frame.label, f"frame seq={frame.seq}")
+        strips.append(ViewStrip(f"frame {frame.seq}", frame.rgb, update.label, truth, update.depth_m))
+    return strips
 
 
 def _scores_line(session: MapSession) -> str:
@@ -134,6 +139,7 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "file": bundle.weights_path.name,
             "recipe": bundle.checkpoint.recipe.get("kind", "unknown"),
             "finetuned_frames": len(bundle.checkpoint.train_stamps_ns),
+            "learned": session.learned,
         },
         "seed": pipeline.config.seed,
         "quality": pipeline.config.quality,

@@ -12,9 +12,10 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from replay.importers.tum import match_nearest, pose_matrix, read_trajectory
+from replay.importers.tum import match_nearest, read_trajectory
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import ImportSourceError
+from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.mapping.history import SEGMENTS
 from semantic_mapper.mapping.pose_correction import ALWAYS
 from semantic_mapper.types import Float64

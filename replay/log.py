@@ -1,22 +1,27 @@
 """The log: an MCAP file whose messages are the very bytes that travel between processes.
 
 One message a chunk, not compressed (images already are), each chunk with its checksum and flushed at once: a killed
-writer loses at most the message it was writing, and a damaged byte spoils one message. What the stream is (cameras,
-label set) stands twice: as an attachment, and as the first message.
+writer loses at most the message it was writing, and a damaged byte spoils one message. A full disk costs the message
+that does not fit: the file ends with the one before. What the stream is (cameras, label set) stands twice: as an
+attachment, and as the first message.
 """
 
 from __future__ import annotations
 
 import json
-import os
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import IO
+from typing import IO, cast
 
 import msgspec
+from mcap.data_stream import RecordBuilder
+from mcap.records import DataEnd, Footer
 from mcap.writer import CompressionType, Writer
 
-from replay.reader import INFO_ATTACHMENT, LogReader
+from replay.mcap_scan import MAGIC
+from replay.reader import INFO_ATTACHMENT, LogAttachment, LogReader
+from replay.whole_file import WholeFile
 from semantic_mapper.errors import LogError
 from semantic_mapper.transport import headers
 from semantic_mapper.transport.codec import (
@@ -31,7 +36,7 @@ from semantic_mapper.transport.framing import pack_parts
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 
-__all__ = ["LogReader", "LogWriter"]
+__all__ = ["LogAttachment", "LogReader", "LogWriter"]
 
 PROFILE = "semantic-mapper"
 _DEFAULTS = CodecOptions()
@@ -53,13 +58,20 @@ class LogWriter:
         info: What the stream is.
         options: How ``write_frame`` packs; lossless by default.
         overwrite: Whether an existing file may be replaced.
+        attachments: What else to keep in it.
 
     Raises:
-        LogError: the file exists, or cannot be written.
+        LogError: the file exists, or cannot be written; then there is none.
     """
 
     def __init__(
-        self, path: Path, info: StreamInfo, *, options: CodecOptions = _DEFAULTS, overwrite: bool = False
+        self,
+        path: Path,
+        info: StreamInfo,
+        *,
+        options: CodecOptions = _DEFAULTS,
+        overwrite: bool = False,
+        attachments: Sequence[LogAttachment] = (),
     ) -> None:
         self.path = path
         self.frames = 0
@@ -69,22 +81,31 @@ class LogWriter:
         self._schemas: dict[str, int] = {}
         self._last_stamp_ns = 0
         parts = encode_info(info)  # before the file is made: what cannot be packed leaves none behind
+        self._failed = False
         self._file = _create(path, overwrite)
         # A chunk is closed once it is longer than chunk_size, that is after each message.
-        self._writer = Writer(self._file, chunk_size=1, compression=CompressionType.NONE)
+        self._writer = Writer(cast(IO[bytes], self._file), chunk_size=1, compression=CompressionType.NONE)
         try:
             self._writer.start(profile=PROFILE)
             self._writer.add_attachment(0, 0, INFO_ATTACHMENT, "application/msgpack", pack_parts(parts))
+            for attachment in attachments:
+                self.attach(attachment)
             self._writer.add_metadata("semantic-mapper", _for_people(info))
             self.write_parts(parts)
-        except OSError as error:
+        except LogError:
             self._file.close()
-            raise self._cannot_write(error) from error
+            if path.is_file():
+                path.unlink()
+            raise
 
     @property
     def bytes_written(self) -> int:
         """Size of the file so far."""
-        return self._file.tell() if not self._file.closed else self.path.stat().st_size
+        return self._file.size
+
+    def attach(self, attachment: LogAttachment) -> None:
+        """Keep a file in the log, from the next message on; of several of one name readers give the last."""
+        self._writer.add_attachment(0, 0, attachment.name, attachment.media_type, attachment.data)
 
     def write_frame(self, frame: PosedFrame, *, encoded_rgb: EncodedImage | None = None) -> None:
         """Append one frame.
@@ -104,20 +125,23 @@ class LogWriter:
 
         Raises:
             CodecError: not a message of ours; the log is as it was.
-            LogError: the disk is full or gone.
+            LogError: the disk is full or gone; the log is as it was, and takes nothing more.
         """
+        if self._failed:
+            raise LogError(f"{self.path}: is closed to further messages since one could not be written")
         envelope = read_envelope(parts)
         stamp = envelope.stamp_ns or self._last_stamp_ns
+        self._writer.add_message(
+            channel_id=self._channel(envelope.topic, envelope.source),
+            log_time=stamp,
+            publish_time=stamp,
+            sequence=envelope.seq & 0xFFFFFFFF,
+            data=pack_parts(parts),
+        )
         try:
-            self._writer.add_message(
-                channel_id=self._channel(envelope.topic, envelope.source),
-                log_time=stamp,
-                publish_time=stamp,
-                sequence=envelope.seq & 0xFFFFFFFF,
-                data=pack_parts(parts),
-            )
-            self._file.flush()
+            self._file.commit()
         except OSError as error:
+            self._failed = True  # the index in memory tells of a message that is not there
             raise self._cannot_write(error) from error
         self._last_stamp_ns = stamp
         self.messages += 1
@@ -126,15 +150,20 @@ class LogWriter:
     def close(self) -> None:
         """Write the index and close the file. Harmless when repeated.
 
+        Where there is no room for the index, the log ends without one: it is whole, and slower to search.
+
         Raises:
-            LogError: the disk is full or gone.
+            LogError: the disk is full to the last byte, or gone; what was written can be read.
         """
         if self._file.closed:
             return
         try:
-            self._writer.finish()
-            self._file.flush()
-            os.fsync(self._file.fileno())
+            if not (self._failed or self._end_with_index()):
+                self._failed = True
+            if self._failed:
+                self._file.write(_short_end())
+                self._file.commit()
+            self._file.sync()
         except OSError as error:
             raise self._cannot_write(error) from error
         finally:
@@ -147,6 +176,14 @@ class LogWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def _end_with_index(self) -> bool:
+        self._writer.finish()
+        try:
+            self._file.commit()
+        except OSError:
+            return False
+        return True
 
     def _channel(self, topic: str, source: str) -> int:
         name = f"{topic}/{source}"
@@ -163,13 +200,21 @@ class LogWriter:
         return LogError(f"{self.path}: cannot be written ({error}); {self.frames} frames are in it and can be read")
 
 
-def _create(path: Path, overwrite: bool) -> IO[bytes]:
+def _create(path: Path, overwrite: bool) -> WholeFile:
     try:
-        return path.open("wb" if overwrite else "xb")
+        return WholeFile(path, overwrite=overwrite)
     except FileExistsError as error:
         raise LogError(f"{path}: exists already; remove it or choose another name") from error
     except OSError as error:
         raise LogError(f"{path}: cannot be written: {error}") from error
+
+
+def _short_end() -> bytes:
+    """The end of an MCAP file without index: 50 bytes."""
+    builder = RecordBuilder()
+    DataEnd(0).write(builder)
+    Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
+    return builder.end() + MAGIC
 
 
 def _schema(kind: type[headers.Header]) -> bytes:

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from replay.rerun_log import RerunLog
+from replay.rerun_log import RerunLog, recording_file
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.mapping.export import ColorBy, colored, sure_faces, sure_points
 from semantic_mapper.mapping.formats.files import whole_path
@@ -144,7 +144,7 @@ def _export_points(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> E
         write_npz(path, points, labels)
     else:
         with whole_path(path) as part:
-            RerunLog(part, labels).finish(points)
+            RerunLog(recording_file(part), labels, voxel_map.config.voxel_size_m).finish(points)
     return ExportReport((path,), f"{len(points.xyz):,} points")
 
 

@@ -13,6 +13,7 @@ import struct
 import zlib
 from dataclasses import dataclass, field
 
+import lz4.frame
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -37,10 +38,12 @@ _PARSE_ERRORS = (
     CRCValidationError,
     struct.error,
     ValueError,
+    OverflowError,
     EOFError,
     RuntimeError,
     MemoryError,
     zlib.error,
+    zstandard.ZstdError,
 )
 
 
@@ -108,6 +111,16 @@ def scan(fd: int, where: str) -> Scan:
             # Back to the last chunk: a record in between with a damaged length may have led us past others.
             at = _find_chunk(fd, sure, result.size)
             result.damages.append(Damage(sure, at, len(result.chunks), reason))
+    return result
+
+
+def scan_end(fd: int, length: int) -> Scan:
+    """The same of the last ``length`` bytes, from the first believable chunk in them: quick, however long the file."""
+    result = Scan(size=os.fstat(fd).st_size)
+    at = len(MAGIC) if length >= result.size else _find_chunk(fd, result.size - length, result.size)
+    while at < result.size and not result.finished:
+        whole, reason = _record_at(fd, at, result)
+        at = _find_chunk(fd, at + 1, result.size) if reason else at + whole
     return result
 
 
@@ -205,6 +218,10 @@ def read_messages(fd: int, offset: int, length: int, where: str) -> list[Message
         chunk = Chunk.read(stream)
         if chunk.compression == "zstd":
             _check_zstd_size(chunk)
+        elif chunk.compression == "lz4":
+            _unpack_lz4(chunk)
+        elif chunk.compression:
+            raise ValueError(f"compressed with {chunk.compression!r}, which is not known")
         return [r for r in breakup_chunk(chunk, validate_crc=True) if isinstance(r, Message)]
     except OSError as error:
         raise LogError(f"{where}: cannot be read from disk: {error}") from error
@@ -251,3 +268,11 @@ def _check_zstd_size(chunk: Chunk) -> None:
     """The decompressor allocates what the data announce, not what the chunk does."""
     if zstandard.frame_content_size(chunk.data) != chunk.uncompressed_size:
         raise ValueError("compressed data announce another size than the chunk")
+
+
+def _unpack_lz4(chunk: Chunk) -> None:
+    """The decompressor believes any amount of data unless it is told how much there may be."""
+    data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=chunk.uncompressed_size + 1)
+    if len(data) != chunk.uncompressed_size:
+        raise ValueError("compressed data hold another size than the chunk announces")
+    chunk.compression, chunk.data = "", data

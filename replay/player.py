@@ -11,7 +11,7 @@ from typing import Literal
 
 import structlog
 
-from replay.reader import LogReader
+from replay.sequence import Log
 from semantic_mapper.errors import CodecError, LogError, NodeError, TransportError
 from semantic_mapper.transport.codec import Envelope, Parts, decode_frame, encode_end, encode_info
 from semantic_mapper.transport.messages import EndOfStream, FrameRefused
@@ -42,6 +42,7 @@ class PlayOptions:
         subscriber_timeout_s: How long to wait for them.
         ack_timeout_s: How long the mapper may think about one frame in lockstep; the first ones compile kernels.
         source: How the player calls itself in its ``EndOfStream``.
+        from_stamp_ns: Frames captured before are passed over; 0 = none.
     """
 
     mode: Mode = "lockstep"
@@ -51,6 +52,7 @@ class PlayOptions:
     subscriber_timeout_s: float = 60.0
     ack_timeout_s: float = 300.0
     source: str = "player"
+    from_stamp_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +115,7 @@ class Lockstep:
 
 
 def play(
-    log: LogReader,
+    log: Log,
     publisher: Publisher,
     acks: LosslessSubscriber | None = None,
     options: PlayOptions | None = None,
@@ -145,7 +147,11 @@ def play(
     publisher.wait_for_subscribers("frame", options.subscribers, options.subscriber_timeout_s)
     if acks is not None:
         acks.wait_until_heard(options.subscriber_timeout_s)
-    publisher.publish(encode_info(dataclasses.replace(log.info, frame_count=total), options.source))
+    metadata = dict(log.info.metadata)
+    if options.from_stamp_ns:
+        metadata["played_from_stamp_ns"] = str(options.from_stamp_ns)
+    info = dataclasses.replace(log.info, frame_count=total, metadata=metadata)
+    publisher.publish(encode_info(info, options.source))
     run = _Run(log, publisher, options, stop, on_frame)
     reason, detail = "error", "the player failed"
     try:
@@ -172,7 +178,7 @@ class _Run:
 
     def __init__(
         self,
-        log: LogReader,
+        log: Log,
         publisher: Publisher,
         options: PlayOptions,
         stop: threading.Event,
@@ -192,6 +198,8 @@ class _Run:
         """Send frame after frame."""
         clock = _Clock(self.options.rate) if self.options.mode == "realtime" else None
         for envelope, parts in self.log.frame_parts():
+            if envelope.stamp_ns < self.options.from_stamp_ns:
+                continue
             if self.options.max_frames is not None and self.published >= self.options.max_frames:
                 return
             if clock is not None:

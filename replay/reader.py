@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 
@@ -18,6 +18,21 @@ from semantic_mapper.transport.topics import parse_topic
 from semantic_mapper.types import PosedFrame
 
 INFO_ATTACHMENT = "stream_info"
+
+
+@dataclass(frozen=True, slots=True)
+class LogAttachment:
+    """A file that is kept in a log.
+
+    Args:
+        name: Of the file ("calibration.json").
+        media_type: What it is ("application/json").
+        data: Its bytes.
+    """
+
+    name: str
+    media_type: str
+    data: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +85,7 @@ class LogReader:
             self._frames: list[int] = []
             self._index = self._make_index(found)
             self._frames = [i for i, entry in enumerate(self._index) if entry.topic in ("frame", "")]
+            self._attachments = found.attachments
             self.finished = found.finished
             self.info = self._read_info(found)
             self._report_damages(found)
@@ -90,6 +106,14 @@ class LogReader:
                 yield self.frame(number)
             except LogError as error:
                 self._report(error)
+
+    def frames_or_errors(self, count: int) -> Iterator[PosedFrame | LogError]:
+        """The first ``count`` frames in order; the error in place of one that is damaged."""
+        for number in range(count):
+            try:
+                yield self.frame(number)
+            except LogError as error:
+                yield error
 
     def frame(self, number: int) -> PosedFrame:
         """Frame ``number`` of ``len(self)``.
@@ -113,6 +137,17 @@ class LogReader:
         """Messages of all topics as they travel."""
         return self._parts(self._index)
 
+    def attachments(self) -> dict[str, LogAttachment]:
+        """Files that are kept in the log, by name; one whose checksum is wrong is reported and left out."""
+        kept: dict[str, LogAttachment] = {}
+        for offset, length in self._attachments:
+            found = read_attachment(self._file.fileno(), offset, length)
+            if found is None:
+                self._report(LogError(f"{self.path}: the attachment at byte {offset} is damaged; left out"))
+            elif found.name != INFO_ATTACHMENT:
+                kept[found.name] = LogAttachment(found.name, found.media_type, found.data)
+        return kept
+
     def close(self) -> None:
         """Close the file. Harmless when repeated."""
         self._file.close()
@@ -133,6 +168,24 @@ class LogReader:
         return entries
 
     def _read_info(self, found: Scan) -> StreamInfo:
+        """What the stream is; of several cameras, each tells of itself when it begins."""
+        first = self._read_first_info(found)
+        cameras, sources = dict(first.cameras), [first.source]
+        for entry in self._index:
+            if entry.topic != "info":
+                continue
+            try:
+                info = decode_info(self._read(entry))
+            except (LogError, CodecError):  # told when its turn comes
+                continue
+            if not set(info.cameras) <= set(cameras):
+                cameras |= info.cameras
+                sources.append(info.source)
+        if len(sources) == 1:
+            return first
+        return replace(first, source=" + ".join(sources), cameras=cameras, frame_count=None)
+
+    def _read_first_info(self, found: Scan) -> StreamInfo:
         for offset, length in found.attachments:
             attachment = read_attachment(self._file.fileno(), offset, length)
             if attachment is not None and attachment.name == INFO_ATTACHMENT:

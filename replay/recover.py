@@ -31,7 +31,10 @@ def recover(src: Path, dst: Path) -> RecoverReport:
     Raises:
         LogError: ``src`` gives no frame at all, or ``dst`` exists or cannot be written.
     """
-    with LogReader(src) as reader, LogWriter(dst, reader.info) as writer:
+    with (
+        LogReader(src) as reader,
+        LogWriter(dst, reader.info, attachments=tuple(reader.attachments().values())) as writer,
+    ):
         for envelope, parts in reader.messages():
             if envelope.topic != "info":  # the writer has put it there already
                 writer.write_parts(parts)

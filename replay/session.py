@@ -101,7 +101,7 @@ class MapSession:
         stream_labels: Label set of the frames' label images; None where they have none.
         exclude_stamps: Frames to leave out of the scores, beside those that the weights were finetuned on.
         source: Name of the log or stream, for the summary.
-        rerun: Where to write a Rerun recording; None for none.
+        rerun: Gets every frame, what was rendered for it, and the map at the end; see ``open_recording``.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class MapSession:
         stream_labels: LabelSet | None,
         exclude_stamps: frozenset[int] = frozenset(),
         source: str = "",
-        rerun: Path | None = None,
+        rerun: RerunLog | None = None,
     ) -> None:
         self.bundle = bundle
         self.pipeline = bundle.pipeline
@@ -123,6 +123,7 @@ class MapSession:
         self.scored = 0
         self.excluded = 0
         self.corrected_poses = 0  # given; the map has moved with them
+        self.learned: dict[str, Any] | None = None  # what became of weights that were offered meanwhile
         self.unfinished_correction = ""  # what the map has not moved with, and why
         self.without_depth = 0  # their geometry was rendered, not measured
         # Frames that were not mapped, those that were but whose label image cannot be used, and stretches of a log in
@@ -137,7 +138,7 @@ class MapSession:
         self.surface_truth = SurfaceTruth(self.pipeline.label_set)
         self.snapshots: list[tuple[PosedFrame, MapUpdate]] = []
         self._snapshot_stride = 1
-        self._rerun = None if rerun is None else _open_rerun(rerun, self.pipeline.label_set)
+        self._rerun = rerun
 
     def process(self, frame: PosedFrame) -> MapUpdate | None:
         """Map one frame; None where it was refused (counted and logged, the map unchanged)."""
@@ -159,6 +160,11 @@ class MapSession:
         if self._rerun is not None:
             self._rerun.log_step(frame, update)
         return update
+
+    def follow_weights(self, checkpoint: Checkpoint, path: Path) -> None:
+        """Take note of other weights in the pipeline; from now on, no frame that they were fitted to is scored."""
+        self.bundle = replace(self.bundle, checkpoint=checkpoint, weights_path=path)
+        self.exclude_stamps |= checkpoint.train_stamps_ns
 
     def follow_correction(self) -> None:
         """Take what the scores compare with to the poses that the map has after a correction."""
@@ -220,7 +226,10 @@ class MapSession:
             self._snapshot_stride *= 2
 
 
-def _open_rerun(path: Path, label_set: LabelSet) -> RerunLog:
-    from replay.rerun_log import RerunLog  # loads for over a second, and few sessions need it
+def open_recording(path: Path | None, pipeline: MappingPipeline) -> RerunLog | None:
+    """A Rerun recording (.rrd) of a session with this pipeline; None where no path is given."""
+    if path is None:
+        return None
+    from replay.rerun_log import RerunLog, recording_file  # loads for over a second, and few sessions need it
 
-    return RerunLog(path, label_set)
+    return RerunLog(recording_file(path), pipeline.label_set, pipeline.voxel_map.config.voxel_size_m)

@@ -51,6 +51,7 @@ class _Intrinsics(msgspec.Struct):
 class _Labels(msgspec.Struct):
     classes: dict[str, str]
     id_space: str = ""
+    colors: dict[str, tuple[int, int, int]] = msgspec.field(default_factory=dict)
     ignore: Annotated[int, Meta(ge=0, le=255)] = 0
 
 
@@ -164,10 +165,19 @@ class FolderRecording:
             if (self._folder / "label").is_dir():
                 self.notices.append("label/ is left out: labels.json, which names its classes, is missing")
             return None
-        try:
-            return label_set_from(msgspec.json.decode(file.read_bytes(), type=_Labels), self._folder.resolve().name)
-        except (msgspec.DecodeError, OSError, LabelError, ValueError) as error:
-            raise ImportSourceError(f"{file}: {error}") from error
+        return read_label_set(file)
+
+
+def read_label_set(file: Path) -> LabelSet:
+    """``labels.json`` -> label set; one that says nothing else is called as its folder.
+
+    Raises:
+        ImportSourceError: missing, or no label set.
+    """
+    try:
+        return label_set_from(msgspec.json.decode(file.read_bytes(), type=_Labels), file.resolve().parent.name)
+    except (msgspec.DecodeError, OSError, LabelError, ValueError) as error:
+        raise ImportSourceError(f"{file}: {error}") from error
 
 
 def read_intrinsics(file: Path) -> tuple[CameraIntrinsics, float]:
@@ -186,19 +196,20 @@ def read_intrinsics(file: Path) -> tuple[CameraIntrinsics, float]:
 
 
 def label_set_from(labels: _Labels, folder_name: str) -> LabelSet:
-    """Label set of a recording: its own ids and names; the colours of a known set where it draws its ids from one.
+    """Label set of a recording: its own ids, names and colours; those of a known set where it draws its ids from one.
 
     Raises:
-        LabelError, ValueError: ids that are no numbers of 0 to 255, or a class twice.
+        LabelError, ValueError: ids that are no numbers of 0 to 255, a class twice, or colours beyond 255.
     """
+    if any(not 0 <= value <= 255 for color in labels.colors.values() for value in color):
+        raise ValueError("colors must be three numbers of 0 to 255")
     classes = {int(key): name for key, name in labels.classes.items()}
     classes.pop(labels.ignore, None)
     ids = sorted(classes)
     name = labels.id_space.lower() or folder_name
     own = make_label_set(name, [classes[i] for i in ids], ids=ids, ignore_id=labels.ignore)
     known = PROVIDED.get(name)
-    if known is None:
-        return own
-    known_colors = dict(zip(known.ids, known.colors, strict=True))
-    colors = tuple(known_colors.get(i, color) for i, color in zip(ids, own.colors, strict=True))
+    chosen = {} if known is None else dict(zip(known.ids, known.colors, strict=True))
+    chosen |= {int(key): color for key, color in labels.colors.items()}
+    colors = tuple(chosen.get(i, color) for i, color in zip(ids, own.colors, strict=True))
     return LabelSet(own.name, own.ids, own.names, colors, own.ignore_id)

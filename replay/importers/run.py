@@ -9,6 +9,8 @@ from pathlib import Path
 
 from replay.importers.base import BadFrameError, ImportOptions, ImportReport, Recording, Skipped
 from replay.importers.folder import FolderRecording
+from replay.importers.kitti360 import Kitti360Recording
+from replay.importers.replica import ReplicaRecording
 from replay.importers.scannet import ScanNetRecording
 from replay.importers.tum import TumRecording
 from replay.log import LogWriter
@@ -22,6 +24,8 @@ FORMATS: dict[str, Callable[[Path, ImportOptions], Recording]] = {
     "folder": FolderRecording,
     "tum": TumRecording,
     "scannet": ScanNetRecording,
+    "replica": ReplicaRecording,
+    "kitti360": Kitti360Recording,
 }
 
 # What a folder of each format has, and no other.
@@ -29,6 +33,8 @@ _MARKS = {
     "folder": ("color", "poses.txt", "intrinsics.json"),
     "tum": ("rgb.txt", "depth.txt", "groundtruth.txt"),
     "scannet": ("color", "depth", "pose"),
+    "replica": ("rgb", "depth", "traj_w_c.txt"),
+    "kitti360": ("calibration/perspective.txt", "data_2d_raw", "data_poses"),
 }
 
 _DEFAULTS = ImportOptions()
@@ -52,6 +58,11 @@ def detect_format(src: Path) -> str:
         if not lacks:
             return name
         missing.append(f"{name} (lacks {', '.join(lacks)})")
+    if src.resolve().parent.name == "data_2d_raw":
+        return "kitti360"
+    sequences = sorted(path.parent for path in src.glob("*/traj_w_c.txt"))
+    if sequences:
+        raise ImportSourceError(f"{src}: is a scene of Replica; name one sequence: {', '.join(map(str, sequences))}")
     raise ImportSourceError(f"{src}: is no recording of a known format: {'; '.join(missing)}")
 
 
@@ -64,25 +75,29 @@ def import_recording(
     options: ImportOptions = _DEFAULTS,
     renames: Mapping[str, str] | None = None,
     codec: CodecOptions | None = None,
+    overwrite: bool = False,
 ) -> ImportReport:
-    """Write the recording in folder ``src`` to the log ``dst``, which is replaced only by a complete import.
+    """Write the recording in folder ``src`` to the log ``dst``, which is there only once the import is complete.
 
     A frame that cannot be used is left out and reported; a bad label image costs the frame its label only.
 
     Args:
         src: Folder of the recording.
         dst: Log to write.
-        format_name: "folder", "tum" or "scannet"; None = found out.
+        format_name: "folder", "tum", "scannet", "replica" or "kitti360"; None = found out.
         on_progress: Called with (frames looked at, frames in all).
         options: How to read.
         renames: New names of classes by their present ones; classes of one name become one class.
         codec: How to pack; lossless by default, images that are JPEG or PNG files stay what they are.
+        overwrite: Whether a log that is there may be replaced.
 
     Raises:
         ImportSourceError: not such a recording, or not one good frame in it.
         LabelError: a class to rename that the recording does not have.
-        LogError: ``dst`` cannot be written.
+        LogError: ``dst`` is there already, or cannot be written.
     """
+    if dst.exists() and not overwrite:
+        raise LogError(f"{dst}: exists already; choose another name, or --overwrite it")
     name = format_name or detect_format(src)
     if name not in FORMATS:
         raise ImportSourceError(f"no format '{name}'; there are {', '.join(FORMATS)}")

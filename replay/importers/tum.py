@@ -26,6 +26,7 @@ from replay.importers.base import (
 )
 from replay.importers.folder import read_intrinsics
 from semantic_mapper.errors import ImportSourceError
+from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
@@ -221,16 +222,3 @@ def _slerp(a: Float64, b: Float64, share: float) -> Float64:
         return a + share * (b - a)
     angle = np.arccos(cosine)
     return (np.sin((1 - share) * angle) * a + np.sin(share * angle) * b) / np.sin(angle)
-
-
-def pose_matrix(position: Float64, quaternion: Float64) -> Float64:
-    """Pose (4, 4) of a position (3,) and a quaternion (4,) as x y z w, which is normalised."""
-    x, y, z, w = quaternion / np.linalg.norm(quaternion)
-    T_world_camera = np.eye(4)
-    T_world_camera[:3, :3] = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    )
-    T_world_camera[:3, 3] = position
-    return T_world_camera

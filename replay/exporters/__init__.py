@@ -1,0 +1,7 @@
+"""Logs in formats of other programs."""
+
+from __future__ import annotations
+
+from replay.exporters.run import FORMATS, LogExportReport, LogExportRequest, export_log, log_format_of
+
+__all__ = ["FORMATS", "LogExportReport", "LogExportRequest", "export_log", "log_format_of"]

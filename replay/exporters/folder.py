@@ -1,0 +1,261 @@
+"""Logs as folders of images: the sequence folder that ``import`` reads, TUM RGB-D, and TUM's trajectory file alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from replay.exporters.base import ExportFrame, LeftOut, depth_units, quaternion, seconds, write_png
+from replay.importers.tum import DEPTH_SCALE as TUM_SCALE
+from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.types import CameraIntrinsics, PosedFrame
+
+_SUFFIX = {"jpeg": "jpg", "png": "png", "raw": "png"}
+_EXACT_M = 1e-6  # float32 has no more at the distances of a room
+
+
+class FolderExporter:
+    """The sequence folder (see ``replay/importers/folder.py``): the same frames come back from ``import``.
+
+    Colour images keep the bytes of the log, depth its units, poses and stamps every digit. Numbers of frames are their
+    places in the folder.
+
+    Args:
+        folder: Is there, and empty.
+        info: Of the log.
+    """
+
+    def __init__(self, folder: Path, info: StreamInfo) -> None:
+        self.notices: list[str] = []
+        self._folder = folder
+        self._labels = info.label_set
+        self._poses: list[str] = []
+        self._stamps: list[int] = []
+        self._depth = _DepthFiles(None)
+        self._intrinsics = _OneCamera()
+        (folder / "color").mkdir()
+
+    def add(self, item: ExportFrame) -> None:
+        """Write one frame.
+
+        Raises:
+            LeftOut: its stamp does not rise, or its camera has changed.
+        """
+        frame = item.frame
+        if self._stamps and frame.stamp_ns <= self._stamps[-1]:
+            raise LeftOut("it is not later than the frame before it, which the layout needs")
+        self._intrinsics.check(frame)
+        number = len(self._poses)
+        color = self._folder / "color" / f"{number:06d}.{_SUFFIX[item.rgb.encoding]}"
+        color.write_bytes(item.rgb.data)
+        self._depth.write(self._folder / "depth" / f"{number:06d}.png", item)
+        if frame.label is not None and self._labels is not None:
+            (self._folder / "label").mkdir(exist_ok=True)
+            write_png(self._folder / "label" / f"{number:06d}.png", frame.label)
+        self._poses.append(" ".join(map(repr, frame.T_world_camera.ravel().tolist())))
+        self._stamps.append(frame.stamp_ns)
+
+    def finish(self) -> None:
+        """Write what describes the images."""
+        self._depth.fill_in(self._folder / "depth", len(self._poses), self._intrinsics.value)
+        (self._folder / "poses.txt").write_text("\n".join(self._poses) + "\n", encoding="ascii")
+        (self._folder / "timestamps.txt").write_text("\n".join(map(str, self._stamps)) + "\n", encoding="ascii")
+        self._intrinsics.write(self._folder / "intrinsics.json", self._depth.scale)
+        if self._labels is not None:
+            labels = self._labels
+            plain = {
+                "id_space": labels.name,
+                "classes": {str(i): name for i, name in zip(labels.ids, labels.names, strict=True)},
+                "ignore": labels.ignore_id,
+                "colors": {str(i): list(c) for i, c in zip(labels.ids, labels.colors, strict=True)},
+            }
+            text = json.dumps(plain, indent=1, ensure_ascii=False)
+            (self._folder / "labels.json").write_text(text, encoding="utf-8")
+        self.notices += self._depth.notices + self._intrinsics.notices
+
+
+class TumExporter:
+    """A TUM RGB-D sequence: ``rgb/``, ``depth/`` (5000 units a metre), their lists and ``groundtruth.txt``.
+
+    Beside what the data set has there is ``intrinsics.json``, which our import reads.
+
+    Args:
+        folder: Is there, and empty.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.notices: list[str] = []
+        self._folder = folder
+        self._names: dict[str, list[str]] = {"rgb": [], "depth": []}
+        self._trajectory = Trajectory()
+        self._depth = _DepthFiles(TUM_SCALE)
+        self._intrinsics = _OneCamera()
+        (folder / "rgb").mkdir()
+
+    def add(self, item: ExportFrame) -> None:
+        """Write one frame.
+
+        Raises:
+            LeftOut: there is a frame of that time already, or its camera has changed.
+        """
+        frame = item.frame
+        self._intrinsics.check(frame)
+        self._trajectory.add(item)
+        stamp = seconds(frame.stamp_ns)
+        color = f"rgb/{stamp}.{_SUFFIX[item.rgb.encoding]}"
+        (self._folder / color).write_bytes(item.rgb.data)
+        self._names["rgb"].append(f"{stamp} {color}")
+        if self._depth.write(self._folder / "depth" / f"{stamp}.png", item):
+            self._names["depth"].append(f"{stamp} depth/{stamp}.png")
+
+    def finish(self) -> None:
+        """Write the lists."""
+        titles = {"rgb": "# color images", "depth": "# depth maps, 5000 units a metre"}
+        for name, lines in self._names.items():
+            text = "\n".join((titles[name], "# timestamp filename", *sorted(lines, key=_by_stamp)))
+            (self._folder / f"{name}.txt").write_text(text + "\n", encoding="ascii")
+        self._trajectory.write(self._folder / "groundtruth.txt")
+        self._intrinsics.write(self._folder / "intrinsics.json", TUM_SCALE)
+        missing = len(self._names["rgb"]) - len(self._names["depth"])
+        if missing:
+            self.notices.append(f"{missing} frames have no depth; programs that pair the lists will leave them out")
+        self.notices += self._depth.notices + self._intrinsics.notices
+
+
+class TrajectoryExporter:
+    """Poses alone, a line ``stamp tx ty tz qx qy qz qw`` each, as ``evo`` and others read them.
+
+    Args:
+        path: Of the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.notices: list[str] = []
+        self._path = path
+        self._trajectory = Trajectory()
+
+    def add(self, item: ExportFrame) -> None:
+        """Take one frame.
+
+        Raises:
+            LeftOut: there is a frame of that time already.
+        """
+        self._trajectory.add(item)
+
+    def finish(self) -> None:
+        """Write the file."""
+        self._trajectory.write(self._path)
+
+
+class Trajectory:
+    """Poses by time."""
+
+    def __init__(self) -> None:
+        self._lines: dict[int, str] = {}
+
+    def add(self, item: ExportFrame) -> None:
+        """Take the pose of one frame.
+
+        Raises:
+            LeftOut: there is one of that time already.
+        """
+        frame = item.frame
+        if frame.stamp_ns in self._lines:
+            raise LeftOut("there is a frame of the same time already")
+        numbers = (*frame.T_world_camera[:3, 3].tolist(), *quaternion(frame.T_world_camera).tolist())
+        self._lines[frame.stamp_ns] = " ".join((seconds(frame.stamp_ns), *map(repr, numbers)))
+
+    def write(self, file: Path) -> None:
+        """Write them in order of time."""
+        lines = ("# timestamp tx ty tz qx qy qz qw", *(self._lines[stamp] for stamp in sorted(self._lines)))
+        file.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+class _DepthFiles:
+    """Depth images of one scale, and what they could not hold."""
+
+    def __init__(self, scale: float | None) -> None:
+        self._scale = scale
+        self._written: set[str] = set()
+        self._inexact = 0
+        self._largest_error = 0.0
+        self._made_up = 0
+
+    @property
+    def scale(self) -> float:
+        """Units a metre."""
+        return self._scale or 1000.0
+
+    @property
+    def notices(self) -> list[str]:
+        """For people."""
+        told: list[str] = []
+        if self._inexact:
+            told.append(
+                f"depth of {self._inexact} frames is not exact in steps of 1/{self.scale:g} m: off by up to "
+                f"{self._largest_error * 1e3:.3g} mm"
+            )
+        if self._made_up:
+            told.append(f"{self._made_up} frames have no depth; their depth images are empty (0 = no measurement)")
+        return told
+
+    def write(self, file: Path, item: ExportFrame) -> bool:
+        """False where the frame has no depth."""
+        depth = item.frame.depth_m
+        if depth is None:
+            return False
+        self._scale = self._scale or item.depth_scale or None
+        units, error = depth_units(depth, self.scale)
+        if error > _EXACT_M:
+            self._inexact += 1
+            self._largest_error = max(self._largest_error, error)
+        file.parent.mkdir(exist_ok=True)
+        write_png(file, units)
+        self._written.add(file.name)
+        return True
+
+    def fill_in(self, folder: Path, count: int, intrinsics: CameraIntrinsics | None) -> None:
+        """Empty images for frames without depth, where others have some: the layout has one for each or none."""
+        if not self._written or intrinsics is None:
+            return
+        empty = np.zeros((intrinsics.height, intrinsics.width), np.uint16)
+        for name in {f"{number:06d}.png" for number in range(count)} - self._written:
+            write_png(folder / name, empty)
+            self._made_up += 1
+
+
+class _OneCamera:
+    """The intrinsics that all frames of a folder share."""
+
+    def __init__(self) -> None:
+        self.value: CameraIntrinsics | None = None
+
+    @property
+    def notices(self) -> list[str]:
+        """For people."""
+        bent = self.value is not None and any(self.value.distortion)
+        return ["lens distortion is not in the files: undistort the images with the log's own"] if bent else []
+
+    def check(self, frame: PosedFrame) -> None:
+        """Take the first frame's.
+
+        Raises:
+            LeftOut: a later frame has others.
+        """
+        self.value = self.value or frame.intrinsics
+        if frame.intrinsics != self.value:
+            raise LeftOut("its camera has other intrinsics than the first frame's, and the layout has but one")
+
+    def write(self, file: Path, depth_scale: float) -> None:
+        """Write them as ``import`` reads them."""
+        if self.value is not None:
+            k = self.value
+            plain = {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}
+            file.write_text(json.dumps({**plain, "depth_scale": depth_scale}, indent=1), encoding="ascii")
+
+
+def _by_stamp(line: str) -> tuple[int, str]:
+    whole, _, rest = line.partition(".")
+    return int(whole), rest

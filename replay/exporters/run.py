@@ -1,0 +1,173 @@
+"""A log -> the format of another program: choose the writer, give it the frames, say what it could not hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from replay.exporters.base import Exporter, ExportFrame, LeftOut, encoded, whole_place
+from replay.exporters.folder import FolderExporter, TrajectoryExporter, TumExporter
+from replay.sequence import Log
+from semantic_mapper.errors import CodecError, ConfigError, LogError
+from semantic_mapper.transport.codec import EncodedImage, Envelope, decode_frame
+from semantic_mapper.transport.images import sniff_image
+from semantic_mapper.transport.messages import StreamInfo
+
+LogFormat = Literal["foxglove", "rrd", "trajectory", "tum", "folder"]
+FORMATS: tuple[LogFormat, ...] = get_args(LogFormat)
+_SUFFIXES: dict[str, LogFormat] = {
+    ".mcap": "foxglove",
+    ".rrd": "rrd",
+    ".txt": "trajectory",
+    ".tum": "trajectory",
+    "": "folder",
+}
+_FOLDERS = ("tum", "folder")
+_ONE_CAMERA = ("trajectory", "tum", "folder")
+
+
+@dataclass(frozen=True, slots=True)
+class LogExportRequest:
+    """What to write.
+
+    Args:
+        format: Of the file or folder.
+        camera: Only the frames of this one; empty = all, which trajectory, tum and folder can hold of one camera only.
+        max_frames: Stop after so many; 0 = all.
+    """
+
+    format: LogFormat
+    camera: str = ""
+    max_frames: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class LogExportReport:
+    """What was written.
+
+    Args:
+        frames: Written.
+        left_out: Frames that could not be, with the reason.
+        notices: Sentences on what the format could not hold.
+    """
+
+    frames: int
+    left_out: tuple[str, ...]
+    notices: tuple[str, ...]
+
+
+def log_format_of(path: Path, given: str | None) -> LogFormat:
+    """The format of a file or folder to write.
+
+    Raises:
+        ConfigError: nothing is given, and the name does not tell; or it is a format for maps.
+    """
+    for name in FORMATS:
+        if given == name:
+            return name
+    if given is not None:
+        raise ConfigError(f"--format {given} is for saved maps; logs can be written as {', '.join(FORMATS)}")
+    if path.suffix.lower() not in _SUFFIXES:
+        raise ConfigError(
+            f"{path}: which format is that? Logs are written as .mcap (Foxglove), .rrd (Rerun), .txt (trajectory), or "
+            f"a folder without ending; or give --format {'|'.join(FORMATS)}"
+        )
+    return _SUFFIXES[path.suffix.lower()]
+
+
+def export_log(log: Log, out: Path, request: LogExportRequest, on_frame: Callable[[], None]) -> LogExportReport:
+    """Write the frames of a log; ``out`` is there only once it is whole.
+
+    Args:
+        log: To read; damaged frames are passed over and stand in its ``errors``.
+        out: File or folder to make; a file is replaced, a folder never.
+        request: What to write.
+        on_frame: Called for each frame that was looked at.
+
+    Raises:
+        ConfigError: a camera that is not in the log, or several where the format holds one.
+        LogError: ``out`` is there already, or cannot be written; or no frame could be.
+    """
+    is_folder = request.format in _FOLDERS
+    if is_folder and out.exists():
+        raise LogError(f"{out}: exists already; name a folder that is to be made")
+    if out.is_dir():
+        raise LogError(f"{out}: is a folder; give the name of a file")
+    if not is_folder and out.suffix == ".mcap" and out.exists() and out.resolve() != log.path.resolve():
+        raise LogError(f"{out}: exists already, and may be a log of its own; give another name")
+    if out.resolve() == log.path.resolve():
+        raise ConfigError(f"{out}: is the log itself; choose another name for the result")
+    camera = _choose_camera(log, request)
+    left_out: list[str] = []
+    frames = 0
+    with whole_place(out, folder=is_folder) as place:
+        exporter = _exporter(place, log.info, request.format)
+        for envelope, parts in _frames(log, camera, request.max_frames):
+            on_frame()
+            try:
+                exporter.add(_unpacked(envelope, parts))
+            except (LeftOut, CodecError) as error:
+                left_out.append(f"frame seq={envelope.seq} of camera '{envelope.source}': {error}")
+            else:
+                frames += 1
+        exporter.finish()
+        if not frames:
+            why = left_out[0] if left_out else "it holds none that can be read"
+            raise LogError(f"{log.path}: no frame could be written: {why}")
+    return LogExportReport(frames, tuple(left_out), tuple(exporter.notices))
+
+
+def _exporter(place: Path, info: StreamInfo, name: LogFormat) -> Exporter:
+    if name == "foxglove":
+        from replay.exporters.foxglove import FoxgloveExporter
+
+        return FoxgloveExporter(place, info)
+    if name == "rrd":
+        from replay.exporters.rerun import RerunExporter
+
+        return RerunExporter(place, info)
+    if name == "trajectory":
+        return TrajectoryExporter(place)
+    return TumExporter(place) if name == "tum" else FolderExporter(place, info)
+
+
+def _choose_camera(log: Log, request: LogExportRequest) -> str:
+    """The camera to write, empty = all.
+
+    Raises:
+        ConfigError: it is not in the log, or has to be named.
+    """
+    if not request.camera and request.format not in _ONE_CAMERA:
+        return ""
+    there = sorted({envelope.source for envelope, _ in log.frame_parts()})
+    if request.camera and request.camera not in there:
+        raise ConfigError(f"--camera {request.camera}: the log has frames of {', '.join(there) or 'none'}")
+    if request.format in _ONE_CAMERA and not request.camera and len(there) > 1:
+        raise ConfigError(f"{request.format} holds one camera; name one of {', '.join(there)} with --camera")
+    return request.camera
+
+
+def _frames(log: Log, camera: str, max_frames: int) -> Iterator[tuple[Envelope, list[bytes]]]:
+    count = 0
+    for envelope, parts in log.frame_parts():
+        if camera and envelope.source != camera:
+            continue
+        if max_frames and count >= max_frames:
+            return
+        count += 1
+        yield envelope, parts
+
+
+def _unpacked(envelope: Envelope, parts: list[bytes]) -> ExportFrame:
+    """Decode a frame.
+
+    Raises:
+        CodecError: it is damaged.
+    """
+    frame = decode_frame(parts)
+    if envelope.rgb_encoding == "raw":
+        return ExportFrame(frame, encoded(frame.rgb), envelope.depth_scale)
+    encoding, _ = sniff_image(parts[2])
+    return ExportFrame(frame, EncodedImage(encoding, parts[2]), envelope.depth_scale)

@@ -1,0 +1,261 @@
+"""KITTI-360: one drive, its two rectified perspective cameras, without depth.
+
+The layout is that of https://www.cvlibs.net/datasets/kitti-360/documentation.php ("Folder Structure", "Calibration",
+"Camera Poses"): under the root, ``calibration/perspective.txt`` (``P_rect_0x`` 3x4, ``S_rect_0x`` width height),
+``data_2d_raw/DRIVE/image_0x/data_rect/NNNNNNNNNN.png`` and ``image_0x/timestamps.txt`` (a row a frame),
+``data_poses/DRIVE/cam0_to_world.txt`` (frame number and the 16 numbers of ``T_world_camera`` of the rectified left
+camera; not every frame has one), and, for drives that are labelled,
+``data_2d_semantics/train/DRIVE/image_0x/semantic/NNNNNNNNNN.png`` (uint8 ids). DRIVE is ``2013_05_28_drive_0000_sync``
+and the like; give the root where it holds one, else ``data_2d_raw/DRIVE`` itself.
+
+Class ids, names and colours are those of ``kitti360scripts/helpers/labels.py`` in
+https://github.com/autonomousvision/kitti360Scripts, but for its category "void", which is read as unknown.
+"""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from replay.importers.base import (
+    BadFrameError,
+    ImportOptions,
+    LoadedFrame,
+    Skipped,
+    check_frame_pose,
+    image_size_must_be,
+    numbered_files,
+    read_lines,
+    read_plane,
+    read_rgb,
+)
+from semantic_mapper.errors import FrameError, ImportSourceError, LabelError
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame, UInt8
+
+CAMERAS = ("image_00", "image_01")
+NOMINAL_HZ = 10.0  # of drives whose timestamps.txt is not there
+_CLASSES = (  # from id 7 on
+    "road 804080|sidewalk f423e8|parking faaaa0|rail track e6968c|building 464646|wall 66669c|fence be9999|"
+    "guard rail b4a5b4|bridge 966464|tunnel 96785a|pole 999999|polegroup 999999|traffic light faaa1e|"
+    "traffic sign dcdc00|vegetation 6b8e23|terrain 98fb98|sky 4682b4|person dc143c|rider ff0000|car 00008e|"
+    "truck 000046|bus 003c64|caravan 00005a|trailer 00006e|train 005064|motorcycle 0000e6|bicycle 770b20|garage 408080|"
+    "gate be9999|stop 96785a|smallpole 999999|lamp 004040|trash bin 0080c0|vending machine 804000|box 404080"
+).split("|")
+_FIRST_ID = 7
+_VOID = (*range(1, _FIRST_ID), 42, 43, 44, 255)  # ego vehicle, static, ..., unknown object, and license plate (-1)
+
+
+def _label_set() -> LabelSet:
+    names, colors = zip(*(text.rsplit(" ", 1) for text in _CLASSES), strict=True)
+    rgb = tuple((c[0], c[1], c[2]) for c in map(bytes.fromhex, colors))
+    return LabelSet("kitti360-ids", tuple(range(_FIRST_ID, _FIRST_ID + len(names))), names, rgb)
+
+
+LABELS = _label_set()
+
+
+class Kitti360Recording:
+    """A drive, opened; a frame for each image of the left camera and, where they are there, of the right one.
+
+    Args:
+        folder: The root with one drive, or the drive's folder in ``data_2d_raw``.
+        options: See ``ImportOptions``; cameras are called as their folders are.
+
+    Raises:
+        ImportSourceError: calibration, images or poses are missing or cannot be understood.
+    """
+
+    def __init__(self, folder: Path, options: ImportOptions) -> None:
+        self.notices = ["the data set has no depth images: frames come without depth"]
+        self.depth_scale = 1000.0
+        root, drive = find_drive(folder)
+        self._drive_folder = root / "data_2d_raw" / drive
+        self._semantics = root / "data_2d_semantics" / "train" / drive
+        self._files = {name: numbered_files(self._drive_folder / name / "data_rect", (".png",)) for name in CAMERAS}
+        self._cameras = [name for name in CAMERAS if self._files[name]]
+        if not self._cameras:
+            where = self._drive_folder / CAMERAS[0] / "data_rect"
+            raise ImportSourceError(f"{where}: no rectified images; download 'Perspective Images' of this drive")
+        calibration = root / "calibration" / "perspective.txt"
+        self._intrinsics: dict[str, CameraIntrinsics] = {}
+        self._T_cam0_camera: dict[str, Float64] = {}
+        values = _read_calibration(calibration)
+        for name in self._cameras:
+            self._intrinsics[name], self._T_cam0_camera[name] = rectified_camera(values, name[-2:], calibration)
+        self._poses_file = root / "data_poses" / drive / "cam0_to_world.txt"
+        self._poses = self._read_poses()
+        self._stamps = self._read_stamps(options.frame_hz)
+        labelled = any((self._semantics / name / "semantic").is_dir() for name in self._cameras)
+        if not labelled:
+            self.notices.append(f"no labels: {self._semantics} has no semantic/; test drives have none")
+        # The two cameras fire together: the left one first, so that stamps never fall.
+        self._order = sorted((number, name) for name in self._cameras for number in self._files[name])
+        self.info = StreamInfo(
+            source=f"kitti360 {drive}",
+            cameras=self._intrinsics,
+            label_set=LABELS if labelled else None,
+            frame_count=len(self._order),
+            frame_hz=options.frame_hz or NOMINAL_HZ,
+        )
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+    def load(self, number: int) -> LoadedFrame:
+        """Read one frame.
+
+        Raises:
+            BadFrameError: it cannot be used.
+        """
+        index, camera = self._order[number]
+        file = self._files[camera][index]
+        pose = self._pose(index, camera)
+        rgb, encoded = read_rgb(file)
+        intrinsics = self._intrinsics[camera]
+        image_size_must_be(rgb, intrinsics, file)
+        label, label_error = None, None
+        if (self._semantics / camera / "semantic").is_dir():
+            try:
+                size = (intrinsics.height, intrinsics.width)
+                label = read_semantics(self._semantics / camera / "semantic" / f"{index:010d}.png", size)
+            except BadFrameError as error:
+                label_error = Skipped(error.file, error.reason, number, label_only=True)
+        frame = PosedFrame(
+            stamp_ns=self._stamp(index, camera),
+            seq=index,
+            camera_id=camera,
+            rgb=rgb,
+            depth_m=None,
+            label=label,
+            intrinsics=intrinsics,
+            T_world_camera=pose,
+        )
+        return LoadedFrame(frame, encoded, label_error)
+
+    def _pose(self, index: int, camera: str) -> Float64:
+        if index not in self._poses:
+            raise BadFrameError(self._poses_file, f"has no pose for image {index}; the drive has poses where it moved")
+        line, pose = self._poses[index]
+        return check_frame_pose(pose, self._poses_file, line) @ self._T_cam0_camera[camera]
+
+    def _stamp(self, index: int, camera: str) -> int:
+        stamps = self._stamps.get(camera)
+        if stamps is None:
+            return round(index * 1e9 / self.info.frame_hz)
+        if index >= len(stamps):
+            file = self._drive_folder / camera / "timestamps.txt"
+            raise BadFrameError(file, f"has {len(stamps)} rows and so no time for image {index}")
+        return stamps[index]
+
+    def _read_poses(self) -> dict[int, tuple[int, Float64]]:
+        poses: dict[int, tuple[int, Float64]] = {}
+        for line, text in read_lines(self._poses_file):
+            try:
+                index, *numbers = text.split()
+                T_world_cam0 = np.array([float(n) for n in numbers], np.float64).reshape(4, 4)
+                poses[int(index)] = line, T_world_cam0
+            except ValueError as error:
+                raise ImportSourceError(
+                    f"{self._poses_file}, line {line}: expected a frame number and the 16 numbers of a 4x4 matrix "
+                    f"({error}); poses.txt, with 12, is another file"
+                ) from error
+        if not poses:
+            raise ImportSourceError(f"{self._poses_file}: holds no pose")
+        return poses
+
+    def _read_stamps(self, frame_hz: float | None) -> dict[str, list[int]]:
+        files = {name: self._drive_folder / name / "timestamps.txt" for name in self._cameras}
+        missing = [str(file) for file in files.values() if not file.exists()]
+        if missing or frame_hz is not None:
+            why = f"{missing[0]} is missing" if missing else "a rate is given"
+            self.notices.append(f"{why}: stamps are made up at {frame_hz or NOMINAL_HZ:g} frames a second")
+            return {}
+        return {name: [_time_ns(text, file, n) for n, text in read_lines(file)] for name, file in files.items()}
+
+
+def find_drive(folder: Path) -> tuple[Path, str]:
+    """Root of the data set and name of the drive.
+
+    Raises:
+        ImportSourceError: several drives, none, or a folder of another kind.
+    """
+    folder = folder.resolve()
+    if folder.parent.name == "data_2d_raw":
+        return folder.parent.parent, folder.name
+    drives = sorted(path.name for path in (folder / "data_2d_raw").glob("*_drive_*_sync") if path.is_dir())
+    if len(drives) == 1:
+        return folder, drives[0]
+    if not drives:
+        raise ImportSourceError(f"{folder / 'data_2d_raw'}: no drive (2013_05_28_drive_0000_sync or the like) in it")
+    raise ImportSourceError(
+        f"{folder}: holds {len(drives)} drives; name the folder of one: {folder / 'data_2d_raw' / drives[0]}, "
+        f"{', '.join(drives[1:])}"
+    )
+
+
+def rectified_camera(values: dict[str, list[float]], which: str, file: Path) -> tuple[CameraIntrinsics, Float64]:
+    """Intrinsics of a rectified camera, and ``T_cam0_camera`` (4, 4): where it stands beside the left one.
+
+    Args:
+        values: Lines of ``perspective.txt`` by name.
+        which: "00" or "01".
+        file: Named in errors.
+
+    Raises:
+        ImportSourceError: lines are missing, or of another length.
+    """
+    P, size = values.get(f"P_rect_{which}", []), values.get(f"S_rect_{which}", [])
+    if len(P) != 12 or len(size) != 2:
+        raise ImportSourceError(f"{file}: needs 'P_rect_{which}:' with 12 numbers and 'S_rect_{which}:' with 2")
+    matrix = np.array(P, np.float64).reshape(3, 4)
+    K = matrix[:, :3]
+    try:
+        intrinsics = CameraIntrinsics(K[0, 0], K[1, 1], K[0, 2], K[1, 2], int(size[0]), int(size[1]))
+    except FrameError as error:
+        raise ImportSourceError(f"{file}: {error}") from error
+    T_cam0_camera = np.eye(4)
+    T_cam0_camera[:3, 3] = -np.linalg.solve(K, matrix[:, 3])  # P = K [I | t] takes points of the left camera
+    return intrinsics, T_cam0_camera
+
+
+def read_semantics(file: Path, size: tuple[int, int]) -> UInt8:
+    """Label image (H, W) with the ids of the data set; those of its category "void" become 0.
+
+    Raises:
+        BadFrameError: missing, damaged, of another size, or an id that the data set does not have.
+    """
+    ids = read_plane(file, "uint8", size, "label").astype(np.uint8)
+    ids[np.isin(ids, _VOID)] = LABELS.ignore_id
+    try:
+        LABELS.to_channels(ids, "label image")
+    except LabelError as error:
+        raise BadFrameError(file, str(error)) from error
+    return ids
+
+
+def _read_calibration(file: Path) -> dict[str, list[float]]:
+    values: dict[str, list[float]] = {}
+    for line, text in read_lines(file):
+        name, _, numbers = text.partition(":")
+        if not re.fullmatch(r"[PRS]_rect_0[01]", name.strip()):
+            continue
+        try:
+            values[name.strip()] = [float(n) for n in numbers.split()]
+        except ValueError as error:
+            raise ImportSourceError(f"{file}, line {line}: {error}") from error
+    return values
+
+
+def _time_ns(text: str, file: Path, line: int) -> int:
+    """``2013-05-28 08:46:02.904547200`` -> nanoseconds since 1970."""
+    seconds, _, fraction = text.strip().partition(".")
+    try:
+        whole = datetime.strptime(seconds, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+        return int(whole.timestamp()) * 1_000_000_000 + int((fraction or "0")[:9].ljust(9, "0"))
+    except ValueError as error:
+        raise ImportSourceError(f"{file}, line {line}: expected a date and a time: {error}") from error

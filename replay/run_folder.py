@@ -1,0 +1,40 @@
+"""What a replay, or a mapper node, has left in its folder: the summary and the map, read back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from replay.summary import read_summary
+from semantic_mapper.mapping.voxel_map import VoxelMap
+
+MAP_FILE = "map.npz"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """One run of a log.
+
+    Args:
+        name: For people.
+        voxel_map: Its map.
+        summary: Its ``summary.json``; None where only the map is known.
+    """
+
+    name: str
+    voxel_map: VoxelMap
+    summary: Mapping[str, Any] | None
+
+
+def read_run(path: Path) -> Run:
+    """Read the folder of a run, or a saved map alone.
+
+    Raises:
+        ConfigError: a folder without a whole summary.
+        MapError: no map there, or a damaged one.
+    """
+    if path.is_dir():
+        return Run(str(path), VoxelMap.load(path / MAP_FILE), read_summary(path))
+    return Run(str(path), VoxelMap.load(path), None)

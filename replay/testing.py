@@ -1,0 +1,274 @@
+"""Replays inside tests: a log goes through the very pipeline of a robot, and the map is there to be asserted on.
+
+Importing this loads nothing heavy: PyTorch and Open3D come with the first replay.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from semantic_mapper.errors import LogError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from replay.compare import Comparison
+    from semantic_mapper.config import MapperConfig
+    from semantic_mapper.mapping.voxel_map import VoxelMap
+    from semantic_mapper.queries.nearest import NearestSurface
+    from semantic_mapper.queries.snapshot import MapSnapshot
+
+UPDATE_OPTION = "--update-runs"
+
+Settings = Mapping[str, Any] | Path | str | None
+Quality = Literal["fast", "balanced", "reference"] | None
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayedMap:
+    """The map that a log has become, and the questions of tests to it. Points are (3,) metres in the world.
+
+    Args:
+        folder: What ``semantic-mapper replay`` would have written: map, picture, summary.
+        voxel_map: The map.
+        summary: As in ``summary.json``.
+        root: What paths of stored runs are relative to.
+        update: Store runs instead of comparing with them.
+    """
+
+    folder: Path
+    voxel_map: VoxelMap
+    summary: Mapping[str, Any]
+    root: Path
+    update: bool = False
+
+    def __repr__(self) -> str:
+        return f"<map of {self.mapped} frames, {self.blocks} blocks; see {self.folder}>"
+
+    @cached_property
+    def snapshot(self) -> MapSnapshot:
+        """For all queries of ``semantic_mapper.queries``."""
+        from semantic_mapper.queries.mirror import MapMirror
+
+        return MapMirror.of(self.voxel_map).snapshot()
+
+    def class_at(self, point: ArrayLike, radius_m: float | None = None) -> str | None:
+        """Name of the class of the surface at a point; None where there is none, or nobody knows what it is.
+
+        Raises:
+            MapError: not a point, or a radius beyond what ``queries.lookup.at`` takes.
+        """
+        import numpy as np
+
+        from semantic_mapper.queries.lookup import at
+
+        labels, found = self.snapshot.label_set, int(at(self.snapshot, np.asarray(point)[None], radius_m).label[0])
+        return None if found == labels.ignore_id else labels.names[labels.ids.index(found)]
+
+    def nearest(self, class_name: str, point: ArrayLike, min_confidence: float = 0.0) -> NearestSurface | None:
+        """The surface of a class that is nearest to a point: ``xyz``, ``distance_m``, ``confidence``; None = nowhere.
+
+        Raises:
+            LabelError: no such class; lists those there are.
+            MapError: not a point.
+        """
+        from semantic_mapper.queries.nearest import nearest
+
+        return nearest(self.snapshot, class_name, point, min_confidence)
+
+    def is_free(self, point: ArrayLike) -> bool:
+        """Whether a point is known to be free: neither occupied nor unknown.
+
+        Raises:
+            MapError: not a point.
+        """
+        import numpy as np
+
+        from semantic_mapper.queries.occupancy import State, occupancy
+
+        return int(occupancy(self.snapshot, np.asarray(point)[None])[0]) == State.FREE
+
+    @property
+    def blocks(self) -> int:
+        """Blocks of 8^3 voxels."""
+        return self.voxel_map.block_count
+
+    @property
+    def mapped(self) -> int:
+        """Frames that are in the map."""
+        return int(self.summary["frames"]["fused"])
+
+    @property
+    def refused(self) -> list[str]:
+        """Why frames were refused: a reason each of the first 50, labels that cannot be used included."""
+        return [str(refusal["reason"]) for refusal in self.summary["refusals"]]
+
+    @property
+    def miou(self) -> float:
+        """Of the rendered views against the labels of the log, 0..1.
+
+        Raises:
+            LogError: no frame of the log has labels that count.
+        """
+        return self._score("miou")
+
+    @property
+    def map_miou(self) -> float:
+        """Of the map's surface against the labels of the log, 0..1.
+
+        Raises:
+            LogError: no frame of the log has labels that count.
+        """
+        return self._score("map_miou")
+
+    def compare(self, stored: Path | str, **tolerances: float) -> Comparison:
+        """Compare with an earlier run: a folder with ``map.npz`` and ``summary.json``, or a map alone.
+
+        Args:
+            stored: The run; a relative path begins at pytest's root folder.
+            tolerances: By field, as of ``replay.tolerances.Tolerances``.
+
+        Raises:
+            ConfigError: no such field, or a folder without a run.
+            MapError: no such map, or a damaged one.
+        """
+        from replay.compare import compare_runs
+        from replay.run_folder import Run, read_run
+        from replay.tolerances import Tolerances
+        from semantic_mapper.config import convert_config
+
+        allowed = convert_config(tolerances, Tolerances, "tolerances")
+        earlier = read_run(self.root / stored)
+        return compare_runs(earlier, Run(str(self.folder), self.voxel_map, self.summary), allowed)
+
+    def store(self, target: Path | str) -> None:
+        """Write what ``compare`` needs of this run to a folder, made if missing.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        from replay.run_folder import MAP_FILE
+        from replay.summary import SUMMARY_FILE
+
+        folder = self.root / target
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in (MAP_FILE, SUMMARY_FILE):
+            shutil.copyfile(self.folder / name, folder / name)
+
+    def assert_like(self, stored: Path | str, **tolerances: float) -> None:
+        """Fail where this run is not as an earlier one within tolerances; see ``compare``.
+
+        ``pytest --update-runs`` stores this run there instead. A failure names what differs, and a picture of it.
+
+        Raises:
+            AssertionError: it differs, or no run is stored there.
+        """
+        from replay.compare_picture import draw_comparison
+        from semantic_mapper.evaluation.sheet import write_picture
+
+        target = self.root / stored
+        if self.update:
+            self.store(target)
+            return
+        if not target.exists():
+            raise AssertionError(f"no run is stored at {target}; look at {self.folder}, then `pytest {UPDATE_OPTION}`")
+        comparison = self.compare(stored, **tolerances)
+        if not comparison.equal:
+            picture = self.folder / "compare.png"
+            write_picture(picture, draw_comparison(comparison))
+            lines = [f"the map is not as {target}; see {picture}", *comparison.differences(), *comparison.notes]
+            raise AssertionError("\n  ".join(lines))
+
+    def _score(self, name: str) -> float:
+        value = self.summary["metrics"][name]
+        if value is None:
+            raise LogError(
+                f"{self.folder}: nothing to score: no frame has labels, or the weights have seen all of them"
+            )
+        return float(value)
+
+
+class LogReplays:
+    """Replays logs, each once for the same settings, however many tests ask for it.
+
+    Args:
+        root: What relative paths begin at.
+        make_folder: Gives a new folder for the results of a replay, by the log's name.
+        update: See ``ReplayedMap``.
+    """
+
+    def __init__(self, root: Path, make_folder: Callable[[str], Path], *, update: bool = False) -> None:
+        self._root = root
+        self._make_folder = make_folder
+        self._update = update
+        self._done: dict[str, ReplayedMap] = {}
+
+    def __call__(
+        self,
+        log: Path | str,
+        *,
+        weights: Path | str | None = None,
+        config: Settings = None,
+        quality: Quality = None,
+        max_frames: int = 0,
+    ) -> ReplayedMap:
+        """Replay a log through ``MappingPipeline.step``, as ``semantic-mapper replay`` does.
+
+        Args:
+            log: Recorded log (.mcap).
+            weights: None = those that ship with the package.
+            config: Of the mapper: a TOML file, or its sections as a dict.
+            quality: None = as the config says.
+            max_frames: 0 = all.
+
+        Raises:
+            LogError: the log cannot be read, or none of its frames can be mapped.
+            WeightsError, ConfigError, MapError: as of ``load_pipeline`` and ``MappingPipeline.step``.
+        """
+        # Read by OpenMP once, when the first of its libraries loads; spinning threads slow each other down.
+        os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+        log = self._root / log
+        weights = None if weights is None else self._root / weights
+        mapper = self._read_config(config, quality)
+        key = repr((log, weights, mapper, max_frames))
+        if key not in self._done:
+            self._done[key] = self._replay(log, weights, mapper, max_frames)
+        return self._done[key]
+
+    def _read_config(self, config: Settings, quality: Quality) -> MapperConfig:
+        from semantic_mapper.config import MapperConfig, check_quality, convert_config, read_toml
+
+        data = dict(config) if isinstance(config, Mapping) else read_toml(self._root / config) if config else {}
+        where = "config of the replay" if isinstance(config, Mapping) else str(config)
+        data |= {} if quality is None else {"quality": quality}
+        mapper = convert_config(data, MapperConfig, where)
+        check_quality(data, mapper.quality, where)
+        return mapper
+
+    def _replay(self, path: Path, weights: Path | None, config: MapperConfig, max_frames: int) -> ReplayedMap:
+        from replay.sequence import open_log
+        from replay.session import MapSession, load_pipeline
+        from semantic_mapper.types import PosedFrame
+
+        with open_log(path) as log:
+            bundle = load_pipeline(weights, config)
+            session = MapSession(bundle, stream_labels=log.info.label_set, source=log.info.source)
+            for error in log.errors:
+                session.note_damage(str(error))
+            for number, item in enumerate(log.frames_or_errors(min(len(log), max_frames or len(log)))):
+                if isinstance(item, PosedFrame):
+                    session.process(item)
+                else:
+                    session.refuse(number, 0, str(item))
+        if not session.fused:
+            reason = session.refusals.first[0].reason if session.refusals else "no frame finds a source view"
+            raise LogError(f"{path}: none of its frames could be mapped; the first: {reason}")
+        folder = self._make_folder(path.stem)
+        summary = session.finish(folder)
+        return ReplayedMap(folder, session.pipeline.voxel_map, summary, self._root, self._update)
