@@ -47,6 +47,8 @@ class Autosave:
 
     def follow(self) -> None:
         """Begin a save if it is time; to be called between two frames."""
+        if self._ending.is_set():
+            return
         version = self._map.version
         if time.monotonic() - self._begun < self._every_s or self._saved_version == version:
             return
@@ -56,6 +58,12 @@ class Autosave:
         saving = self._map.begin_save()
         self._thread = threading.Thread(target=self._save, args=(saving, version), name="autosave", daemon=True)
         self._thread.start()
+
+    def end(self, why: str) -> None:
+        """Save no more; ``why`` is told as the failure of the last save."""
+        self.close()
+        self.failure = why
+        _log.error("autosave_ends", reason=why)
 
     def close(self) -> None:
         """Give up what is being written; the file is as it was before."""

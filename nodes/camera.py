@@ -1,30 +1,45 @@
-"""The camera node: publishes posed frames. In this version they come from a log, which is played."""
+"""The camera node: publishes posed frames, of a log that it plays or of a camera."""
 
 from __future__ import annotations
 
+import dataclasses
 import threading
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import structlog
 
 from nodes.console import frame_progress
+from nodes.listeners import drain, wait_for_listeners
 from nodes.node import NodeContext, run_node
 from nodes.options import CameraOptions
-from semantic_mapper.errors import LogError, TransportError
+from nodes.playing_on import Beginning
+from semantic_mapper.errors import LogError
 
 if TYPE_CHECKING:
-    from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
+    from semantic_mapper.transport.codec import Envelope
 
-DRAIN_S = 600.0  # how long subscribers may take to work off what waits for them after the last frame
-WAIT_SLICE_S = 0.2
-STOP_DRAIN_S = 3.0  # the same after a stop request
+PACKAGES = ("replay.player", "replay.sequence", "semantic_mapper.transport.sockets")
 
 _log = structlog.get_logger(__name__)
 
 
 def run_camera(context: NodeContext, options: CameraOptions) -> None:
+    """Publish frames to the end of the source, or until stopped.
+
+    Raises:
+        LogError, NodeError, TransportError: see ``_play``.
+        CameraError, ConfigError: see ``run_live_camera``.
+    """
+    if options.camera is not None:
+        from nodes.live_camera import run_live_camera
+
+        run_live_camera(context, options, options.camera)
+    elif options.log is not None:
+        _play(context, options, Path(options.log))
+
+
+def _play(context: NodeContext, options: CameraOptions, path: Path) -> None:
     """Play a log to its end, or until stopped.
 
     Raises:
@@ -32,8 +47,8 @@ def run_camera(context: NodeContext, options: CameraOptions) -> None:
         NodeError: lockstep, and the mapper has gone.
         TransportError: nobody subscribes.
     """
-    from replay.log import LogReader
     from replay.player import ACK_TOPICS, PlayOptions, play
+    from replay.sequence import open_log
     from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
     def on_error(error: LogError) -> None:
@@ -49,10 +64,12 @@ def run_camera(context: NodeContext, options: CameraOptions) -> None:
         source=context.name,
     )
     stopped = threading.Event()
-    with LogReader(Path(options.log), on_error=on_error) as log:
+    with open_log(path, on_error=on_error) as log:
+        context = context.await_turn()
         policy = "drop" if options.mode == "realtime" else "block"
         with Publisher(context.endpoint(context.name), policy=policy) as publisher:
-            _log.info("playing", log=options.log, frames=len(log), mode=options.mode)
+            context.heart.ready()
+            _log.info("playing", log=str(path), frames=len(log), mode=options.mode)
             watcher = threading.Thread(target=_pass_on_stop, args=(context, stopped), daemon=True)
             watcher.start()
             acks = None
@@ -60,40 +77,26 @@ def run_camera(context: NodeContext, options: CameraOptions) -> None:
                 acks = LosslessSubscriber(context.endpoint(options.mapper), ACK_TOPICS)
             total = min(len(log), options.max_frames or len(log))
             try:
-                if not _wait_for_listeners(context, options, publisher, acks):
+                if not wait_for_listeners(context, publisher, options.subscriber_timeout_s, acks):
+                    _log.info("played", published=0, stopped=True)
                     return
                 with frame_progress("played", total) as bar:
-                    report = play(
-                        log, publisher, acks, play_options, stop=stopped, on_frame=lambda envelope, ack: bar.advance()
-                    )
+                    began = Beginning(context, options.rate)
+
+                    def on_frame(envelope: Envelope, ack: object) -> None:
+                        bar.advance()
+                        began.note(envelope.stamp_ns)
+
+                    play_options = dataclasses.replace(play_options, from_stamp_ns=began.due_stamp_ns())
+                    report = play(log, publisher, acks, play_options, stop=stopped, on_frame=on_frame)
             finally:
                 if acks is not None:
                     acks.close()
             for error in report.errors[len(log.errors) :]:
                 _log.error("frame_left_out", error=str(error))
             _log.info("played", published=report.published, damaged=len(report.errors), stopped=report.stopped)
-            _drain(context, publisher)
-
-
-def _wait_for_listeners(
-    context: NodeContext, options: CameraOptions, publisher: Publisher, acks: LosslessSubscriber | None
-) -> bool:
-    """Wait until all others are there, in slices: False where a stop request came first.
-
-    Raises:
-        TransportError: too few within the time.
-    """
-    deadline = time.monotonic() + options.subscriber_timeout_s
-    while not context.stop:
-        try:
-            publisher.wait_for_subscribers("frame", context.subscribers, WAIT_SLICE_S)
-            if acks is not None:
-                acks.wait_until_heard(WAIT_SLICE_S)
-            return True
-        except TransportError:
-            if time.monotonic() > deadline:
-                raise
-    return False
+            context.heart.ending()
+            drain(context, publisher)
 
 
 def _pass_on_stop(context: NodeContext, stopped: threading.Event) -> None:
@@ -102,12 +105,5 @@ def _pass_on_stop(context: NodeContext, stopped: threading.Event) -> None:
             stopped.set()
 
 
-def _drain(context: NodeContext, publisher: Publisher) -> None:
-    """Stay until the subscribers have left, which they do after the end of the stream: only then is all delivered."""
-    began = time.monotonic()
-    while publisher.subscribers("frame") and time.monotonic() - began < (STOP_DRAIN_S if context.stop else DRAIN_S):
-        time.sleep(0.05)
-
-
 if __name__ == "__main__":
-    run_node(CameraOptions, run_camera)
+    run_node(CameraOptions, run_camera, PACKAGES)

@@ -9,16 +9,25 @@ from typing import Annotated
 import typer
 
 from nodes import (
+    cli_calibrate,
+    cli_cameras,
+    cli_compare,
     cli_correct,
     cli_demo,
     cli_doctor,
     cli_eval,
     cli_export,
     cli_finetune,
+    cli_keys,
+    cli_label,
     cli_log,
     cli_query,
+    cli_record,
     cli_replay,
+    cli_top,
     cli_up,
+    cli_view,
+    cli_weights,
 )
 from nodes.verb import Settings
 from semantic_mapper import __version__
@@ -35,7 +44,13 @@ app = typer.Typer(
 for _function in (
     cli_demo.demo,
     cli_replay.replay,
+    cli_compare.compare,
     cli_up.up,
+    cli_top.top,
+    cli_view.view,
+    cli_cameras.cameras,
+    cli_record.record,
+    cli_calibrate.calibrate,
     cli_log.import_,
     cli_log.info,
     cli_log.recover,
@@ -44,9 +59,13 @@ for _function in (
     cli_finetune.finetune,
     cli_eval.evaluate,
     cli_correct.correct,
+    cli_label.label,
+    cli_weights.weights,
     cli_doctor.doctor,
 ):
     app.command(_function.__name__.rstrip("_").replace("evaluate", "eval"))(_function)
+
+app.add_typer(cli_keys.app, name="keys")
 
 # Coordinates below 0 look like options.
 app.command("query", context_settings={"ignore_unknown_options": True})(cli_query.query)

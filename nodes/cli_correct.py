@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nodes.console import Output, frame_progress
+from nodes.identity import KeysOption, ServerOption, server_identity
 from nodes.verb import EXIT_FAILED, verb
 
 if TYPE_CHECKING:
@@ -35,6 +36,8 @@ def correct(
         ),
     ] = None,
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Until the map has moved.")] = True,
+    server: ServerOption = "",
+    keys: KeysOption = None,
     json: Annotated[
         bool, typer.Option("--json", help="Print the outcome as JSON, and nothing else, on stdout.")
     ] = False,
@@ -56,7 +59,7 @@ def correct(
     pairs = zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)
     poses = {(camera, stamp_ns): pose for stamp_ns, pose in pairs}
     until_ns = ALWAYS if until is None else round(until * 1e9)
-    with MapClient(endpoint) as client:
+    with MapClient(endpoint, identity=server_identity(server, keys)) as client:
         begun = client.correct_poses(poses, until_ns=until_ns, within_ns=MATCH_NS)
         state = _follow(client) if wait else begun
     outcome = {**asdict(state), "used": begun.used, "left_out": begun.left_out}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -15,11 +16,20 @@ _MARKS = {"ok": "[green]ok[/green]", "note": "[yellow]note[/yellow]", "bad": "[b
 
 @verb
 def doctor(
+    launch: Annotated[
+        Path | None,
+        typer.Argument(metavar="[LAUNCH.toml]", help="A launch file whose ports and keys are looked at, too."),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="For the launch file, as of `up`; may be repeated."),
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
 ) -> int:
     """Look for what this machine lacks, with a mend for each thing; exit code 1 where something needed is missing.
 
     Example: semantic-mapper doctor
+    Example: semantic-mapper doctor launch/headless-onboard.toml --set keys=~/.config/semantic-mapper/keys
     """
     output = Output.guarded()
     from rich.markup import escape
@@ -27,7 +37,7 @@ def doctor(
 
     from nodes.doctor import examine
 
-    checks = examine()
+    checks = examine(launch, settings or ())
     if json:
         output.json([asdict(c) for c in checks])
     else:

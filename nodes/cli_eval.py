@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,10 +12,16 @@ from nodes.cli_replay import MaxFramesOption
 from nodes.console import Output
 from nodes.verb import verb
 
+if TYPE_CHECKING:
+    from rich.table import Table
+
 BASELINE_SECONDS = 300.0
 
 TargetsArgument = Annotated[
-    list[Path] | None, typer.Argument(metavar="DIR_OR_LOG...", help="Folders that `replay` has written, and logs.")
+    list[Path] | None,
+    typer.Argument(
+        metavar="DIR_OR_LOG...", help="Folders that `replay` has written; logs, or folders with their parts."
+    ),
 ]
 JsonOption = Annotated[
     Path | None,
@@ -62,7 +68,7 @@ def evaluate(
     steps: suites.StepsOption = None,
     maps: suites.MapOption = False,
 ) -> int:
-    """Print a table of figures and write them as JSON.
+    """Print a table of figures and write them as JSON, and as a page of HTML beside it.
 
     A DIR gives the figures of its replay. A LOG is mapped and scored: with --weights that were finetuned on it, the
     keyframes they were fitted to never count, and --baselines adds a per-image U-Net and labels carried over by depth,
@@ -117,13 +123,17 @@ def _evaluate_targets(
     if not targets:
         raise typer.BadParameter("give folders or logs, or --suite", param_hint="DIR_OR_LOG")
     output = Output.guarded()
+    from nodes.report_page import write_eval_report
     from nodes.results import print_results
+    from nodes.saved_maps import is_log
     from replay.artifacts import write_json
 
-    folders = [t for t in targets if t.is_dir()]
+    logs = [t for t in targets if is_log(t) or not t.is_dir()]
+    folders = [t for t in targets if t not in logs]
     if mesh is not None and not folders:
         raise typer.BadParameter("goes with a DIR that `replay` has written", param_hint="--mesh")
     found: dict[str, Any] = {"replays": {}, "logs": {}}
+    tables: dict[str, Table] = {}
     if folders:
         found["replays"] = print_results(output, folders)
     if mesh is not None:
@@ -132,14 +142,16 @@ def _evaluate_targets(
         found["surface"] = {str(f): compare_with_mesh(f, mesh) for f in folders}
         for name, figures in found["surface"].items():
             output.print(f"{name}: {surface_line(figures)}")
-    for log in (t for t in targets if not t.is_dir()):
+    for log in logs:
         from nodes.scoring import ScoreRequest, score_log, score_table
 
         found["logs"][str(log)] = scores = score_log(ScoreRequest(log, *options))
-        output.print(score_table(log.name, scores))
+        tables[str(log)] = score_table(log.name, scores)
+        output.print(tables[str(log)])
     path = json_file or (folders[0] / "eval.json" if folders else targets[0].with_suffix(".eval.json"))
     write_json(path, found)
-    output.print(f"written to {path}")
+    write_eval_report(page := path.with_suffix(".html"), found["replays"], folders, tables, found)
+    output.print(f"written to {path} and, for a browser, {page}")
     return 0
 
 

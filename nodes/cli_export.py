@@ -1,22 +1,28 @@
-"""Verbs about saved maps: ``export``, ``merge``."""
+"""Verbs about saved maps: ``export`` (also of logs), ``merge``."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from nodes.console import Output
 from nodes.verb import verb
 
+if TYPE_CHECKING:
+    from replay.map_export import ExportRequest
+
 
 @verb
 def export(
-    map_: Annotated[Path, typer.Argument(metavar="MAP", help="Saved map (map.npz), or a folder of results with one.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="MAP|LOG", help="Saved map, log, or a folder: of results, or with parts of a log.")
+    ],
     out: Annotated[Path, typer.Option("--out", help="File to write; its ending says the format.")],
     format: Annotated[  # noqa: A002 - the name of the option
-        Literal["ply", "ply-mesh", "obj", "glb", "npz", "grid", "rrd"] | None,
+        Literal["ply", "ply-mesh", "obj", "glb", "npz", "grid", "rrd", "foxglove", "trajectory", "tum", "folder"]
+        | None,
         typer.Option(help="Where the ending does not say it: ply and npz are points, ply-mesh, obj and glb meshes."),
     ] = None,
     color: Annotated[
@@ -35,26 +41,47 @@ def export(
     ] = None,
     resolution: Annotated[float | None, typer.Option(help="grid: side of a cell in metres.  [default: 0.05]")] = None,
     floor: Annotated[float | None, typer.Option(help="grid: height of the floor; found when not given.")] = None,
+    camera: Annotated[str, typer.Option(help="Logs: the frames of this camera only.")] = "",
+    max_frames: Annotated[int, typer.Option(min=0, help="Logs: stop after so many; 0 = all.")] = 0,
 ) -> None:
-    """Write a saved map in a format of other programs.
+    """Write a saved map, or a log, in a format of other programs.
 
-    .ply points (with --format ply-mesh a mesh), .obj mesh with materials, .glb mesh for viewers, .npz arrays for
+    Maps: .ply points (with --format ply-mesh a mesh), .obj mesh with materials, .glb mesh for viewers, .npz arrays for
     numpy, .yaml/.pgm floor plan for nav2 and map_server, .rrd for Rerun. In a floor plan a cell is free only where the
     floor was seen.
 
+    Logs: .mcap with Foxglove's schemas, .rrd for Rerun, .txt trajectory (TUM), a folder that `import` reads again
+    without loss, or with --format tum a TUM RGB-D sequence.
+
     Example: semantic-mapper export runs/kitchen --out kitchen.glb --color class
     Example: semantic-mapper export runs/kitchen/map.npz --out plan.yaml --height 0.1 1.2
+    Example: semantic-mapper export kitchen.mcap --out kitchen-foxglove.mcap
     """
     output = Output.guarded()
+    from nodes.export_recording import export_recording
+    from nodes.saved_maps import is_log
+    from replay.map_export import ExportRequest, format_of, parse_up
+    from semantic_mapper.errors import ConfigError
+
+    if is_log(source):
+        given = {"--color": color, "--height": height, "--resolution": resolution, "--floor": floor}
+        given |= {"--up": up != "auto", "--min-weight": min_weight != 1.0, "--min-confidence": min_confidence > 0}
+        map_options = [name for name, value in given.items() if value]
+        return export_recording(output, source, out, format, camera, max_frames, map_options)
+    if camera or max_frames:
+        raise ConfigError("--camera and --max-frames are for logs; a map has no frames")
+    kind = format_of(out, format)
+    request = ExportRequest(kind, min_weight, min_confidence, color, parse_up(up), height, resolution, floor)
+    return _export_map(output, source, out, request)
+
+
+def _export_map(output: Output, folder_or_map: Path, out: Path, request: ExportRequest) -> None:
     from nodes.outputs import prepare_file
     from nodes.saved_maps import map_path, refuse_overwriting
-    from replay.map_export import ExportRequest, export_map, format_of, parse_up
+    from replay.map_export import export_map
     from semantic_mapper.mapping.voxel_map import VoxelMap
 
-    source = map_path(map_)
-    request = ExportRequest(
-        format_of(out, format), min_weight, min_confidence, color, parse_up(up), height, resolution, floor
-    )
+    source = map_path(folder_or_map)
     refuse_overwriting(out, source)
     prepare_file(out)
     report = export_map(VoxelMap.load(source), out, request)

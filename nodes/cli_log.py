@@ -20,7 +20,8 @@ def import_(
     source: Annotated[Path, typer.Argument(metavar="SRC", help="Folder of the recording.")],
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Log to write (.mcap).")],
     format: Annotated[  # noqa: A002 - the name of the option
-        Literal["folder", "tum", "scannet"] | None, typer.Option(help="Found out when not given.")
+        Literal["folder", "tum", "scannet", "replica", "kitti360"] | None,
+        typer.Option(help="Found out when not given."),
     ] = None,
     max_frames: Annotated[int, typer.Option(min=0, help="Stop after so many; 0 = all.")] = 0,
     rename: Annotated[
@@ -29,8 +30,9 @@ def import_(
     rotate: Annotated[
         Literal["0", "90", "180", "270"], typer.Option(help="Turn every image clockwise by so many degrees.")
     ] = "0",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a log that is there.")] = False,
 ) -> None:
-    """Make a log of a recording: sequence folder, TUM RGB-D, or exported ScanNet.
+    """Make a log of a recording: sequence folder, TUM RGB-D, exported ScanNet, Replica (Semantic-NeRF), KITTI-360.
 
     Frames that cannot be used are left out, each with its file and the reason. --rotate is for cameras that are mounted
     on their side: the weights know upright rooms. Poses and intrinsics turn with the images.
@@ -53,7 +55,9 @@ def import_(
             bar.set(done)
 
         options = ImportOptions(max_frames=max_frames or None, quarters=int(rotate) // 90)
-        report = import_recording(source, log, format, on_progress, options=options, renames=renames)
+        report = import_recording(
+            source, log, format, on_progress, options=options, renames=renames, overwrite=overwrite
+        )
     labels = "no labels" if not report.labelled else f"{report.labelled} of them labelled"
     output.print(f"{log}: {report.frames} frames ({labels}), {report.bytes / 1e6:.1f} MB, from a '{report.format}'")
     for notice in report.notices:
@@ -67,7 +71,10 @@ def import_(
 
 @verb
 def info(
-    file: Annotated[Path, typer.Argument(help="Recorded log (.mcap), or saved map (.npz).")],
+    file: Annotated[
+        list[Path],
+        typer.Argument(metavar="FILE...", help="Recorded log (.mcap), its parts or their folder; or saved map (.npz)."),
+    ],
     json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
 ) -> int:
     """Say what a log holds (topics, frames, cameras, duration, damage), or a map (frames, size, blocks, classes).
@@ -79,8 +86,10 @@ def info(
     Example: semantic-mapper info runs/demo/map.npz
     """
     output = Output.guarded()
-    if file.suffix == MAP_SUFFIX:
-        return _map_info(output, file, json)
+    if file[0].suffix == MAP_SUFFIX:
+        if len(file) > 1:
+            raise typer.BadParameter("one map at a time")
+        return _map_info(output, file[0], json)
     from nodes.log_info import describe_log, info_table
 
     with frame_progress("read", None, unit="messages") as bar:
@@ -89,7 +98,7 @@ def info(
         output.json(found)
     else:
         output.print(info_table(found))
-        _print_damage(output, file, found)
+        _print_damage(output, found)
     return EXIT_FAILED if found["damage"] else 0
 
 
@@ -104,7 +113,7 @@ def _map_info(output: Output, file: Path, json: bool) -> int:
     return 0
 
 
-def _print_damage(output: Output, log: Path, found: dict[str, Any]) -> None:
+def _print_damage(output: Output, found: dict[str, Any]) -> None:
     for notice in found["notices"]:
         output.print(f"note: {notice}")
     for damage in found["damage"][:LISTED]:
@@ -112,6 +121,7 @@ def _print_damage(output: Output, log: Path, found: dict[str, Any]) -> None:
     if len(found["damage"]) > LISTED:
         output.print(f"and {len(found['damage']) - LISTED} more")
     if found["damage"] or not found["finished"]:
+        log = Path(found["parts"][0])  # parts are mended one by one
         output.print(
             f"`semantic-mapper recover {log} {log.with_stem(log.stem + '-recovered')}` makes a clean log of it"
         )

@@ -9,6 +9,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 from nodes.console import Output
+from nodes.identity import KeysOption, ServerOption, server_identity
 from nodes.outputs import prepare_file
 from nodes.verb import verb
 
@@ -33,6 +34,8 @@ class Asked(NamedTuple):
     point: tuple[float, ...] = ()
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     min_confidence: float = 0.0
+    server: str = ""
+    keys: Path | None = None
 
 
 @verb
@@ -51,6 +54,8 @@ def query(
     min_confidence: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="nearest: places less sure of the class do not count.")
     ] = 0.0,
+    server: ServerOption = "",
+    keys: KeysOption = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Also write the answer here.")
     ] = None,
@@ -66,6 +71,7 @@ def query(
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1 --min-confidence 0.5
     Example: semantic-mapper query runs/demo/map.npz instances --up 0 0 1 --json things.json
     Example: semantic-mapper query ipc:///run/robot/query nearest chair 0 0 1
+    Example: semantic-mapper query tcp://robot:5570 info --server robot
     """
     class_name, point = _read_arguments(question, arguments or [])
     output = Output.guarded()
@@ -75,7 +81,7 @@ def query(
     if json_file is not None:
         prepare_file(json_file)
     ask = ask_mapper if "://" in source else ask_file
-    asked = Asked(question, class_name, point, up, min_confidence)
+    asked = Asked(question, class_name, point, up, min_confidence, server, keys)
     found = {"map": source, **ask(source, asked)}
     output.print(answer_table(found))
     if json_file is not None:
@@ -119,7 +125,7 @@ def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
     from nodes import map_answers
     from semantic_mapper.client import MapClient
 
-    with MapClient(source) as client:
+    with MapClient(source, identity=server_identity(asked.server, asked.keys)) as client:
         match asked.question:
             case Question.INFO:
                 return map_answers.describe_map(client.mirror().snapshot())

@@ -28,7 +28,10 @@ ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file w
 
 @verb
 def replay(
-    log: Annotated[Path, typer.Argument(help="Recorded log (.mcap); `import` makes one.")],
+    log: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG...", help="Recorded log (.mcap), the parts of one, or a folder with them."),
+    ],
     out: OutOption,
     weights: WeightsOption = None,
     voxel_size: VoxelSizeOption = None,
@@ -49,7 +52,7 @@ def replay(
         typer.Option(help="Corrected poses (TUM: stamp tx ty tz qx qy qz qw); the map moves to them at the end."),
     ] = None,
 ) -> int:
-    """Map a recorded log: writes summary.json, map.ply, map.npz and overview.png.
+    """Map a recorded log: writes report.html, summary.json, map.ply, map.npz and overview.png.
 
     Frames that the weights were finetuned on are mapped, but never scored. Damaged or impossible frames are refused
     with the reason; the rest is mapped. Ctrl-C still writes the map of the frames so far (exit code 130).
@@ -61,7 +64,9 @@ def replay(
     from nodes.summary_table import notes, result_lines, summary_table
 
     settings = mapper_config(config, voxel_size, seed, quality)
-    request = ReplayRequest(log, out, weights, settings, max_frames, eval_exclude, rerun, corrections)
+    request = ReplayRequest(
+        log[0], out, weights, settings, max_frames, eval_exclude, rerun, corrections, tuple(log[1:])
+    )
     with StopRequest() as stop:
         with frame_progress("replay", None) as bar:
             summary = replay_log(request, stop, bar.start, bar.set)

@@ -27,7 +27,8 @@ def up(
     """Start the nodes of a launch file as processes and watch over them until they end.
 
     Ctrl-C ends all nodes in order, the map so far is written, and the exit code is 0; a second Ctrl-C kills them. When
-    a node fails, the others are ended in order too, the error says which one it was and why, and the exit code is 1.
+    a node fails, the others are ended in order too, the error says which one it was and why, and the exit code is 1;
+    where the launch file says so it is started anew first (`restart`). `semantic-mapper top` shows how the nodes are.
 
     Example: semantic-mapper up launch/replay.toml --set log=kitchen.mcap --out runs/up
     """
@@ -36,11 +37,12 @@ def up(
     from nodes.launcher import Launcher
     from nodes.options import MapperOptions
     from nodes.results import print_results
+    from nodes.systemd import Notifier
 
     checked = load_launch(launch, settings or (), out)
     folders = [Path(o.out) for o in checked.options.values() if isinstance(o, MapperOptions)]
     before = [_written(f) for f in folders]
-    with StopRequest() as stop, Launcher(checked) as launcher:
+    with StopRequest() as stop, Launcher(checked, Notifier.from_environment()) as launcher:
         launcher.run(stop)
     fresh = [f for f, stamp in zip(folders, before, strict=True) if _written(f) not in (0, stamp)]
     results = print_results(output, fresh)

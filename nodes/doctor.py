@@ -10,12 +10,12 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Literal
 
+from nodes import doctor_launch, doctor_robot
+from nodes.doctor_check import Check
 from nodes.process import usable_cores
 from semantic_mapper.errors import SemanticMapperError
 
@@ -24,21 +24,21 @@ DISK_GB = 2.0
 MEMORY_GB = 3.0
 
 
-@dataclass(frozen=True, slots=True)
-class Check:
-    """One finding: ``note`` = works, but worth knowing; ``bad`` = something will fail, ``mend`` says what to do."""
+def examine(launch: Path | None = None, settings: Sequence[str] = ()) -> list[Check]:
+    """All examinations, in the order of how much depends on them.
 
-    name: str
-    state: Literal["ok", "note", "bad"]
-    found: str
-    mend: str = ""
-
-
-def examine() -> list[Check]:
-    """All examinations, in the order of how much depends on them."""
+    Args:
+        launch: A launch file, to be examined, too.
+        settings: For it, as of ``load_launch``.
+    """
     checks: list[Check] = []
-    for check in (_python, _libc, _packages, _libusb, _open3d, _torch, _weights, _sockets, _curve, _machine, _disk):
+    own = (_python, _libc, _packages, _libusb, _open3d, _torch, _weights, _sockets, _curve, _machine, _disk)
+    robot = doctor_robot
+    others = (robot.room, robot.cameras, robot.oak, robot.clocks, robot.ports, robot.left_sockets)
+    for check in (*own, *others, doctor_launch.own_keys):
         checks.extend(check())
+    if launch is not None:
+        checks.extend(doctor_launch.launch_file(launch, settings))
     return checks
 
 
@@ -58,19 +58,35 @@ def _libc() -> Iterator[Check]:
 
 
 def _packages() -> Iterator[Check]:
-    missing, found = [], []
+    missing, other, found = [], [], []
     for requirement in metadata.requires("semantic-mapper") or ():
         if "extra ==" in requirement:  # wanted by whoever asked for it
             continue
         name = re.split(r"[\s<>=!~;\[]", requirement, maxsplit=1)[0]
         try:
-            found.append(f"{name} {metadata.version(name)}")
+            version = metadata.version(name)
+            found.append(f"{name} {version}")
+            if not _within(version, requirement):
+                other.append(f"{name} {version}, not {requirement.removeprefix(name)}")
         except metadata.PackageNotFoundError:
             missing.append(name)
     if missing:
         yield Check("packages", "bad", f"missing: {', '.join(missing)}", "make setup")
+    elif other:
+        yield Check("packages", "bad", "; ".join(other), "make setup")
     else:
         yield Check("packages", "ok", ", ".join(found))
+
+
+def _within(version: str, requirement: str) -> bool:
+    """Whether a version keeps the bounds ">=" and "<" of a requirement, number by number."""
+    own = [int(n) for n in re.findall(r"\d+", version.partition("+")[0])]
+    for sign, bound in re.findall(r"(>=|<)\s*([\d.]+)", requirement.partition(";")[0]):
+        limit = [int(n) for n in bound.split(".") if n]
+        below = own[: len(limit)] < limit
+        if below != (sign == "<"):
+            return False
+    return True
 
 
 def _libusb() -> Iterator[Check]:

@@ -10,7 +10,7 @@ import structlog
 from nodes.console import FrameProgress
 from nodes.outputs import prepare_file
 from nodes.process import StopRequest
-from replay.log import LogReader
+from replay.sequence import Log, open_log
 from semantic_mapper.errors import FrameError, LabelError, LogError
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint, save_checkpoint
 from semantic_mapper.geometry import check_pose
@@ -46,7 +46,7 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
     prepare_file(request.out)
     # First, so that a wrong path does not cost the reading of a log.
     start = None if request.from_scratch else load_checkpoint(request.weights or default_checkpoint_path())
-    with LogReader(request.log) as log:
+    with open_log(request.log) as log:
         label_set = log.info.label_set
         if label_set is None:
             raise LabelError(f"{request.log}: has no label images; finetuning needs labelled keyframes")
@@ -74,7 +74,7 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
 
 
 def choose_labelled(
-    log: LogReader, label_set: LabelSet, request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
+    log: Log, label_set: LabelSet, request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
 ) -> list[PosedFrame]:
     """The labelled frames that show most of what the log shows.
 

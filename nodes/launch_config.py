@@ -3,19 +3,32 @@
 from __future__ import annotations
 
 import difflib
+import os
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
-from nodes.options import OPTIONS, CameraOptions, MapperOptions, NodeOptions, RecorderOptions
+from nodes.camera_ids import check_camera_ids
+from nodes.options import (
+    OPTIONS,
+    CameraOptions,
+    Count,
+    FinetunerOptions,
+    MapperOptions,
+    NodeOptions,
+    Positive,
+    RecorderOptions,
+)
 from semantic_mapper.config import Config, convert_config, load_config
 from semantic_mapper.errors import ConfigError
 
 Value = str | int | float | bool
+STATUS_SOCKET = "launch"  # where the launcher publishes how all nodes are
 _PLACE = re.compile(r"\{(\w+)\}")
 
 
@@ -23,22 +36,41 @@ class NodeEntry(Config, frozen=True):
     """One process."""
 
     name: str  # unique; also the name of its endpoint
-    kind: Literal["camera", "mapper", "recorder"]  # runs `python -I -m nodes.KIND`
+    kind: Literal["camera", "mapper", "recorder", "finetuner"]  # runs `python -I -m nodes.KIND`
     options: dict[str, Any] = msgspec.field(
         default_factory=dict
     )  # see nodes/options.py; "{NAME}" stands for a value of [set]
+    # "on-failure": a node that is killed, sent away (SIGTERM of anybody but its launcher), hangs or fails comes back,
+    # and the others go on meanwhile; save where it fails by itself before it was ever ready, which the next start would
+    # not mend. "never": the launch ends then. A node that is done, such as a log played to its end, stays away.
+    restart: Literal["never", "on-failure"] = "never"
+    backoff_s: Positive = 0.1  # pause before the first restart; twice as long with each further one in the window
+    backoff_max_s: Positive = 10.0  # but no longer than this
+    max_restarts: Count = 5  # so many within the window; the next failure ends the launch
+    window_s: Positive = 60.0
+    # Keep a second process that has loaded all packages and waits, to take over at once: it costs its memory (a
+    # mapper's is half a gigabyte, part of it shared with the first one), and a core for some seconds after each start.
+    standby: bool = False
 
 
 class LaunchFile(Config, frozen=True):
     """A launch file as it stands on disk."""
 
     node: tuple[NodeEntry, ...]
-    set: dict[str, Value] = msgspec.field(
-        default_factory=dict
-    )  # values that `--set NAME=VALUE` replaces; an empty one has to be given
-    heartbeat_s: float = 30.0  # a node that gives no sign of life for so long is killed
-    stop_s: float = 15.0  # how long camera and recorder may take to end when asked to
-    finish_s: float = 300.0  # how long a mapper may take to write its map
+    # Values that `--set NAME=VALUE` replaces; an empty one has to be given. "{now}" in one of them stands for the time
+    # of the start, such as 20261123T024700Z, with a number where that is there already.
+    set: dict[str, Value] = msgspec.field(default_factory=dict)
+    # A node that gives no sign of life for so long, and neither has had nor wants processor time meanwhile, is killed.
+    # One that starts or ends, or is busy, or waits for a processor or a disk, may be silent for half a minute.
+    heartbeat_s: Annotated[float, msgspec.Meta(ge=0.5)] = 30.0
+    stall_s: Positive = 300.0  # so long a turn of its main loop may take; the first frames compile
+    start_s: Positive = 300.0  # so long it may take from its start until it is ready; then the other two count
+    stop_s: Positive = 15.0  # how long camera and recorder may take to end when asked to
+    finish_s: Positive = 300.0  # how long a mapper may take to write its map, and a finetuner to end
+    # A fixed endpoint at which the status of all nodes can be subscribed to (`semantic-mapper top`), beside the one in
+    # the folder of sockets: ipc://PATH, tcp://127.0.0.1:PORT, with keys also tcp://0.0.0.0:PORT; empty = none.
+    publish: Annotated[str, msgspec.Meta(pattern=r"^([a-z]+://.+|\{\w+\}|)\Z")] = ""
+    keys: str = ""  # folder of keys (`semantic-mapper keys`) for it; empty = none
 
 
 class Launch(Config, frozen=True):
@@ -47,20 +79,26 @@ class Launch(Config, frozen=True):
     ``options`` are by node name, in the order of the file.
     """
 
+    name: str  # of the file
     nodes: tuple[NodeEntry, ...]
     options: dict[str, NodeOptions]
     heartbeat_s: float
+    stall_s: float
+    start_s: float
     stop_s: float
     finish_s: float
+    publish: str = ""
+    keys: str = ""
 
     def inputs(self, name: str) -> tuple[str, ...]:
         """Names of the nodes that a node subscribes to."""
         return self.options[name].inputs()
 
     def sockets(self) -> tuple[str, ...]:
-        """Names of all endpoints: those of the nodes, and those where mappers answer questions."""
-        mappers = [o for o in self.options.values() if isinstance(o, MapperOptions)]
-        return (*self.options, *(o.query for o in mappers if o.query and "://" not in o.query))
+        """Names of all endpoints: of the nodes, where mappers answer questions and labels come, the launcher's own."""
+        others = [o.query for o in self.options.values() if isinstance(o, MapperOptions)]
+        others += [o.labels for o in self.options.values() if isinstance(o, FinetunerOptions)]
+        return (STATUS_SOCKET, *self.options, *(name for name in others if name and "://" not in name))
 
     def listeners(self, name: str) -> int:
         """How many nodes subscribe to the frames of a node."""
@@ -80,12 +118,14 @@ def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = Non
         ConfigError: unknown key, name or node (with the nearest valid one), a missing value, or one of a wrong type.
     """
     file = load_config(path, LaunchFile)
-    values = dict(file.set)
-    changes = [_parse_setting(s) for s in settings] + ([("out", str(out))] if out is not None else [])
+    values: dict[str, Value] = {"now": "", **file.set}
+    changes = [_parse_setting(s, file.set) for s in settings] + ([("out", str(out))] if out is not None else [])
     for name, value in changes:
         if name not in values:
             raise ConfigError(f"{path}: nothing is called '{name}' in its [set] table{_nearest(name, values)}")
         values[name] = value
+    values["now"] = values["now"] or _name_start(values)
+    values = {k: v.replace("{now}", str(values["now"])) if isinstance(v, str) else v for k, v in values.items()}
     names = [n.name for n in file.node]
     for name in names:
         if names.count(name) > 1 or not re.fullmatch(r"[A-Za-z0-9_.-]{1,48}", name):
@@ -99,21 +139,73 @@ def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = Non
                 )
     if not any(isinstance(o, CameraOptions) for o in options.values()):
         raise ConfigError(f"{path}: no node of kind 'camera': nothing would ever happen")
+    _check_restarts(file, options, path)
+    _check_cameras(options, path)
     launch = Launch(
-        nodes=file.node, options=options, heartbeat_s=file.heartbeat_s, stop_s=file.stop_s, finish_s=file.finish_s
+        name=path.name,
+        nodes=file.node,
+        options=options,
+        heartbeat_s=file.heartbeat_s,
+        stall_s=file.stall_s,
+        start_s=file.start_s,
+        stop_s=file.stop_s,
+        finish_s=file.finish_s,
+        publish=str(_fill_in(file.publish, values, f"{path}: publish")),
+        keys=str(_fill_in(file.keys, values, f"{path}: keys")),
     )
     sockets = launch.sockets()
     twice = sorted({name for name in sockets if sockets.count(name) > 1})
     if twice:
         raise ConfigError(
-            f"{path}: {', '.join(twice)}: names two endpoints; give each mapper a `query` of its own that is no node"
+            f"{path}: {', '.join(twice)}: names two endpoints; give each mapper a `query` of its own that is no node "
+            f"('{STATUS_SOCKET}' is the launcher's own)"
         )
     return launch
 
 
+def _check_restarts(file: LaunchFile, options: Mapping[str, NodeOptions], path: Path) -> None:
+    """Restarts are for what is live: frames that wait for their readers have a result, which a restart would spoil.
+
+    Raises:
+        ConfigError: a node is to be restarted while a camera waits for others; or a finetuner has a standby.
+    """
+    learning = [n.name for n in file.node if n.standby and n.kind == "finetuner"]
+    if learning:
+        raise ConfigError(
+            f"{path}: node '{learning[0]}' has no standby: what it learns from is in its memory; set standby = false"
+        )
+    restarted = [n.name for n in file.node if n.restart != "never"]
+    waiting = [name for name, own in options.items() if isinstance(own, CameraOptions) and not own.live]
+    if restarted and waiting:
+        raise ConfigError(
+            f"{path}: node '{restarted[0]}' is to be restarted, but camera '{waiting[0]}' waits for those who read its "
+            'frames, and what they have lost would be missing in the result; set mode = "realtime" there, or '
+            'restart = "never" here'
+        )
+
+
+def _check_cameras(options: Mapping[str, NodeOptions], path: Path) -> None:
+    """Frames that go to one place are told apart by the names of their cameras.
+
+    Raises:
+        ConfigError: two cameras of one name.
+    """
+    for name, own in options.items():
+        if not isinstance(own, MapperOptions | RecorderOptions):
+            continue
+        for source in own.cameras:
+            if not isinstance(options[source], CameraOptions):
+                raise ConfigError(f"{path}: node '{name}' takes the frames of '{source}', which is no camera")
+        cameras = {source: options[source] for source in own.cameras}
+        check_camera_ids(name, {s: c for s, c in cameras.items() if isinstance(c, CameraOptions)}, str(path))
+
+
 def _convert_options(node: NodeEntry, values: Mapping[str, Value], path: Path) -> NodeOptions:
     where = f"{path}: node '{node.name}'"
-    required = {f.encode_name for f in msgspec.structs.fields(OPTIONS[node.kind]) if f.required}
+    fields = msgspec.structs.fields(OPTIONS[node.kind])
+    required = {
+        f.encode_name for f in fields if f.required or f.default is None
+    }  # None: no text, rather than an empty one
     for key, value in node.options.items():
         whole = _PLACE.fullmatch(value) if isinstance(value, str) else None
         if key in required and whole is not None and values.get(whole[1]) == "":
@@ -126,6 +218,8 @@ def _fill_in(value: Any, values: Mapping[str, Value], where: str) -> Any:
     """Replace "{NAME}" in texts; a text that is nothing else takes the value's own type."""
     if isinstance(value, list):
         return [_fill_in(v, values, where) for v in value]
+    if isinstance(value, dict):
+        return {k: _fill_in(v, values, f"{where}.{k}") for k, v in value.items()}
     if not isinstance(value, str):
         return value
     for name in _PLACE.findall(value):
@@ -137,7 +231,17 @@ def _fill_in(value: Any, values: Mapping[str, Value], where: str) -> Any:
     return _PLACE.sub(lambda found: str(values[found[1]]), value)
 
 
-def _parse_setting(text: str) -> tuple[str, Value]:
+def _name_start(values: Mapping[str, Value]) -> str:
+    """The time, and a number where something is called so already: clocks are set back, or begin anew each day."""
+    time = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
+    places = [value for value in values.values() if isinstance(value, str) and "{now}" in value]
+    names = (time, *(f"{time}-{n}" for n in range(1, 1000)))
+    free = (name for name in names if not any(os.path.exists(p.replace("{now}", name)) for p in places))
+    return next(free, time)
+
+
+def _parse_setting(text: str, own: Mapping[str, Value]) -> tuple[str, Value]:
+    """NAME=VALUE. What is a text in the file stays one, whatever it looks like: ids of devices may be numbers."""
     name, equals, value = text.partition("=")
     if not equals or not name:
         raise ConfigError(f"--set {text}: write NAME=VALUE")
@@ -145,7 +249,8 @@ def _parse_setting(text: str) -> tuple[str, Value]:
         parsed = tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:  # a bare word, such as a path
         return name, value
-    return name, parsed if isinstance(parsed, str | int | float | bool) else value
+    kinds = str if isinstance(own.get(name, ""), str) else str | int | float | bool
+    return name, parsed if isinstance(parsed, kinds) else value
 
 
 def _nearest(name: str, names: Sequence[str] | Mapping[str, Value]) -> str:

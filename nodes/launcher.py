@@ -1,29 +1,29 @@
-"""Starts the nodes of a launch, watches over them, and ends them in order: camera, recorder, mapper."""
+"""Starts the nodes of a launch, watches over them, and ends them in order: camera, finetuner, recorder, mapper."""
 
 from __future__ import annotations
 
-import os
-import shutil
-import sys
-import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import msgspec
 import structlog
 
-from nodes.child import Child
 from nodes.launch_config import Launch
-from nodes.options import NodeJob
+from nodes.launch_note import leave_launch_note
+from nodes.launch_status import LaunchStatus
+from nodes.member import Member
+from nodes.own_folder import OwnFolder, sweep
 from nodes.process import StopRequest
+from nodes.systemd import Notifier
 from semantic_mapper.errors import NodeError
+from semantic_mapper.transport.messages import NodeState
 
 POLL_S = 0.05
-FOLDER_PREFIX = "semantic-mapper-"
-KILL_S = 5.0  # between SIGTERM and SIGKILL for a node that has overstayed its time
-STOP_ORDER = ("camera", "recorder", "mapper")  # sources first, so that the others get the end of the stream
+END_HEARD_S = 2.0  # after the last camera has ended, a node that was not there then will not hear of it
+STOP_ORDER = ("camera", "finetuner", "recorder", "mapper")  # sources first: the others get the end of the stream
+NO_END = ("finetuner",)  # hear of no end of a stream: once it is over, nobody needs them any more
 
 _log = structlog.get_logger(__name__)
 
@@ -35,19 +35,22 @@ class Launcher:
 
     Args:
         launch: From ``load_launch``.
+        notifier: Who is told how it goes, beside the status topic.
     """
 
-    def __init__(self, launch: Launch) -> None:
+    def __init__(self, launch: Launch, notifier: Notifier | None = None) -> None:
         self._launch = launch
-        self._children: list[Child] = []
-        self._folder = Path()
-        self._failures: list[str] = []
+        self._notifier = notifier or Notifier("")
+        self._members: list[Member] = []
+        self._told_ready = False
+        self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        _sweep()
-        self._folder = Path(tempfile.mkdtemp(prefix=f"{FOLDER_PREFIX}{os.getpid()}-"))  # mode 0700
+        sweep()
+        folder = OwnFolder()
+        self._stack.callback(folder.close)  # last of all
         try:
-            self._start()
+            self._start(folder.path)
         except BaseException:
             self._clean_up()
             raise
@@ -59,93 +62,85 @@ class Launcher:
         self._clean_up()
 
     def run(self, stop: StopRequest) -> None:
-        """Watch until all nodes have ended, one has failed, or a stop is requested; then end the rest in order.
+        """Watch until all nodes have ended, one has failed for good, or a stop is requested; then end all in order.
 
         Raises:
             NodeError: a node failed, hung, or had to be killed; names it and its last words.
         """
-        while not stop and not self._failures and self._sources_run():
+        while not stop and not self._failures() and self._sources_run():
             self._look_after_all()
+            self._tell("running" if self._told_ready else "starting")
             time.sleep(POLL_S)
-        self._look_after_all()  # a camera that has failed since the last look
+        self._look_after_all(last=True)  # a camera that has failed since the last look
         if stop:
             _log.info("stopping", by=stop.name)
+        self._notifier.stopping(sum(map(self._patience_s, {member.kind for member in self._members})))
         for kind in STOP_ORDER:
             self._end(kind, stop)
-        if self._failures:
-            raise NodeError("; then ".join(self._failures))
+        self._status.tell(self._members, "ended", now=True)
+        if failures := self._failures():
+            raise NodeError("; then ".join(failures))
 
-    def _start(self) -> None:
-        _log.info("launching", nodes=len(self._launch.nodes), sockets=str(self._folder))
-        endpoints = {name: f"ipc://{self._folder}/{name}" for name in self._launch.sockets()}
+    def _start(self, folder: Path) -> None:
+        _log.info("launching", nodes=len(self._launch.nodes), sockets=str(folder))
+        leave_launch_note(self._launch, folder)
+        endpoints = {name: f"ipc://{folder}/{name}" for name in self._launch.sockets()}
+        names = [n.name for n in self._launch.nodes]
+        status = LaunchStatus(endpoints, names, self._launch.publish, self._launch.keys)
+        self._status = self._stack.enter_context(status)
         for node in self._launch.nodes:
-            job = NodeJob(
-                name=node.name,
-                options=msgspec.to_builtins(self._launch.options[node.name]),
-                endpoints=endpoints,
-                subscribers=self._launch.listeners(node.name),
-            )
-            child = Child(node.kind, job)
-            self._children.append(child)
-            _log.info("node_started", node=child.name, kind=child.kind, pid=child.pid)
+            self._members.append(Member(node, self._launch, endpoints, str(folder)))
+
+    def _failures(self) -> list[str]:
+        """Of nodes that are not started any more: the first one may explain the others."""
+        return [m.failure for m in sorted(self._members, key=lambda m: m.failed_at) if m.failure]
 
     def _sources_run(self) -> bool:
         """Whether a camera still runs: when none does, the others have the end of the stream and end by themselves."""
-        return any(c.exit_code() is None for c in self._children if c.kind == "camera")
+        return any(m.runs for m in self._members if m.kind == "camera")
 
-    def _look_after_all(self) -> None:
-        for child in self._children:
-            code = child.exit_code()
-            if code is None and child.silent_s() > self._launch.heartbeat_s:
-                child.kill()
-                child.wait(KILL_S)
-                self._fail(child, f"it gave no sign of life for {self._launch.heartbeat_s:g} s and was killed")
-            elif child.has_failed():
-                self._fail(child)
+    def _look_after_all(self, *, last: bool = False) -> None:
+        calm = all(m.state == "running" for m in self._members)
+        for member in self._members:
+            member.look_after(last=last, calm=calm)
+
+    def _tell(self, state: NodeState) -> None:
+        """Publish how it goes, and tell systemd."""
+        self._status.tell(self._members, state)
+        self._notifier.alive()
+        states = {m.name: m.state for m in self._members}
+        begun = set(states.values()) <= {"running", "stopping", "ended"}
+        if not self._told_ready and begun and not self._failures():
+            self._told_ready = True
+            self._notifier.ready("all nodes are ready")
+            _log.info("all_ready")
+        restarts = sum(m.restarts for m in self._members)
+        told = ", ".join(f"{name} {state}" for name, state in states.items())
+        self._notifier.status(f"{told}; {restarts} restarts")
+
+    def _patience_s(self, kind: str) -> float:
+        # One that loads its packages still, on a busy machine, hears of a stop late.
+        return self._launch.finish_s if kind in ("mapper", *NO_END) else self._launch.stop_s
 
     def _end(self, kind: str, stop: StopRequest) -> None:
         """Wait for all nodes of a kind; ask them as soon as there is a reason not to wait for the end of the stream."""
-        patience = self._launch.finish_s if kind == "mapper" else self._launch.stop_s
-        children = [c for c in self._children if c.kind == kind]
-        asked = False
-        deadline = time.monotonic() + patience
-        while time.monotonic() < deadline and any(c.exit_code() is None for c in children):
-            if not asked and (stop or self._failures):
-                asked = True
-                for child in children:
-                    child.ask_to_stop()
-            self._look_after_all()
+        patience = self._patience_s(kind)
+        members = [m for m in self._members if m.kind == kind]
+        began = time.monotonic()
+        while time.monotonic() - began < patience and any(m.runs for m in members):
+            late = time.monotonic() - began > END_HEARD_S and any(m.restarts for m in self._members)
+            for member in members:
+                if stop or kind in NO_END or self._failures() or (late and member.state != "stopping"):
+                    member.ask_to_stop()
+            self._look_after_all(last=True)
+            self._tell("stopping")
             time.sleep(POLL_S)
-        for child in children:
-            if child.exit_code() is None:
-                child.ask_to_stop()
-                if not child.wait(KILL_S):
-                    child.kill()
-                    child.wait(KILL_S)
-                self._fail(child, f"it did not end within {patience:g} s")
-        self._look_after_all()
-
-    def _fail(self, child: Child, why: str = "") -> None:
-        text = child.describe_end() + (f" ({why})" if why else "")
-        if not any(f.startswith(f"node '{child.name}' ") for f in self._failures):
-            self._failures.append(text)
-            _log.error("node_ended", node=child.name, why=why or "exit code", code=child.exit_code())
+        for member in members:
+            member.overstay(patience)
+        self._look_after_all(last=True)
 
     def _clean_up(self) -> None:
-        for child in self._children:
-            child.close()
-        self._children.clear()
-        shutil.rmtree(self._folder, onerror=_tell_left_over)
-
-
-def _sweep() -> None:
-    """Remove the socket folders of launchers that were killed: theirs is the only name that a dead process leaves."""
-    for folder in Path(tempfile.gettempdir()).glob(f"{FOLDER_PREFIX}*-*"):
-        pid = folder.name.removeprefix(FOLDER_PREFIX).partition("-")[0]
-        if pid.isdigit() and not Path("/proc", pid).exists() and folder.stat().st_uid == os.getuid():
-            shutil.rmtree(folder, onerror=_tell_left_over)
-
-
-def _tell_left_over(function: object, path: str, error: object) -> None:
-    sys.stderr.flush()
-    _log.warning("left_over", path=path, error=str(error))
+        for member in self._members:
+            member.close()
+        self._members.clear()
+        self._stack.close()

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.table import Table
 
-from replay.log import LogReader
+from replay.sequence import LogSequence, open_log, read_part
 
 
-def describe_log(path: Path, on_message: Callable[[], None]) -> dict[str, Any]:
-    """Read all messages of a log and say what is in it.
+def describe_log(paths: Sequence[Path], on_message: Callable[[], None]) -> dict[str, Any]:
+    """Read all messages of a log (or of the parts of one) and say what is in it.
 
     Raises:
         LogError: it cannot be opened.
@@ -22,7 +22,10 @@ def describe_log(path: Path, on_message: Callable[[], None]) -> dict[str, Any]:
     sizes: Counter[str] = Counter()
     stamps: list[int] = []
     depth = labelled = 0
-    with LogReader(path, allow_empty=True) as log:
+    with open_log(paths, allow_empty=True) as log:
+        logs = log.logs if isinstance(log, LogSequence) else [log]
+        files = [part.path for part in logs]
+        part = None if len(logs) > 1 else read_part(logs[0])
         for envelope, parts in log.messages():
             topic = f"{envelope.topic}/{envelope.source}" if envelope.topic != "info" else "info"
             topics[topic] += 1
@@ -32,13 +35,15 @@ def describe_log(path: Path, on_message: Callable[[], None]) -> dict[str, Any]:
                 depth += envelope.has_depth
                 labelled += envelope.has_label
             on_message()
-        stream = log.info
+        stream, attachments = log.info, log.attachments()
         damage, notices, finished = [str(e) for e in log.errors], list(log.notices), log.finished
     seconds = (max(stamps) - min(stamps)) / 1e9 if stamps else 0.0
     return {
-        "log": str(path),
+        "log": str(paths[0]),
+        "parts": [str(file) for file in files],
+        "part": None if part is None else part.part,
         "source": stream.source,
-        "size_bytes": path.stat().st_size,
+        "size_bytes": sum(file.stat().st_size for file in files),
         "frames": len(stamps),
         "frames_with_depth": depth,
         "frames_with_labels": labelled,
@@ -53,6 +58,7 @@ def describe_log(path: Path, on_message: Callable[[], None]) -> dict[str, Any]:
         else {"name": stream.label_set.name, "classes": list(stream.label_set.names)},
         "topics": {name: {"messages": count, "bytes": sizes[name]} for name, count in sorted(topics.items())},
         "metadata": dict(stream.metadata),
+        "attachments": {name: len(kept.data) for name, kept in attachments.items()},
         "finished": finished,
         "notices": notices,
         "damage": damage,
@@ -64,6 +70,10 @@ def info_table(found: dict[str, Any]) -> Table:
     table = Table(title=found["log"], title_justify="left", show_header=False)
     table.add_row("source", found["source"])
     table.add_row("size", f"{found['size_bytes'] / 1e6:.1f} MB")
+    if len(found["parts"]) > 1:
+        table.add_row("parts", ", ".join(Path(part).name for part in found["parts"]))
+    elif found["part"] is not None:
+        table.add_row("part", f"{found['part']} of a recording")
     depth, labels = found["frames_with_depth"], found["frames_with_labels"]
     table.add_row("frames", f"{found['frames']} ({depth} with depth, {labels} with labels)")
     rate = f", {found['frame_hz']:g} Hz" if found["frame_hz"] else ""
@@ -75,6 +85,8 @@ def info_table(found: dict[str, Any]) -> Table:
     table.add_row("classes", text)
     for key, value in found["metadata"].items():
         table.add_row(key, value)
+    for name, size in found["attachments"].items():
+        table.add_row(f"file {name}", f"{size} bytes")
     table.add_section()
     for name, topic in found["topics"].items():
         table.add_row(f"topic {name}", f"{topic['messages']} messages, {topic['bytes'] / 1e6:.1f} MB")

@@ -8,15 +8,39 @@ import msgspec
 
 from semantic_mapper.config import Config
 
+SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # of transport/topics.py, which loads what the launcher has no need of
+ENDPOINT_PATTERN = r"^([a-z]+://.+|)\Z"
+
 Text = Annotated[str, msgspec.Meta(min_length=1)]
 Count = Annotated[int, msgspec.Meta(ge=0)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+PoseRow = tuple[float, float, float, float]
+
+
+class LiveCamera(Config, frozen=True):
+    """A camera that is connected, or a video."""
+
+    kind: Text  # of drivers/registry.py: v4l2, opencv, oak
+    poses: Text | dict[str, Any]  # who knows where the camera is: TOML file, or the same as a table; see drivers/poses
+    config: str | dict[str, Any] = msgspec.field(
+        default_factory=dict
+    )  # the driver's: TOML file, or the same as a table
+    id: Annotated[str, msgspec.Meta(pattern=SOURCE_PATTERN)] = "camera"  # what its frames are called
+    # Where it sits on the rig that `poses` tells of (T_base_rig, T_world_rig), row by row; empty = as its calibration
+    # file says.
+    T_rig_camera: tuple[PoseRow, PoseRow, PoseRow, PoseRow] | None = None
+    # A camera that cannot be opened when the node starts is tried again for so long; 0 = until it is there. One that is
+    # lost later is waited for without end.
+    open_s: Annotated[float, msgspec.Meta(ge=0)] = 0.0
 
 
 class CameraOptions(Config, frozen=True):
-    """Plays a log as if it were a camera."""
+    """Publishes the frames of a log, as if it were a camera, or those of a camera."""
 
-    log: Text  # the log to play
+    log: Text | None = None  # the log to play (a folder: the parts of a recording), or ...
+    camera: LiveCamera | None = (
+        None  # ... the camera; of the options below it knows subscriber_timeout_s and max_frames
+    )
     mode: Literal["lockstep", "realtime", "fast"] = "lockstep"  # wait for the mapper; keep the recording's time; hurry
     mapper: str = "mapper"  # lockstep: the node whose answers are waited for
     rate: Positive = 1.0  # realtime: 2 = twice as fast as recorded
@@ -26,14 +50,23 @@ class CameraOptions(Config, frozen=True):
 
     def inputs(self) -> tuple[str, ...]:
         """Nodes that it listens to."""
-        return (self.mapper,) if self.mode == "lockstep" else ()
+        return (self.mapper,) if self.log is not None and self.mode == "lockstep" else ()
+
+    def __post_init__(self) -> None:
+        if (self.log is None) == (self.camera is None):
+            raise ValueError("name either a log or a camera")
+
+    @property
+    def live(self) -> bool:
+        """Whether frames come when they come, whoever listens: only then may a node be away for a moment."""
+        return self.camera is not None or self.mode == "realtime"
 
 
 class MapperOptions(Config, frozen=True):
     """Maps the frames of a camera node."""
 
     out: Text  # folder for the map, the picture and the summary
-    input: str = "camera"  # the node whose frames are mapped
+    input: Text | Annotated[tuple[Text, ...], msgspec.Meta(min_length=1)] = "camera"  # whose frames: a node, or several
     delivery: Literal["newest", "all"] = "newest"  # live: an unread frame gives way to a newer one; all: nothing lost
     weights: str = ""  # empty = those that ship with the package
     config: str = ""  # TOML file with settings of the mapper; empty = defaults
@@ -44,40 +77,109 @@ class MapperOptions(Config, frozen=True):
     # process leaves. It costs one frame the time to copy what it touches (some 20 ms), and the next ones up to half of
     # a core while it is written. 0 = only at the end.
     save_every_s: Annotated[float, msgspec.Meta(ge=0)] = 0.0
-    # Where questions about the map are answered: a name, or an endpoint (ipc://PATH, tcp://127.0.0.1:PORT); empty =
-    # nowhere. A name stands for a socket among those of the launch, or of this user where the node is started by hand.
+    # Where questions about the map are answered: a name, or an endpoint (ipc://PATH, tcp://127.0.0.1:PORT; with keys
+    # also tcp://0.0.0.0:PORT, for other machines); empty = nowhere. A name stands for a socket among those of the
+    # launch, or of this user where the node is started by hand.
     query: Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z0-9_-][A-Za-z0-9_.-]{0,47}|[a-z]+://.+|)\Z")] = "query"
+
+    # The node of kind "finetuner" whose weights are taken while mapping, if they are better; empty = none.
+    learner: str = ""
+    # New weights are refused that agree with less than this share of what the map is sure of: those that contradict
+    # most of it are more often wrong than the map is. 0 = the finetuner's own judgement is enough.
+    least_agreement: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.4
+
+    # A fixed endpoint beside that of the launch at which its updates and status can be subscribed to: ipc://PATH,
+    # tcp://127.0.0.1:PORT, with keys also tcp://0.0.0.0:PORT; empty = none.
+    publish: Annotated[str, msgspec.Meta(pattern=ENDPOINT_PATTERN)] = ""
+
+    # Folder of keys (`semantic-mapper keys`): questions and what is published are encrypted, and for its peers alone;
+    # empty = none.
+    keys: str = ""
 
     def inputs(self) -> tuple[str, ...]:
         """Nodes that it listens to."""
-        return (self.input,)
+        return (*self.cameras, self.learner) if self.learner else self.cameras
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Nodes whose frames are mapped."""
+        return (self.input,) if isinstance(self.input, str) else self.input
 
 
 class RecorderOptions(Config, frozen=True):
-    """Writes what other nodes publish to a log; loses nothing."""
+    """Writes what other nodes publish to a log; loses nothing but what the disk has no room for."""
 
-    out: Text  # the log to write
-    # The nodes to record: first the one with the frames, whose end ends the recording.
+    out: Text  # the log to write; further parts are called as it is, with -1, -2, ... before the ending
+    # The nodes to record: first those with frames (`streams`), whose end ends the recording.
     sources: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)] = ("camera", "mapper")
+    streams: Annotated[int, msgspec.Meta(ge=1)] = 1  # how many of the sources, from the first on, are cameras
     topics: tuple[str, ...] = ("info", "frame", "refused", "status")  # "map" may be added
-    overwrite: bool = False  # replace a log that is there
+    overwrite: bool = False  # replace a log that is there; where there are splits, with all its parts
     source_timeout_s: Positive = 180.0  # how long the others may take to start
+    split_mb: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # a new part before one grows beyond this; 0 = any size
+    split_s: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # a new part after so many seconds; 0 = any time
+    # Where the disk is full: "stop" recording, or "delete-oldest" parts of this recording. The other nodes go on.
+    disk_full: Literal["stop", "delete-oldest"] = "stop"
+    reserve_mb: Annotated[float, msgspec.Meta(ge=0)] = 500.0  # so much of the disk is left free: then it counts as full
+    # Colour images: "as-sent" (cameras send PNG, which is lossless), "png", or "jpeg", some seven times smaller.
+    # Depth is always lossless, packed as differences and zstd.
+    rgb: Literal["as-sent", "png", "jpeg"] = "as-sent"
+    jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 92
 
     def inputs(self) -> tuple[str, ...]:
         """Nodes that it listens to."""
         return self.sources
 
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Nodes whose frames are recorded."""
+        return self.sources[: self.streams]
 
-NodeOptions = CameraOptions | MapperOptions | RecorderOptions
-OPTIONS: dict[str, type[CameraOptions] | type[MapperOptions] | type[RecorderOptions]] = {
+    def __post_init__(self) -> None:
+        if self.streams > len(self.sources):
+            raise ValueError(f"streams = {self.streams}: there are {len(self.sources)} sources")
+        if self.disk_full == "delete-oldest" and not (self.split_mb or self.split_s):
+            raise ValueError('disk_full = "delete-oldest" deletes whole parts: give split_mb or split_s')
+
+
+class FinetunerOptions(Config, frozen=True):
+    """Finetunes the weights of a mapper on labelled keyframes, beside it and within a budget."""
+
+    mapper: str = "mapper"  # the node that uses the weights; its `learner` is this one
+    weights: str = ""  # those that the mapper was started with, the very same file; empty = those of the package
+    config: str = ""  # TOML file with an OnlineConfig (semantic_mapper/training/online.py); empty = defaults
+    # Where labelled keyframes come from: a name or an endpoint, at which a labelling tool, a teacher network or
+    # `semantic-mapper label` binds a publisher (topic "keyframe"), for as long as it has something to say.
+    labels: Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z0-9_-][A-Za-z0-9_.-]{0,47}|[a-z]+://.+)\Z")] = "labels"
+    share: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.5  # of one core (or of the GPU) that learning may take
+    threads: Annotated[int, msgspec.Meta(ge=1, le=64)] = 1  # that it computes with, all together within its share
+    # How much others go before it, 0 to 19. With 19 (on Linux) it learns only while nobody else wants the core; where
+    # others want all of every core all the time, that is a third of a per cent, and 18 some two per cent.
+    niceness: Annotated[int, msgspec.Meta(ge=0, le=19)] = 19
+    settle_s: Annotated[float, msgspec.Meta(ge=0)] = 2.0  # no keyframe for so long, and those that came are learned
+    # The mapper's `out`: started anew, it finds the weights that the mapper keeps there, and in the folder `learning`
+    # the labelled keyframes that it has kept itself; empty = begin with neither.
+    out: str = ""
+    # After a round that failed for want of memory, say: pause before the next with the same keyframes, twice as long
+    # with each further one in a row, but no more than an hour.
+    retry_s: Positive = 20.0
+
+    def inputs(self) -> tuple[str, ...]:
+        """Nodes that it listens to."""
+        return (self.mapper,)
+
+
+NodeOptions = CameraOptions | MapperOptions | RecorderOptions | FinetunerOptions
+OPTIONS: dict[str, type[CameraOptions] | type[MapperOptions] | type[RecorderOptions] | type[FinetunerOptions]] = {
     "camera": CameraOptions,
     "mapper": MapperOptions,
     "recorder": RecorderOptions,
+    "finetuner": FinetunerOptions,
 }
 
 
 class NodeJob(Config, frozen=True):
-    """What the launcher tells a node, as JSON, in its one argument.
+    """What the launcher tells a node, as JSON, in its one argument or in the open file that this names (``fd:N``).
 
     A node that is started by hand needs ``{"name": ..., "options": {...}}`` only; endpoints default to those of this
     user, and nobody watches over it.
@@ -88,4 +190,14 @@ class NodeJob(Config, frozen=True):
     endpoints: dict[str, str] = msgspec.field(default_factory=dict)  # by node name
     subscribers: Count = 1  # a camera waits for so many before its first frame
     heartbeat_fd: int = -1  # where to tell that it lives; -1 = nowhere
+    restarts: Count = 0  # how often it was started anew
+    comes_back: bool = False  # it is started anew where it fails: its failure is no end of its stream
+    waits: bool = False  # prepare all, then wait for a ``Call`` as a line of stdin
+    folder: str = ""  # of the launch; a node leaves notes there for the process that may have to replace it
     orphan_s: Count = 120  # without its launcher, it has so many seconds to write its results
+
+
+class Call(Config, frozen=True):
+    """What the launcher tells a process that has waited: begin, in the place of one that has failed."""
+
+    restarts: Count  # as of ``NodeJob``

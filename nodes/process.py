@@ -14,6 +14,7 @@ from typing import Any, Self
 
 import structlog
 
+STOP_SIGNAL = signal.SIGUSR1  # by which a launcher asks its nodes to end: SIGTERM may come from anybody
 MAX_THREADS = 16  # more gain nothing on the small work of one frame
 
 
@@ -25,7 +26,11 @@ def prepare_process(*, verbose: bool = False) -> None:
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # spinning threads slow torch next to Open3D 10 to 250 times
     os.environ.setdefault("OMP_NUM_THREADS", str(min(usable_cores(), MAX_THREADS)))
-    os.environ.setdefault("NUMBA_NUM_THREADS", os.environ["OMP_NUM_THREADS"])
+    if (
+        "numba" not in sys.modules
+    ):  # a numba that has started its threads compiles nothing more once another number is set
+        os.environ.setdefault("NUMBA_NUM_THREADS", os.environ["OMP_NUM_THREADS"])
+    os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2")  # s; a camera that has stalled hangs OpenCV for 10
     structlog.configure(
         processors=[
             structlog.contextvars.merge_contextvars,
@@ -56,11 +61,15 @@ class StopRequest:
     Args:
         patient: Further signals change nothing (nodes: the launcher kills what does not end). Otherwise the second
             one raises ``KeyboardInterrupt`` (a person has pressed Ctrl-C twice).
+        signals: Those that are noted.
     """
 
-    def __init__(self, *, patient: bool = False) -> None:
+    def __init__(
+        self, *, patient: bool = False, signals: tuple[signal.Signals, ...] = (signal.SIGINT, signal.SIGTERM)
+    ) -> None:
         self.signum = 0
         self._patient = patient
+        self._signals = signals
         self._previous: dict[int, Any] = {}
 
     def __bool__(self) -> bool:
@@ -68,16 +77,18 @@ class StopRequest:
 
     @property
     def name(self) -> str:
-        """Of the signal: SIGINT, SIGTERM, or empty."""
+        """Who asked: SIGINT, SIGTERM, the launcher, or empty."""
+        if self.signum == STOP_SIGNAL:
+            return "the launcher"
         return signal.Signals(self.signum).name if self.signum else ""
 
     @property
     def exit_code(self) -> int:
-        """What shells expect of a process that a signal has ended: 128 + its number; 0 where none came."""
-        return 128 + self.signum if self.signum else 0
+        """What shells expect of a process that a signal has ended: 128 + its number; 0 for none and the launcher's."""
+        return 128 + self.signum if self.signum not in (0, STOP_SIGNAL) else 0
 
     def __enter__(self) -> Self:
-        for signum in (signal.SIGINT, signal.SIGTERM):
+        for signum in self._signals:
             self._previous[signum] = signal.signal(signum, self._note)
         return self
 

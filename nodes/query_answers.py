@@ -11,6 +11,7 @@ import numpy as np
 import structlog
 
 from nodes.live_correction import LiveCorrection
+from nodes.live_weights import LiveWeights
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.queries.boxes import points_in_box
 from semantic_mapper.queries.instances import Instance, InstanceTracker
@@ -72,12 +73,16 @@ class Answers:
     Args:
         relay: Of the mirror.
         correction: Takes corrected poses; without it they are refused.
+        weights: Says which weights are in use, and exchanges them; without it such questions are refused.
     """
 
-    def __init__(self, relay: MirrorRelay, correction: LiveCorrection | None = None) -> None:
+    def __init__(
+        self, relay: MirrorRelay, correction: LiveCorrection | None = None, weights: LiveWeights | None = None
+    ) -> None:
         self.map_id = uuid.uuid4().hex
         self._relay = relay
         self._correction = correction
+        self._weights = weights
         self._tracked: dict[messages.Point, _Tracked] = {}  # by direction; the last one asked stands last
 
     def read(self, parts: Parts) -> Question:
@@ -88,7 +93,8 @@ class Answers:
         except (SemanticMapperError, MemoryError) as error:
             refusal = encode_error(_told(error))
             return Question(lambda: refusal, messages.RequestHeader(), takes_long=False, about_map=False)
-        about_map = not isinstance(header, messages.CorrectPosesRequest | messages.CorrectionRequest)
+        beside = messages.CorrectPosesRequest | messages.CorrectionRequest | messages.WeightsRequest
+        about_map = not isinstance(header, beside)
         return Question(lambda: self._encoded(kind, header, arrays), header, takes_long, about_map)
 
     def _encoded(self, kind: str, header: messages.RequestHeader, arrays: Arrays) -> list[bytes]:
@@ -126,6 +132,8 @@ class Answers:
                 return self._changes(snapshot, header)
             case messages.CorrectPosesRequest() | messages.CorrectionRequest():
                 return self._correct(snapshot, header, arrays)
+            case messages.WeightsRequest():
+                return self._exchange_weights(snapshot, header)
             case _:
                 raise MapError(f"{type(header).__name__}: cannot be answered")
 
@@ -141,6 +149,13 @@ class Answers:
         is_new = isinstance(header, messages.CorrectPosesRequest)
         state = correction.begin(header, arrays) if is_new else correction.describe()
         return messages.CorrectionAnswer(**self._about(snapshot), **state), {}
+
+    def _exchange_weights(self, snapshot: MapSnapshot, header: messages.WeightsRequest) -> Answer:
+        weights = self._weights
+        if weights is None:
+            raise MapError("this mapper takes no weights while it runs (option `learner`)")
+        state = weights.describe() if header.to is None else weights.ask_for(header.to)
+        return messages.WeightsAnswer(**self._about(snapshot), **state), {}
 
     def _about(self, snapshot: MapSnapshot) -> dict[str, Any]:
         return {"map_id": self.map_id, "version": snapshot.version, "epoch": snapshot.epoch}

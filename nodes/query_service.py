@@ -15,6 +15,7 @@ from typing import Self
 import structlog
 
 from nodes.live_correction import LiveCorrection
+from nodes.live_weights import LiveWeights
 from nodes.long_questions import LongQuestions
 from nodes.query_answers import Answers, Question
 from nodes.waiting_questions import Asked, WaitingQuestions
@@ -26,6 +27,7 @@ from semantic_mapper.queries.relay import MirrorRelay
 from semantic_mapper.queries.warm_up import warm_up
 from semantic_mapper.transport.query_codec import encode_error
 from semantic_mapper.transport.query_sockets import QueryServer
+from semantic_mapper.transport.security import Keys
 
 PERIOD_S = 0.1  # between two deliveries, at least
 MAX_SHARE = 0.1  # of the mapper's time that deliveries may take; the pause after a dear one is longer
@@ -52,16 +54,25 @@ class QueryService:
         endpoint: Where to listen.
         voxel_map: The map; only ``follow`` reads it.
         correction: Takes corrected poses; without it they are refused.
+        weights: Takes other weights; without it questions about them are refused.
+        keys: See ``QueryServer``.
 
     Raises:
         TransportError: the endpoint is taken or cannot be bound.
     """
 
-    def __init__(self, endpoint: str, voxel_map: VoxelMap, correction: LiveCorrection | None = None) -> None:
+    def __init__(
+        self,
+        endpoint: str,
+        voxel_map: VoxelMap,
+        correction: LiveCorrection | None = None,
+        keys: Keys | None = None,
+        weights: LiveWeights | None = None,
+    ) -> None:
         self._map = voxel_map
         config = voxel_map.config
         self._relay = MirrorRelay(MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set))
-        self._answers = Answers(self._relay, correction)
+        self._answers = Answers(self._relay, correction, weights)
         self._given = 0  # version that deliveries have come to
         self._next_at = 0.0
         self._delivered: deque[CopiedChanges] = deque()
@@ -73,7 +84,7 @@ class QueryService:
         self._overdue = False  # somebody has waited in vain, or would
         self._closed = threading.Event()
         self.answered = 0
-        self._server = QueryServer(endpoint)
+        self._server = QueryServer(endpoint, keys=keys)
         self.endpoint = self._server.endpoint
         self._long = LongQuestions(f"long queries {endpoint}", self._answer, self._server.wake)
         self._threads = (

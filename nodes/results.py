@@ -1,35 +1,14 @@
-"""Folders that a replay has written: reading and showing them."""
+"""Folders that a replay has written, shown."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from nodes.console import Output
 from nodes.summary_table import notes, result_lines, summary_table
-from semantic_mapper.errors import ConfigError
-
-
-def read_summary(folder: Path) -> dict[str, Any]:
-    """The summary in a result folder.
-
-    Raises:
-        ConfigError: there is none, or it is damaged.
-    """
-    path = folder / "summary.json"
-    try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(
-            f"{folder}: no summary.json; give a folder that `semantic-mapper replay` has written"
-        ) from error
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from error
-    if not isinstance(summary, dict) or "frames" not in summary or "metrics" not in summary:
-        raise ConfigError(f"{path}: is not the summary of a replay")
-    return summary
+from replay.summary import read_summary
 
 
 def unique_names(folders: Sequence[Path]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ from nodes.finishing import finish_session
 from nodes.outputs import prepare_folder
 from nodes.process import StopRequest
 from replay.corrections import correct_session, keeping_frames, read_corrections
-from replay.log import LogReader
-from replay.session import MapSession, load_pipeline
+from replay.sequence import Log, open_log
+from replay.session import MapSession, load_pipeline, open_recording
 from semantic_mapper.config import MapperConfig, Quality, check_quality, convert_config, read_toml
 from semantic_mapper.errors import LogError, SemanticMapperError
 from semantic_mapper.fields.checkpoint import load_checkpoint
@@ -29,7 +29,7 @@ class ReplayRequest:
     """What to replay.
 
     Args:
-        log: The log.
+        log: The log, or a folder with the parts of a recording.
         out: Folder for the results.
         weights: None = those that ship with the package.
         config: Of the mapper.
@@ -37,6 +37,7 @@ class ReplayRequest:
         exclude: Weights whose finetuning frames are left out of the scores, beside those of ``weights``.
         rerun: Where to write a Rerun recording.
         corrections: Trajectory file with corrected poses, which the map is moved to at the end of the log.
+        further_parts: Of the recording that ``log`` is a part of.
     """
 
     log: Path
@@ -47,6 +48,7 @@ class ReplayRequest:
     exclude: Path | None = None
     rerun: Path | None = None
     corrections: Path | None = None
+    further_parts: tuple[Path, ...] = ()
 
 
 def replay_log(
@@ -72,7 +74,7 @@ def replay_log(
     prepare_folder(request.out)
     trajectory = read_corrections(request.corrections) if request.corrections else None
     exclude = load_checkpoint(request.exclude).train_stamps_ns if request.exclude else frozenset[int]()
-    with LogReader(request.log) as log:
+    with open_log((request.log, *request.further_parts)) as log:
         for notice in log.notices:
             _log.warning("log_notice", notice=notice)
         config = request.config if trajectory is None else keeping_frames(request.config, len(log))
@@ -83,7 +85,7 @@ def replay_log(
             stream_labels=log.info.label_set,
             exclude_stamps=exclude,
             source=log.info.source,
-            rerun=request.rerun,
+            rerun=open_recording(request.rerun, bundle.pipeline),
         )
         for error in log.errors:  # stretches of the file in which no frame can be made out
             session.note_damage(str(error))
@@ -104,12 +106,10 @@ def replay_log(
     return summary
 
 
-def _map_frames(
-    session: MapSession, log: LogReader, total: int, stop: StopRequest, on_frame: Callable[[int], None]
-) -> int:
+def _map_frames(session: MapSession, log: Log, total: int, stop: StopRequest, on_frame: Callable[[int], None]) -> int:
     """Feed the session; how many frames were looked at."""
     done = 0
-    for done, item in enumerate(_frames(log, total), 1):
+    for done, item in enumerate(log.frames_or_errors(total), 1):
         if isinstance(item, PosedFrame):
             session.process(item)
         else:
@@ -119,15 +119,6 @@ def _map_frames(
             _log.warning("stopped", by=stop.name, frames=done, of=total)
             break
     return done
-
-
-def _frames(log: LogReader, total: int) -> Iterator[PosedFrame | LogError]:
-    """Frames in order; the error in place of one that is damaged."""
-    for number in range(total):
-        try:
-            yield log.frame(number)
-        except LogError as error:
-            yield error
 
 
 def mapper_config(

@@ -1,4 +1,4 @@
-"""Saved maps and transforms as the command line names them."""
+"""Saved maps, logs and transforms as the command line names them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from semantic_mapper.geometry import check_pose
 from semantic_mapper.types import Float64
 
 MAP_NAME = "map.npz"
+LOG_SUFFIX = ".mcap"
 
 
 def map_path(path: Path) -> Path:
@@ -68,3 +69,10 @@ def _read_transform(path: Path) -> Float64:
         raise ConfigError(f"--transform {path}: expected 4 rows of 4 numbers, got {T.shape[0]} of {T.shape[1]}")
     check_pose(T, str(path))
     return T
+
+
+def is_log(source: Path) -> bool:
+    """Whether a log is meant rather than a map: a log file, or a folder with logs and no map."""
+    if source.is_dir():
+        return not (source / MAP_NAME).exists() and any(source.glob(f"*{LOG_SUFFIX}"))
+    return source.suffix == LOG_SUFFIX

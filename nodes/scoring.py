@@ -13,7 +13,7 @@ from nodes.console import frame_progress
 from nodes.run_replay import mapper_config
 from nodes.summary_table import percent
 from replay.evaluate import baseline_predictors, evaluate_frames, sray_predictors
-from replay.log import LogReader
+from replay.sequence import Log, open_log
 from replay.session import load_pipeline
 from semantic_mapper.errors import LabelError, WeightsError
 from semantic_mapper.types import PosedFrame
@@ -41,7 +41,7 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
     Raises:
         LogError, LabelError, WeightsError: nothing can be scored.
     """
-    with LogReader(request.log) as log:
+    with open_log(request.log) as log:
         stream_labels = log.info.label_set
         if stream_labels is None:
             raise LabelError(f"{request.log}: has no label images to score against")
@@ -67,7 +67,7 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
         return {**asdict(found), "damaged": len(log.errors), "weights": bundle.weights_path.name}
 
 
-def _frames_at(log: LogReader, stamps: frozenset[int]) -> list[PosedFrame]:
+def _frames_at(log: Log, stamps: frozenset[int]) -> list[PosedFrame]:
     numbers = [i for i, (envelope, _) in enumerate(log.frame_parts()) if envelope.stamp_ns in stamps]
     if len(numbers) < 2:
         raise WeightsError(

@@ -11,6 +11,7 @@ from typing import Any
 from nodes.console import FrameProgress, Output, frame_progress, stderr_console
 from nodes.outputs import prepare_file
 from nodes.process import StopRequest
+from nodes.report_page import write_suite_report
 from nodes.suite_table import difference_lines, suite_table
 from replay.artifacts import write_json
 from semantic_mapper import __version__
@@ -72,12 +73,16 @@ def run_suite_verb(
                 _map_rooms(suite, contestants, paths, store, bar, stop)
         found = _collect(suite, contestants, store, maps)
         write_json(out, found)
-        output.print(suite_table(found))
-        for line in difference_lines(found):
+        table, lines = suite_table(found), difference_lines(found)
+        output.print(table)
+        for line in lines:
             output.print(line)
         output.print(f"written to {out}")
-        for picture in _draw(suite, contestants, store, found, out):
+        pictures = list(_draw(suite, contestants, store, found, out))
+        for picture in pictures:
             output.print(f"picture: {picture}")
+        write_suite_report(page := out.with_suffix(".html"), table, lines, pictures, found)
+        output.print(f"page: {page}")
         if stop:
             stderr_console().print(f"stopped by {stop.name}; the same command goes on from here", style="yellow")
         return stop.exit_code

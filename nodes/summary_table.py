@@ -8,6 +8,8 @@ from typing import Any
 
 from rich.table import Table
 
+from replay.summary import dig
+
 
 def summary_table(summaries: Mapping[str, Mapping[str, Any]]) -> Table:
     """One column a summary, by name; classes that any of them has scored come last."""
@@ -17,10 +19,10 @@ def summary_table(summaries: Mapping[str, Mapping[str, Any]]) -> Table:
         table.add_column(name, justify="right")
     columns = list(summaries.values())
     for name, path, show in _ROWS:
-        values = [_dig(s, path) for s in columns]
+        values = [dig(s, path) for s in columns]
         if any(v is not None for v in values):
             table.add_row(name, *(show(v) if v is not None else "-" for v in values))
-    classes = [_dig(s, "metrics.per_class") or {} for s in columns]
+    classes = [dig(s, "metrics.per_class") or {} for s in columns]
     names = list(dict.fromkeys(n for c in classes for n in c))
     if names:
         table.add_section()
@@ -35,6 +37,7 @@ def result_lines(out: Path) -> list[str]:
         "overview.png": "picture",
         "map.ply": "point cloud: x y z red green blue label confidence",
         "map.npz": "the map itself",
+        "report.html": "report on one page, for a browser",
         "summary.json": "all figures",
     }
     return [f"  {out / name}  ({text})" for name, text in what.items() if (out / name).exists()]
@@ -58,19 +61,14 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
         lines.append(summary["map"]["unfinished_correction"])
     if summary.get("stopped_by"):
         lines.append(f"stopped by {summary['stopped_by']}: the results are those of the frames so far")
+    if summary.get("restarted"):
+        lines.append(f"{summary['restarted']}; frames are counted since then")
     return lines
 
 
 def percent(value: float) -> str:
     """0.1234 -> 12.3 %."""
     return f"{value * 100:.1f} %"
-
-
-def _dig(summary: Mapping[str, Any], path: str) -> Any:
-    value: Any = summary
-    for key in path.split("."):
-        value = value.get(key) if isinstance(value, Mapping) else None
-    return value
 
 
 def _ms(value: float) -> str:

@@ -1,0 +1,164 @@
+"""``semantic-mapper view``: a running system, a log or a saved map in the browser."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from nodes.cli_replay import ConfigOption, MaxFramesOption, WeightsOption
+from nodes.console import Output, frame_progress
+from nodes.identity import KeysOption, ServerOption, server_identity
+from nodes.process import StopRequest
+from nodes.verb import verb
+from semantic_mapper.errors import ConfigError, TransportError
+
+if TYPE_CHECKING:
+    from nodes.watching import Live
+    from nodes.web_viewer import WebViewer
+
+LEAST_MEMORY_MB = 64
+POLL_S = 0.2
+MAP_SUFFIX = ".npz"
+
+PortOption = Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the web page; 0 = any that is free.")]
+DataPortOption = Annotated[
+    int, typer.Option(min=0, max=65535, help="Of the data that the page shows; 0 = any that is free.")
+]
+MemoryOption = Annotated[
+    int, typer.Option("--memory", metavar="MB", min=LEAST_MEMORY_MB, help="For what is shown; then the oldest goes.")
+]
+RefreshOption = Annotated[float, typer.Option("--refresh", metavar="S", min=0.2, help="Seconds between two maps.")]
+
+
+@verb
+def view(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="A log (.mcap, or a folder with the parts of one), a saved map (.npz, or a folder with map.npz), the "
+            "socket folder of a running launch, or where a mapper answers (tcp://...); by default the one launch that "
+            "runs here."
+        ),
+    ] = "",
+    port: PortOption = 9090,
+    data_port: DataPortOption = 9876,
+    memory: MemoryOption = 512,
+    refresh: RefreshOption = 2.0,
+    query: Annotated[str, typer.Option(help="Launch: name of the mapper's `query` endpoint.")] = "query",
+    weights: WeightsOption = None,
+    config: ConfigOption = None,
+    max_frames: MaxFramesOption = 0,
+    server: ServerOption = "",
+    keys: KeysOption = None,
+) -> None:
+    """Show images, rendered semantics, depth, the camera's path, the map and stage times in a browser, until Ctrl-C.
+
+    The map has a tab for each of its colourings: class, camera colour, confidence, and age, that is, how long ago its
+    surroundings last changed while they were watched (a saved map has none). A log is mapped while it is shown. The
+    page is served on this machine alone, and sends nothing anywhere; to see it from another one, tunnel both ports.
+
+    Example: semantic-mapper view
+    Example: semantic-mapper view runs/demo
+    Example: semantic-mapper view kitchen.mcap --weights kitchen.safetensors
+    Example: semantic-mapper view tcp://robot:5570 --server robot
+    Example: ssh -L 9090:127.0.0.1:9090 -L 9876:127.0.0.1:9876 robot semantic-mapper view
+    """
+    path = Path(source)
+    log = _is_log(source)
+    if not log and (weights or config or max_frames):
+        raise typer.BadParameter("go with a log", param_hint="--weights, --config, --max-frames")
+    if server and "://" not in source:
+        raise typer.BadParameter("goes with an endpoint such as tcp://robot:5570", param_hint="--server")
+    output = Output.guarded()
+    from nodes.web_viewer import WebViewer
+
+    saved = None if log else _saved_map(path, source)
+    if (log or saved) and not (saved or path).exists():
+        raise ConfigError(f"{path}: no such file")
+    live = None if log or saved else _find_live(source, query, server, keys)
+    with StopRequest() as stop, WebViewer(port, data_port, memory) as viewer:
+        output.print(f"watch at {viewer.page_url}")
+        if saved is not None:
+            from nodes.watching import show_saved
+            from replay.rerun_log import recording_server
+
+            show_saved(saved, recording_server(viewer.data_url))
+        elif live is None:
+            _show_log(path, weights, config, max_frames, viewer, refresh, stop)
+        else:
+            _show_live(live, viewer, refresh, stop, output)
+        while not stop:
+            if not viewer.alive:
+                raise TransportError("the process that serves the viewer has ended; start `view` again")
+            time.sleep(POLL_S)
+
+
+def _is_log(source: str) -> bool:
+    from nodes.saved_maps import is_log
+
+    return bool(source) and is_log(Path(source))
+
+
+def _saved_map(path: Path, source: str) -> Path | None:
+    """The file of a saved map, where the source is one."""
+    from nodes.saved_maps import MAP_NAME
+
+    if path.suffix == MAP_SUFFIX:
+        return path
+    return path / MAP_NAME if source and (path / MAP_NAME).is_file() else None
+
+
+def _find_live(source: str, query: str, server: str, keys: Path | None) -> Live:
+    """Endpoints of a running launch, or of a mapper anywhere.
+
+    Raises:
+        TransportError: none runs here, several do, or the folder is none of a launch.
+    """
+    from nodes.launch_note import read_launch_note
+    from nodes.running_launches import launch_folder, node_endpoints
+    from nodes.watching import Live
+
+    if "://" in source:
+        return Live(source, (), server_identity(server, keys))
+    folder = launch_folder(source)
+    nodes = node_endpoints(folder)
+    streams = sum(camera in nodes for camera in read_launch_note(folder).names("camera"))
+    return Live(f"ipc://{folder}/{query}", tuple(nodes.values()), streams=streams)
+
+
+def _show_log(
+    path: Path,
+    weights: Path | None,
+    config: Path | None,
+    max_frames: int,
+    viewer: WebViewer,
+    refresh: float,
+    stop: StopRequest,
+) -> None:
+    from nodes.run_replay import mapper_config
+    from nodes.watching import show_log
+    from replay.rerun_log import recording_server
+
+    settings = mapper_config(config, None)
+    with frame_progress("map", None) as bar:
+        show_log(
+            path,
+            weights,
+            settings,
+            max_frames,
+            recording_server(viewer.data_url),
+            refresh,
+            going=lambda: not stop and viewer.alive,
+            on_start=bar.start,
+            on_frame=bar.set,
+        )
+
+
+def _show_live(live: Live, viewer: WebViewer, refresh: float, stop: StopRequest, output: Output) -> None:
+    from nodes.watching import show_live
+    from replay.rerun_log import recording_server
+
+    show_live(live, recording_server(viewer.data_url), refresh, stop, output.print)
