@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import random
-import re
+from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -19,19 +20,11 @@ settings.register_profile("project", deadline=None, derandomize=True, max_exampl
 settings.load_profile("project")
 
 
-def pytest_configure() -> None:
-    """Throw compiled kernels away that are older than any kernel's source.
-
-    Numba looks at the file of the outermost function alone: after a change in one that it calls it would go on running,
-    and testing, the old code.
-    """
-    folder = REPOSITORY / "semantic_mapper"
-    sources = [p for p in folder.rglob("*.py") if re.search(r"njit|parallel_kernel", p.read_text(encoding="utf-8"))]
-    newest = max(p.stat().st_mtime for p in sources)
-    compiled = list(folder.rglob("*.nb[ic]"))
-    if any(p.stat().st_mtime < newest for p in compiled):
-        for path in compiled:
-            path.unlink(missing_ok=True)
+@pytest.fixture(autouse=True)
+def _keep_environment() -> Iterator[None]:
+    """What a command that runs inside a test sets for its process must not reach the next test."""
+    with patch.dict(os.environ):
+        yield
 
 
 @pytest.fixture(autouse=True)

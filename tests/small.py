@@ -7,9 +7,11 @@ from functools import cache
 import torch
 
 from semantic_mapper.config import EncoderConfig, MapperConfig, SRayConfig, convert_config
+from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
+from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
 INTRINSICS = CameraIntrinsics(66.0, 66.0, 47.5, 35.5, 96, 72)
@@ -21,6 +23,14 @@ def tiny_field(label_set: LabelSet = ROOMS, seed: int = 0) -> SRay:
     """Random weights, evaluation mode."""
     torch.manual_seed(seed)
     return SRay(SMALL_MODEL, label_set).eval()
+
+
+def settled_field() -> SRay:
+    """As ``tiny_field``, but its encoder's norms know images: as that of trained weights, it can rest."""
+    field = tiny_field()
+    assert field.image_encoder is not None
+    calibrate(field.image_encoder, stack_sources([view_from_frame(f, ROOMS, 96) for f in tiny_frames(6)]))
+    return field.eval()
 
 
 @cache

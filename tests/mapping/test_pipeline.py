@@ -111,6 +111,26 @@ def test_a_camera_one_pixel_narrower_has_features_of_the_same_size_and_is_still_
     assert pipeline.step(narrow).fused
 
 
+def test_cameras_of_two_sizes_have_each_their_own_keyframes():
+    """At one place both become keyframes, and each is rendered from views of its own size."""
+    pipeline = make_pipeline(keyframes={"translation_m": 0.02})
+
+    def narrow(frame: PosedFrame, seq: int) -> PosedFrame:
+        intrinsics = replace(
+            frame.intrinsics, cx=frame.intrinsics.cx - 8, cy=frame.intrinsics.cy - 6, width=80, height=60
+        )
+        rgb, depth = frame.rgb[6:66, 8:88].copy(), frame.depth_m[6:66, 8:88].copy()
+        return replace(frame, seq=seq, camera_id="narrow", rgb=rgb, depth_m=depth, label=None, intrinsics=intrinsics)
+
+    wide, other = [], []
+    for frame in tiny_frames(4):
+        wide.append(pipeline.step(frame))
+        other.append(pipeline.step(narrow(frame, frame.seq + 100)))
+    assert wide[0].is_keyframe and other[0].is_keyframe
+    assert wide[3].source_seqs and set(wide[3].source_seqs) <= {0, 1, 2}
+    assert other[3].source_seqs and set(other[3].source_seqs) <= {100, 101, 102}
+
+
 def test_an_odd_sized_first_frame_does_not_shut_out_the_rest():
     pipeline = make_pipeline()
     frames = tiny_frames()

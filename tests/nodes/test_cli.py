@@ -7,7 +7,21 @@ import pytest
 from semantic_mapper import __version__
 from tests.nodes.support import run
 
-VERBS = ("demo", "replay", "up", "import", "info", "recover", "finetune", "eval", "doctor", "query", "train", "bench")
+VERBS = (
+    "demo",
+    "replay",
+    "up",
+    "record",
+    "import",
+    "info",
+    "recover",
+    "finetune",
+    "eval",
+    "doctor",
+    "query",
+    "train",
+    "bench",
+)
 
 
 @pytest.mark.parametrize("verb", VERBS)

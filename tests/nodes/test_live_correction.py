@@ -8,11 +8,13 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
+from nodes.heartbeat import Heart
 from nodes.live_correction import LiveCorrection
 from nodes.mapper import run_mapper
 from nodes.node import NodeContext
@@ -77,14 +79,17 @@ def config_file(folder: Path, history: int = 100) -> Path:
 
 
 @contextmanager
-def running_robot(weights: Path, out: Path, history: int = 100) -> Iterator[Robot]:
+def running_robot(
+    weights: Path, out: Path, history: int = 100, restarts: int = 0, notes: Path | None = None, **more: Any
+) -> Iterator[Robot]:
     with a_folder() as folder:
-        endpoints = {name: f"ipc://{folder / name}" for name in ("camera", "mapper", "query")}
+        names = ("camera", "mapper", "query", "finetuner", "labels")
+        endpoints = {name: f"ipc://{folder / name}" for name in names}
         options = MapperOptions(
-            out=str(out), weights=str(weights), config=str(config_file(folder, history)), delivery="all"
+            out=str(out), weights=str(weights), config=str(config_file(folder, history)), delivery="all", **more
         )
         stop = StopRequest(patient=True)
-        context = NodeContext("mapper", endpoints, 1, stop)
+        context = NodeContext("mapper", endpoints, 1, stop, Heart(-1, 1), restarts, notes)
         mapper = threading.Thread(target=run_mapper, args=(context, options), daemon=True)
         status: list[Status] = []
         ended = threading.Event()

@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from nodes.process import StopRequest
+from nodes.process import STOP_SIGNAL, StopRequest
 
 
 def _python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -36,6 +36,12 @@ def test_patient_request_keeps_the_first_signal() -> None:
         assert stop.name == "SIGTERM" and stop.exit_code == 143
 
 
+def test_request_of_a_launcher_is_no_signal_that_ends_a_process() -> None:
+    with StopRequest(signals=(STOP_SIGNAL, signal.SIGTERM)) as stop:
+        os.kill(os.getpid(), STOP_SIGNAL)
+        assert stop and stop.name == "the launcher" and stop.exit_code == 0
+
+
 def test_handlers_are_given_back() -> None:
     before = signal.getsignal(signal.SIGINT)
     with StopRequest():
@@ -54,6 +60,22 @@ print(json.dumps([*(os.environ[n] for n in names), "torch" in sys.modules]))
     policy, omp, numba, heavy = json.loads(_python(code).stdout)
     assert policy == "passive" and int(omp) >= 1 and numba == omp and not heavy
     assert json.loads(_python(code, OMP_NUM_THREADS="3").stdout)[1:3] == ["3", "3"]
+
+
+def test_numba_compiles_after_a_process_that_had_it_was_prepared() -> None:
+    code = """
+import os
+import numba, numpy
+from nodes.process import prepare_process
+total = numba.njit(parallel=True)(lambda values: values.sum())
+total(numpy.ones(3))
+del os.environ["NUMBA_NUM_THREADS"]
+os.environ["OMP_NUM_THREADS"] = "1"
+prepare_process()
+print(total(numpy.ones(3, numpy.float32)))
+"""
+    done = _python(code, OMP_NUM_THREADS="2", NUMBA_NUM_THREADS="2")
+    assert done.stdout.split() == ["3.0"], done.stderr
 
 
 def test_stray_prints_never_reach_stdout() -> None:

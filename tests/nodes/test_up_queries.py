@@ -45,9 +45,13 @@ def test_a_mapper_is_asked_while_it_replays(weights: Path, config: Path, tmp_pat
 
 def test_without_a_query_endpoint_there_is_none_and_names_must_differ(tmp_path: Path) -> None:
     launch = load_launch(REPLAY_LAUNCH, ["log=x"], tmp_path)
-    assert launch.sockets() == ("mapper", "camera", "query")
-    assert load_launch(REPLAY_LAUNCH, ["log=x", "query="], tmp_path).sockets() == ("mapper", "camera")
-    assert load_launch(REPLAY_LAUNCH, ["log=x", "query=ipc:///a/b"], tmp_path).sockets() == ("mapper", "camera")
+    assert launch.sockets() == ("launch", "mapper", "camera", "query")
+    assert load_launch(REPLAY_LAUNCH, ["log=x", "query="], tmp_path).sockets() == ("launch", "mapper", "camera")
+    assert load_launch(REPLAY_LAUNCH, ["log=x", "query=ipc:///a/b"], tmp_path).sockets() == (
+        "launch",
+        "mapper",
+        "camera",
+    )
     with pytest.raises(ConfigError, match="camera: names two endpoints"):
         load_launch(REPLAY_LAUNCH, ["log=x", "query=camera"], tmp_path)
     with pytest.raises(ConfigError, match="query"):

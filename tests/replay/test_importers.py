@@ -34,7 +34,7 @@ def scannet(tmp_path: Path) -> Path:
 
 def imported(src: Path, **options: object) -> tuple[ImportReport, LogReader]:
     dst = src.parent / "log.mcap"
-    report = import_recording(src, dst, options=ImportOptions(**options))  # type: ignore[arg-type]
+    report = import_recording(src, dst, options=ImportOptions(**options), overwrite=True)  # type: ignore[arg-type]
     return report, LogReader(dst)
 
 
@@ -185,6 +185,8 @@ def test_an_import_without_one_good_frame_fails_and_leaves_an_older_log_alone(fo
     before = dst.read_bytes()
     (folder / "poses.txt").write_text("\n".join(["nan " * 16] * 6))
     with pytest.raises(ImportSourceError, match="none of its 6 frames can be used"):
+        import_recording(folder, dst, overwrite=True)
+    with pytest.raises(LogError, match=r"log\.mcap: exists already; choose another name, or --overwrite it"):
         import_recording(folder, dst)
     assert dst.read_bytes() == before
     assert sorted(p.name for p in folder.parent.iterdir()) == ["kitchen", "log.mcap"]
@@ -194,16 +196,16 @@ def test_an_import_may_be_done_again_and_tells_its_progress(folder: Path) -> Non
     dst = folder.parent / "log.mcap"
     told: list[tuple[int, int]] = []
     for _ in range(2):
-        import_recording(folder, dst, "folder", lambda done, total: told.append((done, total)))
+        import_recording(folder, dst, "folder", lambda done, total: told.append((done, total)), overwrite=True)
     assert told == [(i, 6) for i in range(1, 7)] * 2
-    assert import_recording(folder, dst, options=ImportOptions(max_frames=2)).frames == 2
+    assert import_recording(folder, dst, options=ImportOptions(max_frames=2), overwrite=True).frames == 2
 
 
 def test_a_destination_that_cannot_be_written_is_a_clear_error(folder: Path) -> None:
     with pytest.raises(LogError, match="cannot be written"):
         import_recording(folder, folder / "no" / "such" / "log.mcap")
     with pytest.raises(LogError, match="cannot be written"):
-        import_recording(folder, folder)
+        import_recording(folder, folder, overwrite=True)
 
 
 def test_formats_are_told_apart(folder: Path, tum: Path, scannet: Path, tmp_path: Path) -> None:

@@ -114,21 +114,23 @@ def test_a_plan_says_what_was_found_out_for_it(corner: VoxelMap, tmp_path: Path)
     assert told.found == ()
 
 
-def test_rerun_gets_both_clouds(corner: VoxelMap, tmp_path: Path) -> None:
+def test_rerun_gets_a_cloud_for_each_colouring(corner: VoxelMap, tmp_path: Path) -> None:
     export_map(corner, tmp_path / "map.rrd", ExportRequest("rrd"))
     assert list(tmp_path.iterdir()) == [tmp_path / "map.rrd"]
     clouds: dict[str, dict[str, np.ndarray]] = {}
     for chunk in rerun.chunk.RrdReader(tmp_path / "map.rrd").stream():
         if chunk.entity_path.startswith("/world/map"):
             batch = chunk.to_record_batch()
-            names = {"positions": np.float32, "colors": np.uint32}
-            clouds[chunk.entity_path] = {
-                name: np.array(batch.column(f"Points3D:{name}").to_pylist()[0], dtype) for name, dtype in names.items()
+            names = {"positions": np.float32, "colors": np.uint32, "class_ids": np.uint16}
+            clouds[chunk.entity_path.removeprefix("/world/map/")] = {
+                name: np.array(batch.column(f"Points3D:{name}").to_pylist()[0], dtype)
+                for name, dtype in names.items()
+                if f"Points3D:{name}" in batch.schema.names
             }
     points = corner.points()
-    colors = {"/world/map/semantic": LABELS.colorize(points.label), "/world/map/colour": points.rgb}
-    assert clouds.keys() == colors.keys()
-    for name, cloud in clouds.items():
+    assert clouds.keys() == {"class", "colour", "confidence"}, "a saved map does not know its ages"
+    for cloud in clouds.values():
         np.testing.assert_array_equal(cloud["positions"], points.xyz)
-        rgb = np.stack([(cloud["colors"] >> shift) & 255 for shift in (24, 16, 8)], axis=1)
-        np.testing.assert_array_equal(rgb, colors[name])
+    np.testing.assert_array_equal(clouds["class"]["class_ids"], points.label)
+    rgb = np.stack([(clouds["colour"]["colors"] >> shift) & 255 for shift in (24, 16, 8)], axis=1)
+    np.testing.assert_array_equal(rgb, points.rgb)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from replay.evaluate import baseline_predictors, evaluate_frames, sray_predictors
-from replay.session import SNAPSHOTS, MapSession, load_pipeline, make_field
+from replay.session import SNAPSHOTS, MapSession, load_pipeline, make_field, open_recording
 from replay.tallies import StepTimes
 from replay.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.config import MapperConfig, convert_config
@@ -30,8 +30,10 @@ def weights(tmp_path):
     return tmp_path / "w.safetensors"
 
 
-def run(weights, frames, **options):
-    session = MapSession(load_pipeline(weights, tiny_config()), stream_labels=ROOMS, source="test", **options)
+def run(weights, frames, rerun=None, **options):
+    bundle = load_pipeline(weights, tiny_config())
+    recording = open_recording(rerun, bundle.pipeline)
+    session = MapSession(bundle, stream_labels=ROOMS, source="test", rerun=recording, **options)
     for frame in frames:
         session.process(frame)
     return session

@@ -13,13 +13,25 @@ from semantic_mapper.transport.codec import (
     CodecOptions,
     encode_end,
     encode_frame,
+    encode_in_use,
     encode_info,
+    encode_keyframe,
     encode_map_update,
     encode_refused,
     encode_status,
+    encode_weights,
 )
 from semantic_mapper.transport.compression import depth_from_uint16
-from semantic_mapper.transport.messages import EndOfStream, FrameRefused, Status, StreamInfo
+from semantic_mapper.transport.learning_messages import digest_of
+from semantic_mapper.transport.messages import (
+    EndOfStream,
+    FrameRefused,
+    LabelledKeyframe,
+    Status,
+    StreamInfo,
+    WeightsInUse,
+    WeightsUpdate,
+)
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
 INTRINSICS = CameraIntrinsics(20.5, 21.0, 11.5, 8.5, 24, 18)
@@ -70,6 +82,15 @@ def make_status() -> Status:
     return Status("mapper", "degraded", 5, {"fused": 7}, {"frame": 0.25}, ("the GPU is gone; running on the CPU",))
 
 
+def make_weights() -> WeightsUpdate:
+    data = b"safetensors" * 9
+    return WeightsUpdate("learner", 2, data, digest_of(data), "cd" * 32, 0.8, 0.5, 9, 3)
+
+
+def make_in_use() -> WeightsInUse:
+    return WeightsInUse("mapper", 1, "cd" * 32, 2, 2, False, "it disagrees with the map", 1, True)
+
+
 def all_messages() -> dict[str, list[bytes]]:
     """One encoded message of each topic."""
     return {
@@ -79,6 +100,9 @@ def all_messages() -> dict[str, list[bytes]]:
         "status": encode_status(make_status()),
         "info": encode_info(make_info()),
         "end": encode_end(EndOfStream("player", "end", 200)),
+        "keyframe": encode_keyframe(LabelledKeyframe(make_frame(), NYU40, "a person")),
+        "weights": encode_weights(make_weights()),
+        "in_use": encode_in_use(make_in_use()),
     }
 
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import random
 import tracemalloc
+from pathlib import Path
 
 import cv2
 import msgpack
@@ -20,21 +21,29 @@ from semantic_mapper.transport.codec import (
     decode,
     decode_end,
     decode_frame,
+    decode_in_use,
     decode_info,
+    decode_keyframe,
     decode_map_update,
     decode_refused,
     decode_status,
+    decode_weights,
     encode_end,
     encode_frame,
+    encode_in_use,
     encode_info,
+    encode_keyframe,
     encode_map_update,
     encode_refused,
     encode_status,
+    encode_weights,
     read_envelope,
 )
 from semantic_mapper.transport.compression import depth_from_uint16, depth_to_uint16
 from semantic_mapper.transport.framing import pack_parts, unpack_parts
-from semantic_mapper.transport.messages import EndOfStream, FrameRefused, Status, StreamInfo
+from semantic_mapper.transport.headers import MAX_KEYFRAME_BYTES, MAX_WEIGHTS_BYTES
+from semantic_mapper.transport.images import sniff_image
+from semantic_mapper.transport.messages import EndOfStream, FrameRefused, LabelledKeyframe, Status, StreamInfo
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
 from . import samples
@@ -151,6 +160,35 @@ def test_small_messages_survive() -> None:
     assert decode_end(encode_end(end)) == end
 
 
+def test_messages_of_learning_survive() -> None:
+    assert decode_weights(encode_weights(samples.make_weights())) == samples.make_weights()
+    assert decode_in_use(encode_in_use(samples.make_in_use())) == samples.make_in_use()
+    frame = samples.make_frame()
+    keyframe = decode_keyframe(encode_keyframe(LabelledKeyframe(frame, NYU40, "a person")))
+    assert (keyframe.label_set, keyframe.teacher, keyframe.frame.seq) == (NYU40, "a person", frame.seq)
+    assert keyframe.frame.label is not None and np.array_equal(keyframe.frame.label, frame.label)
+    envelope = read_envelope(encode_keyframe(LabelledKeyframe(frame, NYU40)))
+    assert (envelope.source, envelope.stamp_ns, envelope.has_label) == ("front", frame.stamp_ns, True)
+
+
+def test_what_cannot_be_learned_from_is_refused() -> None:
+    with pytest.raises(CodecError, match="nothing to learn"):
+        encode_keyframe(LabelledKeyframe(samples.make_frame(label=False), NYU40))
+    parts = encode_keyframe(LabelledKeyframe(samples.make_frame(), NYU40))
+    with pytest.raises(CodecError, match="has no label image"):
+        decode_keyframe([*parts[:2], *encode_frame(samples.make_frame(label=False))[1:]])
+    with pytest.raises(CodecError, match="has no frame"):
+        decode_keyframe(parts[:2])
+    weights = encode_weights(samples.make_weights())
+    other = bytes([weights[2][0] ^ 1]) + weights[2][1:]
+    with pytest.raises(CodecError, match="not the one that its digest names"):
+        decode_weights([*weights[:2], other])
+    with pytest.raises(CodecError, match="bytes"):
+        decode_weights(with_header(weights, bytes=MAX_WEIGHTS_BYTES + 1))
+    with pytest.raises(CodecError, match="digest"):
+        decode_weights(with_header(weights, digest="../../etc"))
+
+
 def test_the_envelope_tells_what_a_message_is_without_decoding_it() -> None:
     frame = samples.make_frame(label=False)
     envelope = read_envelope(encode_frame(frame))
@@ -159,6 +197,37 @@ def test_the_envelope_tells_what_a_message_is_without_decoding_it() -> None:
     assert envelope.has_depth and not envelope.has_label
     for name, parts in samples.all_messages().items():
         assert read_envelope(parts).topic == name
+
+
+def test_a_keyframe_is_bounded_as_a_whole_before_anything_is_allocated() -> None:
+    parts = encode_keyframe(LabelledKeyframe(samples.make_frame(), NYU40))
+    inner = with_header([b"", parts[2]], intrinsics={**msgpack.unpackb(parts[2])["intrinsics"], "width": 1 << 12})
+    intrinsics = {**msgpack.unpackb(inner[1])["intrinsics"], "height": (1 << 11) + 1}
+    wide = with_header(inner, intrinsics=intrinsics)[1]
+    padding = bytes(MAX_KEYFRAME_BYTES // 2)
+    rgb, label = {"encoding": "png", "bytes": len(padding)}, {"encoding": "u8_zstd", "bytes": len(padding)}
+    long = with_header([b"", parts[2]], rgb=rgb, depth=None, label=label)[1]
+    tracemalloc.start()
+    for bad, says in (
+        ([*parts[:2], wide, *parts[3:]], "a keyframe has at most 8388608 pixels"),
+        ([*parts[:2], long, padding, padding], "a keyframe has at most 67633152"),
+    ):
+        for read in (decode_keyframe, read_envelope):
+            with pytest.raises(CodecError, match=says):
+                read(bad)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**20
+    size, small = (1 << 12, 1 << 12), samples.make_frame()
+    large = dataclasses.replace(
+        small,
+        rgb=np.broadcast_to(np.uint8(0), (*size, 3)),
+        depth_m=None,
+        label=np.broadcast_to(np.uint8(1), size),
+        intrinsics=dataclasses.replace(small.intrinsics, width=size[1], height=size[0]),
+    )
+    with pytest.raises(CodecError, match="4096x4096"):
+        encode_keyframe(LabelledKeyframe(large, NYU40))
 
 
 def with_header(parts: list[bytes], **changes: object) -> list[bytes]:
@@ -281,3 +350,11 @@ def test_a_payload_that_is_no_framed_message_is_refused(payload: bytes) -> None:
 def test_framing_bombs_are_refused(payload: bytes) -> None:
     with pytest.raises(CodecError):
         unpack_parts(payload)
+
+
+def test_a_small_png_that_would_take_gigabytes_is_refused() -> None:
+    parts = unpack_parts((Path(__file__).with_name("crashers") / "png-bomb.msg").read_bytes())
+    with pytest.raises(CodecError, match=r"PNG image|bad header"):
+        decode_frame(parts)
+    with pytest.raises(CodecError, match="PNG image"):
+        sniff_image(parts[2])

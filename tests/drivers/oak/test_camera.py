@@ -1,0 +1,268 @@
+from __future__ import annotations
+
+import itertools
+import threading
+from datetime import timedelta
+from pathlib import Path
+
+import depthai as dai
+import numpy as np
+import pytest
+
+from drivers.base import Camera, CameraImage
+from drivers.oak.images import MAX_DAMAGED
+from drivers.oak.stream import Sources
+from semantic_mapper.errors import CameraError
+from tests.drivers.oak import host
+from tests.drivers.oak.host import HEIGHT, PERIOD, WIDTH, depth_message, long_ago, rgb_message
+
+
+def take(camera: Camera, count: int) -> list[CameraImage]:
+    return list(itertools.islice(camera, count))
+
+
+def messages(count: int, *, start: timedelta | None = None) -> tuple[list[dai.Buffer], list[dai.Buffer]]:
+    start = start or long_ago(count)
+    return [rgb_message(k, start) for k in range(count)], [depth_message(k, start) for k in range(count)]
+
+
+def test_a_replayed_recording_gives_colours_metres_stamps_and_intrinsics(
+    recording: tuple[Path, timedelta], calibration: Path
+) -> None:
+    folder, start = recording
+    with host.camera(lambda: host.replayed(folder, calibration)) as camera:
+        assert isinstance(camera, Camera)
+        info = camera.info
+        images = take(camera, 10)
+    assert info.source == host.NAME and info.frame_hz == host.FPS
+    assert [image.seq for image in images] == list(range(10))
+    for k, image in enumerate(images):
+        assert image.intrinsics == info.cameras["front"]
+        red, blue = image.rgb[HEIGHT // 2, WIDTH // 4], image.rgb[HEIGHT // 2, 3 * WIDTH // 4]
+        assert np.abs(red.astype(int) - (200, 8 * k, 0)).max() < 16  # the video is lossy
+        assert np.abs(blue.astype(int) - (0, 8 * k, 200)).max() < 16
+        assert image.depth_m is not None and image.depth_m.dtype == np.float32
+        millimetres = host.depth_image(k)
+        millimetres[0, :2] = 0
+        np.testing.assert_allclose(image.depth_m, millimetres / 1000, atol=1e-6)
+        stamp_ns = (start + k * PERIOD) // timedelta(microseconds=1) * 1000
+        assert abs(image.stamp_ns - stamp_ns) < 1_000_000  # DepthAI's clock is the machine's monotonic one
+    intrinsics = info.cameras["front"]
+    # of the calibration, whose images are twenty times as large
+    assert (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy) == pytest.approx((50, 51, 32.5, 23.5))
+    assert (intrinsics.width, intrinsics.height, intrinsics.distortion) == (WIDTH, HEIGHT, ())
+
+
+@pytest.mark.parametrize("kind", ["BGR888i", "RGB888i", "RGB888p", "NV12", "YUV420p"])
+def test_colours_are_the_same_in_every_format(calibration: Path, kind: str) -> None:
+    start = long_ago(1)
+    frame = rgb_message(5, start, getattr(dai.ImgFrame.Type, kind))
+    with host.camera(lambda: host.played(calibration, [frame], None)) as camera:
+        (image,) = take(camera, 1)
+    assert image.depth_m is None
+    assert np.abs(image.rgb.astype(int) - host.rgb_image(5))[:, [0, 10, -10, -1]].max() < 4
+
+
+def test_padded_rows_are_left_out(calibration: Path) -> None:
+    start, stride = long_ago(1), WIDTH + 16
+    packed = rgb_message(5, start).getFrame()
+    padded = np.full((packed.shape[0], stride), 99, np.uint8)
+    padded[:, :WIDTH] = packed
+    frame = dai.ImgFrame()
+    frame.setType(dai.ImgFrame.Type.NV12)
+    frame.setWidth(WIDTH)
+    frame.setHeight(HEIGHT)
+    frame.setStride(stride)
+    frame.fb.p1Offset, frame.fb.p2Offset = 0, stride * HEIGHT
+    frame.setData(padded.ravel())
+    with host.camera(lambda: host.played(calibration, [host.stamped(frame, 5, start)], None)) as camera:
+        (image,) = take(camera, 1)
+    assert np.abs(image.rgb.astype(int) - host.rgb_image(5))[:, [0, 10, -10, -1]].max() < 4
+
+
+def test_a_grey_camera_gives_grey_images(calibration: Path) -> None:
+    frame = dai.ImgFrame()
+    frame.setCvFrame(np.full((HEIGHT, WIDTH), 77, np.uint8), dai.ImgFrame.Type.GRAY8)
+    with host.camera(lambda: host.played(calibration, [host.stamped(frame, 0, long_ago(1))], None)) as camera:
+        (image,) = take(camera, 1)
+    assert image.rgb.shape == (HEIGHT, WIDTH, 3) and (image.rgb == 77).all()
+
+
+def test_intrinsics_that_the_images_carry_count_more_than_the_calibration(calibration: Path) -> None:
+    rgb, depth = messages(3)
+    cropped = dai.ImgTransformation(WIDTH, HEIGHT, [[70.0, 0, 30], [0, 71, 20], [0, 0, 1]])
+    other = dai.ImgTransformation(WIDTH, HEIGHT, [[60.0, 0, 30], [0, 61, 20], [0, 0, 1]])
+    for message in rgb:
+        message.setTransformation(cropped)
+    with host.camera(lambda: host.played(calibration, rgb, depth)) as camera:
+        (image,) = take(camera, 1)
+        assert camera.troubles == ()
+    assert (image.intrinsics.fx, image.intrinsics.cy) == (70, 20)
+    for message in depth:
+        message.setTransformation(other)
+    with host.camera(lambda: host.played(calibration, rgb, depth)) as camera:
+        (trouble,) = camera.troubles
+    assert "not be aligned" in trouble
+
+
+def test_a_lost_message_is_a_gap(calibration: Path) -> None:
+    rgb, depth = messages(9)
+    del depth[2], rgb[5]  # what is left of the pair is left out, too
+    with host.camera(lambda: host.played(calibration, rgb, depth)) as camera:
+        images = take(camera, 7)
+    assert [image.seq for image in images] == [0, 1, 3, 4, 6, 7, 8]
+    for image in images:  # colour and depth are of one moment
+        assert image.depth_m is not None
+        assert round(float(image.depth_m[1, 1]) * 1000) - 1110 == image.seq
+        assert abs(int(image.rgb[0, 0, 1]) - 8 * image.seq) < 4
+
+
+def test_doubles_and_images_out_of_order_are_passed_over(calibration: Path) -> None:
+    start = long_ago(6)
+    order = [0, 1, 1, 3, 2, 4]
+    rgb = [rgb_message(k, start) for k in order]
+    with host.camera(lambda: host.played(calibration, rgb, None)) as camera:
+        images = take(camera, 4)
+    assert [image.seq for image in images] == [0, 1, 3, 4]
+    stamps = [image.stamp_ns for image in images]
+    assert stamps == sorted(set(stamps))
+
+
+def test_a_stamp_of_the_future_does_not_stop_those_after_it(calibration: Path) -> None:
+    rgb, _ = messages(3)
+    late = rgb_message(0, dai.Clock.now() + timedelta(hours=1))
+    with host.camera(lambda: host.played(calibration, [late, *rgb], None)) as camera:
+        images = take(camera, 3)
+    assert [round(int(image.rgb[0, 0, 1]) / 8) for image in images] == [0, 1, 2]
+
+
+def test_a_device_that_goes_away_is_waited_for(calibration: Path) -> None:
+    start = long_ago(60)
+    troubles: list[str] = []
+    turned: list[float] = []
+
+    def absent() -> Sources:
+        troubles.extend(camera.troubles)
+        turned.append(camera.turned_at)
+        raise CameraError("no OAK camera is connected")
+
+    def back() -> Sources:
+        troubles.extend(camera.troubles)
+        turned.append(camera.turned_at)
+        counted_anew = [host.stamped(rgb_message(k, start), k, start + 25 * PERIOD) for k in range(4)]
+        return host.played(calibration, counted_anew, None)
+
+    first = [rgb_message(k, start) for k in range(4)]
+    camera = host.camera(lambda: host.played(calibration, first, None, ends=True), absent, back)
+    with camera:
+        images = take(camera, 8)
+        assert camera.troubles == ()
+        turned.append(camera.turned_at)
+    assert 0 < turned[0] < turned[1] < turned[2], "it comes round while it waits, too"
+    assert [image.seq for image in images] == [0, 1, 2, 3, 25, 26, 27, 28]  # a number for each that was lost
+    assert np.diff([image.stamp_ns for image in images]).min() > 0
+    assert len(troubles) == 2 and "has gone" in troubles[0] and "no OAK camera is connected" in troubles[1]
+    assert all(host.NAME in text and "front" in text for text in troubles)
+
+
+def test_the_same_device_is_looked_for_again(calibration: Path) -> None:
+    rgb, _ = messages(2)
+    asked: list[str] = []
+
+    def connect(config: host.Config, on_state: object) -> Sources:
+        asked.append(config.device)
+        return host.played(calibration, rgb, None, ends=True)
+
+    camera = host.OakCamera(host.CONFIG, "front", connect=connect)
+    with camera:
+        for _ in zip(range(2), camera, strict=False):
+            pass
+        threading.Timer(1.0, camera.stop).start()
+        list(camera)  # all that comes then is older than the last image
+    assert asked[:2] == ["", "1844301000000000"]
+
+
+def test_a_stream_that_stalls_is_opened_again(calibration: Path) -> None:
+    start = long_ago(60)
+    config = host.Config(width=WIDTH, height=HEIGHT, fps=host.FPS, stall_s=1.0, retry_s=0.02)
+    troubles: list[str] = []
+
+    def again() -> Sources:
+        troubles.extend(camera.troubles)
+        return host.played(calibration, [rgb_message(k, start) for k in (40, 41)], None)
+
+    first = [rgb_message(k, start) for k in range(3)]
+    camera = host.camera(lambda: host.played(calibration, first, None), again, config=config)
+    with camera:
+        seqs = [image.seq for image in take(camera, 5)]
+    assert seqs == [0, 1, 2, 40, 41]
+    assert len(troubles) == 1 and "no image for 1 s" in troubles[0]
+
+
+def test_a_device_without_images_is_refused(calibration: Path) -> None:
+    rgb, _ = messages(3)
+    config = host.Config(width=WIDTH, height=HEIGHT, fps=host.FPS, start_s=0.3)
+    camera = host.camera(lambda: host.played(calibration, rgb, []), config=config)
+    with pytest.raises(CameraError, match=r"was opened, but it has given no image with depth for 0\.3 s"), camera:
+        pass
+
+
+def test_stop_ends_the_iteration(calibration: Path) -> None:
+    rgb, _ = messages(3)
+    with host.camera(lambda: host.played(calibration, rgb, None)) as camera:
+        threading.Timer(0.5, camera.stop).start()
+        assert len(list(camera)) == 3
+
+
+def test_info_of_a_closed_camera_says_so() -> None:
+    with pytest.raises(CameraError, match="not open"):
+        _ = host.camera().info
+
+
+def test_another_size_than_asked_for_is_an_error(calibration: Path) -> None:
+    rgb, _ = messages(1)
+    config = host.Config(width=80, height=60, fps=host.FPS)
+    with (
+        host.camera(lambda: host.played(calibration, rgb, None), config=config) as camera,
+        pytest.raises(CameraError, match="64x48, but 80x60 was asked for"),
+    ):
+        take(camera, 1)
+
+
+def test_depth_that_is_no_depth_is_an_error(calibration: Path) -> None:
+    rgb, _ = messages(1)
+    start = rgb[0].getTimestamp()
+    grey = dai.ImgFrame()
+    grey.setCvFrame(np.zeros((HEIGHT, WIDTH), np.uint8), dai.ImgFrame.Type.GRAY8)
+    with (
+        host.camera(lambda: host.played(calibration, rgb, [host.stamped(grey, 0, start)])) as camera,
+        pytest.raises(CameraError, match="16 bits a pixel, got uint8"),
+    ):
+        take(camera, 1)
+
+
+def damaged(k: int, start: timedelta) -> dai.ImgFrame:
+    frame = dai.ImgFrame()
+    frame.setData(np.zeros(10, np.uint8))
+    frame.setWidth(WIDTH)
+    frame.setHeight(HEIGHT)
+    frame.setType(dai.ImgFrame.Type.NV12)
+    return host.stamped(frame, k, start)
+
+
+def test_a_damaged_image_is_passed_over_and_told(calibration: Path) -> None:
+    start = long_ago(4)
+    rgb = [rgb_message(0, start), damaged(1, start), damaged(2, start), rgb_message(3, start)]
+    with host.camera(lambda: host.played(calibration, rgb, None)) as camera:
+        images = iter(camera)
+        assert [next(images).seq, next(images).seq] == [0, 3]
+
+
+def test_images_that_are_all_damaged_are_an_error(calibration: Path) -> None:
+    start = long_ago(MAX_DAMAGED)
+    rgb = [damaged(k, start) for k in range(MAX_DAMAGED)]
+    with (
+        host.camera(lambda: host.played(calibration, rgb, None)) as camera,
+        pytest.raises(CameraError, match=r"cannot be read: .*enough data"),
+    ):
+        take(camera, 1)

@@ -1,0 +1,106 @@
+"""What of the device's part can be had without a device: its names in DepthAI, and calibrations."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import get_args
+
+import depthai as dai
+import numpy as np
+import pytest
+
+from drivers.oak.config import Config, Preset, Socket
+from drivers.oak.device import load_calibration, rgb_to_left
+from drivers.oak.images import read_intrinsics
+from semantic_mapper.errors import CameraError
+from tests.drivers.oak.host import RGB_IN_LEFT_CM
+
+ROOT = Path(__file__).resolve().parents[3]
+
+REPLAY_WITHOUT_A_FILE = """
+import sys
+from pathlib import Path
+from tests.drivers.oak import host
+from semantic_mapper.errors import CameraError
+try:
+    with host.camera(lambda: host.replayed(Path(sys.argv[1]), Path(sys.argv[2]))):
+        pass
+except CameraError as error:
+    print("CameraError:", error)
+"""
+
+ERROR_IN_A_READER = """
+import sys
+from pathlib import Path
+from tests.drivers.oak import host
+camera = host.camera(lambda: host.played(Path(sys.argv[2]), [host.rgb_message(0, host.long_ago(1))], None))
+with camera:
+    for image in camera:
+        raise RuntimeError("of the reader")
+"""
+
+
+def run(program: str, folder: Path, calibration: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", program, str(folder), str(calibration)],
+        cwd=ROOT,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+
+
+def test_every_setting_has_its_name_in_depthai() -> None:
+    for preset in get_args(Preset):
+        assert getattr(dai.node.StereoDepth.PresetMode, preset.upper())
+    for socket in get_args(Socket):
+        assert getattr(dai.CameraBoardSocket, socket) is not None
+
+
+def test_intrinsics_follow_the_size(calibration: Path) -> None:
+    handler = load_calibration(None, str(calibration))
+    half = read_intrinsics(handler, "CAM_A", 640, 480)
+    assert (half.fx, half.fy, half.cx, half.cy) == pytest.approx((500, 510, 325, 235))
+    cropped = read_intrinsics(handler, "CAM_A", 640, 400)
+    assert (cropped.fx, cropped.fy, cropped.cx, cropped.cy) == pytest.approx((500, 510, 325, 195))
+
+
+def test_a_camera_that_the_calibration_does_not_know_is_an_error(calibration: Path) -> None:
+    handler = load_calibration(None, str(calibration))
+    with pytest.raises(CameraError, match="says nothing of the camera at CAM_D"):
+        read_intrinsics(handler, "CAM_D", 640, 480)
+    with pytest.raises(CameraError, match="does not link CAM_A and CAM_D"):
+        rgb_to_left(handler, Config(left="CAM_D"))
+
+
+def test_extrinsics_are_metres_from_colour_to_left(calibration: Path) -> None:
+    handler = load_calibration(None, str(calibration))
+    T_left_rgb = rgb_to_left(handler, Config())
+    np.testing.assert_allclose(T_left_rgb[:3, 3], np.array(RGB_IN_LEFT_CM) / 100, atol=1e-6)
+    np.testing.assert_allclose(rgb_to_left(handler, Config(rgb="CAM_B")), np.eye(4))
+
+
+@pytest.mark.parametrize("text", [None, "no JSON", json.dumps({"cameraData": 3})])
+def test_a_file_that_is_no_calibration_is_an_error(tmp_path: Path, text: str | None) -> None:
+    path = tmp_path / "calibration.json"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(CameraError, match=r"calibration\.json: not a calibration of DepthAI's"):
+        load_calibration(None, str(path))
+
+
+def test_an_exception_in_a_node_of_the_pipeline_is_a_camera_error(tmp_path: Path, calibration: Path) -> None:
+    done = run(REPLAY_WITHOUT_A_FILE, tmp_path, calibration)
+    assert done.returncode == 0, done.stderr
+    assert "CameraError: OAK of the tests was opened, but it has gone" in done.stdout
+
+
+def test_an_exception_of_the_reader_ends_the_process_cleanly(tmp_path: Path, calibration: Path) -> None:
+    done = run(ERROR_IN_A_READER, tmp_path, calibration)
+    assert done.returncode == 1  # no signal: DepthAI's threads have ended
+    assert done.stderr.rstrip().endswith("RuntimeError: of the reader")

@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+import itertools
+from datetime import timedelta
+from pathlib import Path
+
+import depthai as dai
+import msgspec
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drivers.base import CameraImage
+from drivers.oak import odometry
+from drivers.oak.stream import Sources
+from drivers.oak.tracking import GAP_NS, T_BODY_LEFT, PoseTrack, basalt_pose
+from semantic_mapper.errors import CameraError, PoseError
+from semantic_mapper.geometry import invert_pose
+from semantic_mapper.types import Float64
+from tests.drivers.oak import host
+from tests.drivers.oak.host import FPS, HEIGHT, WIDTH, rgb_message
+
+SPEED = np.array((0.4, -0.2, 0.1))  # metres a second
+TURN = np.array((0.1, 0.5, -0.3))  # radians a second
+WAITS = host.Config(width=WIDTH, height=HEIGHT, fps=FPS, retry_s=0.02, queue=64, odometry_wait_s=20.0, odometry=True)
+
+
+def pose(rotation: Float64, position: Float64) -> Float64:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(rotation).as_matrix()
+    T[:3, 3] = position
+    return T
+
+
+T_LEFT_RGB = pose(np.array((0.02, -0.01, 0.03)), np.array((0.0375, 0.005, -0.0025)))
+
+
+def left_pose(seconds: float) -> Float64:
+    return pose(np.array((0.3, 0.0, 0.0)), np.zeros(3)) @ pose(TURN * seconds, SPEED * seconds)
+
+
+def basalt_says(k: int) -> dai.TransformData:
+    """What Basalt sends of pair ``k``: the body's pose, without a stamp."""
+    T_world_body = left_pose(k / FPS) @ invert_pose(T_BODY_LEFT)
+    quaternion = Rotation.from_matrix(T_world_body[:3, :3]).as_quat()
+    return dai.TransformData(*T_world_body[:3, 3].tolist(), *quaternion.tolist())
+
+
+def live(calibration: Path, count: int, *, ends: bool = False, start: timedelta | None = None) -> Sources:
+    """Colour images as a camera gives them: each when it has been captured."""
+    start = start or dai.Clock.now()
+    rgb = [rgb_message(k, start) for k in range(count)]
+    return host.played(calibration, rgb, None, period_s=1 / FPS, ends=ends)
+
+
+def with_pose(images: list[CameraImage]) -> list[CameraImage]:
+    return [image for image in images if image.own_pose is not None]
+
+
+def test_images_carry_the_pose_of_their_moment(calibration: Path) -> None:
+    start = dai.Clock.now()
+    sources = host.tracked(live(calibration, 60, start=start), basalt_says, T_LEFT_RGB, start=start)
+    camera = host.camera(lambda: sources, config=WAITS)
+    with camera:
+        images = list(itertools.islice(camera, 50))
+        assert camera.troubles == ()
+    assert all(image.tracks_itself for image in images)
+    posed = with_pose(images)
+    assert len(posed) > 10  # but those from before the first pose
+    start_ns = start // timedelta(microseconds=1) * 1000
+    for image in posed:
+        assert image.own_pose is not None and image.own_pose.source == "vio"
+        # pairs are slower than images, so this lies between two poses
+        expected = left_pose((image.stamp_ns - start_ns) / 1e9) @ T_LEFT_RGB
+        np.testing.assert_allclose(image.own_pose.T_world_camera, expected, atol=1e-4)
+
+
+def test_images_do_not_wait_for_ever(calibration: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(odometry, "ANSWER_S", 0.2)
+    config = host.Config(width=WIDTH, height=HEIGHT, fps=FPS, odometry=True, odometry_wait_s=0.1)
+    camera = host.camera(
+        lambda: host.tracked(live(calibration, 60), basalt_says, T_LEFT_RGB, slowness_s=3.0), config=config
+    )
+    with camera:
+        images = list(itertools.islice(camera, 40))
+        assert any("odometry has not answered for 0.2 s" in trouble for trouble in camera.troubles)
+    assert not with_pose(images)
+
+
+def test_after_a_reconnection_poses_are_withheld(calibration: Path) -> None:
+    def connect(count: int, ends: bool) -> Sources:
+        return host.tracked(live(calibration, count, ends=ends), basalt_says, T_LEFT_RGB)
+
+    camera = host.camera(lambda: connect(30, True), lambda: connect(60, False), config=WAITS)
+    before: list[CameraImage] = []
+    with camera:
+        for image in camera:
+            if any("began anew" in trouble for trouble in camera.troubles):
+                break
+            before.append(image)
+        after = [image, *itertools.islice(camera, 20)]
+    assert with_pose(before) and not with_pose(after)
+    assert after[0].seq > before[-1].seq + 1
+
+
+def test_a_reconnection_ends_the_camera_where_that_is_asked_for(calibration: Path) -> None:
+    def connect(count: int, ends: bool) -> Sources:
+        return host.tracked(live(calibration, count, ends=ends), basalt_says, T_LEFT_RGB)
+
+    config = msgspec.structs.replace(WAITS, other_world="end")
+    camera = host.camera(lambda: connect(30, True), lambda: connect(60, False), config=config)
+    with camera, pytest.raises(CameraError, match="was away, and its odometry began anew"):
+        list(itertools.islice(camera, 80))
+
+
+def test_a_lost_track_is_told(calibration: Path) -> None:
+    lost = dai.TransformData(float("nan"), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    config = host.Config(width=WIDTH, height=HEIGHT, fps=FPS, odometry=True, odometry_wait_s=0.1)
+    camera = host.camera(lambda: host.tracked(live(calibration, 30), lambda _: lost, T_LEFT_RGB), config=config)
+    with camera:
+        assert not with_pose(list(itertools.islice(camera, 20)))
+        assert any("lost track" in trouble for trouble in camera.troubles)
+
+
+def test_an_exception_while_tracking_ends_the_images_with_an_error(calibration: Path) -> None:
+    camera = host.camera(lambda: host.tracked(live(calibration, 60), lambda _: dai.Buffer(), T_LEFT_RGB), config=WAITS)
+    with camera, pytest.raises(CameraError, match=r"odometry has ended: .*getTranslation"):
+        list(itertools.islice(camera, 50))
+
+
+def test_extrinsics_that_are_no_pose_are_refused(calibration: Path) -> None:
+    camera = host.camera(lambda: host.tracked(live(calibration, 3), basalt_says, np.diag((2.0, 1, 1, 1))), config=WAITS)
+    with pytest.raises(CameraError, match="extrinsics of the OAK's colour camera: the pose is not a rotation"), camera:
+        pass
+
+
+def test_the_body_looks_along_x_and_the_camera_along_z() -> None:
+    T_world_left = basalt_pose((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))
+    np.testing.assert_allclose(T_world_left[:3, 2], (1, 0, 0))  # forward is x of the world
+    np.testing.assert_allclose(T_world_left[:3, 0], (0, -1, 0))  # right of the image is -y
+    np.testing.assert_allclose(T_world_left[:3, 1], (0, 0, -1))  # down is -z
+    np.testing.assert_allclose(T_world_left[:3, 3], (1, 2, 3))
+
+
+@pytest.mark.parametrize("quaternion", [(0.0, 0.0, 0.0, 0.0), (float("inf"), 0.0, 0.0, 1.0)])
+def test_no_rotation_is_no_pose(quaternion: tuple[float, float, float, float]) -> None:
+    with pytest.raises(PoseError, match="gave no pose"):
+        basalt_pose((0.0, 0.0, 0.0), quaternion)
+
+
+def test_nothing_is_interpolated_across_a_gap_or_beyond_the_ends() -> None:
+    track = PoseTrack(np.eye(4))
+    assert not track.reaches(0) and track.at(0) is None
+    for stamp_ns in (1_000, 1_000 + GAP_NS, 1_001 + 2 * GAP_NS):
+        track.add(stamp_ns, np.eye(4))
+    track.add(5, np.eye(4))  # late: passed over
+    assert track.reaches(1_001 + 2 * GAP_NS) and not track.reaches(1_002 + 2 * GAP_NS)
+    known = [stamp_ns for stamp_ns in (999, 1_000, 2_000, 1_000 + GAP_NS, 2_000 + GAP_NS) if track.at(stamp_ns)]
+    assert known == [1_000, 2_000, 1_000 + GAP_NS]

@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.poses.motion import PoseTrack, StampedPose, along, turn_between
+from semantic_mapper.types import Float64
+
+from .images import MS, rigid
+
+RATE = np.array((0.3, -0.8, 0.5))  # radians a second
+SPEED = np.array((0.4, 0.1, -0.2))  # metres a second
+
+
+def truth(stamp_ns: int) -> Float64:
+    """Steady turning and a straight way: what slerp and a line give exactly."""
+    t = stamp_ns / 1e9
+    return rigid(RATE * t, SPEED * t)
+
+
+def track(stamps_ms: list[int], **limits: int) -> PoseTrack:
+    made = PoseTrack(
+        limits.get("keep", 100), limits.get("gap_ms", 200) * MS, max_ahead_ns=limits.get("ahead_ms", 50) * MS
+    )
+    for ms in stamps_ms:
+        assert made.add(StampedPose(ms * MS, truth(ms * MS), 0.01))
+    return made
+
+
+@given(st.integers(1000, 3000))
+def test_between_samples_the_pose_is_that_of_steady_motion(ms: int) -> None:
+    found = track(list(range(1000, 3001, 100))).at(ms * MS)
+    assert isinstance(found, StampedPose) and found.stamp_ns == ms * MS
+    assert np.allclose(found.T, truth(ms * MS), atol=1e-9)
+    assert found.sigma == pytest.approx(0.01)
+
+
+@given(st.integers(1, 50))
+def test_the_motion_goes_on_for_a_bounded_while(ahead_ms: int) -> None:
+    found = track([0, 100, 200]).at((200 + ahead_ms) * MS)
+    assert isinstance(found, StampedPose)
+    assert np.allclose(found.T, truth((200 + ahead_ms) * MS), atol=1e-9)
+    assert found.sigma > 0.01  # a guess is less sure
+
+
+def test_curved_motion_is_followed_to_second_order() -> None:
+    def circle(t: float) -> Float64:
+        return rigid((0, 0, t), (np.cos(t), np.sin(t), 0))
+
+    errors = []
+    for step in (0.2, 0.1):
+        made = PoseTrack(10, 10**10, 0)
+        made.add(StampedPose(0, circle(0)))
+        made.add(StampedPose(round(step * 1e9), circle(step)))
+        found = made.at(round(step * 5e8))
+        assert isinstance(found, StampedPose)
+        errors.append(np.linalg.norm(found.T[:3, 3] - circle(step / 2)[:3, 3]))
+    assert errors[0] == pytest.approx(0.2**2 / 8, rel=0.01)  # the chord's distance from the arc
+    assert errors[1] == pytest.approx(errors[0] / 4, rel=0.01)
+
+
+def test_where_there_is_no_pose_the_track_says_why() -> None:
+    made = track([1000, 1100, 1600, 1700])
+    assert PoseTrack(3, 1, 1).at(5) == "empty"
+    assert made.at(999 * MS) == "before"
+    assert made.at(1300 * MS) == "gap"
+    assert made.at(1751 * MS) == "stale"
+    assert isinstance(made.at(1600 * MS), StampedPose)
+    assert track([1000]).at(1001 * MS) == "stale"  # one pose tells no motion
+    assert track([1000, 1500]).at(1501 * MS) == "stale"  # nor do two that are far apart
+
+
+def test_late_and_doubled_samples_are_left_out_and_old_ones_forgotten() -> None:
+    made = track([100, 200, 300], keep=2)
+    assert not made.add(StampedPose(300 * MS, np.eye(4)))
+    assert not made.add(StampedPose(250 * MS, np.eye(4)))
+    assert made.at(150 * MS) == "before" and made.newest_ns == 300 * MS
+    made.clear()
+    assert made.newest_ns is None
+
+
+def test_a_motion_goes_on_beyond_its_ends() -> None:
+    a, b = truth(0), truth(10**9)
+    assert np.allclose(along(a, b, 1.7), truth(1_700_000_000)) and np.allclose(along(a, b, -0.5), truth(-500_000_000))
+    assert np.allclose(turn_between(a, b), RATE)

@@ -1,0 +1,204 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from drivers.base import CameraImage, PoseEstimate
+from drivers.poses.alignment import Aligner, Target, fit
+from drivers.poses.config import OdometryPoses
+from drivers.poses.depth_view import make_levels, thin_depth, thinned
+from drivers.poses.features import find_features, pose_from_features
+from drivers.poses.keyframe_map import KeyframeMap, OdometryKeyframe
+from drivers.poses.motion import turn_between
+from drivers.poses.odometry import OdometryPoseSource
+from semantic_mapper.errors import CameraError
+from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
+from semantic_mapper.geometry import invert_pose, unproject
+from semantic_mapper.scenes import TRAIN_SEEDS, CameraPathConfig, NoiseConfig, room_frames
+from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
+
+from . import images
+from .images import as_image, rigid
+
+INTRINSICS = CameraIntrinsics(132.0, 132.0, 79.5, 59.5, 160, 120)
+CONFIG = OdometryPoses(width=160, features=400, depth_max_m=6.0)
+PATH = CameraPathConfig(step_m=0.04)
+
+
+@cache
+def walk(noise: bool = False) -> tuple[PosedFrame, ...]:
+    """Forty frames of 160x120 through a furnished room."""
+    sensor = NoiseConfig(depth="d435") if noise else None
+    return tuple(room_frames(TRAIN_SEEDS[7], 40, INTRINSICS, path=PATH, noise=sensor))
+
+
+def follow(frames: list[CameraImage], source: OdometryPoseSource) -> list[PoseEstimate | None]:
+    with source:
+        return [source.pose(frame) for frame in frames]
+
+
+def poses_of(estimates: list[PoseEstimate | None]) -> Float64:
+    assert all(e is not None for e in estimates)
+    return np.array([e.T_world_camera for e in estimates if e is not None])
+
+
+def truth() -> Float64:
+    return np.array([f.T_world_camera for f in walk()])
+
+
+def started(config: OdometryPoses = CONFIG) -> OdometryPoseSource:
+    rows = tuple(tuple(float(v) for v in row) for row in walk()[0].T_world_camera)
+    return OdometryPoseSource(
+        OdometryPoses(**{**{n: getattr(config, n) for n in config.__struct_fields__}, "T_world_start": rows})
+    )
+
+
+def test_a_camera_is_followed_through_a_room() -> None:
+    source = started()
+    estimates = follow([as_image(f) for f in walk()], source)
+    found = poses_of(estimates)
+    way = np.linalg.norm(np.diff(truth()[:, :3, 3], axis=0), axis=1).sum()
+    assert way > 1.0
+    assert absolute_trajectory_error(found, truth()).rmse_m < 0.01 * way
+    assert relative_pose_error(found, truth()).rmse_deg < 0.3
+    assert np.array_equal(found[0], truth()[0])
+    assert source.counters["tracked"] == 40 and source.counters["keyframes"] > 2 and source.troubles == ()
+    assert {e.source for e in estimates if e is not None} == {"odometry"}
+
+
+def test_noisy_depth_is_followed_too_and_the_uncertainty_grows_with_the_way() -> None:
+    source = started()
+    estimates = follow([as_image(f) for f in walk(noise=True)], source)
+    found = poses_of(estimates)
+    assert absolute_trajectory_error(found, truth()).rmse_m < 0.05
+    off = np.linalg.norm(found[:, :3, 3] - truth()[:, :3, 3], axis=1)
+    sigma = np.array([e.sigma for e in estimates if e is not None])
+    assert sigma[0] == 0 and sigma[-1] > sigma[1] > 0
+    assert np.mean(off[1:] < 3 * sigma[1:]) > 0.8
+
+
+def test_a_blacked_out_stretch_is_lost_and_the_camera_found_again() -> None:
+    frames = [as_image(f) for f in walk()]
+    back = [replace(f, stamp_ns=f.stamp_ns + 10**10) for f in frames[:15]]  # a long time later, at the beginning again
+    dark = [
+        replace(f, rgb=np.zeros_like(f.rgb), depth_m=np.zeros_like(f.depth_m), stamp_ns=f.stamp_ns + 10**9)
+        for f in frames[20:26]
+    ]
+    source = started()
+    with source:
+        assert all(source.pose(f) is not None for f in frames[:20])
+        for f in dark:
+            assert source.pose(f) is None
+            assert "show the camera a place" in source.troubles[0]
+        assert source.counters["lost"] == 6 and source.counters["relocalised"] == 0
+        found = poses_of([source.pose(f) for f in back])
+    assert source.counters["relocalised"] == 1 and source.troubles == ()
+    assert np.linalg.norm(found[:, :3, 3] - truth()[:15, :3, 3], axis=1).max() < 0.02
+
+
+def test_a_place_that_was_never_seen_is_not_taken_for_one_that_was() -> None:
+    """Lost in one room, the camera wakes up in another."""
+    elsewhere = [as_image(f) for f in room_frames(TRAIN_SEEDS[23], 8, INTRINSICS, path=PATH)]
+    source = started()
+    with source:
+        for f in walk()[:15]:
+            source.pose(as_image(f))
+        assert [source.pose(replace(f, stamp_ns=f.stamp_ns + 10**10)) for f in elsewhere] == [None] * 8
+    assert source.counters["lost"] == 8
+
+
+def test_a_single_dark_image_costs_itself_only() -> None:
+    frames = [as_image(f) for f in walk()[:12]]
+    frames[6] = replace(frames[6], depth_m=None)
+    found = follow(frames, started())
+    assert [e is None for e in found] == [i == 6 for i in range(12)]
+
+
+def test_a_camera_without_depth_is_refused_with_the_ways_out() -> None:
+    with pytest.raises(CameraError, match=r"has no depth.*scale.*kind = \"topic\".*kind = \"device\""):
+        OdometryPoseSource(CONFIG).pose(images.image(5, depth=False))
+
+
+def test_another_camera_or_size_in_between_is_refused() -> None:
+    source = OdometryPoseSource(CONFIG)
+    first = as_image(walk()[0])
+    source.pose(first)
+    with pytest.raises(CameraError, match="a pose source of its own"):
+        source.pose(replace(first, camera_id="other"))
+
+
+def test_points_and_rays_of_thinned_images_are_those_of_the_whole() -> None:
+    frame = walk()[0]
+    assert frame.depth_m is not None
+    whole = unproject(frame.depth_m, INTRINSICS)
+    for stride in (2, 3):
+        small = thinned(INTRINSICS, stride, stride // 2)
+        depth = thin_depth(frame.depth_m, stride, 100.0)
+        assert depth.shape == (small.height, small.width)
+        assert np.allclose(unproject(depth, small), whole[stride // 2 :: stride, stride // 2 :: stride], atol=1e-5)
+
+
+def test_normals_are_those_of_the_surface() -> None:
+    """A plane, aslant."""
+    normal = np.array((0.3, -0.4, -1.0)) / np.linalg.norm((0.3, -0.4, -1.0))
+    rays = unproject(np.ones((120, 160), np.float32), INTRINSICS)
+    depth = (-2.0 / (rays @ normal)).astype(np.float32)
+    for level in make_levels(depth, INTRINSICS, 2):
+        known = np.isfinite(level.normals[..., 0])
+        assert known.mean() > 0.8
+        assert np.abs(level.normals[known] @ normal).min() > 0.999
+
+
+def test_alignment_finds_the_way_between_two_views() -> None:
+    a, b = walk()[0], walk()[2]
+    levels = []
+    for f in (a, b):
+        assert f.depth_m is not None
+        levels.append(make_levels(thin_depth(f.depth_m, 1, 6.0), INTRINSICS, 3))
+    target = Target(levels[0], a.T_world_camera)
+    guess = b.T_world_camera @ rigid((0.01, -0.015, 0.01), (0.02, -0.01, 0.02))
+    found = Aligner(CONFIG).align(levels[1], [target], guess)
+    assert found is not None
+    assert np.linalg.norm(found[:3, 3] - b.T_world_camera[:3, 3]) < 0.005
+    assert np.allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-12)
+    before, after = (fit(levels[1], target, T, 0.07) for T in (guess, found))
+    assert after.rmse_m < 0.5 * before.rmse_m and after.fitness > 0.9 and after.overlap > 0.6
+
+
+def test_a_bare_wall_holds_nothing() -> None:
+    wall = make_levels(np.full((120, 160), 2.0, np.float32), INTRINSICS, 3)
+    found = fit(wall, Target(wall, np.eye(4)), np.eye(4), 0.07)
+    eigenvalues = np.linalg.eigvalsh(found.normal_matrix)
+    assert (eigenvalues[:3] < 1e-3 * eigenvalues[3]).all()  # along it, and turning on it
+
+
+def test_corners_tell_the_way_between_two_views() -> None:
+    a, b = walk()[0], walk()[3]
+    found_of = []
+    for f in (a, b):
+        assert f.depth_m is not None
+        found_of.append(find_features(f.rgb, f.depth_m, 400))
+    found = pose_from_features(found_of[1], found_of[0], INTRINSICS, 15)
+    assert found is not None and found[1] >= 15
+    truth_of = invert_pose(a.T_world_camera) @ b.T_world_camera
+    assert np.linalg.norm(found[0][:3, 3] - truth_of[:3, 3]) < 0.04
+    assert np.rad2deg(np.linalg.norm(turn_between(found[0], truth_of))) < 2
+    blank = find_features(np.full((120, 160, 3), 50, np.uint8), np.ones((120, 160), np.float32), 400)
+    assert pose_from_features(blank, found_of[0], INTRINSICS, 15) is None
+    assert pose_from_features(found_of[0], blank, INTRINSICS, 15) is None
+
+
+def test_the_most_crowded_keyframe_goes_and_old_ones_are_preferred() -> None:
+    features = find_features(np.full((120, 160, 3), 50, np.uint8), np.ones((120, 160), np.float32), 10)
+    made = KeyframeMap(capacity=4)
+    for x in (0.0, 0.3, 0.35, 1.5, 1.8):
+        made.add(OdometryKeyframe(Target((), rigid(shift=(x, 0, 0))), features, x))
+    assert [k.way_m for k in made.frames] == [0.0, 0.3, 1.5, 1.8]  # 0.35 was next to 0.3, and younger
+    assert [k.way_m for k in made.near(rigid(shift=(0.25, 0, 0)), 3)] == [0.3, 0.0]
+    assert [k.way_m for k in made.near(rigid(shift=(1.7, 0, 0)), 2)] == [1.8, 1.5]
+    assert [k.way_m for k in made.near(rigid(shift=(9, 0, 0)), 3)] == [1.8]
+    way, turn = made.distances(rigid((0, 0.2, 0), (0, 1.0, 0)))
+    assert way[0] == pytest.approx(1.0) and turn[0] == pytest.approx(0.2)

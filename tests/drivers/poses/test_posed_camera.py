@@ -1,0 +1,215 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import pytest
+
+from drivers.base import Camera, CameraImage, FrameSource, PoseEstimate, PoseSource
+from drivers.poses.config import DevicePoses, FixedPose, PoseChecks
+from drivers.poses.posed_camera import PosedCamera
+from drivers.poses.still import DevicePoseSource, FixedPoseSource
+from semantic_mapper.errors import CameraError
+from semantic_mapper.types import Float64
+
+from .images import MS, ListCamera, image, rigid
+
+
+class Told:
+    """A pose source that says what a function says."""
+
+    def __init__(self, pose_of: Callable[[CameraImage], Float64 | None], sigma: float = 0.0) -> None:
+        self.pose_of = pose_of
+        self.sigma = sigma
+        self.is_open = False
+
+    def __enter__(self) -> Self:
+        self.is_open = True
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.is_open = False
+
+    def pose(self, image: CameraImage) -> PoseEstimate | None:
+        T = self.pose_of(image)
+        return None if T is None else PoseEstimate(T, "told", self.sigma)
+
+
+def images(count: int, step_ms: int = 100) -> list[CameraImage]:
+    return [image((i + 1) * step_ms * MS, seq=i) for i in range(count)]
+
+
+def run(camera: PosedCamera) -> list[int]:
+    with camera:
+        return [frame.seq for frame in camera]
+
+
+def test_frames_carry_the_image_and_the_pose_with_its_source_and_uncertainty() -> None:
+    device = [image(7, seq=3, own=rigid((0, 0.1, 0), (1, 2, 3)))]
+    camera = PosedCamera(ListCamera(device), DevicePoseSource(DevicePoses()))
+    assert isinstance(camera, FrameSource) and isinstance(ListCamera([]), Camera)
+    with camera:
+        (frame,) = camera
+    assert (frame.stamp_ns, frame.seq, frame.camera_id, frame.pose_source, frame.pose_sigma) == (
+        7,
+        3,
+        "cam",
+        "vio",
+        0.01,
+    )
+    assert np.array_equal(frame.T_world_camera, rigid((0, 0.1, 0), (1, 2, 3))) and frame.label is None
+    assert frame.rgb is device[0].rgb and frame.depth_m is device[0].depth_m
+    assert camera.info.source == "list" and camera.counters["frames"] == 1
+
+
+def test_an_image_without_a_pose_is_left_out_and_counted() -> None:
+    camera = PosedCamera(ListCamera(images(5)), Told(lambda i: None if i.seq in (1, 3) else np.eye(4)))
+    assert run(camera) == [0, 2, 4]
+    assert camera.counters == {"frames": 3, "no_pose": 2, "stale": 0, "not_rotation": 0, "jumping": 0}
+
+
+@pytest.mark.parametrize("what", ["nan", "mirror", "scale", "row", "shape", "sigma"])
+def test_what_is_no_pose_is_left_out_and_counted(what: str) -> None:
+    bad = {
+        "nan": np.full((4, 4), np.nan),
+        "mirror": np.diag((1.0, 1.0, -1.0, 1.0)),
+        "scale": np.diag((1.1, 1.1, 1.1, 1.0)),
+        "row": np.eye(4) + np.eye(4)[[3, 0, 1, 2]] * 0 + np.outer((0, 0, 0, 1), (1, 0, 0, 0)),
+        "shape": np.eye(3),
+        "sigma": np.eye(4),
+    }[what]
+    source = Told(lambda i: bad if i.seq == 1 else np.eye(4))
+    camera = PosedCamera(ListCamera(images(3)), source)
+    if what == "sigma":
+        source.sigma = np.nan
+        assert run(camera) == [] and camera.counters["not_rotation"] == 3
+        return
+    assert run(camera) == [0, 2]
+    assert camera.counters["not_rotation"] == 1
+
+
+def test_images_that_are_not_later_are_left_out_camera_by_camera() -> None:
+    stream = [image(1, 0), image(1, 1), image(3, 2), image(2, 3), image(2, 4, camera_id="other"), image(4, 5)]
+    camera = PosedCamera(ListCamera(stream), FixedPoseSource(FixedPose()))
+    assert run(camera) == [0, 2, 4, 5]
+    assert camera.counters["stale"] == 2
+
+
+def test_a_jump_is_refused_and_the_frames_after_it_are_fine() -> None:
+    def pose_of(i: CameraImage) -> Float64:
+        return rigid(shift=(0.1 * i.seq + (5.0 if i.seq == 4 else 0.0), 0, 0))
+
+    camera = PosedCamera(ListCamera(images(8)), Told(pose_of))
+    with camera:
+        seqs = []
+        for frame in camera:
+            seqs.append(frame.seq)
+            if frame.seq == 3:
+                iterator_trouble = camera.troubles
+    assert seqs == [0, 1, 2, 3, 5, 6, 7] and camera.counters["jumping"] == 1
+    assert iterator_trouble == camera.troubles == ("the lens cap is on",)  # over with the next good pose
+
+
+def test_limits_follow_the_time_between_images() -> None:
+    checks = PoseChecks(max_speed_m_s=1.0, slack_m=0.0, max_turn_deg_s=90.0, slack_deg=0.0, settle=0)
+
+    def jumps(step_ms: int, shift_m: float, turn_deg: float) -> int:
+        told = Told(lambda i: rigid((0, np.deg2rad(turn_deg) * i.seq, 0), (shift_m * i.seq, 0, 0)))
+        camera = PosedCamera(ListCamera(images(2, step_ms)), told, checks)
+        run(camera)
+        return camera.counters["jumping"]
+
+    assert jumps(100, 0.099, 0) == 0 and jumps(100, 0.101, 0) == 1
+    assert jumps(500, 0.49, 0) == 0 and jumps(500, 0.51, 0) == 1
+    assert jumps(100, 0, 8.9) == 0 and jumps(100, 0, 9.1) == 1
+
+
+def test_after_a_jump_poses_that_agree_are_believed() -> None:
+    """Odometry that has found its place again, or closed a loop."""
+    told = Told(lambda i: rigid(shift=(0.01 * i.seq + (20.0 if i.seq >= 3 else 0.0), 0, 0)))
+    camera = PosedCamera(ListCamera(images(12)), told, PoseChecks(settle=4))
+    assert run(camera) == [0, 1, 2, 7, 8, 9, 10, 11]
+    never = PosedCamera(ListCamera(images(12)), told, PoseChecks(settle=0))
+    assert run(never) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("far", [rigid(shift=(6.0, 0, 0)), rigid((0, 0, np.pi / 2))])
+def test_a_source_that_begins_in_another_world_is_refused_until_it_comes_back(far: Float64) -> None:
+    told = Told(lambda i: (far if 3 <= i.seq < 600 else np.eye(4)) @ rigid(shift=(0.001 * i.seq, 0, 0)))
+    camera = PosedCamera(ListCamera(images(610)), told)  # for a minute
+    assert run(camera) == [0, 1, 2, *range(600, 610)] and camera.counters["jumping"] == 597
+
+
+def test_one_that_was_a_little_too_quick_passes_when_it_is_within_reach() -> None:
+    told = Told(lambda i: rigid(shift=(0.4 * min(i.seq, 5), 0, 0)))  # 4 m/s; 3 are believed
+    camera = PosedCamera(ListCamera(images(20)), told, PoseChecks(slack_m=0.0))
+    assert run(camera) == [0, *range(7, 20)]
+
+
+def test_poses_that_keep_jumping_are_never_believed() -> None:
+    told = Told(lambda i: rigid(shift=(0 if i.seq < 2 else 5.0 * i.seq, 0, 0)))
+    camera = PosedCamera(ListCamera(images(20)), told, PoseChecks(settle=3))
+    assert run(camera) == [0, 1] and camera.counters["jumping"] == 18
+
+
+def test_camera_and_poses_are_opened_stopped_and_freed_together() -> None:
+    device, told = ListCamera(images(1)), Told(lambda i: np.eye(4))
+    camera = PosedCamera(device, told)
+    with camera:
+        assert device.is_open and told.is_open
+        camera.stop()
+        assert device.stopped
+    assert not device.is_open and not told.is_open
+    assert isinstance(told, PoseSource)
+
+
+def test_poses_are_freed_where_the_camera_does_not_open() -> None:
+    class Missing(ListCamera):
+        def __enter__(self) -> Self:
+            raise CameraError("gone")
+
+    told = Told(lambda i: np.eye(4))
+    with pytest.raises(CameraError, match="gone"), PosedCamera(Missing([]), told):
+        pass
+    assert not told.is_open
+
+
+def test_the_troubles_and_counters_of_the_pose_source_are_told_too() -> None:
+    camera = PosedCamera(ListCamera([image(1)]), DevicePoseSource(DevicePoses()))
+    assert run(camera) == []
+    assert camera.troubles[0] == "the lens cap is on" and "does not know where it is" in camera.troubles[1]
+
+
+def test_a_camera_that_never_tells_its_pose_is_refused_with_the_ways_out() -> None:
+    camera = PosedCamera(ListCamera(images(40)), DevicePoseSource(DevicePoses(patience_s=2.0)))
+    with pytest.raises(CameraError, match=r"no pose of its own for 2\.1 s.*kind = \"topic\".*kind = \"board\""):
+        run(camera)
+
+
+def test_a_device_that_was_tracked_may_be_lost_for_as_long_as_it_takes() -> None:
+    stream = [image(1 * MS, 0, own=np.eye(4)), *images(40)[1:]]
+    camera = PosedCamera(ListCamera(stream), DevicePoseSource(DevicePoses(patience_s=1.0)))
+    assert run(camera) == [0] and camera.counters["no_pose"] == 39
+
+
+def test_a_device_that_tracks_itself_may_take_as_long_for_its_first_pose_as_it_needs() -> None:
+    quiet = [replace(unposed, tracks_itself=True) for unposed in images(40)]
+    stream = [*quiet, image(5000 * MS, 40, own=np.eye(4))]
+    camera = PosedCamera(ListCamera(stream), DevicePoseSource(DevicePoses(patience_s=1.0)))
+    assert run(camera) == [40] and camera.counters["no_pose"] == 40
+    waits = PosedCamera(ListCamera(quiet), DevicePoseSource(DevicePoses(patience_s=1.0)))
+    assert run(waits) == [] and "does not know where it is" in waits.troubles[1]
+
+
+def test_a_fixed_camera_is_where_it_is_said_to_be() -> None:
+    rows = tuple(tuple(row) for row in rigid((0, 1, 0), (3, 2, 1)).tolist())
+    camera = PosedCamera(ListCamera(images(2)), FixedPoseSource(FixedPose(T_world_camera=rows, sigma=0.3)))
+    with camera:
+        frames = list(camera)
+    assert [f.pose_source for f in frames] == ["fixed", "fixed"] and frames[1].pose_sigma == 0.3
+    assert np.allclose(frames[1].T_world_camera, rigid((0, 1, 0), (3, 2, 1)))

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+import tomllib
+from typing import Any
+
+import pytest
+
+from drivers.base import PoseSource
+from drivers.poses.board import BoardPoseSource
+from drivers.poses.config import IDENTITY, KINDS
+from drivers.poses.odometry import OdometryPoseSource
+from drivers.poses.posed_camera import TellingPoseSource
+from drivers.poses.sources import open_poses, read_pose_config
+from drivers.poses.still import DevicePoseSource, FixedPoseSource
+from drivers.poses.topic import TopicPoseSource
+from semantic_mapper.errors import ConfigError
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        ('kind = "device"', DevicePoseSource),
+        ('kind = "fixed"\nT_world_camera = [[1,0,0,2],[0,1,0,0],[0,0,1,0],[0,0,0,1]]\nsigma = 0.1', FixedPoseSource),
+        ('kind = "topic"\nendpoint = "ipc:///tmp/robot"\n[cameras]\n', TopicPoseSource),
+        ('kind = "board"\ncolumns = 5', BoardPoseSource),
+        ('kind = "rgbd"\nwidth = 160', OdometryPoseSource),
+    ],
+)
+def test_a_section_of_a_launch_file_becomes_a_pose_source(text: str, kind: type) -> None:
+    source = open_poses(tomllib.loads(text))
+    assert isinstance(source, kind)
+    assert isinstance(source, PoseSource) and isinstance(source, TellingPoseSource)
+    assert source.troubles == () and not source.counters
+
+
+def test_every_kind_has_its_name() -> None:
+    assert set(KINDS) == {"device", "fixed", "topic", "board", "rgbd"}
+    for name, kind in KINDS.items():
+        assert name in str(kind.__annotations__["kind"])
+
+
+@pytest.mark.parametrize(
+    ("config", "reason"),
+    [
+        ({}, "kind must be one of device, fixed, topic, board, rgbd, got None"),
+        ({"kind": "bord"}, "did you mean 'board'"),
+        ({"kind": "topic"}, "endpoint"),
+        ({"kind": "board", "column": 3}, "did you mean `columns`"),
+        ({"kind": "board", "square_m": 0.02}, "must be smaller than square_m"),
+        ({"kind": "board", "rows": 1}, "at least 2 columns"),
+        ({"kind": "board", "pattern": "tags", "columns": 1, "rows": 1}, "min_corners = 6: the board has 4"),
+        ({"kind": "fixed", "T_world_camera": [[1, 0], [0, 1]]}, "T_world_camera"),
+        ({"kind": "rgbd", "min_fitness": 1.5}, "min_fitness"),
+    ],
+)
+def test_what_is_wrong_is_named(config: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
+        read_pose_config(config, "launch.toml: poses")
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [("fixed", "T_world_camera"), ("topic", "T_base_camera"), ("board", "T_world_board"), ("rgbd", "T_world_start")],
+)
+def test_matrices_must_be_rigid(kind: str, name: str) -> None:
+    for value in (2.0, math.nan):
+        rows = [list(row) for row in IDENTITY]
+        rows[0][0] = value
+        with pytest.raises(ConfigError, match=f"poses: {name}"):
+            read_pose_config(
+                {"kind": kind, "endpoint": "ipc:///tmp/x", name: rows}
+                if kind == "topic"
+                else {"kind": kind, name: rows}
+            )
+    scaled = [[0.5, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 0.5, 0], [0, 0, 0, 1]]
+    with pytest.raises(ConfigError, match=r"cameras\.left"):
+        read_pose_config({"kind": "topic", "endpoint": "ipc:///tmp/x", "cameras": {"left": scaled}})
+
+
+def test_open3d_is_loaded_by_odometry_alone() -> None:
+    program = (
+        "import sys\n"
+        "from drivers.poses.sources import open_poses\n"
+        "open_poses({'kind': 'fixed'}), open_poses({'kind': 'board'}), open_poses({'kind': 'device'})\n"
+        "print('open3d' in sys.modules)\n"
+        "open_poses({'kind': 'rgbd'})\n"
+        "print('open3d' in sys.modules)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.stdout.split()[0] == "False" and done.stdout.split()[-1] == "True", done.stderr

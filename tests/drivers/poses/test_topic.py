@@ -1,0 +1,257 @@
+from __future__ import annotations
+
+import json
+import math
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zmq
+
+from drivers.poses import topic
+from drivers.poses.config import TopicPoses
+from drivers.poses.topic import TopicPoseSource
+from semantic_mapper.errors import CameraError
+from semantic_mapper.geometry import invert_pose
+from semantic_mapper.transport.pose_message import PoseMessage, encode_pose
+from semantic_mapper.transport.security import allow, forget, make_keys, secure_server
+
+from .images import MS, image, rigid
+
+WAIT_S = 20.0
+
+
+class Robot:
+    """A publisher of poses: along x at 1 m/s, turning about z at 1 rad/s."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.socket = zmq.Context.instance().socket(zmq.XPUB)
+        self.socket.setsockopt(zmq.LINGER, 0)
+        self.socket.bind(endpoint)
+
+    def wait(self) -> None:
+        """Until somebody has subscribed; others may have left before."""
+        while True:
+            assert self.socket.poll(int(WAIT_S * 1e3)), "nobody subscribed"
+            if self.socket.recv()[:1] == b"\x01":
+                return
+
+    def tell(self, ms: int, **changes: object) -> None:
+        t = ms / 1e3
+        fields = {
+            "stamp_ns": ms * MS,
+            "position": (t, 0.0, 0.0),
+            "quaternion": (0.0, 0.0, math.sin(t / 2), math.cos(t / 2)),
+            "sigma": 0.02,
+            "parent": "odom",
+            "child": "base",
+        }
+        self.socket.send_multipart(encode_pose(PoseMessage(**{**fields, **changes})))
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    with tempfile.TemporaryDirectory(prefix="sm-") as folder:
+        yield f"ipc://{Path(folder) / 'socket'}"
+
+
+@pytest.fixture
+def robot(endpoint: str) -> Iterator[Robot]:
+    made = Robot(endpoint)
+    yield made
+    made.socket.close(linger=0)
+
+
+def eventually(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < deadline, "did not come true"
+        time.sleep(0.005)
+
+
+@contextmanager
+def listening(endpoint: str, robot: Robot, **settings: object) -> Iterator[TopicPoseSource]:
+    # Waiting is generous: what a test expects to come has been sent.
+    with TopicPoseSource(TopicPoses(endpoint=endpoint, **{"wait_s": WAIT_S, **settings})) as source:
+        robot.wait()
+        yield source
+
+
+def test_an_image_gets_the_pose_at_its_stamp_of_where_the_camera_sits(endpoint: str, robot: Robot) -> None:
+    T_base_camera = rigid((0.1, 0.2, -0.3), (0.2, 0.0, 0.5))
+    other = rigid((0, 0, 1.0), (0, 0.3, 0))
+    rows = {"T_base_camera": T_base_camera.tolist(), "cameras": {"left": other.tolist()}}
+    with listening(endpoint, robot, **rows) as source:
+        for ms in range(1000, 1201, 20):
+            robot.tell(ms)
+        found = source.pose(image(1111 * MS))
+        left = source.pose(image(1111 * MS, camera_id="left"))
+        assert found is not None and left is not None
+        base = rigid((0, 0, 1.111), (1.111, 0, 0))
+        assert np.allclose(found.T_world_camera, base @ T_base_camera, atol=1e-9)
+        assert np.allclose(invert_pose(base) @ left.T_world_camera, other, atol=1e-9)
+        assert found.source == "topic" and found.sigma == pytest.approx(0.02)
+        eventually(lambda: source.counters["messages"] == 11)
+        assert source.troubles == ()
+
+
+def test_an_image_waits_for_the_pose_that_comes_after_it(endpoint: str, robot: Robot) -> None:
+    with listening(endpoint, robot, max_ahead_s=0.001) as source:
+        robot.tell(1000)
+        eventually(lambda: source.counters["messages"] == 1)
+        robot.tell(1040)  # may arrive while ``pose`` waits already
+        found = source.pose(image(1020 * MS))
+    assert found is not None and found.T_world_camera[0, 3] == pytest.approx(1.02)
+
+
+def test_beyond_the_last_pose_the_motion_goes_on_for_a_while_and_no_longer(endpoint: str, robot: Robot) -> None:
+    with listening(endpoint, robot, wait_s=0.0, max_ahead_s=0.05) as source:
+        robot.tell(1000)
+        robot.tell(1020)
+        eventually(lambda: source.counters["messages"] == 2)
+        found = source.pose(image(1060 * MS))
+        assert found is not None and found.T_world_camera[0, 3] == pytest.approx(1.06)
+        assert source.pose(image(1071 * MS)) is None and source.counters["stale"] == 1
+        assert "too far ahead" in source.troubles[0] and "0.051 s older" in source.troubles[0]
+        robot.tell(1080)
+        eventually(lambda: source.counters["messages"] == 3)
+        assert source.pose(image(1075 * MS)) is not None and source.troubles == ()
+
+
+def test_other_clocks_are_refused_with_the_difference_and_mended_by_the_offset(endpoint: str, robot: Robot) -> None:
+    with listening(endpoint, robot) as source:
+        robot.tell(500_000)
+        robot.tell(500_020)
+        eventually(lambda: source.counters["messages"] == 2)
+        assert source.pose(image(1000 * MS)) is None  # at once, not after ``wait_s``
+        assert source.counters["clock"] == 1 and "+499.020 s" in source.troubles[0]
+        assert "clock_offset_ns" in source.troubles[0]
+    with listening(endpoint, robot, clock_offset_ns=-499_000 * MS) as source:
+        robot.tell(500_000)
+        robot.tell(500_020)
+        found = source.pose(image(1010 * MS))
+    assert found is not None and found.T_world_camera[0, 3] == pytest.approx(500.01)
+
+
+def test_a_clock_ahead_by_less_than_is_kept_is_refused_too(endpoint: str, robot: Robot) -> None:
+    with listening(endpoint, robot) as source:
+        for ms in range(1000, 5001, 20):  # 1010 is in here, but of a time 4 s ago
+            robot.tell(ms)
+        eventually(lambda: source.counters["messages"] == 201)
+        assert source.pose(image(1010 * MS)) is None and source.counters["clock"] == 1
+
+
+def test_a_publisher_that_starts_anew_with_an_earlier_clock_is_followed(endpoint: str, robot: Robot) -> None:
+    with listening(endpoint, robot) as source:
+        robot.tell(90_000)
+        robot.tell(1000)
+        robot.tell(1020)
+        eventually(lambda: source.counters["messages"] == 3)
+        found = source.pose(image(1010 * MS))
+    assert found is not None and found.T_world_camera[0, 3] == pytest.approx(1.01)
+
+
+def test_what_is_no_pose_costs_itself_only(endpoint: str, robot: Robot) -> None:
+    with listening(endpoint, robot, parent="odom", child="base") as source:
+        robot.socket.send(b"garbage")
+        robot.socket.send_multipart([b"pose", *[b"{}"] * 5000])
+        robot.tell(1000, parent="map")
+        robot.tell(1000)
+        robot.tell(1000)
+        message = {"v": 1, "stamp_ns": 1040 * MS, "position": [1.04, 0, 0], "quaternion": [0, 0, 0, 1]}
+        robot.socket.send(json.dumps({**message, "parent": "odom", "child": "base"}).encode())
+        found = source.pose(image(1020 * MS))
+        assert found is not None and found.T_world_camera[0, 3] == pytest.approx(1.02)
+        assert source.counters == {"rejected": 2, "other_frames": 1, "out_of_order": 1, "messages": 2}
+
+
+def test_a_message_that_is_too_long_never_gets_in(endpoint: str, robot: Robot) -> None:
+    with listening(endpoint, robot) as source:
+        robot.socket.send(b"x" * 100_000)  # cuts the connection, which is made anew
+
+        clock = count(1000)
+
+        def gets_through() -> bool:
+            robot.tell(next(clock))
+            return source.counters["messages"] > 0
+
+        eventually(gets_through)
+        assert source.counters["rejected"] == 0
+
+
+def test_silence_is_told(endpoint: str) -> None:
+    with TopicPoseSource(TopicPoses(endpoint=endpoint, wait_s=0.01)) as source:
+        assert source.pose(image(5)) is None
+        assert source.counters["empty"] == 1 and "is its publisher running" in source.troubles[0]
+
+
+def test_what_is_no_endpoint_is_refused() -> None:
+    with pytest.raises(CameraError, match="endpoints read"), TopicPoseSource(TopicPoses(endpoint="robot:5000")):
+        pass
+
+
+def test_poses_of_another_machine_need_keys(tmp_path: Path) -> None:
+    for endpoint in ("tcp://robot:5560", "tcp://192.168.1.5:5560"):
+        with pytest.raises(CameraError, match=r"on another machine.*option `server`"):
+            TopicPoseSource(TopicPoses(endpoint=endpoint))
+    with pytest.raises(CameraError, match="no keys here; make them with"):
+        TopicPoseSource(TopicPoses(endpoint="tcp://robot:5560", server="robot", keys=str(tmp_path)))
+    keys = make_keys(tmp_path / "desk")
+    source = TopicPoseSource(TopicPoses(endpoint="tcp://192.0.2.1:5560", server="robot", keys=str(keys.folder)))
+    with pytest.raises(CameraError, match="no peer 'robot'"), source:
+        pass
+
+
+def test_a_robot_with_keys_is_listened_to_and_one_in_its_place_is_not(tmp_path: Path) -> None:
+    robot, thief, desk = (make_keys(tmp_path / name) for name in ("robot", "thief", "desk"))
+    allow(desk.folder, "robot", robot.public.decode())
+    for server in (robot, thief):
+        allow(server.folder, "desk", desk.public.decode())
+    for keys, heard in ((thief, 0), (None, 0), (robot, 1)):
+        socket = zmq.Context.instance().socket(zmq.XPUB)
+        socket.setsockopt(zmq.LINGER, 0)
+        if keys is not None:
+            secure_server(socket, keys)
+        port = socket.bind_to_random_port("tcp://127.0.0.1")
+        settings = TopicPoses(endpoint=f"tcp://127.0.0.1:{port}", server="robot", keys=str(desk.folder))
+        with socket, TopicPoseSource(settings) as source:
+            assert bool(socket.poll(int(WAIT_S * 1e3) if heard else 300)) == bool(heard)
+            if heard:
+                message = PoseMessage(stamp_ns=5, position=(0, 0, 0), quaternion=(0, 0, 0, 1))
+                socket.send_multipart(encode_pose(message))
+                eventually(lambda: source.counters["messages"] == 1)
+
+
+def test_a_key_that_is_missing_for_a_while_is_told_and_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(topic, "_SILENCE_S", 0.1)
+    robot, desk = (make_keys(tmp_path / name) for name in ("robot", "desk"))
+    allow(robot.folder, "desk", desk.public.decode())
+    allow(desk.folder, "robot", robot.public.decode())
+    with zmq.Context.instance().socket(zmq.XPUB) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        secure_server(socket, robot)
+        port = socket.bind_to_random_port("tcp://127.0.0.1")
+        settings = TopicPoses(endpoint=f"tcp://127.0.0.1:{port}", server="robot", keys=str(desk.folder))
+        stamps = count(5)
+
+        def gets_through() -> bool:
+            message = PoseMessage(stamp_ns=next(stamps), position=(0, 0, 0), quaternion=(0, 0, 0, 1))
+            socket.send_multipart(encode_pose(message))
+            return source.counters["messages"] > before
+
+        with TopicPoseSource(settings) as source:
+            before = 0
+            forget(desk.folder, "robot")
+            eventually(lambda: bool(source.troubles))
+            assert "no peer 'robot'" in source.troubles[0]
+            allow(desk.folder, "robot", robot.public.decode())
+            eventually(lambda: not source.troubles)
+            before = source.counters["messages"]
+            eventually(gets_through)

@@ -1,0 +1,105 @@
+"""Calibration files, and images without lens distortion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from drivers.calibration import Rectifier, guess_intrinsics, load_calibration
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.geometry import camera_matrix, project
+from semantic_mapper.types import CameraIntrinsics
+
+LENS = CameraIntrinsics(300.0, 305.0, 158.0, 122.0, 320, 240, (-0.28, 0.09, 0.001, -0.0005, 0.0))
+TEXT = """
+fx = 300
+fy = 305
+cx = 158
+cy = 122
+width = 320
+height = 240
+distortion = [-0.28, 0.09, 0.001, -0.0005, 0.0]
+"""
+
+
+def test_toml_and_json_hold_the_same(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text(TEXT + '[about]\nrms_px = 0.3\ndate = "today"\n')
+    (tmp_path / "a.json").write_text(
+        '{"fx": 300, "fy": 305, "cx": 158, "cy": 122, "width": 320, "height": 240, '
+        '"distortion": [-0.28, 0.09, 0.001, -0.0005, 0]}'
+    )
+    assert load_calibration(tmp_path / "a.toml") == load_calibration(tmp_path / "a.json") == LENS
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("fx = 300", "fx = -300"), "fx"),
+        (("fx = 300", "focal = 300"), "focal"),
+        (("width = 320", ""), "width"),
+        (("cx = 158", "cx = 400"), "outside of the 320x240"),
+        (("cx = 158", "cx = nan"), "principal point"),
+        (("-0.0005, 0.0]", "-0.0005, 0.0, 1.0]"), "6 coefficients"),
+        (("-0.28", "nan"), "distortion"),
+        (("fx = 300", "fx = "), "not valid TOML"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_told(tmp_path: Path, change: tuple[str, str], says: str) -> None:
+    path = tmp_path / "lens.toml"
+    path.write_text(TEXT.replace(*change))
+    with pytest.raises(ConfigError, match=says) as caught:
+        load_calibration(path)
+    assert "lens.toml" in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["none.toml", "none.json"])
+def test_a_missing_file_is_named(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ConfigError, match=f"{name}: no such file"):
+        load_calibration(tmp_path / name)
+
+
+def test_damaged_json_is_told(tmp_path: Path) -> None:
+    (tmp_path / "lens.json").write_text("{")
+    with pytest.raises(ConfigError, match="not valid JSON"):
+        load_calibration(tmp_path / "lens.json")
+
+
+def test_points_appear_where_the_rectified_pinhole_camera_sees_them(rng: np.random.Generator) -> None:
+    """Each point is drawn as a dot where the lens shows it, found in the rectified image, and compared."""
+    rectify = Rectifier(LENS)
+    assert rectify.intrinsics.distortion == ()
+    ys, xs = np.mgrid[0:240, 0:320].astype(np.float64)
+    checked = 0
+    for p in rng.uniform((-0.4, -0.28, 1.0), (0.4, 0.28, 1.0), (40, 3)):
+        seen, _ = cv2.projectPoints(p[None], np.zeros(3), np.zeros(3), camera_matrix(LENS), np.array(LENS.distortion))
+        u, v = np.asarray(seen, np.float64).reshape(2)
+        expected = project(p[None], rectify.intrinsics)[0]
+        if not (8 < u < 311 and 8 < v < 231 and 8 < expected[0] < 311 and 8 < expected[1] < 231):
+            continue
+        dot = 250 * np.exp(-((xs - u) ** 2 + (ys - v) ** 2) / (2 * 2.0**2))
+        image = rectify(np.repeat(dot.astype(np.uint8)[..., None], 3, axis=2))[..., 0].astype(np.float64)
+        found = np.array([(xs * image).sum(), (ys * image).sum()]) / image.sum()
+        assert np.abs(found - expected).max() < 0.25
+        checked += 1
+    assert checked >= 15
+
+
+def test_no_pixel_is_made_up_and_colours_are_turned_to_rgb() -> None:
+    rgb = Rectifier(LENS)(np.full((240, 320, 3), (10, 100, 250), np.uint8))
+    assert rgb.shape == (240, 320, 3) and (rgb == (250, 100, 10)).all()
+
+
+def test_without_distortion_an_image_stays_as_it_is(rng: np.random.Generator) -> None:
+    ideal = CameraIntrinsics(60.0, 60.0, 31.5, 23.5, 64, 48, (0.0, 0.0, 0.0, 0.0))
+    bgr = rng.integers(0, 255, (48, 64, 3), np.uint8)
+    rectify = Rectifier(ideal)
+    np.testing.assert_array_equal(rectify(bgr), bgr[..., ::-1])
+    assert (rectify.intrinsics.fx, rectify.intrinsics.cx) == (60.0, 31.5)
+
+
+def test_a_guess_is_that_of_a_usual_webcam() -> None:
+    guess = guess_intrinsics(640, 480)
+    assert guess.fx == pytest.approx(554.3, abs=0.1) and (guess.cx, guess.cy) == (319.5, 239.5)

@@ -1,0 +1,369 @@
+"""V4L2 cameras that do what they are asked for, and all the ways in which they do not."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from drivers import live
+from drivers.base import Camera, CameraImage
+from drivers.calibration import Rectifier, load_calibration
+from drivers.registry import open_camera
+from drivers.v4l2 import ioctls, list_devices
+from drivers.v4l2.ioctls import Capability
+from semantic_mapper.errors import CameraError, ConfigError
+from tests.drivers.fake_v4l2 import METADATA, Capture, Machine, Sensor, make_machine, write_calibration
+
+PATIENCE_S = 20.0
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
+    return make_machine(tmp_path, monkeypatch)
+
+
+def v4l2(named: Path | str, tmp_path: Path, **settings: Any) -> Camera:
+    config = {"device": str(named), "calibration": write_calibration(tmp_path / "webcam.toml"), "stall_s": 0.1}
+    return open_camera("v4l2", config | settings, "front", "test")
+
+
+def until(holds: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def image_where(images: Iterator[CameraImage], holds: Callable[[CameraImage], bool]) -> CameraImage:
+    return next(image for image in images if holds(image))
+
+
+def test_requests_are_those_of_the_kernel_s_header() -> None:
+    assert (ioctls.QUERYCAP, ioctls.ENUM_FMT) == (0x80685600, 0xC0405602)
+    assert (ioctls.G_CTRL, ioctls.S_CTRL, ioctls.QUERYCTRL) == (0xC008561B, 0xC008561C, 0xC0445624)
+
+
+def test_images_are_rgb_with_the_stamps_of_their_buffers(machine: Machine, tmp_path: Path) -> None:
+    device = machine.plug(Sensor(), 0)
+    with v4l2(device, tmp_path) as camera:
+        before_ns = time.monotonic_ns()
+        images = list(islice(camera, 5))
+        after_ns = time.monotonic_ns()
+        assert camera.info.source == f"V4L2 HD Webcam at {device}" and camera.info.frame_hz == 30
+        assert camera.info.cameras["front"] == images[0].intrinsics
+        assert camera.troubles == ()
+    for image in images:
+        assert image.rgb.shape == (48, 64, 3) and image.rgb.dtype == np.uint8
+        assert (image.rgb[7, 9] == (100, 50, 0)).all()
+        assert image.camera_id == "front" and image.depth_m is None and image.own_pose is None
+        assert before_ns - 100_000_000 < image.stamp_ns < after_ns - 15_000_000  # 20 ms before it arrived
+    seqs = [image.seq for image in images]
+    assert seqs == sorted(set(seqs)) and seqs[0] >= 0
+    stamps = [image.stamp_ns for image in images]
+    assert stamps == sorted(set(stamps))
+
+
+def test_stamps_of_another_clock_are_replaced_by_the_time_of_arrival_and_told(
+    machine: Machine,
+    tmp_path: Path,
+) -> None:
+    device = machine.plug(Sensor(clock=time.time), 0)
+    with v4l2(device, tmp_path) as camera:
+        before_ns = time.monotonic_ns()
+        image = next(iter(camera))
+        assert before_ns - 1_000_000_000 < image.stamp_ns <= time.monotonic_ns()
+        assert len(camera.troubles) == 1 and "stamped when they arrive" in camera.troubles[0]
+
+
+def test_stamps_that_foretell_the_end_of_an_exposure_are_no_later_than_the_arrival(
+    machine: Machine, tmp_path: Path
+) -> None:
+    device = machine.plug(Sensor(clock=lambda: time.monotonic() + 0.07), 0)
+    with v4l2(device, tmp_path) as camera:
+        image = next(iter(camera))
+        assert image.stamp_ns <= time.monotonic_ns() and camera.troubles == ()
+
+
+def test_another_pixel_format_and_rate_than_asked_for_are_told(machine: Machine, tmp_path: Path) -> None:
+    device = machine.plug(Sensor(formats=("YUYV",), rate=10.0), 0)
+    with v4l2(device, tmp_path) as camera:
+        next(iter(camera))
+        told = " / ".join(camera.troubles)
+        assert camera.info.frame_hz == 10
+    assert "asked for pixels as MJPG, it gives YUYV; it offers YUYV" in told
+    assert "asked for 30 images/s, it gives 10" in told
+
+
+def test_another_size_than_was_calibrated_is_refused(machine: Machine, tmp_path: Path) -> None:
+    device = machine.plug(Sensor(sizes=((80, 60),)), 0)
+    with pytest.raises(CameraError, match="80x60, but was calibrated at 64x48"), v4l2(device, tmp_path):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"calibration": ""}, "semantic-mapper calibrate"),
+        ({"device": ""}, "`semantic-mapper cameras` lists"),
+        ({"uncalibrated": True}, "leave one of the two out"),
+        ({"width": 80, "height": 60}, "another size than the 80x60"),
+        ({"calibration": "missing.toml"}, "missing.toml: no such file"),
+        ({"width": 80}, "both width and height"),
+        ({"fourcc": "MJPEG"}, "fourcc"),
+        ({"exposure_m": 3}, "did you mean `exposure_ms`?"),
+    ],
+)
+def test_a_config_that_cannot_work_is_refused_at_once(tmp_path: Path, settings: dict[str, Any], says: str) -> None:
+    with pytest.raises((CameraError, ConfigError)) as caught:
+        v4l2("/dev/video0", tmp_path, **settings)
+    assert says in str(caught.value)
+
+
+def test_uncalibrated_it_gives_images_for_calibrating_and_says_so(machine: Machine, tmp_path: Path) -> None:
+    device = machine.plug(Sensor(sizes=((64, 48), (80, 60))), 0)
+    with v4l2(device, tmp_path, calibration="", uncalibrated=True, width=80, height=60) as camera:
+        image = next(iter(camera))
+        assert image.rgb.shape == (60, 80, 3)
+        assert any("not calibrated" in trouble for trouble in camera.troubles)
+
+
+def test_unplugged_it_is_waited_for_and_found_under_another_index(machine: Machine, tmp_path: Path) -> None:
+    sensor, other = Sensor(level=100), Sensor(card="Other", level=200)
+    device = machine.plug(sensor, 0)
+    with v4l2(device, tmp_path) as camera:
+        images = iter(camera)
+        before = next(images)
+        machine.unplug(sensor)
+        machine.plug(other, 0, link="usb-Other-video-index0")  # has taken its number
+        until(lambda: any("no such camera" in t and "waited for since" in t for t in camera.troubles))
+        plugged_ns = time.monotonic_ns()
+        machine.plug(sensor, 3)
+        after = image_where(images, lambda image: image.stamp_ns > plugged_ns)
+        until(lambda: camera.troubles == ())
+        assert (after.rgb[0, 0] == (100, 50, 0)).all()  # not the other one
+        assert after.seq > before.seq + 1
+
+
+def test_named_by_its_number_it_is_known_by_its_id_from_then_on(machine: Machine, tmp_path: Path) -> None:
+    sensor = Sensor()
+    machine.plug(sensor, 0)
+    with v4l2(machine.dev / "video0", tmp_path) as camera:
+        images = iter(camera)
+        next(images)
+        machine.unplug(sensor)
+        until(lambda: camera.troubles != ())
+        plugged_ns = time.monotonic_ns()
+        machine.plug(sensor, 5)
+        image_where(images, lambda image: image.stamp_ns > plugged_ns)
+
+
+def test_a_stream_that_stalls_is_told_and_started_anew(machine: Machine, tmp_path: Path) -> None:
+    sensor = Sensor()
+    device = machine.plug(sensor, 0)
+    with v4l2(device, tmp_path) as camera:
+        images = iter(camera)
+        before = next(images)
+        sensor.stalled = True
+        until(lambda: any("gives no images" in t for t in camera.troubles))
+        going_ns = time.monotonic_ns()
+        sensor.stalled = False
+        after = image_where(images, lambda image: image.stamp_ns > going_ns)
+        assert sensor.opens >= 2
+        assert after.seq > before.seq + 1
+        until(lambda: camera.troubles == ())
+
+
+def test_a_read_that_hangs_is_told_while_it_hangs(
+    machine: Machine,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("tests.drivers.fake_v4l2.SELECT_S", 1.5)
+    sensor = Sensor()
+    with v4l2(machine.plug(sensor, 0), tmp_path) as camera:
+        next(iter(camera))
+        sensor.stalled = True
+        until(lambda: any("the stream has stalled" in t for t in camera.troubles))
+        assert sensor.opens == 1
+
+
+def test_single_damaged_images_are_gaps_and_no_reason_to_start_anew(
+    machine: Machine,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sensor = Sensor()
+    read = [0]
+    whole = Capture.read
+
+    def every_third(capture: Capture) -> tuple[bool, np.ndarray | None]:
+        read[0] += 1
+        sensor.damaged = read[0] % 3 == 0
+        return whole(capture)
+
+    monkeypatch.setattr(Capture, "read", every_third)
+    with v4l2(machine.plug(sensor, 0), tmp_path) as camera:
+        seqs = [image.seq for image in islice(camera, 8)]
+        assert sensor.opens == 1
+    assert all(seq % 3 != 2 for seq in seqs) and seqs[-1] >= 10
+
+
+def test_a_device_in_use_or_that_is_none_is_told_apart(machine: Machine, tmp_path: Path) -> None:
+    device = machine.plug(Sensor(busy=True), 0)
+    with pytest.raises(CameraError, match="is another program using it"), v4l2(device, tmp_path):
+        pass
+    metadata = machine.plug(Sensor(capabilities=METADATA), 1, link="usb-HD_Webcam-video-index1")
+    with pytest.raises(CameraError, match="gives no images"), v4l2(metadata, tmp_path):
+        pass
+    with pytest.raises(CameraError, match="is it plugged in"), v4l2(machine.dev / "video7", tmp_path):
+        pass
+
+
+def test_a_file_is_no_camera(tmp_path: Path) -> None:
+    (tmp_path / "video0").touch()
+    with pytest.raises(CameraError, match="is no video device"), v4l2(tmp_path / "video0", tmp_path):  # the real kernel
+        pass
+
+
+def test_controls_are_set_automatic_ones_too(machine: Machine, tmp_path: Path) -> None:
+    sensor = Sensor(values={ioctls.EXPOSURE_AUTO: 1, ioctls.AUTO_WHITE_BALANCE: 0})  # left so by somebody else
+    device = machine.plug(sensor, 0)
+    with v4l2(device, tmp_path):
+        assert sensor.values == {ioctls.EXPOSURE_AUTO: 3, ioctls.AUTO_WHITE_BALANCE: 1}
+    with v4l2(device, tmp_path, exposure_ms=8.0, white_balance_k=5000, gain=40, controls={"focus_absolute": 10}) as c:
+        assert c.troubles == ()
+    assert sensor.values == {
+        ioctls.EXPOSURE_AUTO: ioctls.EXPOSURE_MANUAL,
+        ioctls.EXPOSURE_ABSOLUTE: 80,
+        ioctls.AUTO_WHITE_BALANCE: 0,
+        ioctls.WHITE_BALANCE_TEMPERATURE: 5000,
+        ioctls.GAIN: 40,
+        0x009A090A: 10,
+    }
+
+
+def test_controls_that_do_not_follow_are_told(machine: Machine, tmp_path: Path) -> None:
+    device = machine.plug(Sensor(), 0)
+    with v4l2(device, tmp_path, exposure_ms=500.0, gain=101, controls={"focus_absolut": 3}) as camera:
+        told = " / ".join(camera.troubles)
+    assert "asked for exposure_time_absolute = 5000, it has 2047; exposure_time_absolute goes from 3 to 2047" in told
+    assert "gain: asked for gain = 101, it has 100" in told
+    assert "no control 'focus_absolut'; did you mean 'focus_absolute'?" in told
+    bare = machine.plug(Sensor(controls=()), 1, link="usb-Bare-video-index0")
+    with v4l2(bare, tmp_path, gain=3) as camera:
+        assert [t.split(": ", 1)[1] for t in camera.troubles] == ["it has no control for gain"]
+
+
+def test_controls_are_set_again_when_the_camera_comes_back(machine: Machine, tmp_path: Path) -> None:
+    sensor = Sensor()
+    with v4l2(machine.plug(sensor, 0), tmp_path, gain=40) as camera:
+        images = iter(camera)
+        next(images)
+        machine.unplug(sensor)
+        sensor.values.clear()
+        until(lambda: camera.troubles != ())
+        plugged_ns = time.monotonic_ns()
+        machine.plug(sensor, 1)
+        image_where(images, lambda image: image.stamp_ns > plugged_ns)
+        assert sensor.values[ioctls.GAIN] == 40
+
+
+def test_listing_names_cameras_by_id_and_leaves_metadata_out(machine: Machine) -> None:
+    link = machine.plug(Sensor(), 10)
+    machine.plug(Sensor(capabilities=METADATA), 11, link="usb-HD_Webcam-video-index1")
+    plain = machine.plug(Sensor(card="Grabber", formats=("YUYV",)), 2, link="")
+    dead = machine.plug(Sensor(answers=False), 3, link="")
+    rows = [(c.kind, c.name, c.address) for c in list_devices()]
+    assert rows == [("v4l2", "Grabber", str(plain)), ("v4l2", "?", str(dead)), ("v4l2", "HD Webcam", str(link))]
+    notes = [c.note for c in list_devices()]
+    assert notes[2] == "video10; MJPG YUYV; uvcvideo at usb-1.2" and "does not answer" in notes[1]
+
+
+def test_a_camera_that_may_not_be_opened_is_listed_with_the_mend(
+    machine: Machine,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    machine.plug(Sensor(), 0)
+
+    def refuse(*arguments: object) -> Capability:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("drivers.v4l2.ioctls.query_capability", refuse)
+    assert "group `video`" in list_devices()[0].note
+
+
+def test_stop_ends_the_iteration_from_another_thread_even_while_the_camera_is_gone(
+    machine: Machine,
+    tmp_path: Path,
+) -> None:
+    sensor = Sensor()
+    with v4l2(machine.plug(sensor, 0), tmp_path) as camera:
+        images = iter(camera)
+        next(images)
+        machine.unplug(sensor)
+        until(lambda: camera.troubles != ())
+        threading.Timer(0.1, camera.stop).start()
+        assert len(list(images)) <= 1
+
+
+def test_a_failure_of_the_reading_thread_is_no_silence(
+    machine: Machine,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(threading, "excepthook", lambda arguments: None)
+    with v4l2(machine.plug(Sensor(), 0), tmp_path) as camera:
+        images = iter(camera)
+        next(images)
+        monkeypatch.setattr("tests.drivers.fake_v4l2.Capture.read", lambda capture: 1 / 0)
+        with pytest.raises(CameraError, match="its reading thread has failed"):
+            list(images)
+
+
+def test_pauses_between_attempts_grow_to_a_limit(
+    machine: Machine,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pauses: list[float] = []
+
+    class Recording(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            pauses.append(timeout or 0.0)
+            return super().wait(0.001)
+
+    sensor = Sensor()
+    monkeypatch.setattr(live, "MAX_PAUSE_S", 0.4)
+    camera = v4l2(machine.plug(sensor, 0), tmp_path)
+    monkeypatch.setattr(camera, "_stopping", Recording())
+    with camera:
+        next(iter(camera))
+        machine.unplug(sensor)
+        until(lambda: len(pauses) >= 5)
+    assert pauses[:5] == [0.1, 0.2, 0.4, 0.4, 0.4]
+
+
+def test_lens_distortion_is_taken_out(machine: Machine, tmp_path: Path) -> None:
+    path = tmp_path / "lens.json"
+    path.write_text(
+        '{"fx": 60, "fy": 60, "cx": 31.5, "cy": 23.5, "width": 64, "height": 48, "distortion": [-0.3, 0.1, 0, 0]}'
+    )
+    with v4l2(machine.plug(Sensor(), 0), tmp_path, calibration=str(path)) as camera:
+        image = next(iter(camera))
+    assert image.intrinsics == Rectifier(load_calibration(path)).intrinsics
+    assert image.intrinsics.distortion == () and image.intrinsics.fx != 60
+    assert (image.rgb == (100, 50, 0)).all()
+
+
+def test_fourcc_is_text_whatever_the_device_says() -> None:
+    assert ioctls.fourcc_text(cv2.VideoWriter.fourcc(*"MJPG")) == "MJPG"
+    assert ioctls.fourcc_text(0) == "...."
+    assert ioctls.fourcc_text(cv2.VideoWriter.fourcc(*"Y16 ") | 1 << 31) == "Y16 -BE"

@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import ShapeError
+from semantic_mapper.evaluation.trajectory import (
+    absolute_trajectory_error,
+    align_rigid,
+    relative_pose_error,
+    rotation_angle,
+)
+from semantic_mapper.types import Float64
+
+
+def rigid(turn: tuple[float, float, float], shift: tuple[float, float, float]) -> Float64:
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(np.array(turn))[0]
+    T[:3, 3] = shift
+    return T
+
+
+def walk(rng: np.random.Generator, count: int = 40) -> Float64:
+    poses = [np.eye(4)]
+    for _ in range(count - 1):
+        poses.append(poses[-1] @ rigid(tuple(rng.normal(0, 0.05, 3)), tuple(rng.normal(0, 0.1, 3))))
+    return np.array(poses)
+
+
+def test_a_path_in_another_world_has_no_error(rng: np.random.Generator) -> None:
+    truth = walk(rng)
+    other = rigid((0.3, -2.0, 1.1), (5, -3, 2)) @ truth
+    assert absolute_trajectory_error(other, truth).max_m < 1e-12
+    error = relative_pose_error(other, truth, 3)
+    assert error.max_m < 1e-12 and error.rmse_deg < 1e-6
+
+
+def test_alignment_is_the_best_there_is(rng: np.random.Generator) -> None:
+    a, b = rng.normal(size=(30, 3)), rng.normal(size=(30, 3))
+    best = align_rigid(a, b)
+
+    def cost(T: Float64) -> float:
+        return float(((a @ T[:3, :3].T + T[:3, 3] - b) ** 2).sum())
+
+    assert np.allclose(best[:3, :3] @ best[:3, :3].T, np.eye(3)) and np.linalg.det(best[:3, :3]) > 0
+    for _ in range(300):
+        assert cost(best @ rigid(tuple(rng.normal(0, 0.02, 3)), tuple(rng.normal(0, 0.02, 3)))) >= cost(best)
+
+
+def test_alignment_does_not_mirror() -> None:
+    a = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    T = align_rigid(a, a * (1, 1, -1))
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+
+
+def test_errors_of_known_size() -> None:
+    truth = np.tile(np.eye(4), (4, 1, 1))
+    truth[:, :3, 3] = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    estimated = truth.copy()
+    estimated[:, :3, 3] += [[0.1, 0.1, 0], [-0.1, 0.1, 0], [-0.1, -0.1, 0], [0.1, -0.1, 0]]  # shrunk: scale is held
+    found = absolute_trajectory_error(estimated, truth)
+    assert found.rmse_m == pytest.approx(np.sqrt(0.02)) and found.max_m == pytest.approx(np.sqrt(0.02))
+    steps = relative_pose_error(estimated, truth)
+    assert steps.rmse_m == pytest.approx(0.2) and steps.median_m == pytest.approx(0.2) and steps.rmse_deg == 0
+
+
+def test_a_turn_in_one_step_counts_for_the_steps_across_it_only() -> None:
+    truth = np.tile(np.eye(4), (10, 1, 1))
+    estimated = truth.copy()
+    estimated[5:] = rigid((0, 0, 0.1), (0, 0, 0))
+    assert relative_pose_error(estimated, truth, 1).rmse_deg == pytest.approx(np.rad2deg(0.1) * np.sqrt(1 / 9))
+    assert relative_pose_error(estimated, truth, 2).rmse_deg == pytest.approx(np.rad2deg(0.1) * np.sqrt(2 / 8))
+
+
+def test_angles_near_zero_and_half_a_turn() -> None:
+    angles = np.array([0, 1e-9, 1e-4, 1.0, 3.1, np.pi])
+    R = np.array([cv2.Rodrigues(np.array((a, 0.0, 0.0)))[0] for a in angles])
+    assert np.allclose(rotation_angle(R), angles, rtol=1e-6, atol=1e-12)
+
+
+def test_paths_that_do_not_belong_together_are_refused(rng: np.random.Generator) -> None:
+    truth = walk(rng, 5)
+    with pytest.raises(ShapeError, match="as many points"):
+        absolute_trajectory_error(truth[:4], truth)
+    with pytest.raises(ShapeError, match="as many points"):
+        absolute_trajectory_error(truth[:2], truth[:2])
+    with pytest.raises(ShapeError, match="gap 5"):
+        relative_pose_error(truth, truth, 5)

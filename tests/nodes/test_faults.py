@@ -1,0 +1,272 @@
+"""Nodes that are killed or frozen come back and go on; launches end when that is no use; nothing is left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from nodes.child import Child
+from nodes.options import Call, NodeJob
+from replay.log import LogReader
+from replay.recover import recover
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from tests.nodes.support import (
+    REPLAY_LAUNCH,
+    Running,
+    error_line,
+    eventually,
+    is_alive,
+    repeated_frames,
+    run,
+    write_log,
+)
+
+LIVE_LAUNCH = REPLAY_LAUNCH.with_name("replay-live.toml")
+# A camera that nobody listens to starts in a second, and shows all that the launcher does.
+ALONE = """
+heartbeat_s = 1.0
+{extra}
+[[node]]
+name = "eye"
+kind = "camera"
+restart = "on-failure"
+max_restarts = {limit}
+standby = {standby}
+[node.options]
+log = "{log}"
+mode = "realtime"
+"""
+
+
+@pytest.fixture(scope="module")
+def long_log(folder: Path) -> Path:
+    """More frames than any test waits for: over a minute of them."""
+    return write_log(folder / "minute.mcap", repeated_frames(1200))
+
+
+def alone(folder: Path, log: Path, *, limit: int = 5, standby: bool = False, extra: str = "") -> Path:
+    path = folder / "alone.toml"
+    path.write_text(ALONE.format(log=log, limit=limit, standby=str(standby).lower(), extra=extra))
+    return path
+
+
+def wait_for_start(running: Running, name: str, restarts: int) -> int:
+    line = running.wait_for_line(rf"node_started .*node={name} .*restarts={restarts}\b")
+    return int(re.findall(r"pid=(\d+)", line)[0])
+
+
+def processes(running: Running) -> list[int]:
+    return running.node_pids() + [int(n) for n in re.findall(r"standby_started .*pid=(\d+)", running.text)]
+
+
+def frame_numbers(log: Path) -> list[int]:
+    with LogReader(log) as reader:
+        return [envelope.seq for envelope, _ in reader.frame_parts()]
+
+
+def test_every_node_that_is_killed_or_frozen_comes_back_and_the_others_go_on(
+    long_log: Path, weights: Path, config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "up"
+    settings = [f"log={long_log}", f"weights={weights}", f"config={config}", "save_every=1"]
+    words = [word for setting in settings for word in ("--set", setting)]
+    with Running("up", LIVE_LAUNCH, *words, "--out", out) as running:
+        running.wait_for_line("all_ready")
+        running.wait_for_line("map_saved")
+        took: dict[str, float] = {}
+        back = {
+            "camera": r"\[camera\].* playing ",
+            "recorder": r"\[recorder\].* recording ",
+            "mapper": r"stream_begins",
+        }
+        for restarts, signum in enumerate((signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM), start=1):
+            for node, sign in back.items():
+                before = len(re.findall(sign, running.text))
+                pid = wait_for_start(running, node, restarts - 1)
+                began = time.monotonic()
+                os.kill(pid, signum)
+                assert wait_for_start(running, node, restarts) != pid
+                assert eventually(lambda n=before, s=sign: len(re.findall(s, running.text)) > n), running.text
+                took[f"{signum.name} {node}"] = time.monotonic() - began
+                assert eventually(lambda p=pid: not is_alive(p))
+                assert not any(len(re.findall(rf"node_started .*node={n} ", running.text)) > restarts + 1 for n in back)
+        saves = running.text.count("map_saved")
+        assert eventually(lambda: running.text.count("map_saved") > saves), running.text  # it maps on
+        running.process.send_signal(signal.SIGINT)
+        assert running.wait() == 0, running.text
+        assert not any(map(is_alive, processes(running)))
+    with capsys.disabled():
+        print("\nback after:", ", ".join(f"{case} {seconds:.2f} s" for case, seconds in took.items()))  # noqa: T201
+    summary = json.loads((out / "summary.json").read_text())
+    taken_up = [int(n) for n in re.findall(r"map_taken_up .*frames=(\d+)", running.text)]
+    assert len(taken_up) == 3 and f"saved after {taken_up[-1]} frames" in summary["restarted"]
+    assert VoxelMap.load(out / "map.npz").frames == taken_up[-1] + summary["frames"]["fused"]
+    numbers: list[int] = []
+    for part in ("recorded", "recorded-1", "recorded-2", "recorded-3"):
+        recover(out / f"{part}.mcap", whole := out / f"{part}.whole.mcap")
+        numbers += frame_numbers(whole)
+    assert numbers == sorted(set(numbers))  # the camera went on, and no frame is in two logs
+
+
+def test_restart_limit_ends_the_launch_with_the_reason(long_log: Path, tmp_path: Path) -> None:
+    with Running("up", alone(tmp_path, long_log, limit=2)) as running:
+        for restarts in range(3):
+            pid = wait_for_start(running, "eye", restarts)
+            assert eventually(lambda n=restarts: len(re.findall(r"\beye\].* playing ", running.text)) > n)
+            os.kill(pid, signal.SIGKILL)
+        assert running.wait() == 1, running.text
+        line = error_line(running.text)
+        assert "'eye' (camera) ended: killed by SIGKILL" in line
+        assert "it was restarted 2 times within 60 s, and is not any more" in line
+
+
+@pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
+def test_node_that_a_stranger_sends_away_comes_back(long_log: Path, tmp_path: Path, signum: signal.Signals) -> None:
+    with Running("up", alone(tmp_path, long_log)) as running:
+        running.wait_for_line(r"\beye\].* playing ")
+        os.kill(wait_for_start(running, "eye", 0), signum)
+        pid = wait_for_start(running, "eye", 1)
+        assert eventually(lambda: len(re.findall(r"\beye\].* playing ", running.text)) == 2)
+        for process in (running.process.pid, pid):  # as a service manager may, and terminals
+            os.kill(process, signum)
+        assert running.wait() == 0, running.text
+        assert not any(map(is_alive, processes(running)))
+
+
+def test_node_that_is_not_to_come_back_and_is_sent_away_ends_the_launch_with_the_reason(
+    long_log: Path, tmp_path: Path
+) -> None:
+    launch = alone(tmp_path, long_log)
+    launch.write_text(launch.read_text().replace('restart = "on-failure"', 'restart = "never"'))
+    with Running("up", launch) as running:
+        running.wait_for_line(r"\beye\].* playing ")
+        os.kill(wait_for_start(running, "eye", 0), signal.SIGTERM)
+        assert running.wait() == 1, running.text
+    assert "'eye' (camera) ended: sent away by SIGTERM from outside the launch" in error_line(running.text)
+    assert re.search(r"\beye\].* played .*stopped=True", running.text)  # in order all the same
+
+
+def test_log_that_is_at_its_end_ends_a_live_launch_in_order(log: Path, tmp_path: Path) -> None:
+    done = run("up", alone(tmp_path, log))
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("node_started") == 1 and "node_ended" not in done.stderr
+
+
+def test_node_that_never_was_ready_and_says_why_is_not_tried_again(tmp_path: Path) -> None:
+    done = run("up", alone(tmp_path, tmp_path / "none.mcap"))
+    assert done.returncode == 1 and "none.mcap" in error_line(done.stderr)
+    assert done.stderr.count("node_started") == 1
+
+
+def test_standby_takes_over_and_ends_with_the_launch(long_log: Path, tmp_path: Path) -> None:
+    with Running("up", alone(tmp_path, long_log, standby=True)) as running:
+        waiting = int(re.findall(r"pid=(\d+)", running.wait_for_line("standby_started"))[0])
+        os.kill(wait_for_start(running, "eye", 0), signal.SIGKILL)
+        assert wait_for_start(running, "eye", 1) == waiting
+        assert eventually(lambda: running.text.count("standby_started") == 2)
+        running.process.send_signal(signal.SIGTERM)
+        assert running.wait() == 0, running.text
+        assert len(processes(running)) == 4 and not any(map(is_alive, processes(running)))
+
+
+def test_killed_launcher_leaves_no_process_even_where_one_is_frozen(long_log: Path, tmp_path: Path) -> None:
+    with Running("up", alone(tmp_path, long_log, standby=True, extra="")) as running:
+        running.wait_for_line("standby_started")
+        os.kill(wait_for_start(running, "eye", 0), signal.SIGSTOP)
+        running.process.kill()
+        assert eventually(lambda: not any(map(is_alive, processes(running))))
+
+
+HUNG = """
+import ctypes, os, sys
+from nodes.heartbeat import Heart
+heart = Heart(int(sys.argv[1]), 1)
+heart.start()
+heart.ready()
+print("beats", flush=True)
+ctypes.PyDLL(None).sleep(600)  # keeps the interpreter's lock: no thread runs, no Python handler either
+"""
+
+
+def test_kernel_ends_a_process_that_hangs_with_all_its_threads() -> None:
+    read, write = os.pipe()
+    hung = subprocess.Popen([sys.executable, "-c", HUNG, str(write)], pass_fds=(write,), stdout=subprocess.PIPE)
+    os.close(write)
+    assert hung.stdout is not None and hung.stdout.readline() == b"beats\n"
+    assert hung.wait(60) == -signal.SIGALRM
+    os.close(read)  # only now: it cannot have heard of that
+
+
+def test_process_in_waiting_ends_by_itself_where_it_is_not_needed(long_log: Path) -> None:
+    child = Child("camera", NodeJob(name="eye", options={"log": str(long_log)}, waits=True))
+    assert child.exit_code() is None
+    assert child._process.stdin is not None
+    child._process.stdin.close()
+    assert child.wait(60) and child.exit_code() == 0
+    with pytest.raises((OSError, ValueError)):
+        child.begin(Call(restarts=1))
+    child.close()
+
+
+@pytest.fixture
+def watched(long_log: Path, tmp_path: Path) -> Iterator[Running]:
+    with Running("up", alone(tmp_path, long_log)) as running:
+        running.wait_for_line("all_ready")
+        yield running
+
+
+def test_top_shows_a_running_launch(watched: Running) -> None:
+    sockets = watched.wait_for_line("sockets=").split("sockets=")[1].split()[0]
+    pid = wait_for_start(watched, "eye", 0)
+    os.kill(pid, signal.SIGKILL)
+    pid = wait_for_start(watched, "eye", 1)
+    done = run("top", sockets, "--once", "--json")
+    assert done.returncode == 0, done.stderr
+    shown = json.loads(done.stdout)
+    eye = shown["nodes"]["eye"]
+    assert (eye["pid"], eye["restarts"]) == (pid, 1) and eye["memory_mb"] > 5
+    assert eye["counters"]["published"] > 0 and eye["rates_hz"]["published"] > 0 and eye["ages_s"]["frame"] >= 0
+    assert "killed by SIGKILL" in eye["degraded"][0] and 0 <= eye["ages_s"]["beat"] < eye["ages_s"]["start"]
+    assert shown["launch"]["pid"] == watched.process.pid and shown["launch"]["counters"]["restarts"] == 1
+    table = run("top", f"ipc://{sockets}/launch", "--once").stdout
+    assert re.search(rf"eye +\w+ +{pid} ", table)
+
+
+def test_top_says_where_there_is_nothing_to_see(tmp_path: Path) -> None:
+    assert "no socket folder of a launch" in error_line(run("top", str(tmp_path), "--once").stderr)
+    assert run("top", "--json").returncode == 2
+
+
+def test_systemd_hears_of_start_life_and_end(long_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    manager.bind(str(tmp_path / "notify"))
+    manager.settimeout(60)
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    monkeypatch.setenv("WATCHDOG_USEC", "600000")
+    heard: list[str] = []
+
+    def hear(until: str) -> None:
+        while until not in heard:
+            heard.extend(manager.recv(4096).decode().split("\n"))
+
+    with Running("up", alone(tmp_path, long_log)) as running:
+        hear("READY=1")
+        hear("WATCHDOG=1")
+        assert "STOPPING=1" not in heard
+        eye = Path(f"/proc/{wait_for_start(running, 'eye', 0)}/environ").read_bytes()
+        assert b"NOTIFY_SOCKET" not in eye and b"WATCHDOG" not in eye
+        running.process.send_signal(signal.SIGTERM)
+        hear("STOPPING=1")
+        assert running.wait() == 0, running.text
+    assert heard.index("READY=1") < heard.index("STOPPING=1")
+    assert any(line.startswith("STATUS=eye running") for line in heard)

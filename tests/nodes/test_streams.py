@@ -1,0 +1,180 @@
+"""Several camera nodes into one log, and what a node makes of several streams; real sockets and files."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from nodes.gaps import Gaps
+from nodes.heartbeat import Heart
+from nodes.mapper import run_mapper
+from nodes.node import NodeContext
+from nodes.options import MapperOptions, RecorderOptions
+from nodes.process import StopRequest
+from nodes.public_publisher import PublicPublisher
+from nodes.recorder import run_recorder
+from nodes.streams import Streams
+from replay.log import LogReader
+from semantic_mapper.errors import NodeError, TransportError
+from semantic_mapper.labels import NYU40, ROOMS
+from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info, encode_status
+from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
+from semantic_mapper.transport.security import ServerIdentity, allow, make_keys
+from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
+from tests.nodes.support import write_config, write_weights
+from tests.small import INTRINSICS, tiny_frames
+
+LEFT, RIGHT = StreamInfo("left eye", {"left": INTRINSICS}), StreamInfo("right eye", {"right": INTRINSICS})
+
+
+@contextmanager
+def recording(path: Path, endpoints: dict[str, str]) -> Iterator[StopRequest]:
+    stop = StopRequest()
+    context = NodeContext("recorder", endpoints, 0, stop, Heart(-1, 1))
+    options = RecorderOptions(out=str(path), sources=("left", "right"), streams=2)
+    thread = threading.Thread(target=run_recorder, args=(context, options))
+    thread.start()
+    try:
+        yield stop
+        thread.join(20)
+        assert not thread.is_alive()
+    finally:
+        stop.signum = 15
+        thread.join(20)
+
+
+def test_two_cameras_are_recorded_until_both_have_ended_and_one_may_start_anew(tmp_path: Path) -> None:
+    frame = tiny_frames(1)[0]
+    with tempfile.TemporaryDirectory(prefix="sm-") as folder:
+        endpoints = {name: f"ipc://{folder}/{name}" for name in ("left", "right", "recorder")}
+        with Publisher(endpoints["right"]) as right, recording(tmp_path / "both.mcap", endpoints):
+            for restart in range(2):  # the camera's process dies after three frames and counts from 0 again
+                with Publisher(endpoints["left"]) as left:
+                    left.wait_for_subscribers("frame", timeout_s=20)
+                    left.publish(encode_info(LEFT, "left"))
+                    for seq in range(3):
+                        stamp_ns = (10 * restart + seq + 1) * 1000
+                        left.publish(encode_frame(replace(frame, camera_id="left", seq=seq, stamp_ns=stamp_ns)))
+                    if restart:
+                        left.publish(encode_end(EndOfStream("left", "end", 3)))
+            right.wait_for_subscribers("frame", timeout_s=20)
+            right.publish(encode_info(RIGHT, "right"))
+            for seq in range(2):
+                right.publish(encode_frame(replace(frame, camera_id="right", seq=seq, stamp_ns=20_000 + seq)))
+            right.publish(encode_end(EndOfStream("right", "end", 2)))
+    with LogReader(tmp_path / "both.mcap") as log:
+        frames = list(log)
+        assert log.finished and not log.errors
+        assert dict(log.info.cameras) == {"left": INTRINSICS, "right": INTRINSICS}
+        kept = json.loads(log.attachments()["calibration.json"].data)["cameras"]
+        assert kept["left"] == kept["right"] == json.loads(json.dumps(dataclasses.asdict(INTRINSICS)))
+        assert log.info.source == "left eye + right eye"
+    assert [f.seq for f in frames if f.camera_id == "left"] == [0, 1, 2, 0, 1, 2]
+    assert [f.seq for f in frames if f.camera_id == "right"] == [0, 1]
+    gaps = Gaps()
+    for f in frames:
+        gaps.note(f.camera_id, f.seq)
+    assert (gaps.missed, gaps.begun_anew) == (0, 1)
+
+
+def test_two_cameras_of_different_size_are_fused_into_one_map(tmp_path: Path) -> None:
+    weights, config = write_weights(tmp_path / "tiny.safetensors"), write_config(tmp_path / "mapper.toml")
+    small = replace(INTRINSICS, cx=INTRINSICS.cx - 8, cy=INTRINSICS.cy - 6, width=80, height=60)
+    infos = {"left": LEFT, "right": StreamInfo("right eye", {"right": small})}
+    with tempfile.TemporaryDirectory(prefix="sm-") as folder, ExitStack() as stack:
+        endpoints = {name: f"ipc://{folder}/{name}" for name in ("left", "right", "mapper")}
+        options = MapperOptions(
+            out=str(tmp_path),
+            input=("left", "right"),
+            delivery="all",
+            weights=str(weights),
+            config=str(config),
+            query="",
+        )
+        context = NodeContext("mapper", endpoints, 0, StopRequest(), Heart(-1, 1))
+        publishers = {name: stack.enter_context(Publisher(endpoints[name], policy="block")) for name in infos}
+        thread = threading.Thread(target=run_mapper, args=(context, options))
+        thread.start()
+        for name, publisher in publishers.items():
+            publisher.wait_for_subscribers("frame", timeout_s=120)
+            publisher.publish(encode_info(infos[name], name))
+        for frame in tiny_frames(4):
+            publishers["left"].publish(encode_frame(replace(frame, camera_id="left", label=None)), 120)
+            cut = replace(
+                frame,
+                camera_id="right",
+                rgb=frame.rgb[6:66, 8:88].copy(),
+                depth_m=None if frame.depth_m is None else frame.depth_m[6:66, 8:88].copy(),
+                label=None,
+                intrinsics=small,
+            )
+            publishers["right"].publish(encode_frame(cut), 120)
+        publishers["left"].publish(encode_end(EndOfStream("left", "end", 4)))
+        thread.join(0.5)
+        assert thread.is_alive()  # the other one has not ended
+        publishers["right"].publish(encode_end(EndOfStream("right", "end", 5)))  # one was lost on the way
+        thread.join(200)
+        assert not thread.is_alive()
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["source"] == "left eye + right eye" and summary["stopped_by"] is None
+    frames = summary["frames"]
+    assert (frames["published"], frames["fused"], frames["dropped"], frames["refused"]) == (9, 8, 1, 0)
+
+
+def test_streams_end_together_and_say_what_each_said() -> None:
+    streams = Streams(2)
+    assert not streams.begin(LEFT) and not streams.begin(RIGHT) and not streams.begin(LEFT)
+    assert streams.begin(replace(LEFT, frame_hz=5.0))
+    assert streams.source == "left eye + right eye" and streams.label_set is None
+    assert not streams.end(EndOfStream("a", "end", 3))
+    assert not streams.end(EndOfStream("a", "error", 4, "unplugged"))  # started anew meanwhile
+    assert streams.end(EndOfStream("b", "end", 5))
+    assert (streams.published, streams.ended_by) == (9, "a: unplugged")
+    streams.note_frame("left")
+    assert streams.ages_s == {}
+    streams.note_frame("right")
+    assert set(streams.ages_s) == {"frame left", "frame right"}
+
+
+def test_streams_of_different_classes_do_not_go_into_one_map() -> None:
+    streams = Streams(2)
+    streams.begin(replace(LEFT, label_set=ROOMS))
+    with pytest.raises(NodeError, match="'right eye' have other classes than those of 'left eye'"):
+        streams.begin(replace(RIGHT, label_set=NYU40))
+    alone = Streams(1)
+    alone.begin(replace(LEFT, label_set=ROOMS))
+    assert alone.begin(replace(LEFT, label_set=NYU40))  # the same stream, which has changed
+
+
+def test_a_fixed_endpoint_serves_peers_alone_where_there_are_keys(tmp_path: Path) -> None:
+    robot, desk = make_keys(tmp_path / "robot"), make_keys(tmp_path / "desk")
+    allow(tmp_path / "robot", "desk", desk.public.decode())
+    allow(tmp_path / "desk", "robot", robot.public.decode())
+    status = Status("mapper", "running", 5)
+    with tempfile.TemporaryDirectory(prefix="sm-") as folder:
+        own = f"ipc://{folder}/mapper"
+        with pytest.raises(TransportError, match="needs keys on both sides"):
+            PublicPublisher(own, "tcp://0.0.0.0:*", "")
+        with PublicPublisher(own, "tcp://0.0.0.0:*", str(tmp_path / "robot")) as publisher:
+            port = publisher.public_endpoint.rpartition(":")[2]
+            far = f"tcp://127.0.0.1:{port}"
+            with (
+                LosslessSubscriber(own, ("status",)) as near,
+                LosslessSubscriber(far, ("status",), identity=ServerIdentity(desk, "robot")) as peer,
+                LosslessSubscriber(far, ("status",)) as stranger,
+            ):
+                near.wait_until_heard(20)
+                peer.wait_until_heard(20)
+                publisher.publish(encode_status(status))
+                assert near.receive(20) == peer.receive(20) == status
+                assert stranger.receive(0.2) is None
+        with PublicPublisher(own, "", "") as plain:  # free again
+            assert plain.public_endpoint == ""

@@ -1,0 +1,248 @@
+"""Logs in formats of other programs, read back by what reads these formats."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+from base64 import b64decode
+from pathlib import Path
+from typing import Any
+
+import cv2
+import mcap.reader
+import numpy as np
+import pytest
+import rerun.chunk
+from scipy.spatial.transform import Rotation
+
+from nodes.console import Output
+from nodes.export_recording import export_recording
+from nodes.saved_maps import is_log
+from replay.exporters import LogExportReport, LogExportRequest, export_log, log_format_of
+from replay.importers import ImportOptions, import_recording
+from replay.importers.tum import read_trajectory
+from replay.log import LogReader, LogWriter
+from semantic_mapper.errors import ConfigError, LogError
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.transport.codec import CodecOptions, encode_frame
+from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.types import PosedFrame
+from tests.transport import samples
+
+LABELS = LabelSet(
+    "Lab 7",
+    tuple(range(1, 41)),
+    tuple(f"thing {i}" for i in range(40)),
+    tuple((9, i, 200) for i in range(40)),
+)
+PACKING = (CodecOptions(), CodecOptions(rgb="raw"), CodecOptions(rgb="jpeg"))
+
+
+def turned(seq: int, **changes: Any) -> PosedFrame:
+    """A frame with a pose that has all its digits."""
+    frame = samples.make_frame(seq)
+    T = frame.T_world_camera.copy()
+    T[:3, :3] = Rotation.from_rotvec((0.1 * seq, -0.7, 0.3)).as_matrix()
+    return dataclasses.replace(frame, T_world_camera=T, **{"stamp_ns": 10**18 + 33_333_333 * seq, **changes})
+
+
+def write_log(path: Path, frames: list[PosedFrame], packing: tuple[CodecOptions, ...] = PACKING) -> Path:
+    cameras = {frame.camera_id: samples.INTRINSICS for frame in frames}
+    with LogWriter(path, StreamInfo("test", cameras, LABELS, metadata={"place": "lab"})) as log:
+        for i, frame in enumerate(frames):
+            log.write_parts(encode_frame(frame, packing[i % len(packing)]))
+    return path
+
+
+def exported(log: Path, out: Path, name: str | None = None, **more: Any) -> LogExportReport:
+    with LogReader(log) as reader:
+        return export_log(reader, out, LogExportRequest(log_format_of(out, name), **more), lambda: None)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return write_log(tmp_path / "log.mcap", [turned(seq) for seq in range(7)])
+
+
+def test_a_sequence_folder_comes_back_bit_for_bit(log: Path, tmp_path: Path) -> None:
+    report = exported(log, tmp_path / "sequence")
+    assert (report.frames, report.left_out, report.notices) == (7, (), ())
+    back = import_recording(tmp_path / "sequence", tmp_path / "back.mcap")
+    assert (back.format, back.frames, back.labelled, back.skipped) == ("folder", 7, 7, ())
+    with LogReader(log) as one, LogReader(tmp_path / "back.mcap") as other:
+        assert other.info.label_set is not None and other.info.label_set.colors == LABELS.colors
+        assert (other.info.label_set.ids, other.info.label_set.names) == (LABELS.ids, LABELS.names)
+        for a, b in zip(one, other, strict=True):
+            assert (a.stamp_ns, a.seq, a.intrinsics) == (b.stamp_ns, b.seq, b.intrinsics)
+            assert a.T_world_camera.tobytes() == b.T_world_camera.tobytes() and np.array_equal(a.rgb, b.rgb)
+            assert a.depth_m is not None and b.depth_m is not None and a.depth_m.tobytes() == b.depth_m.tobytes()
+            assert a.label is not None and b.label is not None and np.array_equal(a.label, b.label)
+        kept = [(e.rgb_encoding, parts[2]) for e, parts in one.frame_parts()]
+        for (encoding, data), (e, parts) in zip(kept, other.frame_parts(), strict=True):
+            if encoding != "raw":
+                assert (e.rgb_encoding, parts[2]) == (encoding, data)  # the very file
+
+
+def test_real_recording_goes_to_a_folder_and_back(redkitchen: Path, tmp_path: Path) -> None:
+    import_recording(redkitchen, tmp_path / "log.mcap", options=ImportOptions(max_frames=3))
+    exported(tmp_path / "log.mcap", tmp_path / "sequence")
+    for name in ("color/000001.jpg", "labels.json"):
+        assert (tmp_path / "sequence" / name).exists()
+    assert (tmp_path / "sequence/color/000001.jpg").read_bytes() == (redkitchen / "color/000001.jpg").read_bytes()
+    import_recording(tmp_path / "sequence", tmp_path / "back.mcap")
+    with LogReader(tmp_path / "log.mcap") as one, LogReader(tmp_path / "back.mcap") as other:
+        assert one.info.label_set == other.info.label_set
+        for (_, a), (_, b) in zip(one.frame_parts(), other.frame_parts(), strict=True):
+            assert a == b  # the log's bytes
+
+
+def test_what_a_sequence_folder_cannot_hold_is_told(tmp_path: Path) -> None:
+    odd = np.full((18, 24), 1.00026, np.float32)
+    other = dataclasses.replace(samples.INTRINSICS, fx=99.0)
+    frames = [
+        turned(0),
+        turned(1, depth_m=None),
+        turned(2, depth_m=odd),
+        turned(3, stamp_ns=5),
+        turned(4, intrinsics=other),
+    ]
+    report = exported(write_log(tmp_path / "log.mcap", frames), tmp_path / "sequence")
+    assert report.frames == 3
+    assert "seq=3" in report.left_out[0] and "not later" in report.left_out[0]
+    assert "seq=4" in report.left_out[1] and "other intrinsics" in report.left_out[1]
+    assert "off by up to 0.26 mm" in report.notices[0] and "1 frames have no depth" in report.notices[1]
+    back = import_recording(tmp_path / "sequence", tmp_path / "back.mcap")
+    assert back.frames == 3
+    with LogReader(tmp_path / "back.mcap") as reader:
+        depths = [frame.depth_m for frame in reader]
+    assert depths[1] is not None and not depths[1].any() and depths[2] is not None
+    np.testing.assert_allclose(depths[2], odd, atol=6e-4)
+
+
+def test_tum_sequence_and_trajectory(log: Path, tmp_path: Path) -> None:
+    report = exported(log, tmp_path / "desk", "tum")
+    assert report.frames == 7 and not report.notices
+    assert exported(log, tmp_path / "poses.txt").frames == 7
+    assert (tmp_path / "poses.txt").read_text() == (tmp_path / "desk" / "groundtruth.txt").read_text()
+    notices: list[str] = []
+    stamps, rows = read_trajectory(tmp_path / "poses.txt", notices)
+    back = import_recording(tmp_path / "desk", tmp_path / "back.mcap")
+    assert (back.format, back.frames, back.skipped, notices) == ("tum", 7, (), [])
+    with LogReader(log) as one, LogReader(tmp_path / "back.mcap") as other:
+        for i, (a, b) in enumerate(zip(one, other, strict=True)):
+            assert a.stamp_ns == b.stamp_ns == stamps[i] and np.array_equal(a.rgb, b.rgb)
+            assert a.depth_m is not None and b.depth_m is not None and a.depth_m.tobytes() == b.depth_m.tobytes()
+            np.testing.assert_allclose(a.T_world_camera, b.T_world_camera, atol=1e-14)
+            np.testing.assert_allclose(rows[i, :3], a.T_world_camera[:3, 3], rtol=0)
+
+
+def test_foxglove_file_is_what_the_schemas_say(tmp_path: Path) -> None:
+    odd = np.full((18, 24), 1.00026, np.float32)
+    frames = [turned(0), turned(1, camera_id="left"), turned(2, depth_m=odd, label=None), turned(3, depth_m=None)]
+    log = write_log(tmp_path / "log.mcap", frames)
+    assert exported(log, tmp_path / "foxglove.mcap").frames == 4
+    with (tmp_path / "foxglove.mcap").open("rb") as file:
+        reader = mcap.reader.make_reader(file, validate_crcs=True)
+        found = [(s, c, m.log_time, json.loads(m.data)) for s, c, m in reader.iter_messages()]
+        summary = reader.get_summary()
+    assert summary is not None
+    assert {c.topic for c in summary.channels.values()} == {
+        "/tf",
+        *(f"/{camera}/{kind}" for camera in ("front", "left") for kind in ("rgb", "depth", "labels", "calibration")),
+    }
+    for schema, channel, stamp, message in found:
+        assert schema is not None and schema.encoding == "jsonschema" and channel.message_encoding == "json"
+        described = json.loads(schema.data)
+        assert set(message) == set(described["properties"]) and described["title"] == schema.name
+        assert stamp == message["timestamp"]["sec"] * 10**9 + message["timestamp"]["nsec"]
+        for name, value in described["properties"].items():
+            assert isinstance(message[name], _TYPES[value["type"]]), name
+    by_topic: dict[str, list[dict[str, Any]]] = {}
+    for _, channel, _, message in found:
+        by_topic.setdefault(channel.topic, []).append(message)
+    for frame, tf in zip(frames, by_topic["/tf"], strict=True):
+        assert (tf["parent_frame_id"], tf["child_frame_id"]) == ("world", frame.camera_id)
+        R = Rotation.from_quat([tf["rotation"][k] for k in "xyzw"]).as_matrix()
+        np.testing.assert_allclose(R, frame.T_world_camera[:3, :3], atol=1e-12)
+        assert [tf["translation"][k] for k in "xyz"] == frame.T_world_camera[:3, 3].tolist()
+    image = by_topic["/front/rgb"][0]
+    pixels = cv2.imdecode(np.frombuffer(b64decode(image["data"]), np.uint8), cv2.IMREAD_COLOR)
+    assert image["format"] == "png" and np.array_equal(pixels[..., ::-1], frames[0].rgb)
+    mm, metres = by_topic["/front/depth"]
+    assert (mm["encoding"], mm["step"]) == ("16UC1", 48) and (metres["encoding"], metres["step"]) == ("32FC1", 96)
+    assert frames[0].depth_m is not None
+    units = np.frombuffer(b64decode(mm["data"]), "<u2").reshape(18, 24)
+    assert np.array_equal(units.astype(np.float32) / np.float32(1000), frames[0].depth_m)
+    assert np.array_equal(np.frombuffer(b64decode(metres["data"]), "<f4").reshape(18, 24), odd)
+    drawn = cv2.imdecode(np.frombuffer(b64decode(by_topic["/left/labels"][0]["data"]), np.uint8), cv2.IMREAD_COLOR)
+    assert frames[1].label is not None and np.array_equal(drawn[..., ::-1], LABELS.colorize(frames[1].label))
+    calibration = by_topic["/left/calibration"][0]
+    assert calibration["K"] == [20.5, 0, 11.5, 0, 21.0, 8.5, 0, 0, 1] and len(calibration["P"]) == 12
+
+
+_TYPES: dict[str, Any] = {"object": dict, "string": str, "integer": int, "array": list, "number": float}
+
+
+def test_rerun_file_holds_every_frame(log: Path, tmp_path: Path) -> None:
+    assert exported(log, tmp_path / "log.rrd").frames == 7
+    rows: dict[str, int] = {}
+    for chunk in rerun.chunk.RrdReader(tmp_path / "log.rrd").stream():
+        rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
+    for name in ("rgb", "semantics", "depth"):
+        assert rows[f"/world/cameras/{samples.CAMERA}/image/{name}"] == 7
+
+
+def test_one_camera_of_several(tmp_path: Path) -> None:
+    frames = [turned(seq, camera_id=("front", "left")[seq % 2]) for seq in range(8)]
+    log = write_log(tmp_path / "log.mcap", frames)
+    for name in ("tum", "folder", "trajectory"):
+        with pytest.raises(ConfigError, match="holds one camera; name one of front, left with --camera"):
+            exported(log, tmp_path / "out", name)
+    with pytest.raises(ConfigError, match="the log has frames of front, left"):
+        exported(log, tmp_path / "out", "tum", camera="right")
+    assert exported(log, tmp_path / "out", "tum", camera="left", max_frames=3).frames == 3
+    assert not (tmp_path / "out" / ".exporting").exists()
+    stamps, _ = read_trajectory(tmp_path / "out" / "groundtruth.txt", [])
+    assert stamps.tolist() == [frames[i].stamp_ns for i in (1, 3, 5)]
+
+
+def test_what_cannot_be_written_is_refused_and_nothing_is_left(log: Path, tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    before = log.read_bytes()
+    for out, name, error, message in (
+        (tmp_path / "there", "folder", LogError, "exists already"),
+        (tmp_path / "there", "rrd", LogError, "is a folder"),
+        (log, "foxglove", ConfigError, "is the log itself"),
+        (tmp_path / "a.xyz", None, ConfigError, "which format"),
+        (tmp_path / "a.mcap", "glb", ConfigError, "for saved maps"),
+        (tmp_path / "no" / "such", "tum", LogError, "cannot be written"),
+    ):
+        with pytest.raises(error, match=message):
+            exported(log, out, name)
+    same = write_log(tmp_path / "back.mcap", [turned(0, camera_id="x"), turned(1, stamp_ns=10**18, camera_id="x")])
+    report = exported(same, tmp_path / "poses.tum")
+    assert report.frames == 1 and "same time" in report.left_out[0]
+    assert log.read_bytes() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["back.mcap", "log.mcap", "poses.tum", "there"]
+
+
+def test_damaged_frames_are_left_out(log: Path, tmp_path: Path) -> None:
+    data = bytearray(log.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    log.write_bytes(data)
+    assert exported(log, tmp_path / "sequence").frames == 6
+
+
+def test_the_verb_takes_logs_and_tells_them_from_maps(log: Path, tmp_path: Path) -> None:
+    assert is_log(log) and is_log(tmp_path) and not is_log(tmp_path / "map.npz")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "recorded.mcap").touch()
+    assert is_log(tmp_path / "run")
+    (tmp_path / "run" / "map.npz").touch()
+    assert not is_log(tmp_path / "run")
+    told = io.StringIO()
+    export_recording(Output(told), log, tmp_path / "poses.txt", None, "", 2, [])
+    assert f"{tmp_path / 'poses.txt'}: 2 frames (trajectory)" in told.getvalue()
+    with pytest.raises(ConfigError, match="--color: for saved maps only"):
+        export_recording(Output(told), log, tmp_path / "x.rrd", None, "", 0, ["--color"])

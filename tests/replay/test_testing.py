@@ -1,0 +1,172 @@
+"""The pytest plugin: replays in process, questions to their maps, stored runs, and that it costs nothing before."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from replay.testing import LogReplays, ReplayedMap
+from semantic_mapper.errors import ConfigError, LabelError, LogError, MapError
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.queries.lookup import at
+from semantic_mapper.queries.occupancy import State, occupancy
+from semantic_mapper.types import PosedFrame
+from tests.nodes.support import CONFIG, run, write_config, write_log, write_weights
+from tests.small import tiny_frames
+
+ROOT = Path(__file__).resolve().parents[2]
+PROJECT = """
+def test_the_room(replay_log):
+    room = replay_log("room.mcap", weights="tiny.safetensors", config="mapper.toml", max_frames={frames})
+    assert room.mapped == {frames}
+    room.assert_like("stored", confidence=0.5)
+"""
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a robot project: a log, weights, settings."""
+    folder = tmp_path_factory.mktemp("project")
+    write_log(folder / "room.mcap", tiny_frames())
+    write_weights(folder / "tiny.safetensors")
+    write_config(folder / "mapper.toml")
+    return folder
+
+
+def replays(root: Path, made: Path, **options: bool) -> LogReplays:
+    folders = iter(range(100))
+    return LogReplays(root, lambda name: made / f"{name}-{next(folders)}", **options)
+
+
+@pytest.fixture(scope="module")
+def room(root: Path, tmp_path_factory: pytest.TempPathFactory) -> ReplayedMap:
+    made = replays(root, tmp_path_factory.mktemp("replays"))
+    return made("room.mcap", weights="tiny.safetensors", config="mapper.toml")
+
+
+def test_the_map_is_that_of_the_command_line(room: ReplayedMap, root: Path, tmp_path: Path) -> None:
+    arguments = ("--weights", root / "tiny.safetensors", "--config", root / "mapper.toml")
+    done = run("replay", root / "room.mcap", "--out", tmp_path, *arguments)
+    assert done.returncode == 0, done.stderr
+    assert (room.folder / "map.npz").read_bytes() == (tmp_path / "map.npz").read_bytes()
+    told = json.loads((tmp_path / "summary.json").read_text())
+    assert (room.miou, room.map_miou) == (told["metrics"]["miou"], told["metrics"]["map_miou"])
+    assert (room.mapped, room.blocks, room.refused) == (6, told["map"]["blocks"], [])
+    assert (room.folder / "overview.png").exists()
+
+
+def test_questions_are_answered_as_the_queries_answer_them(room: ReplayedMap) -> None:
+    points = room.voxel_map.points()
+    answers = at(room.snapshot, points.xyz[::500])
+    names = dict(zip(ROOMS.ids, ROOMS.names, strict=True))
+    said = [room.class_at(p) for p in points.xyz[::500]]
+    assert said == [names.get(int(i)) for i in answers.label] and len(set(said)) > 1
+    assert room.class_at((90.0, 0.0, 0.0)) is None
+    wall = room.nearest("wall", (0.0, 0.0, 1.0))
+    if wall is not None:
+        assert room.class_at(wall.xyz) == "wall"
+    around = points.xyz[::500] + np.random.default_rng(0).normal(0, 0.2, (len(points.xyz[::500]), 3))
+    states = occupancy(room.snapshot, around)
+    assert [room.is_free(p) for p in around] == [s == State.FREE for s in states] and len(set(states)) == 3
+    with pytest.raises(LabelError, match="spaceship"):
+        room.nearest("spaceship", (0, 0, 0))
+    with pytest.raises(MapError, match="expected shape"):
+        room.class_at((1.0, 2.0))
+
+
+def test_a_replay_is_done_once_for_the_same_settings(root: Path, tmp_path: Path) -> None:
+    replay_log = replays(root, tmp_path)
+    sections = {name: section for name, section in tomllib.loads(CONFIG).items() if name != "sampling"}
+    first = replay_log("room.mcap", weights="tiny.safetensors", config=sections, max_frames=2)
+    assert replay_log(root / "room.mcap", weights=root / "tiny.safetensors", config=sections, max_frames=2) is first
+    other = replay_log("room.mcap", weights="tiny.safetensors", config=sections, quality="fast", max_frames=2)
+    assert other is not first and other.summary["quality"] == "fast" and first.mapped == other.mapped == 2
+
+
+def test_refused_frames_are_told_and_a_log_of_nothing_else_is_an_error(root: Path, tmp_path: Path) -> None:
+    def lost(frame: PosedFrame) -> PosedFrame:
+        return replace(frame, T_world_camera=2 * frame.T_world_camera)
+
+    frames = tiny_frames(3)
+    write_log(tmp_path / "some.mcap", [lost(frames[0]), *frames[1:]])
+    write_log(tmp_path / "none.mcap", [lost(f) for f in frames])
+    replay_log, settings = replays(root, tmp_path), {"weights": "tiny.safetensors", "config": "mapper.toml"}
+    some = replay_log(tmp_path / "some.mcap", **settings)
+    assert some.mapped == 2 and len(some.refused) == 1 and "seq=0" in some.refused[0]
+    with pytest.raises(LogError, match="none of its frames could be mapped"):
+        replay_log(tmp_path / "none.mcap", **settings)
+    with pytest.raises(LogError, match=r"gone\.mcap"):
+        replay_log("gone.mcap", **settings)
+    with pytest.raises(ConfigError, match="did you mean `voxel_map`"):
+        replay_log("room.mcap", config={"voxel_maps": {}})
+
+
+def test_scores_of_a_log_without_labels_are_an_error_not_a_number(root: Path, tmp_path: Path) -> None:
+    write_log(tmp_path / "bare.mcap", [replace(f, label=None) for f in tiny_frames(2)])
+    bare = replays(root, tmp_path)(tmp_path / "bare.mcap", weights="tiny.safetensors", config="mapper.toml")
+    with pytest.raises(LogError, match="nothing to score"):
+        _ = bare.miou
+
+
+def test_a_stored_run_is_compared_with_tolerances(room: ReplayedMap, root: Path, tmp_path: Path) -> None:
+    room.store(tmp_path / "stored")
+    assert sorted(p.name for p in (tmp_path / "stored").iterdir()) == ["map.npz", "summary.json"]
+    room.assert_like(tmp_path / "stored")
+    fewer = replays(root, tmp_path)("room.mcap", weights="tiny.safetensors", config="mapper.toml", max_frames=5)
+    with pytest.raises(AssertionError, match="frames_mapped: 6 and 5, 1 apart, allowed 0") as failure:
+        fewer.assert_like(tmp_path / "stored")
+    picture = fewer.folder / "compare.png"
+    assert str(picture) in str(failure.value) and picture.exists()
+    differing = [f.name for f in fewer.compare(tmp_path / "stored").fields if not f.within]
+    assert "frames_published" in differing and "voxel_size_m" not in differing
+    fewer.assert_like(tmp_path / "stored", **dict.fromkeys(differing, float("inf")))
+    with pytest.raises(ConfigError, match="did you mean `labels`"):
+        fewer.assert_like(tmp_path / "stored", label=0.1)
+    with pytest.raises(AssertionError, match=r"no run is stored at .*--update-runs"):
+        room.assert_like("nowhere")
+
+
+def pytest_run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """pytest of a project of its own, with the plugin named, as an installation registers it."""
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "semantic_mapper.testing", "-p", "no:dash", *arguments]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_a_project_stores_a_run_passes_and_fails_when_the_map_changes(root: Path) -> None:
+    (root / "pyproject.toml").write_text("[tool.pytest.ini_options]\n")
+    test = root / "test_room.py"
+    test.write_text(PROJECT.format(frames=2))
+    done = pytest_run(root)
+    assert done.returncode == 1 and "no run is stored" in done.stdout, done.stdout + done.stderr
+    assert pytest_run(root, "--update-runs").returncode == 0
+    assert VoxelMap.load(root / "stored" / "map.npz").frames == 2
+    assert pytest_run(root).returncode == 0
+    test.write_text(PROJECT.format(frames=3))
+    done = pytest_run(root)
+    assert done.returncode == 1 and "frames_mapped: 2 and 3, 1 apart, allowed 0" in done.stdout
+
+
+def test_the_plugin_costs_nothing_until_it_is_used() -> None:
+    program = (
+        "import sys, semantic_mapper.testing\n"
+        "heavy = {'numpy', 'torch', 'open3d', 'numba', 'scipy', 'cv2', 'zmq', 'msgspec', 'structlog'}\n"
+        "print(sorted(heavy & set(sys.modules)))\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False)
+    assert (done.stdout.strip(), done.returncode) == ("[]", 0), done.stderr
+
+
+def test_pytest_finds_the_plugin_under_the_name_of_its_module() -> None:
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert declared["entry-points"]["pytest11"] == {"semantic_mapper.testing": "semantic_mapper.testing"}
