@@ -10,10 +10,10 @@ READY := .venv/.ready
 # Both cores busy with spinning OpenMP threads make torch operations next to Open3D 10 to 250 times slower.
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: help setup demo test check bench format lock clean
+.PHONY: help setup demo test test-v4l2 test-web check bench format lock clean
 
 help:  ## list the targets
-	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
+	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
 
 setup: $(READY)  ## make .venv as uv.lock says, with everything that Open3D needs
 
@@ -25,7 +25,13 @@ demo: $(READY)  ## map an embedded scene; results in runs/demo
 	.venv/bin/semantic-mapper demo --out runs/demo
 
 test: $(READY)  ## run all tests
-	OMP_NUM_THREADS=1 .venv/bin/python -m pytest tests
+	OMP_NUM_THREADS=1 .venv/bin/python -m pytest tests -n 2 --dist loadfile
+
+test-v4l2: $(READY)  ## run the V4L2 driver against Debian's kernel with a virtual camera, in QEMU
+	.venv/bin/python scripts/v4l2_machine.py
+
+test-web: $(READY)  ## look at the viewer in a headless browser, and check the picture
+	.venv/bin/python scripts/web_viewer_check.py
 
 check: $(READY)  ## formatting, lint, types, import contracts
 	.venv/bin/ruff format --check .
