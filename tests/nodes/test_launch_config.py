@@ -179,11 +179,10 @@ def test_launch_files_for_cameras_are_as_the_docs_say() -> None:
         if not any(node.kind == "camera" and "camera" in node.options for node in file.node):
             continue
         live += 1
-        learns = any(node.kind == "finetuner" for node in file.node)
-        assert file.heartbeat_s == (5.0 if learns else 1.5), path.name
+        assert file.heartbeat_s == 1.5, path.name
         assert "{now}" in str(file.set["out"]), path.name
         for node in file.node:
-            assert node.standby == (node.kind in ("mapper", "recorder") and not learns), f"{path.name}: {node.name}"
+            assert node.standby == (node.kind != "camera"), f"{path.name}: {node.name}"
     assert live == 6
 
 
