@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
 PACKAGES = ("semantic_mapper.transport.sockets",)  # those that compute must not be loaded before ``_take_back_seat``
+_COMPUTING = ("nodes.learning_round", "nodes.learning_store")  # loaded after it, by a process in waiting, too
 POLL_S = 0.1
 STATUS_PERIOD_S = 1.0
 MAX_WAITING = 8  # keyframes, of about half a megabyte each, and of 64 MiB at the most
@@ -54,6 +56,9 @@ def run_finetuner(context: NodeContext, options: FinetunerOptions) -> None:
     config = load_config(Path(options.config), OnlineConfig) if options.config else OnlineConfig()
     path = Path(options.weights) if options.weights else default_checkpoint_path()
     start, digest = load_checkpoint(path), digest_of(path.read_bytes())
+    for name in _COMPUTING:
+        import_module(name)
+    context = context.await_turn()
     endpoint = options.labels if "://" in options.labels else context.endpoint(options.labels)
     with (
         Publisher(context.endpoint(context.name), hwm=2) as publisher,

@@ -167,13 +167,8 @@ def _check_restarts(file: LaunchFile, options: Mapping[str, NodeOptions], path: 
     """Restarts are for what is live: frames that wait for their readers have a result, which a restart would spoil.
 
     Raises:
-        ConfigError: a node is to be restarted while a camera waits for others; or a finetuner has a standby.
+        ConfigError: a node is to be restarted while a camera waits for others.
     """
-    learning = [n.name for n in file.node if n.standby and n.kind == "finetuner"]
-    if learning:
-        raise ConfigError(
-            f"{path}: node '{learning[0]}' has no standby: what it learns from is in its memory; set standby = false"
-        )
     restarted = [n.name for n in file.node if n.restart != "never"]
     waiting = [name for name, own in options.items() if isinstance(own, CameraOptions) and not own.live]
     if restarted and waiting:

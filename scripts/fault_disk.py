@@ -42,8 +42,10 @@ def full_disks(rounds: int) -> Iterator[Outcome]:
             if done.returncode:
                 raise RuntimeError(f"no small disk could be recorded to: {done.stderr.strip()}")
             found = json.loads(done.stdout.splitlines()[-1])
-            counts = {"counted as lost": found["lost"], "parts deleted": found["deleted"]}
-            yield Outcome(f"disk full, `{policy}`", found["pause_s"], lost_messages=found["unaccounted"], counts=counts)
+            counted = {"messages counted as lost": found["lost"], "parts deleted": found["deleted"]}
+            counts = {name: count for name, count in counted.items() if count}
+            case = f"disk full while recording, `{policy}` (longest write)"
+            yield Outcome(case, found["pause_s"], lost_messages=found["unaccounted"], counts=counts)
 
 
 def fill(disk: Path, policy: str, seed: int) -> dict[str, float]:

@@ -1,8 +1,9 @@
 """Breaks a live launch in every way we know, again and again: how long until it is back, and what was lost.
 
-Nodes are killed and frozen in a long launch (launch/replay-live.toml: a log in the time of its
-recording, with camera, mapper and recorder); the clock is stepped in another; each kill of the launcher has one of its
-own; floods of garbage hit a mapper node; a small disk is filled; camera and frames are spoiled in process.
+Nodes are killed and frozen in a long launch (launch/replay-live.toml: a log in the time of its recording, with camera,
+mapper and recorder), a finetuner in another (launch/replay-learning.toml); the clock is stepped in a third; each kill
+of the launcher has one of its own; floods of garbage hit a mapper node; a small disk is filled; camera and frames are
+spoiled in process.
 
 Example: python -m scripts.faults --rounds 20 --out runs/faults
 """
@@ -17,12 +18,12 @@ import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from scripts import fault_disk, fault_frames, fault_inputs, fault_nodes, fault_table
+from scripts import fault_disk, fault_finetuner, fault_frames, fault_inputs, fault_nodes, fault_table
 from scripts.long_log import write_long_log
 
 HZ = 15.0
 LOG_S = 2400.0
-CASES = ("nodes", "launcher", "clock", "disk", "floods", "keys", "unplugged", "frames")
+CASES = ("nodes", "finetuner", "launcher", "clock", "disk", "floods", "keys", "unplugged", "frames")
 
 
 def main() -> None:
@@ -54,7 +55,7 @@ def main() -> None:
 
 def _run(case: str, arguments: argparse.Namespace, folder: Path) -> Iterable[fault_table.Outcome]:
     rounds, weights, config = arguments.rounds, arguments.weights, arguments.config
-    if case in ("nodes", "launcher", "clock"):
+    if case in ("nodes", "finetuner", "launcher", "clock"):
         log = arguments.log or folder / "long.mcap"
         if not log.exists():
             write_long_log(log, LOG_S, HZ)
@@ -62,6 +63,8 @@ def _run(case: str, arguments: argparse.Namespace, folder: Path) -> Iterable[fau
         settings += [f"{name}={value}" for name, value in (("weights", weights), ("config", config)) if value]
         if case == "nodes":
             return fault_nodes.node_faults(settings, folder / "nodes", rounds)
+        if case == "finetuner":
+            return fault_finetuner.finetuner_faults(settings, folder / "finetuner", rounds)
         if case == "launcher":
             return fault_nodes.launcher_kills(settings, folder / "launcher", rounds)
         return fault_nodes.clock_steps(settings, folder / "clock", rounds)

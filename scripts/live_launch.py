@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
@@ -21,8 +21,8 @@ from semantic_mapper.transport.sockets import LosslessSubscriber
 from semantic_mapper.transport.topics import TOPICS
 
 COMMAND = Path(sys.executable).parent / "semantic-mapper"
-LAUNCH_FILE = Path(__file__).resolve().parents[1] / "launch" / "replay-live.toml"
-NODES = ("camera", "recorder", "mapper")
+LAUNCH_FOLDER = Path(__file__).resolve().parents[1] / "launch"
+NODES = ("camera", "recorder", "mapper")  # of replay-live.toml
 PATIENCE_S = 600.0
 # Faults come faster here than in a life: each is to meet a node as if it were the first in its window.
 _EVERY_FAULT_IS_THE_FIRST = 'restart = "on-failure"\nmax_restarts = 100000\nwindow_s = 3.0'
@@ -116,21 +116,31 @@ class Heard:
 
 
 class LiveLaunch:
-    """``semantic-mapper up launch/replay-live.toml`` in the background. A context manager that leaves no process.
+    """``semantic-mapper up`` of a launch file in the background. A context manager that leaves no process.
 
     Args:
         settings: NAME=VALUE, as of ``up``.
         out: Folder for its results.
         variables: Added to its environment.
+        name: Of the launch file.
+        nodes: That it has.
     """
 
-    def __init__(self, settings: Iterable[str], out: Path, variables: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        settings: Iterable[str],
+        out: Path,
+        variables: Mapping[str, str] | None = None,
+        name: str = "replay-live.toml",
+        nodes: Sequence[str] = NODES,
+    ) -> None:
         out.mkdir(parents=True, exist_ok=True)
         file = out / "launch.toml"
-        text = LAUNCH_FILE.read_text(encoding="utf-8")
+        text = (LAUNCH_FOLDER / name).read_text(encoding="utf-8")
         file.write_text(text.replace('restart = "on-failure"', _EVERY_FAULT_IS_THE_FIRST), encoding="utf-8")
         chosen = [word for setting in settings for word in ("--set", setting)]
         self.out = out
+        self.nodes = tuple(nodes)
         self.process = subprocess.Popen(
             [str(COMMAND), "up", str(file), *chosen, "--out", str(out)],
             stdout=subprocess.DEVNULL,
@@ -160,17 +170,21 @@ class LiveLaunch:
                 self.process.kill()
                 self.process.wait()
 
+    def sockets(self) -> str:
+        """Folder of its sockets, once all nodes are ready."""
+        self.told.wait("all_ready")
+        return re.split(r"sockets=", self.told.wait("sockets=")[1])[1].split()[0]
+
     def listen(self) -> tuple[Heard, Heard]:
         """Hear camera and mapper, from when all are ready."""
-        self.told.wait("all_ready")
-        folder = re.split(r"sockets=", self.told.wait("sockets=")[1])[1].split()[0]
+        folder = self.sockets()
         self.camera = Heard(f"ipc://{folder}/camera", ("frame",))
         self.mapper = Heard(f"ipc://{folder}/mapper", ("map", "refused", "status"))
         return self.camera, self.mapper
 
     def pids(self) -> dict[str, int]:
         """Of the nodes that are at work."""
-        return {node: int(self.told.all(rf"node_started .*node={node} pid=(\d+)")[-1]) for node in NODES}
+        return {node: int(self.told.all(rf"node_started .*node={node} pid=(\d+)")[-1]) for node in self.nodes}
 
     def all_pids(self) -> list[int]:
         """Of every process that ever was."""

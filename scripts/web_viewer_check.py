@@ -1,51 +1,56 @@
 """Look at the viewer as a person would: a map in a headless browser, and check what the picture shows.
 
-Run by ``make test-web``. The map is a room whose classes are known, so the picture must hold their colours, in the map
-and in the legend; and the page must have reached nobody but this machine. A page of a report is looked at, too.
+Run by ``make test-web``. A saved map is a room whose classes are known, so the picture must hold their colours, in the
+map and in the legend; and the page must have reached nobody but this machine. A launch is watched while its map grows
+(``--log`` and ``--weights``: of a recording instead of a room). A page of a report is looked at, too.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 from pathlib import Path
 from urllib.parse import urlsplit
 
-import cv2
 import numpy as np
 from browser import ROOT, Browser, provide_browser
+from web_live import look_at_live
+from web_pictures import LARGEST, take, what_is_missing
 
 from nodes.html_page import HtmlPage
 from nodes.watching import show_saved
 from nodes.web_viewer import WebViewer
 from replay.rerun_log import recording_server
 from semantic_mapper.config import VoxelMapConfig
-from semantic_mapper.evaluation.legend import LegendRow, legend_rows
+from semantic_mapper.evaluation.legend import legend_rows
 from semantic_mapper.evaluation.plot import Bar, draw_bars
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.scenes import TEST_SEEDS, room_frames
-from semantic_mapper.types import CameraIntrinsics, UInt8
+from semantic_mapper.types import CameraIntrinsics
 
 OUT = ROOT / "runs" / "web"
 WIDTH, HEIGHT = 1280, 800
 FRAMES, VOXEL_M = 24, 0.04
 CAMERA = CameraIntrinsics(160.0, 160.0, 119.5, 89.5, 240, 180)
-LEGEND_FROM, TOP = 0.8, 50  # the legend begins at this share of the width; above this row are the names of the views
-LARGEST = 4  # classes that are looked for in the map; all of them in the legend
-LEAST_MAP, LEAST_LEGEND = 800, 80  # pixels of each
-LEAST_FILLED = 0.15  # of the map's view that is not its background
 SHOWN_S, LOOK_S = 300.0, 4.0  # how long it may take, rendered without a GPU on a busy machine
 
 
 def main() -> int:
     """0 where all that should be seen is seen."""
+    parser = argparse.ArgumentParser(description="Look at the viewer in a headless browser.")
+    parser.add_argument(
+        "--log", type=Path, help="what the camera of the launch sends; a room of the benchmark's without"
+    )
+    parser.add_argument("--weights", type=Path, help="of the launch's mapper")
+    chosen = parser.parse_args()
     if error := provide_browser():
         print(f"test-web: skipped: {error}", file=sys.stderr)
         return 0
     OUT.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
-    failures = look_at_viewer() + look_at_report()
+    failures = look_at_viewer() + look_at_live(OUT, chosen.log, chosen.weights) + look_at_report()
     for failure in failures:
         print(f"test-web: {failure}", file=sys.stderr)
     print(f"test-web: {'failed' if failures else 'passed'} in {time.monotonic() - began:.0f} s; pictures in {OUT}")
@@ -84,40 +89,6 @@ def make_room() -> VoxelMap:
         sure = np.eye(len(ROOMS), dtype=np.float32)[np.maximum(channels, 0)] * 0.9 + np.float32(0.1 / len(ROOMS))
         voxel_map.integrate(frame, frame.depth_m, sure, channels >= 0)
     return voxel_map
-
-
-def take(browser: Browser, path: Path) -> UInt8:
-    """A screenshot (H, W, 3) RGB, also written to a file."""
-    data = browser.screenshot()
-    path.write_bytes(data)
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    assert picture is not None
-    return np.asarray(picture[..., ::-1], np.uint8)
-
-
-def what_is_missing(picture: UInt8, rows: list[LegendRow]) -> list[str]:
-    """What of a map with these classes cannot be seen in a screenshot."""
-    edge = round(LEGEND_FROM * picture.shape[1])
-    space, legend = picture[TOP:, :edge], picture[TOP:, edge:]
-    missing: list[str] = []
-    filled = float((np.ptp(space.astype(np.int16), axis=2) > 24).mean())  # the background is grey
-    if filled < LEAST_FILLED:
-        missing.append(f"the map's view is all but empty: {filled:.1%} of it has a colour")
-    for name, color, _ in rows[:LARGEST]:
-        if (count := pixels_of(space, color)) < LEAST_MAP:
-            missing.append(f"{name} is not seen in the map: {count} pixels")
-    for name, color, _ in rows:
-        if (count := pixels_of(legend, color)) < LEAST_LEGEND:
-            missing.append(f"{name} is not in the legend: {count} pixels")
-    return missing
-
-
-def pixels_of(picture: UInt8, color: tuple[int, int, int]) -> int:
-    """Pixels of a colour, or of one that shading has made darker."""
-    seen, wanted = picture.astype(np.float32), np.array(color, np.float32)
-    length = np.linalg.norm(seen, axis=2)
-    along = seen @ wanted / np.linalg.norm(wanted)
-    return int(((length > 0.5 * np.linalg.norm(wanted)) & (along > 0.996 * length)).sum())
 
 
 def look_at_report() -> list[str]:

@@ -28,7 +28,14 @@ from semantic_mapper.mapping.block_index import (
 )
 from semantic_mapper.mapping.block_store import BLOCK_VOXELS, BlockStore, BlockValues, PackedBlocks, pack_blocks
 from semantic_mapper.mapping.evidence import EVIDENCE_DTYPES
-from semantic_mapper.mapping.grid_buffers import ATTRIBUTES, GridBuffers, advised_mb, make_open3d_grid, view_buffers
+from semantic_mapper.mapping.grid_buffers import (
+    ATTRIBUTES,
+    GridBuffers,
+    advised_mb,
+    copy_blocks,
+    make_open3d_grid,
+    view_buffers,
+)
 from semantic_mapper.mapping.open3d_loader import load_open3d
 
 LEAST_RESIDENT = 256  # blocks that memory has room for, whatever the limit
@@ -74,6 +81,7 @@ class BlockGrid:
         if memory_bytes > 0:
             self._max_resident = min(max_blocks, max(LEAST_RESIDENT, memory_bytes // self.block_bytes))
             initial_blocks = self._max_resident  # at once: growing needs room for the old memory beside the new
+        self._channels = channels
         self._grid = make_open3d_grid(voxel_size_m, channels, max(1, min(initial_blocks, max_blocks)), evidence)
         self._map = self._grid.hashmap()
         self._index = make_block_index(np.empty((0, 3), np.int32), np.empty(0, np.int32))
@@ -368,10 +376,11 @@ class BlockGrid:
     def _grow(self, needed: int) -> None:
         capacity = min(max(needed, self.capacity + self.capacity // 2), self._max_resident)
         _log.debug("map_grows", blocks=self.block_count, capacity=capacity)
-        _, before = self.sorted_blocks()
+        keys, before = self.sorted_blocks()
+        larger = make_open3d_grid(self._voxel_size_m, self._channels, capacity, self.evidence)
+        indices = copy_blocks(self.buffers(), keys, before, larger.hashmap())
         used, version = self._used[before], self._version[before]
-        self._map.reserve(capacity)  # moves the memory and renumbers the blocks
-        keys, indices = self.sorted_blocks()
+        self._grid, self._map = larger, larger.hashmap()
         self._index = make_block_index(keys, indices)
         self._used, self._version = np.zeros(self.capacity, np.int64), np.zeros(self.capacity, np.int64)
         self._used[indices], self._version[indices] = used, version

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from replay.log import LogReader
-from scripts import fault_frames, fault_inputs, fault_table, long_log, soak
+from scripts import fault_finetuner, fault_frames, fault_inputs, fault_table, long_log, soak
 from scripts.fault_table import Outcome
 
 
@@ -28,6 +28,14 @@ def test_the_table_shows_the_worst_of_each_case(tmp_path: Path) -> None:
 def test_a_camera_that_was_unplugged_comes_back() -> None:
     (outcome,) = fault_frames.unplugged_cameras(1)
     assert outcome.others == 0
+
+
+def test_a_finetuner_that_is_killed_or_frozen_is_back_with_its_keyframes(tmp_path: Path) -> None:
+    log = long_log.write_long_log(tmp_path / "long.mcap", 400.0, 5.0)
+    killed, frozen = fault_finetuner.finetuner_faults([f"log={log}"], tmp_path / "launch", 1)
+    assert (killed.case, frozen.case) == ("kill -9 finetuner", "SIGSTOP finetuner")
+    for outcome in (killed, frozen):
+        assert outcome.counts["keyframes lost"] == outcome.others == 0
 
 
 def test_bad_messages_are_all_bad_and_of_many_kinds() -> None:
