@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from semantic_mapper.errors import SemanticMapperError
+
 
 @dataclass(frozen=True, slots=True)
 class Check:
@@ -14,3 +16,9 @@ class Check:
     state: Literal["ok", "note", "bad"]
     found: str
     mend: str = ""
+
+
+def failed(name: str, error: SemanticMapperError) -> Check:
+    """Errors say what is wrong; and after a semicolon, how to mend it."""
+    found, _, mend = str(error).partition("; ")
+    return Check(name, "bad", found, mend)

@@ -1,11 +1,12 @@
-"""Examinations of a launch file: what `up` would refuse, ports that are taken, keys that cannot be used."""
+"""Examinations of a launch file: what `up` or its nodes would refuse, ports that are taken, keys that are of no use."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from nodes.doctor_check import Check
+from nodes.doctor_check import Check, failed
+from nodes.doctor_nodes import node_settings
 from nodes.doctor_robot import port_is_taken
 from nodes.identity import default_folder
 from nodes.launch_config import Launch, load_launch
@@ -23,9 +24,10 @@ def launch_file(path: Path, settings: Sequence[str]) -> Iterator[Check]:
     try:
         launch = load_launch(path, settings)
     except SemanticMapperError as error:
-        yield _failed(path.name, error)
+        yield failed(path.name, error)
         return
     yield Check(path.name, "ok", f"{len(launch.nodes)} nodes: {', '.join(node.name for node in launch.nodes)}")
+    yield from node_settings(launch)
     checks = {keys: keys_in(Path(keys).expanduser()) for _, keys in _listening(launch) if keys}
     yield from checks.values()
     for endpoint, keys in _listening(launch):
@@ -49,7 +51,7 @@ def keys_in(folder: Path) -> Check:
     try:
         peers = load_keys(folder).peers()
     except SemanticMapperError as error:
-        return _failed("keys", error)
+        return failed("keys", error)
     if not peers:
         return Check(
             "keys", "note", f"{folder}: no peers, so that nobody is let in", "semantic-mapper keys allow NAME KEY"
@@ -73,15 +75,9 @@ def _address(endpoint: str, folder: str) -> Check:
     try:
         check_bind(endpoint, load_keys(Path(folder).expanduser()) if folder else None)
     except SemanticMapperError as error:
-        return _failed("address", error)
+        return failed("address", error)
     host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
     if endpoint.startswith("tcp://") and port.isdigit() and port_is_taken(int(port), host):
         mend = f"`ss -ltnp 'sport = :{port}'` says who; give another with --set"
         return Check("address", "note", f"{endpoint} is in use (by this very launch, if it runs)", mend)
     return Check("address", "ok", endpoint)
-
-
-def _failed(name: str, error: SemanticMapperError) -> Check:
-    """Errors say what is wrong; and after a semicolon, how to mend it."""
-    found, _, mend = str(error).partition("; ")
-    return Check(name, "bad", found, mend)

@@ -69,7 +69,7 @@ def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCame
 
     make_source(live)  # mistakes in the config are told before anything waits for the camera
     if context.comes_back:
-        _check_world(context, live)
+        check_world(context.name, live)
     context = context.await_turn()
     with Publisher(context.endpoint(context.name), policy="drop") as publisher, _Teller(context, publisher) as teller:
         context.heart.ready()  # a camera may be plugged in much later
@@ -84,7 +84,7 @@ def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCame
         drain(context, publisher)
 
 
-def _check_world(context: NodeContext, live: LiveCamera) -> None:
+def check_world(name: str, live: LiveCamera) -> None:
     """A camera that tracks itself must not come back: its next process would put frames where they do not belong.
 
     Raises:
@@ -97,7 +97,7 @@ def _check_world(context: NodeContext, live: LiveCamera) -> None:
     poses = read_pose_config({key: value for key, value in config.items() if key != "checks"}, where)
     if begins_world(poses):
         raise ConfigError(
-            f"node '{context.name}' is to be started anew where it fails, but poses of kind '{poses.kind}' begin in "
+            f"node '{name}' is to be started anew where it fails, but poses of kind '{poses.kind}' begin in "
             'another world then, and its frames would spoil the map: set restart = "never" (the launch ends then, and '
             "the map is written), or take poses from a topic or a board"
         )

@@ -82,3 +82,22 @@ def test_keys_that_a_launch_file_names_are_read(tmp_path: Path, monkeypatch: pyt
     assert [c.state for c in doctor_launch.own_keys()] == ["ok"]
     monkeypatch.setattr(doctor_launch, "default_folder", lambda: folder)
     assert [c.state for c in doctor_launch.own_keys()] == ["bad"]
+
+
+def test_what_a_node_would_refuse_as_it_starts_is_told_before(tmp_path: Path) -> None:
+    found = of(REPLAY_LAUNCH, f"log={tmp_path / 'none.mcap'}")
+    assert (found["camera"][0].state, found["mapper"][0].state) == ("bad", "ok")
+    assert "no such log" in found["camera"][0].found
+    found = of(ROBOT, "fps=15")
+    assert found["camera"][0] == Check("camera", "ok", "settings of camera 'oak' (oak) and its poses")
+    assert of(ROBOT, "fps=-1")["camera"][0].state == "bad"
+    file = tmp_path / "learning.toml"
+    text = ROBOT.with_name("learning.toml").read_text(encoding="utf-8")
+    file.write_text(text.replace('restart = "never"', 'restart = "on-failure"'), encoding="utf-8")
+    (tmp_path / "mapper.toml").write_text("[voxel_map]\nvoxel_size = 0.1\n", encoding="utf-8")
+    (tmp_path / "broken.safetensors").write_bytes(b"no weights")
+    settings = (f"config={tmp_path / 'mapper.toml'}", f"weights={tmp_path / 'broken.safetensors'}")
+    found = of(file, *settings)
+    assert "begin in another world" in found["camera"][0].found
+    assert "voxel_size" in found["mapper"][0].found and "broken.safetensors" in found["finetuner"][0].found
+    assert {found[name][0].state for name in ("camera", "mapper", "finetuner")} == {"bad"}

@@ -230,7 +230,7 @@ def test_a_failure_ends_the_stream_only_where_the_camera_is_not_started_anew(
     writer.release()
     config = {"source": str(film), "calibration": write_calibration(tmp_path / "lens.toml")}
     poses = {"kind": "device", "patience_s": 0.1}  # a video tells no pose of its own
-    monkeypatch.setattr(live_camera, "_check_world", lambda *_: None)
+    monkeypatch.setattr(live_camera, "check_world", lambda *_: None)
     with running({"camera": {"kind": "opencv", "config": config, "poses": poses}}, comes_back=comes_back) as node:
         node.until(lambda m: isinstance(m, EndOfStream) or (isinstance(m, Status) and m.state == "ended"))
         ends = [m for m in list(node.heard) if isinstance(m, EndOfStream)]

@@ -1,0 +1,65 @@
+"""Examinations of what the nodes of a launch file are told: what each of them would refuse as it starts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from nodes.doctor_check import Check, failed
+from nodes.launch_config import Launch, NodeEntry
+from nodes.options import CameraOptions, FinetunerOptions, MapperOptions
+from semantic_mapper.errors import ConfigError, SemanticMapperError
+
+
+def node_settings(launch: Launch) -> Iterator[Check]:
+    """One check a node that has settings beyond its options: files that it reads, tables of its camera and poses."""
+    for entry in launch.nodes:
+        try:
+            found = _settings(entry, launch)
+        except SemanticMapperError as error:
+            yield failed(entry.name, error)
+        else:
+            if found:
+                yield Check(entry.name, "ok", found)
+
+
+def _settings(entry: NodeEntry, launch: Launch) -> str:
+    """What was found to be right.
+
+    Raises:
+        SemanticMapperError: something is not.
+    """
+    match launch.options[entry.name]:
+        case CameraOptions(camera=None, log=str(log)):
+            if not Path(log).exists():
+                raise ConfigError(f"{log}: no such log")
+            return log
+        case CameraOptions(camera=live) if live is not None:
+            from nodes.live_camera import check_world, make_source
+
+            make_source(live)
+            if entry.restart != "never":
+                check_world(entry.name, live)
+            return f"settings of camera '{live.id}' ({live.kind}) and its poses"
+        case MapperOptions() as options:
+            from nodes.run_replay import mapper_config
+
+            mapper_config(Path(options.config) if options.config else None, options.voxel_size_m or None)
+            return _weights(options.weights)
+        case FinetunerOptions() as options:
+            from semantic_mapper.config import load_config
+            from semantic_mapper.training.online import OnlineConfig
+
+            if options.config:
+                load_config(Path(options.config), OnlineConfig)
+            return _weights(options.weights)
+        case _:
+            return ""
+
+
+def _weights(named: str) -> str:
+    from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
+
+    path = Path(named) if named else default_checkpoint_path()
+    load_checkpoint(path)
+    return f"settings, and weights {path.name}"
