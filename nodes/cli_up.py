@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
@@ -36,14 +37,17 @@ def up(
     from nodes.launch_config import load_launch
     from nodes.launcher import Launcher
     from nodes.options import MapperOptions
+    from nodes.outputs import hold_folder
     from nodes.results import print_results
     from nodes.systemd import Notifier
 
     checked = load_launch(launch, settings or (), out)
     folders = [Path(o.out) for o in checked.options.values() if isinstance(o, MapperOptions)]
     before = [_written(f) for f in folders]
-    with StopRequest() as stop, Launcher(checked, Notifier.from_environment()) as launcher:
-        launcher.run(stop)
+    with StopRequest() as stop, ExitStack() as stack:
+        for folder in dict.fromkeys(f.resolve() for f in folders):
+            stack.enter_context(hold_folder(folder))
+        stack.enter_context(Launcher(checked, Notifier.from_environment())).run(stop)
     fresh = [f for f, stamp in zip(folders, before, strict=True) if _written(f) not in (0, stamp)]
     results = print_results(output, fresh)
     for name, summary in results.items():

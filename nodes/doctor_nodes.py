@@ -7,8 +7,8 @@ from pathlib import Path
 
 from nodes.doctor_check import Check, failed
 from nodes.launch_config import Launch, NodeEntry
-from nodes.options import CameraOptions, FinetunerOptions, MapperOptions
-from semantic_mapper.errors import ConfigError, SemanticMapperError
+from nodes.options import CameraOptions, FinetunerOptions, LiveCamera, MapperOptions
+from semantic_mapper.errors import CameraError, ConfigError, SemanticMapperError
 
 
 def node_settings(launch: Launch) -> Iterator[Check]:
@@ -40,7 +40,7 @@ def _settings(entry: NodeEntry, launch: Launch) -> str:
             make_source(live)
             if entry.restart != "never":
                 check_world(entry.name, live)
-            return f"settings of camera '{live.id}' ({live.kind}) and its poses"
+            return f"{_connected(live)}; its settings and poses"
         case MapperOptions() as options:
             from nodes.run_replay import mapper_config
 
@@ -55,6 +55,30 @@ def _settings(entry: NodeEntry, launch: Launch) -> str:
             return _weights(options.weights)
         case _:
             return ""
+
+
+def _connected(live: LiveCamera) -> str:
+    """The camera, by its address.
+
+    Raises:
+        CameraError: it is not there.
+    """
+    from drivers.registry import find_cameras
+    from nodes.live_camera import table_of
+
+    device = str(table_of(live.config, "camera.config")[0].get("device", ""))
+    # Files and streams are named, not found; a device file has several names; an IP address may lie behind a router.
+    if live.kind == "opencv" or Path(device).is_char_device() or device.count(".") == 3:
+        return f"{live.kind} {device}".rstrip()
+    found, unknown = find_cameras((live.kind,))
+    if live.kind in unknown:
+        raise CameraError(unknown[live.kind])
+    addresses = [camera.address for camera in found]
+    if device in addresses or (addresses and not device):
+        return f"{live.kind} {device or addresses[0]}"
+    missing = f"{live.kind} {device} is not connected" if device else f"no {live.kind} camera is connected"
+    there = f", there are {', '.join(addresses)}" if addresses else ""
+    raise CameraError(f"camera '{live.id}': {missing}{there}; plug it in (`up` waits for it)")
 
 
 def _weights(named: str) -> str:

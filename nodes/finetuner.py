@@ -160,7 +160,7 @@ class _Finetuner:
     def _take_up(self, store: LearningStore) -> None:
         """Go on with what the process before this one had; a launch begins with nothing."""
         if not self._context.restarts:
-            store.clear()
+            store.put_aside()
             return
         progress = store.restore(self._pool)
         self._rolled_back, self._failures = progress.rolled_back, progress.failures

@@ -7,6 +7,7 @@ says which there are and what has become of them.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +15,7 @@ import msgspec
 import structlog
 
 from nodes.options import Count
+from nodes.outputs import free_name
 from semantic_mapper.config import Config, convert_config
 from semantic_mapper.errors import CodecError, ConfigError, SemanticMapperError
 from semantic_mapper.labels import LabelSet
@@ -71,14 +73,20 @@ class LearningStore:
         self._digests: dict[str, PosedFrame] = {}  # on disk
         self._written: _Record | None = None
 
-    def clear(self) -> None:
-        """Forget what another launch has left.
+    def put_aside(self) -> None:
+        """Begin with nothing; what another launch has left, which people may have labelled, stays beside.
 
         Raises:
-            OSError: a file cannot be deleted.
+            OSError: it cannot be moved.
         """
-        (self._folder / _RECORD).unlink(missing_ok=True)
-        self._delete_others(())
+        record = self._folder / _RECORD
+        if not record.exists() or not any(self._folder.glob(f"*{_SUFFIX}")):
+            record.unlink(missing_ok=True)
+            return
+        left = datetime.fromtimestamp(record.stat().st_mtime, UTC)
+        kept = free_name(self._folder.with_name(f"{self._folder.name}-earlier-{left:%Y%m%dT%H%M%SZ}"))
+        self._folder.rename(kept)
+        _log.warning("earlier_keyframes_kept", folder=str(kept))
 
     def keep(self, kept: Sequence[Kept], progress: Progress) -> None:
         """Make the files what they should be; cheap where they are.

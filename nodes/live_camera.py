@@ -93,7 +93,7 @@ def check_world(name: str, live: LiveCamera) -> None:
     from drivers.poses.config import begins_world
     from drivers.poses.sources import read_pose_config
 
-    config, where = _table(live.poses, "camera.poses")
+    config, where = table_of(live.poses, "camera.poses")
     poses = read_pose_config({key: value for key, value in config.items() if key != "checks"}, where)
     if begins_world(poses):
         raise ConfigError(
@@ -112,10 +112,10 @@ def make_source(live: LiveCamera) -> LiveSource:
     from drivers.mounts import mount_of
     from drivers.registry import open_camera
 
-    config, where = _table(live.config, "camera.config")
+    config, where = table_of(live.config, "camera.config")
     camera = open_camera(live.kind, config, live.id, where)
     mount = mount_of(live.T_rig_camera, live.kind, config, f"camera '{live.id}'")
-    return with_poses(camera, _table(live.poses, "camera.poses")[0], mount)
+    return with_poses(camera, table_of(live.poses, "camera.poses")[0], mount)
 
 
 def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> LiveSource:
@@ -135,7 +135,7 @@ def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> LiveSour
     return PosedCamera(camera, make_poses(poses), checks=checks, T_rig_camera=mount.for_poses(poses))
 
 
-def _table(named: str | dict[str, Any], where: str) -> tuple[dict[str, Any], str]:
+def table_of(named: str | dict[str, Any], where: str) -> tuple[dict[str, Any], str]:
     """A table of the launch file, or of the file that it names, and what to call it in messages."""
     from semantic_mapper.config import read_toml
 

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import structlog
+
 from semantic_mapper.errors import ConfigError
+
+_log = structlog.get_logger(__name__)
 
 
 def prepare_file(path: Path) -> None:
@@ -31,3 +39,32 @@ def prepare_folder(out: Path) -> None:
         probe.unlink()
     except OSError as error:
         raise ConfigError(f"{out}: cannot hold the results ({error.strerror}); choose another folder") from error
+
+
+def free_name(path: Path) -> Path:
+    """The path, or the first of "NAME-1", "NAME-2", ... where nothing is yet."""
+    names = (path, *(path.with_stem(f"{path.stem}-{n}") for n in range(1, 1000)))
+    return next(p for p in names if not p.exists())
+
+
+@contextmanager
+def hold_folder(out: Path) -> Iterator[None]:
+    """Make the folder for results, and keep other runs out of it for as long as this one lasts.
+
+    Raises:
+        ConfigError: it cannot be made or written to, or another run writes its results there.
+    """
+    prepare_folder(out)
+    folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(
+                f"{out}: another run writes its results there; choose another folder (--out), or wait until it ends"
+            ) from None
+        except OSError as error:  # file systems without locks
+            _log.warning("folder_not_held", folder=str(out), reason=error.strerror)
+        yield
+    finally:
+        os.close(folder)

@@ -8,6 +8,7 @@ from pathlib import Path
 import structlog
 
 from nodes.node import NodeContext
+from nodes.outputs import free_name
 from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.voxel_map import VoxelMap
 
@@ -75,7 +76,7 @@ def keep_earlier(context: NodeContext, path: Path) -> None:
     if there == _NO_FILE or context.note(_EARLIER) not in ("", there):
         return
     saved = datetime.fromtimestamp(path.stat().st_mtime, UTC)
-    kept = _free(path.parent / f"earlier-{saved:%Y%m%dT%H%M%SZ}")
+    kept = free_name(path.parent / f"earlier-{saved:%Y%m%dT%H%M%SZ}")
     kept.mkdir()
     for file in (*map(path.with_name, _RESULTS), *path.parent.glob(f"{path.stem}-before-restart-*{path.suffix}")):
         if file.exists():
@@ -84,14 +85,8 @@ def keep_earlier(context: NodeContext, path: Path) -> None:
     _log.warning("earlier_results_kept", folder=str(kept))
 
 
-def _free(path: Path) -> Path:
-    """The path, or the first of "NAME-1", "NAME-2", ... where nothing is yet."""
-    names = (path, *(path.with_stem(f"{path.stem}-{n}") for n in range(1, 1000)))
-    return next(p for p in names if not p.exists())
-
-
 def _put_aside(context: NodeContext, path: Path) -> str:
-    aside = _free(path.with_name(f"{path.stem}-before-restart-{context.restarts}{path.suffix}"))
+    aside = free_name(path.with_name(f"{path.stem}-before-restart-{context.restarts}{path.suffix}"))
     path.replace(aside)
     context.leave_note(_EARLIER, _NO_FILE)
     context.leave_note(_UNSOUND, "")

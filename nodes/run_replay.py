@@ -11,7 +11,7 @@ import msgspec
 import structlog
 
 from nodes.finishing import finish_session
-from nodes.outputs import prepare_folder
+from nodes.outputs import hold_folder
 from nodes.process import StopRequest
 from replay.corrections import correct_session, keeping_frames, read_corrections
 from replay.sequence import Log, open_log
@@ -71,10 +71,9 @@ def replay_log(
         LogError, WeightsError, ConfigError, MapError: nothing could be mapped; the message says why.
         ImportSourceError: the corrections cannot be read.
     """
-    prepare_folder(request.out)
     trajectory = read_corrections(request.corrections) if request.corrections else None
     exclude = load_checkpoint(request.exclude).train_stamps_ns if request.exclude else frozenset[int]()
-    with open_log((request.log, *request.further_parts)) as log:
+    with hold_folder(request.out), open_log((request.log, *request.further_parts)) as log:
         for notice in log.notices:
             _log.warning("log_notice", notice=notice)
         config = request.config if trajectory is None else keeping_frames(request.config, len(log))

@@ -186,6 +186,10 @@ def test_a_restarted_finetuner_goes_on_with_the_weights_and_keyframes_of_the_one
             with runs(0) as heard:  # another launch
                 assert eventually(lambda: heard.counters().get("kept") == 0)
                 assert not list((out / "learning").glob("*.keyframe"))
+            with runs(0) as heard:
+                assert eventually(lambda: heard.counters().get("kept") == 0)
+            (earlier,) = out.glob("learning-earlier-*")
+            assert len(list(earlier.glob("*.keyframe"))) == 7, "which people may have labelled"
 
 
 def test_a_round_that_fails_or_dies_keeps_its_keyframes_for_the_next(
