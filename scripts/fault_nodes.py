@@ -129,13 +129,44 @@ def clock_steps(settings: Sequence[str], out: Path, rounds: int) -> list[Outcome
     return found
 
 
-def launcher_kills(settings: Sequence[str], out: Path, rounds: int) -> Iterator[Outcome]:
-    """Launch after launch: with one node frozen, kill -9 of the launcher; nothing may stay, and results are written."""
+def launcher_freezes(settings: Sequence[str], out: Path, rounds: int) -> Iterator[Outcome]:
+    """In one launch: SIGSTOP of the launcher for a while; its nodes go on, and it finds them alive."""
+    with LiveLaunch(settings, out) as launch:
+        camera, mapper = launch.listen()
+        launch.told.wait("map_saved")
+        for node in NODES:
+            launch.wait_until_covered(node)
+        for _ in range(rounds):
+            pids, began_s = launch.all_pids(), time.monotonic()
+            launch.process.send_signal(signal.SIGSTOP)
+            time.sleep(WATCH_S)
+            launch.process.send_signal(signal.SIGCONT)
+            time.sleep(SETTLE_S)
+            maps = [at for at, _ in mapper.numbers("map") if at >= began_s - 0.5]
+            numbers = [seq for at, seq in camera.numbers("frame") if at >= began_s - 0.5]
+            yield Outcome(
+                f"SIGSTOP launcher for {WATCH_S:g} s (longest pause of the map)",
+                max(b - a for a, b in itertools.pairwise(maps)),
+                numbers[-1] - numbers[0] + 1 - len(numbers),
+                others=len(set(launch.all_pids()) ^ set(pids)),
+            )
+
+
+def launcher_kills(settings: Sequence[str], out: Path, rounds: int, frozen: bool) -> Iterator[Outcome]:
+    """Launch after launch: kill -9 of the launcher; nothing may stay, and results are written.
+
+    Args:
+        settings, out: See ``LiveLaunch``.
+        rounds: Launches.
+        frozen: One node is frozen before.
+    """
+    how = "one node frozen" if frozen else "its nodes well"
     for count in range(rounds):
-        with LiveLaunch(settings, out / f"launch-{count}") as launch:
+        with LiveLaunch(settings, out / f"launch-{count}-{frozen}") as launch:
             launch.told.wait("map_saved")
             time.sleep(SETTLE_S)
-            os.kill(launch.pids()[NODES[count % len(NODES)]], signal.SIGSTOP)
+            if frozen:
+                os.kill(launch.pids()[NODES[count % len(NODES)]], signal.SIGSTOP)
             began_s = time.monotonic()
             launch.process.kill()
             launch.process.wait()
@@ -145,10 +176,10 @@ def launcher_kills(settings: Sequence[str], out: Path, rounds: int) -> Iterator[
             gone_s = time.monotonic() - began_s
             unwritten = int(not (launch.out / "summary.json").exists())
             yield Outcome(
-                "kill -9 launcher, one node frozen (until all are gone)",
+                f"kill -9 launcher, {how} (until all are gone)",
                 gone_s,
                 lost_blocks=unwritten,
                 left=sum(map(is_alive, pids)),
                 counts={"processes ended": len(pids)},
             )
-        print(f"launcher: round {count + 1} of {rounds}", flush=True)
+        print(f"launcher, {how}: round {count + 1} of {rounds}", flush=True)

@@ -11,6 +11,7 @@ Example: python -m scripts.faults --rounds 20 --out runs/faults
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import platform
 import tempfile
@@ -31,7 +32,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=20, help="of each case")
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
-    parser.add_argument("--messages", type=int, default=1_000_000, help="of garbage, in all rounds together")
+    parser.add_argument("--messages", type=int, default=5_000_000, help="of garbage, in all rounds together")
     parser.add_argument("--log", type=Path, help="an hour's log to play; made where it is not given")
     parser.add_argument("--weights", default="", help="as of `semantic-mapper up --set`")
     parser.add_argument("--config", default="", help="as of `semantic-mapper up --set`")
@@ -66,7 +67,10 @@ def _run(case: str, arguments: argparse.Namespace, folder: Path) -> Iterable[fau
         if case == "finetuner":
             return fault_finetuner.finetuner_faults(settings, folder / "finetuner", rounds)
         if case == "launcher":
-            return fault_nodes.launcher_kills(settings, folder / "launcher", rounds)
+            kills = (
+                fault_nodes.launcher_kills(settings, folder / "launcher", rounds, frozen) for frozen in (False, True)
+            )
+            return itertools.chain(*kills, fault_nodes.launcher_freezes(settings, folder / "frozen", rounds))
         return fault_nodes.clock_steps(settings, folder / "clock", rounds)
     cases: dict[str, Callable[[], Iterable[fault_table.Outcome]]] = {
         "disk": lambda: fault_disk.full_disks(rounds),
