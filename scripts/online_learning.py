@@ -316,10 +316,10 @@ def run(args: argparse.Namespace, out: Path) -> dict[str, Any]:
         version = robot.version
         robot.offer(misled(out / "weights" / f"{version:06d}.safetensors"))
         robot.map_until(lambda: robot.in_use.judged > version and not robot.in_use.accepted, score)
-        robot.map_frames(args.frames // 2, score)
+        robot.map_frames(2 * args.frames, score)
         robot.client.return_to_weights(0)
         robot.map_until(lambda: robot.version == 0, score)
-        robot.map_frames(args.frames, score)
+        robot.map_frames(3 * args.frames, score)
         summary = robot.end()
         story = robot.story
     swap = next(e["frame"] for e in story.events if e["what"] == "weights exchanged")
@@ -349,7 +349,7 @@ def draw(found: dict[str, Any], path: Path) -> None:
     marks = [Curve(name, ((events[e], 0.0), (events[e], 100.0))) for e, name in MARKS.items() if e in events]
     curve = Curve("mIoU, %", tuple((x, y) for x, y in found["curve"]), marked=True)
     panel = Panel(f"mIoU of {WINDOW} frames", (curve, *marks), "seconds of mapping")
-    write_picture(path, draw_panels("", [panel], 1))
+    write_picture(path, draw_panels("", [panel], 1, (1080, 420)))
 
 
 def main() -> None:
@@ -361,7 +361,7 @@ def main() -> None:
     parser.add_argument("--learning", default="", help="TOML file with an OnlineConfig")
     parser.add_argument("--keyframes", type=int, default=12, help="labelled well")
     parser.add_argument("--bad", type=int, default=8, help="labelled with shuffled classes, later")
-    parser.add_argument("--frames", type=int, default=60, help="mapped before, between and after")
+    parser.add_argument("--frames", type=int, default=60, help="mapped before learning; a multiple of it later")
     parser.add_argument("--share", type=float, default=0.5, help="of a core, for the finetuner")
     parser.add_argument("--niceness", type=int, default=19, help="of the finetuner, 0 to 19")
     parser.add_argument("--json", type=Path, help="write the figures here")

@@ -60,16 +60,19 @@ class Panel:
     x_title: str = ""
 
 
-def draw_panels(title: str, panels: Sequence[Panel], across: int = 3) -> UInt8:
-    """Panels of one size beside and below each other, under a title if it has letters, as (h, w, 3) RGB."""
+def draw_panels(
+    title: str, panels: Sequence[Panel], across: int = 3, size: tuple[int, int] = (_WIDTH, _HEIGHT)
+) -> UInt8:
+    """Panels of one size (width, height) beside and below each other, under a title if it has letters, (h, w, 3) RGB."""
+    wide, high = size
     down, top = -(-len(panels) // across), MARGIN + (_TITLE if title else 0)
-    width = 2 * MARGIN + across * _WIDTH + (across - 1) * GAP
-    picture = new_canvas(width, top + down * _HEIGHT + (down - 1) * GAP + MARGIN)
+    width = 2 * MARGIN + across * wide + (across - 1) * GAP
+    picture = new_canvas(width, top + down * high + (down - 1) * GAP + MARGIN)
     draw_text(picture, title, (MARGIN, MARGIN), 18, TEXT)
     for number, panel in enumerate(panels):
-        x = MARGIN + number % across * (_WIDTH + GAP)
-        y = top + number // across * (_HEIGHT + GAP)
-        draw_panel(picture[y : y + _HEIGHT, x : x + _WIDTH], panel.title, panel.curves, panel.x_title)
+        x = MARGIN + number % across * (wide + GAP)
+        y = top + number // across * (high + GAP)
+        draw_panel(picture[y : y + high, x : x + wide], panel.title, panel.curves, panel.x_title)
     return picture
 
 
