@@ -63,7 +63,7 @@ class Panel:
 def draw_panels(
     title: str, panels: Sequence[Panel], across: int = 3, size: tuple[int, int] = (_WIDTH, _HEIGHT)
 ) -> UInt8:
-    """Panels of one size (width, height) beside and below each other, under a title if it has letters, (h, w, 3) RGB."""
+    """Panels of one size (width, height) beside and below each other, under a title if there is one, (h, w, 3) RGB."""
     wide, high = size
     down, top = -(-len(panels) // across), MARGIN + (_TITLE if title else 0)
     width = 2 * MARGIN + across * wide + (across - 1) * GAP
