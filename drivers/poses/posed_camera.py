@@ -13,14 +13,15 @@ import structlog
 
 from drivers.base import Camera, CameraImage, PoseEstimate, PoseSource
 from drivers.poses.config import PoseChecks
-from drivers.poses.motion import StampedPose, turn_between
+from drivers.poses.gate import PoseGate, Verdict
 from semantic_mapper.errors import PoseError, ShapeError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import Float64, PosedFrame
 
 _DEFAULTS = PoseChecks()
-FAR = 2.0  # times what is allowed: a jump, whatever comes after it
+EXACT = ("fixed",)  # sources whose poses come from the settings: the first one is not doubted
+REASONS = ("no_pose", "stale", "not_rotation", "jumping", "unsettled")
 
 _log = structlog.get_logger(__name__)
 
@@ -43,7 +44,8 @@ class TellingPoseSource(PoseSource, Protocol):
 class PosedCamera:
     """A ``FrameSource``: the images of a camera, each with its pose.
 
-    An image that gets none is left out, which shows as a gap in ``seq``.
+    An image that gets none is left out, which shows as a gap in ``seq``. A camera's first frames are held back until
+    some of their poses agree with each other (``first_agree``), and are given then.
 
     Args:
         camera: Gives the images.
@@ -54,7 +56,8 @@ class PosedCamera:
     Attributes:
         counters: "frames" given; images left out: "no_pose" (the source has none), "stale" (the image is not later than
             the one before: late, doubled or out of order), "not_rotation" (NaN, mirror, scale), "jumping" (faster than
-            the camera can have moved). With "pose_" before them, those of the pose source.
+            the camera can have moved), "unsettled" (at the beginning, while poses do not agree with each
+            other). With "pose_" before them, those of the pose source.
     """
 
     def __init__(
@@ -70,7 +73,7 @@ class PosedCamera:
         self._checks = checks
         self._T_rig_camera = T_rig_camera
         self._counts: Counter[str] = Counter()
-        self._gates: dict[str, _JumpGate] = {}
+        self._gates: dict[str, PoseGate] = {}
         self._last_ns: dict[str, int] = {}
         self._trouble = ""
 
@@ -82,7 +85,7 @@ class PosedCamera:
     @property
     def counters(self) -> dict[str, int]:
         """Frames given and left out; see the class."""
-        own = {name: self._counts[name] for name in ("frames", "no_pose", "stale", "not_rotation", "jumping")}
+        own = {name: self._counts[name] for name in ("frames", *REASONS)}
         if not isinstance(self._poses, TellingPoseSource):
             return own
         return own | {f"pose_{name}": count for name, count in dict(self._poses.counters).items()}
@@ -128,8 +131,10 @@ class PosedCamera:
         for image in self._camera:
             estimate = self._checked_pose(image)
             if estimate is not None:
-                self._counts["frames"] += 1
-                yield _frame(image, estimate)
+                gate = self._gates.setdefault(image.camera_id, PoseGate(self._checks, exact=estimate.source in EXACT))
+                yield from self._passed(gate.take(_frame(image, estimate)), image.camera_id)
+        for camera_id, gate in self._gates.items():
+            yield from self._passed(gate.end(), camera_id)
 
     def _checked_pose(self, image: CameraImage) -> PoseEstimate | None:
         if image.stamp_ns <= self._last_ns.get(image.camera_id, -1):
@@ -148,65 +153,28 @@ class PosedCamera:
             return self._refuse(image, "not_rotation", str(error))
         if not np.isfinite(estimate.sigma) or estimate.sigma < 0:
             return self._refuse(image, "not_rotation", f"its pose has an uncertainty of {estimate.sigma} m")
-        gate = self._gates.setdefault(image.camera_id, _JumpGate(self._checks))
-        jump = gate.refusal(StampedPose(image.stamp_ns, estimate.T_world_camera))
-        if jump:
-            return self._refuse(image, "jumping", jump)
-        self._trouble = ""
         return estimate
 
-    def _refuse(self, image: CameraImage, reason: str, detail: str) -> None:
+    def _passed(self, verdict: Verdict, camera_id: str) -> Iterator[PosedFrame]:
+        for frame, why in verdict.jumping:
+            self._refuse(frame, "jumping", why)
+        for frame, why in verdict.unsettled:
+            self._refuse(frame, "unsettled", why)
+        if verdict.waiting:
+            self._trouble = f"frames of '{camera_id}' are held back: {verdict.waiting}"
+        elif verdict.passed:
+            self._trouble = ""
+        for frame in verdict.passed:
+            self._counts["frames"] += 1
+            yield frame
+
+    def _refuse(self, image: CameraImage | PosedFrame, reason: str, detail: str) -> None:
         """Count it; tell of it at each power of two."""
         self._counts[reason] += 1
         count = self._counts[reason]
         self._trouble = f"image {image.seq} of '{image.camera_id}' was left out ({reason}): {detail}"
         if count & (count - 1) == 0:
             _log.warning("image_left_out", reason=reason, count=count, detail=self._trouble)
-
-
-class _JumpGate:
-    """Lets poses pass that a camera can have reached from the last one; and the new place, once it is sure of it.
-
-    What is within reach grows with the time since the last pose that passed. A source that has jumped far and goes on
-    from there must not pass because of that; one that jumps back may.
-    """
-
-    def __init__(self, checks: PoseChecks) -> None:
-        self._checks = checks
-        self._last: StampedPose | None = None
-        self._elsewhere: StampedPose | None = None  # the last refused pose, and ...
-        self._agreeing = 0  # ... how many in a row agree with it, and ...
-        self._far = False  # ... whether the first of them was so far that no quick movement explains it
-
-    def refusal(self, sample: StampedPose) -> str:
-        """Why a pose is refused; empty where it passes."""
-        reason = "" if self._last is None else self._jump(self._last, sample)
-        follows = self._elsewhere is not None and not self._jump(self._elsewhere, sample)
-        if not reason and follows and self._far:
-            reason = "it goes on from where the pose had jumped to"
-        if reason:
-            self._agreeing = self._agreeing + 1 if follows else 1
-            if not follows and self._last is not None:
-                self._far = bool(self._jump(self._last, sample, FAR))
-            self._elsewhere = sample
-            if not 0 < self._checks.settle < self._agreeing:
-                return reason
-            _log.warning("jump_accepted", reason=reason, agreeing=self._agreeing)
-        self._last, self._elsewhere, self._agreeing = sample, None, 0
-        return ""
-
-    def _jump(self, a: StampedPose, b: StampedPose, times: float = 1.0) -> str:
-        seconds = (b.stamp_ns - a.stamp_ns) / 1e9
-        moved_m = float(np.linalg.norm(b.T[:3, 3] - a.T[:3, 3]))
-        turned_deg = float(np.rad2deg(np.linalg.norm(turn_between(a.T, b.T))))
-        allowed_m = times * (self._checks.slack_m + self._checks.max_speed_m_s * seconds)
-        allowed_deg = times * (self._checks.slack_deg + self._checks.max_turn_deg_s * seconds)
-        if moved_m <= allowed_m and turned_deg <= allowed_deg:
-            return ""
-        return (
-            f"the pose jumps by {moved_m:.2f} m and {turned_deg:.0f} degrees in {seconds:.3f} s; at most "
-            f"{allowed_m:.2f} m and {allowed_deg:.0f} degrees are believed (max_speed_m_s, max_turn_deg_s)"
-        )
 
 
 def _frame(image: CameraImage, estimate: PoseEstimate) -> PosedFrame:
