@@ -24,6 +24,9 @@ from semantic_mapper.transport.security import ServerIdentity, load_keys, secure
 _POLL_MS = 50
 _SILENCE_S = 1.0  # after so long without a message the connection is made anew
 _FRESH_NS = 500_000_000  # a message that came so long ago was sent just now, as far as clocks go
+# A pose cannot be of a moment that has not come. So much is left to publishers that tell where the robot will be when
+# the message arrives, and to an offset between two clocks that is not exact; it is what ``max_ahead_s`` bridges, too.
+_FUTURE_NS = 50_000_000
 _MISSES = {
     "before": "is older than the poses that are kept",
     "gap": "falls into a gap between two poses",
@@ -45,9 +48,9 @@ class TopicPoseSource:
         CameraError: not an endpoint; one of another machine, and there is no `server`; or there are no keys.
 
     Attributes:
-        counters: Messages ("messages"), those that were none ("rejected"), of other frames ("other_frames"), not later
-            than the one before ("out_of_order"), far from the images' clock ("clock"), and images without a pose by
-            reason ("empty", "before", "gap", "stale").
+        counters: Messages ("messages"), those that were none ("rejected"), of other frames ("other_frames"), of
+            a moment that has not come ("future"), not later than the one before ("out_of_order"), and images without a
+            pose by reason ("empty", "before", "gap", "stale", "clock": messages are far from the images' clock).
     """
 
     def __init__(self, config: TopicPoses) -> None:
@@ -105,7 +108,7 @@ class TopicPoseSource:
                 return self._refuse("clock", self._clock_trouble(image))
             found = self._track.at(image.stamp_ns)
         if found == "empty":
-            return self._refuse("empty", f"no pose has come from {self._config.endpoint}; is its publisher running?")
+            return self._refuse("empty", self._empty_trouble())
         if isinstance(found, str):
             return self._refuse(found, self._miss_trouble(image, found))
         self._image_trouble = ""
@@ -133,6 +136,11 @@ class TopicPoseSource:
             f"the images of '{image.camera_id}': they are of another clock; stamp both with CLOCK_MONOTONIC of one "
             f"machine, or set clock_offset_ns (now {self._config.clock_offset_ns}) if the difference is constant"
         )
+
+    def _empty_trouble(self) -> str:
+        if self._message_trouble:
+            return f"no pose that came from {self._config.endpoint} could be used"
+        return f"no pose has come from {self._config.endpoint}; is its publisher running?"
 
     def _miss_trouble(self, image: CameraImage, miss: str) -> str:
         newest = self._track.newest_ns or 0
@@ -212,23 +220,42 @@ class TopicPoseSource:
                 self._drop("other_frames", f"the message's {name} frame is '{told}', not '{wanted}'")
                 return
         sample = _sample(message, self._config.clock_offset_ns)
+        now_ns = time.monotonic_ns()
+        if sample.stamp_ns - now_ns > _FUTURE_NS:
+            self._drop("future", self._future_trouble(sample, now_ns))
+            return
         with self._changed:
             newest = self._track.newest_ns
-            if newest is not None and newest - sample.stamp_ns > self._config.max_clock_difference_s * 1e9:
-                self._track.clear()  # the publisher's clock was set back, or it was started anew
+            if newest is not None and self._is_set_back(newest - sample.stamp_ns, now_ns):
+                self._track.clear()
             if not self._track.add(sample):
                 self._drop("out_of_order", f"stamp {sample.stamp_ns} is not after {newest}")
                 return
-            self._arrived_ns = time.monotonic_ns()
+            self._arrived_ns = now_ns
             self._connection_trouble = self._message_trouble = ""
             self.counters["messages"] += 1
             self._changed.notify_all()
 
+    def _is_set_back(self, behind_ns: int, now_ns: int) -> bool:
+        """Whether the publisher's clock was set back, or it was started anew, as told by a message so far behind.
+
+        Not while others keep coming that are not behind: then it is of a second publisher, on another clock.
+        """
+        silent = now_ns - self._arrived_ns > _FRESH_NS
+        return silent and behind_ns > self._config.max_clock_difference_s * 1e9
+
+    def _future_trouble(self, sample: StampedPose, now_ns: int) -> str:
+        return (
+            f"it is stamped {(sample.stamp_ns - now_ns) / 1e9:.3f} s ahead of this machine's CLOCK_MONOTONIC, so it is "
+            "of another clock; stamp poses with CLOCK_MONOTONIC of this machine, or set clock_offset_ns (now "
+            f"{self._config.clock_offset_ns}) if the difference is constant"
+        )
+
     def _drop(self, reason: str, detail: str) -> None:
         """A message that cannot be used costs itself and nothing else; told of at each power of two."""
+        self._message_trouble = f"a message of {self._config.endpoint} was dropped: {detail}"
         self.counters[reason] += 1
         count = self.counters[reason]
-        self._message_trouble = f"a message of {self._config.endpoint} was dropped: {detail}"
         if count & (count - 1) == 0:
             _log.warning("pose_message_dropped", reason=reason, count=count, detail=detail)
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -125,17 +126,17 @@ def test_beyond_the_last_pose_the_motion_goes_on_for_a_while_and_no_longer(endpo
 
 def test_other_clocks_are_refused_with_the_difference_and_mended_by_the_offset(endpoint: str, robot: Robot) -> None:
     with listening(endpoint, robot) as source:
-        robot.tell(500_000)
-        robot.tell(500_020)
+        robot.tell(5000)
+        robot.tell(5020)
         eventually(lambda: source.counters["messages"] == 2)
         assert source.pose(image(1000 * MS)) is None  # at once, not after ``wait_s``
-        assert source.counters["clock"] == 1 and "+499.020 s" in source.troubles[0]
+        assert source.counters["clock"] == 1 and "+4.020 s" in source.troubles[0]
         assert "clock_offset_ns" in source.troubles[0]
-    with listening(endpoint, robot, clock_offset_ns=-499_000 * MS) as source:
-        robot.tell(500_000)
-        robot.tell(500_020)
+    with listening(endpoint, robot, clock_offset_ns=-4000 * MS) as source:
+        robot.tell(5000)
+        robot.tell(5020)
         found = source.pose(image(1010 * MS))
-    assert found is not None and found.T_world_camera[0, 3] == pytest.approx(500.01)
+    assert found is not None and found.T_world_camera[0, 3] == pytest.approx(5.01)
 
 
 def test_a_clock_ahead_by_less_than_is_kept_is_refused_too(endpoint: str, robot: Robot) -> None:
@@ -148,12 +149,65 @@ def test_a_clock_ahead_by_less_than_is_kept_is_refused_too(endpoint: str, robot:
 
 def test_a_publisher_that_starts_anew_with_an_earlier_clock_is_followed(endpoint: str, robot: Robot) -> None:
     with listening(endpoint, robot) as source:
-        robot.tell(90_000)
-        robot.tell(1000)
-        robot.tell(1020)
-        eventually(lambda: source.counters["messages"] == 3)
-        found = source.pose(image(1010 * MS))
-    assert found is not None and found.T_world_camera[0, 3] == pytest.approx(1.01)
+        robot.tell(4000)
+        eventually(lambda: source.counters["messages"] == 1)
+        clock = count(1000)
+
+        def followed() -> bool:
+            robot.tell(next(clock))
+            return source.counters["messages"] > 2
+
+        eventually(followed)
+        newest = source.counters["messages"] + source.counters["out_of_order"] + 998
+        found = source.pose(image(newest * MS))
+    assert found is not None and found.T_world_camera[0, 3] == pytest.approx(newest / 1e3)
+
+
+@pytest.fixture
+def stopped_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is 10 s on this machine's clock, and stays so."""
+    clock = SimpleNamespace(monotonic=time.monotonic, monotonic_ns=lambda: 10_000 * MS)
+    monkeypatch.setattr(topic, "time", clock)
+
+
+@pytest.mark.usefixtures("stopped_clock")
+def test_a_second_publisher_on_a_clock_that_is_behind_disturbs_nothing(endpoint: str, robot: Robot) -> None:
+    with listening(endpoint, robot) as source:
+        for ms in range(9800, 10_000, 20):
+            robot.tell(ms)
+            robot.tell(ms - 3000)
+        eventually(lambda: source.counters["out_of_order"] == 10)
+        assert source.counters["messages"] == 10
+        found = source.pose(image(9850 * MS))
+    assert found is not None and found.T_world_camera[0, 3] == pytest.approx(9.85)
+
+
+@pytest.mark.usefixtures("stopped_clock")
+@pytest.mark.parametrize("ahead_ms", [300, 900, 3_600_000])
+def test_messages_of_moments_that_have_not_come_disturb_nothing(endpoint: str, robot: Robot, ahead_ms: int) -> None:
+    with listening(endpoint, robot) as source:
+        for ms in range(9800, 10_000, 20):
+            robot.tell(ms)
+            robot.tell(ms + ahead_ms)
+        eventually(lambda: source.counters["future"] == 10)
+        assert source.counters == {"messages": 10, "future": 10}
+        assert "ahead of this machine's CLOCK_MONOTONIC" in source.troubles[0]
+        assert "clock_offset_ns" in source.troubles[0]
+        found = source.pose(image(9850 * MS))
+    assert found is not None and found.T_world_camera[0, 3] == pytest.approx(9.85)
+
+
+@pytest.mark.usefixtures("stopped_clock")
+def test_a_pose_may_be_ahead_by_as_much_as_a_robot_looks_ahead(endpoint: str, robot: Robot) -> None:
+    with listening(endpoint, robot, wait_s=0.0) as source:
+        robot.tell(10_051)
+        eventually(lambda: source.counters["future"] == 1)
+        assert source.pose(image(10_000 * MS)) is None
+        ahead, empty = source.troubles
+        assert "it is stamped 0.051 s ahead" in ahead and "no pose that came from" in empty  # not told as silence
+        robot.tell(10_050)
+        eventually(lambda: source.counters["messages"] == 1)
+        assert source.pose(image(10_050 * MS)) is not None and source.troubles == ()
 
 
 def test_what_is_no_pose_costs_itself_only(endpoint: str, robot: Robot) -> None:
