@@ -6,8 +6,11 @@ from typing import Annotated
 
 import msgspec
 
+from drivers.v4l2.ioctls import HIGHEST, LOWEST
 from semantic_mapper import config
-from semantic_mapper.config import AtLeastZero, NotNegative, Positive
+from semantic_mapper.config import NotNegative, Positive
+
+_MAX_EXPOSURE_MS = HIGHEST // 10  # the control counts tenths of a millisecond
 
 
 class Config(config.Config, frozen=True):
@@ -22,12 +25,13 @@ class Config(config.Config, frozen=True):
     # Pixel format asked for, four letters. MJPG passes through USB at full rate; YUYV is without artefacts. Empty = as
     # the device has it.
     fourcc: Annotated[str, msgspec.Meta(pattern=r"^(.{4}|)\Z")] = "MJPG"
-    exposure_ms: AtLeastZero = 0.0  # 0 = automatic; a short one blurs less while the robot moves
-    white_balance_k: NotNegative = 0  # colour temperature in kelvin; 0 = automatic
-    gain: Annotated[int, msgspec.Meta(ge=-1)] = -1  # in the device's own units; -1 = as it is
+    # 0 = automatic; a short one blurs less while the robot moves
+    exposure_ms: Annotated[float, msgspec.Meta(ge=0, le=_MAX_EXPOSURE_MS)] = 0.0
+    white_balance_k: Annotated[int, msgspec.Meta(ge=0, le=HIGHEST)] = 0  # colour temperature in kelvin; 0 = automatic
+    gain: Annotated[int, msgspec.Meta(ge=-1, le=HIGHEST)] = -1  # in the device's own units; -1 = as it is
     # Any other control by the name that the device gives it, in small letters with _ (focus_absolute); see
     # `v4l2-ctl --list-ctrls`. A lens that focuses by itself changes its focal length: fix it.
-    controls: dict[str, int] = msgspec.field(default_factory=dict)
+    controls: dict[str, Annotated[int, msgspec.Meta(ge=LOWEST, le=HIGHEST)]] = msgspec.field(default_factory=dict)
     stall_s: Positive = 2.0  # without an image for so long, the stream counts as stalled and is started anew
 
     def __post_init__(self) -> None:

@@ -72,5 +72,5 @@ def _set(fd: int, control: Control | None, wish: _Wish) -> str:
         ioctls.set_control(fd, control.id, value)
         given = ioctls.get_control(fd, control.id)
     except OSError as error:
-        return f"{wish.setting}: it refuses {control.name} = {value} ({error.strerror}); {span}"
+        return f"{wish.setting}: it refuses {control.name} = {value} ({error.strerror or error}); {span}"
     return "" if given == value else f"{wish.setting}: asked for {control.name} = {value}, it has {given}; {span}"

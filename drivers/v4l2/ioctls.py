@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from semantic_mapper.errors import CameraError
+
 EXPOSURE_AUTO = 0x009A0901
 EXPOSURE_ABSOLUTE = 0x009A0902  # in 100 microseconds
 AUTO_WHITE_BALANCE = 0x0098090C
@@ -23,6 +25,8 @@ WHITE_BALANCE_TEMPERATURE = 0x0098091A
 AUTOGAIN = 0x00980912
 GAIN = 0x00980913
 EXPOSURE_MANUAL = 1  # of EXPOSURE_AUTO
+
+LOWEST, HIGHEST = -(2**31), 2**31 - 1  # value of a control
 
 _CAP_VIDEO_CAPTURE = 0x00000001
 _CAP_DEVICE_CAPS = 0x80000000
@@ -176,7 +180,14 @@ def get_control(fd: int, control: int) -> int:
 
 
 def set_control(fd: int, control: int, value: int) -> None:
-    """Set a control. Raises ``OSError`` where the device refuses."""
+    """Set a control.
+
+    Raises:
+        CameraError: more than the kernel's 32 bits hold; ctypes would pass on what is left of it.
+        OSError: the device refuses.
+    """
+    if not LOWEST <= value <= HIGHEST:
+        raise CameraError(f"control {control:#x} = {value}: a control's value must be from {LOWEST} to {HIGHEST}")
     fcntl.ioctl(fd, S_CTRL, _ControlValue(id=control, value=value))
 
 

@@ -262,6 +262,34 @@ def test_controls_that_do_not_follow_are_told(machine: Machine, tmp_path: Path) 
         assert [t.split(": ", 1)[1] for t in camera.troubles] == ["it has no control for gain"]
 
 
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"gain": 2**31},
+        {"white_balance_k": 2**32 + 4000},
+        {"exposure_ms": 5e8},
+        {"exposure_ms": float("inf")},
+        {"controls": {"focus_absolute": 2**32 + 10}},
+        {"controls": {"focus_absolute": -(2**31) - 1}},
+    ],
+)
+def test_values_of_more_than_32_bits_are_refused(machine: Machine, tmp_path: Path, settings: dict[str, Any]) -> None:
+    device = machine.plug(Sensor(), 0)
+    with pytest.raises(ConfigError, match=next(iter(settings))):
+        v4l2(device, tmp_path, **settings)
+
+
+def test_no_control_is_set_to_what_is_left_of_a_value(machine: Machine) -> None:
+    sensor = Sensor()
+    with ioctls.opened(machine.plug(sensor, 0)) as fd:
+        for value in (2**32 + 40, 2**31, -(2**31) - 1):
+            with pytest.raises(CameraError, match=rf"= {value}: a control's value must be from -2147483648 to"):
+                ioctls.set_control(fd, ioctls.GAIN, value)
+        assert sensor.values == {}
+        ioctls.set_control(fd, ioctls.GAIN, 40)
+    assert sensor.values == {ioctls.GAIN: 40}
+
+
 def test_controls_are_set_again_when_the_camera_comes_back(machine: Machine, tmp_path: Path) -> None:
     sensor = Sensor()
     with v4l2(machine.plug(sensor, 0), tmp_path, gain=40) as camera:
