@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from types import TracebackType
+from typing import TYPE_CHECKING, Annotated, Self
 
 import typer
 
@@ -16,6 +18,8 @@ from nodes.verb import verb
 from semantic_mapper.errors import ConfigError, TransportError
 
 if TYPE_CHECKING:
+    from rerun import RecordingStream
+
     from nodes.watching import Live
     from nodes.web_viewer import WebViewer
 
@@ -73,27 +77,64 @@ def view(
     if server and "://" not in source:
         raise typer.BadParameter("goes with an endpoint such as tcp://robot:5570", param_hint="--server")
     output = Output.guarded()
-    from nodes.web_viewer import WebViewer
-
     saved = None if log else _saved_map(path, source)
-    if (log or saved) and not (saved or path).exists():
-        raise ConfigError(f"{path}: no such file")
+    if source and "://" not in source and not path.exists():
+        other = "" if log or saved else ", and no socket folder of a launch"
+        raise ConfigError(f"{path}: no such file{other}; without a name, `view` shows the one launch that runs here")
     live = None if log or saved else _find_live(source, query, server, keys)
-    with StopRequest() as stop, WebViewer(port, data_port, memory) as viewer:
-        output.print(f"watch at {viewer.page_url}")
+    with StopRequest() as stop, _Page(port, data_port, memory, output) as page:
         if saved is not None:
             from nodes.watching import show_saved
-            from replay.rerun_log import recording_server
 
-            show_saved(saved, recording_server(viewer.data_url))
+            show_saved(saved, page.begin)
         elif live is None:
-            _show_log(path, weights, config, max_frames, viewer, refresh, stop)
+            _show_log(path, weights, config, max_frames, page, refresh, stop)
         else:
-            _show_live(live, viewer, refresh, stop, output)
+            from nodes.watching import show_live
+
+            show_live(live, page.begin, refresh, stop, output.print)
         while not stop:
-            if not viewer.alive:
+            if not page.alive:
                 raise TransportError("the process that serves the viewer has ended; start `view` again")
             time.sleep(POLL_S)
+
+
+class _Page:
+    """The page, served from when there is something to show on it; a context manager."""
+
+    def __init__(self, port: int, data_port: int, memory_mb: int, output: Output) -> None:
+        self._settings = port, data_port, memory_mb
+        self._output = output
+        self._ends = ExitStack()
+        self._viewer: WebViewer | None = None
+
+    @property
+    def alive(self) -> bool:
+        """Whether it is served."""
+        return self._viewer is not None and self._viewer.alive
+
+    def begin(self) -> RecordingStream:
+        """Serve it, say where, and tell what writes on it.
+
+        Raises:
+            DependencyError, TransportError: see ``WebViewer``.
+        """
+        from nodes.web_viewer import WebViewer
+        from replay.rerun_log import recording_server
+
+        self._viewer = self._ends.enter_context(WebViewer(*self._settings))
+        self._output.print(f"watch at {self._viewer.page_url}")
+        stream = recording_server(self._viewer.data_url)
+        self._ends.callback(stream.disconnect)  # before its server ends, which it would complain of at length
+        return stream
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ends.close()
 
 
 def _is_log(source: str) -> bool:
@@ -134,13 +175,12 @@ def _show_log(
     weights: Path | None,
     config: Path | None,
     max_frames: int,
-    viewer: WebViewer,
+    page: _Page,
     refresh: float,
     stop: StopRequest,
 ) -> None:
     from nodes.run_replay import mapper_config
     from nodes.watching import show_log
-    from replay.rerun_log import recording_server
 
     settings = mapper_config(config, None)
     with frame_progress("map", None) as bar:
@@ -149,16 +189,9 @@ def _show_log(
             weights,
             settings,
             max_frames,
-            recording_server(viewer.data_url),
+            page.begin,
             refresh,
-            going=lambda: not stop and viewer.alive,
+            going=lambda: not stop and page.alive,
             on_start=bar.start,
             on_frame=bar.set,
         )
-
-
-def _show_live(live: Live, viewer: WebViewer, refresh: float, stop: StopRequest, output: Output) -> None:
-    from nodes.watching import show_live
-    from replay.rerun_log import recording_server
-
-    show_live(live, recording_server(viewer.data_url), refresh, stop, output.print)

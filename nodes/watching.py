@@ -36,6 +36,8 @@ MAX_POINTS = 400_000  # of a map that is shown again and again: of a larger one 
 POLL_S = 0.1
 ASK_AGAIN_S = 1.0  # a mapper that does not answer yet
 
+Begin = Callable[[], rr.RecordingStream]  # what is to be shown is open: where does it go?
+
 _log = structlog.get_logger(__name__)
 
 
@@ -83,14 +85,14 @@ def thinned(points: MapPoints, ages: Float32) -> tuple[MapPoints, Float32]:
     return few, ages[::step]
 
 
-def show_saved(path: Path, stream: rr.RecordingStream) -> None:
+def show_saved(path: Path, begin: Begin) -> None:
     """Show a saved map; its ages are not known.
 
     Raises:
         MapError: it cannot be read.
     """
     voxel_map = VoxelMap.load(path)
-    log = RerunLog(stream, voxel_map.label_set, voxel_map.config.voxel_size_m)
+    log = RerunLog(begin(), voxel_map.label_set, voxel_map.config.voxel_size_m)
     log.finish(voxel_map.points())
 
 
@@ -99,7 +101,7 @@ def show_log(
     weights: Path | None,
     config: MapperConfig,
     frames: int,
-    stream: rr.RecordingStream,
+    begin: Begin,
     refresh_s: float,
     going: Callable[[], bool],
     on_start: Callable[[int], None],
@@ -111,7 +113,7 @@ def show_log(
         path: The log.
         weights, config: See ``load_pipeline``.
         frames: At most so many; 0 = all.
-        stream: Where to write it.
+        begin: Says where to write it, once log and weights are open.
         refresh_s: Time between two maps.
         going: Whether to go on.
         on_start: Told how many frames there are.
@@ -124,7 +126,7 @@ def show_log(
     pipeline = bundle.pipeline
     voxel_map = pipeline.voxel_map
     with open_log(path) as reader:
-        log = RerunLog(stream, pipeline.label_set, voxel_map.config.voxel_size_m)
+        log = RerunLog(begin(), pipeline.label_set, voxel_map.config.voxel_size_m)
         show, mirror = _MapShow(log), MapMirror.of(voxel_map)
         session = MapSession(bundle, stream_labels=None, source=reader.info.source, rerun=log)
         total = min(len(reader), frames or len(reader))
@@ -147,7 +149,7 @@ def show_log(
 
 
 def show_live(
-    live: Live, stream: rr.RecordingStream, refresh_s: float, stop: StopRequest, tell: Callable[[str], None]
+    live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tell: Callable[[str], None]
 ) -> None:
     """Show a running system until its streams have ended or somebody asks to stop.
 
@@ -155,7 +157,7 @@ def show_live(
 
     Args:
         live: Where it is.
-        stream: Where to write it.
+        begin: Says where to write it, once the endpoint is known to be one.
         refresh_s: Time between two maps.
         stop: Somebody wants to end it.
         tell: Told in words how it goes.
@@ -164,6 +166,7 @@ def show_live(
         TransportError: an endpoint that is none.
     """
     with MapClient(live.query, identity=live.identity, attempts=1) as client:
+        stream = begin()
         snapshot = _first_snapshot(client, stop, tell)
         if snapshot is None:
             return

@@ -69,7 +69,7 @@ def look_at_viewer() -> list[str]:
     assert len(left) == 1 + LARGEST + len(rows), "an empty picture lacks all"
     with WebViewer(0, 0) as viewer, Browser(WIDTH, HEIGHT) as browser:
         browser.open(viewer.page_url)  # before there is anything to see
-        show_saved(OUT / "map.npz", recording_server(viewer.data_url))
+        show_saved(OUT / "map.npz", lambda: recording_server(viewer.data_url))
         deadline = time.monotonic() + SHOWN_S
         while left and time.monotonic() < deadline:
             browser.wait(LOOK_S)

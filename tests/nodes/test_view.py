@@ -24,14 +24,15 @@ import pytest
 import rerun.chunk
 
 from nodes import watching
-from nodes.cli_view import _find_live
+from nodes.cli_view import _find_live, _Page
+from nodes.console import Output
 from nodes.launch_config import STATUS_SOCKET
 from nodes.launch_note import NOTE, LaunchNote, NodeNote
 from nodes.process import StopRequest
 from nodes.watching import Live, show_live, show_log, show_saved, thinned
 from nodes.web_viewer import WebViewer
 from replay.rerun_log import MAX_PATH, RerunLog, recording_file, recording_server
-from semantic_mapper.errors import TransportError
+from semantic_mapper.errors import MapError, TransportError
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.queries.ages import BlockAges
 from semantic_mapper.queries.mirror import MapMirror
@@ -40,7 +41,7 @@ from semantic_mapper.transport.messages import EndOfStream, NodeState, Status
 from semantic_mapper.transport.security import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.sockets import Publisher
 from semantic_mapper.types import MapUpdate
-from tests.nodes.support import eventually, is_alive
+from tests.nodes.support import error_line, eventually, is_alive, run
 from tests.nodes.test_query_service import answering
 from tests.queries.scene import LABELS, painted, whole_map
 from tests.small import tiny_config, tiny_frames
@@ -109,6 +110,33 @@ def test_the_page_is_served_here_alone_and_may_speak_to_nobody_else() -> None:
     assert not settings.exists()
 
 
+def test_what_cannot_be_shown_is_refused_before_a_page_is_promised(tmp_path: Path) -> None:
+    for name in ("map.npz", "log.mcap", "text"):
+        (tmp_path / name).write_bytes(b"neither of these" * 100)
+    words = {
+        tmp_path / "map.npz": "damaged or not a map",
+        tmp_path / "log.mcap": "not an MCAP log",
+        tmp_path / "text": "no socket folder of a launch",
+        tmp_path / "nope": "no such file, and no socket folder of a launch",
+        "tcp://10.1.2.3:5570": "without keys",
+    }
+    for source, reason in words.items():
+        done = run("view", source, "--port", "0", "--data-port", "0")
+        assert done.returncode == 1 and reason in error_line(done.stderr)
+        assert not done.stdout and len(done.stderr.splitlines()) == 1, "no address, and nothing of Rerun's"
+
+
+def test_an_error_while_something_is_shown_is_the_only_one(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(MapError), _Page(0, 0, 64, Output.guarded()) as page:
+        log = RerunLog(page.begin(), LABELS)
+        assert page.alive
+        for _ in range(20):
+            log.log_map(whole_map().points())
+        raise MapError("ours")
+    said = capfd.readouterr()
+    assert said.out.startswith("watch at http://127.0.0.1:") and not said.err
+
+
 def test_a_viewer_that_is_killed_leaves_no_server() -> None:
     program = (
         "import time\nfrom nodes.web_viewer import WebViewer\n"
@@ -130,7 +158,7 @@ def test_a_log_is_mapped_and_shown_with_all_colourings(log: Path, weights: Path,
         weights,
         tiny_config(),
         5,
-        recording_file(tmp_path / "log.rrd"),
+        lambda: recording_file(tmp_path / "log.rrd"),
         0.0,
         going=lambda: len(done) < 4,
         on_start=done.append,
@@ -149,7 +177,7 @@ def test_a_log_is_mapped_and_shown_with_all_colourings(log: Path, weights: Path,
 def watching_live(live: Live, path: Path, told: list[str]) -> Iterator[StopRequest]:
     """Somebody who watches, until it is over or asked to stop at the end."""
     stop = StopRequest()
-    watcher = threading.Thread(target=show_live, args=(live, recording_file(path), 0.2, stop, told.append))
+    watcher = threading.Thread(target=show_live, args=(live, lambda: recording_file(path), 0.2, stop, told.append))
     watcher.start()
     try:
         yield stop
@@ -242,7 +270,7 @@ def test_a_map_on_another_machine_is_shown_to_who_has_a_key(tmp_path: Path) -> N
 
 def test_a_saved_map_has_no_ages(tmp_path: Path) -> None:
     whole_map().save(tmp_path / "map.npz")
-    show_saved(tmp_path / "map.npz", recording_file(tmp_path / "map.rrd"))
+    show_saved(tmp_path / "map.npz", lambda: recording_file(tmp_path / "map.rrd"))
     rows = logged(tmp_path / "map.rrd")
     assert rows["/world/map/class"] == rows["/legend"] == 1 and "/world/map/age" not in rows
 
