@@ -60,6 +60,9 @@ class LogWriter:
         overwrite: Whether an existing file may be replaced.
         attachments: What else to keep in it.
 
+    Attributes:
+        trouble: Why it takes nothing more; None where all is well.
+
     Raises:
         LogError: the file exists, or cannot be written; then there is none.
     """
@@ -82,6 +85,7 @@ class LogWriter:
         self._last_stamp_ns = 0
         parts = encode_info(info)  # before the file is made: what cannot be packed leaves none behind
         self._failed = False
+        self.trouble: OSError | None = None
         self._file = _create(path, overwrite)
         # A chunk is closed once it is longer than chunk_size, that is after each message.
         self._writer = Writer(cast(IO[bytes], self._file), chunk_size=1, compression=CompressionType.NONE)
@@ -92,11 +96,11 @@ class LogWriter:
                 self.attach(attachment)
             self._writer.add_metadata("semantic-mapper", _for_people(info))
             self.write_parts(parts)
-        except LogError:
+        except LogError as error:
             self._file.close()
             if path.is_file():
                 path.unlink()
-            raise
+            raise LogError(f"{path}: cannot be written: {self.trouble or error}") from self.trouble
 
     @property
     def bytes_written(self) -> int:
@@ -197,6 +201,7 @@ class LogWriter:
         return self._channels[name]
 
     def _cannot_write(self, error: OSError) -> LogError:
+        self.trouble = error
         return LogError(f"{self.path}: cannot be written ({error}); {self.frames} frames are in it and can be read")
 
 

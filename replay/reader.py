@@ -201,8 +201,8 @@ class LogReader:
                     self._report(LogError(f"{self._where(entry)}: {error}"))
         damaged = f"; damaged: {self.errors[0]}" if self.errors else ""
         raise LogError(
-            f"{self.path}: says nothing of its cameras and classes: not a log of semantic-mapper, or cut off before "
-            f"its first frame{damaged}"
+            f"{self.path}: says nothing of its cameras and classes: not a log of semantic-mapper (what `export` writes "
+            f"for Foxglove is none either: use the log it was made of), or cut off before its first frame{damaged}"
         )
 
     def _report_damages(self, found: Scan) -> None:

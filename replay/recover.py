@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from replay.log import LogReader, LogWriter
+from replay.log import LogReader
+from replay.whole_log import whole_log
 from semantic_mapper.errors import LogError
 
 
@@ -29,11 +30,11 @@ def recover(src: Path, dst: Path) -> RecoverReport:
     """Write every intact message of ``src`` to the new log ``dst``; ``src`` is not touched.
 
     Raises:
-        LogError: ``src`` gives no frame at all, or ``dst`` exists or cannot be written.
+        LogError: ``src`` gives no frame at all, or ``dst`` exists or cannot be written; then there is no ``dst``.
     """
     with (
         LogReader(src) as reader,
-        LogWriter(dst, reader.info, attachments=tuple(reader.attachments().values())) as writer,
+        whole_log(dst, reader.info, attachments=tuple(reader.attachments().values())) as writer,
     ):
         for envelope, parts in reader.messages():
             if envelope.topic != "info":  # the writer has put it there already

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -13,7 +12,9 @@ from replay.importers.kitti360 import Kitti360Recording
 from replay.importers.replica import ReplicaRecording
 from replay.importers.scannet import ScanNetRecording
 from replay.importers.tum import TumRecording
-from replay.log import LogWriter
+from replay.log import LogReader, LogWriter
+from replay.sequence import SUFFIX as LOG_SUFFIX
+from replay.whole_log import whole_log
 from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LabelError, LogError
 from semantic_mapper.transport.codec import CodecOptions
 from semantic_mapper.transport.messages import StreamInfo
@@ -49,9 +50,7 @@ def detect_format(src: Path) -> str:
     if not src.exists():
         raise ImportSourceError(f"{src}: no such folder")
     if src.is_file():
-        is_log = src.suffix == ".mcap"
-        hint = "is a log already; replay it as it is" if is_log else "is a file, not the folder of a recording"
-        raise ImportSourceError(f"{src}: {hint}")
+        raise ImportSourceError(f"{src}: {_what_file(src)}")
     missing: list[str] = []
     for name, marks in _MARKS.items():
         lacks = [mark for mark in marks if not (src / mark).exists()]
@@ -64,6 +63,20 @@ def detect_format(src: Path) -> str:
     if sequences:
         raise ImportSourceError(f"{src}: is a scene of Replica; name one sequence: {', '.join(map(str, sequences))}")
     raise ImportSourceError(f"{src}: is no recording of a known format: {'; '.join(missing)}")
+
+
+def _what_file(src: Path) -> str:
+    """Why a file is not imported."""
+    if src.suffix != LOG_SUFFIX:
+        return "is a file, not the folder of a recording"
+    try:
+        LogReader(src, allow_empty=True).close()
+    except LogError:
+        return (
+            "is neither the folder of a recording nor a log of semantic-mapper; MCAP files of other programs, and "
+            "those that `export` has written for Foxglove, cannot be imported: use the log that they were made of"
+        )
+    return "is a log already; replay it as it is"
 
 
 def import_recording(
@@ -108,20 +121,13 @@ def import_recording(
     info, changed = _changes(src, recording.info, options, renames or {})
     packing = codec or CodecOptions(depth_scale=recording.depth_scale)
 
-    unfinished = dst.with_name(f".{dst.name}.importing")
-    try:
-        with LogWriter(unfinished, info, options=packing, overwrite=True) as writer:
-            keep_files = codec is None and options.quarters % 4 == 0
-            labelled, skipped = _copy(recording, writer, total, changed, on_progress, keep_files=keep_files)
-            frames = writer.frames
+    with whole_log(dst, info, options=packing, overwrite=overwrite) as writer:
+        keep_files = codec is None and options.quarters % 4 == 0
+        labelled, skipped = _copy(recording, writer, total, changed, on_progress, keep_files=keep_files)
+        frames = writer.frames
         if frames == 0:
             reasons = "; ".join(f"{s.file}: {s.reason}" for s in skipped[:3])
             raise ImportSourceError(f"{src}: none of its {total} frames can be used: {reasons}")
-        os.replace(unfinished, dst)
-    except OSError as error:
-        raise LogError(f"{dst}: cannot be written: {error}") from error
-    finally:
-        unfinished.unlink(missing_ok=True)
     return ImportReport(frames, labelled, tuple(skipped), tuple(recording.notices), name, info, dst.stat().st_size)
 
 

@@ -23,7 +23,7 @@ from replay.exporters import LogExportReport, LogExportRequest, export_log, log_
 from replay.importers import ImportOptions, import_recording
 from replay.importers.tum import read_trajectory
 from replay.log import LogReader, LogWriter
-from semantic_mapper.errors import ConfigError, LogError
+from semantic_mapper.errors import ConfigError, ImportSourceError, LogError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.transport.codec import CodecOptions, encode_frame
 from semantic_mapper.transport.messages import StreamInfo
@@ -182,6 +182,17 @@ def test_foxglove_file_is_what_the_schemas_say(tmp_path: Path) -> None:
 
 
 _TYPES: dict[str, Any] = {"object": dict, "string": str, "integer": int, "array": list, "number": float}
+
+
+def test_a_foxglove_file_sends_its_reader_to_the_log(log: Path, tmp_path: Path) -> None:
+    exported(log, tmp_path / "foxglove.mcap")
+    words = "for Foxglove.*use the log"
+    with pytest.raises(ImportSourceError, match=words):
+        import_recording(tmp_path / "foxglove.mcap", tmp_path / "back.mcap")
+    with pytest.raises(LogError, match=words):
+        LogReader(tmp_path / "foxglove.mcap")
+    with pytest.raises(ImportSourceError, match="is a log already; replay it as it is"):
+        import_recording(log, tmp_path / "back.mcap")
 
 
 def test_rerun_file_holds_every_frame(log: Path, tmp_path: Path) -> None:
