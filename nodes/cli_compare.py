@@ -84,11 +84,18 @@ def comparison_table(comparison: Comparison) -> Table:
 
 def _compare(a: Path, b: Path, tolerances: Tolerances, exact: bool, picture: Path | None) -> tuple[Comparison, Path]:
     from nodes.outputs import prepare_file
+    from nodes.saved_maps import is_log
     from replay.compare import compare_runs
     from replay.compare_picture import draw_comparison
     from replay.run_folder import read_run
     from semantic_mapper.evaluation.sheet import write_picture
 
+    for path in (a, b):
+        if path.exists() and is_log(path):
+            raise ConfigError(
+                f"{path}: is a log, and `compare` takes maps or results of runs: `semantic-mapper replay {path} --out "
+                "FOLDER` makes one, to be named here as FOLDER"
+            )
     runs = read_run(a), read_run(b)
     drawn = picture or (b if b.is_dir() else b.parent) / "compare.png"
     prepare_file(drawn)

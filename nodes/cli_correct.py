@@ -51,6 +51,7 @@ def correct(
     Example: semantic-mapper correct ipc:///run/robot/query optimised.tum
     """
     output = Output.guarded()
+    from nodes.running_launches import refuse_missing_socket
     from replay.corrections import MATCH_NS, read_corrections
     from semantic_mapper.client import MapClient
     from semantic_mapper.mapping.pose_correction import ALWAYS
@@ -59,6 +60,7 @@ def correct(
     pairs = zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)
     poses = {(camera, stamp_ns): pose for stamp_ns, pose in pairs}
     until_ns = ALWAYS if until is None else round(until * 1e9)
+    refuse_missing_socket(endpoint)
     with MapClient(endpoint, identity=server_identity(server, keys)) as client:
         begun = client.correct_poses(poses, until_ns=until_ns, within_ns=MATCH_NS)
         state = _follow(client) if wait else begun

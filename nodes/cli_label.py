@@ -54,12 +54,34 @@ def label(
     from semantic_mapper.transport.messages import LabelledKeyframe
 
     endpoint = labels_endpoint(to)
+    if "://" not in to:
+        _refuse_without_finetuner(Path(endpoint.removeprefix("ipc://")).parent)
     with StopRequest() as stop, frame_progress("label", None) as bar:
         chosen, label_set = choose_keyframes(log, keyframes, numbers, images, stop, bar)
         with sending(endpoint, timeout, stop) as send:
             for frame in chosen:
                 send(LabelledKeyframe(frame, label_set, teacher or f"log {log.name}"))
     output.print(f"{len(chosen)} labelled keyframes sent: frames {', '.join(str(f.seq) for f in chosen)} of {log.name}")
+
+
+def _refuse_without_finetuner(folder: Path) -> None:
+    """Say at once, rather than after ``--timeout``, that nobody in a launch will ever listen.
+
+    Raises:
+        TransportError: the launch has no finetuner.
+    """
+    from nodes.launch_note import NOTE, read_launch_note
+    from semantic_mapper.errors import TransportError
+
+    if not (folder / NOTE).exists():
+        return
+    note = read_launch_note(folder)
+    if not note.names("finetuner"):
+        nodes = ", ".join(f"{node.name} ({node.kind})" for node in note.nodes)
+        raise TransportError(
+            f"{folder}: {note.launch} has no finetuner to label for, its nodes are {nodes}; add one as in "
+            "launch/learning.toml, or say with --to where one listens (its option `labels`)"
+        )
 
 
 def _numbers(text: str) -> list[int]:

@@ -123,8 +123,10 @@ def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
         MapError, LabelError: a question that cannot be answered.
     """
     from nodes import map_answers
+    from nodes.running_launches import refuse_missing_socket
     from semantic_mapper.client import MapClient
 
+    refuse_missing_socket(source)
     with MapClient(source, identity=server_identity(asked.server, asked.keys)) as client:
         match asked.question:
             case Question.INFO:

@@ -43,8 +43,10 @@ def weights(
     if to is not None and not rollback:
         raise typer.BadParameter("goes with --rollback", param_hint="--to")
     output = Output.guarded()
+    from nodes.running_launches import refuse_missing_socket
     from semantic_mapper.client import MapClient
 
+    refuse_missing_socket(endpoint)
     with MapClient(endpoint, identity=server_identity(server, keys)) as client:
         state = _go_back(client, to) if rollback else client.weights()
     if json:

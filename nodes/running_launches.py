@@ -37,14 +37,31 @@ def launch_folder(place: str) -> Path:
         TransportError: none runs, several do, or the folder is none of a launch.
     """
     if place:
+        if not Path(place).exists():
+            raise TransportError(f"{place}: no such folder; `up` names the socket folder of its launch as it starts")
         if not (Path(place) / STATUS_SOCKET).exists():
             raise TransportError(f"{place}: no socket folder of a launch that runs; `up` names its own as it starts")
         return Path(place).absolute()
     folders = running_launches()
-    if len(folders) != 1:
-        which = f"several launches run, name one: {', '.join(map(str, folders))}" if folders else "no launch runs here"
-        raise TransportError(f"{which}; `semantic-mapper up LAUNCH.toml` starts one")
+    if not folders:
+        raise TransportError("no launch runs here; `semantic-mapper up LAUNCH.toml` starts one")
+    if len(folders) > 1:
+        raise TransportError(f"several launches run here; name one by its folder: {', '.join(map(str, folders))}")
     return folders[0]
+
+
+def refuse_missing_socket(endpoint: str) -> None:
+    """Say at once that nobody answers, rather than after several attempts, where there is not even a socket's file.
+
+    Raises:
+        TransportError: an ``ipc://`` path without a file.
+    """
+    transport, _, path = endpoint.partition("://")
+    if transport == "ipc" and path and not path.startswith("@") and not Path(path).exists():
+        raise TransportError(
+            f"{endpoint}: there is no such socket; does the mapper run? `up` names the socket folder of its launch as "
+            "it starts, and its mapper answers at ipc://FOLDER/query"
+        )
 
 
 def node_endpoints(folder: Path) -> dict[str, str]:

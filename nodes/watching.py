@@ -148,9 +148,7 @@ def show_log(
         log.close()
 
 
-def show_live(
-    live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tell: Callable[[str], None]
-) -> None:
+def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tell: Callable[[str], None]) -> None:
     """Show a running system until its streams have ended or somebody asks to stop.
 
     The mapper is asked first, and waited for: a camera that waits for its listeners would else count this one in.

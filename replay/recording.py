@@ -318,7 +318,10 @@ def make_way(path: Path, *, overwrite: bool, dry: bool = False) -> None:
     """
     for file in parts_on_disk(path).values():  # parts also come of a recorder that was restarted
         if not overwrite:
-            raise LogError(f"{file}: exists already; give another name or set overwrite = true")
+            raise LogError(
+                f"{file}: exists already; give another name, or let it be replaced: --overwrite, in a launch file "
+                "overwrite = true"
+            )
         if not file.is_file():
             raise LogError(f"{file}: is no file that a log could replace; give another name")
         if not dry:

@@ -18,6 +18,7 @@ from semantic_mapper.types import PosedFrame
 
 PART_ATTACHMENT = "part.json"
 SUFFIX = ".mcap"
+LISTED = 5  # files of a folder that an error names
 
 
 class Part(msgspec.Struct, frozen=True):
@@ -169,7 +170,16 @@ def open_log(
     files = [file for path in named for file in (logs_in(path) if path.is_dir() else [path])]
     if len(files) == 1:
         return LogReader(files[0], on_error=on_error, allow_empty=allow_empty)
-    return LogSequence(files, on_error=on_error, allow_empty=allow_empty)
+    try:
+        return LogSequence(files, on_error=on_error, allow_empty=allow_empty)
+    except LogError as error:
+        if len(named) > 1:
+            raise
+        names = ", ".join(file.name for file in files[:LISTED]) + (", ..." if len(files) > LISTED else "")
+        raise LogError(
+            f"{named[0]}: a folder is taken for the parts of one recording, which its logs are not: {error}. To read "
+            f"one of them, name its file: {names}"
+        ) from error
 
 
 def logs_in(folder: Path) -> list[Path]:

@@ -84,3 +84,13 @@ def test_what_cannot_be_read_is_no_difference(replayed: Path, tmp_path: Path) ->
 def test_exact_leaves_nothing_to_tolerate(replayed: Path) -> None:
     done = run("compare", replayed, replayed, "--exact", "-t", "labels=1")
     assert done.returncode == 2 and "--exact" in done.stderr
+
+
+def test_logs_are_refused_with_how_to_make_what_can_be_compared(log: Path, replayed: Path) -> None:
+    for a, b in ((log, replayed), (replayed, log)):
+        done = run("compare", a, b)
+        assert done.returncode == 2
+        assert (
+            f"is a log, and `compare` takes maps or results of runs: `semantic-mapper replay {log} --out FOLDER`"
+            in (error_line(done.stderr))
+        )
