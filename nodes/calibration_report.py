@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import datetime
+import tempfile
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +38,7 @@ def write_files(out: Path, found: Calibration, settings: CalibrationSettings) ->
     """A TOML file and a picture of each camera; returns their paths.
 
     Raises:
-        ConfigError: a picture cannot be written.
-        OSError: a file cannot be written.
+        ConfigError: a file cannot be written; it is as it was.
     """
     written: list[Path] = []
     b = settings.board
@@ -56,13 +57,36 @@ def write_files(out: Path, found: Calibration, settings: CalibrationSettings) ->
             about["rig"] = f"that of camera {next(iter(found.cameras))}; {', '.join(found.cameras)}"
             about["rig_position_sigma_mm"] = float(f"{1000 * found.rig.position_sigma_m[name]:.3g}")
             about["rig_turn_sigma_deg"] = float(f"{found.rig.turn_sigma_deg[name]:.3g}")
-        save_calibration(out / f"{name}.toml", camera.intrinsics, mount, about)
+        with _whole(out / f"{name}.toml") as part:
+            save_calibration(part, camera.intrinsics, mount, about)
         picture = out / f"{name}.png"
         drawn = draw_calibration(name, camera, settings.calibration)
-        if not cv2.imwrite(str(picture), np.ascontiguousarray(drawn[..., ::-1])):
-            raise ConfigError(f"{picture}: cannot be written")
+        write_whole(picture, cv2.imencode(".png", np.ascontiguousarray(drawn[..., ::-1]))[1].tobytes())
         written += [out / f"{name}.toml", picture]
     return written
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file, or leave it as it was.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
+    with _whole(path) as part:
+        part.write_bytes(data)
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """Where to write what is to become a file once it is complete."""
+    try:
+        with tempfile.TemporaryDirectory(prefix=".writing-", dir=path.parent) as folder:
+            part = Path(folder) / path.name
+            yield part
+            part.replace(path)
+    except OSError as error:
+        reason = error.strerror or error
+        raise ConfigError(f"{path}: cannot be written ({reason}); make room, or choose another place") from error
 
 
 def report(found: Calibration, gathered: Mapping[str, ViewGatherer], worst: int) -> Iterator[Any]:

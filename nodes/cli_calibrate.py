@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -68,8 +70,9 @@ def calibrate(
             return
     if not sources:
         raise typer.BadParameter("name a camera, video, log or folder; or --board FILE.png to print a board")
-    found, gathered = _calibrate(sources, settings, out, size, known=known, rig=rig, seconds=seconds)
-    files = write_files(out, found, settings)
+    with _folder_for_results(out):
+        found, gathered = _calibrate(sources, settings, size, known=known, rig=rig, seconds=seconds)
+        files = write_files(out, found, settings)
     if json:
         output.json(report_json(found, gathered.cameras, files))
         return
@@ -100,12 +103,13 @@ def _settings(path: Path | None, square_mm: float) -> Any:
 
 def _draw_board(output: Output, settings: Any, path: Path, json: bool) -> None:
     from drivers.calibrating.sheet import sheet_png
+    from nodes.calibration_report import write_whole
     from nodes.outputs import prepare_file
 
     if path.suffix.lower() != ".png":
         raise ConfigError(f"{path}: the board is written as a PNG picture; give a name that ends with .png")
     prepare_file(path)
-    path.write_bytes(sheet_png(settings.board))
+    write_whole(path, sheet_png(settings.board))
     if not json:
         b = settings.board
         output.print(
@@ -114,16 +118,34 @@ def _draw_board(output: Output, settings: Any, path: Path, json: bool) -> None:
         )
 
 
+@contextmanager
+def _folder_for_results(out: Path) -> Iterator[None]:
+    """Make the folder, and remove it again where nothing comes into it.
+
+    Raises:
+        ConfigError: it cannot be made or written to.
+    """
+    from nodes.outputs import prepare_folder
+
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    try:
+        prepare_folder(out)
+        yield
+    except BaseException:
+        for folder in made:
+            with suppress(OSError):  # something is in it
+                folder.rmdir()
+        raise
+
+
 def _calibrate(
-    sources: list[str], settings: Any, out: Path, size: str, *, known: bool, rig: bool, seconds: float
+    sources: list[str], settings: Any, size: str, *, known: bool, rig: bool, seconds: float
 ) -> tuple[Calibration, Gathering]:
     from drivers.calibrating.solve import solve
     from nodes.calibration_run import Gathering
     from nodes.calibration_sources import parse_sources
-    from nodes.outputs import prepare_folder
 
     places = parse_sources(sources, size)
-    prepare_folder(out)
     gathered = Gathering(settings.board, settings.calibration)
     with StopRequest() as stop:
         gathered.run(places, stop, seconds, rig=rig and len(places) > 1)

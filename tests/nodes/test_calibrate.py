@@ -25,7 +25,8 @@ from semantic_mapper.errors import CameraError, ConfigError
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 from tests.drivers.calibrating.boards import BOARD, LENS, shown
-from tests.nodes.support import error_line, run
+from tests.nodes.support import error_line, run, run_here
+from tests.replay.test_recording import files_at_most
 
 SETTINGS = CalibrationSettings(board=BOARD)
 BOARD_FILE = '[board]\nkind = "board"\ncolumns = 8\nrows = 6\nsquare_m = 0.04\nmarker_m = 0.03\n'
@@ -142,11 +143,33 @@ def test_poor_coverage_is_refused_in_one_line(pictures: Path, tmp_path: Path) ->
             (left / name).write_bytes((pictures / name).read_bytes())
     config = tmp_path / "board.toml"
     config.write_text(BOARD_FILE + "[calibration]\nmin_views = 4\n")
-    done = run("calibrate", left, "--config", config, "--out", tmp_path / "none")
+    done = run("calibrate", left, "--config", config, "--out", tmp_path / "none" / "deep")
     assert done.returncode == 1
     line = error_line(done.stderr)
     assert "camera 'camera' cannot be calibrated" in line and "right" in line and "hold it there, too" in line
-    assert not list((tmp_path / "none").glob("*.toml"))
+    assert not (tmp_path / "none").exists(), "what was made for the results goes with them"
+
+
+def test_a_board_that_does_not_fit_on_the_disk_is_named_and_leaves_nothing(tmp_path: Path) -> None:
+    with files_at_most(1000):
+        code, said = run_here("calibrate", "--board", tmp_path / "board.png")
+    assert code == 1 and f"error: {tmp_path / 'board.png'}: cannot be written (File too large)" in said
+    assert not list(tmp_path.iterdir())
+    assert run_here("calibrate", "--board", tmp_path / "board.png")[0] == 0
+    assert [file.name for file in tmp_path.iterdir()] == ["board.png"]
+
+
+@pytest.mark.parametrize(("room", "failed"), [(10, "camera.toml"), (2000, "camera.png")])
+def test_results_that_do_not_fit_on_the_disk_leave_those_that_were_there(
+    pictures: Path, tmp_path: Path, room: int, failed: str
+) -> None:
+    gathered = gather(str(pictures))
+    found = solve(gathered.cameras, set(), SETTINGS.calibration, rig=False)
+    (tmp_path / failed).write_text("old")
+    with files_at_most(room), pytest.raises(ConfigError, match=rf"{failed}: cannot be written \(File too large\)"):
+        write_files(tmp_path, found, SETTINGS)
+    assert (tmp_path / failed).read_text() == "old"
+    assert {file.name for file in tmp_path.iterdir()} <= {"camera.toml", "camera.png"}
 
 
 def test_what_is_no_source_is_told(pictures: Path, tmp_path: Path) -> None:

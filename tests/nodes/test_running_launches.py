@@ -17,7 +17,7 @@ from tests.nodes.support import error_line, run, run_here
 
 def test_advice_fits_how_many_launches_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(running_launches, "running_launches", lambda: [])
-    with pytest.raises(TransportError, match="no launch runs here; `semantic-mapper up LAUNCH.toml` starts one"):
+    with pytest.raises(TransportError, match=r"no launch runs here; `semantic-mapper up LAUNCH\.toml` starts one"):
         launch_folder("")
     both = [tmp_path / "a", tmp_path / "b"]
     monkeypatch.setattr(running_launches, "running_launches", lambda: both)

@@ -127,12 +127,16 @@ def test_what_cannot_be_shown_is_refused_before_a_page_is_promised(tmp_path: Pat
 
 
 def test_an_error_while_something_is_shown_is_the_only_one(capfd: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(MapError), _Page(0, 0, 64, Output.guarded()) as page:
-        log = RerunLog(page.begin(), LABELS)
-        assert page.alive
-        for _ in range(20):
-            log.log_map(whole_map().points())
-        raise MapError("ours")
+    def show_and_fail() -> None:
+        with _Page(0, 0, 64, Output.guarded()) as page:
+            log = RerunLog(page.begin(), LABELS)
+            assert page.alive
+            for _ in range(20):
+                log.log_map(whole_map().points())
+            raise MapError("ours")
+
+    with pytest.raises(MapError, match="ours"):
+        show_and_fail()
     said = capfd.readouterr()
     assert said.out.startswith("watch at http://127.0.0.1:") and not said.err
 

@@ -32,7 +32,7 @@ def test_on_a_full_disk_an_import_and_a_recovery_leave_nothing(
     small.mkdir()
     disk = Disk(small, room, monkeypatch)
     for make, source in ((import_recording, recording), (recover, log)):
-        with pytest.raises(LogError, match="No space left on device.*nothing of it was left") as caught:
+        with pytest.raises(LogError, match=r"No space left on device.*nothing of it was left") as caught:
             make(source, small / "new.mcap")
         assert str(caught.value).startswith(f"{small / 'new.mcap'}: ") and "can be read" not in str(caught.value)
         assert not list(small.iterdir())
