@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import cv2
 import numpy as np
@@ -12,7 +14,18 @@ from replay.compare import Comparison
 from replay.run_folder import Run
 from replay.surface_match import SurfaceMatch
 from semantic_mapper.errors import MapError
-from semantic_mapper.evaluation.canvas import DIM_TEXT, GAP, MARGIN, PANEL, TEXT, draw_text, new_canvas, paste, shorten
+from semantic_mapper.evaluation.canvas import (
+    DIM_TEXT,
+    GAP,
+    MARGIN,
+    PANEL,
+    TEXT,
+    draw_text,
+    new_canvas,
+    paste,
+    shorten,
+    text_width,
+)
 from semantic_mapper.evaluation.report import class_colors
 from semantic_mapper.evaluation.splat import draw_points, from_above
 from semantic_mapper.evaluation.upright import ceiling_height, upright_rotation
@@ -25,6 +38,8 @@ PANEL_HEIGHT = 420
 HEADER = 74
 CAPTION = 26
 LINE = 18  # of the table
+HEAD_TEXT, ROW_TEXT = 14, 13
+COLUMN_GAP = 12
 ONLY_A = (240, 96, 72)
 ONLY_B = (72, 150, 240)
 MOVED = (246, 204, 70)
@@ -179,15 +194,17 @@ def _blend(image: Float32, strength: Float32, color: tuple[int, int, int]) -> Fl
 
 
 def _draw_table(canvas: UInt8, comparison: Comparison, x: int, y: int) -> None:
-    columns = (x, x + 220, x + 296, x + 372, x + 444)
     verdict, color = ("equal", WITHIN) if comparison.equal else ("differs", ONLY_A)
-    for text, at in zip((verdict, "A", "B", "difference", "allowed"), columns, strict=True):
-        draw_text(canvas, text, (at, y + 4), 14, color if text == verdict else DIM_TEXT)
+    head = (verdict, "A", "B", "difference", "allowed")
+    rows = [(field.title, *field.texts()) for field in comparison.fields]
+    starts = table_columns([head, *rows])
+    for text, start in zip(head, starts, strict=True):
+        draw_text(canvas, text, (x + start, y + 4), HEAD_TEXT, color if text == verdict else DIM_TEXT)
     y += CAPTION
-    for field in comparison.fields:
-        texts = (shorten(field.title, 212, 13), *field.texts())
-        for text, at in zip(texts, columns, strict=True):
-            draw_text(canvas, text, (at, y), 13, TEXT if field.within else ONLY_A)
+    for field, (title, *texts) in zip(comparison.fields, rows, strict=True):
+        shown = (shorten(title, starts[1] - COLUMN_GAP, ROW_TEXT), *texts)
+        for text, start in zip(shown, starts, strict=True):
+            draw_text(canvas, text, (x + start, y), ROW_TEXT, TEXT if field.within else ONLY_A)
         y += LINE
     if comparison.label_changes:
         draw_text(canvas, "classes: A, B, points of A", (x, y + LINE // 2), 13, DIM_TEXT)
@@ -196,3 +213,10 @@ def _draw_table(canvas: UInt8, comparison: Comparison, x: int, y: int) -> None:
         for text, at in zip((mine, theirs, f"{count:,}"), (x, x + 150, x + 300), strict=True):
             draw_text(canvas, shorten(text, 140, 13), (at, y), 13, TEXT)
         y += LINE
+
+
+def table_columns(rows: Sequence[Sequence[str]]) -> list[int]:
+    """Where the columns of a table begin, pixels from its left: each as wide as its widest text, the first the rest."""
+    widths = [max(text_width(text, HEAD_TEXT) for text in column) for column in list(zip(*rows, strict=True))[1:]]
+    ends = accumulate(reversed(widths), lambda total, width: total + COLUMN_GAP + width)
+    return [0, *reversed([COLUMN - end for end in ends])]

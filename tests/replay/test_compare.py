@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from replay.compare import Comparison, compare_runs
-from replay.compare_picture import ONLY_A, RELABELLED, draw_comparison
+from replay.compare_picture import COLUMN, ONLY_A, RELABELLED, ROW_TEXT, draw_comparison, table_columns
 from replay.run_folder import Run, read_run
 from replay.surface_match import match_surfaces
 from replay.tolerances import FIELDS, Tolerances
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, MapError
+from semantic_mapper.evaluation.canvas import text_width
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.views import LABELS, small_map
@@ -266,3 +267,17 @@ def test_the_picture_shows_where_maps_differ_and_nothing_where_they_do_not() -> 
     missing = draw_comparison(compare_maps(wall(), wall(cut=40)))
     assert count(missing[plans], ONLY_A) > 200 and count(missing, RELABELLED) == 0
     assert missing.shape[1] == 1600 and missing.dtype == np.uint8
+
+
+def test_the_columns_of_the_picture_do_not_overlap() -> None:
+    rows = [
+        ("differs", "A", "B", "difference", "allowed"),
+        ("accuracy_mm (95 % of the surface)", "1464.46 mm", "1.02 mm", "1463.44 mm", "1.00 mm"),
+        ("labels", "120,000", "1,234,567", "12.345 %", "1.0 %"),
+    ]
+    starts = table_columns(rows)
+    ends = [*starts[1:], COLUMN]
+    for row in rows:
+        for text, start, end in zip(row[1:], starts[1:], ends[1:], strict=True):
+            assert start + text_width(text, ROW_TEXT) <= end
+    assert starts[0] == 0 and starts[1] > 100, "there is room for the name of the field"
