@@ -215,7 +215,7 @@ def test_formats_are_told_apart(folder: Path, tum: Path, scannet: Path, tmp_path
     for src, complaint in (
         ("nothing", "no recording of a known format"),
         ("no", "no such folder"),
-        ("log.mcap", "a log already"),
+        ("log.mcap", "nor a log of semantic-mapper"),
     ):
         with pytest.raises(ImportSourceError, match=complaint):
             detect_format(tmp_path / src)
