@@ -60,7 +60,10 @@ def check_bind(endpoint: str, keys: Keys | None = None) -> None:
     transport, _, address = endpoint.partition("://")
     if transport == "ipc":
         if address.startswith("@") or len(os.fsencode(address)) > _MAX_IPC_PATH or not address:
-            raise TransportError(f"{endpoint}: an ipc address is a path of 1 to {_MAX_IPC_PATH} bytes")
+            raise TransportError(
+                f"{endpoint}: an ipc address is a path of 1 to {_MAX_IPC_PATH} bytes; use a shorter one (sockets of "
+                "a launch lie in TMPDIR)"
+            )
     elif transport == "tcp":
         if not _is_loopback(address):
             _check_keys(endpoint, keys)
