@@ -7,10 +7,10 @@ SHELL := /bin/bash
 PYTHON ?= python3
 READY := .venv/.ready
 
-# Both cores busy with spinning OpenMP threads make torch operations next to Open3D 10 to 250 times slower.
-export OMP_WAIT_POLICY ?= passive
+# One thread of computation for each of two test processes. A worker that crashes ends the run with an error.
+PYTEST := OMP_NUM_THREADS=1 .venv/bin/python -m pytest tests -n 2 --dist worksteal --max-worker-restart 0
 
-.PHONY: help setup demo test test-v4l2 test-web check bench format lock clean
+.PHONY: help setup demo test test-slow test-all test-v4l2 test-web check bench format lock clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -24,8 +24,14 @@ $(READY): pyproject.toml uv.lock scripts/setup.sh scripts/system_libs.py
 demo: $(READY)  ## map an embedded scene; results in runs/demo
 	.venv/bin/semantic-mapper demo --out runs/demo
 
-test: $(READY)  ## run all tests
-	OMP_NUM_THREADS=1 .venv/bin/python -m pytest tests -n 2 --dist loadfile
+test: $(READY)  ## run the quick tests
+	$(PYTEST) -m "not slow"
+
+test-slow: $(READY)  ## run the slow tests: crash rounds, launches, learning, training
+	$(PYTEST) -m slow
+
+test-all: $(READY)  ## run all tests
+	$(PYTEST)
 
 test-v4l2: $(READY)  ## run the V4L2 driver against Debian's kernel with a virtual camera, in QEMU
 	.venv/bin/python scripts/v4l2_machine.py

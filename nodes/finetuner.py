@@ -75,8 +75,7 @@ def run_finetuner(context: NodeContext, options: FinetunerOptions) -> None:
 
 def _take_back_seat(options: FinetunerOptions) -> None:
     """Before anything that computes is loaded: threads that it starts inherit this."""
-    for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ[name] = str(options.threads)
+    os.environ["OMP_NUM_THREADS"] = str(options.threads)
     os.setpriority(os.PRIO_PROCESS, 0, max(options.niceness, os.getpriority(os.PRIO_PROCESS, 0)))
 
 

@@ -1,6 +1,6 @@
 """What every process of ours does first: thread counts, logging, and how it is asked to stop.
 
-Imports nothing heavy: thread counts must be in the environment before torch, numba or Open3D are loaded.
+Imports nothing heavy: thread counts must be in the environment before torch or Open3D are loaded.
 """
 
 from __future__ import annotations
@@ -24,12 +24,7 @@ def prepare_process(*, verbose: bool = False) -> None:
     Both the command line and the nodes call it, so that they compute with the same number of threads: the map of one
     process equals that of several, bit for bit.
     """
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # spinning threads slow torch next to Open3D 10 to 250 times
     os.environ.setdefault("OMP_NUM_THREADS", str(min(usable_cores(), MAX_THREADS)))
-    if (
-        "numba" not in sys.modules
-    ):  # a numba that has started its threads compiles nothing more once another number is set
-        os.environ.setdefault("NUMBA_NUM_THREADS", os.environ["OMP_NUM_THREADS"])
     os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2")  # s; a camera that has stalled hangs OpenCV for 10
     structlog.configure(
         processors=[

@@ -5,7 +5,6 @@ Importing this loads nothing heavy: PyTorch and Open3D come with the first repla
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -231,8 +230,6 @@ class LogReplays:
             LogError: the log cannot be read, or none of its frames can be mapped.
             WeightsError, ConfigError, MapError: as of ``load_pipeline`` and ``MappingPipeline.step``.
         """
-        # Read by OpenMP once, when the first of its libraries loads; spinning threads slow each other down.
-        os.environ.setdefault("OMP_WAIT_POLICY", "passive")
         log = self._root / log
         weights = None if weights is None else self._root / weights
         mapper = self._read_config(config, quality)

@@ -134,7 +134,7 @@ def train(name: str, out: Path, budget: Budget) -> int:
     if state.is_file():
         command += ["--resume"]
     print(f"{name}: {' '.join(command)}", flush=True)
-    one_thread = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+    one_thread = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
     limits = one_thread if budget.tier == "cpu" else {}
     if budget.tier == "cpu" and budget.cores > 1:
         # One core trains and the others render rooms ahead: more threads for the training itself gain little.

@@ -26,7 +26,6 @@ _log = structlog.get_logger(__name__)
 def kernel(
     *,
     inline: bool = False,
-    parallel: bool = False,
     fastmath: bool = False,
     error_model: Literal["python", "numpy"] = "python",
 ) -> Callable[[FunctionT], FunctionT]:
@@ -34,14 +33,12 @@ def kernel(
 
     Args:
         inline: Put the function into its callers before types are known.
-        parallel: Run ``prange`` loops on numba's threads; `semantic_mapper.threads.parallel_kernel` starts them first.
         fastmath: Let LLVM round otherwise than IEEE 754 says.
         error_model: ``"python"`` (division by zero raises) or ``"numpy"`` (it gives inf or NaN, and vectorises).
     """
     compile_: Any = numba.njit(
         nogil=True,
         inline="always" if inline else "never",
-        parallel=parallel,
         fastmath=fastmath,
         error_model=error_model,
     )

@@ -1,34 +1,37 @@
-"""One thread pool for torch and the compiled kernels, which share OpenMP's; and word of kernels being compiled."""
+"""Compiled loops on several threads, as many as torch uses; and a log event while kernels are compiled."""
 
 from __future__ import annotations
 
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-import functools
+import os
 from collections.abc import Callable
-from typing import Any, TypeVar
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 import numba
 import structlog
 import torch
-from numba.core import config as numba_config
 from numba.core import event as numba_event
 
 from semantic_mapper.kernel_cache import kernel
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
+P = ParamSpec("P")
+
+MAX_POOL_THREADS = 64  # enough for every caller to have its own; threads start only when they are needed
 
 _log = structlog.get_logger(__name__)
 
 
 class _CompileNotice(numba_event.Listener):
-    """Tells once in the log why nothing seems to happen. Kernels that come from numba's cache are no such event."""
+    """Logs once why nothing seems to happen. Kernels that come from numba's cache are no such event."""
 
     def __init__(self) -> None:
-        self._told = False
+        self._logged = False
 
     def on_start(self, event: Any) -> None:
-        if not self._told:
-            self._told = True
+        if not self._logged:
+            self._logged = True
             _log.info("compiling_kernels", note="once on this machine; all of them take about two minutes")
 
     def on_end(self, event: Any) -> None:
@@ -38,33 +41,57 @@ class _CompileNotice(numba_event.Listener):
 numba_event.register("numba:compile", _CompileNotice())
 
 
-@functools.cache
-def share_threads() -> int:
-    """Start numba's threads and give torch its own number of threads back; returns what a kernel will use.
+class ParallelKernel(Generic[P]):
+    """A compiled loop that is split over threads; see `parallel_kernel`. Any number of threads may call it at once.
 
-    Starting them sets OpenMP's thread count to numba's for the whole process. Torch, which still believes in its own
-    (``OMP_NUM_THREADS``, say), then splits and rounds its convolutions differently, and oneDNN's backward pass, planned
-    for one count and run with the other, can crash.
+    It does not use numba's own threads. Their OpenMP layer needs a library that a bare system lacks, changes torch's
+    thread count, and the layer without that need ends the process when two threads call kernels at once.
     """
-    # Open3D brings a TBB older than numba accepts; numba, asking for it first, would warn before going on.
-    priority: Any = numba_config
-    priority.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
-    threads = torch.get_num_threads()
-    follow_torch_threads()  # starts them
-    torch.set_num_threads(threads)
-    return numba.get_num_threads()
+
+    def __init__(self, run: Callable[Concatenate[int, int, P], None], chunks_per_thread: int) -> None:
+        self._run = run
+        self._chunks_per_thread = chunks_per_thread
+
+    def __call__(self, count: int, /, *args: P.args, **kwargs: P.kwargs) -> None:
+        """Run iterations 0 to ``count`` on as many threads as torch uses, this one included; returns when all ended."""
+        threads = min(torch.get_num_threads(), count)
+        if threads <= 1:
+            self._run(0, count, *args, **kwargs)
+            return
+        chunks = min(threads * self._chunks_per_thread, count)
+        ranges = iter([(count * n // chunks, count * (n + 1) // chunks) for n in range(chunks)])
+
+        def work() -> None:
+            for start, stop in ranges:
+                self._run(start, stop, *args, **kwargs)
+
+        others = [_submit(work) for _ in range(threads - 1)]
+        try:
+            work()
+        finally:
+            wait(others)  # they write into the caller's arrays
+        for other in others:
+            other.result()
 
 
-def follow_torch_threads() -> None:
-    """Let the kernels that this thread starts use as many threads as torch does now."""
-    started: Any = numba_config
-    numba.set_num_threads(min(torch.get_num_threads(), started.NUMBA_NUM_THREADS))
+def parallel_kernel(
+    *, fastmath: bool = False, chunks_per_thread: int = 1
+) -> Callable[[Callable[Concatenate[int, int, P], None]], ParallelKernel[P]]:
+    """A `kernel` whose loop runs on several threads.
 
+    The function takes the range of its loop as its first two arguments, ``start`` and ``stop``, writes each iteration's
+    result into arrays and returns nothing. It is called with the number of iterations in their place. Iterations must
+    not depend on each other; the result is then the same to the bit for any number of threads.
 
-def parallel_kernel(*, fastmath: bool = False) -> Callable[[FunctionT], FunctionT]:
-    """A `kernel` with ``prange`` loops, on the shared threads."""
-    share_threads()
-    return kernel(parallel=True, fastmath=fastmath)
+    Args:
+        fastmath: As of `kernel`.
+        chunks_per_thread: More than 1 where iterations differ in cost. A chunk costs some 20 microseconds.
+    """
+
+    def decorate(function: Callable[Concatenate[int, int, P], None]) -> ParallelKernel[P]:
+        return ParallelKernel(kernel(fastmath=fastmath)(function), chunks_per_thread)
+
+    return decorate
 
 
 def inlined_kernel(function: FunctionT) -> FunctionT:
@@ -75,3 +102,21 @@ def inlined_kernel(function: FunctionT) -> FunctionT:
     """
     decorate: Any = numba.njit(fastmath=True, nogil=True, forceinline=True)
     return decorate(function)
+
+
+def _submit(work: Callable[[], None]) -> Future[None]:
+    try:
+        return _pool.submit(work)
+    except RuntimeError:  # the interpreter is ending and starts no threads; a thread that still maps does all by itself
+        done: Future[None] = Future()
+        done.set_result(None)
+        return done
+
+
+def _new_pool() -> None:
+    global _pool
+    _pool = ThreadPoolExecutor(MAX_POOL_THREADS, thread_name_prefix="kernel")
+
+
+_new_pool()
+os.register_at_fork(after_in_child=_new_pool)  # a child has none of its parent's threads

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import importlib.metadata
 import pkgutil
 import re
@@ -17,8 +16,6 @@ import semantic_mapper
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("semantic_mapper", "drivers", "replay", "nodes")
-MAX_FILE_LINES = 400
-MAX_FUNCTION_LINES = 60
 
 
 def sources() -> list[Path]:
@@ -81,20 +78,6 @@ def test_one_file_loads_open3d() -> None:
     assert files == ["semantic_mapper/mapping/open3d_loader.py"]
 
 
-def test_files_and_functions_stay_short() -> None:
-    too_long: list[str] = []
-    for path in sources():
-        text = path.read_text(encoding="utf-8")
-        if text.count("\n") > MAX_FILE_LINES:
-            too_long.append(f"{path.relative_to(ROOT)}: {text.count(chr(10))} lines")
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.end_lineno is not None:
-                lines = node.end_lineno - node.lineno + 1
-                if lines > MAX_FUNCTION_LINES:
-                    too_long.append(f"{path.relative_to(ROOT)}: {node.name}: {lines} lines")
-    assert not too_long
-
-
 def test_no_file_names_a_machine_or_a_package_index() -> None:
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
     if listed.returncode != 0:
@@ -116,13 +99,7 @@ def test_no_file_names_a_machine_or_a_package_index() -> None:
     assert not named
 
 
-def test_continuous_integration_runs_the_tests_and_then_the_checks() -> None:
-    lines = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
-    assert "set -euo pipefail" in lines
-    assert lines[-2:] == ["make test", "make check"]
-
-
-@pytest.mark.parametrize("target", ["setup", "demo", "test", "test-v4l2", "test-web", "check", "bench"])
+@pytest.mark.parametrize("target", ["setup", "demo", "test", "test-slow", "test-v4l2", "test-web", "check", "bench"])
 def test_every_target_sets_up_what_it_needs(target: str) -> None:
     planned = subprocess.run(
         ["make", "--dry-run", "--always-make", target], cwd=ROOT, capture_output=True, text=True, check=False

@@ -11,7 +11,6 @@ from __future__ import annotations
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportUntypedFunctionDecorator=false
 import numpy as np
 import torch
-from numba import prange
 from numpy.typing import NDArray
 
 from semantic_mapper.config import SamplingConfig
@@ -73,7 +72,9 @@ def render_sparse_view(
     traced, step = len(v), COARSEST
     while step > 1:
         doubt = np.zeros((height, width), np.float32)
-        _fill_between(step, probabilities, known, depth_m, prior_depth_m, rgb, doubt)
+        half = step // 2
+        lines = (len(rgb) + half - 1) // half
+        _fill_between(lines, step, probabilities, known, depth_m, prior_depth_m, rgb, doubt)
         flat = np.flatnonzero(doubt)
         left = max(int(share * height * width) - traced, 0)
         if len(flat) > left:
@@ -85,14 +86,13 @@ def render_sparse_view(
 
 
 @parallel_kernel()
-def _fill_between(step, probabilities, known, depth, prior, rgb, doubt):  # pragma: no cover - compiled
+def _fill_between(start, stop, step, probabilities, known, depth, prior, rgb, doubt):  # pragma: no cover - compiled
     """Give the pixels half way between those of a grid the mean of the known grid pixels round them; in place.
 
     Fills ``doubt`` (H, W) with how little those tell of such a pixel: 0 = enough.
     """
-    height, width = depth.shape
-    half = step // 2
-    for line in prange((height + half - 1) // half):
+    width, half = depth.shape[1], step // 2
+    for line in range(start, stop):
         v = line * half
         for u in range(0, width, half):
             if v % step > 0 or u % step > 0:

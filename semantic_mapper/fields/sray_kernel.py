@@ -11,7 +11,6 @@ from __future__ import annotations
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUntypedFunctionDecorator=false
 import math
 
-import numba
 import numpy as np
 
 from semantic_mapper.fields.geometry_net import LEAST_VISIBILITY, OWN_DENSITY_OFFSET
@@ -315,11 +314,12 @@ def _render_ray(r, rays, sources, settings, weights, scratch, out):
     _composite(refined, blended, labels, weight, share, rendered[r], colour[r], carried[r])
 
 
-@parallel_kernel(fastmath=True)
-def render_rays(rays, sources, settings, weights, tasks, out):
+@parallel_kernel(fastmath=True, chunks_per_thread=4)
+def render_rays(start, stop, rays, sources, settings, weights, out):
     """Render all rays; see ``SRay.render_samples``.
 
     Args:
+        start, stop: Range of rays; the caller passes their number instead.
         rays: origin (R, 3), direction (R, 3), z (R, N) ascending.
         sources: maps (m, h, w, C + 3) features and colour, geometry (m, h, w, 6) with the
             logarithm of the first scale at the end, K (m, 4) fx fy cx cy, T (m, 3, 4),
@@ -327,15 +327,9 @@ def render_rays(rays, sources, settings, weights, tasks, out):
         settings: heads, weight of the residual, ln(1 / tau), whether views count by their visibility, least weight of a
             sample that is looked at.
         weights: See ``sray_streaming.pack_weights``.
-        tasks: Number of blocks the rays are split into; each has its own scratch.
         out: rendered (R, C), colour (R, 3), depth (R,), opacity (R,), known (R,), carried labels (R, L).
     """
-    count, samples = rays[2].shape
     views, channels = sources[0].shape[0], sources[0].shape[3] - 3
-    block = (count + tasks - 1) // tasks
-    radial, cross, blend, density, semantic = weights  # a parallel loop takes no nested tuple
-    for task in numba.prange(tasks):
-        packed = (radial, cross, blend, density, semantic)
-        scratch = _make_scratch(views, samples, channels, out[5].shape[1])
-        for r in range(task * block, min((task + 1) * block, count)):
-            _render_ray(r, rays, sources, settings, packed, scratch, out)
+    scratch = _make_scratch(views, rays[2].shape[1], channels, out[5].shape[1])
+    for r in range(start, stop):
+        _render_ray(r, rays, sources, settings, weights, scratch, out)

@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import nn
@@ -19,10 +18,7 @@ from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_kernel import render_rays
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.threads import follow_torch_threads
 from semantic_mapper.types import FieldRender, Float32, RayBatch, SourceViews
-
-TASKS_PER_THREAD = 4  # rays differ in cost (views that see nothing), so give the threads something to balance
 
 
 def compiled_covers(model: SRay) -> bool:
@@ -49,8 +45,6 @@ class StreamingSRay:
         self.model = model
         self.sampling = sampling or SamplingConfig()
         self._weights = pack_weights(model)
-        # Torch's count may have been changed since the threads were started.
-        follow_torch_threads()
 
     @property
     def label_set(self) -> LabelSet:
@@ -98,6 +92,7 @@ class StreamingSRay:
         channel = sources.channel if (sources.channel >= 0).any() else sources.channel[:, :0, :0]
         K = torch.stack((sources.K[:, 0, 0], sources.K[:, 1, 1], sources.K[:, 0, 2], sources.K[:, 1, 2]), dim=1)
         render_rays(
+            count,
             (_array(rays.origin), _array(rays.direction), _array(z)),
             (
                 _array(maps),
@@ -114,7 +109,6 @@ class StreamingSRay:
                 np.float32(least_weight),
             ),
             self._weights,
-            TASKS_PER_THREAD * numba.get_num_threads(),
             tuple(t.numpy() for t in (rendered, colour, depth, opacity, known, carried)),
         )
         return self._classify(rendered, colour, depth, opacity, known, carried)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import FrameError
@@ -69,7 +68,7 @@ def blocks_in_band(
         slots = np.full((_BANDS, 2 * capacity), -1, np.int64)
         keys = np.empty((_BANDS, capacity), np.int64)
         counts = np.zeros(_BANDS, np.int64)
-        _collect_bands(depth_m, camera, voxel_size_m, truncation_m, depth_max_m, slots, keys, counts)
+        _collect_bands(_BANDS, depth_m, camera, voxel_size_m, truncation_m, depth_max_m, slots, keys, counts)
         if counts.max() <= capacity:
             return np.unique(np.concatenate([row[:count] for row, count in zip(keys, counts, strict=True)]))
         capacity *= 4  # a band of the image crosses unusually many blocks (fine voxels): again with more room
@@ -221,8 +220,8 @@ def _is_smooth(least, most, flat, wide):
 
 
 @parallel_kernel()
-def _collect_bands(depth, camera, voxel, truncation, depth_max, slots, keys, counts):
-    for band in prange(len(counts)):
+def _collect_bands(start, stop, depth, camera, voxel, truncation, depth_max, slots, keys, counts):
+    for band in range(start, stop):
         counts[band] = _collect_band(
             band, len(counts), depth, camera, voxel, truncation, depth_max, slots[band], keys[band]
         )

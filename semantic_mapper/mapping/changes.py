@@ -187,7 +187,7 @@ def _compact_into(out: BlockChanges, rows: NDArray[np.int64], blocks: PackedBloc
     _compact(data, blocks.ends, rows, *limits, *arrays)
 
 
-# Serial: another thread than the mapper's runs it, and numba's fallback layer allows no two parallel kernels at once.
+# Serial: it runs beside the mapper, which needs the other threads.
 @kernel()
 def _compact(views, ends, rows, ids, vote_discount, min_weight, tsdf, label, confidence, rgb):
     """Write packed blocks (B,) to ``rows`` (B,) of the output."""

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from semantic_mapper.kernel_cache import kernel
@@ -31,10 +30,11 @@ def surface_voxels(keys: NDArray[np.int32], blocks: NDArray[np.int32], grid: Blo
         min_weight: Both ends of an edge need this TSDF weight.
     """
     buffers = grid.buffers()
-    counts = _count_crossings(keys, blocks, grid.index, buffers, min_weight)
+    counts = np.zeros(len(blocks), np.int64)
+    _count_crossings(len(blocks), keys, blocks, grid.index, buffers, min_weight, counts)
     starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
     points = np.empty((int(starts[-1]), 3), np.float64)
-    _write_crossings(keys, blocks, grid.index, buffers, min_weight, starts, points)
+    _write_crossings(len(blocks), keys, blocks, grid.index, buffers, min_weight, starts, points)
     return points
 
 
@@ -62,16 +62,14 @@ def _crossing(buffers, block, voxel, axis, neighbours, min_weight):
 
 
 @parallel_kernel()
-def _count_crossings(keys, blocks, index, buffers, min_weight):
-    counts = np.zeros(len(blocks), np.int64)
-    for n in prange(len(blocks)):
+def _count_crossings(start, stop, keys, blocks, index, buffers, min_weight, counts):
+    for n in range(start, stop):
         counts[n] = _block_crossings(keys[n], blocks[n], index, buffers, min_weight, np.empty((0, 3), np.float64))
-    return counts
 
 
 @parallel_kernel()
-def _write_crossings(keys, blocks, index, buffers, min_weight, starts, points):
-    for n in prange(len(blocks)):
+def _write_crossings(start, stop, keys, blocks, index, buffers, min_weight, starts, points):
+    for n in range(start, stop):
         _block_crossings(keys[n], blocks[n], index, buffers, min_weight, points[starts[n] : starts[n + 1]])
 
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
@@ -97,9 +96,11 @@ def make_votes(
     Returns:
         The votes, and how many known pixels hold probabilities that are not finite, negative or do not sum to 1.
     """
-    log_p, proper = _log_rows(probabilities)
-    weights, bad = _vote_weights(depth, rows, proper, camera, depth_max)
-    return Votes(log_p, rows, weights), bad
+    log_p, proper = np.empty_like(probabilities), np.empty(len(probabilities), np.bool_)
+    _log_rows(len(probabilities), probabilities, log_p, proper)
+    weights, bad = np.zeros(depth.shape, np.float32), np.zeros(len(depth), np.int64)
+    _vote_weights(len(depth), depth, rows, proper, camera, depth_max, weights, bad)
+    return Votes(log_p, rows, weights), int(bad.sum())
 
 
 def no_votes(height: int, width: int, classes: int) -> Votes:
@@ -109,11 +110,10 @@ def no_votes(height: int, width: int, classes: int) -> Votes:
 
 
 @parallel_kernel()
-def _log_rows(probabilities):
+def _log_rows(start, stop, probabilities, logs, proper):
     """Floored log of rows (K, L), and whether each is of numbers that are not negative and sum to 1."""
-    logs, proper = np.empty_like(probabilities), np.empty(len(probabilities), np.bool_)
     floor = np.float32(PROBABILITY_FLOOR)
-    for n in prange(len(probabilities)):
+    for n in range(start, stop):
         total, least = 0.0, np.float32(0.0)
         for c in range(probabilities.shape[1]):
             p = probabilities[n, c]
@@ -121,15 +121,13 @@ def _log_rows(probabilities):
             least = min(least, p)
             logs[n, c] = np.log(max(p, floor))
         proper[n] = abs(total - 1.0) < 1e-2 and least >= 0
-    return logs, proper
 
 
 @parallel_kernel()
-def _vote_weights(depth, rows, proper, camera, depth_max):
+def _vote_weights(start, stop, depth, rows, proper, camera, depth_max, weights, bad):
+    """Fill weights (H, W), and bad (H,) with the number of pixels of each row whose probabilities are not proper."""
     height, width = depth.shape
-    weights = np.zeros((height, width), np.float32)
-    bad = 0
-    for v in prange(height):
+    for v in range(start, stop):
         up, down = depth[max(v - 1, 0)], depth[min(v + 1, height - 1)]
         _weigh_row(v, 0 < v < height - 1, up, depth[v], down, camera, depth_max, weights[v])
         for u in range(width):
@@ -138,8 +136,7 @@ def _vote_weights(depth, rows, proper, camera, depth_max):
                 weights[v, u] = 0
             elif not proper[row] and weights[v, u] > 0:
                 weights[v, u] = 0
-                bad += 1
-    return weights, bad
+                bad[v] += 1
 
 
 @kernel(error_model="numpy")
@@ -166,11 +163,12 @@ def _weigh_row(v, inside, up, depth, down, camera, depth_max, weights):
         weights[u] = least * min(near * near, one) if (z > 0) & (z <= far) else np.float32(0.0)
 
 
-@parallel_kernel()
-def fuse_blocks(indices, buffers, camera, limits, depth, rgb, trust, votes, moment):
-    """Fuse one frame into the blocks with buffer ``indices`` (B,), in place.
+@parallel_kernel(chunks_per_thread=4)
+def fuse_blocks(start, stop, indices, buffers, camera, limits, depth, rgb, trust, votes, moment):
+    """Fuse one frame into the blocks with buffer ``indices[start:stop]``, in place.
 
     Args:
+        start, stop: Range of ``indices``; the caller passes their number instead.
         indices: (B,) int32, each once.
         buffers: ``GridBuffers``.
         camera: ``Camera`` of the frame.
@@ -182,7 +180,7 @@ def fuse_blocks(indices, buffers, camera, limits, depth, rgb, trust, votes, mome
         moment: A number that changes from frame to frame; see ``evidence``.
     """
     offsets = voxel_offsets(camera, limits.voxel_size)
-    for i in prange(len(indices)):
+    for i in range(start, stop):
         _fuse_block(indices[i], offsets, buffers, camera, limits, depth, rgb, trust, votes, moment)
 
 

@@ -44,28 +44,29 @@ def lift(
     out = np.empty(depth.shape, np.int32)
     channel = np.where(known, probabilities.argmax(axis=2), -1)
     look = np.dstack((rgb_low.astype(np.float32), depth_low))
-    _lift(probabilities.reshape(-1, probabilities.shape[2]), channel, _of_one_class(channel), look, rgb, depth, out)
+    one_class = np.empty(channel.shape, np.bool_)
+    _of_one_class(len(channel), channel, one_class)
+    flat = probabilities.reshape(-1, probabilities.shape[2])
+    _lift(len(depth), flat, channel, one_class, look, rgb, depth, out)
     return out
 
 
 @parallel_kernel()
-def _of_one_class(channel):
+def _of_one_class(start, stop, channel, out):
     """Whether the 3x3 coarse pixels round each (as far as they are in the image) are known and of one class."""
     height, width = channel.shape
-    out = np.empty((height, width), np.bool_)
-    for j in numba.prange(height):
+    for j in range(start, stop):
         for i in range(width):
             same = channel[j, i] >= 0
             for y in range(max(j - 1, 0), min(j + 2, height)):
                 for x in range(max(i - 1, 0), min(i + 2, width)):
                     same = same and channel[y, x] == channel[j, i]
             out[j, i] = same
-    return out
 
 
 @parallel_kernel()
-def _lift(probabilities, channel, one_class, look, rgb, depth, out):
-    for v in numba.prange(len(depth)):
+def _lift(start, stop, probabilities, channel, one_class, look, rgb, depth, out):
+    for v in range(start, stop):
         _lift_row(v, probabilities, channel, one_class, look, rgb, depth, out)
 
 

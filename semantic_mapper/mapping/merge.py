@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
@@ -95,11 +94,13 @@ def add_blocks(target: BlockGrid, source: BlockGrid, T_target_source: VoxelTrans
     for wanted, needed in _parts(pairs):
         grid = source.holding(needed)
         moved = _empty_blocks(len(wanted), grid.buffers().evidence.shape[2])
-        _resample(unpack_keys(wanted), R_source_target, T_target_source.t, grid.index, grid.buffers(), moved)
+        _resample(
+            len(wanted), unpack_keys(wanted), R_source_target, T_target_source.t, grid.index, grid.buffers(), moved
+        )
         holds = (moved.weight > 0).any(axis=1)  # votes come with weight
         if holds.any():
             blocks = target.activate(wanted[holds])
-            _add(blocks, target.buffers(), BlockValues(*(part[holds] for part in moved)), cap)
+            _add(len(blocks), blocks, target.buffers(), BlockValues(*(part[holds] for part in moved)), cap)
             target.mark_changed(blocks, version)
 
 
@@ -162,9 +163,9 @@ def _empty_blocks(count: int, classes: int) -> BlockValues:
 
 
 @parallel_kernel()
-def _resample(keys, R, t, index, buffers, moved):
+def _resample(start, stop, keys, R, t, index, buffers, moved):
     """Fill blocks ``moved``, which lie at ``keys`` (B, 3): their point p is the source's ``R @ (p - t)``, in voxels."""
-    for n in prange(len(keys)):
+    for n in range(start, stop):
         blocks, voxels, shares = np.empty(8, np.int64), np.empty(8, np.int64), np.empty(8, np.float64)
         for voxel in range(BLOCK_VOXELS):
             x = keys[n, 0] * BLOCK_SIDE + (voxel & 7) - t[0]
@@ -264,9 +265,9 @@ def _blend_votes(count, blocks, voxels, shares, total, buffers, moved, n, voxel)
 
 
 @parallel_kernel()
-def _add(blocks, buffers, added, cap):
+def _add(start, stop, blocks, buffers, added, cap):
     """Add blocks ``added`` to those with buffer indices ``blocks``, in place."""
-    for n in prange(len(blocks)):
+    for n in range(start, stop):
         _add_block(blocks[n], buffers, n, added, cap)  # numba drops what is written to a tuple's arrays right here
 
 

@@ -11,7 +11,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
@@ -157,7 +156,7 @@ def cast_view(
     for window, seen in _windows(grid, camera, intrinsics, config):
         if len(seen):
             grid.page_in(seen)
-        _cast_rays(camera, window, limits, grid.index, grid.buffers(), depth, rgb, channel, confidence)
+        _cast_rays(window.height, camera, window, limits, grid.index, grid.buffers(), depth, rgb, channel, confidence)
     return depth, rgb, channel, confidence
 
 
@@ -186,11 +185,11 @@ def _windows(
 
 
 @parallel_kernel()
-def _cast_rays(camera, window, limits, index, buffers, depth, rgb, channel, confidence):
-    """Fill a window of what ``cast_view`` returns."""
+def _cast_rays(start, stop, camera, window, limits, index, buffers, depth, rgb, channel, confidence):
+    """Fill rows of a window of what ``cast_view`` returns."""
     voxel_size, truncation_voxels, z_max, vote_discount = limits
     classes = buffers.evidence.shape[2]
-    for v in prange(window.top, window.top + window.height):
+    for v in range(window.top + start, window.top + stop):
         origin, d, p = np.empty(3), np.empty(3), np.empty(3)
         color, evidence = np.empty(3, np.float64), np.empty(classes, np.float64)
         y = (v - camera.cy) / camera.fy

@@ -9,7 +9,6 @@ the only one it means what the field said: n_eff = 1. The label is the argmax, i
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
 from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.labels import LabelSet
@@ -36,7 +35,9 @@ def read_points(
     Returns:
         rgb (N, 3) uint8, label (N,) uint8 ids (ignore id = no votes), confidence (N,) float32 (0 = no votes).
     """
-    rgb, channel, confidence = _read_points(voxels, index, buffers, vote_discount)
+    rgb, channel = np.zeros((len(voxels), 3), np.uint8), np.full(len(voxels), -1, np.int64)
+    confidence = np.zeros(len(voxels), np.float32)
+    _read_points(len(voxels), voxels, index, buffers, vote_discount, rgb, channel, confidence)
     return rgb, label_set.to_ids(channel), confidence
 
 
@@ -128,16 +129,9 @@ def read_point(p, index, buffers, vote_discount, rgb, color, evidence):
 
 
 @parallel_kernel()
-def _read_points(voxels, index, buffers, vote_discount):
-    count, classes = len(voxels), buffers.evidence.shape[2]
-    rgb = np.zeros((count, 3), np.uint8)
-    channel = np.full(count, -1, np.int64)
-    confidence = np.zeros(count, np.float32)
-    chunk = 1024
-    for job in prange((count + chunk - 1) // chunk):
-        color, evidence = np.empty(3, np.float64), np.empty(classes, np.float64)
-        for i in range(job * chunk, min((job + 1) * chunk, count)):
-            best, p = read_point(voxels[i], index, buffers, vote_discount, rgb[i], color, evidence)
-            channel[i] = best
-            confidence[i] = p
-    return rgb, channel, confidence
+def _read_points(start, stop, voxels, index, buffers, vote_discount, rgb, channel, confidence):
+    color, evidence = np.empty(3, np.float64), np.empty(buffers.evidence.shape[2], np.float64)
+    for i in range(start, stop):
+        best, p = read_point(voxels[i], index, buffers, vote_discount, rgb[i], color, evidence)
+        channel[i] = best
+        confidence[i] = p

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from semantic_mapper.mapping.block_grid import BLOCK_VOXELS
@@ -45,17 +44,18 @@ def surface_patches(voxel_map: VoxelMap, max_votes: float) -> SurfacePatches:
     with voxel_map.locked() as grid:
         keys, blocks = grid.sorted_blocks()
         near = SURFACE_VOXELS / config.truncation_voxels
-        total, need, count = _sum_up(keys, blocks, grid.buffers(), near, config.vote_discount, max_votes)
+        total, need = np.zeros((len(blocks), 3)), np.zeros(len(blocks))
+        count = np.zeros(len(blocks), np.int64)
+        _sum_up(len(blocks), keys, blocks, grid.buffers(), near, config.vote_discount, max_votes, total, need, count)
     has = count > 0
     xyz = total[has] / count[has, None] * config.voxel_size_m
     return SurfacePatches(pack_keys(keys[has]), xyz, need[has])
 
 
 @parallel_kernel()
-def _sum_up(keys, blocks, buffers, near, vote_discount, max_votes):
+def _sum_up(start, stop, keys, blocks, buffers, near, vote_discount, max_votes, total, need, count):
     """Sums over the surface voxels of blocks (B,): positions (B, 3) in voxels, need (B,), and their number (B,)."""
-    total, need, count = np.zeros((len(blocks), 3)), np.zeros(len(blocks)), np.zeros(len(blocks), np.int64)
-    for n in prange(len(blocks)):
+    for n in range(start, stop):
         block = blocks[n]
         for voxel in range(BLOCK_VOXELS):
             if buffers.weight[block, voxel] <= 0 or abs(buffers.tsdf[block, voxel]) > near:
@@ -68,4 +68,3 @@ def _sum_up(keys, blocks, buffers, near, vote_discount, max_votes):
             total[n, 1] += keys[n, 1] * BLOCK_SIDE + ((voxel >> 3) & 7)
             total[n, 2] += keys[n, 2] * BLOCK_SIDE + (voxel >> 6)
             count[n] += 1
-    return total, need, count

@@ -6,7 +6,6 @@ A rendered view measures nothing, so TSDF, colour and weight stay as they are, t
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
 from semantic_mapper.config import VirtualViewConfig
 from semantic_mapper.geometry import check_pose
@@ -62,14 +61,14 @@ def add_votes(
         packed = packed[np.isin(packed, pack_keys(grid.all_keys()))]  # existing ones alone
         max_votes, moment = np.float32(config.max_votes), voxel_map.version
         for blocks in voxel_map.changing(packed) if len(packed) else ():
-            _vote_blocks(blocks, grid.buffers(), camera, limits, depth, votes, max_votes, moment)
+            _vote_blocks(len(blocks), blocks, grid.buffers(), camera, limits, depth, votes, max_votes, moment)
     return len(packed)
 
 
 @parallel_kernel()
-def _vote_blocks(indices, buffers, camera, limits, depth, votes, max_votes, moment):
+def _vote_blocks(start, stop, indices, buffers, camera, limits, depth, votes, max_votes, moment):
     offsets = voxel_offsets(camera, limits.voxel_size)
-    for i in prange(len(indices)):
+    for i in range(start, stop):
         _vote_block(indices[i], offsets, buffers, camera, limits, depth, votes, max_votes, moment)
 
 

@@ -39,8 +39,7 @@ from semantic_mapper.mapping.ray_casting import cast_view
 from semantic_mapper.mapping.readout import read_points
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 
-# One lock for all maps of a process: growth moves the memory that readers look at, and numba's fallback threading
-# layer ends the process when two threads enter parallel kernels at once.
+# One lock for all maps of a process: growth moves the memory that readers look at, and merging takes two maps at once.
 _KERNEL_LOCK = threading.RLock()
 
 BoolImage = NDArray[np.bool_]
@@ -182,7 +181,18 @@ class VoxelMap:
             packed = blocks_in_band(depth, camera, self.config.voxel_size_m, self.truncation_m, self.config.depth_max_m)
             rgb = np.ascontiguousarray(frame.rgb)
             for blocks in self.changing(packed):
-                fuse_blocks(blocks, self._grid.buffers(), camera, self._limits, depth, rgb, weights, votes, self.frames)
+                fuse_blocks(
+                    len(blocks),
+                    blocks,
+                    self._grid.buffers(),
+                    camera,
+                    self._limits,
+                    depth,
+                    rgb,
+                    weights,
+                    votes,
+                    self.frames,
+                )
             self.frames += 1
             self.last_stamp_ns = frame.stamp_ns
         return len(packed)

@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 def prepare_worker() -> None:
     """One thread of computation, deaf to Ctrl-C (the parent ends it), gone when the parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ[name] = "1"
+    os.environ["OMP_NUM_THREADS"] = "1"
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()

@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import threading
 
-import numba
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
@@ -282,15 +282,15 @@ def test_growth_from_one_block_gives_the_map_that_had_room_at_once() -> None:
 
 def test_same_frames_give_the_same_bits_on_one_thread_and_on_two() -> None:
     maps = [small_map(), small_map(), small_map()]
-    before = numba.get_num_threads()
+    before = torch.get_num_threads()
     try:
-        numba.set_num_threads(min(2, numba.config.NUMBA_NUM_THREADS))
+        torch.set_num_threads(2)
         fuse_sphere(maps[0])
         fuse_sphere(maps[1])
-        numba.set_num_threads(1)
+        torch.set_num_threads(1)
         fuse_sphere(maps[2])
     finally:
-        numba.set_num_threads(before)
+        torch.set_num_threads(before)
     states = [m.block_state() for m in maps]
     assert same(states[0], states[1]) and same(states[0], states[2])
     assert (maps[0].points().xyz == maps[2].points().xyz).all()

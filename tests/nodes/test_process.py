@@ -54,28 +54,11 @@ def test_threads_are_set_before_anything_heavy_is_loaded_and_the_users_choice_is
 import json, os, sys
 from nodes.process import prepare_process
 prepare_process()
-names = ("OMP_WAIT_POLICY", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS")
-print(json.dumps([*(os.environ[n] for n in names), "torch" in sys.modules]))
+print(json.dumps([os.environ["OMP_NUM_THREADS"], "torch" in sys.modules]))
 """
-    policy, omp, numba, heavy = json.loads(_python(code).stdout)
-    assert policy == "passive" and int(omp) >= 1 and numba == omp and not heavy
-    assert json.loads(_python(code, OMP_NUM_THREADS="3").stdout)[1:3] == ["3", "3"]
-
-
-def test_numba_compiles_after_a_process_that_had_it_was_prepared() -> None:
-    code = """
-import os
-import numba, numpy
-from nodes.process import prepare_process
-total = numba.njit(parallel=True)(lambda values: values.sum())
-total(numpy.ones(3))
-del os.environ["NUMBA_NUM_THREADS"]
-os.environ["OMP_NUM_THREADS"] = "1"
-prepare_process()
-print(total(numpy.ones(3, numpy.float32)))
-"""
-    done = _python(code, OMP_NUM_THREADS="2", NUMBA_NUM_THREADS="2")
-    assert done.stdout.split() == ["3.0"], done.stderr
+    omp, heavy = json.loads(_python(code).stdout)
+    assert int(omp) >= 1 and not heavy
+    assert json.loads(_python(code, OMP_NUM_THREADS="3").stdout)[0] == "3"
 
 
 def test_stray_prints_never_reach_stdout() -> None:
