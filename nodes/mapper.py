@@ -204,12 +204,13 @@ class _Mapper:
     def finish(self) -> None:
         """Write what there is."""
         from nodes.finishing import finish_session
+        from replay.session import MapSession
 
         if self._session is None:
-            if self._taken_up:
-                raise NodeError(f"{self._taken_up}; then no stream began, so that no results can be written")
-            _log.warning("nothing_to_write", reason="no stream has begun")
-            return
+            if not self._bundle.pipeline.voxel_map.frames:
+                _log.warning("nothing_to_write", reason="no stream has begun")
+                return
+            self._session = MapSession(self._bundle, stream_labels=None)  # of the map that was saved before a restart
         self._tell_status("stopping", now=True)
         if self._autosave is not None:
             self._autosave.close()

@@ -53,6 +53,7 @@ class Member:
         self.child: Child | None = None
         self._standby: Child | None = None
         self._standby_due = 0.0
+        self._finishes = False
         self._start()
 
     @property
@@ -128,8 +129,25 @@ class Member:
 
     def ask_to_stop(self) -> None:
         """Ask its process, if there is one."""
+        if self.child is None or (self._finishes and not self.child.pulse.ready):  # the request would end it at once
+            return
+        self.child.ask_to_stop()
+
+    def start_to_finish(self) -> None:
+        """Start a node that reached its restart limit once more, to be stopped: it writes results from what it saved."""
+        if not self.failure or self._entry.restart == "never" or not self.restarts:
+            return
+        job = msgspec.structs.replace(self._job, restarts=self.restarts, subscribers=0)
+        try:
+            child = self._wake_standby(self.restarts) or Child(self.kind, job)
+        except OSError as error:
+            _log.error("results_not_written", node=self.name, reason=str(error))
+            return
         if self.child is not None:
-            self.child.ask_to_stop()
+            self.child.close()
+        self.child = child
+        self._finishes = True
+        _log.info("node_finishes", node=self.name, pid=child.pid)
 
     def close(self) -> None:
         """Leave no process behind."""

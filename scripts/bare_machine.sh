@@ -54,7 +54,7 @@ mkdir -p "$root/build"
 git clone -q "$checkout" "$root/build/$name"
 variables=(PATH=/usr/local/bin:/usr/bin:/bin:/usr/sbin:/sbin LANG=C.UTF-8)
 while IFS= read -r variable; do variables+=("$variable"); done < <(
-  env | grep -E '^(SSL_CERT_[A-Z]+|PIP_[A-Z_]+|UV_[A-Z_]+|REQUESTS_CA_BUNDLE|CURL_CA_BUNDLE|GIT_SSL_[A-Z]+|[a-z]+_proxy|[A-Z]+_PROXY)=' || true)
+  env | grep -E '^(SSL_CERT_[A-Z]+|PIP_CERT|PIP_INDEX_URL|PIP_EXTRA_INDEX_URL|PIP_DEFAULT_TIMEOUT|UV_[A-Z_]+|REQUESTS_CA_BUNDLE|CURL_CA_BUNDLE|GIT_SSL_[A-Z]+|[a-z]+_proxy|[A-Z]+_PROXY)=' || true)
 if $as_user; then
   chroot "$root" useradd --create-home --uid 4321 tester 2>/dev/null || true
   chroot "$root" chown -R tester /build

@@ -130,6 +130,29 @@ def test_restart_limit_ends_the_launch_with_the_reason(long_log: Path, tmp_path:
         assert "it was restarted 2 times within 60 s, and is not any more" in line
 
 
+def test_a_mapper_that_reaches_its_restart_limit_leaves_the_results_of_the_map_it_saved(
+    long_log: Path, weights: Path, config: Path, tmp_path: Path
+) -> None:
+    launch, out = tmp_path / "limit.toml", tmp_path / "up"
+    text = LIVE_LAUNCH.read_text(encoding="utf-8")
+    launch.write_text(text.replace('restart = "on-failure"', 'restart = "on-failure"\nmax_restarts = 1'))
+    settings = [f"log={long_log}", f"weights={weights}", f"config={config}", "save_every=1"]
+    words = [word for setting in settings for word in ("--set", setting)]
+    with Running("up", launch, *words, "--out", out) as running:
+        running.wait_for_line("map_saved")
+        for restarts in range(2):
+            os.kill(wait_for_start(running, "mapper", restarts), signal.SIGKILL)
+        assert running.wait() == 1, running.text
+        assert not any(map(is_alive, processes(running)))
+    assert (out / "summary.json").exists(), running.text
+    assert "it was restarted 1 times within 60 s" in error_line(running.text)
+    saved = VoxelMap.load(out / "map.npz")
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["map"]["blocks"] == saved.block_count > 0
+    assert summary["stopped_by"] and f"saved after {saved.frames} frames" in summary["restarted"]
+    assert {"map.ply", "overview.png", "report.html"} <= {path.name for path in out.iterdir()}
+
+
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
 def test_node_that_a_stranger_sends_away_comes_back(long_log: Path, tmp_path: Path, signum: signal.Signals) -> None:
     with Running("up", alone(tmp_path, long_log)) as running:
