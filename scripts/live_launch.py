@@ -24,8 +24,6 @@ COMMAND = Path(sys.executable).parent / "semantic-mapper"
 LAUNCH_FOLDER = Path(__file__).resolve().parents[1] / "launch"
 NODES = ("camera", "recorder", "mapper")  # of replay-live.toml
 PATIENCE_S = 600.0
-# Faults come faster here than in a life: each is to meet a node as if it were the first in its window.
-_EVERY_FAULT_IS_THE_FIRST = 'restart = "on-failure"\nmax_restarts = 100000\nwindow_s = 3.0'
 
 Key = tuple[str, str, int, int]  # topic, source, stamp, number
 
@@ -122,7 +120,7 @@ class LiveLaunch:
         settings: NAME=VALUE, as of ``up``.
         out: Folder for its results.
         variables: Added to its environment.
-        name: Of the launch file.
+        name: Of the launch file, which is used as it ships.
         nodes: That it has.
     """
 
@@ -135,14 +133,11 @@ class LiveLaunch:
         nodes: Sequence[str] = NODES,
     ) -> None:
         out.mkdir(parents=True, exist_ok=True)
-        file = out / "launch.toml"
-        text = (LAUNCH_FOLDER / name).read_text(encoding="utf-8")
-        file.write_text(text.replace('restart = "on-failure"', _EVERY_FAULT_IS_THE_FIRST), encoding="utf-8")
         chosen = [word for setting in settings for word in ("--set", setting)]
         self.out = out
         self.nodes = tuple(nodes)
         self.process = subprocess.Popen(
-            [str(COMMAND), "up", str(file), *chosen, "--out", str(out)],
+            [str(COMMAND), "up", str(LAUNCH_FOLDER / name), *chosen, "--out", str(out)],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
