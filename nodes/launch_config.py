@@ -46,8 +46,8 @@ class NodeEntry(Config, frozen=True):
     restart: Literal["never", "on-failure"] = "never"
     backoff_s: Positive = 0.1  # pause before the first restart; twice as long with each further one in the window
     backoff_max_s: Positive = 10.0  # but no longer than this
-    # So many within the window; the next failure ends the launch. With the defaults a node that was ever ready is restarted
-    # for as long as the launch runs: back-off leaves no room for so many.
+    # So many within the window; the next failure ends the launch. With the defaults a node that was ever ready is
+    # restarted for as long as the launch runs: back-off leaves no room for so many.
     max_restarts: Count = 20
     window_s: Positive = 60.0
     # Keep a second process that has loaded all packages and waits, to take over at once: it costs its memory (a

@@ -13,7 +13,7 @@ from nodes.gaps import Gaps
 from nodes.node import NodeContext, run_node
 from nodes.options import MapperOptions
 from nodes.streams import Streams
-from semantic_mapper.errors import NodeError, SemanticMapperError
+from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.memory import give_back_freed_memory
 
 if TYPE_CHECKING:

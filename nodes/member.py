@@ -134,7 +134,7 @@ class Member:
         self.child.ask_to_stop()
 
     def start_to_finish(self) -> None:
-        """Start a node that reached its restart limit once more, to be stopped: it writes results from what it saved."""
+        """Start a node that reached its restart limit once more, to be stopped: it writes results of what it saved."""
         if not self.failure or self._entry.restart == "never" or not self.restarts:
             return
         job = msgspec.structs.replace(self._job, restarts=self.restarts, subscribers=0)

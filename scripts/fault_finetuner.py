@@ -25,7 +25,13 @@ PATIENCE_S = 120.0  # for a word of the finetuner
 
 
 def finetuner_faults(settings: Sequence[str], out: Path, rounds: int) -> Iterator[Outcome]:
-    """kill -9 and SIGSTOP of the finetuner, which has keyframes to learn from; all rounds in one launch."""
+    """kill -9 and SIGSTOP of the finetuner, which has keyframes to learn from; a launch each round."""
+    for count in range(rounds):
+        yield from _finetuner_faults(settings, out / f"launch-{count}")
+        print(f"finetuner: round {count + 1} of {rounds}", flush=True)
+
+
+def _finetuner_faults(settings: Sequence[str], out: Path) -> Iterator[Outcome]:
     with LiveLaunch(settings, out, name="replay-learning.toml", nodes=NODES) as launch:
         folder = launch.sockets()
         camera, mapper = launch.listen()
@@ -38,12 +44,10 @@ def finetuner_faults(settings: Sequence[str], out: Path, rounds: int) -> Iterato
                 labels.publish(encode_keyframe(LabelledKeyframe(frame, ROOMS, "script")))
             while _next_word(words).counters["kept"] < KEYFRAMES:
                 pass
-            for count in range(rounds):
-                for fault in FAULTS:
-                    launch.wait_until_covered("finetuner")
-                    time.sleep(SETTLE_S)
-                    yield _hit(launch, words, fault)
-                print(f"finetuner: round {count + 1} of {rounds}", flush=True)
+            for fault in FAULTS:
+                launch.wait_until_covered("finetuner")
+                time.sleep(SETTLE_S)
+                yield _hit(launch, words, fault)
         assert camera.came and mapper.came, "frames were mapped meanwhile"
     if left := sum(map(is_alive, launch.all_pids())):
         raise SystemExit(f"{left} processes were left behind")

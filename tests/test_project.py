@@ -115,3 +115,20 @@ def test_every_relative_link_of_the_documentation_leads_somewhere() -> None:
             if "://" not in target and not (page.parent / target).exists():
                 broken.append(f"{page.relative_to(ROOT)}: {target}")
     assert not broken
+
+
+@pytest.mark.parametrize("end", ["os.abort()", "ctypes.PyDLL(None).sleep(1000)"], ids=["crash", "hang"])
+def test_a_test_that_crashes_or_hangs_in_native_code_ends_the_run_with_an_error(end: str, tmp_path: Path) -> None:
+    for name, line in (("bad", end), ("good", "pass")):
+        body = f"import ctypes, os, pytest\n@pytest.mark.parametrize('i', range(4))\ndef test_{name}(i):\n    {line}\n"
+        (tmp_path / f"test_{name}.py").write_text(body, encoding="utf-8")
+    planned = subprocess.run(
+        ["make", "--dry-run", "--always-make", "test"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    command = next(line for line in planned.stdout.splitlines() if "pytest tests" in line)
+    command = command.replace("pytest tests", f"pytest -c pyproject.toml {tmp_path} -o faulthandler_timeout=5")
+    done = subprocess.run(
+        ["bash", "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=240, stdin=subprocess.DEVNULL
+    )
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "crashed while running 'test_bad.py::test_bad" in done.stdout.replace(f"{tmp_path.name}/", "")
