@@ -56,10 +56,10 @@ variables=(PATH=/usr/local/bin:/usr/bin:/bin:/usr/sbin:/sbin LANG=C.UTF-8)
 while IFS= read -r variable; do variables+=("$variable"); done < <(
   env | grep -E '^(SSL_CERT_[A-Z]+|PIP_CERT|PIP_INDEX_URL|PIP_EXTRA_INDEX_URL|PIP_DEFAULT_TIMEOUT|UV_[A-Z_]+|REQUESTS_CA_BUNDLE|CURL_CA_BUNDLE|GIT_SSL_[A-Z]+|[a-z]+_proxy|[A-Z]+_PROXY)=' || true)
 if $as_user; then
-  chroot "$root" useradd --create-home --uid 4321 tester 2>/dev/null || true
+  chroot "$root" useradd --create-home --home-dir /var/tester --uid 4321 tester 2>/dev/null || true
   chroot "$root" chown -R tester /build
-  chroot "$root" chmod 555 /home/tester
-  chroot --userspec=tester "$root" /usr/bin/env -i HOME=/home/tester "${variables[@]}" bash -c "cd '/build/$name' && $command"
+  chroot "$root" chmod 555 /var/tester
+  chroot --userspec=tester "$root" /usr/bin/env -i HOME=/var/tester "${variables[@]}" bash -c "cd '/build/$name' && $command"
 else
   chroot "$root" /usr/bin/env -i HOME=/root "${variables[@]}" bash -c "cd '/build/$name' && $command"
 fi
