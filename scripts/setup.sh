@@ -21,6 +21,10 @@ fi
 # Wheels of several hundred MB over a slow line: be patient. Never a downloaded Python: the one at hand is the one tested.
 export UV_HTTP_TIMEOUT="${UV_HTTP_TIMEOUT:-300}" UV_PYTHON_DOWNLOADS=never UV_PROJECT_ENVIRONMENT=.venv
 unset VIRTUAL_ENV
+cache="${UV_CACHE_DIR:-${XDG_CACHE_HOME:-${HOME:-/nonexistent}/.cache}/uv}"
+if ! mkdir -p "$cache" 2>/dev/null || [[ ! -w $cache ]]; then
+  export UV_CACHE_DIR="$PWD/.tools/cache"  # a home that cannot be written to
+fi
 "$uv" sync --frozen --python "$python"
 
 .venv/bin/python scripts/system_libs.py

@@ -45,8 +45,11 @@ def kernel(
 
     def decorate(function: FunctionT) -> FunctionT:
         dispatcher = compile_(function)
-        # As numba's own `enable_caching` does for `cache=True`, which offers no choice of the cache.
-        dispatcher._cache = KernelCache(function)
+        try:
+            # As numba's own `enable_caching` does for `cache=True`, which offers no choice of the cache.
+            dispatcher._cache = KernelCache(function)
+        except RuntimeError as error:  # neither the package's folder nor the user's cache folder can be written to
+            _log_no_cache(str(_PACKAGE), type(error).__name__)
         return dispatcher
 
     return decorate
@@ -92,6 +95,12 @@ class KernelCache(FunctionCache):
 @functools.cache
 def _log_no_lock(folder: str, error: str) -> None:
     _log.warning("kernels_without_lock", folder=folder, error=error, note="start one process first, then the others")
+
+
+@functools.cache
+def _log_no_cache(folder: str, error: str) -> None:
+    note = "kernels compile at every start, for about two minutes; set NUMBA_CACHE_DIR to a writable folder"
+    _log.warning("kernels_not_kept", folder=folder, error=error, note=note)
 
 
 @functools.cache

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numba.core.caching import IndexDataCacheFile
+from numba.core.caching import CacheImpl, IndexDataCacheFile
 
 from semantic_mapper import kernel_cache
 
@@ -93,3 +93,14 @@ def test_code_is_compiled_anew_after_a_change_in_any_kernels_file(
         assert [hits(), hits()] == [0, 1]
     finally:
         kernel_cache.kernels_stamp.cache_clear()
+
+
+def test_kernels_run_where_no_folder_can_keep_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(CacheImpl, "_locator_classes", [])  # a read-only installation and a read-only home
+    kernels = _module(tmp_path, monkeypatch)
+    assert kernels.total_bytes(np.ones(3, np.float32)) == 12
+    assert not list(tmp_path.rglob("*.nbc"))
+    said = capsys.readouterr()
+    assert "NUMBA_CACHE_DIR" in said.out + said.err
