@@ -11,6 +11,9 @@ from rich.table import Table
 
 from replay.sequence import LogSequence, open_log, read_part
 
+MAX_TOPICS = 256  # counted by name; a log may be made to hold a new one in each message
+OTHER_TOPICS = "others"
+
 
 def describe_log(paths: Sequence[Path], on_message: Callable[[], None]) -> dict[str, Any]:
     """Read all messages of a log (or of the parts of one) and say what is in it.
@@ -28,6 +31,8 @@ def describe_log(paths: Sequence[Path], on_message: Callable[[], None]) -> dict[
         part = None if len(logs) > 1 else read_part(logs[0])
         for envelope, parts in log.messages():
             topic = f"{envelope.topic}/{envelope.source}" if envelope.topic != "info" else "info"
+            if topic not in topics and len(topics) >= MAX_TOPICS:
+                topic = OTHER_TOPICS
             topics[topic] += 1
             sizes[topic] += sum(len(p) for p in parts)
             if envelope.topic == "frame":
