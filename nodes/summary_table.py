@@ -35,7 +35,7 @@ def result_lines(out: Path) -> list[str]:
     """Where the results are."""
     what = {
         "overview.png": "picture",
-        "map.ply": "point cloud: x y z red green blue label confidence",
+        "map.ply": "point cloud: x y z red green blue label confidence; class names as comments",
         "map.npz": "the map itself",
         "report.html": "report on one page, for a browser",
         "summary.json": "all figures",

@@ -36,7 +36,7 @@ def write_artifacts(session: MapSession, out: Path, rerun: RerunLog | None) -> d
     """Write everything to ``out`` (made if missing); the summary comes last, so its presence means "complete"."""
     out.mkdir(parents=True, exist_ok=True)
     points = session.pipeline.voxel_map.points()
-    write_ply(out / "map.ply", points)
+    write_ply(out / "map.ply", points, session.pipeline.label_set)
     session.pipeline.voxel_map.save(out / "map.npz")
     _draw_overview(session, points, out / "overview.png")
     if rerun is not None:

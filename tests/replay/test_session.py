@@ -53,7 +53,9 @@ def test_a_session_leaves_summary_map_points_and_picture(tmp_path, weights):
     points = VoxelMap.load(tmp_path / "out/map.npz").points()
     assert len(points.xyz) == summary["map"]["surface_points"]
     ply = (tmp_path / "out/map.ply").read_bytes()
-    assert b"property uchar label" in ply[:400] and b"property float confidence" in ply[:400]
+    header = ply.split(b"end_header")[0].decode()
+    assert "property uchar label" in header and "property float confidence" in header
+    assert {f"comment label {i} {name}" for i, name in summary["labels"].items()} <= set(header.splitlines())
     assert cv2.imread(str(tmp_path / "out/overview.png")).std() > 10
     assert (tmp_path / "run.rrd").read_bytes()[:4] in (b"RRF2", b"RRIO", b"RRF3") and (
         tmp_path / "run.rrd"
