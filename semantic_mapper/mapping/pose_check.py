@@ -96,8 +96,8 @@ class PoseCheck:
     def _explain(self, recent: float, keyframes: Sequence[Keyframe]) -> str:
         own = [k for k in keyframes if not k.labelled][-WINDOW:]
         text = (
-            f"the depth of overlapping keyframes disagrees by {100 * recent:.1f} % (lower quartile; below 1 % where poses and "
-            f"depth fit), found at frame seq={own[-1].seq}: the map cannot be trusted. Check the poses "
+            f"the depth of overlapping keyframes disagrees by {100 * recent:.1f} % (lower quartile; below 1 % where "
+            f"poses and depth fit), found at frame seq={own[-1].seq}: the map cannot be trusted. Check the poses "
             "(T_world_camera, OpenCV axes, metres, stamps), the depth scale and the intrinsics"
         )
         for cause, change, depth_factor in _CAUSES:
