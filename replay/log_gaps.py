@@ -26,7 +26,7 @@ def find_gaps(seqs: Sequence[int], stamps_ns: Sequence[int]) -> dict[str, Any]:
     """
     steps = np.diff(np.asarray(seqs, np.int64))
     onward = steps > 0
-    stride = max(1, int(np.median(steps[onward]))) if onward.any() else 1
+    stride = int(np.percentile(steps[onward], 50, method="lower")) if onward.any() else 1
     missing = np.where(onward, steps // stride - 1, 0).clip(min=0)
     intervals = np.diff(np.asarray(stamps_ns, np.int64))
     forward = intervals > 0
@@ -34,7 +34,7 @@ def find_gaps(seqs: Sequence[int], stamps_ns: Sequence[int]) -> dict[str, Any]:
     long = intervals > LONG_INTERVAL * typical if typical is not None else np.zeros(len(intervals), bool)
     at, later = (int(x.argmax()) if len(x) else 0 for x in (missing, intervals))
     return {
-        "frames_missing": int(missing.sum()),
+        "frames_missing": sum(missing.tolist()),
         "sequence_gaps": int((missing > 0).sum()),
         "largest_sequence_gap": int(missing[at]) if len(missing) else 0,
         "largest_sequence_gap_after_seq": int(seqs[at]) if missing.any() else None,

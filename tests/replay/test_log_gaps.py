@@ -19,6 +19,12 @@ def test_every_tenth_frame_is_no_gap_and_one_missing_of_them_is() -> None:
     assert (gaps["frames_missing"], gaps["largest_sequence_gap_after_seq"]) == (1, 20)
 
 
+def test_the_largest_numbers_that_a_log_can_hold_are_counted() -> None:
+    largest = 2**63 - 1
+    gaps = find_gaps([0, 1, largest, 0, 1, largest], [0, 1, largest, 0, 1, largest])
+    assert gaps["frames_missing"] == 2 * (largest - 2) and gaps["counter_restarts"] == 1
+
+
 def test_time_may_stand_still_while_numbers_go_on() -> None:
     gaps = find_gaps(range(5), [0, TENTH, 2 * TENTH, 40 * TENTH, 41 * TENTH])
     assert (gaps["frames_missing"], gaps["time_gaps"], gaps["longest_time_gap_s"]) == (0, 1, 3.8)
