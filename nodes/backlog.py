@@ -11,7 +11,7 @@ import structlog
 
 from nodes.node import NodeContext
 from nodes.streams import Streams
-from replay.mcap_scan import read_messages, scan_end
+from replay.mcap_scan import read_payloads, scan_end
 from replay.sequence import parts_on_disk
 from semantic_mapper.errors import CodecError, LogError
 from semantic_mapper.transport.codec import decode_end, read_envelope
@@ -131,6 +131,6 @@ def _last_chunks(fd: int, length: int) -> list[tuple[int, int]]:
 
 def _keys_of_chunk(fd: int, offset: int, size: int) -> set[Key]:
     try:
-        return {_key(unpack_parts(message.data)) for message in read_messages(fd, offset, size, "")}
+        return {_key(unpack_parts(payload)) for payload in read_payloads(fd, offset, size)}
     except (LogError, CodecError):  # cut off: it has to be written again
         return set()

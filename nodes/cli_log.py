@@ -77,7 +77,7 @@ def info(
     ],
     json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
 ) -> int:
-    """Say what a log holds (topics, frames, cameras, duration, damage), or a map (frames, size, blocks, classes).
+    """Say what a log holds (topics, frames, cameras, duration, gaps, damage), or a map (frames, size, blocks, classes).
 
     Of a log it reads every message, so that damage anywhere is found; exit code 1 where there is any. Of a map it reads
     what the file says of itself, which is quick however large the map is.

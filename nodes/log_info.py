@@ -9,7 +9,11 @@ from typing import Any
 
 from rich.table import Table
 
+from replay.log_gaps import find_gaps, gaps_text
 from replay.sequence import LogSequence, open_log, read_part
+
+MAX_TOPICS = 256  # counted by name; a log may be made to hold a new one in each message
+OTHER_TOPICS = "others"
 
 
 def describe_log(paths: Sequence[Path], on_message: Callable[[], None]) -> dict[str, Any]:
@@ -20,7 +24,8 @@ def describe_log(paths: Sequence[Path], on_message: Callable[[], None]) -> dict[
     """
     topics: Counter[str] = Counter()
     sizes: Counter[str] = Counter()
-    stamps: list[int] = []
+    stamps: dict[str, list[int]] = {}  # of frames, by camera; seqs likewise
+    seqs: dict[str, list[int]] = {}
     depth = labelled = 0
     with open_log(paths, allow_empty=True) as log:
         logs = log.logs if isinstance(log, LogSequence) else [log]
@@ -28,31 +33,37 @@ def describe_log(paths: Sequence[Path], on_message: Callable[[], None]) -> dict[
         part = None if len(logs) > 1 else read_part(logs[0])
         for envelope, parts in log.messages():
             topic = f"{envelope.topic}/{envelope.source}" if envelope.topic != "info" else "info"
+            if topic not in topics and len(topics) >= MAX_TOPICS:
+                topic = OTHER_TOPICS
             topics[topic] += 1
             sizes[topic] += sum(len(p) for p in parts)
             if envelope.topic == "frame":
-                stamps.append(envelope.stamp_ns)
+                camera = envelope.source if envelope.source in stamps or len(stamps) < MAX_TOPICS else OTHER_TOPICS
+                stamps.setdefault(camera, []).append(envelope.stamp_ns)
+                seqs.setdefault(camera, []).append(envelope.seq)
                 depth += envelope.has_depth
                 labelled += envelope.has_label
             on_message()
         stream, attachments = log.info, log.attachments()
         damage, notices, finished = [str(e) for e in log.errors], list(log.notices), log.finished
-    seconds = (max(stamps) - min(stamps)) / 1e9 if stamps else 0.0
+    frames = sum(map(len, stamps.values()))
+    seconds = (max(map(max, stamps.values())) - min(map(min, stamps.values()))) / 1e9 if stamps else 0.0
     return {
         "log": str(paths[0]),
         "parts": [str(file) for file in files],
         "part": None if part is None else part.part,
         "source": stream.source,
         "size_bytes": sum(file.stat().st_size for file in files),
-        "frames": len(stamps),
+        "frames": frames,
         "frames_with_depth": depth,
         "frames_with_labels": labelled,
         "duration_s": round(seconds, 3),
-        "frame_hz": round((len(stamps) - 1) / seconds, 2) if seconds > 0 else None,
+        "frame_hz": round((frames - 1) / seconds, 2) if seconds > 0 else None,
         "cameras": {
             name: {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}
             for name, k in stream.cameras.items()
         },
+        "gaps": {name: find_gaps(seqs[name], stamps[name]) for name in sorted(stamps)},
         "label_set": None
         if stream.label_set is None
         else {"name": stream.label_set.name, "classes": list(stream.label_set.names)},
@@ -80,6 +91,8 @@ def info_table(found: dict[str, Any]) -> Table:
     table.add_row("duration", f"{found['duration_s']:g} s{rate}")
     for name, k in found["cameras"].items():
         table.add_row(f"camera {name}", f"{k['width']}x{k['height']}, fx {k['fx']:.1f} fy {k['fy']:.1f}")
+    for name, gaps in found["gaps"].items():
+        table.add_row(f"gaps {name}", gaps_text(gaps))
     label_set = found["label_set"]
     text = "none" if label_set is None else f"{label_set['name']}: {', '.join(label_set['classes'])}"
     table.add_row("classes", text)

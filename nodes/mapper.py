@@ -330,6 +330,8 @@ class _Mapper:
             degraded += self._weights.degraded
         if self._taken_up:
             degraded += (self._taken_up,)
+        if self._bundle.pipeline.pose_check.warning:
+            degraded += (self._bundle.pipeline.pose_check.warning,)
         if self._queries is not None:
             counters |= {"answered": self._queries.answered, "abandoned": self._queries.abandoned}
             if not self._queries.alive:

@@ -12,7 +12,7 @@ from rich.table import Table
 from nodes.console import frame_progress
 from nodes.run_replay import mapper_config
 from nodes.summary_table import percent
-from replay.evaluate import baseline_predictors, evaluate_frames, sray_predictors
+from replay.evaluate import baseline_predictors, evaluate_frames, field_predictors
 from replay.sequence import Log, open_log
 from replay.session import load_pipeline
 from semantic_mapper.errors import LabelError, WeightsError
@@ -46,7 +46,7 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
         if stream_labels is None:
             raise LabelError(f"{request.log}: has no label images to score against")
         bundle = load_pipeline(request.weights, mapper_config(request.config, None, request.seed))
-        predictors = sray_predictors(bundle)
+        predictors = field_predictors(bundle)
         stamps = bundle.checkpoint.train_stamps_ns
         if request.baselines:
             keyframes = _frames_at(log, stamps)

@@ -35,7 +35,7 @@ def result_lines(out: Path) -> list[str]:
     """Where the results are."""
     what = {
         "overview.png": "picture",
-        "map.ply": "point cloud: x y z red green blue label confidence",
+        "map.ply": "point cloud: x y z red green blue label confidence; class names as comments",
         "map.npz": "the map itself",
         "report.html": "report on one page, for a browser",
         "summary.json": "all figures",
@@ -46,6 +46,13 @@ def result_lines(out: Path) -> list[str]:
 def notes(summary: Mapping[str, Any]) -> list[str]:
     """What a reader of the figures has to know."""
     frames, lines = summary["frames"], []
+    if dig(summary, "pose_check.warning"):
+        lines.append(f"warning: {summary['pose_check']['warning']}")
+    if fraction := dig(summary, "depth.rendered_fraction"):
+        lines.append(
+            f"depth: rendered by the field for {percent(fraction)} of the frames, which have no sensor depth; geometry "
+            "is less exact than with a depth sensor"
+        )
     if frames.get("excluded_from_scores"):
         lines.append(
             f"{frames['excluded_from_scores']} frames are left out of the scores: weights were finetuned on them"
@@ -75,6 +82,11 @@ def _ms(value: float) -> str:
     return f"{value:.0f} ms"
 
 
+_DEPTH_SOURCES = {
+    "sensor": "sensor",
+    "rendered": "rendered by the field (no depth sensor)",
+    "mixed": "rendered by the field for {} of the frames",
+}
 _ROWS: Sequence[tuple[str, str, Any]] = (
     ("log", "source", str),
     ("weights", "weights.file", str),
@@ -83,6 +95,8 @@ _ROWS: Sequence[tuple[str, str, Any]] = (
     ("frames dropped", "frames.dropped", str),
     ("frames refused", "frames.refused", str),
     ("frames scored", "frames.scored", str),
+    ("depth", "depth", lambda d: _DEPTH_SOURCES[d["source"]].format(percent(d["rendered_fraction"]))),
+    ("depth disagreement", "pose_check.depth_disagreement", percent),
     ("latency p50", "latency_ms.p50", _ms),
     ("latency p95", "latency_ms.p95", _ms),
     ("voxel size", "map.voxel_size_m", lambda v: f"{v * 100:g} cm"),

@@ -36,7 +36,7 @@ def write_artifacts(session: MapSession, out: Path, rerun: RerunLog | None) -> d
     """Write everything to ``out`` (made if missing); the summary comes last, so its presence means "complete"."""
     out.mkdir(parents=True, exist_ok=True)
     points = session.pipeline.voxel_map.points()
-    write_ply(out / "map.ply", points)
+    write_ply(out / "map.ply", points, session.pipeline.label_set)
     session.pipeline.voxel_map.save(out / "map.npz")
     _draw_overview(session, points, out / "overview.png")
     if rerun is not None:
@@ -56,7 +56,7 @@ def _draw_overview(session: MapSession, points: MapPoints, path: Path) -> None:
         points,
         label_set,
         title=f"{session.source or 'session'}: {session.fused} frames, {len(points.xyz):,} surface points, {size}",
-        subtitle=_scores_line(session),
+        subtitle=_scores_line(session) + _depth_line(session),
         up=camera_up(np.stack(poses)) if poses else None,
     )
 
@@ -68,7 +68,9 @@ def view_strips(session: MapSession, count: int) -> list[ViewStrip]:
         truth = None
         if session.truth is not None and frame.label is not None:
             truth = session.truth.to_map_ids(frame.label, f"frame seq={frame.seq}")
-        strips.append(ViewStrip(f"frame {frame.seq}", frame.rgb, update.label, truth, update.depth_m))
+        strips.append(
+            ViewStrip(f"frame {frame.seq}", frame.rgb, update.label, truth, update.depth_m, frame.depth_m is None)
+        )
     return strips
 
 
@@ -77,6 +79,17 @@ def _scores_line(session: MapSession) -> str:
     if miou is None:
         return "no labels to score against"
     return f"mIoU {100 * miou:.1f} % over {session.scored} labelled frames that the weights have not seen"
+
+
+def _depth_line(session: MapSession) -> str:
+    source = _depth_source(session)
+    if source["source"] == "sensor":
+        return ""
+    if source["source"] == "rendered":
+        return "; depth: rendered by the field (no depth sensor)"
+    return (
+        f"; depth: rendered by the field for {100 * source['rendered_fraction']:.0f} % of the frames (no sensor depth)"
+    )
 
 
 def _spread(items: Sequence[ItemT], count: int) -> list[ItemT]:
@@ -112,6 +125,13 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
         },
         "latency_ms": {**_percentiles(session.step_ms), "first": _rounded(session.step_ms.first)},
         "stages_ms": {name: _percentiles(times) for name, times in session.stage_ms.items()},
+        "depth": _depth_source(session),
+        "pose_check": {
+            "keyframes_compared": pipeline.pose_check.compared,
+            "depth_disagreement": _rounded(pipeline.pose_check.recent, 4),
+            "worst_depth_disagreement": _rounded(pipeline.pose_check.worst, 4),
+            "warning": pipeline.pose_check.warning or None,
+        },
         "map": {
             "voxel_size_m": voxel_map.config.voxel_size_m,
             "blocks": voxel_map.block_count,
@@ -130,7 +150,7 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "scored_classes": list(session.truth.shared) if session.truth is not None else None,
         },
         "field": {
-            "name": "sray",
+            "name": bundle.checkpoint.model.kind,
             "renderer": type(pipeline.field).__name__,
             "sampling": pipeline.config.sampling.mode,
             "anchors": len(bundle.checkpoint.anchors),
@@ -148,6 +168,14 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
         "damaged_stretches": session.damages.first,
         "versions": versions(),
     }
+
+
+def _depth_source(session: MapSession) -> dict[str, Any]:
+    """Where the geometry comes from; frames without sensor depth have theirs rendered by the field."""
+    mapped = session.published - session.dropped - len(session.refusals)
+    fraction = session.without_depth / mapped if mapped else 0.0
+    source = "sensor" if not session.without_depth else "rendered" if fraction == 1 else "mixed"
+    return {"source": source, "rendered_fraction": round(fraction, 4)}
 
 
 def _metrics(session: MapSession, points: MapPoints) -> dict[str, Any]:
@@ -168,8 +196,8 @@ def _percentiles(times: StepTimes) -> dict[str, float | None]:
     return {"p50": _rounded(times.percentile(50)), "p95": _rounded(times.percentile(95))}
 
 
-def _rounded(ms: float | None) -> float | None:
-    return None if ms is None else round(ms, 2)
+def _rounded(value: float | None, digits: int = 2) -> float | None:
+    return None if value is None else round(value, digits)
 
 
 def versions() -> dict[str, str]:

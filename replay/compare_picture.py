@@ -128,7 +128,8 @@ def _find_up(surface: SurfaceMatch) -> Float64 | None:
 def _classes(surface: SurfaceMatch, plan: _Plan) -> UInt8:
     upright, below = plan.upright(surface.points.xyz)
     colors = class_colors(surface.points.label, surface.label_set)
-    picture, _ = draw_points(from_above(upright[below]), colors[below], (COLUMN, PANEL_HEIGHT), PANEL)
+    camera = plan.centre * (1.0, -1.0), plan.scale  # of both maps, as in all plans
+    picture, _ = draw_points(from_above(upright[below]), colors[below], (COLUMN, PANEL_HEIGHT), PANEL, camera=camera)
     return picture
 
 

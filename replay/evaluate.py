@@ -33,15 +33,16 @@ class Evaluation:
     refused: int
 
 
-def sray_predictors(bundle: PipelineBundle) -> dict[str, Predictor]:
-    """S-Ray as it maps (the frame itself is a source view) and for a novel view (the frame is none)."""
+def field_predictors(bundle: PipelineBundle) -> dict[str, Predictor]:
+    """The field as it maps (the frame itself is a source view) and for a novel view (the frame is none), by kind."""
     novel = _with_current_view(bundle.pipeline.config, False)
     pipeline = MappingPipeline(
         novel, make_field(bundle.checkpoint.model, novel), bundle.pipeline.label_set, anchors=bundle.checkpoint.anchors
     )
+    kind = bundle.checkpoint.model.kind
     return {
-        "sray": lambda frame: bundle.pipeline.step(frame).label,
-        "sray, novel view": lambda frame: pipeline.step(frame).label,
+        kind: lambda frame: bundle.pipeline.step(frame).label,
+        f"{kind}, novel view": lambda frame: pipeline.step(frame).label,
     }
 
 

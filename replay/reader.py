@@ -6,10 +6,11 @@ import os
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 
-from replay.mcap_scan import Scan, payload_heads, read_attachment, read_messages, scan
+from replay.mcap_scan import Damage, ReadLimits, Scan, payload_heads, read_attachment, read_payloads, scan
 from semantic_mapper.errors import CodecError, LogError
 from semantic_mapper.transport.codec import Envelope, decode_frame, decode_info, read_envelope
 from semantic_mapper.transport.framing import unpack_parts
@@ -18,6 +19,8 @@ from semantic_mapper.transport.topics import parse_topic
 from semantic_mapper.types import PosedFrame
 
 INFO_ATTACHMENT = "stream_info"
+DAMAGED_COST = 8  # messages: what it costs to report one that cannot be read
+MAX_INFOS = 1024  # messages that describe a stream; a recording has one a camera and restart
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +78,7 @@ class LogReader:
         self.notices: list[str] = []
         self._on_error = on_error
         self._reported: set[str] = set()
+        self._last_chunk: tuple[int, list[bytes] | str] = -1, ""
         try:
             self._file = path.open("rb")
             os.pread(self._file.fileno(), 1, 0)  # a folder opens, but cannot be read
@@ -162,18 +166,29 @@ class LogReader:
 
     def _make_index(self, found: Scan) -> list[_Entry]:
         entries: list[_Entry] = []
-        for offset, length in found.chunks:
-            for position, head in enumerate(payload_heads(self._file.fileno(), offset, length)):
-                entries.append(_Entry(len(entries), offset, length, position, _topic_name(head)))
+        limits = ReadLimits.of_file(found.size)
+        for number, (offset, length) in enumerate(found.chunks):
+            heads = payload_heads(self._file.fileno(), offset, length, limits)
+            topics = [_topic_name(head) for head in heads]
+            if not any(topics):
+                topics = [""]  # nothing of ours in it: reported once
+            limits.messages -= len(topics) + DAMAGED_COST * topics.count("")
+            if limits.messages < 0 or limits.records <= 0:
+                reason = "the file holds more messages than a recording of its size; the rest is not read"
+                found.damages.append(Damage(offset, found.size, number, reason))
+                break
+            entries += [
+                _Entry(len(entries) + position, offset, length, position, topic)
+                for position, topic in enumerate(topics)
+            ]
         return entries
 
     def _read_info(self, found: Scan) -> StreamInfo:
         """What the stream is; of several cameras, each tells of itself when it begins."""
         first = self._read_first_info(found)
         cameras, sources = dict(first.cameras), [first.source]
-        for entry in self._index:
-            if entry.topic != "info":
-                continue
+        infos = (entry for entry in self._index if entry.topic == "info")
+        for entry in islice(infos, MAX_INFOS):
             try:
                 info = decode_info(self._read(entry))
             except (LogError, CodecError):  # told when its turn comes
@@ -193,12 +208,12 @@ class LogReader:
                     return decode_info(unpack_parts(attachment.data))
                 except CodecError as error:
                     self._report(LogError(f"{self.path}: stream information at byte {offset}: {error}"))
-        for entry in self._index:
-            if entry.topic == "info":
-                try:
-                    return decode_info(self._read(entry))
-                except (LogError, CodecError) as error:
-                    self._report(LogError(f"{self._where(entry)}: {error}"))
+        infos = (entry for entry in self._index if entry.topic == "info")
+        for entry in islice(infos, MAX_INFOS):
+            try:
+                return decode_info(self._read(entry))
+            except (LogError, CodecError) as error:
+                self._report(LogError(f"{self._where(entry)}: {error}"))
         damaged = f"; damaged: {self.errors[0]}" if self.errors else ""
         raise LogError(
             f"{self.path}: says nothing of its cameras and classes: not a log of semantic-mapper (what `export` writes "
@@ -207,8 +222,8 @@ class LogReader:
 
     def _report_damages(self, found: Scan) -> None:
         for damage in found.damages:
-            before = sum(entry.offset < damage.offset for entry in self._index)
-            frames = sum(self._index[i].offset < damage.offset for i in self._frames)
+            before = bisect_left(self._index, damage.offset, key=lambda entry: entry.offset)
+            frames = bisect_left(self._frames, before)
             self._report(
                 LogError(
                     f"{self.path}: bytes {damage.offset} to {damage.end}, after message {before - 1} (frame "
@@ -236,11 +251,23 @@ class LogReader:
     def _read(self, entry: _Entry) -> list[bytes]:
         if self._file.closed:
             raise LogError(f"{self.path}: the log is closed")
-        where = self._where(entry)
-        messages = read_messages(self._file.fileno(), entry.offset, entry.length, where)
-        if entry.position >= len(messages):
-            raise LogError(f"{where}: damaged: the chunk holds {len(messages)} messages")
-        return unpack_parts(messages[entry.position].data)
+        payloads = self._read_chunk(entry)
+        if isinstance(payloads, str):
+            raise LogError(f"{self._where(entry)}: {payloads}")
+        if entry.position >= len(payloads):
+            raise LogError(f"{self._where(entry)}: damaged: the chunk holds {len(payloads)} messages")
+        return unpack_parts(payloads[entry.position])
+
+    def _read_chunk(self, entry: _Entry) -> list[bytes] | str:
+        """Messages of a chunk, or why there are none; the last chunk is kept for those that have several messages."""
+        offset, payloads = self._last_chunk  # one read and one write: other threads may exchange it
+        if offset != entry.offset:
+            try:
+                payloads = read_payloads(self._file.fileno(), entry.offset, entry.length)
+            except LogError as error:
+                payloads = str(error)
+            self._last_chunk = entry.offset, payloads
+        return payloads
 
     def _where(self, entry: _Entry) -> str:
         at = bisect_left(self._frames, entry.number)

@@ -73,6 +73,7 @@ class ViewStrip:
         rendered: (h, w) uint8 class ids; the ignore id is drawn grey.
         truth: (H, W) uint8 class ids, None where there are none.
         depth_m: (H, W) float32, 0 = none; None for a stream without depth.
+        depth_rendered: The field rendered it; no sensor measured it.
     """
 
     name: str
@@ -80,6 +81,7 @@ class ViewStrip:
     rendered: UInt8
     truth: UInt8 | None = None
     depth_m: Float32 | None = None
+    depth_rendered: bool = False
 
 
 def write_overview(
@@ -171,7 +173,7 @@ def draw_strip(strip: ViewStrip, label_set: LabelSet) -> UInt8:
         tiles.append(("truth", class_colors(strip.truth, label_set), cv2.INTER_NEAREST))
     if strip.depth_m is not None:
         caption, picture = _color_depth(strip.depth_m)
-        tiles.append((caption, picture, cv2.INTER_NEAREST))
+        tiles.append((f"rendered {caption}" if strip.depth_rendered else caption, picture, cv2.INTER_NEAREST))
     columns = max(len(tiles), 3)  # two tiles side by side would tower over the map
     tile_width = (WIDTH - 2 * MARGIN - (columns - 1) * GAP) // columns
     tile_height = round(tile_width * strip.rgb.shape[0] / strip.rgb.shape[1])

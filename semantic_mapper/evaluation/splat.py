@@ -15,15 +15,21 @@ EDGE_STRENGTH = 1.1  # of the shading
 
 
 def draw_points(
-    xyz_view: Float64, colors: UInt8, size: tuple[int, int], background: tuple[int, int, int]
+    xyz_view: Float64,
+    colors: UInt8,
+    size: tuple[int, int],
+    background: tuple[int, int, int],
+    *,
+    camera: tuple[Float64, float] | None = None,
 ) -> tuple[UInt8, float]:
-    """Draw points in parallel projection, fitted into the picture.
+    """Draw points in parallel projection, fitted into the picture unless a camera is given.
 
     Args:
         xyz_view: (N, 3) metres: x to the right, y down, z away from the viewer.
         colors: (N, 3) uint8.
         size: (width, height) of the picture.
         background: (r, g, b).
+        camera: The x and y (2,) of the picture's centre and pixels a metre, to draw several maps alike.
 
     Returns:
         (H, W, 3) uint8 picture and its scale in pixels a metre.
@@ -32,10 +38,13 @@ def draw_points(
     canvas = np.full((height, width, 3), background, np.uint8)
     if not len(xyz_view):
         return cv2.resize(canvas, size, interpolation=cv2.INTER_AREA).astype(np.uint8), 1.0
-    low, high = np.percentile(xyz_view[:, :2], (0.1, 99.9), axis=0)
-    extent = np.maximum(high - low, 0.1) * 1.04 + 0.05
-    scale = float(min(width / extent[0], height / extent[1]))
-    pixel = np.floor((xyz_view[:, :2] - (low + high) / 2) * scale + (width / 2, height / 2)).astype(np.int64)
+    if camera is None:
+        low, high = np.percentile(xyz_view[:, :2], (0.1, 99.9), axis=0)
+        extent = np.maximum(high - low, 0.1) * 1.04 + 0.05
+        centre, scale = (low + high) / 2, float(min(width / extent[0], height / extent[1]))
+    else:
+        centre, scale = camera[0], camera[1] * SUPERSAMPLING
+    pixel = np.floor((xyz_view[:, :2] - centre) * scale + (width / 2, height / 2)).astype(np.int64)
     nearest, depth = _z_buffer(pixel, xyz_view[:, 2], width, height)
     side = int(np.clip(np.ceil(_spacing(xyz_view) * scale * 1.1), 1, MAX_SPLAT))
     nearest, depth = _grow(nearest, depth, side)

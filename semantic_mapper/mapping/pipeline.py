@@ -26,6 +26,7 @@ from semantic_mapper.mapping.depth_trust import depth_trust
 from semantic_mapper.mapping.history import FusedFrame
 from semantic_mapper.mapping.keyframes import EncodedSize, Keyframe, KeyframeStore
 from semantic_mapper.mapping.lifting import lift
+from semantic_mapper.mapping.pose_check import PoseCheck
 from semantic_mapper.mapping.view_renderer import RenderedView, ViewRenderer
 from semantic_mapper.mapping.virtual_views import ViewpointChooser, VirtualLook
 from semantic_mapper.mapping.vote_fusion import add_votes
@@ -69,6 +70,7 @@ class MappingPipeline:
         self.label_set = label_set
         self.voxel_map = VoxelMap(config.voxel_map, label_set)
         self.keyframes = KeyframeStore(config.keyframes)
+        self.pose_check = PoseCheck(config.voxel_map.depth_max_m)
         self._viewpoints = ViewpointChooser(config.virtual, config.seed)
         self._steps = 0
         self._renderer = ViewRenderer(field, config.render, config.sampling)
@@ -230,7 +232,9 @@ class MappingPipeline:
         with self._stage("keyframe"):
             is_keyframe = self.keyframes.wants(frame.T_world_camera, current.size)
             if is_keyframe:
-                self.keyframes.add(self._make_keyframe(frame, current))
+                keyframe = self._make_keyframe(frame, current)
+                self.pose_check.add(keyframe, sources, self.keyframes.keyframes)
+                self.keyframes.add(keyframe)
         self._intrinsics[frame.camera_id] = frame.intrinsics
         self._odd_sizes.pop(frame.camera_id, None)
         label, confidence = self._at_rows(table, rows)

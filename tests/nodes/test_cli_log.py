@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from replay.log import LogWriter
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 from tests.mapping.test_voxel_map import fuse_sphere
 from tests.mapping.views import small_map
@@ -64,6 +68,29 @@ def test_info_shows_topics_frames_and_classes(log: Path) -> None:
     assert done.returncode == 0, done.stderr
     for text in ("6 (6 with depth, 6 with labels)", "96x72", "topic frame/rooms", "rooms: wall, floor", "none"):
         assert text in done.stdout
+
+
+def test_info_lists_the_gaps_of_each_camera(tmp_path: Path) -> None:
+    """Frames that a recorder dropped, and a camera that stood still; another camera is whole."""
+    whole, frames = tiny_frames(6), []
+    for camera, seqs in (("left", (0, 1, 2, 6, 7, 9)), ("right", range(6))):
+        frames += [
+            replace(frame, camera_id=camera, seq=seq, stamp_ns=10**9 + seq * 10**8)
+            for frame, seq in zip(whole, seqs, strict=True)
+        ]
+    frames.sort(key=lambda frame: frame.stamp_ns)
+    log = tmp_path / "gaps.mcap"
+    with LogWriter(log, StreamInfo("test", {"left": INTRINSICS, "right": INTRINSICS}, ROOMS)) as writer:
+        for frame in frames:
+            writer.write_frame(frame)
+    gaps = json.loads(run("info", log, "--json").stdout)["gaps"]
+    left = gaps["left"]
+    assert (left["frames_missing"], left["sequence_gaps"], left["largest_sequence_gap"]) == (4, 2, 3)
+    assert (left["time_gaps"], left["longest_time_gap_s"], left["interval_s"]) == (1, 0.4, 0.1)
+    assert left["largest_sequence_gap_after_seq"] == left["longest_time_gap_after_seq"] == 2
+    assert gaps["right"]["frames_missing"] == gaps["right"]["time_gaps"] == 0
+    shown = " ".join(run("info", log).stdout.split())
+    assert "gaps left" in shown and "4 frames missing" in shown and "after seq 2" in shown
 
 
 def test_info_of_a_map_says_what_it_is(tmp_path: Path) -> None:

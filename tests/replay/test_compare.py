@@ -10,13 +10,23 @@ import numpy as np
 import pytest
 
 from replay.compare import Comparison, compare_runs
-from replay.compare_picture import COLUMN, ONLY_A, RELABELLED, ROW_TEXT, draw_comparison, table_columns
+from replay.compare_picture import (
+    CAPTION,
+    COLUMN,
+    HEADER,
+    ONLY_A,
+    PANEL_HEIGHT,
+    RELABELLED,
+    ROW_TEXT,
+    draw_comparison,
+    table_columns,
+)
 from replay.run_folder import Run, read_run
 from replay.surface_match import match_surfaces
 from replay.tolerances import FIELDS, Tolerances
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, MapError
-from semantic_mapper.evaluation.canvas import text_width
+from semantic_mapper.evaluation.canvas import GAP, MARGIN, PANEL, text_width
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.views import LABELS, small_map
@@ -267,6 +277,15 @@ def test_the_picture_shows_where_maps_differ_and_nothing_where_they_do_not() -> 
     missing = draw_comparison(compare_maps(wall(), wall(cut=40)))
     assert count(missing[plans], ONLY_A) > 200 and count(missing, RELABELLED) == 0
     assert missing.shape[1] == 1600 and missing.dtype == np.uint8
+
+
+def test_both_maps_are_drawn_from_one_camera_at_one_scale() -> None:
+    picture = draw_comparison(compare_maps(wall(), wall(cut=60)))
+    top = HEADER + CAPTION
+    panels = [picture[top : top + PANEL_HEIGHT, x : x + COLUMN] for x in (MARGIN, MARGIN + COLUMN + GAP)]
+    whole, part = ((np.abs(panel.astype(int) - PANEL).max(axis=-1) > 20) for panel in panels)
+    assert 0.2 < part.sum() / whole.sum() < 0.9
+    assert (part & whole).sum() > 0.97 * part.sum(), "what both have stands at one place of both panels"
 
 
 def test_the_columns_of_the_picture_do_not_overlap() -> None:

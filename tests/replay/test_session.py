@@ -5,20 +5,25 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import torch
 
-from replay.evaluate import baseline_predictors, evaluate_frames, sray_predictors
+from nodes.summary_table import notes, summary_table
+from replay import artifacts
+from replay.evaluate import baseline_predictors, evaluate_frames, field_predictors
 from replay.session import SNAPSHOTS, MapSession, load_pipeline, make_field, open_recording
 from replay.tallies import StepTimes
 from replay.truth import SurfaceTruth, TruthMapper
-from semantic_mapper.config import MapperConfig, convert_config
+from semantic_mapper.config import MapperConfig, convert_config, to_plain
 from semantic_mapper.errors import LabelError, WeightsError
 from semantic_mapper.evaluation.metrics import confusion_of
 from semantic_mapper.fields.checkpoint import Checkpoint, anchor_from_frame, save_checkpoint
+from semantic_mapper.fields.registry import build_field
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import NYU40, ROOMS, make_label_set
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from tests.small import tiny_config, tiny_field, tiny_frames
+from tests.small import SMALL_ENCODER, tiny_config, tiny_field, tiny_frames
 
 
 @pytest.fixture
@@ -53,7 +58,9 @@ def test_a_session_leaves_summary_map_points_and_picture(tmp_path, weights):
     points = VoxelMap.load(tmp_path / "out/map.npz").points()
     assert len(points.xyz) == summary["map"]["surface_points"]
     ply = (tmp_path / "out/map.ply").read_bytes()
-    assert b"property uchar label" in ply[:400] and b"property float confidence" in ply[:400]
+    header = ply.split(b"end_header")[0].decode()
+    assert "property uchar label" in header and "property float confidence" in header
+    assert {f"comment label {i} {name}" for i, name in summary["labels"].items()} <= set(header.splitlines())
     assert cv2.imread(str(tmp_path / "out/overview.png")).std() > 10
     assert (tmp_path / "run.rrd").read_bytes()[:4] in (b"RRF2", b"RRIO", b"RRF3") and (
         tmp_path / "run.rrd"
@@ -80,10 +87,59 @@ def test_the_first_frame_which_may_compile_kernels_does_not_count_in_the_percent
     assert latency == {"p50": 10.0, "p95": 10.0, "first": 9000.0}
 
 
-def test_frames_without_depth_are_counted_because_their_geometry_is_rendered(tmp_path, weights):
+@pytest.mark.parametrize(
+    ("measured", "row", "line"),
+    [
+        (6, "sensor", ""),
+        (3, "rendered by the field for 50.0 % of the frames", "for 50 % of the frames"),
+        (0, "rendered by the field (no depth sensor)", "rendered by the field (no depth sensor)"),
+    ],
+)
+def test_summary_table_notes_and_picture_say_where_depth_comes_from(
+    tmp_path, weights, monkeypatch, measured, row, line
+):
     frames = tiny_frames()
-    session = run(weights, [*frames[:3], *(replace(f, depth_m=None) for f in frames[3:])])
-    assert session.finish(tmp_path / "out")["frames"]["without_depth"] == 3
+    session = run(weights, [*frames[:measured], *(replace(f, depth_m=None) for f in frames[measured:])])
+    drawn = []
+    monkeypatch.setattr(
+        artifacts, "write_overview", lambda _, strips, *__, subtitle, **___: drawn.append((strips, subtitle))
+    )
+    summary = session.finish(tmp_path / "out")
+    assert summary["frames"]["without_depth"] == 6 - measured
+    assert summary["depth"] == {
+        "source": {6: "sensor", 3: "mixed", 0: "rendered"}[measured],
+        "rendered_fraction": 1 - measured / 6,
+    }
+    table = summary_table({"run": summary})
+    cells = dict(zip(*(column.cells for column in table.columns), strict=True))
+    assert cells["depth"] == row
+    assert any("rendered by the field" in note for note in notes(summary)) == (measured < 6)
+    ((strips, subtitle),) = drawn
+    assert line in subtitle and ("rendered" in subtitle) == bool(line)
+    assert [strip.depth_rendered for strip in strips] == [frames[0].depth_m is None or measured == 0, measured < 6]
+
+
+def test_poses_that_contradict_the_depth_are_in_summary_table_and_notes(tmp_path, weights):
+    right = run(weights, tiny_frames(30)).finish(tmp_path / "right")
+    assert right["pose_check"]["warning"] is None and right["pose_check"]["depth_disagreement"] < 0.01
+    wrong_poses = [replace(f, T_world_camera=invert_pose(f.T_world_camera)) for f in tiny_frames(30)]
+    wrong = run(weights, wrong_poses).finish(tmp_path / "wrong")
+    assert "poses inverted" in wrong["pose_check"]["warning"]
+    assert wrong["pose_check"]["worst_depth_disagreement"] >= wrong["pose_check"]["depth_disagreement"] > 0.02
+    table = summary_table({"right": right, "wrong": wrong})
+    names, *values = (list(column.cells) for column in table.columns)
+    first, second = (column[names.index("depth disagreement")] for column in values)
+    assert float(first.removesuffix(" %")) < 1 and float(second.removesuffix(" %")) > 2
+    assert not any("inverted" in note for note in notes(right)) and "poses inverted" in notes(wrong)[0]
+
+
+def test_the_summary_names_the_kind_of_field(tmp_path):
+    torch.manual_seed(0)
+    field = build_field("unet", {"encoder": to_plain(SMALL_ENCODER)}, ROOMS)
+    save_checkpoint(Checkpoint(field, (), {"kind": "train", "width": 96}), tmp_path / "unet.safetensors")
+    session = run(tmp_path / "unet.safetensors", tiny_frames()[:2])
+    assert session.finish(tmp_path / "out")["field"]["name"] == "unet"
+    assert set(field_predictors(session.bundle)) == {"unet", "unet, novel view"}
 
 
 def test_frames_that_the_weights_have_seen_are_not_scored(weights):
@@ -224,7 +280,7 @@ def test_methods_are_scored_on_the_same_frames_and_keyframes_never_count(weights
     frames = list(tiny_frames())
     bundle = load_pipeline(weights, tiny_config())
     keyframes = [frames[1], frames[4]]
-    predictors = sray_predictors(bundle) | baseline_predictors(keyframes, ROOMS, seconds=1.0, seed=0)
+    predictors = field_predictors(bundle) | baseline_predictors(keyframes, ROOMS, seconds=1.0, seed=0)
     excluded = frozenset(f.stamp_ns for f in keyframes)
     result = evaluate_frames(frames, predictors, ROOMS, ROOMS, excluded)
     assert set(result.methods) == {"sray", "sray, novel view", "per-image U-Net", "labels carried by depth"}

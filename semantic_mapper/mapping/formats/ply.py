@@ -1,4 +1,8 @@
-"""PLY, binary little-endian: points, or a mesh. World frame, metres; class ids with their names as comments."""
+"""PLY, binary little-endian: points, or a mesh. World frame, metres; class ids with their names as comments.
+
+``comment label 3 chair`` says what the id 3 of the property ``label`` means. Names are ASCII, with Python's escapes for
+what is not, backslashes included: ``name.encode().decode("unicode_escape")`` gives the name back.
+"""
 
 from __future__ import annotations
 
@@ -24,12 +28,13 @@ _VERTEX = np.dtype(
         ("confidence", "<f4"),
     ]
 )
+MAX_NAME = 200  # characters of a class name in a comment
 _FACE = np.dtype([("count", "u1"), ("corners", "<i4", (3,))])
 _TYPES = {"<f4": "float", "|u1": "uchar"}
 
 
-def write_ply(path: Path, points: MapPoints, label_set: LabelSet | None = None) -> None:
-    """Write points as x y z red green blue label confidence; with ``label_set``, a comment names each class.
+def write_ply(path: Path, points: MapPoints, label_set: LabelSet) -> None:
+    """Write points as x y z red green blue label confidence; a comment names each class.
 
     Raises:
         MapError: the file cannot be written.
@@ -38,7 +43,7 @@ def write_ply(path: Path, points: MapPoints, label_set: LabelSet | None = None) 
     _write(path, vertices, np.empty(0, _FACE), label_set, mesh=False)
 
 
-def write_ply_mesh(path: Path, mesh: MapMesh, label_set: LabelSet | None = None) -> None:
+def write_ply_mesh(path: Path, mesh: MapMesh, label_set: LabelSet) -> None:
     """Write a triangle mesh: vertices as ``write_ply`` has them, faces as lists ``vertex_indices``.
 
     Raises:
@@ -60,23 +65,21 @@ def _vertices(xyz: Float32, rgb: UInt8, label: UInt8, confidence: Float32) -> ND
     return vertices
 
 
-def _write(
-    path: Path, vertices: NDArray[np.void], faces: NDArray[np.void], label_set: LabelSet | None, *, mesh: bool
-) -> None:
+def _write(path: Path, vertices: NDArray[np.void], faces: NDArray[np.void], label_set: LabelSet, *, mesh: bool) -> None:
     lines = ["ply", "format binary_little_endian 1.0"]
-    if label_set is not None:
-        lines += [f"comment label {i} {_one_line(n)}" for i, n in zip(label_set.ids, label_set.names, strict=True)]
-        lines.append(f"comment label {label_set.ignore_id} unknown")
+    lines += [f"comment label {i} {_escaped(n)}" for i, n in zip(label_set.ids, label_set.names, strict=True)]
+    lines.append(f"comment label {label_set.ignore_id} unknown")
     lines.append(f"element vertex {len(vertices)}")
     lines += [f"property {_TYPES[_VERTEX[name].str]} {name}" for name in _VERTEX.names or ()]
     if mesh:
         lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
     lines.append("end_header")
     with whole_file(path) as file:
-        file.write(("\n".join(lines) + "\n").encode("ascii", "backslashreplace"))
+        file.write(("\n".join(lines) + "\n").encode("ascii"))
         file.write(vertices.tobytes())
         file.write(faces.tobytes())
 
 
-def _one_line(name: str) -> str:
-    return " ".join(name.split())
+def _escaped(name: str) -> str:
+    """One line of printable ASCII; Open3D's reader writes past its buffer at lines above 1,000 characters."""
+    return name.encode("unicode_escape").decode("ascii")[:MAX_NAME]

@@ -1,0 +1,149 @@
+"""Poses, depth and intrinsics that contradict each other are found, and what fits raises no warning."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from structlog.testing import capture_logs
+
+from semantic_mapper.config import KeyframeConfig
+from semantic_mapper.geometry import invert_pose
+from semantic_mapper.imaging import resize_depth, working_intrinsics
+from semantic_mapper.mapping.keyframes import KeyframeStore
+from semantic_mapper.mapping.pipeline import COVERAGE_WIDTH
+from semantic_mapper.mapping.pose_check import MAX_DISAGREEMENT, MIN_KEYFRAMES, PoseCheck
+from semantic_mapper.types import CameraIntrinsics, PosedFrame
+from tests.mapping.test_keyframes import keyframe
+from tests.mapping.test_pipeline import make_pipeline, same_map
+from tests.small import tiny_frames
+
+Change = Callable[[PosedFrame], PosedFrame]
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def check(frames: Iterable[PosedFrame], change: Change = lambda frame: frame) -> PoseCheck:
+    """What the pipeline does with its keyframes, without encoding them."""
+    store, poses = KeyframeStore(KeyframeConfig()), PoseCheck(5.0)
+    for frame in map(change, frames):
+        if not store.wants(frame.T_world_camera):
+            continue
+        intrinsics = working_intrinsics(frame.intrinsics, COVERAGE_WIDTH)
+        depth = resize_depth(frame, intrinsics)
+        new = replace(keyframe(frame.seq, frame.T_world_camera, depth=depth), intrinsics=intrinsics)
+        poses.add(new, store.choose(frame.T_world_camera, intrinsics, depth, 7), store.keyframes)
+        store.add(new)
+    return poses
+
+
+def room() -> tuple[PosedFrame, ...]:
+    return tiny_frames(30)
+
+
+def posed(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    return lambda frame: replace(frame, T_world_camera=change(frame.T_world_camera))
+
+
+def millimetres(T: np.ndarray) -> np.ndarray:
+    return np.block([[T[:3, :3], 1000 * T[:3, 3:]], [T[3:]]])
+
+
+def deeper(factor: float) -> Change:
+    def change(frame: PosedFrame) -> PosedFrame:
+        assert frame.depth_m is not None
+        return replace(frame, depth_m=frame.depth_m * np.float32(factor))
+
+    return change
+
+
+WRONG: dict[str, tuple[Change, str]] = {
+    "inverted": (posed(invert_pose), "With poses inverted"),
+    "OpenGL axes": (posed(lambda T: T @ OPENGL), "With camera axes turned"),
+    "millimetres": (posed(millimetres), "With translations divided by 1000"),
+    "depth five times too large": (deeper(5), "With depth divided by 5"),
+    "depth five times too small": (deeper(0.2), "With depth multiplied by 5"),
+    "depth halved": (deeper(0.5), "the depth scale and the intrinsics"),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_what_contradicts_itself_is_reported_once_with_its_cause(wrong: str) -> None:
+    change, cause = WRONG[wrong]
+    with capture_logs() as logs:
+        poses = check(room(), change)
+    assert poses.compared >= MIN_KEYFRAMES and poses.worst is not None and poses.worst > MAX_DISAGREEMENT
+    assert cause in poses.warning and "T_world_camera" in poses.warning
+    assert [entry["event"] for entry in logs] == ["keyframes_contradict_each_other"]
+
+
+def test_a_good_recording_is_far_from_a_warning() -> None:
+    poses = check(room())
+    assert not poses.warning and poses.compared > MIN_KEYFRAMES
+    assert poses.worst is not None and poses.worst < MAX_DISAGREEMENT / 2
+
+
+def test_what_moves_in_a_third_of_the_picture_raises_no_warning() -> None:
+    rng = np.random.default_rng(0)
+
+    def passer_by(frame: PosedFrame) -> PosedFrame:
+        assert frame.depth_m is not None
+        depth, width = frame.depth_m.copy(), frame.intrinsics.width
+        left = int(rng.integers(0, width - width // 3))
+        depth[:, left : left + width // 3] = rng.uniform(0.5, 1.0)
+        return replace(frame, depth_m=depth)
+
+    poses = check(room(), passer_by)
+    assert poses.compared > MIN_KEYFRAMES and not poses.warning
+
+
+def test_few_keyframes_and_frames_without_depth_are_not_judged() -> None:
+    assert check(room()[:3], posed(invert_pose)).worst is None
+    blind = check(room(), lambda frame: replace(frame, depth_m=None))
+    assert (blind.compared, blind.recent, blind.warning) == (0, None, "")
+
+
+def test_keyframes_of_other_weights_are_not_compared() -> None:
+    poses = PoseCheck(5.0)
+    anchor = keyframe(0, np.eye(4), labelled=True, depth=np.full((60, 80), 1.0, np.float32))
+    poses.add(keyframe(1, np.eye(4)), [anchor], [anchor])
+    assert poses.compared == 0
+
+
+def test_the_pipeline_checks_its_keyframes_and_the_map_stays_the_same() -> None:
+    checked, unchecked = make_pipeline(), make_pipeline()
+    unchecked.pose_check.add = lambda *_: None  # type: ignore[method-assign]
+    for frame in room():
+        wrong = replace(frame, T_world_camera=invert_pose(frame.T_world_camera))
+        checked.step(wrong)
+        unchecked.step(wrong)
+    assert "poses inverted" in checked.pose_check.warning and not unchecked.pose_check.warning
+    assert same_map(checked, unchecked)
+
+
+def test_real_poses_that_are_pixels_off_raise_no_warning(redkitchen: Path) -> None:
+    k = json.loads((redkitchen / "intrinsics.json").read_text())
+    intrinsics = CameraIntrinsics(k["fx"], k["fy"], k["cx"], k["cy"], k["width"], k["height"])
+    poses = np.loadtxt(redkitchen / "poses.txt").reshape(-1, 4, 4)
+    files = sorted((redkitchen / "depth").iterdir())
+    template = room()[0]
+    frames = [
+        replace(
+            template,
+            seq=i,
+            rgb=np.zeros((k["height"], k["width"], 3), np.uint8),
+            label=None,
+            depth_m=(cv2.imread(str(files[i]), cv2.IMREAD_UNCHANGED) / k["depth_scale"]).astype(np.float32),
+            intrinsics=intrinsics,
+            T_world_camera=poses[i],
+        )
+        for i in range(0, len(files), 4)
+    ]
+    good = check(frames)
+    assert good.compared > 20 and not good.warning
+    assert good.worst is not None and good.worst < MAX_DISAGREEMENT / 2
+    assert "With poses inverted" in check(frames, posed(invert_pose)).warning
