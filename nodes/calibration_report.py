@@ -11,7 +11,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from rich.markup import escape
 from rich.table import Table
 
 from drivers.calibrating.config import CalibrationConfig
@@ -102,7 +101,7 @@ def report(found: Calibration, gathered: Mapping[str, ViewGatherer], worst: int)
             place = ", ".join(f"{1000 * v:.1f}" for v in T[:3, 3])
             sigmas = found.rig.position_sigma_m[name] * 1000, found.rig.turn_sigma_deg[name]
             moments = str(found.rig.instants[name])
-            table.add_row(escape(name), moments, place, f"{sigmas[0]:.2f}", f"{turned:.2f}", f"{sigmas[1]:.3f}")
+            table.add_row(name, moments, place, f"{sigmas[0]:.2f}", f"{turned:.2f}", f"{sigmas[1]:.3f}")
         table.caption = f"{found.rig.rms_px:.3f} px RMS of all corners at once"
         yield table
 
@@ -135,15 +134,15 @@ def _values(camera: CameraCalibration) -> dict[str, float]:
 
 def _camera_table(name: str, camera: CameraCalibration, views: ViewGatherer, worst: int) -> Table:
     i = camera.intrinsics
-    table = Table(title=f"{escape(name)}, {i.width} x {i.height}", title_justify="left", show_header=False)
+    table = Table(title=f"{name}, {i.width} x {i.height}", title_justify="left", show_header=False)
     table.add_column()
     table.add_column(overflow="fold")
     left_out = f"; {len(camera.left_out)} did not fit: {', '.join(camera.left_out)}" if camera.left_out else ""
-    used = f"{views.images} looked at, {views.seen} with the board, {len(camera.views)} used{escape(left_out)}"
+    used = f"{views.images} looked at, {views.seen} with the board, {len(camera.views)} used{left_out}"
     table.add_row("images", used)
     table.add_row("error", f"{camera.rms_px:.3f} px RMS")
     order = sorted(zip(camera.errors_px, camera.views, strict=True), key=lambda pair: -pair[0])
-    table.add_row("worst images", escape(", ".join(f"{view.name} {error:.2f} px" for error, view in order[:worst])))
+    table.add_row("worst images", ", ".join(f"{view.name} {error:.2f} px" for error, view in order[:worst]))
     if not camera.estimated:
         table.add_row("intrinsics", "as the source tells them")
     for key, value in _values(camera).items():

@@ -19,6 +19,7 @@ from rich.text import Text
 from nodes.console import stderr_console
 from nodes.process import prepare_process
 from semantic_mapper.errors import SemanticMapperError
+from semantic_mapper.plain_text import visible
 
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
@@ -67,5 +68,5 @@ def verb(function: Callable[ParamsT, int | None]) -> Callable[ParamsT, None]:
 
 def show_error(message: str) -> None:
     """One red line on stderr."""
-    line = Text.assemble(("error: ", "bold red"), (" ".join(message.split("\n")), "red"))
+    line = Text.assemble(("error: ", "bold red"), (visible(" ".join(message.split("\n"))), "red"))
     stderr_console().print(line, soft_wrap=True)
