@@ -16,7 +16,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from semantic_mapper.config import AtLeastOne, Config, Positive, convert_config, read_toml
+from semantic_mapper.config import AtLeastOne, Config, Positive, convert_config, read_json, read_toml
 from semantic_mapper.errors import CameraError, ConfigError, PoseError
 from semantic_mapper.geometry import camera_matrix, check_pose
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
@@ -173,14 +173,5 @@ def _toml_value(value: str | float) -> str:
 
 
 def _load_file(path: Path) -> CalibrationFile:
-    plain = _read_json(path) if path.suffix == ".json" else read_toml(path)
+    plain = read_json(path, dict) if path.suffix == ".json" else read_toml(path)
     return convert_config(plain, CalibrationFile, str(path))
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return msgspec.json.decode(path.read_bytes())
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such file") from error
-    except msgspec.DecodeError as error:
-        raise ConfigError(f"{path}: not valid JSON: {error}") from error

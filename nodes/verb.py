@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import ParamSpec
 
 import structlog
@@ -23,6 +23,7 @@ from semantic_mapper.plain_text import visible
 
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
+MAX_OPTION = 1e6  # of lengths, times and sizes; that many seconds are eleven days
 
 _log = structlog.get_logger(__name__)
 
@@ -41,6 +42,7 @@ def verb(function: Callable[ParamsT, int | None]) -> Callable[ParamsT, None]:
     @functools.wraps(function)
     def command(*args: ParamsT.args, **kwargs: ParamsT.kwargs) -> None:
         prepare_process(verbose=Settings.verbose)
+        _check_numbers(kwargs)
         try:
             code = function(*args, **kwargs)
         except SemanticMapperError as error:
@@ -64,6 +66,19 @@ def verb(function: Callable[ParamsT, int | None]) -> Callable[ParamsT, None]:
     # Click joins the lines of a paragraph but for those after a backspace: an example is there to be copied.
     command.__doc__ = inspect.cleandoc(function.__doc__ or "").replace("\n\nExample:", "\n\n\b\nExample:", 1)
     return command
+
+
+def _check_numbers(options: Mapping[str, object]) -> None:
+    """Options know lower bounds only, and NaN passes these.
+
+    Raises:
+        typer.BadParameter: a number that nothing can be computed with.
+    """
+    for name, value in options.items():
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, float) and not -MAX_OPTION <= number <= MAX_OPTION:
+                hint = f"--{name.replace('_', '-')}"
+                raise typer.BadParameter(f"{number:g}: give a number of at most {MAX_OPTION:g}", param_hint=hint)
 
 
 def show_error(message: str) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from semantic_mapper import __version__
-from tests.nodes.support import run
+from tests.nodes.support import run, run_here
 
 VERBS = (
     "demo",
@@ -73,3 +75,9 @@ def test_no_heavy_package_is_loaded_for_help() -> None:
     code = "import sys, nodes.cli; print([m for m in ('torch', 'numpy', 'open3d', 'numba', 'cv2') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("number", ["inf", "nan", "1e308"])
+def test_numbers_that_nothing_can_be_computed_with_are_wrong_usage(number: str, tmp_path: Path) -> None:
+    code, said = run_here("label", tmp_path / "x.mcap", "--timeout", number)
+    assert code == 2 and "--timeout" in said and "at most 1e+06" in said
