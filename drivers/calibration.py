@@ -18,6 +18,7 @@ import numpy as np
 
 from semantic_mapper.config import AtLeastOne, Config, Positive, convert_config, read_json, read_toml
 from semantic_mapper.errors import CameraError, ConfigError, PoseError
+from semantic_mapper.files import write_bytes
 from semantic_mapper.geometry import camera_matrix, check_pose
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
@@ -103,9 +104,7 @@ def save_calibration(
         lines += ["T_rig_camera = [", *(f"    {row!r}," for row in T_rig_camera.tolist()), "]"]
     lines += ["", "[about]", *(f"{name} = {_toml_value(value)}" for name, value in about.items())]
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    part.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    part.replace(path)
+    write_bytes(path, ("\n".join(lines) + "\n").encode())
 
 
 def require_calibration(path: str, uncalibrated: bool, camera: str) -> CameraIntrinsics | None:

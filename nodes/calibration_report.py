@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +23,7 @@ from drivers.poses.config import BoardPoses
 from semantic_mapper import __version__
 from semantic_mapper.config import Config
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.files import write_bytes
 
 
 class CalibrationSettings(Config, frozen=True):
@@ -56,8 +56,8 @@ def write_files(out: Path, found: Calibration, settings: CalibrationSettings) ->
             about["rig"] = f"that of camera {next(iter(found.cameras))}; {', '.join(found.cameras)}"
             about["rig_position_sigma_mm"] = float(f"{1000 * found.rig.position_sigma_m[name]:.3g}")
             about["rig_turn_sigma_deg"] = float(f"{found.rig.turn_sigma_deg[name]:.3g}")
-        with _whole(out / f"{name}.toml") as part:
-            save_calibration(part, camera.intrinsics, mount, about)
+        with _explained(out / f"{name}.toml"):
+            save_calibration(out / f"{name}.toml", camera.intrinsics, mount, about)
         picture = out / f"{name}.png"
         drawn = draw_calibration(name, camera, settings.calibration)
         write_whole(picture, cv2.imencode(".png", np.ascontiguousarray(drawn[..., ::-1]))[1].tobytes())
@@ -71,18 +71,15 @@ def write_whole(path: Path, data: bytes) -> None:
     Raises:
         ConfigError: it cannot be written.
     """
-    with _whole(path) as part:
-        part.write_bytes(data)
+    with _explained(path):
+        write_bytes(path, data)
 
 
 @contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """Where to write what is to become a file once it is complete."""
+def _explained(path: Path) -> Iterator[None]:
+    """Make of what the system says an error that says what to do."""
     try:
-        with tempfile.TemporaryDirectory(prefix=".writing-", dir=path.parent) as folder:
-            part = Path(folder) / path.name
-            yield part
-            part.replace(path)
+        yield
     except OSError as error:
         reason = error.strerror or error
         raise ConfigError(f"{path}: cannot be written ({reason}); make room, or choose another place") from error

@@ -12,6 +12,7 @@ import numpy as np
 from rich.table import Table
 
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.files import write_bytes
 from semantic_mapper.plain_text import visible
 from semantic_mapper.types import UInt8
 
@@ -104,13 +105,11 @@ class HtmlPage:
         head = f'<meta charset="utf-8"/><title>{self._title}</title><style>{_STYLE}</style>'
         body = "\n".join([f"<h1>{self._title}</h1>", *self._parts])
         page = f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
-        part = path.with_name(path.name + ".part")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            part.write_text(page, encoding="utf-8")
-            part.replace(path)
+            write_bytes(path, page.encode())
         except OSError as error:
-            raise ConfigError(f"{path}: cannot be written: {error}") from error
+            raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def _escape(text: str, keep: str = "") -> str:

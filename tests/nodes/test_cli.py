@@ -80,4 +80,4 @@ def test_no_heavy_package_is_loaded_for_help() -> None:
 @pytest.mark.parametrize("number", ["inf", "nan", "1e308"])
 def test_numbers_that_nothing_can_be_computed_with_are_wrong_usage(number: str, tmp_path: Path) -> None:
     code, said = run_here("label", tmp_path / "x.mcap", "--timeout", number)
-    assert code == 2 and "--timeout" in said and "at most 1e+06" in said
+    assert code == 2 and "--timeout" in said
