@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import structlog
-
 from replay.log import LogWriter
 from replay.reader import LogAttachment, LogReader
 from replay.sequence import Part, part_path, parts_on_disk, read_part
 from semantic_mapper.errors import LogError
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.transport.codec import Parts
 from semantic_mapper.transport.messages import StreamInfo
 
@@ -24,7 +23,7 @@ DiskFull = Literal["stop", "delete-oldest"]
 RETRY_S = 1.0  # how often a recording that pauses looks for room
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import structlog
 
 from semantic_mapper.benchmark.config import SuiteConfig, check_suite, settings_digest, suite_seeds
 from semantic_mapper.benchmark.figures import image_note
@@ -17,8 +16,9 @@ from semantic_mapper.benchmark.rooms import BenchmarkRoom, make_benchmark_room
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.evaluation.sheet import SheetRow
 from semantic_mapper.files import atomic_write
+from semantic_mapper.log_events import get_logger
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 SHEET_ROWS = 6
 

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import TypeVar
 
 import msgspec
-import structlog
 
 from semantic_mapper.benchmark.records import MapRecord, Record, RoomRecord
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.files import open_unlinked
+from semantic_mapper.log_events import get_logger
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 RecordT = TypeVar("RecordT", RoomRecord, MapRecord)
 

@@ -13,11 +13,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import structlog
-
 from semantic_mapper.errors import DependencyError
+from semantic_mapper.log_events import get_logger
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 @functools.cache

@@ -10,9 +10,8 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Self
 
-import structlog
-
 from semantic_mapper.files import open_unlinked, write_bytes
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.curves import write_curves
 
 HISTORY_FILE = "history.jsonl"
@@ -33,7 +32,7 @@ _NAMES = {
     "blind_accuracy": "validation/accuracy without depth",
 }
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class TrainLog(AbstractContextManager["TrainLog"]):

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import structlog
 import zmq
 from zmq.auth import create_certificates, load_certificate
 from zmq.auth.thread import ThreadAuthenticator
@@ -25,11 +24,12 @@ from zmq.utils import z85
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.files import write_bytes
+from semantic_mapper.log_events import get_logger
 
 _KEY_LETTERS = 40  # of a public key as text (Z85)
 _OWN, _PEERS = "own", "peers"
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 _lock = threading.Lock()
 _authenticators: weakref.WeakKeyDictionary[Any, ThreadAuthenticator] = weakref.WeakKeyDictionary()
 

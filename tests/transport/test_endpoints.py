@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import socket
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -69,7 +70,7 @@ def test_a_socket_is_its_users_alone_and_one_that_was_left_is_taken_over(tmp_pat
         left.bind(str(path))  # stays when it is closed, as a killed process leaves it
     before = os.umask(0)
     try:
-        with serve(server, f"ipc://{path}"):
+        with closing(serve(server, f"ipc://{path}")):
             assert path.is_socket() and path.stat().st_mode & 0o777 == 0o600
             assert os.umask(0) == 0
     finally:
