@@ -36,8 +36,9 @@ def doctor(
     from rich.text import Text
 
     from nodes.doctor import examine
+    from nodes.packaged import find_launch
 
-    checks = examine(launch, settings or ())
+    checks = examine(find_launch(launch) if launch else None, settings or ())
     if json:
         output.json([asdict(c) for c in checks])
     else:
