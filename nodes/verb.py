@@ -19,6 +19,7 @@ from rich.text import Text
 from nodes.console import stderr_console
 from nodes.process import prepare_process
 from semantic_mapper.errors import SemanticMapperError
+from semantic_mapper.memory import is_out_of_memory, memory_message
 from semantic_mapper.plain_text import visible
 
 EXIT_FAILED = 1
@@ -49,6 +50,13 @@ def verb(function: Callable[ParamsT, int | None]) -> Callable[ParamsT, None]:
             if Settings.verbose:
                 _log.exception("failed", error=str(error))
             show_error(str(error))
+            code = EXIT_FAILED
+        except (MemoryError, ImportError, RuntimeError) as error:
+            if not is_out_of_memory(error):
+                raise
+            if Settings.verbose:
+                _log.exception("failed")
+            show_error(memory_message(error))
             code = EXIT_FAILED
         except KeyboardInterrupt:
             show_error("interrupted")

@@ -108,7 +108,7 @@ class Recording:
         self._done_frames = self._done_messages = 0  # in parts that are finished
         self.lost = self.deleted = 0
         self.trouble = ""
-        self.ended = False
+        self.ended = self.gone = False
         self._retry_at = float("-inf")
         there = parts_on_disk(path)
         if goes_on:
@@ -219,6 +219,9 @@ class Recording:
         self._done_frames += part.frames
         self._done_messages += part.messages
         self._finished.append(part.path)
+        if not part.path.exists():  # Linux lets a removed file be written to
+            self.gone = True
+            _log.error("part_gone", log=str(part.path), frames=part.frames)
         try:
             part.close()
         except LogError as error:  # its messages are whole
@@ -286,7 +289,7 @@ class Recording:
         if self._rules.disk_full == "stop":
             self.ended = True
             self._finish_part()
-            what = "recording has stopped; what is recorded is whole"
+            what = "recording has stopped; " + ("its file is gone" if self.gone else "what is recorded is whole")
         else:
             what = "no older part is left to delete; recording goes on once there is room"
         self._retry_at = self._clock() + RETRY_S

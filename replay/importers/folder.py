@@ -31,7 +31,7 @@ from replay.importers.base import (
 )
 from semantic_mapper.config import read_json
 from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError, LabelError
-from semantic_mapper.labels import PROVIDED, LabelSet, make_label_set
+from semantic_mapper.labels import MAX_NAME, PROVIDED, LabelSet, make_label_set
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
@@ -209,7 +209,7 @@ def label_set_from(labels: _Labels, folder_name: str) -> LabelSet:
     classes = {int(key): name for key, name in labels.classes.items()}
     classes.pop(labels.ignore, None)
     ids = sorted(classes)
-    name = labels.id_space.lower() or folder_name
+    name = labels.id_space.lower() or folder_name[:MAX_NAME]
     own = make_label_set(name, [classes[i] for i in ids], ids=ids, ignore_id=labels.ignore)
     known = PROVIDED.get(name)
     chosen = {} if known is None else dict(zip(known.ids, known.colors, strict=True))

@@ -165,6 +165,8 @@ def test_stamps_come_from_timestamps_txt_where_there_is_one(folder: Path, text: 
         ("intrinsics.json", '{"width": ' + "[" * 100_000, "intrinsics.json: "),
         ("intrinsics.json", '{"width": 32, "height": 24, "fx": 1e300, "fy": 1, "cx": 1, "cy": 1}', "fx = 1e.300"),
         ("intrinsics.json", " " * (1 << 20) + "{}", "larger than the limit"),
+        ("labels.json", f'{{"classes": {{"1": "{"x" * 5000}"}}}}', "labels.json: .*name of class 1 has 5,000 letters"),
+        ("labels.json", f'{{"id_space": "{"x" * 5000}", "classes": {{"1": "x"}}}}', "labels.json: .*its own name has"),
         ("labels.json", '{"classes": {"one": "wall"}}', "labels.json"),
         ("labels.json", '{"classes": ' + '{"a":' * 100_000, "labels.json: "),
         ("labels.json", " " * (1 << 20) + "{}", "larger than the limit"),
