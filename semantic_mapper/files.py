@@ -35,11 +35,14 @@ def read_regular(path: Path, limit: int) -> bytes:
         OSError: it is missing or cannot be read; ``filename`` is set.
     """
     fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe without a writer must not block
-    if not stat.S_ISREG(os.fstat(fd).st_mode):
+    status = os.fstat(fd)
+    if not stat.S_ISREG(status.st_mode):
         os.close(fd)
         raise ConfigError(f"{path}: is no regular file; copy its content to one")
     with os.fdopen(fd, "rb") as file:
-        data = file.read(limit + 1)
+        data = file.read(min(status.st_size, limit) + 1)
+        while len(data) <= limit and (more := file.read(1 << 16)):  # it grows, or is the kernel's and has no size
+            data += more
     if len(data) > limit:
         raise ConfigError(f"{path}: is larger than the limit of {limit:,} bytes; is it the right file?")
     return data

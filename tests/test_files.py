@@ -20,6 +20,7 @@ def test_a_regular_file_is_read_up_to_the_limit(tmp_path: Path) -> None:
     assert read_regular(path, 5) == b"12345"
     with pytest.raises(ConfigError, match=r"file: is larger than the limit of 4 bytes"):
         read_regular(path, 4)
+    assert read_regular(Path("/proc/self/status"), 1 << 20).startswith(b"Name:")  # has no size
 
 
 def test_what_may_never_end_is_refused_at_once(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 from itertools import islice
 from pathlib import Path
 
@@ -374,3 +375,23 @@ def test_the_kitchen_recording_is_imported_without_loss(redkitchen: Path, tmp_pa
             assert frame.depth_m is not None and np.array_equal(frame.depth_m, raw.astype(np.float32) / 1000)
             own = cv2.imread(str(redkitchen / "label" / f"{i:06d}.png"), cv2.IMREAD_UNCHANGED)
             assert np.array_equal(frame.label, own)
+
+
+@pytest.mark.parametrize("name", ["color/000001.jpg", "depth/000001.png", "label/000001.png"])
+def test_an_image_that_is_a_pipe_or_a_device_is_left_out(folder: Path, tmp_path: Path, name: str) -> None:
+    (folder / name).unlink()
+    for make in (lambda: os.mkfifo(folder / name), lambda: (folder / name).symlink_to("/dev/zero")):
+        make()
+        report = import_recording(folder, tmp_path / "out.mcap")
+        assert [(skipped.frame, skipped.file) for skipped in report.skipped] == [(1, folder / name)]
+        assert "is no regular file" in report.skipped[0].reason
+        (folder / name).unlink()
+        (tmp_path / "out.mcap").unlink()
+
+
+@pytest.mark.parametrize("name", ["poses.txt", "timestamps.txt", "labels.json", "intrinsics.json"])
+def test_a_list_that_is_a_pipe_stops_the_import(folder: Path, tmp_path: Path, name: str) -> None:
+    (folder / name).unlink(missing_ok=True)
+    os.mkfifo(folder / name)
+    with pytest.raises(ImportSourceError, match=f"{name}: is no regular file"):
+        import_recording(folder, tmp_path / "out.mcap")
