@@ -16,8 +16,9 @@ import cv2
 import msgspec
 import numpy as np
 
-from semantic_mapper.config import AtLeastOne, Config, Positive, convert_config, read_toml
+from semantic_mapper.config import AtLeastOne, Config, Positive, convert_config, read_json, read_toml
 from semantic_mapper.errors import CameraError, ConfigError, PoseError
+from semantic_mapper.files import write_bytes
 from semantic_mapper.geometry import camera_matrix, check_pose
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
@@ -103,9 +104,7 @@ def save_calibration(
         lines += ["T_rig_camera = [", *(f"    {row!r}," for row in T_rig_camera.tolist()), "]"]
     lines += ["", "[about]", *(f"{name} = {_toml_value(value)}" for name, value in about.items())]
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    part.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    part.replace(path)
+    write_bytes(path, ("\n".join(lines) + "\n").encode())
 
 
 def require_calibration(path: str, uncalibrated: bool, camera: str) -> CameraIntrinsics | None:
@@ -173,14 +172,5 @@ def _toml_value(value: str | float) -> str:
 
 
 def _load_file(path: Path) -> CalibrationFile:
-    plain = _read_json(path) if path.suffix == ".json" else read_toml(path)
+    plain = read_json(path, dict) if path.suffix == ".json" else read_toml(path)
     return convert_config(plain, CalibrationFile, str(path))
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return msgspec.json.decode(path.read_bytes())
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such file") from error
-    except msgspec.DecodeError as error:
-        raise ConfigError(f"{path}: not valid JSON: {error}") from error

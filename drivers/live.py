@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol, Self
 
-import structlog
-
 from drivers.base import CameraImage
 from drivers.calibration import Rectifier, guess_intrinsics
 from semantic_mapper.errors import CameraError
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, UInt8
 
@@ -26,7 +25,7 @@ FAILURES = 3  # reads in a row that give nothing: the device is opened anew
 WAIT_SLICE_S = 0.2
 CLOSE_S = 1.0  # how long closing waits for a read that hangs; its thread frees the device whenever it returns
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from rich.markup import escape
 from rich.table import Table
 
 from drivers.calibrating.config import CalibrationConfig
@@ -25,6 +23,7 @@ from drivers.poses.config import BoardPoses
 from semantic_mapper import __version__
 from semantic_mapper.config import Config
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.files import write_bytes
 
 
 class CalibrationSettings(Config, frozen=True):
@@ -57,8 +56,8 @@ def write_files(out: Path, found: Calibration, settings: CalibrationSettings) ->
             about["rig"] = f"that of camera {next(iter(found.cameras))}; {', '.join(found.cameras)}"
             about["rig_position_sigma_mm"] = float(f"{1000 * found.rig.position_sigma_m[name]:.3g}")
             about["rig_turn_sigma_deg"] = float(f"{found.rig.turn_sigma_deg[name]:.3g}")
-        with _whole(out / f"{name}.toml") as part:
-            save_calibration(part, camera.intrinsics, mount, about)
+        with _explained(out / f"{name}.toml"):
+            save_calibration(out / f"{name}.toml", camera.intrinsics, mount, about)
         picture = out / f"{name}.png"
         drawn = draw_calibration(name, camera, settings.calibration)
         write_whole(picture, cv2.imencode(".png", np.ascontiguousarray(drawn[..., ::-1]))[1].tobytes())
@@ -72,18 +71,15 @@ def write_whole(path: Path, data: bytes) -> None:
     Raises:
         ConfigError: it cannot be written.
     """
-    with _whole(path) as part:
-        part.write_bytes(data)
+    with _explained(path):
+        write_bytes(path, data)
 
 
 @contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """Where to write what is to become a file once it is complete."""
+def _explained(path: Path) -> Iterator[None]:
+    """Make of what the system says an error that says what to do."""
     try:
-        with tempfile.TemporaryDirectory(prefix=".writing-", dir=path.parent) as folder:
-            part = Path(folder) / path.name
-            yield part
-            part.replace(path)
+        yield
     except OSError as error:
         reason = error.strerror or error
         raise ConfigError(f"{path}: cannot be written ({reason}); make room, or choose another place") from error
@@ -102,7 +98,7 @@ def report(found: Calibration, gathered: Mapping[str, ViewGatherer], worst: int)
             place = ", ".join(f"{1000 * v:.1f}" for v in T[:3, 3])
             sigmas = found.rig.position_sigma_m[name] * 1000, found.rig.turn_sigma_deg[name]
             moments = str(found.rig.instants[name])
-            table.add_row(escape(name), moments, place, f"{sigmas[0]:.2f}", f"{turned:.2f}", f"{sigmas[1]:.3f}")
+            table.add_row(name, moments, place, f"{sigmas[0]:.2f}", f"{turned:.2f}", f"{sigmas[1]:.3f}")
         table.caption = f"{found.rig.rms_px:.3f} px RMS of all corners at once"
         yield table
 
@@ -135,15 +131,15 @@ def _values(camera: CameraCalibration) -> dict[str, float]:
 
 def _camera_table(name: str, camera: CameraCalibration, views: ViewGatherer, worst: int) -> Table:
     i = camera.intrinsics
-    table = Table(title=f"{escape(name)}, {i.width} x {i.height}", title_justify="left", show_header=False)
+    table = Table(title=f"{name}, {i.width} x {i.height}", title_justify="left", show_header=False)
     table.add_column()
     table.add_column(overflow="fold")
     left_out = f"; {len(camera.left_out)} did not fit: {', '.join(camera.left_out)}" if camera.left_out else ""
-    used = f"{views.images} looked at, {views.seen} with the board, {len(camera.views)} used{escape(left_out)}"
+    used = f"{views.images} looked at, {views.seen} with the board, {len(camera.views)} used{left_out}"
     table.add_row("images", used)
     table.add_row("error", f"{camera.rms_px:.3f} px RMS")
     order = sorted(zip(camera.errors_px, camera.views, strict=True), key=lambda pair: -pair[0])
-    table.add_row("worst images", escape(", ".join(f"{view.name} {error:.2f} px" for error, view in order[:worst])))
+    table.add_row("worst images", ", ".join(f"{view.name} {error:.2f} px" for error, view in order[:worst]))
     if not camera.estimated:
         table.add_row("intrinsics", "as the source tells them")
     for key, value in _values(camera).items():

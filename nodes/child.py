@@ -18,6 +18,7 @@ from nodes.options import Call, NodeJob
 from nodes.process import STOP_SIGNAL
 from nodes.process_figures import Stillness
 from nodes.systemd import SYSTEMD_VARIABLES
+from semantic_mapper.plain_text import visible
 
 KILL_S = 5.0  # between the request to end and SIGKILL, and between SIGKILL and the end
 TAIL_LINES = 12
@@ -145,7 +146,7 @@ class Child:
         assert stream is not None
         with stream:
             for raw in stream:
-                line = raw.decode(errors="replace").rstrip("\n")
+                line = visible(raw.decode(errors="replace").rstrip("\n"))
                 self.tail.append(line)
                 try:
                     sys.stderr.write(f"[{self.name}] {line}\n")

@@ -20,6 +20,7 @@ from nodes import (
     cli_finetune,
     cli_keys,
     cli_label,
+    cli_launch,
     cli_log,
     cli_query,
     cli_record,
@@ -35,7 +36,6 @@ from semantic_mapper import __version__
 app = typer.Typer(
     name="semantic-mapper",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
@@ -66,6 +66,7 @@ for _function in (
     app.command(_function.__name__.rstrip("_").replace("evaluate", "eval"))(_function)
 
 app.add_typer(cli_keys.app, name="keys")
+app.add_typer(cli_launch.app, name="launch")
 
 # Coordinates below 0 look like options.
 app.command("query", context_settings={"ignore_unknown_options": True})(cli_query.query)

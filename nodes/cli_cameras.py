@@ -24,7 +24,6 @@ def cameras(
     Example: semantic-mapper cameras --kind v4l2 --json
     """
     output = Output.guarded()
-    from rich.markup import escape
     from rich.table import Table
 
     from drivers.registry import KINDS, find_cameras
@@ -38,9 +37,9 @@ def cameras(
         for title in ("kind", "name", "address", "note"):
             table.add_column(title, overflow="fold")
         for camera in found:
-            table.add_row(camera.kind, *(escape(text) for text in (camera.name, camera.address, camera.note)))
+            table.add_row(camera.kind, camera.name, camera.address, camera.note)
         output.print(table)
     else:
         output.print("no camera is connected")
     for name, reason in unknown.items():
-        output.print(f"{name}: cannot be asked: {escape(reason)}")
+        output.print(f"{name}: cannot be asked: {reason}")

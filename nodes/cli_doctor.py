@@ -11,7 +11,7 @@ import typer
 from nodes.console import Output
 from nodes.verb import EXIT_FAILED, verb
 
-_MARKS = {"ok": "[green]ok[/green]", "note": "[yellow]note[/yellow]", "bad": "[bold red]bad[/bold red]"}
+_STYLES = {"ok": "green", "note": "yellow", "bad": "bold red"}
 
 
 @verb
@@ -32,12 +32,13 @@ def doctor(
     Example: semantic-mapper doctor launch/headless-onboard.toml --set keys=~/.config/semantic-mapper/keys
     """
     output = Output.guarded()
-    from rich.markup import escape
     from rich.table import Table
+    from rich.text import Text
 
     from nodes.doctor import examine
+    from nodes.packaged import find_launch
 
-    checks = examine(launch, settings or ())
+    checks = examine(find_launch(launch) if launch else None, settings or ())
     if json:
         output.json([asdict(c) for c in checks])
     else:
@@ -45,6 +46,6 @@ def doctor(
         for title in ("", "what", "found", "mend"):
             table.add_column(title, overflow="fold")
         for check in checks:
-            table.add_row(_MARKS[check.state], check.name, escape(check.found), escape(check.mend))
+            table.add_row(Text(check.state, _STYLES[check.state]), check.name, check.found, check.mend)
         output.print(table)
     return EXIT_FAILED if any(c.state == "bad" for c in checks) else 0

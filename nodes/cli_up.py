@@ -13,10 +13,14 @@ from nodes.process import StopRequest
 from nodes.verb import verb
 from semantic_mapper.errors import LogError
 
+LaunchArgument = Annotated[
+    Path, typer.Argument(metavar="LAUNCH", help="Launch file, or one of the package: `semantic-mapper launch list`.")
+]
+
 
 @verb
 def up(
-    launch: Annotated[Path, typer.Argument(metavar="LAUNCH.toml", help="Launch file; see launch/.")],
+    launch: LaunchArgument,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Replace a value of the file's [set] table; may be repeated."),
@@ -31,6 +35,7 @@ def up(
     a node fails, the others are ended in order too, the error says which one it was and why, and the exit code is 1;
     where the launch file says so it is started anew first (`restart`). `semantic-mapper top` shows how the nodes are.
 
+    Example: semantic-mapper up replay --set log=kitchen.mcap --out runs/up
     Example: semantic-mapper up launch/replay.toml --set log=kitchen.mcap --out runs/up
     """
     output = Output.guarded()
@@ -38,10 +43,11 @@ def up(
     from nodes.launcher import Launcher
     from nodes.options import MapperOptions
     from nodes.outputs import hold_folder
+    from nodes.packaged import find_launch
     from nodes.results import print_results
     from nodes.systemd import Notifier
 
-    checked = load_launch(launch, settings or (), out)
+    checked = load_launch(find_launch(launch), settings or (), out)
     folders = [Path(o.out) for o in checked.options.values() if isinstance(o, MapperOptions)]
     before = [_written(f) for f in folders]
     with StopRequest() as stop, ExitStack() as stack:

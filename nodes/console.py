@@ -1,4 +1,7 @@
-"""What people and programs see of the command line: results on stdout, everything else on stderr."""
+"""What people and programs see of the command line: results on stdout, everything else on stderr.
+
+Text is shown as it is: nothing in it is markup, and what would steer the terminal is made visible (``PlainConsole``).
+"""
 
 from __future__ import annotations
 
@@ -6,34 +9,62 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
 
 import structlog
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
     Task,
-    TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.segment import Segment
 from rich.text import Text
+
+from semantic_mapper.plain_text import visible
 
 _log = structlog.get_logger(__name__)
 
 LOG_PERIOD_S = 15.0  # how often progress is told where there is no terminal to draw a bar on
 
 
+class PlainConsole(Console):
+    r"""A console on which every text is plain, wherever it stands: in a line, a cell, a title or beside a bar.
+
+    Names of classes, cameras and files come from logs, maps and weights of others. Markup and emoji codes in them are
+    text, and control characters are shown as escapes (``\x1b``), so that no name can end a verb, hide, forge a line or
+    command the terminal. Colours are given as ``style``.
+
+    Args:
+        file: Where to write; None = stdout.
+        stderr: Write to the current ``sys.stderr``.
+    """
+
+    def __init__(self, file: TextIO | None = None, *, stderr: bool = False) -> None:
+        super().__init__(file=file, stderr=stderr, markup=False, emoji=False, highlight=False)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Every string that rich is given comes by here, whatever it is part of."""
+        plain = {"markup": False, "emoji": False, "highlight": False}
+        return super().render_str(visible(text), **{**options, **plain})
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """And every ``Text``, which may hold line breaks of its own."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else segment._replace(text=visible(segment.text, keep="\n"))
+
+
 class Output:
     """Where results go. ``guarded`` keeps stray prints (Open3D prints memory statistics at exit) off stdout."""
 
     def __init__(self, stream: TextIO) -> None:
-        self.console = Console(file=stream, highlight=False)
+        self.console = PlainConsole(stream)
         self._stream = stream
 
     @classmethod
@@ -46,7 +77,7 @@ class Output:
         return cls(stream)
 
     def print(self, *things: Any) -> None:
-        """Show something to people."""
+        """Show something to people; what is in a text is shown as it is, on one line."""
         self.console.print(*things, soft_wrap=True)
         self._stream.flush()
 
@@ -56,9 +87,9 @@ class Output:
         self._stream.flush()
 
 
-def stderr_console() -> Console:
+def stderr_console() -> PlainConsole:
     """For messages and progress."""
-    return Console(stderr=True, highlight=False)
+    return PlainConsole(stderr=True)
 
 
 class FrameProgress:
@@ -100,18 +131,29 @@ class FrameProgress:
 def frame_progress(what: str, total: int | None, unit: str = "frames") -> Iterator[FrameProgress]:
     """Show progress while inside; ``total`` None where nobody knows it."""
     columns = (
-        TextColumn("[bold]{task.description}"),
+        _TextColumn(lambda task: task.description, "bold"),
         BarColumn(),
         MofNCompleteColumn(),
         _RateColumn(unit),
-        TextColumn("eta"),
+        _TextColumn(lambda task: "eta"),
         TimeRemainingColumn(),
         TimeElapsedColumn(),
-        TextColumn("{task.fields[note]}"),
+        _TextColumn(lambda task: task.fields["note"]),
     )
     console = stderr_console()
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         yield FrameProgress(progress, progress.add_task(what, total=total, note=""), what, total, unit)
+
+
+class _TextColumn(ProgressColumn):
+    """Rich's own reads markup."""
+
+    def __init__(self, text: Callable[[Task], str], style: str = "") -> None:
+        super().__init__()
+        self._text, self._style = text, style
+
+    def render(self, task: Task) -> Text:
+        return Text(visible(self._text(task)), style=self._style)
 
 
 class _RateColumn(ProgressColumn):

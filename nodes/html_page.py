@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from html import escape
+from html import escape as escape_markup
 from pathlib import Path
 
 import cv2
@@ -12,6 +12,8 @@ import numpy as np
 from rich.table import Table
 
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.files import write_bytes
+from semantic_mapper.plain_text import visible
 from semantic_mapper.types import UInt8
 
 JPEG_QUALITY = 88
@@ -35,17 +37,17 @@ class HtmlPage:
     """
 
     def __init__(self, title: str) -> None:
-        self._title = escape(title)
+        self._title = _escape(title)
         self._parts: list[str] = []
 
     def heading(self, text: str) -> None:
         """Of a new section."""
-        self._parts.append(f"<h2>{escape(text)}</h2>")
+        self._parts.append(f"<h2>{_escape(text)}</h2>")
 
     def text(self, text: str, *, note: bool = False) -> None:
         """A paragraph; ``note``: one that the reader must not miss."""
         kind = ' class="note"' if note else ""
-        self._parts.append(f"<p{kind}>{escape(text)}</p>")
+        self._parts.append(f"<p{kind}>{_escape(text)}</p>")
 
     def table(self, table: Table) -> None:
         """The same table that the console shows; its cells are text."""
@@ -54,7 +56,7 @@ class HtmlPage:
         heads = [str(column.header) for column in table.columns]
         lines = ["<table>"]
         if table.title:
-            lines.append(f"<caption>{escape(str(table.title))}</caption>")
+            lines.append(f"<caption>{_escape(str(table.title))}</caption>")
         if any(heads):
             lines.append(_row("th", heads, sides))
         after_section = False
@@ -78,7 +80,7 @@ class HtmlPage:
         assert encoded
         kind = "jpeg" if photo else "png"
         source = f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
-        alt = escape(caption, quote=True)
+        alt = _escape(caption)
         self._parts.append(f'<figure><img src="{source}" alt="{alt}"/><figcaption>{alt}</figcaption></figure>')
 
     def picture_file(self, path: Path, caption: str) -> None:
@@ -91,7 +93,8 @@ class HtmlPage:
 
     def folded(self, summary: str, text: str) -> None:
         """Text that a click unfolds."""
-        self._parts.append(f"<details><summary>{escape(summary)}</summary><pre>{escape(text)}</pre></details>")
+        inside = _escape(text, keep="\n")
+        self._parts.append(f"<details><summary>{_escape(summary)}</summary><pre>{inside}</pre></details>")
 
     def write(self, path: Path) -> None:
         """Write the page, whole or not at all.
@@ -102,15 +105,18 @@ class HtmlPage:
         head = f'<meta charset="utf-8"/><title>{self._title}</title><style>{_STYLE}</style>'
         body = "\n".join([f"<h1>{self._title}</h1>", *self._parts])
         page = f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
-        part = path.with_name(path.name + ".part")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            part.write_text(page, encoding="utf-8")
-            part.replace(path)
+            write_bytes(path, page.encode())
         except OSError as error:
-            raise ConfigError(f"{path}: cannot be written: {error}") from error
+            raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _escape(text: str, keep: str = "") -> str:
+    """Text as text: no markup, and nothing that turns the direction of writing."""
+    return escape_markup(visible(text, keep), quote=True)
 
 
 def _row(kind: str, cells: Sequence[str], sides: Sequence[str], attributes: str = "") -> str:
-    written = (f"<{kind}{side}>{escape(cell)}</{kind}>" for cell, side in zip(cells, sides, strict=True))
+    written = (f"<{kind}{side}>{_escape(cell)}</{kind}>" for cell, side in zip(cells, sides, strict=True))
     return f"<tr{attributes}>{''.join(written)}</tr>"

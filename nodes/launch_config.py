@@ -29,6 +29,9 @@ from semantic_mapper.errors import ConfigError
 
 Value = str | int | float | bool
 STATUS_SOCKET = "launch"  # where the launcher publishes how all nodes are
+MAX_NODES = 64  # each is a process
+MAX_SHOWN = 60  # letters of an argument in a message
+MAX_TEXT = 4096  # letters of a text, once values of [set] are filled in
 _PLACE = re.compile(r"\{(\w+)\}")
 
 
@@ -58,7 +61,7 @@ class NodeEntry(Config, frozen=True):
 class LaunchFile(Config, frozen=True):
     """A launch file as it stands on disk."""
 
-    node: tuple[NodeEntry, ...]
+    node: Annotated[tuple[NodeEntry, ...], msgspec.Meta(max_length=MAX_NODES)]
     # Values that `--set NAME=VALUE` replaces; an empty one has to be given. "{now}" in one of them stands for the time
     # of the start, such as 20261123T024700Z, with a number where that is there already.
     set: dict[str, Value] = msgspec.field(default_factory=dict)
@@ -225,6 +228,9 @@ def _fill_in(value: Any, values: Mapping[str, Value], where: str) -> Any:
     whole = _PLACE.fullmatch(value)
     if whole is not None:
         return values[whole[1]]
+    places = [str(values[name]) for name in _PLACE.findall(value)]
+    if len(value) + sum(map(len, places)) > MAX_TEXT:
+        raise ConfigError(f"{where}: is longer than {MAX_TEXT} letters with the values of the [set] table in it")
     return _PLACE.sub(lambda found: str(values[found[1]]), value)
 
 
@@ -241,10 +247,12 @@ def _parse_setting(text: str, own: Mapping[str, Value]) -> tuple[str, Value]:
     """NAME=VALUE. What is a text in the file stays one, whatever it looks like: ids of devices may be numbers."""
     name, equals, value = text.partition("=")
     if not equals or not name:
-        raise ConfigError(f"--set {text}: write NAME=VALUE")
+        raise ConfigError(f"--set {text[:MAX_SHOWN]}: write NAME=VALUE")
+    if len(value) > MAX_TEXT:
+        raise ConfigError(f"--set {name[:MAX_SHOWN]}: the value is longer than {MAX_TEXT} letters")
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:  # a bare word, such as a path
+    except (ValueError, RecursionError):  # a bare word, such as a path, or a number of thousands of digits
         return name, value
     kinds = str if isinstance(own.get(name, ""), str) else str | int | float | bool
     return name, parsed if isinstance(parsed, kinds) else value
@@ -252,4 +260,4 @@ def _parse_setting(text: str, own: Mapping[str, Value]) -> tuple[str, Value]:
 
 def _nearest(name: str, names: Sequence[str] | Mapping[str, Value]) -> str:
     near = difflib.get_close_matches(name, list(names), n=1, cutoff=0.5)
-    return f"; did you mean '{near[0]}'?" if near else f"; there are {', '.join(names) or 'none'}"
+    return f"; did you mean '{near[0]}'?" if near else f"; there are {', '.join(list(names)[:MAX_NODES]) or 'none'}"

@@ -9,7 +9,9 @@ import msgspec
 
 from drivers.urls import hide_password
 from nodes.launch_config import Launch
+from semantic_mapper.config import MAX_FILE_BYTES
 from semantic_mapper.errors import TransportError
+from semantic_mapper.files import read_regular
 
 NOTE = "launch.json"
 
@@ -63,7 +65,7 @@ def read_launch_note(folder: Path) -> LaunchNote:
         TransportError: there is none, or it cannot be understood.
     """
     try:
-        return msgspec.json.decode((folder / NOTE).read_bytes(), type=LaunchNote)
+        return msgspec.json.decode(read_regular(folder / NOTE, MAX_FILE_BYTES), type=LaunchNote)
     except OSError as error:
         raise TransportError(
             f"{folder}: no socket folder of a launch ({error.strerror}); `up` names its own"

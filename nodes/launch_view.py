@@ -8,8 +8,10 @@ from typing import Any
 
 from rich.box import SIMPLE
 from rich.table import Table
+from rich.text import Text
 
 from nodes.launch_config import STATUS_SOCKET
+from semantic_mapper.plain_text import visible
 from semantic_mapper.transport.messages import Status
 from semantic_mapper.transport.sockets import NewestSubscriber
 
@@ -87,7 +89,7 @@ class LaunchView:
             table.add_row(name, *(show(row) for show in _COLUMNS.values()))
         troubles = [f"{name}: {t}" for name, row in rows.items() for t in row["degraded"] if name != STATUS_SOCKET]
         if troubles:
-            table.caption, table.caption_justify = "\n".join(troubles), "left"
+            table.caption, table.caption_justify = Text("\n".join(map(visible, troubles))), "left"
         return table
 
 

@@ -18,6 +18,7 @@ from nodes.options import Count
 from nodes.outputs import free_name
 from semantic_mapper.config import Config, convert_config
 from semantic_mapper.errors import CodecError, ConfigError, SemanticMapperError
+from semantic_mapper.files import write_bytes
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.keyframe_pool import Kept, KeyframePool
 from semantic_mapper.transport.codec import decode_keyframe, encode_keyframe
@@ -99,7 +100,7 @@ class LearningStore:
         if record == self._written:
             return
         self._folder.mkdir(parents=True, exist_ok=True)
-        _write_whole(self._folder / _RECORD, msgspec.json.format(msgspec.json.encode(record), indent=1))
+        write_bytes(self._folder / _RECORD, msgspec.json.format(msgspec.json.encode(record), indent=1))
         self._written = record
         named = {file.digest for file in files}
         self._digests = {digest: frame for digest, frame in self._digests.items() if digest in named}
@@ -151,7 +152,7 @@ class LearningStore:
         digest = digest_of(data)
         if not self._path(digest).exists():
             self._folder.mkdir(parents=True, exist_ok=True)
-            _write_whole(self._path(digest), data)
+            write_bytes(self._path(digest), data)
         self._digests[digest] = frame
         return digest
 
@@ -167,12 +168,3 @@ class LearningStore:
 
 def _file_of(kept: Kept, digest: str) -> KeptFile:
     return KeptFile(digest=digest, held_out=kept.held_out, proved_at=kept.proved_at, trials=kept.trials)
-
-
-def _write_whole(path: Path, data: bytes) -> None:
-    part = path.with_name(f"{path.name}.part")
-    try:
-        part.write_bytes(data)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)

@@ -20,6 +20,7 @@ from nodes.options import Call, CameraOptions, NodeJob, NodeOptions
 from nodes.process import STOP_SIGNAL, StopRequest, prepare_process
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, SemanticMapperError
+from semantic_mapper.memory import is_out_of_memory, memory_message
 
 _log = structlog.get_logger(__name__)
 
@@ -164,6 +165,10 @@ def run_node(
         code = stop.exit_code if job.heartbeat_fd >= 0 else 0
     except (SemanticMapperError, OSError) as error:
         _log.error(FAILURE_EVENT, error=str(error))
+    except (MemoryError, ImportError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        _log.error(FAILURE_EVENT, error=memory_message(error))
     sys.exit(code)
 
 

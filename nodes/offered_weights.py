@@ -9,6 +9,7 @@ from typing import Literal
 from semantic_mapper.errors import WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, check_same_shape, load_checkpoint
 from semantic_mapper.fields.learned import encode_alike
+from semantic_mapper.files import atomic_path
 from semantic_mapper.transport.learning_messages import digest_of
 from semantic_mapper.transport.messages import WeightsUpdate
 from semantic_mapper.transport.query_messages import WeightsEntry
@@ -73,14 +74,9 @@ def read_offer(update: WeightsUpdate, path: Path, like: Checkpoint) -> Checkpoin
         OSError: it cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    try:
+    with atomic_path(path) as part:
         part.write_bytes(update.data)
-        checkpoint = read_weights(part, like)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-    return checkpoint
+        return read_weights(part, like)
 
 
 def read_weights(path: Path, like: Checkpoint) -> Checkpoint:

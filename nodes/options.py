@@ -6,14 +6,14 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from semantic_mapper.config import Config
+from semantic_mapper.config import Config, Positive
 
 SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # of transport/topics.py, which loads what the launcher has no need of
 ENDPOINT_PATTERN = r"^([a-z]+://.+|)\Z"
 
 Text = Annotated[str, msgspec.Meta(min_length=1)]
-Count = Annotated[int, msgspec.Meta(ge=0)]
-Positive = Annotated[float, msgspec.Meta(gt=0)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**31 - 1)]
+Names = Annotated[tuple[Text, ...], msgspec.Meta(min_length=1, max_length=64)]
 PoseRow = tuple[float, float, float, float]
 
 
@@ -43,7 +43,7 @@ class CameraOptions(Config, frozen=True):
     )
     mode: Literal["lockstep", "realtime", "fast"] = "lockstep"  # wait for the mapper; keep the recording's time; hurry
     mapper: str = "mapper"  # lockstep: the node whose answers are waited for
-    rate: Positive = 1.0  # realtime: 2 = twice as fast as recorded
+    rate: Annotated[float, msgspec.Meta(ge=0.001, le=1000)] = 1.0  # realtime: 2 = twice as fast as recorded
     max_frames: Count = 0  # 0 = all
     subscriber_timeout_s: Positive = 180.0  # how long the others may take to start
     ack_timeout_s: Positive = 300.0  # lockstep: how long the mapper may take for one frame; the first one compiles
@@ -66,7 +66,7 @@ class MapperOptions(Config, frozen=True):
     """Maps the frames of a camera node."""
 
     out: Text  # folder for the map, the picture and the summary
-    input: Text | Annotated[tuple[Text, ...], msgspec.Meta(min_length=1)] = "camera"  # whose frames: a node, or several
+    input: Text | Names = "camera"  # whose frames: a node, or several
     delivery: Literal["newest", "all"] = "newest"  # live: an unread frame gives way to a newer one; all: nothing lost
     weights: str = ""  # empty = those that ship with the package
     config: str = ""  # TOML file with settings of the mapper; empty = defaults
@@ -111,7 +111,7 @@ class RecorderOptions(Config, frozen=True):
 
     out: Text  # the log to write; further parts are called as it is, with -1, -2, ... before the ending
     # The nodes to record: first those with frames (`streams`), whose end ends the recording.
-    sources: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)] = ("camera", "mapper")
+    sources: Names = ("camera", "mapper")
     streams: Annotated[int, msgspec.Meta(ge=1)] = 1  # how many of the sources, from the first on, are cameras
     topics: tuple[str, ...] = ("info", "frame", "refused", "status")  # "map" may be added
     overwrite: bool = False  # replace a log that is there; where there are splits, with all its parts

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 import structlog
 
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.files import remove_stale
 
 _log = structlog.get_logger(__name__)
 
@@ -34,9 +36,8 @@ def prepare_folder(out: Path) -> None:
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".writable"
-        probe.touch()
-        probe.unlink()
+        with tempfile.TemporaryFile(dir=out):
+            pass
     except OSError as error:
         raise ConfigError(f"{out}: cannot hold the results ({error.strerror}); choose another folder") from error
 
@@ -65,6 +66,8 @@ def hold_folder(out: Path) -> Iterator[None]:
             ) from None
         except OSError as error:  # file systems without locks
             _log.warning("folder_not_held", folder=str(out), reason=error.strerror)
+        for left in remove_stale(out):
+            _log.info("unfinished_file_removed", path=str(left))
         yield
     finally:
         os.close(folder)

@@ -14,6 +14,8 @@ from typing import Any, Self
 
 import structlog
 
+from semantic_mapper.plain_text import visible
+
 STOP_SIGNAL = signal.SIGUSR1  # by which a launcher asks its nodes to end: SIGTERM may come from anybody
 MAX_THREADS = 16  # more gain nothing on the small work of one frame
 
@@ -120,5 +122,9 @@ def _make_logger(*names: Any) -> structlog.PrintLogger:
 
 
 def _one_line(logger: Any, method: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
-    """Keep one event on one line, whatever a message says."""
-    return {k: v.replace("\n", " | ") if isinstance(v, str) and k != "exception" else v for k, v in event.items()}
+    """Keep one event on one line and the terminal as it is, whatever a message says."""
+    return {k: _shown(v, k) if isinstance(v, str) else v for k, v in event.items()}
+
+
+def _shown(text: str, key: str) -> str:
+    return visible(text, keep="\n") if key == "exception" else visible(text.replace("\n", " | "))

@@ -45,7 +45,8 @@ def run_recorder(context: NodeContext, options: RecorderOptions) -> None:
     """Record until the stream ends or somebody asks to stop, and tell how it goes.
 
     Raises:
-        LogError: the log cannot be begun. A disk that is full later ends the recording, not the node.
+        LogError: the log cannot be begun, or somebody has removed it meanwhile. A disk that is full later ends the
+            recording, not the node.
         TransportError: a source cannot be subscribed to, or the endpoint is taken.
     """
     from semantic_mapper.transport.publisher import Publisher
@@ -66,10 +67,11 @@ def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Rec
         follow: Called at least some twenty times a second; True = it is enough.
 
     Raises:
-        LogError: the log cannot be begun.
+        LogError: the log cannot be begun, or somebody has removed it meanwhile.
         TransportError: a source cannot be subscribed to.
     """
     from nodes.backlog import listen_while_waiting
+    from semantic_mapper.errors import LogError
     from semantic_mapper.transport.sockets import LosslessSubscriber
 
     topics = tuple(dict.fromkeys(("info", *options.topics, "end")))
@@ -106,6 +108,8 @@ def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Rec
         if context.stop and not backlog.ended:
             _drain(context, recorder, sources)
         context.heart.ending()
+    if recorder.recording is not None and recorder.recording.gone:
+        raise LogError(f"{recorder.recording.path}: was removed while it was written, and what it held is lost")
     return recorder
 
 

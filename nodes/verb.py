@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import ParamSpec
 
 import structlog
@@ -19,9 +19,12 @@ from rich.text import Text
 from nodes.console import stderr_console
 from nodes.process import prepare_process
 from semantic_mapper.errors import SemanticMapperError
+from semantic_mapper.memory import is_out_of_memory, memory_message
+from semantic_mapper.plain_text import visible
 
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
+MAX_OPTION = 1e6  # of lengths, times and sizes; that many seconds are eleven days
 
 _log = structlog.get_logger(__name__)
 
@@ -40,12 +43,20 @@ def verb(function: Callable[ParamsT, int | None]) -> Callable[ParamsT, None]:
     @functools.wraps(function)
     def command(*args: ParamsT.args, **kwargs: ParamsT.kwargs) -> None:
         prepare_process(verbose=Settings.verbose)
+        _check_numbers(kwargs)
         try:
             code = function(*args, **kwargs)
         except SemanticMapperError as error:
             if Settings.verbose:
                 _log.exception("failed", error=str(error))
             show_error(str(error))
+            code = EXIT_FAILED
+        except (MemoryError, ImportError, RuntimeError) as error:
+            if not is_out_of_memory(error):
+                raise
+            if Settings.verbose:
+                _log.exception("failed")
+            show_error(memory_message(error))
             code = EXIT_FAILED
         except KeyboardInterrupt:
             show_error("interrupted")
@@ -65,7 +76,20 @@ def verb(function: Callable[ParamsT, int | None]) -> Callable[ParamsT, None]:
     return command
 
 
+def _check_numbers(options: Mapping[str, object]) -> None:
+    """Options know lower bounds only, and NaN passes these.
+
+    Raises:
+        typer.BadParameter: a number that nothing can be computed with.
+    """
+    for name, value in options.items():
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, float) and not -MAX_OPTION <= number <= MAX_OPTION:
+                hint = f"--{name.replace('_', '-')}"
+                raise typer.BadParameter(f"{number:g}: give a number of at most {MAX_OPTION:g}", param_hint=hint)
+
+
 def show_error(message: str) -> None:
     """One red line on stderr."""
-    line = Text.assemble(("error: ", "bold red"), (" ".join(message.split("\n")), "red"))
+    line = Text.assemble(("error: ", "bold red"), (visible(" ".join(message.split("\n"))), "red"))
     stderr_console().print(line, soft_wrap=True)

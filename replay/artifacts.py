@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -18,6 +17,7 @@ from semantic_mapper.config import to_plain
 from semantic_mapper.evaluation.metrics import confusion_of
 from semantic_mapper.evaluation.report import ViewStrip, write_overview
 from semantic_mapper.evaluation.upright import camera_up
+from semantic_mapper.files import write_bytes
 from semantic_mapper.mapping.formats.ply import write_ply
 from semantic_mapper.mapping.map_types import MapPoints
 
@@ -102,9 +102,7 @@ def _spread(items: Sequence[ItemT], count: int) -> list[ItemT]:
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Write JSON atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(part, path)
+    write_bytes(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
 
 
 def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:

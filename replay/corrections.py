@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
-import structlog
 from numpy.typing import NDArray
 
 from replay.importers.tum import match_nearest, read_trajectory
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.geometry import pose_matrix
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.history import SEGMENTS
 from semantic_mapper.mapping.pose_correction import ALWAYS
 from semantic_mapper.types import Float64
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 MATCH_NS = 5_000_000  # trajectories are written with microseconds, or with the stamp of another picture of the rig
 _PORTION = 8  # frames
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

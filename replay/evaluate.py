@@ -6,19 +6,18 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import structlog
-
 from replay.session import PipelineBundle, make_field
 from replay.truth import TruthMapper
 from semantic_mapper.config import MapperConfig, convert_config, to_plain
 from semantic_mapper.errors import FrameError, LabelError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.training.baselines import UNetBaseline, UNetConfig, WarpBaseline
 from semantic_mapper.types import PosedFrame, UInt8
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 Predictor = Callable[[PosedFrame], UInt8]
 

@@ -9,10 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-import structlog
-
 from replay.sequence import Log
 from semantic_mapper.errors import CodecError, LogError, NodeError, TransportError
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.transport.codec import Envelope, Parts, decode_frame, encode_end, encode_info
 from semantic_mapper.transport.messages import EndOfStream, FrameRefused
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
@@ -26,7 +25,7 @@ END_TIMEOUT_S = 60.0  # a lossless mapper behind a full queue needs the time of 
 STOP_TIMEOUT_S = 5.0  # ... but who presses Ctrl-C does not want to wait for a mapper that hangs
 _SLICE_S = 0.1
 
-logger = structlog.get_logger(__name__)
+logger = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)

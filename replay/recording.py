@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import structlog
-
 from replay.log import LogWriter
 from replay.reader import LogAttachment, LogReader
 from replay.sequence import Part, part_path, parts_on_disk, read_part
 from semantic_mapper.errors import LogError
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.transport.codec import Parts
 from semantic_mapper.transport.messages import StreamInfo
 
@@ -24,7 +23,7 @@ DiskFull = Literal["stop", "delete-oldest"]
 RETRY_S = 1.0  # how often a recording that pauses looks for room
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +108,7 @@ class Recording:
         self._done_frames = self._done_messages = 0  # in parts that are finished
         self.lost = self.deleted = 0
         self.trouble = ""
-        self.ended = False
+        self.ended = self.gone = False
         self._retry_at = float("-inf")
         there = parts_on_disk(path)
         if goes_on:
@@ -220,6 +219,9 @@ class Recording:
         self._done_frames += part.frames
         self._done_messages += part.messages
         self._finished.append(part.path)
+        if not part.path.exists():  # Linux lets a removed file be written to
+            self.gone = True
+            _log.error("part_gone", log=str(part.path), frames=part.frames)
         try:
             part.close()
         except LogError as error:  # its messages are whole
@@ -287,7 +289,7 @@ class Recording:
         if self._rules.disk_full == "stop":
             self.ended = True
             self._finish_part()
-            what = "recording has stopped; what is recorded is whole"
+            what = "recording has stopped; " + ("its file is gone" if self.gone else "what is recorded is whole")
         else:
             what = "no older part is left to delete; recording goes on once there is room"
         self._retry_at = self._clock() + RETRY_S

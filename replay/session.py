@@ -11,8 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import structlog
-
 from replay.artifacts import MAX_LISTED, write_artifacts
 from replay.tallies import FirstAndLast, StepTimes
 from replay.truth import SurfaceTruth, TruthMapper
@@ -27,13 +25,14 @@ from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_streaming import StreamingSRay, compiled_covers
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.types import MapUpdate, PosedFrame
 
 if TYPE_CHECKING:
     from replay.rerun_log import RerunLog
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 SNAPSHOTS = 8  # frames kept for the overview picture
 

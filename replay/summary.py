@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.files import read_regular
 
 SUMMARY_FILE = "summary.json"
+MAX_SUMMARY_BYTES = 1 << 24
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
@@ -20,12 +22,16 @@ def read_summary(folder: Path) -> dict[str, Any]:
     """
     path = folder / SUMMARY_FILE
     try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
+        summary = json.loads(read_regular(path, MAX_SUMMARY_BYTES))
+    except (FileNotFoundError, NotADirectoryError) as error:
         raise ConfigError(
             f"{folder}: no summary.json; give a folder that `semantic-mapper replay` has written"
         ) from error
+    except RecursionError as error:
+        raise ConfigError(f"{path}: cannot be read: too many values inside each other") from error
     except (OSError, ValueError) as error:
+        if isinstance(error, ConfigError):
+            raise
         raise ConfigError(f"{path}: cannot be read: {error}") from error
     if not isinstance(summary, dict) or "frames" not in summary or "metrics" not in summary:
         raise ConfigError(f"{path}: is not the summary of a replay")

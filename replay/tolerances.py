@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from semantic_mapper.config import AtLeastZero, Config
 
@@ -14,6 +14,8 @@ class Tolerances(Config, frozen=True):
     A replay repeats bit for bit on one machine with one number of threads. These defaults leave room for another CPU or
     number of threads, where convolutions round otherwise; what ought not to change at all has none.
     """
+
+    infinite: ClassVar[bool] = True
 
     frames_published: AtLeastZero = 0  # frames
     frames_mapped: AtLeastZero = 0

@@ -6,6 +6,8 @@ import contextlib
 import os
 from pathlib import Path
 
+from semantic_mapper.files import open_unlinked
+
 
 class WholeFile:
     """A new file, open for writing. ``write`` collects in memory, ``commit`` brings all of it to the file or nothing.
@@ -22,8 +24,9 @@ class WholeFile:
     """
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
-        only_new = os.O_TRUNC if overwrite else os.O_EXCL
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | only_new, 0o666)
+        if overwrite and path.is_symlink():
+            path.unlink()  # replaced, never written through
+        self._fd = open_unlinked(path, os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if overwrite else os.O_EXCL))
         self._pending: list[bytes] = []
         self._pending_bytes = 0
         self.size = 0

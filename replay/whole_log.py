@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from replay.log import LogAttachment, LogWriter
 from semantic_mapper.errors import LogError
+from semantic_mapper.files import atomic_path
 from semantic_mapper.transport.codec import CodecOptions
 from semantic_mapper.transport.messages import StreamInfo
 
@@ -35,27 +35,19 @@ def whole_log(
     """
     if path.exists() and not overwrite:
         raise LogError(f"{path}: exists already; remove it or choose another name")
-    unfinished = path.with_name(f".{path.name}.unfinished")
     writer: LogWriter | None = None
     try:
-        writer = LogWriter(unfinished, info, options=options, attachments=attachments, overwrite=True)
-        with writer:
-            yield writer
-        _rename(unfinished, path)
+        with atomic_path(path) as unfinished:
+            writer = LogWriter(unfinished, info, options=options, attachments=attachments, overwrite=True)
+            with writer:
+                yield writer
+    except OSError as error:
+        raise _nothing_left(path, error) from error
     except LogError as error:
         reason = error.__cause__ if writer is None else writer.trouble
         if not isinstance(reason, OSError):  # of a log that is read meanwhile
             raise
         raise _nothing_left(path, reason) from error
-    finally:
-        unfinished.unlink(missing_ok=True)
-
-
-def _rename(unfinished: Path, path: Path) -> None:
-    try:
-        os.replace(unfinished, path)
-    except OSError as error:
-        raise _nothing_left(path, error) from error
 
 
 def _nothing_left(path: Path, error: OSError) -> LogError:

@@ -6,25 +6,38 @@ Every struct here is frozen; ``load_config`` fills one from a file, ``to_toml_di
 from __future__ import annotations
 
 import difflib
+import math
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import msgspec
 
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.files import read_regular
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
+MAX_FILE_BYTES = 1 << 20  # of a file of settings
+MAX_DEPTH = 32  # tables and lists inside each other
+MAX_NUMBER = 1e12  # the largest float of any setting
+MAX_DURATION_S = 1e6  # eleven days; the longest time that every system call takes in milliseconds
+MAX_COUNT = 2**31 - 1
+MAX_STORED = 2**63 - 1  # the largest whole number: stamps in nanoseconds
+_MESSAGE = 400  # letters of what a file says, in a message
+
+Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 NotNegative = Annotated[int, msgspec.Meta(ge=0)]
 AtLeastZero = Annotated[float, msgspec.Meta(ge=0)]
-AtLeastOne = Annotated[int, msgspec.Meta(ge=1)]
+AtLeastOne = Annotated[int, msgspec.Meta(ge=1, le=MAX_COUNT)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
-AtLeastTwo = Annotated[int, msgspec.Meta(ge=2)]
+AtLeastTwo = Annotated[int, msgspec.Meta(ge=2, le=MAX_COUNT)]
+Samples = Annotated[int, msgspec.Meta(ge=2, le=1024)]  # of one ray
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Base of all configuration structs."""
+
+    infinite: ClassVar[bool] = False  # whether ``inf`` is a value of its numbers
 
 
 class EncoderConfig(Config, frozen=True):
@@ -95,9 +108,9 @@ class SamplingConfig(Config, frozen=True):
     """Where a ray is sampled."""
 
     mode: Literal["reference", "streaming"] = "streaming"
-    coarse: AtLeastTwo = 64  # reference: uniform in inverse depth
-    fine: AtLeastOne = 64  # reference: drawn from the coarse weights
-    guided: AtLeastTwo = 8  # streaming: round the depth prior, or uniform in inverse depth where there is none
+    coarse: Samples = 64  # reference: uniform in inverse depth
+    fine: Annotated[int, msgspec.Meta(ge=1, le=1024)] = 64  # reference: drawn from the coarse weights
+    guided: Samples = 8  # streaming: round the depth prior, or uniform in inverse depth where there is none
     free_space: NotNegative = 1  # of the guided samples: between the camera and the guided interval
     guided_sigma: Positive = 0.02  # half width of the guided interval: guided_sigma * z + guided_floor_m
     guided_floor_m: Positive = 0.04
@@ -119,7 +132,9 @@ class KeyframeConfig(Config, frozen=True):
 
     translation_m: Positive = 0.15  # new keyframe when moved this far from the nearest one, or ...
     rotation_deg: Positive = 12.0  # ... turned this far
-    capacity: AtLeastOne = 64  # keyframes kept; the one whose loss costs least coverage goes first
+    capacity: Annotated[int, msgspec.Meta(ge=1, le=4096)] = (
+        64  # keyframes kept; the one whose loss costs least coverage goes first
+    )
     source_views: Annotated[int, msgspec.Meta(ge=1, le=16)] = 8  # m of the paper
     use_current_view: bool = True  # the frame being mapped is itself a source view of its rendering
 
@@ -127,11 +142,13 @@ class KeyframeConfig(Config, frozen=True):
 class VoxelMapConfig(Config, frozen=True):
     """The fused map."""
 
-    voxel_size_m: Positive = 0.02
-    truncation_voxels: Positive = 4.0
-    depth_max_m: Positive = 5.0
+    voxel_size_m: Annotated[float, msgspec.Meta(ge=1e-4, le=10)] = 0.02
+    truncation_voxels: Annotated[float, msgspec.Meta(gt=0, le=64)] = 4.0
+    depth_max_m: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 5.0
     max_weight: Positive = 255.0  # cap of the TSDF weight, so that the map stays able to change
-    initial_blocks: AtLeastOne = 2000  # capacity at start; grows by half when full
+    initial_blocks: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = (
+        2000  # capacity at start; grows by half when full
+    )
     max_blocks: AtLeastOne = 200_000  # refuse to grow past this, with a clear error
     memory_mb: NotNegative = 0  # for voxels; what was used longest ago goes to disk; 0 = no limit
     vote_discount: Share = 0.75  # rho: how much a repeated view of a voxel repeats what earlier views said
@@ -155,7 +172,7 @@ class VirtualViewConfig(Config, frozen=True):
 
     # After every so many frames, in time that ``render.target_hz`` knows nothing of; 0 = only where asked for.
     every_n_frames: NotNegative = 0
-    views: AtLeastOne = 1  # at a time
+    views: Annotated[int, msgspec.Meta(ge=1, le=64)] = 1  # at a time
     weight: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.3  # of their votes, against those of a frame
     max_votes: Positive = 0.3  # only voxels with fewer take theirs; a frame's vote from up to 2 m, head on, is 1
     keyframes: AtLeastTwo = 2  # that must see a surface for a virtual view to look at it
@@ -168,12 +185,13 @@ class RenderConfig(Config, frozen=True):
     scale: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.25
     # 1 = rays for all its pixels; below, for every fourth a side and, up to this share, where these do not tell enough.
     share: Share = 0.2
-    blind_samples: AtLeastTwo = 32  # a ray, of views of which neither sensor nor map knows any depth
-    target_hz: Annotated[float, msgspec.Meta(ge=0)] = (
+    blind_samples: Samples = 32  # a ray, of views of which neither sensor nor map knows any depth
+    target_hz: Annotated[float, msgspec.Meta(ge=0, le=1000)] = (
         0.0  # hold this rate by fewer rays and samples than set; 0 = off, for maps that repeat
     )
-    encode_width: NotNegative = 0  # of the source images when they are encoded; 0 = what the weights were trained at
-    rays_per_chunk: NotNegative = 0  # 0 = 2,048 on a CPU, 32,768 on a GPU
+    # Of the source images when they are encoded; 0 = what the weights were trained at.
+    encode_width: Annotated[int, msgspec.Meta(ge=0, le=1 << 14)] = 0
+    rays_per_chunk: Annotated[int, msgspec.Meta(ge=0, le=1 << 22)] = 0  # 0 = 2,048 on a CPU, 32,768 on a GPU
     device: Literal["cpu", "cuda"] = "cpu"  # where views are encoded and rendered; the map is always the CPU's
     bfloat16: bool = False  # on a GPU: networks compute in bfloat16; geometry and logits never do
 
@@ -262,22 +280,109 @@ def read_toml(path: Path) -> dict[str, Any]:
     """A TOML file as plain data.
 
     Raises:
-        ConfigError: file missing, or not TOML.
+        ConfigError: file missing, no regular file, larger than ``MAX_FILE_BYTES``, or not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+        return tomllib.loads(_read(path).decode("utf-8"))
+    except (ValueError, RecursionError) as error:  # of TOML, UTF-8, and whole numbers of thousands of digits
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"{path}: not valid TOML: {_reason(error)}") from error
+
+
+JsonT = TypeVar("JsonT")
+
+
+def read_json(path: Path, kind: type[JsonT], limit: int = MAX_FILE_BYTES) -> JsonT:
+    """A JSON file of at most ``limit`` bytes as ``kind`` (``dict`` or a struct).
+
+    Raises:
+        ConfigError: file missing, no regular file, larger than ``limit``, not JSON, of another form, or with
+            a number that nothing has.
+    """
+    try:
+        data = msgspec.json.decode(_read(path, limit), type=kind)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{path}: {_reason(error)}") from error
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ConfigError(f"{path}: not valid JSON: {_reason(error)}") from error
+    check_values(msgspec.to_builtins(data), str(path))
+    return data
 
 
 def convert_config(data: Any, kind: type[ConfigT], where: str) -> ConfigT:
-    """Check plain data against ``kind``; see ``load_config``."""
+    """Check plain data against ``kind``; see ``load_config``.
+
+    Raises:
+        ConfigError: an unknown key (with the nearest valid one), a value of the wrong type or out of its range, or one
+            that ``check_values`` refuses.
+    """
+    check_values(data, where, infinite=issubclass(kind, Config) and kind.infinite)
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{where}: {error}{_nearest_key(str(error), kind)}") from error
+        raise ConfigError(f"{where}: {_reason(error)}{_nearest_key(str(error), kind)}") from error
+
+
+def check_values(data: Any, where: str, *, infinite: bool = False) -> None:
+    """Refuse what no setting can be: numbers that are not finite or too large to compute with, text
+    that the system takes for no name, and endless nesting.
+
+    Args:
+        data: Plain data.
+        where: Its file, for messages.
+        infinite: Whether ``inf`` is a value.
+
+    Raises:
+        ConfigError: names the setting.
+    """
+    left: list[tuple[str, Any, int]] = [("", data, 0)]
+    while left:
+        name, value, depth = left.pop()
+        if depth > MAX_DEPTH:
+            raise ConfigError(f"{where}: {name[:_MESSAGE]}: more than {MAX_DEPTH} tables or lists inside each other")
+        if isinstance(value, Mapping):
+            left += [(f"{name}.{key}" if name else str(key), item, depth + 1) for key, item in value.items()]
+        elif isinstance(value, list | tuple):
+            left += [(f"{name}[{n}]", item, depth + 1) for n, item in enumerate(value)]
+        elif isinstance(value, int | float) and not (infinite and value == math.inf):
+            _check_number(name, value, where)
+        elif isinstance(value, str):
+            _check_text(name, value, where)
+
+
+def _check_number(name: str, value: float, where: str) -> None:
+    limit = MAX_STORED if isinstance(value, int) else MAX_NUMBER
+    if name.endswith("_s"):
+        limit = MAX_DURATION_S
+    if not -limit <= value <= limit:  # NaN is not, either
+        text = f"{value:g}" if isinstance(value, float) else f"a number of {value.bit_length()} bits"
+        raise ConfigError(f"{where}: {name[:_MESSAGE]} = {text}: give a number between -{limit:g} and {limit:g}")
+
+
+def _check_text(name: str, value: str, where: str) -> None:
+    try:
+        value.encode()  # what the command line cannot decode is half a surrogate pair
+    except UnicodeEncodeError as error:
+        raise ConfigError(f"{where}: {name[:_MESSAGE]} is not UTF-8: {error.reason}; rename the file") from error
+    if "\0" in value:
+        raise ConfigError(f"{where}: {name[:_MESSAGE]} holds a NUL character, which no path and no name may")
+
+
+def _read(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
+    try:
+        return read_regular(path, limit)
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path}: no such file") from error
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, RecursionError):
+        return "too many tables or lists inside each other"
+    text = str(error).partition("; use sys.set_int_max_str_digits")[0]  # a way out for programmers
+    return text if len(text) <= _MESSAGE else f"{text[:_MESSAGE]}..."
 
 
 def to_plain(config: msgspec.Struct) -> dict[str, Any]:
@@ -286,9 +391,9 @@ def to_plain(config: msgspec.Struct) -> dict[str, Any]:
 
 
 def _nearest_key(message: str, kind: type[msgspec.Struct]) -> str:
-    if "unknown field" not in message:
+    if "unknown field `" not in message:
         return ""
-    wrong = message.split("unknown field")[1].split("`")[1]
+    wrong = message.partition("unknown field `")[2].partition("`")[0]
     keys = sorted(_keys_at(message, kind) - {wrong})
     near = difflib.get_close_matches(wrong, keys, n=1, cutoff=0.5)
     return f"; did you mean `{near[0]}`?" if near else f"; valid keys are {', '.join(keys)}"

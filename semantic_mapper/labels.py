@@ -17,6 +17,7 @@ from semantic_mapper.errors import LabelError
 from semantic_mapper.types import UInt8
 
 IGNORE_CHANNEL = -1
+MAX_NAME = 128  # letters of a name, as in headers of messages (transport/headers.py)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +45,12 @@ class LabelSet:
             raise LabelError(f"label set '{self.name}' has no classes")
         if len(set(self.ids)) != len(self.ids) or len(set(self.names)) != len(self.names):
             raise LabelError(f"label set '{self.name}' names a class or an id twice")
+        for class_id, name in ((None, self.name), *zip(self.ids, self.names, strict=True)):
+            if len(name) > MAX_NAME:
+                what = "its own name" if class_id is None else f"the name of class {class_id}"
+                raise LabelError(
+                    f"label set '{self.name[:MAX_NAME]}': {what} has {len(name):,} letters, and may have {MAX_NAME}"
+                )
         if self.ignore_id in self.ids:
             raise LabelError(f"label set '{self.name}': id {self.ignore_id} is both a class and the ignore id")
         if not all(0 <= i <= 255 for i in (*self.ids, self.ignore_id)):

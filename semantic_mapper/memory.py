@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # names of mallopt(3)
+_SHORTAGE = ("failed to map segment", "annot allocate memory", "can't allocate memory", "std::bad_alloc")
 LARGEST = 1 << 30  # bytes: tensors of a step are smaller
 
 
@@ -38,3 +39,20 @@ def give_back_freed_memory() -> bool:
         return False
     trim(0)
     return True
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether a lack of memory, or of address space (``ulimit -v``), is behind an error.
+
+    Libraries that cannot be mapped fail to import, and tensors that find no room raise ``RuntimeError``.
+    """
+    text = str(error)
+    return isinstance(error, MemoryError) or (
+        any(words in text for words in _SHORTAGE) and "static TLS" not in text  # loaded too late: another fault
+    )
+
+
+def memory_message(error: BaseException) -> str:
+    """What to say where memory does not suffice."""
+    reason = str(error) or type(error).__name__
+    return f"not enough memory or address space ({reason}); free some, or raise the limit (ulimit -v)"

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 
 from nodes.run_replay import mapper_config
 from semantic_mapper.config import (
+    MAX_FILE_BYTES,
     Config,
     EncoderConfig,
     MapperConfig,
@@ -16,6 +18,8 @@ from semantic_mapper.config import (
     VoxelMapConfig,
     convert_config,
     load_config,
+    read_json,
+    read_toml,
     to_plain,
 )
 from semantic_mapper.errors import ConfigError
@@ -153,3 +157,52 @@ def test_configs_cannot_be_changed() -> None:
 def test_values_that_make_no_sense_are_refused_by_name(section: dict[str, Any], what: str) -> None:
     with pytest.raises(ConfigError, match=what):
         convert_config(section, MapperConfig, "settings.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("seed = " + "9" * 5000, "not valid TOML"),
+        ("x = " + "[" * 20000, "not valid TOML: too many tables or lists inside each other"),
+        ("seed = " + "9" * 4000, r"seed = a number of 13288 bits"),
+        ("seed = 9223372036854775808", "seed = a number of 64 bits"),
+        ("[voxel_map]\nvoxel_size_m = inf", "voxel_map.voxel_size_m = inf: give a number between"),
+        ("[voxel_map]\nvoxel_size_m = nan", "voxel_map.voxel_size_m = nan"),
+        ("[voxel_map]\ndepth_max_m = 1e308", r"voxel_map.depth_max_m = 1e\+308"),
+        ("[voxel_map]\nvoxel_size_m = 1e-300", "voxel_size_m"),
+        ("[voxel_map]\ninitial_blocks = 1000000000", "initial_blocks"),
+        ("[sampling]\nguided = 100000", "guided"),
+        ('[render]\ndevice = "a\\u0000b"', "render.device holds a NUL character"),
+        ('quality = "unknown field"', "quality"),
+        ("k" * 100_000 + " = 1", "unknown field"),
+        ("x = " + "[" * 40 + "]" * 40, "more than 32 tables or lists inside each other"),
+        ("#" * (MAX_FILE_BYTES + 1), "larger than the limit of 1,048,576 bytes"),
+    ],
+)
+def test_a_hostile_file_is_refused_by_name_in_few_words(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "mapper.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=says) as caught:
+        load_config(path, MapperConfig)
+    assert str(path) in str(caught.value) and len(str(caught.value)) < 1500
+
+
+def test_files_without_an_end_are_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    for path in (Path("/dev/zero"), tmp_path / "fifo"):
+        with pytest.raises(ConfigError, match="is no regular file"):
+            read_toml(path)
+        with pytest.raises(ConfigError, match="is no regular file"):
+            read_json(path, dict)
+    with pytest.raises(ConfigError, match="is no regular file"):
+        read_toml(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "text", ['{"a": ' + "[" * 100_000, '{"a": NaN}', '{"a": 1e999}', '{"a": ' + "9" * 5000 + "}", "[]", "\x80"]
+)
+def test_hostile_json_is_refused_by_name(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "camera.json"
+    path.write_text(text, encoding="latin-1")
+    with pytest.raises(ConfigError, match=r"camera\.json: "):
+        read_json(path, dict)

@@ -12,7 +12,6 @@ from types import TracebackType
 from typing import Any, Self
 
 import msgspec
-import structlog
 
 from drivers.base import CameraImage
 from drivers.oak.config import Config
@@ -21,6 +20,7 @@ from drivers.oak.images import ImageMaker, geometry_trouble, read_intrinsics, to
 from drivers.oak.odometry import Odometry
 from drivers.oak.stream import Sources, Stream, StreamEnded
 from semantic_mapper.errors import CameraError, PoseError
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics
 
@@ -32,7 +32,7 @@ _STRANGE_WORLD = (
     "node again for a new map, or take poses from elsewhere"
 )
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class OakCamera:

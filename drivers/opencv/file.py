@@ -11,17 +11,17 @@ from typing import Self
 
 import cv2
 import numpy as np
-import structlog
 
 from drivers.base import CameraImage
 from drivers.calibration import Rectifier, guess_intrinsics
 from drivers.opencv.config import Config
 from drivers.opencv.stream import nominal_hz
 from semantic_mapper.errors import CameraError
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, UInt8
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class VideoFile:

@@ -5,16 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import structlog
 
 from drivers.poses.config import PoseChecks
 from drivers.poses.motion import StampedPose, turn_between
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import PosedFrame
 
 FAR = 2.0  # times what is allowed: a jump, whatever comes after it
 HELD = 3  # times ``first_agree``: so many frames are held back at most while the first poses do not agree
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

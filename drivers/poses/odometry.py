@@ -18,7 +18,6 @@ from typing import Self
 
 import cv2
 import numpy as np
-import structlog
 
 from drivers.base import CameraImage, PoseEstimate
 from drivers.poses.alignment import Aligner, Fit, Target, fit
@@ -29,13 +28,14 @@ from drivers.poses.keyframe_map import KeyframeMap, OdometryKeyframe
 from drivers.poses.motion import StampedPose, along, turn_between
 from drivers.poses.still import WAYS_OUT
 from semantic_mapper.errors import CameraError
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 _LEAST_DEPTH = 0.05  # share of the pixels that need depth
 _POINTS_A_VOTE = 50  # neighbouring points have the same error: so many tell as much as one
 _RECENT_NS = 700_000_000  # after so long without a pose the last motion says nothing any more
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 @dataclass(slots=True, eq=False)

@@ -9,13 +9,13 @@ from types import TracebackType
 from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
-import structlog
 
 from drivers.base import Camera, CameraImage, PoseEstimate, PoseSource
 from drivers.poses.config import PoseChecks
 from drivers.poses.gate import PoseGate, Verdict
 from semantic_mapper.errors import PoseError, ShapeError
 from semantic_mapper.geometry import check_pose
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import Float64, PosedFrame
 
@@ -23,7 +23,7 @@ _DEFAULTS = PoseChecks()
 EXACT = ("fixed",)  # sources whose poses come from the settings: the first one is not doubted
 REASONS = ("no_pose", "stale", "not_rotation", "jumping", "unsettled")
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 @runtime_checkable

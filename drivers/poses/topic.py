@@ -9,13 +9,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import structlog
 import zmq
 
 from drivers.base import CameraImage, PoseEstimate
 from drivers.poses.config import TopicPoses, matrix
 from drivers.poses.motion import PoseTrack, StampedPose
 from semantic_mapper.errors import CameraError, CodecError, TransportError
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.transport.endpoints import check_connect
 from semantic_mapper.transport.pose_message import MAX_POSE_BYTES, PoseMessage, decode_pose
 from semantic_mapper.transport.receiving import receive_bounded
@@ -33,7 +33,7 @@ _MISSES = {
     "stale": "is too far ahead of the newest pose",
 }
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class TopicPoseSource:

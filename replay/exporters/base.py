@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import LogError
+from semantic_mapper.files import atomic_path
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.images import encode_rgb
 from semantic_mapper.types import Float32, Float64, PosedFrame, UInt8
@@ -103,16 +104,19 @@ def whole_place(path: Path, *, folder: bool) -> Iterator[Path]:
     Raises:
         LogError: it cannot be written; nothing is left behind.
     """
-    draft = path.with_name(f".{path.name}.{os.getpid()}.exporting")
     try:
-        if folder:
-            draft.mkdir()
+        with _new_folder(path) if folder else atomic_path(path) as draft:
+            yield draft
+    except OSError as error:
+        raise LogError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+@contextmanager
+def _new_folder(path: Path) -> Iterator[Path]:
+    draft = path.with_name(f".{path.name}.{os.getpid()}.exporting")
+    draft.mkdir()
+    try:
         yield draft
         os.replace(draft, path)
-    except OSError as error:
-        raise LogError(f"{path}: cannot be written: {error}") from error
     finally:
-        if draft.is_dir():
-            shutil.rmtree(draft, ignore_errors=True)
-        else:
-            draft.unlink(missing_ok=True)
+        shutil.rmtree(draft, ignore_errors=True)

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.config import Config
-from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LabelError
+from semantic_mapper.errors import CodecError, ConfigError, FrameError, ImportSourceError, LabelError
+from semantic_mapper.files import read_regular
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.transport.codec import EncodedImage
@@ -40,6 +41,9 @@ class ImportOptions:
     max_frames: int | None = None
     quarters: int = 0
     match_s: float = 0.02
+
+
+MAX_FILE_BYTES = 1 << 28  # of one image, or one list of poses
 
 
 class RenameConfig(Config, frozen=True):
@@ -132,6 +136,19 @@ class BadFrameError(ImportSourceError):
         self.reason = reason
 
 
+def read_bytes(file: Path) -> bytes:
+    """All of one file of a recording.
+
+    Raises:
+        BadFrameError: no regular file (a pipe may never end), or larger than any image or list of poses.
+        OSError: missing, or it cannot be read.
+    """
+    try:
+        return read_regular(file, MAX_FILE_BYTES)
+    except ConfigError as error:
+        raise BadFrameError(file, str(error).removeprefix(f"{file}: ")) from error
+
+
 def read_rgb(file: Path) -> tuple[UInt8, EncodedImage]:
     """Colour image (H, W, 3) and the file's bytes, which the log keeps as they are.
 
@@ -139,7 +156,7 @@ def read_rgb(file: Path) -> tuple[UInt8, EncodedImage]:
         BadFrameError: missing, damaged, cut off, or neither PNG nor JPEG.
     """
     try:
-        data = file.read_bytes()
+        data = read_bytes(file)
         rgb, encoding = decode_image_file(data)
     except OSError as error:
         raise BadFrameError(file, f"cannot be read ({error.strerror or error})") from error
@@ -177,7 +194,7 @@ def read_plane(
         BadFrameError: missing, damaged, of another type or size.
     """
     try:
-        data = file.read_bytes()
+        data = read_bytes(file)
     except OSError as error:
         raise BadFrameError(file, f"the {what} image cannot be read ({error.strerror or error})") from error
     try:
@@ -235,7 +252,7 @@ def read_matrix(file: Path) -> Float64:
         ImportSourceError: missing, or not such a matrix.
     """
     try:
-        numbers = [float(word) for word in file.read_text(encoding="utf-8").split()]
+        numbers = [float(word) for word in read_bytes(file).decode().split()]
     except OSError as error:
         raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
     except ValueError as error:
@@ -266,7 +283,7 @@ def read_lines(file: Path) -> list[tuple[int, str]]:
         ImportSourceError: missing, or not text.
     """
     try:
-        lines = file.read_text(encoding="utf-8").splitlines()
+        lines = read_bytes(file).decode().splitlines()
     except OSError as error:
         raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
     except UnicodeDecodeError as error:

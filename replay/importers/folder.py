@@ -29,8 +29,9 @@ from replay.importers.base import (
     read_rgb,
     seconds_to_ns,
 )
-from semantic_mapper.errors import FrameError, ImportSourceError, LabelError
-from semantic_mapper.labels import PROVIDED, LabelSet, make_label_set
+from semantic_mapper.config import read_json
+from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError, LabelError
+from semantic_mapper.labels import MAX_NAME, PROVIDED, LabelSet, make_label_set
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
@@ -175,8 +176,10 @@ def read_label_set(file: Path) -> LabelSet:
         ImportSourceError: missing, or no label set.
     """
     try:
-        return label_set_from(msgspec.json.decode(file.read_bytes(), type=_Labels), file.resolve().parent.name)
-    except (msgspec.DecodeError, OSError, LabelError, ValueError) as error:
+        return label_set_from(read_json(file, _Labels), file.resolve().parent.name)
+    except ConfigError as error:
+        raise ImportSourceError(str(error)) from error
+    except (LabelError, ValueError) as error:
         raise ImportSourceError(f"{file}: {error}") from error
 
 
@@ -187,11 +190,11 @@ def read_intrinsics(file: Path) -> tuple[CameraIntrinsics, float]:
         ImportSourceError: missing, or a value that cannot be.
     """
     try:
-        i = msgspec.json.decode(file.read_bytes(), type=_Intrinsics)
+        i = read_json(file, _Intrinsics)
         return CameraIntrinsics(i.fx, i.fy, i.cx, i.cy, i.width, i.height), i.depth_scale
-    except OSError as error:
-        raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
-    except (msgspec.DecodeError, FrameError) as error:
+    except ConfigError as error:
+        raise ImportSourceError(str(error)) from error
+    except FrameError as error:
         raise ImportSourceError(f"{file}: {error}") from error
 
 
@@ -206,7 +209,7 @@ def label_set_from(labels: _Labels, folder_name: str) -> LabelSet:
     classes = {int(key): name for key, name in labels.classes.items()}
     classes.pop(labels.ignore, None)
     ids = sorted(classes)
-    name = labels.id_space.lower() or folder_name
+    name = labels.id_space.lower() or folder_name[:MAX_NAME]
     own = make_label_set(name, [classes[i] for i in ids], ids=ids, ignore_id=labels.ignore)
     known = PROVIDED.get(name)
     chosen = {} if known is None else dict(zip(known.ids, known.colors, strict=True))

@@ -31,7 +31,8 @@ from replay.importers.base import (
     read_lines,
     read_rgb,
 )
-from semantic_mapper.errors import ImportSourceError, LabelError
+from semantic_mapper.config import read_json
+from semantic_mapper.errors import ConfigError, ImportSourceError, LabelError
 from semantic_mapper.labels import LabelSet, make_label_set
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
@@ -46,6 +47,9 @@ _TRAJECTORY = "traj_w_c.txt"
 class _Class(msgspec.Struct):
     id: int
     name: str
+
+
+MAX_INFO_BYTES = 1 << 26  # it lists every object of the scene
 
 
 class _Info(msgspec.Struct):
@@ -163,7 +167,9 @@ class ReplicaRecording:
             )
             return None
         try:
-            classes = {c.id: c.name for c in msgspec.json.decode(file.read_bytes(), type=_Info).classes if c.id > 0}
+            classes = {c.id: c.name for c in read_json(file, _Info, MAX_INFO_BYTES).classes if c.id > 0}
             return make_label_set("replica", list(classes.values()), ids=list(classes))
-        except (msgspec.DecodeError, OSError, LabelError) as error:
+        except ConfigError as error:
+            raise ImportSourceError(str(error)) from error
+        except LabelError as error:
             raise ImportSourceError(f"{file}: {error}") from error

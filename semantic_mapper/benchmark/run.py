@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import structlog
 
 from semantic_mapper.benchmark.config import SuiteConfig, check_suite, settings_digest, suite_seeds
 from semantic_mapper.benchmark.figures import image_note
@@ -16,8 +15,10 @@ from semantic_mapper.benchmark.records import RoomRecord
 from semantic_mapper.benchmark.rooms import BenchmarkRoom, make_benchmark_room
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.evaluation.sheet import SheetRow
+from semantic_mapper.files import atomic_write
+from semantic_mapper.log_events import get_logger
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 SHEET_ROWS = 6
 
@@ -118,12 +119,10 @@ def _keep_picture(pictures: Path, room: BenchmarkRoom, result: RoomResult) -> No
     pictures.mkdir(parents=True, exist_ok=True)
     query, answer = next(iter(result.answers.items()))
     record = result.record
-    np.savez_compressed(
-        _picture_path(pictures, record.settings, record.weights, room.seed),
-        rgb=room.frames[query].rgb,
-        truth=room.truth[query].label,
-        label=answer.prediction.label,
-    )
+    with atomic_write(_picture_path(pictures, record.settings, record.weights, room.seed)) as file:
+        np.savez_compressed(
+            file, rgb=room.frames[query].rgb, truth=room.truth[query].label, label=answer.prediction.label
+        )
 
 
 def _picture_path(pictures: Path, settings: str, weights: str, room: int) -> Path:

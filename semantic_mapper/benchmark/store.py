@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import TypeVar
 
 import msgspec
-import structlog
 
 from semantic_mapper.benchmark.records import MapRecord, Record, RoomRecord
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.files import open_unlinked
+from semantic_mapper.log_events import get_logger
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 RecordT = TypeVar("RecordT", RoomRecord, MapRecord)
 
@@ -40,7 +41,7 @@ class RecordStore:
     def add(self, record: Record) -> None:
         """Keep a record, on disk before this returns."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("ab") as file:
+        with open(self.path, "ab", opener=open_unlinked) as file:
             file.write(msgspec.json.encode(record) + b"\n")
         self._records[_key(record)] = record
 

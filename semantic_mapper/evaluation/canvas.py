@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from bisect import bisect_right
 
 import cv2
 import numpy as np
@@ -39,11 +40,10 @@ def text_width(text: str, height: int) -> int:
 
 def shorten(text: str, width: int, height: int) -> str:
     """``text``, cut with "..." where it is wider than ``width`` pixels."""
-    if text_width(text, height) <= width:
+    if len(text) <= width and text_width(text, height) <= width:  # no letter is narrower than a pixel
         return text
-    while text and text_width(text + "...", height) > width:
-        text = text[:-1]
-    return text + "..."
+    letters = range(1, min(len(text), width) + 1)
+    return text[: bisect_right(letters, width, key=lambda count: text_width(text[:count] + "...", height))] + "..."
 
 
 def draw_text(canvas: UInt8, text: str, at: tuple[int, int], height: int, color: tuple[int, int, int]) -> None:

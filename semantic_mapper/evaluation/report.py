@@ -27,6 +27,7 @@ from semantic_mapper.evaluation.canvas import (
 from semantic_mapper.evaluation.legend import draw_legend, legend_rows
 from semantic_mapper.evaluation.splat import draw_points, from_above, from_angle, hides_the_room, open_side
 from semantic_mapper.evaluation.upright import ceiling_height, upright_rotation
+from semantic_mapper.files import write_bytes
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Float32, Float64, UInt8
 
@@ -105,9 +106,9 @@ def write_overview(
     if not encoded:
         raise SemanticMapperError(f"{path}: the picture could not be encoded as PNG")
     try:
-        path.write_bytes(data.tobytes())
+        write_bytes(path, data.tobytes())
     except OSError as error:
-        raise SemanticMapperError(f"{path}: cannot be written: {error}") from error
+        raise SemanticMapperError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def draw_overview(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from semantic_mapper.evaluation.canvas import (
     shorten,
 )
 from semantic_mapper.evaluation.report import class_colors
+from semantic_mapper.files import write_bytes
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import UInt8
 
@@ -97,11 +97,9 @@ def write_picture(path: Path, picture: UInt8) -> None:
         raise SemanticMapperError(f"{path}: the picture could not be encoded as PNG")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name("part." + path.name)
-        part.write_bytes(data.tobytes())
-        os.replace(part, path)
+        write_bytes(path, data.tobytes())
     except OSError as error:
-        raise SemanticMapperError(f"{path}: cannot be written: {error}") from error
+        raise SemanticMapperError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def _left(column: int) -> int:

@@ -9,7 +9,6 @@ from __future__ import annotations
 # torch and safetensors leave parts of their interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import resources
@@ -19,13 +18,14 @@ from typing import Any
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import SemanticMapperError, WeightsError
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.fields.sray import SRay
+from semantic_mapper.files import write_bytes
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, working_intrinsics
 from semantic_mapper.labels import LabelSet
@@ -96,22 +96,21 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -
     if checkpoint.anchors:
         anchor_tensors, metadata["anchors"] = _pack_anchors(checkpoint.anchors)
         tensors |= anchor_tensors
-    part = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        save_tensors(tensors, part, metadata)
-        os.replace(part, path)
+        save_tensors(tensors, path, metadata)
     except (SafetensorError, OSError) as error:
-        part.unlink(missing_ok=True)
         raise WeightsError(f"{path}: cannot be written ({error}); give another file name") from error
 
 
 def save_tensors(tensors: dict[str, torch.Tensor], path: Path, metadata: dict[str, str]) -> None:
-    """``safetensors.save_file``, but with the mode that any new file has: its own are readable by the owner alone."""
-    path.touch()
-    mode = path.stat().st_mode & 0o777
-    save_file(tensors, path, metadata)
-    path.chmod(mode)
+    """``safetensors.save_file``, whole or not at all, with the mode that any new file has.
+
+    Raises:
+        SafetensorError: tensors that the format does not know.
+        OSError: it cannot be written.
+    """
+    write_bytes(path, save(tensors, metadata))
 
 
 def load_checkpoint(path: Path) -> Checkpoint:

@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-import structlog
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.block_index import (
     BlockIndex,
     find_blocks,
@@ -45,7 +45,7 @@ TILE_BLOCKS = 4096  # blocks brought together at a time to be read where some ar
 NEIGHBOURS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
 _READ_AT_ONCE = 256  # blocks between memory and disk: a copy of them takes room beside both
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class BlockGrid:

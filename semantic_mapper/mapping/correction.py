@@ -21,11 +21,11 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-import structlog
 from numpy.typing import NDArray
 
 from semantic_mapper.config import HistoryConfig
 from semantic_mapper.errors import MapError, SemanticMapperError
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.given_poses import FrozenFrames, pair_poses
 from semantic_mapper.mapping.history import FrameEntry, FrameHistory, FusedFrame
 from semantic_mapper.mapping.keyframes import KeyframeStore
@@ -39,7 +39,7 @@ RESTORED_AT_ONCE = 256  # blocks of the frozen frames' map, in the time of a fra
 LEAST_WRITTEN = 64  # blocks that a step, or a frame of a rebuild, puts on disk for the journal, as long as some wait;
 WRITTEN_SHARE = 8  # and at least this part of them
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,15 +5,14 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Iterable, Sequence
 
-import structlog
-
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import check_pose
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.history import FrameEntry
 from semantic_mapper.mapping.pose_correction import CorrectedPoses, PosePair
 from semantic_mapper.types import Float64
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class FrozenFrames:

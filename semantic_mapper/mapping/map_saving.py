@@ -6,14 +6,13 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-import structlog
-
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.grid_snapshot import GridSnapshot
 from semantic_mapper.mapping.map_file import BlockPart, write_map
 from semantic_mapper.mapping.map_manifest import CHUNK_BLOCKS, MapManifest
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class MapSaving:

@@ -13,11 +13,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import structlog
-
 from semantic_mapper.errors import DependencyError
+from semantic_mapper.log_events import get_logger
+from semantic_mapper.memory import is_out_of_memory, memory_message
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 @functools.cache
@@ -30,7 +30,9 @@ def load_open3d() -> Any:
     notes = _preload_libusb() + preload_folder(Path(sys.prefix) / "syslibs")
     try:
         open3d = importlib.import_module("open3d")
-    except (ImportError, OSError) as error:
+    except (ImportError, OSError, MemoryError) as error:
+        if is_out_of_memory(error):
+            raise DependencyError(f"Open3D cannot be loaded: {memory_message(error)}") from error
         raise DependencyError(
             f"Open3D cannot be loaded: {error}. Run `make setup`, which puts missing system libraries into "
             f"{Path(sys.prefix) / 'syslibs'}, or install them yourself (Debian/Ubuntu: `apt-get install libusb-1.0-0 "

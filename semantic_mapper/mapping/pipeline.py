@@ -11,7 +11,6 @@ from contextlib import contextmanager
 
 import cv2
 import numpy as np
-import structlog
 import torch
 from numpy.typing import NDArray
 
@@ -21,6 +20,7 @@ from semantic_mapper.fields.base import EncodedViews, SemanticField, check_class
 from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
 from semantic_mapper.imaging import fill_holes, resize_depth, resize_label, resize_rgb, working_intrinsics
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.correction import CorrectedPoses, CorrectionStatus, MapCorrector
 from semantic_mapper.mapping.depth_trust import depth_trust
 from semantic_mapper.mapping.history import FusedFrame
@@ -33,7 +33,7 @@ from semantic_mapper.mapping.vote_fusion import add_votes
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import CameraIntrinsics, Float32, MapUpdate, PosedFrame, SourceViews, UInt8
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 ODD_FRAMES = 2  # frames of another size that are refused before the new size is believed
 VIRTUAL_SIZE = 2  # times the size of a coarse view: how finely the map is looked at in a virtual one

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import structlog
 from numpy.typing import NDArray
 
 from semantic_mapper.config import RenderConfig, SamplingConfig
@@ -14,10 +13,11 @@ from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import EncodedViews, Sampled, SemanticField
 from semantic_mapper.fields.render import render_view
 from semantic_mapper.fields.sparse_render import render_sparse_view
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.pace import Pace
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class RenderedView(NamedTuple):

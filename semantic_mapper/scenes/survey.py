@@ -13,10 +13,10 @@ from typing import Annotated
 import cv2
 import msgspec
 import numpy as np
-import structlog
 import typer
 
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.scenes.camera import camera_path
 from semantic_mapper.scenes.config import (
     TEST_SEEDS,
@@ -39,7 +39,7 @@ SPLITS = {"train": TRAIN_SEEDS, "validation": VALIDATION_SEEDS, "test": TEST_SEE
 SPREAD = CameraPathConfig(step_m=0.6)  # views that differ
 
 app = typer.Typer(add_completion=False, help=__doc__)
-log = structlog.get_logger(__name__)
+log = get_logger(__name__)
 
 
 def contact_sheet(

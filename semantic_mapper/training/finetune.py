@@ -15,7 +15,6 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
-import structlog
 import torch
 
 from semantic_mapper.config import AtLeastOne, AtLeastZero, Config, NotNegative, Positive, Share, SRayConfig, to_plain
@@ -28,6 +27,7 @@ from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.doubt import with_doubt
 from semantic_mapper.training.head_start import fit_class_rows
 from semantic_mapper.training.losses import IGNORE, Loss, semantic_loss
@@ -45,7 +45,7 @@ from semantic_mapper.training.views import (
 )
 from semantic_mapper.types import PosedFrame
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 HELD_OUT_BLOCK = 16  # pixels a side: single held-out pixels would be known from their neighbours
 HELD_OUT_RAYS = 6144  # over all keyframes: a look must not cost more the more keyframes there are

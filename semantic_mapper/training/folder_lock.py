@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import fcntl
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.files import open_unlinked
 
 LOCK_FILE = ".lock"
 
@@ -23,7 +25,7 @@ def sole_use_of(folder: Path | None) -> Iterator[None]:
         yield
         return
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / LOCK_FILE).open("w", encoding="utf-8") as file:
+    with os.fdopen(open_unlinked(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT), "r+b") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:

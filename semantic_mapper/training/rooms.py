@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-import structlog
 import torch
 from numpy.typing import NDArray
 
 from semantic_mapper.config import Config
 from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.training.cameras import CameraDraw, draw_camera
 from semantic_mapper.training.losses import IGNORE
@@ -26,7 +26,7 @@ from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
 
 CPU = torch.device("cpu")
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class RoomPoolConfig(Config, frozen=True):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import structlog
 import torch
 from torch import nn
 
@@ -13,9 +12,10 @@ from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.recipe import origin
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 def take_over(field: LearnedField, path: Path) -> dict[str, Any]:

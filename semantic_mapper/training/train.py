@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import structlog
 import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
@@ -25,6 +24,7 @@ from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.scenes import SUITE_VERSION
 from semantic_mapper.training.folder_lock import sole_use_of
 from semantic_mapper.training.images import ImageBatch, draw_images, images_loss
@@ -53,7 +53,7 @@ IMAGES_FILE = "after-images.safetensors"  # what steps on images alone have come
 ROOMS_A_SEED = 61_803  # places between the first rooms of two seeds: far apart, and no two seeds have the same
 _FREE = ("seconds", "steps", "device", "workers", "save_every_s")  # may differ when a run goes on
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,8 +10,8 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Self
 
-import structlog
-
+from semantic_mapper.files import open_unlinked, write_bytes
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.curves import write_curves
 
 HISTORY_FILE = "history.jsonl"
@@ -32,7 +32,7 @@ _NAMES = {
     "blind_accuracy": "validation/accuracy without depth",
 }
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class TrainLog(AbstractContextManager["TrainLog"]):
@@ -53,14 +53,14 @@ class TrainLog(AbstractContextManager["TrainLog"]):
         if folder is not None:  # a run that goes on may have written further than its state reaches
             folder.mkdir(parents=True, exist_ok=True)
             lines = "".join(json.dumps(line, allow_nan=False) + "\n" for line in history)
-            (folder / HISTORY_FILE).write_text(lines, encoding="utf-8")
+            write_bytes(folder / HISTORY_FILE, lines.encode())
 
     def add(self, line: dict[str, Any]) -> None:
         """Append one line."""
         self._history.append(line)
         if self._folder is None:
             return
-        with (self._folder / HISTORY_FILE).open("a", encoding="utf-8") as file:
+        with open(self._folder / HISTORY_FILE, "a", encoding="utf-8", opener=open_unlinked) as file:
             file.write(json.dumps(line, allow_nan=False) + "\n")
         if self._events is not None:
             for key, value in line.items():

@@ -9,7 +9,6 @@ from __future__ import annotations
 # torch and safetensors leave parts of their interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import json
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -95,11 +94,7 @@ def save_state(
         "origins": json.dumps(progress.origins),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    save_tensors({name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}, part, metadata)
-    with part.open("rb+") as written:
-        os.fsync(written.fileno())
-    os.replace(part, path)
+    save_tensors({name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}, path, metadata)
 
 
 def unfinished_step(path: Path) -> int | None:

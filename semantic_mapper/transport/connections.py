@@ -11,15 +11,16 @@ import errno
 import time
 import uuid
 
-import structlog
 import zmq
 from zmq.utils.monitor import recv_monitor_message
+
+from semantic_mapper.log_events import get_logger
 
 GIVEN_UP_S = 0.3  # ZeroMQ says at once whether it tries again
 _TRIES_AGAIN = (zmq.EVENT_CONNECT_RETRIED, zmq.EVENT_CONNECT_DELAYED, zmq.EVENT_CONNECTED)
 _EVENTS = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED | sum(_TRIES_AGAIN)
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class Connections:

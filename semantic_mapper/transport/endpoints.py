@@ -9,7 +9,11 @@ import fcntl
 import ipaddress
 import os
 import re
+import stat
 import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import TracebackType
 from typing import IO
@@ -17,8 +21,10 @@ from typing import IO
 import zmq
 
 from semantic_mapper.errors import TransportError
+from semantic_mapper.files import open_unlinked
 from semantic_mapper.transport.security import Keys, ServerIdentity
 
+_umask_lock = threading.Lock()
 _MAX_IPC_PATH = 100  # the kernel takes 107 bytes, lock suffix aside
 
 
@@ -117,11 +123,14 @@ def _is_loopback(address: str) -> bool:
 def bind(socket: zmq.Socket[bytes], endpoint: str, lock: EndpointLock) -> str:
     """Bind a socket where ``lock`` holds the endpoint; returns the endpoint as ZeroMQ names it.
 
+    The file of an ``ipc://`` socket is this user's alone from the start (mode 0600).
+
     Raises:
         TransportError: it cannot be bound; the socket is closed and the lock released then.
     """
     try:
-        socket.bind(endpoint)
+        with _owner_only() if endpoint.startswith("ipc://") else nullcontext():
+            socket.bind(endpoint)
     except zmq.ZMQError as error:
         socket.close(linger=0)
         lock.release()
@@ -129,22 +138,35 @@ def bind(socket: zmq.Socket[bytes], endpoint: str, lock: EndpointLock) -> str:
     return socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
 
+@contextmanager
+def _owner_only() -> Iterator[None]:
+    """The mode of a socket's file is given by the umask alone, which all threads share: hence no longer than needed."""
+    with _umask_lock:
+        before = os.umask(0o177)
+        try:
+            yield
+        finally:
+            os.umask(before)
+
+
 class EndpointLock:
-    """Holds an ``ipc://`` path: ZeroMQ would silently take a living publisher's path over from it.
+    """Holds an ``ipc://`` path: ZeroMQ would silently take a living publisher's path over from it, or a file's.
 
     The kernel releases the lock when the process ends, however it ends. Other transports need none.
 
     Raises:
-        TransportError: somebody else holds it, or its folder does not exist.
+        TransportError: somebody else holds it, its folder does not exist, or a file is there that is no socket.
     """
 
     def __init__(self, endpoint: str) -> None:
-        self._file: IO[str] | None = None
+        self._file: IO[bytes] | None = None
         if not endpoint.startswith("ipc://"):
             return
-        path = Path(endpoint.removeprefix("ipc://") + ".lock")
+        path = Path(endpoint.removeprefix("ipc://"))
+        if os.path.lexists(path) and not stat.S_ISSOCK(path.lstat().st_mode):
+            raise TransportError(f"{endpoint}: a file is there that is no socket; move it, or choose another path")
         try:
-            file = path.open("a")
+            file = os.fdopen(open_unlinked(f"{path}.lock", os.O_RDWR | os.O_CREAT), "rb")
         except OSError as error:
             raise TransportError(f"{endpoint}: cannot be bound: {error}") from error
         try:

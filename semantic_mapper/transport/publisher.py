@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Literal
 
-import structlog
 import zmq
 
 from semantic_mapper.errors import CodecError, TransportError
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.transport.endpoints import EndpointLock, bind, check_bind
 from semantic_mapper.transport.framing import Buffer
 from semantic_mapper.transport.security import Keys, secure_server
@@ -25,7 +25,7 @@ _LATE_S = 0.1  # subscriptions of one socket come in no order; an end must not a
 _MAX_SUBSCRIPTIONS = 4096  # what a stranger's subscriptions may cost us
 _MAX_EVENTS = 256  # heard at a time: a stranger who subscribes without end must not hold up what is published
 
-log = structlog.get_logger(__name__)
+log = get_logger(__name__)
 
 
 class Publisher:

@@ -17,18 +17,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import structlog
 import zmq
 from zmq.auth import create_certificates, load_certificate
 from zmq.auth.thread import ThreadAuthenticator
 from zmq.utils import z85
 
 from semantic_mapper.errors import TransportError
+from semantic_mapper.files import write_bytes
+from semantic_mapper.log_events import get_logger
 
 _KEY_LETTERS = 40  # of a public key as text (Z85)
 _OWN, _PEERS = "own", "peers"
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 _lock = threading.Lock()
 _authenticators: weakref.WeakKeyDictionary[Any, ThreadAuthenticator] = weakref.WeakKeyDictionary()
 
@@ -121,11 +122,9 @@ def allow(folder: Path, name: str, public: str) -> None:
             f"'{public}' is no public key of {_KEY_LETTERS} letters; `semantic-mapper keys show` has it"
         )
     path = folder / _PEERS / f"{name}.key"
-    fresh = path.with_suffix(".new")
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        fresh.write_text(f'metadata\n    name = {name}\ncurve\n    public-key = "{public}"\n', encoding="utf-8")
-        fresh.replace(path)
+        write_bytes(path, f'metadata\n    name = {name}\ncurve\n    public-key = "{public}"\n'.encode())
     except OSError as error:
         raise TransportError(f"{path}: cannot be written: {error}") from error
 

@@ -10,10 +10,10 @@ from collections import deque
 from collections.abc import Sequence
 from types import TracebackType
 
-import structlog
 import zmq
 
 from semantic_mapper.errors import CodecError, TransportError
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.transport.codec import decode, read_envelope
 from semantic_mapper.transport.connections import Connections
 from semantic_mapper.transport.endpoints import check_connect
@@ -29,7 +29,7 @@ _POLL_MS = 50
 _KEEPALIVE = ((zmq.TCP_KEEPALIVE_IDLE, 2), (zmq.TCP_KEEPALIVE_INTVL, 1), (zmq.TCP_KEEPALIVE_CNT, 3))
 _MAX_SLOTS = 256  # cameras and nodes that a mailbox serves; a stranger's invented ones stop here
 
-log = structlog.get_logger(__name__)
+log = get_logger(__name__)
 
 
 class _Subscriber:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
@@ -41,7 +42,7 @@ def test_toml_and_json_hold_the_same(tmp_path: Path) -> None:
         (("fx = 300", "focal = 300"), "focal"),
         (("width = 320", ""), "width"),
         (("cx = 158", "cx = 400"), "outside of the 320x240"),
-        (("cx = 158", "cx = nan"), "principal point"),
+        (("cx = 158", "cx = nan"), "cx = nan"),
         (("-0.0005, 0.0]", "-0.0005, 0.0, 1.0]"), "6 coefficients"),
         (("-0.28", "nan"), "distortion"),
         (("fx = 300", "fx = "), "not valid TOML"),
@@ -65,6 +66,20 @@ def test_damaged_json_is_told(tmp_path: Path) -> None:
     (tmp_path / "lens.json").write_text("{")
     with pytest.raises(ConfigError, match="not valid JSON"):
         load_calibration(tmp_path / "lens.json")
+
+
+@pytest.mark.parametrize("name", ["lens.toml", "lens.json"])
+def test_hostile_calibrations_are_refused(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    nested = ("x = " if path.suffix == ".toml" else '{"x": ') + "[" * 20_000
+    for text in (nested, " " * (1 << 20) + "x"):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=name):
+            load_calibration(path)
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(ConfigError, match="is no regular file"):
+        load_calibration(path)
 
 
 def test_points_appear_where_the_rectified_pinhole_camera_sees_them(rng: np.random.Generator) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import SemanticMapperError, ShapeError
+from semantic_mapper.evaluation import canvas
 from semantic_mapper.evaluation.canvas import UNKNOWN, draw_text, new_canvas, shorten, text_width
 from semantic_mapper.evaluation.report import ViewStrip, class_colors, draw_overview, write_overview
 from semantic_mapper.labels import ROOMS
@@ -96,3 +97,12 @@ def test_long_text_is_cut_to_its_width_and_stays_on_the_canvas() -> None:
     draw_text(canvas, "wider than the canvas Küche", (30, 10), 15, (255, 255, 255))
     draw_text(canvas, "", (0, 0), 15, (255, 255, 255))
     assert canvas.shape == (20, 40, 3)
+
+
+def test_a_name_without_an_end_is_cut_in_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured: list[int] = []
+    width = canvas.text_width
+    monkeypatch.setattr(canvas, "text_width", lambda text, height: measured.append(len(text)) or width(text, height))
+    text = canvas.shorten("word " * 100_000, 600, 20)
+    assert text.endswith("...") and width(text, 20) <= 600 < width("word " * len(text), 20)
+    assert len(measured) <= 12 and max(measured) <= 603

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+from pathlib import Path
+
 import pytest
 
 from semantic_mapper import __version__
-from tests.nodes.support import run
+from tests.nodes.support import COMMAND, run, run_here
 
 VERBS = (
     "demo",
@@ -73,3 +77,26 @@ def test_no_heavy_package_is_loaded_for_help() -> None:
     code = "import sys, nodes.cli; print([m for m in ('torch', 'numpy', 'open3d', 'numba', 'cv2') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("number", ["inf", "nan", "1e308"])
+def test_numbers_that_nothing_can_be_computed_with_are_wrong_usage(number: str, tmp_path: Path) -> None:
+    code, said = run_here("label", tmp_path / "x.mcap", "--timeout", number)
+    assert code == 2 and "--timeout" in said
+
+
+def test_completion_of_bash_knows_verbs_and_options(tmp_path: Path) -> None:
+    def complete(line: str, **more: str) -> list[str]:
+        words = {"COMP_WORDS": line, "COMP_CWORD": str(len(line.split(" ")) - 1)}
+        environment = {**os.environ, "_SEMANTIC_MAPPER_COMPLETE": "complete_bash", **words, **more}
+        done = subprocess.run([str(COMMAND)], env=environment, capture_output=True, text=True, check=False)
+        return done.stdout.split()
+
+    assert complete("semantic-mapper re") == ["replay", "record", "recover"]
+    assert complete("semantic-mapper launch ") == ["list", "show", "copy"]
+    assert "--voxel-size" in complete("semantic-mapper replay --vo")
+    script = complete("", _SEMANTIC_MAPPER_COMPLETE="source_bash")
+    assert "complete" in script and "semantic-mapper" in script
+    home = {**os.environ, "HOME": str(tmp_path), "SHELL": "/bin/bash"}
+    subprocess.run([str(COMMAND), "--install-completion", "bash"], env=home, capture_output=True, check=True)
+    assert "semantic-mapper" in (tmp_path / ".bashrc").read_text()

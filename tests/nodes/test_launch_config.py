@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from datetime import datetime, tzinfo
 from pathlib import Path
 
@@ -259,3 +260,40 @@ def test_mistakes_are_named_with_the_mend(
 def test_launch_without_a_camera_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no node of kind 'camera'"):
         load_launch(_file(tmp_path, "node = []"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "change", "says"),
+    [
+        (["log=x"], ("[[node]]", "stop_s = 1e308\n[[node]]"), "stop_s = 1e+308: give a number between"),
+        (["log=x"], ("[[node]]", "heartbeat_s = inf\n[[node]]"), "heartbeat_s = inf"),
+        (["log=x"], ("[[node]]", "heartbeat_s = 1e7\n[[node]]"), "heartbeat_s = 1e+07"),
+        (["log=x"], ("[[node]]", "heartbeat_s = " + "9" * 5000 + "\n[[node]]"), "not valid TOML"),
+        (["log=x"], ("[[node]]", "x = " + "[" * 20000 + "\n[[node]]"), "not valid TOML"),
+        (["log=x"], ('mode = "realtime"', "subscriber_timeout_s = nan"), "options.subscriber_timeout_s = nan"),
+        (["log=x", "rate=inf"], ("", ""), "rate = inf"),
+        (["log=x", "rate=1e-300"], ("", ""), "rate"),
+        (["log=x", "rate=1e308"], ("", ""), "rate"),
+        (["log=x", "rate=" + "9" * 4094], ("", ""), "rate = a number of"),
+        (["log=x", "rate=" + "9" * 5000], ("", ""), "longer than 4096 letters"),
+        (["log=x", "rate=" + "[" * 4000], ("", ""), "rate"),
+        (["log=" + "x" * 5000], ("", ""), "longer than 4096 letters"),
+        (["log=a\udcff"], ("", ""), "log is not UTF-8"),
+        (["log=x"], ("{log}", "a\\u0000"), "log holds a NUL character"),
+        (["log=" + "x" * 4000], ("results/{log}.d", "{log}{log}"), "longer than 4096 letters"),
+        (["log=x"], ("[[node]]", '[[node]]\nname = "n"\nkind = "camera"\n' * 64 + "[[node]]"), "length <= 64"),
+    ],
+)
+def test_hostile_values_are_refused_by_name(
+    tmp_path: Path, settings: list[str], change: tuple[str, str], says: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_launch(_file(tmp_path, SMALL.replace(change[0], change[1], 1) if change[0] else SMALL), settings)
+    assert says in str(caught.value) and len(str(caught.value)) < 1500
+
+
+def test_a_launch_file_without_an_end_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    for path in (Path("/dev/zero"), tmp_path / "fifo"):
+        with pytest.raises(ConfigError, match="is no regular file"):
+            load_launch(path)

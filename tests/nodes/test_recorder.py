@@ -115,6 +115,16 @@ def sockets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     folder.rmdir()
 
 
+def test_a_recorder_whose_log_was_removed_fails(tmp_path: Path, sockets: Path) -> None:
+    with streaming(tmp_path, sockets, reserve_mb=0) as stream:
+        stream.publish(*range(4))
+        assert eventually((tmp_path / "a.mcap").exists, 30)
+        (tmp_path / "a.mcap").unlink()
+        stream.publisher.publish(encode_end(EndOfStream("camera", "end", 0)))
+        stream.recorder.join(60)
+        assert len(stream.failures) == 1 and "a.mcap: was removed while it was written" in str(stream.failures[0])
+
+
 def test_recorder_splits_packs_and_keeps_what_belongs_to_the_log(tmp_path: Path, sockets: Path) -> None:
     note = LaunchNote("kitchen.toml", (NodeNote("camera", "camera", {"log": "x"}),))
     (sockets / NOTE).write_bytes(msgspec.json.encode(note))

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 from itertools import islice
 from pathlib import Path
 
@@ -162,7 +163,14 @@ def test_stamps_come_from_timestamps_txt_where_there_is_one(folder: Path, text: 
         ("intrinsics.json", "{", "intrinsics.json"),
         ("intrinsics.json", '{"width": 32, "height": 24, "fx": "f"}', "intrinsics.json.*fx"),
         ("intrinsics.json", '{"width": 32, "height": 24, "fx": 0, "fy": 1, "cx": 1, "cy": 1}', "must be positive"),
+        ("intrinsics.json", '{"width": ' + "[" * 100_000, "intrinsics.json: "),
+        ("intrinsics.json", '{"width": 32, "height": 24, "fx": 1e300, "fy": 1, "cx": 1, "cy": 1}', "fx = 1e.300"),
+        ("intrinsics.json", " " * (1 << 20) + "{}", "larger than the limit"),
+        ("labels.json", f'{{"classes": {{"1": "{"x" * 5000}"}}}}', "labels.json: .*name of class 1 has 5,000 letters"),
+        ("labels.json", f'{{"id_space": "{"x" * 5000}", "classes": {{"1": "x"}}}}', "labels.json: .*its own name has"),
         ("labels.json", '{"classes": {"one": "wall"}}', "labels.json"),
+        ("labels.json", '{"classes": ' + '{"a":' * 100_000, "labels.json: "),
+        ("labels.json", " " * (1 << 20) + "{}", "larger than the limit"),
         ("labels.json", '{"classes": {"1": "wall", "2": "wall"}}', "twice"),
         ("poses.txt", "", "holds no pose"),
         ("timestamps.txt", "1\n2", "rising stamp"),
@@ -367,3 +375,23 @@ def test_the_kitchen_recording_is_imported_without_loss(redkitchen: Path, tmp_pa
             assert frame.depth_m is not None and np.array_equal(frame.depth_m, raw.astype(np.float32) / 1000)
             own = cv2.imread(str(redkitchen / "label" / f"{i:06d}.png"), cv2.IMREAD_UNCHANGED)
             assert np.array_equal(frame.label, own)
+
+
+@pytest.mark.parametrize("name", ["color/000001.jpg", "depth/000001.png", "label/000001.png"])
+def test_an_image_that_is_a_pipe_or_a_device_is_left_out(folder: Path, tmp_path: Path, name: str) -> None:
+    (folder / name).unlink()
+    for make in (lambda: os.mkfifo(folder / name), lambda: (folder / name).symlink_to("/dev/zero")):
+        make()
+        report = import_recording(folder, tmp_path / "out.mcap")
+        assert [(skipped.frame, skipped.file) for skipped in report.skipped] == [(1, folder / name)]
+        assert "is no regular file" in report.skipped[0].reason
+        (folder / name).unlink()
+        (tmp_path / "out.mcap").unlink()
+
+
+@pytest.mark.parametrize("name", ["poses.txt", "timestamps.txt", "labels.json", "intrinsics.json"])
+def test_a_list_that_is_a_pipe_stops_the_import(folder: Path, tmp_path: Path, name: str) -> None:
+    (folder / name).unlink(missing_ok=True)
+    os.mkfifo(folder / name)
+    with pytest.raises(ImportSourceError, match=f"{name}: is no regular file"):
+        import_recording(folder, tmp_path / "out.mcap")

@@ -377,3 +377,16 @@ def test_log_without_room_for_its_index_is_closed_without_one(
             log.write_parts(parts)
     with LogReader(tmp_path / "a.mcap") as reader:
         assert reader.finished and len(reader) == 3 and not reader.errors
+
+
+def test_a_log_that_was_removed_is_not_called_whole(tmp_path: Path) -> None:
+    for name, remove in (("folder", shutil.rmtree), ("file", lambda folder: (folder / "a.mcap").unlink())):
+        folder = tmp_path / name
+        folder.mkdir()
+        gone = recording(folder / "a.mcap", RecordingRules())
+        write(gone, range(3))
+        assert not gone.gone
+        remove(folder)
+        write(gone, range(3, 6))
+        gone.close()
+        assert gone.gone and "whole" not in gone.trouble

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.files import atomic_path
 
 
 @contextmanager
@@ -20,18 +20,13 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
     """
     with whole_path(path) as temporary, temporary.open("wb") as file:
         yield file
-        file.flush()
-        os.fsync(file.fileno())
 
 
 @contextmanager
 def whole_path(path: Path) -> Iterator[Path]:
     """As ``whole_file``, for writers that open their file themselves: a name beside ``path`` to write to."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        yield temporary
-        temporary.replace(path)
+        with atomic_path(path) as temporary:
+            yield temporary
     except OSError as error:
-        raise MapError(f"{path}: cannot be written: {error}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
+        raise MapError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -1,0 +1,161 @@
+"""Files that people name: read with a limit, and written so that each is there whole, or as it was before.
+
+What is written goes to a new file beside the one that it becomes, under a name that nobody can foresee, and takes its
+place in one step (``rename``): an existing link is replaced, never written through. The new file is locked while it is
+written, so that what a killed process has left can be told from what another one is about to finish.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import secrets
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from semantic_mapper.errors import ConfigError
+
+_PART = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{12}\.part", re.DOTALL)
+_NAME_BYTES = 200  # of the final name that are part of the other one: names end at 255
+
+
+def read_regular(path: Path, limit: int) -> bytes:
+    """All bytes of a regular file.
+
+    Args:
+        path: Of the file. Pipes, devices and sockets are refused: they may never end, or never begin.
+        limit: Largest size in bytes.
+
+    Raises:
+        ConfigError: no regular file, or a larger one.
+        OSError: it is missing or cannot be read; ``filename`` is set.
+    """
+    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe without a writer must not block
+    status = os.fstat(fd)
+    if not stat.S_ISREG(status.st_mode):
+        os.close(fd)
+        raise ConfigError(f"{path}: is no regular file; copy its content to one")
+    with os.fdopen(fd, "rb") as file:
+        data = file.read(min(status.st_size, limit) + 1)
+        while len(data) <= limit and (more := file.read(1 << 16)):  # it grows, or is the kernel's and has no size
+            data += more
+    if len(data) > limit:
+        raise ConfigError(f"{path}: is larger than the limit of {limit:,} bytes; is it the right file?")
+    return data
+
+
+@contextmanager
+def atomic_write(path: Path) -> Iterator[BinaryIO]:
+    """Give a file to write; at the end its content is on the disk, and it takes the place of ``path``.
+
+    After an error nothing is left of it, and ``path`` is as it was. Two writers at a time do not mix: the last one to
+    end wins. What killed writers of this path have left is removed.
+
+    Args:
+        path: Of the file, in a folder that exists. A link is replaced, and what it points to stays as it is.
+
+    Raises:
+        OSError: it cannot be written; ``filename`` is ``path``.
+    """
+    with atomic_path(path) as part, part.open("wb") as file:
+        yield file
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """As ``atomic_write``, for writers that open their file themselves: an empty file to be written to."""
+    try:
+        remove_stale(path.parent, path.name)
+        part, lock = _new_part(path)
+        try:
+            yield part
+            _sync(part)
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
+            os.close(lock)
+    except OSError as error:
+        if isinstance(error.filename, str) and _PART.fullmatch(os.path.basename(error.filename)):
+            error.filename, error.filename2 = str(path), None
+        raise
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """``Path.write_bytes`` by ``atomic_write``."""
+    with atomic_write(path) as file:
+        file.write(data)
+
+
+def open_unlinked(path: str | Path, flags: int) -> int:
+    """``os.open`` that follows no link at the end of ``path``, and makes the file where ``flags`` has ``O_CREAT``.
+
+    Raises:
+        OSError: as of ``os.open``; ELOOP for a link.
+    """
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+
+
+def remove_stale(folder: Path, name: str = "") -> list[Path]:
+    """Remove unfinished files that killed processes have left in a folder; those that are being written stay.
+
+    Args:
+        folder: Of the files.
+        name: Only those that were to become this one; empty = all.
+
+    Returns:
+        What was removed.
+    """
+    removed = []
+    with suppress(OSError):  # no such folder, or one of somebody else: nothing of ours to remove
+        for entry in os.scandir(folder):
+            match = _PART.fullmatch(entry.name)
+            if match is None or (name and match["name"] != _cut(name)):
+                continue
+            if _remove_unlocked(entry.path):
+                removed.append(Path(entry.path))
+    return removed
+
+
+def _cut(name: str) -> str:
+    return os.fsencode(name)[:_NAME_BYTES].decode(errors="ignore")
+
+
+def _new_part(path: Path) -> tuple[Path, int]:
+    """A new file beside ``path``, and its lock."""
+    while True:
+        part = path.with_name(f".{_cut(path.name)}.{secrets.token_hex(6)}.part")
+        lock = open_unlinked(part, os.O_RDWR | os.O_CREAT | os.O_EXCL)
+        with suppress(OSError):  # file systems without locks: there nothing is ever taken for stale, either
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.fstat(lock).st_nlink:
+            return part, lock
+        os.close(lock)  # taken for stale before it was locked
+
+
+def _remove_unlocked(path: str) -> bool:
+    try:
+        lock = open_unlinked(path, os.O_RDWR | os.O_NONBLOCK)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if stat.S_ISREG(os.fstat(lock).st_mode):
+            os.unlink(path)
+            return True
+    except OSError:  # it is being written, or another process was quicker
+        return False
+    finally:
+        os.close(lock)
+    return False
+
+
+def _sync(part: Path) -> None:
+    fd = open_unlinked(part, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)

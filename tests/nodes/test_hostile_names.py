@@ -1,0 +1,160 @@
+"""Names of classes, attachments, cameras and files are text for every verb, whatever they hold."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.table import Table
+
+from nodes.child import Child
+from nodes.console import Output, frame_progress, stderr_console
+from nodes.html_page import HtmlPage
+from nodes.options import NodeJob
+from replay.log import LogAttachment, LogWriter
+from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
+from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.plain_text import visible
+from semantic_mapper.transport.messages import StreamInfo
+from tests.nodes.support import error_line, run, run_here
+from tests.small import INTRINSICS, tiny_field, tiny_frames
+
+NAMES = ("[/b]", "[bold]x", "a\x1b]0;title\x07", "over\rwritten", "turned\u202eback", "two\nlines", ":smile:", "<i>&")
+SHOWN = (
+    "[/b]",
+    "[bold]x",
+    r"a\x1b]0;title\x07",
+    r"over\rwritten",
+    r"turned\u202eback",
+    r"two\nlines",
+    ":smile:",
+    "<i>&",
+)
+HOSTILE = LabelSet("set[/b]\x1b[2J", ROOMS.ids, NAMES + ROOMS.names[len(NAMES) :], ROOMS.colors)
+
+
+@pytest.fixture(scope="module")
+def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log and weights whose classes, source, metadata and attachment have hostile names."""
+    folder = tmp_path_factory.mktemp("hostile")
+    info = StreamInfo(
+        source="log [/b]\x1b[2J",
+        cameras={"rooms": INTRINSICS},
+        label_set=HOSTILE,
+        frame_count=4,
+        metadata={"[/b]\x1b": "[/red]\u202e"},
+    )
+    files = [LogAttachment(name, "text/plain", b"x") for name in ("[/b].txt", "\x1b[31m.txt")]
+    with LogWriter(folder / "log.mcap", info, attachments=files) as log:
+        for frame in tiny_frames(4):
+            log.write_frame(frame)
+    recipe = {"kind": "test", "width": 96, "train_stamps_ns": []}
+    save_checkpoint(Checkpoint(tiny_field(HOSTILE), (), recipe), folder / "tiny.safetensors")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def results(hostile: Path, config: Path) -> Path:
+    out = hostile / "run"
+    code, said = run_here(
+        "replay", hostile / "log.mcap", "--out", out, "--weights", hostile / "tiny.safetensors", "--config", config
+    )
+    assert code == 0, said
+    check_plain(said)
+    assert "IoU [/b]" in said and "IoU [bold]x" in said
+    return out
+
+
+def check_plain(said: str) -> None:
+    assert visible(said) == said and "Traceback" not in said, said
+
+
+def test_info_shows_all_names_as_they_are(hostile: Path) -> None:
+    code, said = run_here("info", hostile / "log.mcap")
+    assert code == 0, said
+    check_plain(said)
+    for name in (*SHOWN, "file [/b].txt", r"file \x1b[31m.txt", r"log [/b]\x1b[2J", r"[/red]\u202e"):
+        assert "".join(name.split()) in "".join(said.split()).replace("│", ""), name
+
+
+def test_names_in_results_maps_and_scores_are_text(hostile: Path, results: Path, config: Path, tmp_path: Path) -> None:
+    log, weights = hostile / "log.mcap", hostile / "tiny.safetensors"
+    for arguments in (
+        ("info", results / "map.npz"),
+        ("eval", results),
+        ("eval", log, "--weights", weights, "--config", config, "--json", tmp_path / "eval.json"),
+        ("compare", results, results),
+        ("query", results, "instances"),
+        ("query", results, "class", "[/b]"),
+        ("export", results, "--out", tmp_path / "map.ply"),
+        ("export", log, "--out", tmp_path / "folder", "--format", "folder"),
+        ("recover", log, tmp_path / "recovered.mcap"),
+        ("correct", results, "--poses", tmp_path / "[/b]\x1b.txt"),
+        ("label", log, "--to", "ipc:///[/b]\x1b"),
+        ("finetune", log, "--out", tmp_path / "[/b]" / "w.safetensors", "--weights", tmp_path / "[/b]\x1b"),
+        ("merge", results, results, "--out", tmp_path / "merged[/b].npz"),
+        ("up", tmp_path / "[/b]\x1b.toml"),
+        ("view", tmp_path / "[/b]\x1b.mcap"),
+        ("top", "ipc:///[/b]\x1b"),
+    ):
+        _, said = run_here(*arguments)
+        check_plain(said)
+
+
+def test_report_pages_hold_names_as_text(results: Path) -> None:
+    page = (results / "report.html").read_text(encoding="utf-8")
+    assert visible(page, keep="\n") == page
+    assert r"log [/b]\x1b[2J" in page and "IoU [/b]" in page
+    made = HtmlPage("<b>\u202e")
+    made.rows(("<i>",), [("\x1b[2J",)])
+    made.write(results / "made.html")
+    text = (results / "made.html").read_text(encoding="utf-8")
+    assert "<b>" not in text and r"\x1b[2J" in text and r"\u202e" in text
+
+
+def test_error_lines_show_names_as_they_are(tmp_path: Path) -> None:
+    done = run("info", tmp_path / "[/b]\x1b]0;x\x07\nerror: forged\u202e.mcap")
+    assert done.returncode == 1
+    line = error_line(done.stderr)
+    assert r"[/b]\x1b]0;x\x07" in line and r"\u202e" in line and "\x1b" not in done.stderr
+
+
+def test_events_and_lines_of_nodes_are_plain(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    options = {"log": str(tmp_path / "gone[/b]\x1b]0;x\x07.mcap"), "mode": "fast"}
+    child = Child("camera", NodeJob(name="camera", options=options))
+    try:
+        assert child.wait(60)
+        assert "gone[/b]" in child.describe_end() and "\x1b" not in child.describe_end()
+    finally:
+        child.close()
+    said = capfd.readouterr().err
+    assert "gone[/b]" in said and "\x1b" not in said
+
+
+@pytest.mark.parametrize(("name", "shown"), tuple(zip(NAMES, SHOWN, strict=True)))
+def test_every_place_of_a_table_and_a_line_is_plain(name: str, shown: str) -> None:
+    stream = io.StringIO()
+    output = Output(stream)
+    output.console.width = 200
+    table = Table("head " + name, title="title " + name, caption="caption " + name)
+    table.add_row("cell " + name)
+    output.print(table)
+    output.print("line " + name)
+    for place in ("head", "title", "caption", "cell", "line"):
+        assert f"{place} {shown}" in stream.getvalue()
+    assert len(stream.getvalue().splitlines()) == 8  # title, table of 5 lines, caption, line
+
+
+def test_progress_is_plain(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm")
+    with frame_progress("play [/b]\x1b]0;x\x07", 3) as bar:
+        bar.set(1, note="[/b]\x1b]0;y\x07")
+    said = capsys.readouterr().err
+    assert r"play [/b]\x1b]0;x\x07" in said and r"[/b]\x1b]0;y\x07" in said and "\x1b]0" not in said
+
+
+def test_messages_in_a_style_are_plain(capsys: pytest.CaptureFixture[str]) -> None:
+    stderr_console().print("stopped; the map is in /tmp/[/b]\x1b[2J", style="yellow")
+    assert r"/tmp/[/b]\x1b[2J" in capsys.readouterr().err

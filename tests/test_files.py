@@ -1,0 +1,81 @@
+"""Files that people name are read with a limit, and never waited for."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.files import atomic_write, open_unlinked, read_regular, remove_stale, write_bytes
+
+
+def test_a_regular_file_is_read_up_to_the_limit(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"12345")
+    assert read_regular(path, 5) == b"12345"
+    with pytest.raises(ConfigError, match=r"file: is larger than the limit of 4 bytes"):
+        read_regular(path, 4)
+    assert read_regular(Path("/proc/self/status"), 1 << 20).startswith(b"Name:")  # has no size
+
+
+def test_what_may_never_end_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    for path in (Path("/dev/zero"), tmp_path / "fifo", tmp_path):
+        with pytest.raises(ConfigError, match=f"{path}: is no regular file"):
+            read_regular(path, 10)
+    with pytest.raises(FileNotFoundError):
+        read_regular(tmp_path / "gone", 10)
+
+
+def test_a_link_is_replaced_and_what_it_points_to_stays(tmp_path: Path) -> None:
+    (tmp_path / "target").write_bytes(b"precious")
+    (tmp_path / "file").symlink_to(tmp_path / "target")
+    write_bytes(tmp_path / "file", b"result")
+    assert (tmp_path / "target").read_bytes() == b"precious"
+    assert not (tmp_path / "file").is_symlink() and (tmp_path / "file").read_bytes() == b"result"
+    (tmp_path / "link").symlink_to(tmp_path / "target")
+    for flags in (os.O_WRONLY | os.O_CREAT, os.O_WRONLY | os.O_APPEND):
+        with pytest.raises(OSError, match="link"):
+            open_unlinked(tmp_path / "link", flags)
+
+
+def test_an_error_leaves_the_file_as_it_was_and_nothing_beside_it(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"old")
+    with pytest.raises(ZeroDivisionError), atomic_write(path) as file:
+        file.write(bytes([1 // 0]))
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+    with pytest.raises(FileNotFoundError) as caught, atomic_write(tmp_path / "none" / "file"):
+        pass
+    assert caught.value.filename == str(tmp_path / "none" / "file")
+
+
+def test_a_new_file_has_the_mode_of_any_and_may_have_the_longest_name(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        write_bytes(tmp_path / ("ä" * 127), b"x")
+    finally:
+        os.umask(before)
+    assert (tmp_path / ("ä" * 127)).stat().st_mode & 0o777 == 0o640
+
+
+def test_what_killed_writers_left_is_removed_and_what_is_being_written_stays(tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    start = "import os, signal; from pathlib import Path; from semantic_mapper.files import atomic_write\n"
+    killed = f"with atomic_write(Path({str(path)!r})) as f:\n    f.write(b'x'); os.kill(os.getpid(), signal.SIGKILL)"
+    assert subprocess.run([sys.executable, "-c", start + killed], check=False).returncode == -signal.SIGKILL
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".map.npz.") and left.name.endswith(".part")
+    others = (tmp_path / ".hidden.part", tmp_path / "map.npz.part", tmp_path / ".map.npz.nothexnothex.part")
+    for other in others:
+        other.touch()
+    with atomic_write(tmp_path / "other") as file:
+        file.write(b"y")
+        assert remove_stale(tmp_path, "other") == []
+        assert remove_stale(tmp_path) == [left]
+    assert sorted(tmp_path.iterdir()) == sorted((*others, tmp_path / "other"))
