@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from nodes.console import Output, frame_progress
 from nodes.verb import EXIT_FAILED, verb
+
+if TYPE_CHECKING:
+    from replay.importers import ImportReport
 
 LISTED = 10  # skipped files and damages that are shown one by one
 
@@ -60,6 +63,7 @@ def import_(
         )
     labels = "no labels" if not report.labelled else f"{report.labelled} of them labelled"
     output.print(f"{log}: {report.frames} frames ({labels}), {report.bytes / 1e6:.1f} MB, from a '{report.format}'")
+    output.print(f"  depth: {_depth_line(report)}")
     for notice in report.notices:
         output.print(f"  note: {notice}")
     for skipped in report.skipped[:LISTED]:
@@ -67,6 +71,15 @@ def import_(
         output.print(f"  {what}: frame {skipped.frame}: {skipped.file}: {skipped.reason}")
     if len(report.skipped) > LISTED:
         output.print(f"  and {len(report.skipped) - LISTED} more")
+
+
+def _depth_line(report: ImportReport) -> str:
+    if not report.with_depth:
+        return "no frame has a depth image"
+    missing = report.frames - report.with_depth
+    without = f"; {missing} of {report.frames} frames have no depth image" if missing else ""
+    median = f"; half of the first image is nearer than {report.median_depth_m:.2f} m" if report.median_depth_m else ""
+    return f"{report.depth_scale}{median}{without}"
 
 
 @verb
