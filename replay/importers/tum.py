@@ -61,6 +61,8 @@ class TumRecording:
         self._options = options
         self._intrinsics = self._read_intrinsics()
         self._color = self._read_list(folder / "rgb.txt")
+        if not self._color:
+            raise ImportSourceError(f"{folder / 'rgb.txt'}: holds no line 'stamp file'")
         depth = self._read_depth_list()
         self._pose_stamps, self._poses = read_trajectory(folder / "groundtruth.txt", self.notices)
         self._depth_of = match_nearest(
@@ -124,10 +126,11 @@ class TumRecording:
         return _DEFAULT
 
     def _read_depth_list(self) -> list[tuple[int, Path]]:
-        if (self._folder / "depth.txt").exists():
-            return self._read_list(self._folder / "depth.txt")
-        self.notices.append("no depth.txt: frames come without depth")
-        return []
+        file = self._folder / "depth.txt"
+        entries = self._read_list(file) if file.exists() else []
+        if not entries:
+            self.notices.append("no depth.txt, or no image in it: frames come without depth")
+        return entries
 
     def _read_list(self, file: Path) -> list[tuple[int, Path]]:
         entries: list[tuple[int, Path]] = []
@@ -137,8 +140,6 @@ class TumRecording:
                 entries.append((seconds_to_ns(words[0]), self._inside(words[1].strip())))
             except (ValueError, IndexError) as error:
                 self.notices.append(f"{file}, line {line} is passed over: expected 'stamp file' ({error})")
-        if not entries:
-            raise ImportSourceError(f"{file}: holds no line 'stamp file'")
         return sorted(entries, key=lambda entry: entry[0])
 
     def _inside(self, name: str) -> Path:
