@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
 LISTED = 10  # skipped files and damages that are shown one by one
 
-MAP_SUFFIX = ".npz"
-
 
 @verb
 def import_(
@@ -86,7 +84,10 @@ def _depth_line(report: ImportReport) -> str:
 def info(
     file: Annotated[
         list[Path],
-        typer.Argument(metavar="FILE...", help="Recorded log (.mcap), its parts or their folder; or saved map (.npz)."),
+        typer.Argument(
+            metavar="FILE...",
+            help="Recorded log (.mcap), its parts or their folder; or saved map, or a folder with map.npz.",
+        ),
     ],
     json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
 ) -> int:
@@ -96,13 +97,15 @@ def info(
     what the file says of itself, which is quick however large the map is.
 
     Example: semantic-mapper info kitchen.mcap
-    Example: semantic-mapper info runs/demo/map.npz
+    Example: semantic-mapper info runs/demo
     """
     output = Output.guarded()
-    if file[0].suffix == MAP_SUFFIX:
+    from nodes.saved_maps import is_map, map_path
+
+    if is_map(file[0]):
         if len(file) > 1:
             raise typer.BadParameter("one map at a time")
-        return _map_info(output, file[0], json)
+        return _map_info(output, map_path(file[0]), json)
     from nodes.log_info import describe_log, info_table
 
     with frame_progress("read", None, unit="messages") as bar:
