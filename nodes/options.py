@@ -9,6 +9,9 @@ import msgspec
 from semantic_mapper.config import Config
 
 SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # of transport/topics.py, which loads what the launcher has no need of
+# Of drivers/registry.py and drivers/poses/config.py, for the same reason.
+CAMERA_KINDS = ("v4l2", "opencv", "oak")
+POSE_KINDS = ("device", "fixed", "topic", "board", "rgbd")
 ENDPOINT_PATTERN = r"^([a-z]+://.+|)\Z"
 
 Text = Annotated[str, msgspec.Meta(min_length=1)]
