@@ -93,6 +93,11 @@ class Camera(Protocol):
         ...
 
     @property
+    def can_wait(self) -> bool:
+        """Whether its images wait until they are taken, as those of a file do; known before it is open."""
+        ...
+
+    @property
     def turned_at(self) -> float:
         """When the driver last came round (``time.monotonic``), with an image or without: while it waits for a device
         that is away or gives nothing, too, but not while a call into the device hangs. Any thread may ask."""

@@ -129,6 +129,11 @@ class LiveCamera:
         return tuple(told)
 
     @property
+    def can_wait(self) -> bool:
+        """As of ``Camera``."""
+        return False
+
+    @property
     def turned_at(self) -> float:
         """As of ``Camera``."""
         return min(self._read_at, self._asked_at)

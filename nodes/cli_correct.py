@@ -12,6 +12,7 @@ import typer
 from nodes.console import Output, frame_progress
 from nodes.identity import KeysOption, ServerOption, server_identity
 from nodes.verb import EXIT_FAILED, verb
+from semantic_mapper.errors import ConfigError
 
 if TYPE_CHECKING:
     from semantic_mapper.client import Correction, MapClient
@@ -56,6 +57,11 @@ def correct(
     from semantic_mapper.client import MapClient
     from semantic_mapper.mapping.pose_correction import ALWAYS
 
+    if "://" not in endpoint and Path(endpoint).exists():
+        raise ConfigError(
+            f"{endpoint}: is no running mapper; a saved map keeps no frames to correct, so map its log again with "
+            f"`semantic-mapper replay LOG --corrections {file} --out FOLDER`"
+        )
     trajectory = read_corrections(file)
     pairs = zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)
     poses = {(camera, stamp_ns): pose for stamp_ns, pose in pairs}

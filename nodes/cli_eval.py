@@ -125,9 +125,13 @@ def _evaluate_targets(
     output = Output.guarded()
     from nodes.report_page import write_eval_report
     from nodes.results import print_results
-    from nodes.saved_maps import is_log
+    from nodes.saved_maps import MAP_SUFFIX, is_log
     from replay.artifacts import write_json
+    from semantic_mapper.errors import ConfigError
 
+    for target in targets:
+        if target.suffix == MAP_SUFFIX:
+            raise ConfigError(f"{target}: is a map alone; give the folder with its summary.json, or a log")
     logs = [t for t in targets if is_log(t) or not t.is_dir()]
     folders = [t for t in targets if t not in logs]
     if mesh is not None and not folders:

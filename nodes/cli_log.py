@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from nodes.console import Output, frame_progress
 from nodes.verb import EXIT_FAILED, verb
 
-LISTED = 10  # skipped files and damages that are shown one by one
+if TYPE_CHECKING:
+    from replay.importers import ImportReport
 
-MAP_SUFFIX = ".npz"
+LISTED = 10  # skipped files and damages that are shown one by one
 
 
 @verb
@@ -60,6 +61,7 @@ def import_(
         )
     labels = "no labels" if not report.labelled else f"{report.labelled} of them labelled"
     output.print(f"{log}: {report.frames} frames ({labels}), {report.bytes / 1e6:.1f} MB, from a '{report.format}'")
+    output.print(f"  depth: {_depth_line(report)}")
     for notice in report.notices:
         output.print(f"  note: {notice}")
     for skipped in report.skipped[:LISTED]:
@@ -69,11 +71,23 @@ def import_(
         output.print(f"  and {len(report.skipped) - LISTED} more")
 
 
+def _depth_line(report: ImportReport) -> str:
+    if not report.with_depth:
+        return "no frame has a depth image"
+    missing = report.frames - report.with_depth
+    without = f"; {missing} of {report.frames} frames have no depth image" if missing else ""
+    median = f"; half of the first image is nearer than {report.median_depth_m:.2f} m" if report.median_depth_m else ""
+    return f"{report.depth_scale}{median}{without}"
+
+
 @verb
 def info(
     file: Annotated[
         list[Path],
-        typer.Argument(metavar="FILE...", help="Recorded log (.mcap), its parts or their folder; or saved map (.npz)."),
+        typer.Argument(
+            metavar="FILE...",
+            help="Recorded log (.mcap), its parts or their folder; or saved map, or a folder with map.npz.",
+        ),
     ],
     json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
 ) -> int:
@@ -83,13 +97,15 @@ def info(
     what the file says of itself, which is quick however large the map is.
 
     Example: semantic-mapper info kitchen.mcap
-    Example: semantic-mapper info runs/demo/map.npz
+    Example: semantic-mapper info runs/demo
     """
     output = Output.guarded()
-    if file[0].suffix == MAP_SUFFIX:
+    from nodes.saved_maps import is_map, map_path
+
+    if is_map(file[0]):
         if len(file) > 1:
             raise typer.BadParameter("one map at a time")
-        return _map_info(output, file[0], json)
+        return _map_info(output, map_path(file[0]), json)
     from nodes.log_info import describe_log, info_table
 
     with frame_progress("read", None, unit="messages") as bar:

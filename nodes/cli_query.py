@@ -42,7 +42,9 @@ class Asked(NamedTuple):
 def query(
     source: Annotated[
         str,
-        typer.Argument(metavar="MAP", help="Saved map (map.npz), or where a mapper answers (ipc://PATH, tcp://...)."),
+        typer.Argument(
+            metavar="MAP", help="Saved map or folder of results, or where a mapper answers (ipc://PATH, tcp://...)."
+        ),
     ],
     question: Annotated[Question, typer.Argument(metavar="QUESTION", help="info, at, nearest or instances.")],
     arguments: Annotated[
@@ -66,7 +68,7 @@ def query(
     the point is free, occupied or unknown. nearest: the surface of a class that is nearest to a point. instances: all
     things, that is, connected pieces of one class that is not wall, floor or the like, with upright boxes.
 
-    Example: semantic-mapper query runs/demo/map.npz info
+    Example: semantic-mapper query runs/demo info
     Example: semantic-mapper query runs/demo/map.npz at 1.2 -0.4 0.8
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1 --min-confidence 0.5
     Example: semantic-mapper query runs/demo/map.npz instances --up 0 0 1 --json things.json
@@ -93,16 +95,17 @@ def ask_file(source: str, asked: Asked) -> dict[str, Any]:
     """Answer of a saved map.
 
     Raises:
-        MapError, LabelError: no map file, or a question that cannot be answered.
+        ConfigError, MapError, LabelError: no map there, or a question that cannot be answered.
     """
     from nodes import map_answers
+    from nodes.saved_maps import map_path
     from semantic_mapper.mapping.voxel_map import VoxelMap
     from semantic_mapper.queries.instances import InstanceTracker
     from semantic_mapper.queries.lookup import at
     from semantic_mapper.queries.mirror import MapMirror
     from semantic_mapper.queries.nearest import nearest
 
-    snapshot = MapMirror.of(VoxelMap.load(Path(source))).snapshot()
+    snapshot = MapMirror.of(VoxelMap.load(map_path(Path(source)))).snapshot()
     match asked.question:
         case Question.INFO:
             return map_answers.describe_map(snapshot)

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 LEAST_MEMORY_MB = 64
 POLL_S = 0.2
-MAP_SUFFIX = ".npz"
 
 PortOption = Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the web page; 0 = any that is free.")]
 DataPortOption = Annotated[
@@ -145,11 +144,9 @@ def _is_log(source: str) -> bool:
 
 def _saved_map(path: Path, source: str) -> Path | None:
     """The file of a saved map, where the source is one."""
-    from nodes.saved_maps import MAP_NAME
+    from nodes.saved_maps import is_map, map_path
 
-    if path.suffix == MAP_SUFFIX:
-        return path
-    return path / MAP_NAME if source and (path / MAP_NAME).is_file() else None
+    return map_path(path) if source and is_map(path) else None
 
 
 def _find_live(source: str, query: str, server: str, keys: Path | None) -> Live:

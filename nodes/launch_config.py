@@ -15,7 +15,9 @@ import msgspec
 
 from nodes.camera_ids import check_camera_ids
 from nodes.options import (
+    CAMERA_KINDS,
     OPTIONS,
+    POSE_KINDS,
     CameraOptions,
     Count,
     FinetunerOptions,
@@ -211,7 +213,31 @@ def _convert_options(node: NodeEntry, values: Mapping[str, Value], path: Path) -
         if key in required and whole is not None and values.get(whole[1]) == "":
             raise ConfigError(f"{where}: needs '{key}'; give it with --set {whole[1]}=... or in the file's [set] table")
     plain = {key: _fill_in(value, values, f"{where}: {key}") for key, value in node.options.items()}
+    _check_camera_kinds(plain.get("camera"), where)
     return convert_config(plain, OPTIONS[node.kind], where)
+
+
+def _check_camera_kinds(camera: Any, where: str) -> None:
+    """Say at once, before a mapper has started, what the camera's own process would refuse much later.
+
+    Raises:
+        ConfigError: no such kind of camera or of poses, or no poses at all.
+    """
+    if not isinstance(camera, dict):
+        return
+    kind, poses = camera.get("kind"), camera.get("poses")
+    if isinstance(kind, str) and kind not in CAMERA_KINDS:
+        raise ConfigError(f"{where}: `camera.kind`: no kind of camera is called '{kind}'{_nearest(kind, CAMERA_KINDS)}")
+    if poses is None:
+        raise ConfigError(
+            f"{where}: `camera.poses` is missing: a camera alone does not know where it is. Write "
+            '[node.options.camera.poses] with kind = "topic" (odometry from a socket), "board" (a printed board), '
+            '"rgbd" (odometry from depth), "device" (it tracks itself, OAK) or "fixed" (it never moves); for example '
+            'poses = { kind = "topic", endpoint = "tcp://127.0.0.1:5560" }'
+        )
+    if isinstance(poses, dict) and poses.get("kind") not in POSE_KINDS:
+        named = str(poses.get("kind", ""))
+        raise ConfigError(f"{where}: `camera.poses.kind`: '{named}' is no source of poses{_nearest(named, POSE_KINDS)}")
 
 
 def _fill_in(value: Any, values: Mapping[str, Value], where: str) -> Any:

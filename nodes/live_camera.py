@@ -1,11 +1,14 @@
-"""The camera node over a camera: posed frames go out, are dropped rather than held back, and troubles are told."""
+"""The camera node over a camera: posed frames go out, and its troubles with them.
+
+Frames of a live camera are dropped rather than held back; those of a video file wait for their readers.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, Self
@@ -20,6 +23,7 @@ from semantic_mapper.errors import CameraError, ConfigError, TransportError
 if TYPE_CHECKING:
     from drivers.base import Camera, FrameSource
     from drivers.mounts import Mount
+    from semantic_mapper.transport.codec import Parts
     from semantic_mapper.transport.messages import EndReason, NodeState
     from semantic_mapper.transport.sockets import Publisher
     from semantic_mapper.types import PosedFrame
@@ -29,6 +33,11 @@ if TYPE_CHECKING:
 
         @property
         def troubles(self) -> tuple[str, ...]:
+            """As of ``Camera``."""
+            ...
+
+        @property
+        def can_wait(self) -> bool:
             """As of ``Camera``."""
             ...
 
@@ -49,6 +58,7 @@ if TYPE_CHECKING:
 
 STATUS_PERIOD_S = 1.0
 POLL_S = 0.05  # how soon a stop request is passed on
+SEND_SLICE_S = 0.2  # between two looks at whether to stop, while a reader has no room for the next frame
 FIRST_PAUSE_S = 0.2  # before a camera that could not be opened is tried again; doubles each time
 MAX_PAUSE_S = 2.0
 
@@ -67,11 +77,11 @@ def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCame
     """
     from semantic_mapper.transport.sockets import Publisher
 
-    make_source(live)  # mistakes in the config are told before anything waits for the camera
+    policy = "block" if make_source(live).can_wait else "drop"  # mistakes in the config are found here, before any wait
     if context.comes_back:
         check_world(context.name, live)
     context = context.await_turn()
-    with Publisher(context.endpoint(context.name), policy="drop") as publisher, _Teller(context, publisher) as teller:
+    with Publisher(context.endpoint(context.name), policy=policy) as publisher, _Teller(context, publisher) as teller:
         context.heart.ready()  # a camera may be plugged in much later
         with ExitStack() as stack:
             source = _open(context, live, teller, stack)
@@ -198,7 +208,8 @@ def _publish(
         for frame in source:
             if context.stop:
                 break
-            publisher.publish(encode_frame(frame))
+            if not _send_frame(context, options, publisher, encode_frame(frame)):
+                break
             teller.sent(frame)
             if options.max_frames and teller.published >= options.max_frames:
                 break
@@ -208,8 +219,35 @@ def _publish(
         raise
     finally:
         if reason != "error" or not context.comes_back:  # else the stream goes on with the process after this one
-            publisher.publish(encode_end(EndOfStream(context.name, reason, teller.published, detail)))
+            _send_end(publisher, encode_end(EndOfStream(context.name, reason, teller.published, detail)))
         _log.info("published", frames=teller.published, reason=reason)
+
+
+def _send_frame(context: NodeContext, options: CameraOptions, publisher: Publisher, parts: Parts) -> bool:
+    """Publish one frame, and wait for readers that must not lose any; False where a stop request came first.
+
+    Raises:
+        TransportError: a reader has had no room for it within ``ack_timeout_s``.
+    """
+    deadline = time.monotonic() + options.ack_timeout_s
+    while not context.stop:
+        try:
+            publisher.publish(parts, SEND_SLICE_S)
+            return True
+        except TransportError as error:
+            if time.monotonic() > deadline:
+                raise TransportError(
+                    f"camera node '{context.name}': a reader has taken no frame for {options.ack_timeout_s:g} s "
+                    "(ack_timeout_s); it hangs, or needs longer than that for one frame"
+                ) from error
+        context.heart.turn()
+    return False
+
+
+def _send_end(publisher: Publisher, parts: Parts) -> None:
+    """Publish the end of the stream; readers without room for it now are reminded of it while the node drains."""
+    with suppress(TransportError):  # the publisher keeps it for ``remind``
+        publisher.publish(parts, SEND_SLICE_S)
 
 
 class _Teller:
@@ -302,4 +340,5 @@ class _Teller:
             troubles = self._source.troubles
         ages = {} if self._sent_at is None else {"frame": time.monotonic() - self._sent_at}
         status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, troubles)
-        self._publisher.publish(encode_status(status))
+        with suppress(TransportError):  # a reader has no room for it: the next status says what this one did
+            self._publisher.publish(encode_status(status), 0.0)

@@ -9,6 +9,9 @@ import msgspec
 from semantic_mapper.config import Config, Positive
 
 SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # of transport/topics.py, which loads what the launcher has no need of
+# Of drivers/registry.py and drivers/poses/config.py, for the same reason.
+CAMERA_KINDS = ("v4l2", "opencv", "oak")
+POSE_KINDS = ("device", "fixed", "topic", "board", "rgbd")
 ENDPOINT_PATTERN = r"^([a-z]+://.+|)\Z"
 
 Text = Annotated[str, msgspec.Meta(min_length=1)]
@@ -38,15 +41,14 @@ class CameraOptions(Config, frozen=True):
     """Publishes the frames of a log, as if it were a camera, or those of a camera."""
 
     log: Text | None = None  # the log to play (a folder: the parts of a recording), or ...
-    camera: LiveCamera | None = (
-        None  # ... the camera; of the options below it knows subscriber_timeout_s and max_frames
-    )
+    camera: LiveCamera | None = None  # ... the camera; of the options below it knows max_frames and the two times
     mode: Literal["lockstep", "realtime", "fast"] = "lockstep"  # wait for the mapper; keep the recording's time; hurry
     mapper: str = "mapper"  # lockstep: the node whose answers are waited for
     rate: Annotated[float, msgspec.Meta(ge=0.001, le=1000)] = 1.0  # realtime: 2 = twice as fast as recorded
     max_frames: Count = 0  # 0 = all
     subscriber_timeout_s: Positive = 180.0  # how long the others may take to start
-    ack_timeout_s: Positive = 300.0  # lockstep: how long the mapper may take for one frame; the first one compiles
+    # How long a mapper that is waited for (lockstep, fast, a video) may take for one frame; the first one compiles.
+    ack_timeout_s: Positive = 300.0
 
     def inputs(self) -> tuple[str, ...]:
         """Nodes that it listens to."""
@@ -67,7 +69,9 @@ class MapperOptions(Config, frozen=True):
 
     out: Text  # folder for the map, the picture and the summary
     input: Text | Names = "camera"  # whose frames: a node, or several
-    delivery: Literal["newest", "all"] = "newest"  # live: an unread frame gives way to a newer one; all: nothing lost
+    # "newest": an unread frame gives way to a newer one. "all": every frame, in order; logs and video files wait for
+    # the mapper. A live camera cannot wait: frames that its queue has no room for count as dropped.
+    delivery: Literal["newest", "all"] = "newest"
     weights: str = ""  # empty = those that ship with the package
     config: str = ""  # TOML file with settings of the mapper; empty = defaults
     voxel_size_m: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0  # 0 = what the config says

@@ -11,6 +11,7 @@ from semantic_mapper.geometry import check_pose
 from semantic_mapper.types import Float64
 
 MAP_NAME = "map.npz"
+MAP_SUFFIX = ".npz"
 LOG_SUFFIX = ".mcap"
 
 
@@ -18,8 +19,10 @@ def map_path(path: Path) -> Path:
     """The file of a map that is named itself, or by the folder it is in.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is none, or it is a log.
     """
+    if is_log(path):
+        raise ConfigError(f"{path}: is a log; `semantic-mapper replay {path} --out FOLDER` makes a map of it")
     if not path.is_dir():
         return path
     if not (path / MAP_NAME).is_file():
@@ -69,6 +72,11 @@ def _read_transform(path: Path) -> Float64:
         raise ConfigError(f"--transform {path}: expected 4 rows of 4 numbers, got {T.shape[0]} of {T.shape[1]}")
     check_pose(T, str(path))
     return T
+
+
+def is_map(source: Path) -> bool:
+    """Whether a saved map is meant: a map file, or a folder with one."""
+    return source.suffix == MAP_SUFFIX or (source / MAP_NAME).is_file()
 
 
 def is_log(source: Path) -> bool:

@@ -156,6 +156,20 @@ class Scan:
     size: int = 0
 
 
+def _what_is(start: bytes) -> str:
+    """What a file is that begins with these bytes, for people."""
+    if not start:
+        return "it is empty"
+    kinds = {
+        b"PK": "a ZIP file, as saved maps are",
+        b"#ROSBAG": "a ROS 1 bag",
+        b"SQLite": "a SQLite file, as ROS 2 bags are",
+    }
+    return next(
+        (f"it is {name}" for magic, name in kinds.items() if start.startswith(magic)), "it does not start like one"
+    )
+
+
 def scan(fd: int, where: str) -> Scan:
     """Walk the records of an open file.
 
@@ -170,9 +184,8 @@ def scan(fd: int, where: str) -> Scan:
     result = Scan(ReadLimits.of_file(size), size=size)
     magic = os.pread(fd, len(MAGIC), 0)
     if sum(x == y for x, y in zip(magic, MAGIC, strict=False)) < len(MAGIC) - 1:  # one damaged byte is no reason
-        hint = "it is empty" if result.size == 0 else "it does not start like one"
         raise LogError(
-            f"{where}: not an MCAP log ({hint}); make one with `semantic-mapper import` or by "
+            f"{where}: not an MCAP log ({_what_is(os.pread(fd, 16, 0))}); make one with `semantic-mapper import` or by "
             "`semantic-mapper up launch/record.toml`"
         )
     heads = _Heads(fd)

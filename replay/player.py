@@ -39,7 +39,7 @@ class PlayOptions:
         max_frames: Stop after this many; None = all.
         subscribers: Wait for this many before the first frame.
         subscriber_timeout_s: How long to wait for them.
-        ack_timeout_s: How long the mapper may think about one frame in lockstep; the first ones compile kernels.
+        ack_timeout_s: How long the mapper may take for one frame where it is waited for; the first ones compile.
         source: How the player calls itself in its ``EndOfStream``.
         from_stamp_ns: Frames captured before are passed over; 0 = none.
     """
@@ -209,7 +209,7 @@ class _Run:
                 continue
             ack = None
             if lockstep is None:
-                self.publisher.publish(parts)
+                self.publisher.publish(parts, self.options.ack_timeout_s)
             else:
                 ack = lockstep.send(parts, envelope, self.stop)
             self.published += 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 
 from semantic_mapper.evaluation.canvas import DIM_TEXT, draw_text, new_canvas, paste
 from semantic_mapper.evaluation.legend import WIDEST, draw_legend, legend_rows
-from semantic_mapper.evaluation.splat import open_side
+from semantic_mapper.evaluation.splat import seen_from
 from semantic_mapper.evaluation.upright import upright_rotation
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Float32, Float64, UInt8
@@ -23,6 +23,9 @@ CONFIDENCE_SCALE, AGE_SCALE = cv2.COLORMAP_VIRIDIS, cv2.COLORMAP_INFERNO
 LEGEND_WIDTH = 260
 ELEVATION = np.deg2rad(50)  # from which one looks into the map
 DISTANCE = 0.8  # of the eye, times the map's diagonal
+AZIMUTHS_DEG = (35, 55, 125, 145, 215, 235, 305, 325)  # first looks are compared from these sides
+JUDGED_POINTS = 30_000  # of the map, for that
+LOW_PART = 0.6  # of its height: floor and furniture are in it
 _MARGIN, _CAPTION, _BAR = 12, 26, 16
 
 
@@ -36,14 +39,43 @@ class Eye:
 
 
 def eye_on(xyz: Float32, up: Float64 | None) -> Eye:
-    """An eye that sees all points (N, 3), N > 0, and which way is up in them; ``up`` is a first guess."""
+    """An eye that sees most of the floor and of what stands on it, past walls and ceiling, and which way is up.
+
+    Over a map without a ceiling that is a look from above; a closed room is looked at from inside, out of a corner.
+
+    Args:
+        xyz: (N, 3) points of the map, N > 0.
+        up: (3,) first guess of which way is up; None = unknown.
+    """
     R_upright_world = upright_rotation(xyz, up)
-    turned = xyz.astype(np.float64) @ R_upright_world.T
+    step = -(-len(xyz) // JUDGED_POINTS)
+    turned = xyz[::step].astype(np.float64) @ R_upright_world.T
     low, high = np.percentile(turned, (1, 99), axis=0)
-    azimuth, ce = open_side(turned, ELEVATION), np.cos(ELEVATION)
-    direction = np.array((np.cos(azimuth) * ce, np.sin(azimuth) * ce, np.sin(ELEVATION)))
-    position = (low + high) / 2 + DISTANCE * max(float(np.linalg.norm(high - low)), 0.5) * direction
-    return Eye(position @ R_upright_world, (low + high) / 2 @ R_upright_world, R_upright_world[2])
+    counts = turned[turned[:, 2] <= low[2] + LOW_PART * (high[2] - low[2])]
+    others = turned[turned[:, 2] > low[2] + LOW_PART * (high[2] - low[2])]
+    judged = np.concatenate((counts, others))
+    best, most = None, -1
+    for position, target in _first_looks(low, high):
+        seen = int(seen_from(judged, position, target, np.array((0.0, 0.0, 1.0)))[: len(counts)].sum())
+        if seen > most:
+            best, most = (position, target), seen
+    assert best is not None
+    return Eye(best[0] @ R_upright_world, best[1] @ R_upright_world, R_upright_world[2])
+
+
+def _first_looks(low: Float64, high: Float64) -> Iterator[tuple[Float64, Float64]]:
+    """Positions to look at a map from, with z up, and where to look: round it from above, then within its bounds."""
+    centre, size = (low + high) / 2, np.maximum(high - low, 0.3)
+    for azimuth in np.deg2rad(AZIMUTHS_DEG):
+        ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(ELEVATION), np.sin(ELEVATION)
+        yield centre + DISTANCE * float(np.linalg.norm(size)) * np.array((ca * ce, sa * ce, se)), centre
+    for azimuth in np.deg2rad(AZIMUTHS_DEG):
+        towards = np.array((np.cos(azimuth), np.sin(azimuth)))
+        reach = 1 / np.abs(towards / size[:2]).max()  # twice the way to the side of the bounds
+        for part in (0.25, 0.4):
+            at = centre[:2] + part * reach * towards
+            target = np.append(centre[:2] - 0.15 * reach * towards, low[2] + 0.2 * size[2])
+            yield np.append(at, low[2] + 0.8 * size[2]), target
 
 
 def scale_colors(level: Float32, scale: int) -> UInt8:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from replay.summary import read_summary
+from replay.summary import SUMMARY_FILE, read_summary
 from semantic_mapper.mapping.voxel_map import VoxelMap
 
 MAP_FILE = "map.npz"
@@ -32,9 +32,13 @@ def read_run(path: Path) -> Run:
     """Read the folder of a run, or a saved map alone.
 
     Raises:
-        ConfigError: a folder without a whole summary.
+        ConfigError: a folder with a damaged summary.
         MapError: no map there, or a damaged one.
     """
-    if path.is_dir():
-        return Run(str(path), VoxelMap.load(path / MAP_FILE), read_summary(path))
-    return Run(str(path), VoxelMap.load(path), None)
+    if not path.is_dir():
+        return Run(str(path), VoxelMap.load(path), None)
+    voxel_map = VoxelMap.load(path / MAP_FILE)
+    summary = (
+        read_summary(path) if (path / SUMMARY_FILE).exists() else None
+    )  # a mapper saves its map before its summary
+    return Run(str(path), voxel_map, summary)

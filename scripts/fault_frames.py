@@ -65,6 +65,7 @@ class _ListCamera:
     """Gives images of a list; its device tracks itself."""
 
     troubles: tuple[str, ...] = ()
+    can_wait = False
     turned_at = 0.0
     info = StreamInfo("scrambled", {"rooms": INTRINSICS}, ROOMS)
 

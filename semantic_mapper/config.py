@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from types import UnionType
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 
@@ -321,7 +323,7 @@ def convert_config(data: Any, kind: type[ConfigT], where: str) -> ConfigT:
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{where}: {_reason(error)}{_nearest_key(str(error), kind)}") from error
+        raise ConfigError(f"{where}: {_shorten(_explain(str(error), kind))}") from error
 
 
 def check_values(data: Any, where: str, *, infinite: bool = False) -> None:
@@ -381,7 +383,10 @@ def _read(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
 def _reason(error: Exception) -> str:
     if isinstance(error, RecursionError):
         return "too many tables or lists inside each other"
-    text = str(error).partition("; use sys.set_int_max_str_digits")[0]  # a way out for programmers
+    return _shorten(str(error).partition("; use sys.set_int_max_str_digits")[0])  # a way out for programmers
+
+
+def _shorten(text: str) -> str:
     return text if len(text) <= _MESSAGE else f"{text[:_MESSAGE]}..."
 
 
@@ -390,25 +395,72 @@ def to_plain(config: msgspec.Struct) -> dict[str, Any]:
     return msgspec.to_builtins(config)
 
 
-def _nearest_key(message: str, kind: type[msgspec.Struct]) -> str:
-    if "unknown field `" not in message:
-        return ""
-    wrong = message.partition("unknown field `")[2].partition("`")[0]
-    keys = sorted(_keys_at(message, kind) - {wrong})
-    near = difflib.get_close_matches(wrong, keys, n=1, cutoff=0.5)
-    return f"; did you mean `{near[0]}`?" if near else f"; valid keys are {', '.join(keys)}"
+_TOML_WORDS = {
+    "str": "a text",
+    "int": "a whole number",
+    "float": "a number",
+    "bool": "true or false",
+    "array": "a list",
+    "object": "a table",
+    "null": "empty",
+}
 
 
-def _keys_at(message: str, kind: type[msgspec.Struct]) -> set[str]:
-    """Keys of the section that msgspec names ("... - at `$.voxel_map`"), else of all sections."""
-    path = message.rpartition(" - at `$.")[2].rstrip("`").split(".") if " - at `$." in message else []
-    section = kind
-    for name in path:
-        inner = next((item.type for item in msgspec.structs.fields(section) if item.name == name), None)
-        if not (isinstance(inner, type) and issubclass(inner, msgspec.Struct)):
-            return _all_keys(kind)
-        section = inner
-    return {item.name for item in msgspec.structs.fields(section)}
+def _explain(message: str, kind: type[msgspec.Struct]) -> str:
+    """msgspec's message in the words of whoever writes the file: which key, what it must be, the nearest valid name."""
+    what, _, path = message.rpartition(" - at `$") if " - at `$" in message else (message, "", "")
+    path = path.rstrip("`").removeprefix(".")
+    named = re.search(r"`([^`]*)`|'([^']*)'", what)
+    name = (named[1] or named[2] or "") if named is not None else ""
+    at = f"`{path}`: " if path else ""
+    if "unknown field" in what:
+        return f"{at}unknown key `{name}`{_nearest(name, _keys_at(path, kind) - {name}, 'keys')}"
+    if "missing required field" in what:
+        return f"{at}the key `{name}` is missing"
+    if what.startswith("Invalid enum value"):
+        valid = {
+            str(value) for part in _types_at(path, kind) if get_origin(part) is Literal for value in get_args(part)
+        }
+        return f"{at}'{name}' is not valid{_nearest(name, valid, 'values')}"
+    expected = re.fullmatch(r"Expected `([^`]*)`, got `(\w+)`", what)
+    if expected is not None:
+        wanted = " or ".join(_TOML_WORDS.get(word, word) for word in expected[1].split(" | "))
+        return f"{at}must be {wanted}, not {_TOML_WORDS.get(expected[2], expected[2])}"
+    return f"{at}{what}"
+
+
+def _nearest(wrong: str, valid: Collection[str], what: str) -> str:
+    near = difflib.get_close_matches(wrong, sorted(valid), n=1, cutoff=0.5)
+    hint = f"; did you mean `{near[0]}`?" if near else ""
+    return hint or (f"; valid {what} are {', '.join(sorted(valid))}" if valid else "")
+
+
+def _types_at(path: str, kind: type[msgspec.Struct]) -> list[Any]:
+    """What a value may be at a place that msgspec names ("node[0].kind"), unions and annotations taken apart."""
+    found: list[Any] = [kind]
+    for step in re.findall(r"\[[^\]]*\]|[^.\[\]]+", path):
+        inner: list[Any] = []
+        for part in found:
+            if step.startswith("["):
+                inner += get_args(part)
+            elif isinstance(part, type) and issubclass(part, msgspec.Struct):
+                inner += [item.type for item in msgspec.structs.fields(part) if item.name == step]
+        found = [member for part in inner for member in _members(part)]
+    return found
+
+
+def _members(part: Any) -> list[Any]:
+    if get_origin(part) is Annotated:
+        return _members(get_args(part)[0])
+    if get_origin(part) in (Union, UnionType):
+        return [member for arg in get_args(part) for member in _members(arg)]
+    return [part]
+
+
+def _keys_at(path: str, kind: type[msgspec.Struct]) -> set[str]:
+    """Keys of the section at a place; of all sections where there is none."""
+    sections = [part for part in _types_at(path, kind) if isinstance(part, type) and issubclass(part, msgspec.Struct)]
+    return {item.name for part in sections for item in msgspec.structs.fields(part)} or _all_keys(kind)
 
 
 def _all_keys(kind: type[msgspec.Struct]) -> set[str]:

@@ -51,8 +51,15 @@ class LabelSet:
                 raise LabelError(
                     f"label set '{self.name[:MAX_NAME]}': {what} has {len(name):,} letters, and may have {MAX_NAME}"
                 )
+        if self.ignore_id is None:
+            raise LabelError(
+                f"label set '{self.name}': needs an ignore id; make_label_set chooses one for ignore_id=None"
+            )
         if self.ignore_id in self.ids:
-            raise LabelError(f"label set '{self.name}': id {self.ignore_id} is both a class and the ignore id")
+            raise LabelError(
+                f"label set '{self.name}': id {self.ignore_id} is both a class and the ignore id; make_label_set with "
+                "ignore_id=None chooses one that is no class"
+            )
         if not all(0 <= i <= 255 for i in (*self.ids, self.ignore_id)):
             raise LabelError(f"label set '{self.name}': ids must lie in 0..255")
 
@@ -135,10 +142,24 @@ class LabelSet:
 
 
 def make_label_set(
-    name: str, names: Sequence[str], *, ids: Sequence[int] | None = None, ignore_id: int = 0
+    name: str, names: Sequence[str], *, ids: Sequence[int] | None = None, ignore_id: int | None = 0
 ) -> LabelSet:
-    """Build a label set with distinct generated colours; ids default to 1, 2, 3, ..."""
+    """Build a label set with distinct generated colours.
+
+    Args:
+        name: Of the set.
+        names: One a class.
+        ids: One a class, 0 to 255; None = 1, 2, 3, ...
+        ignore_id: Means unknown; None, for a data set that has none: the highest id that is no class.
+
+    Raises:
+        LabelError: names or ids that are no label set, or all 256 ids are classes, so that none can mean unknown.
+    """
     chosen = tuple(ids) if ids is not None else tuple(range(1, len(names) + 1))
+    if ignore_id is None:
+        ignore_id = next((i for i in range(255, -1, -1) if i not in chosen), None)
+    if ignore_id is None:
+        raise LabelError(f"label set '{name}': all 256 ids are classes; one must be left to mean unknown")
     return LabelSet(name, chosen, tuple(names), tuple(_distinct_color(i) for i in chosen), ignore_id)
 
 

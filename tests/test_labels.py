@@ -149,3 +149,12 @@ def test_things_are_what_is_not_stuff() -> None:
     names = {name for label_set in PROVIDED.values() for name in label_set.names}
     assert names >= STUFF_NAMES, "names that no set has are misspelt"
     assert {"chair", "car", "door"} <= names - STUFF_NAMES
+
+
+def test_a_set_without_an_ignore_id_gets_the_highest_id_that_is_no_class() -> None:
+    assert make_label_set("all", ["wall", "floor"], ids=[0, 1], ignore_id=None).ignore_id == 255
+    assert make_label_set("all", ["wall", "sky"], ids=[0, 255], ignore_id=None).ignore_id == 254
+    with pytest.raises(LabelError, match="all 256 ids are classes"):
+        make_label_set("all", [str(i) for i in range(256)], ids=range(256), ignore_id=None)
+    with pytest.raises(LabelError, match="needs an ignore id"):
+        LabelSet("none", (0,), ("wall",), (RED,), None)  # type: ignore[arg-type]

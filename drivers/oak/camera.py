@@ -80,6 +80,11 @@ class OakCamera:
         return tuple(troubles)
 
     @property
+    def can_wait(self) -> bool:
+        """As of ``Camera``."""
+        return False
+
+    @property
     def turned_at(self) -> float:
         """As of ``Camera``."""
         return self._turned_at

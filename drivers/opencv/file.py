@@ -58,6 +58,11 @@ class VideoFile:
         return ()
 
     @property
+    def can_wait(self) -> bool:
+        """As of ``Camera``."""
+        return True
+
+    @property
     def turned_at(self) -> float:
         """As of ``Camera``."""
         return self._turned_at

@@ -97,6 +97,11 @@ class PosedCamera:
         return (*self._camera.troubles, *told, *((self._trouble,) if self._trouble else ()))
 
     @property
+    def can_wait(self) -> bool:
+        """The camera's."""
+        return self._camera.can_wait
+
+    @property
     def turned_at(self) -> float:
         """The camera's; it comes round no more while a pose is awaited that never comes."""
         return self._camera.turned_at

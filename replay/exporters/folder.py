@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from replay.exporters.base import ExportFrame, LeftOut, depth_units, quaternion, seconds, write_png
-from replay.importers.tum import DEPTH_SCALE as TUM_SCALE
+from replay.importers.tum import DEPTH_SCALE
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
+TUM_UNITS_PER_M = DEPTH_SCALE.units_per_m
 _SUFFIX = {"jpeg": "jpg", "png": "png", "raw": "png"}
 _EXACT_M = 1e-6  # float32 has no more at the distances of a room
 
@@ -90,7 +91,7 @@ class TumExporter:
         self._folder = folder
         self._names: dict[str, list[str]] = {"rgb": [], "depth": []}
         self._trajectory = Trajectory()
-        self._depth = _DepthFiles(TUM_SCALE)
+        self._depth = _DepthFiles(TUM_UNITS_PER_M)
         self._intrinsics = _OneCamera()
         (folder / "rgb").mkdir()
 
@@ -117,7 +118,7 @@ class TumExporter:
             text = "\n".join((titles[name], "# timestamp filename", *sorted(lines, key=_by_stamp)))
             (self._folder / f"{name}.txt").write_text(text + "\n", encoding="ascii")
         self._trajectory.write(self._folder / "groundtruth.txt")
-        self._intrinsics.write(self._folder / "intrinsics.json", TUM_SCALE)
+        self._intrinsics.write(self._folder / "intrinsics.json", TUM_UNITS_PER_M)
         missing = len(self._names["rgb"]) - len(self._names["depth"])
         if missing:
             self.notices.append(f"{missing} frames have no depth; programs that pair the lists will leave them out")

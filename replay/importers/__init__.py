@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
-from replay.importers.base import ImportOptions, ImportReport, RenameConfig, Skipped
+from replay.importers.base import DepthScale, ImportOptions, ImportReport, RenameConfig, Skipped
 from replay.importers.run import FORMATS, detect_format, import_recording
 
-__all__ = ["FORMATS", "ImportOptions", "ImportReport", "RenameConfig", "Skipped", "detect_format", "import_recording"]
+__all__ = [
+    "FORMATS",
+    "DepthScale",
+    "ImportOptions",
+    "ImportReport",
+    "RenameConfig",
+    "Skipped",
+    "detect_format",
+    "import_recording",
+]

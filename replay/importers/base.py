@@ -70,12 +70,36 @@ class Skipped:
 
 
 @dataclass(frozen=True, slots=True)
+class DepthScale:
+    """What the numbers of a recording's depth images mean.
+
+    Args:
+        units_per_m: Units per metre.
+        given_in: The file that gives it; None: assumed, since the recording does not say.
+        convention: Whose convention was assumed, for people.
+    """
+
+    units_per_m: float
+    given_in: Path | None = None
+    convention: str = ""
+
+    def __str__(self) -> str:
+        """For people."""
+        if self.given_in is not None:
+            return f"{self.units_per_m:g} units per metre, given in {self.given_in}"
+        return f"{self.units_per_m:g} units per metre, assumed: {self.convention}"
+
+
+@dataclass(frozen=True, slots=True)
 class ImportReport:
     """What an import did.
 
     Args:
         frames: In the log.
         labelled: Of these, with a label image.
+        with_depth: Of these, with a depth image.
+        depth_scale: How their depth images were read.
+        median_depth_m: Of the measurements in the first of them, to judge the scale by; 0 where there are none.
         skipped: Frames and label images that were left out.
         notices: Sentences on what had to be assumed of the whole recording.
         format: Of the recording.
@@ -85,6 +109,9 @@ class ImportReport:
 
     frames: int
     labelled: int
+    with_depth: int
+    depth_scale: DepthScale
+    median_depth_m: float
     skipped: tuple[Skipped, ...]
     notices: tuple[str, ...]
     format: str
@@ -111,7 +138,7 @@ class Recording(Protocol):
     """A foreign recording, opened. ``load`` may be called in any order."""
 
     info: StreamInfo
-    depth_scale: float  # units a metre of its depth images
+    depth_scale: DepthScale  # of its depth images
     notices: list[str]
 
     def __len__(self) -> int:
@@ -165,18 +192,28 @@ def read_rgb(file: Path) -> tuple[UInt8, EncodedImage]:
     return rgb, EncodedImage(encoding, data)
 
 
-def read_depth(file: Path, scale: float, size: tuple[int, int]) -> Float32:
+def read_depth(file: Path, scale: DepthScale, size: tuple[int, int]) -> Float32:
     """Depth image (H, W) in metres.
 
     Args:
         file: 16-bit PNG.
-        scale: Units a metre.
+        scale: Of its numbers.
         size: (height, width) that it must have.
 
     Raises:
         BadFrameError: missing, damaged, not 16-bit, or of another size.
     """
-    return depth_from_uint16(read_plane(file, "uint16", size, "depth").astype(np.uint16, copy=False), scale)
+    units = read_plane(file, "uint16", size, "depth").astype(np.uint16, copy=False)
+    return depth_from_uint16(units, scale.units_per_m)
+
+
+def read_depth_if_there(file: Path | None, scale: DepthScale, size: tuple[int, int]) -> Float32 | None:
+    """Depth image (H, W) in metres; None where there is no such file, as of a frame without depth.
+
+    Raises:
+        BadFrameError: the file is there, and is damaged, not 16-bit, or of another size.
+    """
+    return read_depth(file, scale, size) if file is not None and file.exists() else None
 
 
 def read_plane(

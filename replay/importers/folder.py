@@ -2,7 +2,8 @@
 
 ``color/NNNNNN.jpg|png``, ``depth/NNNNNN.png`` (uint16), ``label/NNNNNN.png`` (uint8) with ``labels.json``,
 ``poses.txt`` (a row of 16 numbers a frame, row-major ``T_world_camera``), ``intrinsics.json`` (width height fx fy cx cy
-depth_scale), and, if there is one, ``timestamps.txt`` (a row a frame: int nanoseconds, or seconds with a point).
+and, unless depth is in millimetres, depth_scale: units per metre), and, if there is one, ``timestamps.txt`` (a row a
+frame: int nanoseconds, or seconds with a point). A frame without a depth image comes without depth.
 """
 
 from __future__ import annotations
@@ -17,13 +18,14 @@ from msgspec import Meta
 
 from replay.importers.base import (
     BadFrameError,
+    DepthScale,
     ImportOptions,
     LoadedFrame,
     Skipped,
     check_frame_pose,
     image_size_must_be,
     numbered_files,
-    read_depth,
+    read_depth_if_there,
     read_label,
     read_lines,
     read_rgb,
@@ -36,6 +38,7 @@ from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
 DEFAULT_HZ = 6.0  # of a recording without timestamps.txt
+DEPTH_SCALE = DepthScale(1000.0, convention="millimetres; another one belongs into intrinsics.json as depth_scale")
 _COLOR = (".jpg", ".jpeg", ".png")
 
 
@@ -46,14 +49,15 @@ class _Intrinsics(msgspec.Struct):
     fy: float
     cx: float
     cy: float
-    depth_scale: Annotated[float, Meta(gt=0, le=1e6)] = 1000.0
+    depth_scale: Annotated[float, Meta(gt=0, le=1e6)] | None = None  # units per metre; None = the format's convention
 
 
 class _Labels(msgspec.Struct):
     classes: dict[str, str]
     id_space: str = ""
     colors: dict[str, tuple[int, int, int]] = msgspec.field(default_factory=dict)
-    ignore: Annotated[int, Meta(ge=0, le=255)] = 0
+    # The id that means unknown; null = none of those in the images. Missing: 0, as most data sets have it.
+    ignore: Annotated[int, Meta(ge=0, le=255)] | msgspec.UnsetType | None = msgspec.UNSET
 
 
 class FolderRecording:
@@ -71,7 +75,8 @@ class FolderRecording:
         self.notices: list[str] = []
         self._folder = folder
         self._camera_id = options.camera_id
-        self._intrinsics, self.depth_scale = read_intrinsics(folder / "intrinsics.json")
+        self._intrinsics, given = read_intrinsics(folder / "intrinsics.json")
+        self.depth_scale = given or DEPTH_SCALE
         self._color = numbered_files(folder / "color", _COLOR)
         self._rows = read_lines(folder / "poses.txt")
         if not self._color:
@@ -111,7 +116,8 @@ class FolderRecording:
         rgb, encoded = read_rgb(file)
         image_size_must_be(rgb, self._intrinsics, file)
         size = (self._intrinsics.height, self._intrinsics.width)
-        depth = read_depth(self._beside(file, "depth"), self.depth_scale, size) if self._has_depth else None
+        depth_file = self._beside(file, "depth") if self._has_depth else None
+        depth = read_depth_if_there(depth_file, self.depth_scale, size)
         label, label_error = None, None
         if self._has_label and self.info.label_set is not None:
             try:
@@ -166,32 +172,53 @@ class FolderRecording:
             if (self._folder / "label").is_dir():
                 self.notices.append("label/ is left out: labels.json, which names its classes, is missing")
             return None
-        return read_label_set(file)
+        return read_label_set(file, self.notices)
 
 
-def read_label_set(file: Path) -> LabelSet:
+def read_label_set(file: Path, notices: list[str] | None = None) -> LabelSet:
     """``labels.json`` -> label set; one that says nothing else is called as its folder.
+
+    Args:
+        file: To read.
+        notices: Gets a sentence on what had to be assumed of the id that means unknown.
 
     Raises:
         ImportSourceError: missing, or no label set.
     """
     try:
-        return label_set_from(read_json(file, _Labels), file.resolve().parent.name)
+        labels = read_json(file, _Labels)
+        label_set = label_set_from(labels, file.resolve().parent.name)
+        if notices is not None:
+            notices += _ignore_notices(labels, label_set, file)
+        return label_set
     except ConfigError as error:
         raise ImportSourceError(str(error)) from error
     except (LabelError, ValueError) as error:
         raise ImportSourceError(f"{file}: {error}") from error
 
 
-def read_intrinsics(file: Path) -> tuple[CameraIntrinsics, float]:
-    """``intrinsics.json`` -> intrinsics and depth units a metre.
+def _ignore_notices(labels: _Labels, label_set: LabelSet, file: Path) -> list[str]:
+    if labels.ignore is None:
+        return [f"{file}: has no ignore id; {label_set.ignore_id}, which is no class, stands for unknown"]
+    name = labels.classes.get("0")
+    if labels.ignore is msgspec.UNSET and name is not None:
+        return [
+            f"{file}: names no ignore id, so class 0 '{name}' is read as unknown; where it is a class, "
+            'write "ignore": null'
+        ]
+    return []
+
+
+def read_intrinsics(file: Path) -> tuple[CameraIntrinsics, DepthScale | None]:
+    """``intrinsics.json`` -> intrinsics, and the scale of depth images where the file gives it.
 
     Raises:
         ImportSourceError: missing, or a value that cannot be.
     """
     try:
         i = read_json(file, _Intrinsics)
-        return CameraIntrinsics(i.fx, i.fy, i.cx, i.cy, i.width, i.height), i.depth_scale
+        scale = DepthScale(i.depth_scale, file) if i.depth_scale is not None else None
+        return CameraIntrinsics(i.fx, i.fy, i.cx, i.cy, i.width, i.height), scale
     except ConfigError as error:
         raise ImportSourceError(str(error)) from error
     except FrameError as error:
@@ -207,10 +234,12 @@ def label_set_from(labels: _Labels, folder_name: str) -> LabelSet:
     if any(not 0 <= value <= 255 for color in labels.colors.values() for value in color):
         raise ValueError("colors must be three numbers of 0 to 255")
     classes = {int(key): name for key, name in labels.classes.items()}
-    classes.pop(labels.ignore, None)
+    ignore_id = 0 if labels.ignore is msgspec.UNSET else labels.ignore
+    if ignore_id is not None:
+        classes.pop(ignore_id, None)
     ids = sorted(classes)
     name = labels.id_space.lower() or folder_name[:MAX_NAME]
-    own = make_label_set(name, [classes[i] for i in ids], ids=ids, ignore_id=labels.ignore)
+    own = make_label_set(name, [classes[i] for i in ids], ids=ids, ignore_id=ignore_id)
     known = PROVIDED.get(name)
     chosen = {} if known is None else dict(zip(known.ids, known.colors, strict=True))
     chosen |= {int(key): color for key, color in labels.colors.items()}

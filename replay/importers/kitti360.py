@@ -22,6 +22,7 @@ import numpy as np
 
 from replay.importers.base import (
     BadFrameError,
+    DepthScale,
     ImportOptions,
     LoadedFrame,
     Skipped,
@@ -72,7 +73,7 @@ class Kitti360Recording:
 
     def __init__(self, folder: Path, options: ImportOptions) -> None:
         self.notices = ["the data set has no depth images: frames come without depth"]
-        self.depth_scale = 1000.0
+        self.depth_scale = DepthScale(1000.0, convention="the data set has no depth images")
         root, drive = find_drive(folder)
         self._drive_folder = root / "data_2d_raw" / drive
         self._semantics = root / "data_2d_semantics" / "train" / drive

@@ -20,13 +20,14 @@ import numpy as np
 
 from replay.importers.base import (
     BadFrameError,
+    DepthScale,
     ImportOptions,
     LoadedFrame,
     Skipped,
     check_frame_pose,
     image_size_must_be,
     numbered_files,
-    read_depth,
+    read_depth_if_there,
     read_label,
     read_lines,
     read_rgb,
@@ -37,7 +38,7 @@ from semantic_mapper.labels import LabelSet, make_label_set
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
-DEPTH_SCALE = 1000.0
+DEPTH_SCALE = DepthScale(1000.0, convention="millimetres, as Semantic-NeRF's renderer writes them")
 RENDER_HZ = 30.0  # the renderer has no clock; its path moves like a hand-held camera at this rate
 HFOV_DEG = 90.0
 _INFO = "info_semantic.json"
@@ -101,8 +102,7 @@ class ReplicaRecording:
         rgb, encoded = read_rgb(file)
         image_size_must_be(rgb, self._intrinsics, file)
         size = (self._intrinsics.height, self._intrinsics.width)
-        depth_file = self._depth.get(name, self._folder / "depth" / f"depth_{name}.png")
-        depth = read_depth(depth_file, DEPTH_SCALE, size)
+        depth = read_depth_if_there(self._depth.get(name), DEPTH_SCALE, size)
         label, label_error = None, None
         if self.info.label_set is not None:
             label_file = self._labels.get(name, self._folder / "semantic_class" / f"semantic_class_{name}.png")

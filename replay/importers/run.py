@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
-from replay.importers.base import BadFrameError, ImportOptions, ImportReport, Recording, Skipped
+import numpy as np
+
+from replay.importers.base import BadFrameError, ImportOptions, ImportReport, LoadedFrame, Recording, Skipped
 from replay.importers.folder import FolderRecording
 from replay.importers.kitti360 import Kitti360Recording
 from replay.importers.replica import ReplicaRecording
@@ -32,7 +35,7 @@ FORMATS: dict[str, Callable[[Path, ImportOptions], Recording]] = {
 # What a folder of each format has, and no other.
 _MARKS = {
     "folder": ("color", "poses.txt", "intrinsics.json"),
-    "tum": ("rgb.txt", "depth.txt", "groundtruth.txt"),
+    "tum": ("rgb.txt", "groundtruth.txt"),
     "scannet": ("color", "depth", "pose"),
     "replica": ("rgb", "depth", "traj_w_c.txt"),
     "kitti360": ("calibration/perspective.txt", "data_2d_raw", "data_poses"),
@@ -119,16 +122,27 @@ def import_recording(
     recording = FORMATS[name](src, options)
     total = len(recording) if options.max_frames is None else min(len(recording), options.max_frames)
     info, changed = _changes(src, recording.info, options, renames or {})
-    packing = codec or CodecOptions(depth_scale=recording.depth_scale)
+    packing = codec or CodecOptions(depth_scale=recording.depth_scale.units_per_m)
 
     with whole_log(dst, info, options=packing, overwrite=overwrite) as writer:
         keep_files = codec is None and options.quarters % 4 == 0
-        labelled, skipped = _copy(recording, writer, total, changed, on_progress, keep_files=keep_files)
+        tally = _copy(recording, writer, total, changed, on_progress, keep_files=keep_files)
         frames = writer.frames
         if frames == 0:
-            reasons = "; ".join(f"{s.file}: {s.reason}" for s in skipped[:3])
+            reasons = "; ".join(f"{s.file}: {s.reason}" for s in tally.skipped[:3])
             raise ImportSourceError(f"{src}: none of its {total} frames can be used: {reasons}")
-    return ImportReport(frames, labelled, tuple(skipped), tuple(recording.notices), name, info, dst.stat().st_size)
+    return ImportReport(
+        frames=frames,
+        labelled=tally.labelled,
+        with_depth=tally.with_depth,
+        depth_scale=recording.depth_scale,
+        median_depth_m=tally.median_depth_m,
+        skipped=tuple(tally.skipped),
+        notices=tuple(recording.notices),
+        format=name,
+        info=info,
+        bytes=dst.stat().st_size,
+    )
 
 
 def _changes(
@@ -151,6 +165,24 @@ def _changes(
     return dataclasses.replace(info, label_set=label_set), changed
 
 
+@dataclass(slots=True)
+class _Tally:
+    labelled: int = 0
+    with_depth: int = 0
+    median_depth_m: float = 0.0
+    skipped: list[Skipped] = dataclasses.field(default_factory=list[Skipped])
+
+    def count(self, loaded: LoadedFrame) -> None:
+        frame = loaded.frame
+        self.labelled += frame.label is not None
+        if loaded.label_error is not None:
+            self.skipped.append(loaded.label_error)
+        if frame.depth_m is not None:
+            self.with_depth += 1
+            if not self.median_depth_m and (frame.depth_m > 0).any():
+                self.median_depth_m = float(np.median(frame.depth_m[frame.depth_m > 0]))
+
+
 def _copy(
     recording: Recording,
     writer: LogWriter,
@@ -159,21 +191,18 @@ def _copy(
     on_progress: Callable[[int, int], None] | None,
     *,
     keep_files: bool,
-) -> tuple[int, list[Skipped]]:
-    skipped: list[Skipped] = []
-    labelled = 0
+) -> _Tally:
+    tally = _Tally()
     for number in range(total):
         try:
             loaded = recording.load(number)
             writer.write_frame(changed(loaded.frame), encoded_rgb=loaded.encoded_rgb if keep_files else None)
         except BadFrameError as error:
-            skipped.append(Skipped(error.file, error.reason, number))
+            tally.skipped.append(Skipped(error.file, error.reason, number))
         except (FrameError, CodecError) as error:
-            skipped.append(Skipped(Path(f"frame {number}"), str(error), number))
+            tally.skipped.append(Skipped(Path(f"frame {number}"), str(error), number))
         else:
-            labelled += loaded.frame.label is not None
-            if loaded.label_error is not None:
-                skipped.append(loaded.label_error)
+            tally.count(loaded)
         if on_progress is not None:
             on_progress(number + 1, total)
-    return labelled, skipped
+    return tally

@@ -22,12 +22,13 @@ from numpy.typing import NDArray
 
 from replay.importers.base import (
     BadFrameError,
+    DepthScale,
     ImportOptions,
     LoadedFrame,
     Skipped,
     check_frame_pose,
     numbered_files,
-    read_depth,
+    read_depth_if_there,
     read_matrix,
     read_plane,
     read_rgb,
@@ -39,7 +40,7 @@ from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame, UInt8
 
-DEPTH_SCALE = 1000.0
+DEPTH_SCALE = DepthScale(1000.0, convention="ScanNet's millimetres")
 SENSOR_HZ = 30.0
 _TABLE = "scannetv2-labels.combined.tsv"
 _SAME_PIXEL = 0.25  # px; colour that is off by less is not resampled
@@ -92,7 +93,7 @@ class ScanNetRecording:
         name, color_file = self._color[number]
         pose = self._pose(name)
         size = (self._intrinsics.height, self._intrinsics.width)
-        depth = read_depth(self._depth.get(name, self._folder / "depth" / f"{name}.png"), self.depth_scale, size)
+        depth = read_depth_if_there(self._depth.get(name), self.depth_scale, size)
         rgb, encoded = self._rgb(color_file)
         label, label_error = None, None
         if self._has_label:

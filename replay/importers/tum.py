@@ -1,9 +1,10 @@
 """TUM RGB-D sequences: ``rgb.txt``, ``depth.txt`` (stamp, file), ``groundtruth.txt`` (stamp tx ty tz qx qy qz qw).
 
 Each colour image gets the depth image nearest in time (each depth image once) and the pose interpolated between its two
-neighbours; a frame that has no depth within 20 ms or no pose is left out. Depth is 5000 units a metre, registered to
-colour. Intrinsics come from ``intrinsics.json`` where the folder has one (same layout as in a sequence folder), else
-from the calibration published for freiburg1, 2 or 3, by the folder's name, else the default of the sensor's ROS driver.
+neighbours. A frame without a depth image within 20 ms comes without depth, and one without a pose is left out. Depth is
+registered to colour, with 5000 units per metre where ``intrinsics.json`` does not give another ``depth_scale``.
+Intrinsics come from ``intrinsics.json`` where the folder has one (same layout as in a sequence folder), else from the
+calibration published for freiburg1, 2 or 3, by the folder's name, else the default of the sensor's ROS driver.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from replay.importers.base import (
     BadFrameError,
+    DepthScale,
     ImportOptions,
     LoadedFrame,
     check_frame_pose,
@@ -30,7 +32,7 @@ from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
-DEPTH_SCALE = 5000.0
+DEPTH_SCALE = DepthScale(5000.0, convention="TUM's; another one belongs into intrinsics.json as depth_scale")
 _POSE_GAP_NS = 200_000_000  # poses come at 100 Hz; over a longer gap nothing is interpolated
 
 _CALIBRATIONS = {
@@ -59,7 +61,9 @@ class TumRecording:
         self._options = options
         self._intrinsics = self._read_intrinsics()
         self._color = self._read_list(folder / "rgb.txt")
-        depth = self._read_list(folder / "depth.txt")
+        if not self._color:
+            raise ImportSourceError(f"{folder / 'rgb.txt'}: holds no line 'stamp file'")
+        depth = self._read_depth_list()
         self._pose_stamps, self._poses = read_trajectory(folder / "groundtruth.txt", self.notices)
         self._depth_of = match_nearest(
             np.array([stamp for stamp, _ in self._color], np.int64),
@@ -84,15 +88,14 @@ class TumRecording:
             BadFrameError: it cannot be used.
         """
         stamp, file = self._color[number]
-        if self._depth_of[number] < 0:
-            raise BadFrameError(file, f"no depth image within {self._options.match_s * 1e3:g} ms of it in depth.txt")
         pose = interpolate_pose(stamp, self._pose_stamps, self._poses, round(self._options.match_s * 1e9))
         if pose is None:
             raise BadFrameError(file, f"groundtruth.txt has no pose near its time {stamp / 1e9:.6f}")
         rgb, encoded = read_rgb(file)
         image_size_must_be(rgb, self._intrinsics, file)
         size = (self._intrinsics.height, self._intrinsics.width)
-        depth = read_depth(self._depth_files[self._depth_of[number]], self.depth_scale, size)
+        match = self._depth_of[number]
+        depth = read_depth(self._depth_files[match], self.depth_scale, size) if match >= 0 else None
         frame = PosedFrame(
             stamp_ns=stamp,
             seq=number,
@@ -108,7 +111,8 @@ class TumRecording:
     def _read_intrinsics(self) -> CameraIntrinsics:
         file = self._folder / "intrinsics.json"
         if file.exists():
-            intrinsics, self.depth_scale = read_intrinsics(file)
+            intrinsics, given = read_intrinsics(file)
+            self.depth_scale = given or DEPTH_SCALE
             return intrinsics
         name = self._folder.resolve().name
         for key, calibration in _CALIBRATIONS.items():
@@ -121,6 +125,13 @@ class TumRecording:
         self.notices.append("no intrinsics.json and no freiburg1, 2 or 3 in the name: the ROS default f = 525 is used")
         return _DEFAULT
 
+    def _read_depth_list(self) -> list[tuple[int, Path]]:
+        file = self._folder / "depth.txt"
+        entries = self._read_list(file) if file.exists() else []
+        if not entries:
+            self.notices.append("no depth.txt, or no image in it: frames come without depth")
+        return entries
+
     def _read_list(self, file: Path) -> list[tuple[int, Path]]:
         entries: list[tuple[int, Path]] = []
         for line, text in read_lines(file):
@@ -129,8 +140,6 @@ class TumRecording:
                 entries.append((seconds_to_ns(words[0]), self._inside(words[1].strip())))
             except (ValueError, IndexError) as error:
                 self.notices.append(f"{file}, line {line} is passed over: expected 'stamp file' ({error})")
-        if not entries:
-            raise ImportSourceError(f"{file}: holds no line 'stamp file'")
         return sorted(entries, key=lambda entry: entry[0])
 
     def _inside(self, name: str) -> Path:
@@ -176,6 +185,8 @@ def match_nearest(a_ns: NDArray[np.int64], b_ns: NDArray[np.int64], within_ns: i
         a_ns, b_ns: (N,), (M,) rising.
         within_ns: Largest difference.
     """
+    if not len(b_ns):
+        return [-1] * len(a_ns)
     right = np.clip(np.searchsorted(b_ns, a_ns), 1, max(len(b_ns) - 1, 1))
     right = np.minimum(right, len(b_ns) - 1)
     left = np.maximum(right - 1, 0)

@@ -11,6 +11,8 @@ from semantic_mapper.types import Float32, Float64, UInt8
 SUPERSAMPLING = 2  # pixels drawn a side for each pixel of the picture
 MAX_SPLAT = 13  # largest side of a splat, drawn pixels
 COLUMN_M = 0.12  # side of the upright columns in which walls are looked for
+VIEW_DEG = 55.0  # vertical field of view of ``seen_from``, as of Rerun's viewer
+NEAREST_M = 0.05  # nothing nearer is in a picture
 EDGE_STRENGTH = 1.1  # of the shading
 
 
@@ -65,6 +67,38 @@ def from_angle(xyz_upright: Float64, azimuth: float, elevation: float) -> Float6
     right = np.array((-sa, ca, 0.0))
     towards_viewer = np.array((ca * ce, sa * ce, se))
     return xyz_upright @ np.stack((right, np.cross(right, towards_viewer), -towards_viewer)).T
+
+
+def seen_from(xyz: Float64, position: Float64, target: Float64, up: Float64) -> NDArray[np.bool_]:
+    """Which points (N, 3) a viewer sees: in his picture, and behind no other. All in metres of one world.
+
+    The picture is coarse, so that points a few centimetres apart stand for a closed surface.
+
+    Args:
+        xyz: Points of surfaces.
+        position, target: (3,) where he is, and where he looks.
+        up: (3,) unit vector, not along his view.
+
+    Returns:
+        (N,) bool.
+    """
+    width, height = 64, 48
+    focal = height / 2 / np.tan(np.deg2rad(VIEW_DEG) / 2)
+    forward = (target - position) / max(float(np.linalg.norm(target - position)), 1e-6)
+    right = np.cross(forward, up)
+    right /= max(float(np.linalg.norm(right)), 1e-6)
+    view = (xyz - position) @ np.stack((right, np.cross(forward, right), forward)).T
+    ahead = np.flatnonzero(view[:, 2] > NEAREST_M)
+    seen = np.zeros(len(xyz), np.bool_)
+    if not len(ahead):
+        return seen
+    z = view[ahead, 2]
+    pixel = np.floor(focal * view[ahead, :2] / z[:, None] + (width / 2, height / 2)).astype(np.int64)
+    _, depth = _grow(*_z_buffer(pixel, z, width, height), 3)
+    inside = ((pixel >= 0) & (pixel < (width, height))).all(axis=1)
+    pixel, z, ahead = pixel[inside], z[inside], ahead[inside]
+    seen[ahead] = z <= depth[pixel[:, 1], pixel[:, 0]] * 1.05 + 0.1
+    return seen
 
 
 def hides_the_room(xyz_upright: Float64, azimuth: float) -> NDArray[np.bool_]:

@@ -49,6 +49,7 @@ def test_recording_with_a_broken_pose_is_imported_but_for_that_frame(tmp_path: P
     assert done.returncode == 0, done.stderr
     assert "3 frames (3 of them labelled)" in done.stdout
     assert "frame 2" in done.stdout and "poses.txt" in done.stdout
+    assert f"depth: 1000 units per metre, given in {source / 'intrinsics.json'}" in done.stdout
     found = json.loads(run("info", log, "--json").stdout)
     assert found["frames"] == found["frames_with_depth"] == found["frames_with_labels"] == 3
     assert found["cameras"]["camera"]["width"] == 96

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nodes.cli_query import Asked, Question, ask_file, ask_mapper
-from tests.nodes.support import run
+from tests.nodes.support import run, run_here
 from tests.nodes.test_query_service import a_folder, answering
 from tests.queries.scene import BALL, BOX, HALF, RADIUS, whole_map
 
@@ -34,6 +34,17 @@ def test_info(map_file: Path) -> None:
     assert found["classes"]["floor"] > found["classes"]["table"] > 500 and found["classes"]["lamp"] == 0
     assert found["surface_voxels"] == found["without_class"] + sum(found["classes"].values())
     assert "table" in shown and "lamp" not in shown
+
+
+def test_a_folder_with_a_map_is_that_map(map_file: Path) -> None:
+    info = Asked(Question.INFO)
+    assert ask_file(str(map_file.parent), info) == ask_file(str(map_file), info)
+    code, said = run_here("info", map_file.parent)
+    assert code == 0 and "blocks" in said
+    code, said = run_here("correct", map_file.parent, map_file)
+    assert code == 1 and "a saved map keeps no frames to correct" in said
+    code, said = run_here("eval", map_file)
+    assert code == 1 and "is a map alone; give the folder" in said
 
 
 def test_at_points_below_zero_too(map_file: Path) -> None:

@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import drivers.poses.config
+import drivers.registry
 from drivers.calibration import save_calibration
 from nodes import launch_config
 from nodes.launch_config import LaunchFile, load_launch
 from nodes.live_camera import make_source
-from nodes.options import CameraOptions, MapperOptions, RecorderOptions
+from nodes.options import CAMERA_KINDS, POSE_KINDS, CameraOptions, MapperOptions, RecorderOptions
 from replay.log import LogWriter
 from semantic_mapper.config import load_config
 from semantic_mapper.errors import ConfigError, TransportError
@@ -240,7 +242,15 @@ def test_file_name_with_spaces_and_equals_sign_is_kept(tmp_path: Path) -> None:
         (["log=x", "rate=fast"], ("", ""), "rate"),
         (["log=x"], ('input = "eye"', 'input = "eyes"'), "did you mean 'eye'?"),
         (["log=x"], ('input = "eye"', 'imput = "eye"'), "did you mean `input`?"),
-        (["log=x"], ('kind = "mapper"', 'kind = "maper"'), "maper"),
+        (
+            ["log=x"],
+            ('kind = "mapper"', 'kind = "maper"'),
+            "`node[1].kind`: 'maper' is not valid; did you mean `mapper`?",
+        ),
+        (["log=x"], ('mode = "realtime"', 'mode = "real"'), "node 'eye': `mode`: 'real' is not valid; did you mean"),
+        (["log=x"], ('mode = "realtime"', 'max_frames = "3"'), "`max_frames`: must be a whole number, not a text"),
+        (["log=x"], ("[node.options]", "[node.option]"), "`node[0]`: unknown key `option`; did you mean `options`?"),
+        (["log=x"], ('out = "results/{log}.d"', ""), "node 'brain': the key `out` is missing"),
         (["log=x"], ('name = "brain"', 'name = "eye"'), "unique"),
         (["log=x"], ('name = "brain"', 'name = "../brain"'), "letters"),
         (["log=x"], ("{rate}", "{rat}"), "did you mean 'rate'?"),
@@ -255,6 +265,28 @@ def test_mistakes_are_named_with_the_mend(
     with pytest.raises(ConfigError) as caught:
         load_launch(path, settings)
     assert says in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("camera", "says"),
+    [
+        ('kind = "opencv"', 'poses = { kind = "topic", endpoint = "tcp://127.0.0.1:5560" }'),
+        ('kind = "opencw", poses = { kind = "fixed" }', "`camera.kind`: no kind of camera is called 'opencw'; did you"),
+        ('kind = "opencv", poses = { kind = "fixt" }', "'fixt' is no source of poses; did you mean 'fixed'?"),
+        ('kind = "v4l2", poses = { T_world_camera = [] }', "there are device, fixed, topic, board, rgbd"),
+    ],
+)
+def test_mistakes_in_a_camera_and_its_poses_are_found_before_anything_starts(
+    tmp_path: Path, camera: str, says: str
+) -> None:
+    text = SMALL.replace('log = "{log}"\nmode = "realtime"\nrate = "{rate}"', f"camera = {{ {camera} }}")
+    with pytest.raises(ConfigError) as caught:
+        load_launch(_file(tmp_path, text), ["log=x"])
+    assert says in str(caught.value) and "launch.toml: node 'eye'" in str(caught.value)
+
+
+def test_kinds_of_cameras_and_poses_are_those_of_the_drivers() -> None:
+    assert (drivers.registry.KINDS, tuple(drivers.poses.config.KINDS)) == (CAMERA_KINDS, POSE_KINDS)
 
 
 def test_launch_without_a_camera_is_refused(tmp_path: Path) -> None:

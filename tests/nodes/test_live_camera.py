@@ -29,7 +29,7 @@ from nodes.node import NodeContext
 from nodes.options import CameraOptions
 from nodes.process import StopRequest
 from semantic_mapper.config import convert_config
-from semantic_mapper.errors import CameraError, ConfigError
+from semantic_mapper.errors import CameraError, ConfigError, TransportError
 from semantic_mapper.transport.messages import EndOfStream, Message, Status, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber
 from semantic_mapper.types import PosedFrame
@@ -55,6 +55,10 @@ class Walking:
     @property
     def troubles(self) -> tuple[str, ...]:
         return self._camera.troubles
+
+    @property
+    def can_wait(self) -> bool:
+        return self._camera.can_wait
 
     @property
     def turned_at(self) -> float:
@@ -110,7 +114,9 @@ class Running:
 
 
 @contextmanager
-def running(options: dict[str, Any], *, comes_back: bool = False, beats: int = -1) -> Iterator[Running]:
+def running(
+    options: dict[str, Any], *, comes_back: bool = False, beats: int = -1, busy: threading.Event | None = None
+) -> Iterator[Running]:
     with tempfile.TemporaryDirectory(prefix="sm-") as folder:  # pytest's own may be longer than a socket's path
         endpoint = f"ipc://{folder}/eye"
         stop = StopRequest()
@@ -127,8 +133,11 @@ def running(options: dict[str, Any], *, comes_back: bool = False, beats: int = -
         ended = threading.Event()
 
         def listen() -> None:
-            with LosslessSubscriber(endpoint, ("info", "frame", "end", "status")) as subscriber:
+            with LosslessSubscriber(endpoint, ("info", "frame", "end", "status"), hwm=2) as subscriber:
                 while not ended.is_set():
+                    if busy is not None and busy.is_set():  # reads nothing
+                        ended.wait(0.01)
+                        continue
                     message = subscriber.receive(0.05)
                     if message is not None:
                         node.heard.append(message)
@@ -184,6 +193,43 @@ def test_a_video_file_is_published_to_its_end(tmp_path: Path) -> None:
     assert all(f.pose_source == "walk" and f.pose_sigma == 0.1 for f in frames)
     assert frames[4].rgb[..., 0].mean() == pytest.approx(120, abs=5)
     assert node.error is None
+
+
+def long_film(tmp_path: Path) -> dict[str, Any]:
+    """60 images, as quickly as they are taken; a third of them is without a pose."""
+    writer = cv2.VideoWriter(str(tmp_path / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 20, (320, 240))
+    noise = np.random.default_rng(1).integers(0, 255, (240, 320, 3), np.uint8)
+    for _ in range(60):
+        writer.write(noise)
+    writer.release()
+    lens = tmp_path / "lens.toml"
+    lens.write_text("fx = 300.0\nfy = 300.0\ncx = 159.5\ncy = 119.5\nwidth = 320\nheight = 240\n")
+    config = {"source": str(tmp_path / "film.avi"), "calibration": str(lens), "pace": "fast"}
+    return {"camera": {"kind": "opencv", "config": config, "poses": {"kind": "walk"}}}
+
+
+def test_a_video_file_waits_for_a_reader_that_must_not_lose_a_frame(tmp_path: Path) -> None:
+    busy = threading.Event()
+    busy.set()
+    with running(long_film(tmp_path), busy=busy) as node:
+        time.sleep(2.0)  # a mapper that compiles
+        assert node.thread.is_alive()
+        busy.clear()
+        end = node.until(lambda m: isinstance(m, EndOfStream))
+    assert isinstance(end, EndOfStream) and (end.reason, end.published) == ("end", 40)
+    assert [f.seq for f in node.frames()] == [n for n in range(60) if n % 3 != 2]
+    assert node.error is None
+
+
+def test_a_video_file_that_waits_for_a_reader_can_be_stopped_and_has_a_limit(tmp_path: Path) -> None:
+    busy = threading.Event()
+    busy.set()
+    with running(long_film(tmp_path), busy=busy) as node:
+        time.sleep(0.5)
+    assert node.error is None, "stopped, not failed"
+    with running(long_film(tmp_path) | {"ack_timeout_s": 0.5}, busy=busy) as node:
+        assert eventually(lambda: isinstance(node.error, TransportError), PATIENCE_S)
+    assert "taken no frame for 0.5 s" in str(node.error)
 
 
 @pytest.mark.parametrize("kind", ["device", "rgbd"])

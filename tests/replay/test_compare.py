@@ -260,7 +260,9 @@ def test_folders_without_a_run_are_named(tmp_path: Path) -> None:
     with pytest.raises(MapError, match="no such map file"):
         read_run(tmp_path)
     wall().save(tmp_path / "map.npz")
-    with pytest.raises(ConfigError, match=r"no summary\.json"):
+    assert read_run(tmp_path).summary is None, "a map alone"
+    (tmp_path / "summary.json").write_text("{}")
+    with pytest.raises(ConfigError, match="is not the summary of a replay"):
         read_run(tmp_path)
     assert read_run(tmp_path / "map.npz").summary is None
 

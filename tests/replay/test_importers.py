@@ -80,6 +80,20 @@ def test_classes_of_an_unknown_id_space_get_colours_of_their_own(folder: Path) -
     assert labels is not None and labels.name == "kitchen" and len(set(labels.colors)) == 3
 
 
+def test_labels_without_an_ignore_id_keep_all_their_classes(folder: Path) -> None:
+    classes = {"0": "wall", "1": "floor", "2": "chair", "5": "lamp"}
+    (folder / "labels.json").write_text(json.dumps({"classes": classes, "ignore": None}))
+    report, log = imported(folder)
+    labels = log.info.label_set
+    assert labels is not None and (labels.ids, labels.ignore_id) == ((0, 1, 2, 5), 255)
+    assert report.labelled == 6 and np.array_equal(log.frame(0).label, rec.label(0))
+    assert (labels.to_channels(rec.label(0)) >= 0).all()
+    assert any("no ignore id; 255" in notice for notice in report.notices)
+    (folder / "labels.json").write_text(json.dumps({"classes": classes}))
+    report, _ = imported(folder)
+    assert any("class 0 'wall' is read as unknown" in notice for notice in report.notices)
+
+
 def test_each_bad_frame_is_left_out_with_its_reason_and_the_rest_kept(tmp_path: Path) -> None:
     src = rec.make_folder(tmp_path / "kitchen", count=14)
     rows = (src / "poses.txt").read_text().splitlines()
@@ -247,7 +261,36 @@ def test_a_tum_sequence_gets_matched_depth_and_interpolated_poses(tum: Path) -> 
     assert first == 1_305_031_102_175_304_000  # to the nanosecond
 
 
-def test_tum_frames_without_depth_or_pose_are_left_out_with_their_reason(tum: Path) -> None:
+@pytest.mark.parametrize("kind", ["folder", "tum"])
+def test_depth_is_read_by_the_convention_of_its_format_where_no_scale_is_given(tmp_path: Path, kind: str) -> None:
+    src = {"folder": rec.make_folder, "tum": rec.make_tum}[kind](tmp_path / kind)
+    given, log = imported(src)
+    expected = log.frame(0).depth_m
+    plain = {key: value for key, value in rec.INTRINSICS.items() if key != "depth_scale"}
+    (src / "intrinsics.json").write_text(json.dumps(plain))
+    assumed, log = imported(src)
+    assert np.array_equal(log.frame(0).depth_m, expected)
+    assert given.depth_scale.units_per_m == assumed.depth_scale.units_per_m == {"folder": 1000, "tum": 5000}[kind]
+    assert given.depth_scale.given_in == src / "intrinsics.json" and assumed.depth_scale.given_in is None
+    assert assumed.with_depth == 6 and assumed.median_depth_m == pytest.approx(np.median(rec.depth(0)) / 1000)
+
+
+def test_a_depth_image_that_is_missing_costs_the_depth_only(folder: Path) -> None:
+    (folder / "depth" / "000003.png").unlink()
+    report, log = imported(folder)
+    assert (report.frames, report.with_depth, report.skipped) == (6, 5, ())
+    assert [frame.seq for frame in log if frame.depth_m is None] == [3]
+
+
+def test_a_tum_sequence_without_depth_is_imported(tum: Path) -> None:
+    (tum / "depth.txt").unlink()
+    report, log = imported(tum)
+    assert (report.format, report.frames, report.with_depth) == ("tum", 6, 0)
+    assert all(frame.depth_m is None for frame in log)
+    assert any("no depth.txt" in notice for notice in report.notices)
+
+
+def test_tum_frames_without_depth_are_kept_and_those_without_a_pose_left_out(tum: Path) -> None:
     depth = (tum / "depth.txt").read_text().splitlines()
     (tum / "depth.txt").write_text("\n".join([*depth[:2], "no time at all", *depth[3:]]))
     truth = (tum / "groundtruth.txt").read_text().splitlines()
@@ -255,9 +298,10 @@ def test_tum_frames_without_depth_or_pose_are_left_out_with_their_reason(tum: Pa
     (tum / "groundtruth.txt").write_text("\n".join(truth[:15]))
     report, log = imported(tum)
     said = reasons(report)
-    assert "no depth image within 20 ms" in said[1]
     assert "groundtruth.txt has no pose near" in said[5]
-    assert [frame.seq for frame in log] == [n for n in range(6) if n not in said]
+    assert 1 not in said and [frame.seq for frame in log] == [n for n in range(6) if n not in said]
+    assert [frame.seq for frame in log if frame.depth_m is None] == [1]
+    assert report.with_depth == report.frames - 1
     assert any("depth.txt, line 3" in notice for notice in report.notices)
     assert any("groundtruth.txt, line 6" in notice for notice in report.notices)
 
@@ -328,12 +372,12 @@ def test_lost_scannet_poses_and_odd_images_are_left_out(scannet: Path) -> None:
     rec.write_image(scannet / "color" / "80.jpg", rec.color(4))
     rec.write_image(scannet / "label-filt" / "100.png", rec.label(5)[:5])
     report, log = imported(scannet)
-    assert [frame.seq for frame in log] == [0, 5]
+    assert [frame.seq for frame in log] == [0, 3, 5]
+    assert log.frame(1).depth_m is None and report.with_depth == 2
     said = reasons(report)
     for number, words in {
         1: "lost track of its pose here (-inf)",
         2: "40.txt: cannot be read",
-        3: "60.png",
         4: "the image is 32x24, the others 64x48",
         5: "neither the size of colour nor of depth",
     }.items():

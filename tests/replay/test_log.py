@@ -318,3 +318,13 @@ def test_a_killed_writer_loses_at_most_the_message_it_was_writing(tmp_path: Path
         assert not reader.finished
     assert found[: last + 1] == list(range(last + 1))  # all that was said to be written
     assert len(found) <= last + 2
+
+
+@pytest.mark.parametrize(
+    ("start", "says"), [(b"PK\x03\x04", "a ZIP file, as saved maps are"), (b"#ROSBAG V2.0\n", "a ROS 1 bag")]
+)
+def test_a_file_of_another_kind_is_named(tmp_path: Path, start: bytes, says: str) -> None:
+    path = tmp_path / "file.mcap"
+    path.write_bytes(start + bytes(100))
+    with pytest.raises(LogError, match=f"not an MCAP log \\(it is {says}\\)"):
+        LogReader(path)

@@ -46,6 +46,7 @@ class ListCamera:
         self.images = list(images)
         self.is_open = False
         self.stopped = False
+        self.can_wait = False
         self.turned_at = 0.0
         self.troubles: tuple[str, ...] = ("the lens cap is on",)
         self.info = StreamInfo("list", {"cam": INTRINSICS})
