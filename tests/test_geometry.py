@@ -44,10 +44,10 @@ def poses(draw: st.DrawFn) -> np.ndarray:
 @st.composite
 def cameras(draw: st.DrawFn) -> CameraIntrinsics:
     width, height = draw(st.integers(2, 40)), draw(st.integers(2, 40))
-    focal = st.floats(5, 500)
+    focal = st.floats(0.2, 20)  # image sides
     return CameraIntrinsics(
-        fx=draw(focal),
-        fy=draw(focal),
+        fx=draw(focal) * width,
+        fy=draw(focal) * height,
         cx=draw(st.floats(0, 1)) * (width - 1),
         cy=draw(st.floats(0, 1)) * (height - 1),
         width=width,

@@ -15,7 +15,7 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.allocation import blocks_in_band, make_camera
+from semantic_mapper.mapping.allocation import blocks_in_band, frame_budget, make_camera
 from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys
 from semantic_mapper.mapping.changes import (
@@ -179,7 +179,14 @@ class VoxelMap:
         camera = make_camera(frame.intrinsics, frame.T_world_camera)
         with _KERNEL_LOCK:
             votes = frame_votes(depth, table, camera, self.config.depth_max_m, len(self.label_set), where, weights)
-            packed = blocks_in_band(depth, camera, self.config.voxel_size_m, self.truncation_m, self.config.depth_max_m)
+            packed = blocks_in_band(
+                depth,
+                camera,
+                self.config.voxel_size_m,
+                self.truncation_m,
+                self.config.depth_max_m,
+                frame_budget(self.config.max_blocks),
+            )
             rgb = np.ascontiguousarray(frame.rgb)
             for blocks in self.changing(packed):
                 fuse_blocks(blocks, self._grid.buffers(), camera, self._limits, depth, rgb, weights, votes, self.frames)

@@ -252,7 +252,7 @@ def test_what_is_no_probability_is_refused_and_changes_nothing(wrong: float) -> 
 
 def test_unrectified_and_far_away_frames_are_refused() -> None:
     depth = np.ones((120, 160), np.float32)
-    distorted = CameraIntrinsics(130, 130, 80, 60, 160, 120, (0.1, 0.0))
+    distorted = CameraIntrinsics(130, 130, 80, 60, 160, 120, (0.1, 0.0, 0.0, 0.0))
     with pytest.raises(FrameError, match="rectified"):
         small_map().integrate(frame(intrinsics=distorted), depth, None, None)
     far = np.eye(4)
