@@ -29,6 +29,7 @@ MIN_FOCAL, MAX_FOCAL = 0.1, 100.0
 CENTER_MARGIN = 1.0  # image sides that the principal point may lie outside of the image, as it does in a crop
 COEFFICIENTS = (0, 4, 5, 8, 12, 14)  # how many OpenCV's lens models have
 MAX_DISTORTION = 1e6  # of a coefficient; ill-conditioned fits of the rational model reach thousands
+MIN_DEPTH_M, MAX_DEPTH_M = 1e-3, 1e3  # what lies beyond, as NaN and infinity, is no measurement: float32 squares it
 MAX_POSE_SIGMA_M = 1e6
 MAX_STAMP_NS = 1 << 62  # 146 years, also as Unix time; sums and differences of two stay within int64
 
@@ -112,7 +113,8 @@ class PosedFrame:
         seq: Counter of the source, from 0 to 2^63 - 1; gaps mean lost frames.
         camera_id: Name of the camera.
         rgb: (H, W, 3) uint8.
-        depth_m: (H, W) float32 z-depth in metres, 0 = no measurement; None without a depth sensor.
+        depth_m: (H, W) float32 z-depth in metres, None without a depth sensor; what is not from ``MIN_DEPTH_M`` to
+            ``MAX_DEPTH_M``, such as 0, is no measurement.
         label: (H, W) uint8 class ids of the stream's label set; None where there are none.
         intrinsics: Of the rectified image.
         T_world_camera: (4, 4) float64.

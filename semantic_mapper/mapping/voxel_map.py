@@ -63,6 +63,7 @@ class VoxelMap:
 
     Raises:
         ConfigError: a value of ``config`` that no map can be built with.
+        MapError: there is no memory for ``initial_blocks``, or for ``memory_mb``.
         DependencyError: Open3D cannot be loaded.
     """
 
@@ -326,7 +327,7 @@ class VoxelMap:
             try:
                 loaded = cls(config, saved.label_set)
                 loaded._grid.reserve(saved.blocks)
-            except (ConfigError, RuntimeError) as error:  # RuntimeError: Open3D gets no memory
+            except (ConfigError, MapError) as error:
                 raise MapError(
                     f"{path}: the saved configuration cannot be used: {error}. Where memory is short, load with a "
                     "memory_mb of your own"

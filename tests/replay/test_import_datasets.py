@@ -26,7 +26,7 @@ R_rect_00: 0.999974 -0.007141 -0.000089 0.007141 0.999969 -0.003247 0.000112 0.0
 P_rect_00: 52.554261 0.0 31.049453 0.0 0.0 52.554261 11.769549 0.0 0.0 0.0 1.0 0.0
 S_rect_00: {w}.0 {h}.0
 R_rect_01: 0.999778 0.012120 -0.017290 -0.012117 0.999926 0.000302 0.017292 -0.000092 0.999850
-P_rect_01: 52.554261 0.0 31.049453 -31.2268 0.0 52.554261 11.769549 0.0 0.0 0.0 1.0 0.0
+P_rect_01: 52.554261 0.0 31.049453 -31.2269 0.0 52.554261 11.769549 0.0 0.0 0.0 1.0 0.0
 S_rect_01: {w}.0 {h}.0
 """
 
@@ -179,6 +179,8 @@ def test_what_is_wrong_with_a_kitti360_folder_is_told(tmp_path: Path) -> None:
     for file, text, complaint in (
         (poses, "250 1 0 0 0 0 1 0 0 0 0 1 0\n", "poses.txt, with 12, is another file"),
         (poses, "", "holds no pose"),
+        (root / "calibration" / "perspective.txt", PERSPECTIVE.format(w="nan", h=24), "perspective.txt"),
+        (root / "calibration" / "perspective.txt", PERSPECTIVE.format(w=640, h=480), "perspective.txt.*do not fit"),
         (root / "calibration" / "perspective.txt", "P_rect_00: 1 2 3\n", "needs 'P_rect_00:' with 12 numbers"),
     ):
         file.write_text(text)

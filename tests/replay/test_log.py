@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import random
 import signal
 import subprocess
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from drivers.base import FrameSource
+from nodes.log_info import describe_log
 from replay.log import LogReader, LogWriter
 from replay.recover import recover
 from semantic_mapper.errors import CodecError, LogError
@@ -318,3 +320,35 @@ def test_a_killed_writer_loses_at_most_the_message_it_was_writing(tmp_path: Path
         assert not reader.finished
     assert found[: last + 1] == list(range(last + 1))  # all that was said to be written
     assert len(found) <= last + 2
+
+
+def hostile_log(path: Path, monkeypatch: pytest.MonkeyPatch, *, info: bool) -> Path:
+    """Three frames, the second with ``cy`` far beyond its image; with ``info``, the stream information has that too."""
+    with monkeypatch.context() as patch:
+        patch.setattr("semantic_mapper.types._check_lens", lambda k: None)  # as written before intrinsics were checked
+        wild = dataclasses.replace(samples.INTRINSICS, cy=1e19)
+        cameras = {samples.CAMERA: wild if info else samples.INTRINSICS}
+        with LogWriter(path, StreamInfo("test", cameras, NYU40)) as writer:
+            for seq in range(3):
+                frame = samples.make_frame(seq)
+                writer.write_frame(dataclasses.replace(frame, intrinsics=wild) if seq == 1 else frame)
+    return path
+
+
+def test_a_frame_whose_intrinsics_do_not_fit_is_reported_as_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = hostile_log(tmp_path / "wild.mcap", monkeypatch, info=False)
+    found = describe_log([path], lambda: None)
+    assert found["frames"] == 2 and len(found["damage"]) == 1
+    assert "frame 1" in found["damage"][0] and "cy=1e+19" in found["damage"][0]
+    with LogReader(path) as reader:
+        assert seqs(reader) == [0, 2]
+
+
+def test_stream_information_whose_intrinsics_do_not_fit_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = hostile_log(tmp_path / "wild.mcap", monkeypatch, info=True)
+    with pytest.raises(LogError, match=r"stream information .* cannot be used: .*camera 'front'.*cy=1e\+19"):
+        LogReader(path)
