@@ -10,21 +10,20 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import cv2
 import msgspec
 import numpy as np
 
 from semantic_mapper.config import AtLeastOne, Config, Positive, convert_config, read_json, read_toml
-from semantic_mapper.errors import CameraError, ConfigError, PoseError
+from semantic_mapper.errors import CameraError, ConfigError, FrameError, PoseError
 from semantic_mapper.files import write_bytes
 from semantic_mapper.geometry import camera_matrix, check_pose
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
 Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]  # a pose, row by row
-COEFFICIENTS = (0, 4, 5, 8, 12, 14)  # how many OpenCV's models of lenses have
 GUESSED_VIEW_DEG = 60.0  # horizontal, of a camera that nobody has calibrated
 
 
@@ -37,13 +36,9 @@ class CalibrationFile(Config, frozen=True):
     cy: float
     width: AtLeastOne
     height: AtLeastOne
-    distortion: tuple[Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)], ...] = ()
+    distortion: tuple[float, ...] = ()
     T_rig_camera: Matrix | None = None  # of a camera on a rig
     about: dict[str, Any] = msgspec.field(default_factory=dict)  # when, how, how well: for people
-
-    def __post_init__(self) -> None:
-        if len(self.distortion) not in COEFFICIENTS:
-            raise ValueError(f"distortion has {len(self.distortion)} coefficients; OpenCV's models have {COEFFICIENTS}")
 
 
 def load_calibration(path: Path) -> CameraIntrinsics:
@@ -57,7 +52,10 @@ def load_calibration(path: Path) -> CameraIntrinsics:
         raise ConfigError(
             f"{path}: the principal point ({file.cx:g}, {file.cy:g}) is outside of the {file.width}x{file.height} image"
         )
-    return CameraIntrinsics(file.fx, file.fy, file.cx, file.cy, file.width, file.height, file.distortion)
+    try:
+        return CameraIntrinsics(file.fx, file.fy, file.cx, file.cy, file.width, file.height, file.distortion)
+    except FrameError as error:
+        raise ConfigError(f"{path}: {error}") from error
 
 
 def load_mount(path: Path) -> Float64 | None:
@@ -145,6 +143,9 @@ class Rectifier:
 
     Args:
         measured: Of the camera with its lens.
+
+    Raises:
+        ConfigError: the distortion leaves no image that a pinhole camera could have made.
     """
 
     def __init__(self, measured: CameraIntrinsics) -> None:
@@ -158,7 +159,12 @@ class Rectifier:
         maps = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), ideal, size, cv2.CV_16SC2)
         self._maps = (np.asarray(maps[0]), np.asarray(maps[1]))
         fx, fy, cx, cy = (float(v) for v in (ideal[0, 0], ideal[1, 1], ideal[0, 2], ideal[1, 2]))
-        self.intrinsics = CameraIntrinsics(fx, fy, cx, cy, *size)
+        try:
+            self.intrinsics = CameraIntrinsics(fx, fy, cx, cy, *size)
+        except FrameError as error:
+            raise ConfigError(
+                f"the lens distortion {measured.distortion} leaves no usable image: {error}; calibrate the camera again"
+            ) from error
 
     def __call__(self, bgr: UInt8) -> UInt8:
         """(H, W, 3) BGR as OpenCV captures it -> rectified RGB of the same size."""

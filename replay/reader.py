@@ -214,10 +214,14 @@ class LogReader:
                 return decode_info(self._read(entry))
             except (LogError, CodecError) as error:
                 self._report(LogError(f"{self._where(entry)}: {error}"))
-        damaged = f"; damaged: {self.errors[0]}" if self.errors else ""
+        if self.errors:
+            raise LogError(
+                f"{self.path}: its stream information (cameras and classes) cannot be used: {self.errors[0]}; record "
+                "or import it again"
+            )
         raise LogError(
             f"{self.path}: says nothing of its cameras and classes: not a log of semantic-mapper (what `export` writes "
-            f"for Foxglove is none either: use the log it was made of), or cut off before its first frame{damaged}"
+            f"for Foxglove is none either: use the log it was made of), or cut off before its first frame"
         )
 
     def _report_damages(self, found: Scan) -> None:

@@ -3,7 +3,12 @@
 Each target runs in a process of its own under atheris (libFuzzer), which is no dependency of the project: `uv pip
 install atheris`. Whatever is raised beside ``SemanticMapperError`` ends it with a crash, as does more than --memory-mb.
 
-Example: python scripts/fuzz.py --minutes 10 --out runs/fuzz
+Example: python -m scripts.fuzz --minutes 10 --out runs/fuzz
+
+With --frames, values instead of bytes are spoiled: so many frames go through the whole step of the mapper, in this
+process and without atheris; see ``fuzz_values``.
+
+Example: python -m scripts.fuzz --frames 100000 --out runs/fuzz
 """
 
 from __future__ import annotations
@@ -19,6 +24,8 @@ import sys
 import time
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 INPUT_SECONDS = 10  # for one input; more counts as a hang
 MAX_BYTES = 1 << 16
@@ -97,6 +104,20 @@ def result(name: str, code: int, out: Path) -> dict[str, Any]:
     }
 
 
+def fuzz_values(frames: int, seed: int, out: Path) -> None:
+    """Send frames with hostile values through the mapper and report the worst."""
+    values = importlib.import_module("scripts.fuzz_values")
+    logging = importlib.import_module("structlog")
+    logging.configure(wrapper_class=logging.make_filtering_bound_logger(50))  # a line a refused frame is too many
+    report = values.run(frames, seed, lambda r: print(r.line(), flush=True))
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "values.json").write_text(json.dumps(msgspec.to_builtins(report), indent=1), encoding="utf-8")
+    print(report.line())
+    print(f"slowest: {report.slowest}")
+    if report.failures:
+        raise SystemExit("; ".join(report.failures))
+
+
 def main() -> None:
     """See the module's docstring."""
     if sys.argv[1:2] == ["--one"]:
@@ -107,8 +128,13 @@ def main() -> None:
     parser.add_argument("--targets", nargs="+", default=["message", "log", "question", "answer", "pose"])
     parser.add_argument("--memory-mb", type=int, default=2048, help="a process that takes more has failed")
     parser.add_argument("--out", type=Path, default=Path("runs/fuzz"), help="corpora, crashes, report.json")
+    parser.add_argument("--frames", type=int, help="spoil the values of so many frames instead of bytes")
+    parser.add_argument("--seed", type=int, default=0, help="of the values")
     arguments = parser.parse_args()
     out = arguments.out.absolute()
+    if arguments.frames:
+        fuzz_values(arguments.frames, arguments.seed, out)
+        return
     began = time.monotonic()
     seconds = max(1, round(60 * arguments.minutes))
     processes = {name: start(name, seconds, arguments.memory_mb, out) for name in arguments.targets}

@@ -10,6 +10,8 @@ from semantic_mapper.errors import PoseError, ShapeError
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, RayBatch
 
 ROTATION_TOLERANCE = 1e-3  # |R^T R - I|: logs store 6 to 9 digits; a real mistake (scale, mirror) is far larger
+# Metres along each axis. Views are rendered in float32, whose steps are 8 mm there: less than half a voxel of 2 cm.
+MAX_TRANSLATION_M = 1e5
 NEAREST_Z_M = 0.05  # nearer points are looked up in no image
 
 
@@ -40,7 +42,8 @@ def check_pose(T_world_camera: Float64, where: str) -> None:
         where: Names the frame or file in the error.
 
     Raises:
-        PoseError: NaN or infinite numbers, wrong last row, or a 3x3 part that is not a rotation.
+        PoseError: NaN or infinite numbers, wrong last row, a 3x3 part that is not a rotation, or a position farther
+            than ``MAX_TRANSLATION_M`` from the origin.
     """
     expect_shape(T_world_camera, "4 4", f"{where}: T_world_camera")
     if not np.isfinite(T_world_camera).all():
@@ -48,12 +51,18 @@ def check_pose(T_world_camera: Float64, where: str) -> None:
     if not np.allclose(T_world_camera[3], (0, 0, 0, 1), atol=1e-9):
         raise PoseError(f"{where}: the last row of the pose must be 0 0 0 1, got {T_world_camera[3]}")
     R = T_world_camera[:3, :3]
-    error = float(np.abs(R.T @ R - np.eye(3)).max())
-    det = float(np.linalg.det(R))
-    if error > ROTATION_TOLERANCE or det < 0:
+    with np.errstate(over="ignore", invalid="ignore"):  # huge numbers give infinity or NaN, which are refused
+        error = float(np.abs(R.T @ R - np.eye(3)).max())
+        det = float(np.linalg.det(R))
+    if not (error <= ROTATION_TOLERANCE and det > 0):
         raise PoseError(
             f"{where}: the pose is not a rotation (|R^T R - I| = {error:.2g}, det = {det:.3f}); "
             "give T_world_camera as a row-major rigid 4x4 without scale or mirror"
+        )
+    if np.abs(T_world_camera[:3, 3]).max() > MAX_TRANSLATION_M:
+        raise PoseError(
+            f"{where}: the camera is at {T_world_camera[:3, 3]} m, beyond the {MAX_TRANSLATION_M / 1000:g} km from the "
+            "origin within which float32 resolves a voxel; give poses in metres, relative to a nearer origin"
         )
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from semantic_mapper.geometry import scale_intrinsics
-from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame, UInt8
+from semantic_mapper.types import MAX_DEPTH_M, MIN_DEPTH_M, CameraIntrinsics, Float32, PosedFrame, UInt8
 
 
 def working_intrinsics(intrinsics: CameraIntrinsics, width: int) -> CameraIntrinsics:
@@ -25,7 +25,7 @@ def resize_rgb(frame: PosedFrame, intrinsics: CameraIntrinsics) -> UInt8:
 
 
 def resize_depth(frame: PosedFrame, intrinsics: CameraIntrinsics) -> Float32:
-    """Depth (H, W) of a frame at the size of ``intrinsics``, 0 where nothing (finite, positive) was measured.
+    """Depth (H, W) of a frame at the size of ``intrinsics``, 0 where it is not from ``MIN_DEPTH_M`` to ``MAX_DEPTH_M``.
 
     Nearest pixel, not averaged: a mean of two depths across an edge lies on no surface.
     """
@@ -34,7 +34,8 @@ def resize_depth(frame: PosedFrame, intrinsics: CameraIntrinsics) -> Float32:
     depth = frame.depth_m
     if depth.shape != (intrinsics.height, intrinsics.width):
         depth = cv2.resize(depth, (intrinsics.width, intrinsics.height), interpolation=cv2.INTER_NEAREST_EXACT)
-    return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+    measured = (depth >= MIN_DEPTH_M) & (depth <= MAX_DEPTH_M)  # False for NaN, too
+    return np.where(measured, depth, 0).astype(np.float32)
 
 
 def resize_label(label: UInt8, intrinsics: CameraIntrinsics) -> UInt8:

@@ -21,10 +21,28 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
+MAX_SIDE = 1 << 14  # pixels
+MAX_PIXELS = 1 << 25  # 8192 x 4096
+# Focal lengths in image sides. 0.1 is a field of view of 157 degrees, about as far as the pinhole model of a rectified
+# image goes (a raw 180 degree fisheye has 0.3); 100 is one of 0.6 degrees, a tele lens of 3.6 m on a 35 mm camera.
+MIN_FOCAL, MAX_FOCAL = 0.1, 100.0
+CENTER_MARGIN = 1.0  # image sides that the principal point may lie outside of the image, as it does in a crop
+COEFFICIENTS = (0, 4, 5, 8, 12, 14)  # how many OpenCV's lens models have
+MAX_DISTORTION = 1e6  # of a coefficient; ill-conditioned fits of the rational model reach thousands
+MIN_DEPTH_M, MAX_DEPTH_M = 1e-3, 1e3  # what lies beyond, as NaN and infinity, is no measurement: float32 squares it
+MAX_POSE_SIGMA_M = 1e6
+MAX_STAMP_NS = 1 << 62  # 146 years, also as Unix time; sums and differences of two stay within int64
+
 
 @dataclass(frozen=True, slots=True)
 class CameraIntrinsics:
-    """Pinhole model in pixels; ``distortion`` holds OpenCV coefficients, empty for a rectified image."""
+    """Pinhole model in pixels; ``distortion`` holds OpenCV coefficients, empty for a rectified image.
+
+    This is the one place where intrinsics are checked, wherever they come from: the bounds are the constants above.
+
+    Raises:
+        FrameError: a value is not finite or does not fit the image size; normalised intrinsics are named as such.
+    """
 
     fx: float
     fy: float
@@ -37,12 +55,53 @@ class CameraIntrinsics:
     def __post_init__(self) -> None:
         values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not all(np.isfinite(v) for v in values):
-            raise FrameError(f"intrinsics must be finite numbers, got {values}")
+            raise FrameError(
+                f"intrinsics must be finite numbers, got fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy} "
+                f"distortion={self.distortion}"
+            )
         if self.fx <= 0 or self.fy <= 0 or self.width <= 0 or self.height <= 0:
             raise FrameError(
                 f"focal lengths and image size must be positive, got fx={self.fx} fy={self.fy} "
                 f"width={self.width} height={self.height}"
             )
+        if max(self.width, self.height) > MAX_SIDE or self.width * self.height > MAX_PIXELS:
+            raise FrameError(
+                f"an image of {self.width}x{self.height} is too large: at most {MAX_SIDE} pixels a side and "
+                f"{MAX_PIXELS} in all; send smaller images"
+            )
+        _check_lens(self)
+        if len(self.distortion) not in COEFFICIENTS:
+            raise FrameError(f"distortion has {len(self.distortion)} coefficients; OpenCV's models have {COEFFICIENTS}")
+        if any(abs(d) > MAX_DISTORTION for d in self.distortion):
+            raise FrameError(
+                f"distortion {self.distortion} has a coefficient beyond {MAX_DISTORTION:g}: calibrate again"
+            )
+
+
+def _check_lens(k: CameraIntrinsics) -> None:
+    """Focal lengths and principal point against the image size, so that every ray has a bounded slope."""
+    longest = MAX_FOCAL * max(k.width, k.height)
+    focal = MIN_FOCAL * k.width <= k.fx <= longest and MIN_FOCAL * k.height <= k.fy <= longest
+    margin_x, margin_y = CENTER_MARGIN * k.width, CENTER_MARGIN * k.height
+    center = -margin_x <= k.cx + 0.5 <= k.width + margin_x and -margin_y <= k.cy + 0.5 <= k.height + margin_y
+    if focal and center:
+        return
+    got = f"fx={k.fx:.6g} fy={k.fy:.6g} cx={k.cx:.6g} cy={k.cy:.6g} do not fit a {k.width}x{k.height} image"
+    if k.fx < 5 and k.fy < 5 and 0 <= k.cx <= 1 and 0 <= k.cy <= 1:
+        raise FrameError(
+            f"intrinsics {got}: they look normalised to the image size, but must be in pixels; multiply fx and cx by "
+            f"the width and fy and cy by the height (fx={k.fx * k.width:.6g} fy={k.fy * k.height:.6g} "
+            f"cx={k.cx * k.width:.6g} cy={k.cy * k.height:.6g})"
+        )
+    if not focal:
+        raise FrameError(
+            f"intrinsics {got}: focal lengths must be in pixels, from {MIN_FOCAL:g} times the image side (a field of "
+            f"view of 157 degrees) to {MAX_FOCAL:g} times; check the calibration"
+        )
+    raise FrameError(
+        f"intrinsics {got}: the principal point must be in the image, or at most {CENTER_MARGIN:g} image side outside "
+        "of it; where images were resized or cropped after calibration, scale and shift the intrinsics with them"
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,11 +109,12 @@ class PosedFrame:
     """One camera image with its pose, as a driver or a log gives it.
 
     Args:
-        stamp_ns: Capture time, int64 nanoseconds on the robot's monotonic clock.
-        seq: Counter of the source, from 0; gaps mean lost frames.
+        stamp_ns: Capture time, int64 nanoseconds on the robot's monotonic clock, 0 to ``MAX_STAMP_NS``.
+        seq: Counter of the source, from 0 to 2^63 - 1; gaps mean lost frames.
         camera_id: Name of the camera.
         rgb: (H, W, 3) uint8.
-        depth_m: (H, W) float32 z-depth in metres, 0 = no measurement; None without a depth sensor.
+        depth_m: (H, W) float32 z-depth in metres, None without a depth sensor; what is not from ``MIN_DEPTH_M`` to
+            ``MAX_DEPTH_M``, such as 0, is no measurement.
         label: (H, W) uint8 class ids of the stream's label set; None where there are none.
         intrinsics: Of the rectified image.
         T_world_camera: (4, 4) float64.
@@ -62,7 +122,7 @@ class PosedFrame:
         pose_sigma: One-sigma position uncertainty in metres; 0 = not known.
 
     Raises:
-        FrameError: where a shape or dtype is off. The pose is checked by ``geometry.check_pose``.
+        FrameError: a shape or dtype is off, or a number out of its range. ``geometry.check_pose`` checks the pose.
     """
 
     stamp_ns: int
@@ -78,12 +138,22 @@ class PosedFrame:
 
     def __post_init__(self) -> None:
         size = (self.intrinsics.height, self.intrinsics.width)
+        _expect_range(self, "stamp_ns", self.stamp_ns, MAX_STAMP_NS)
+        _expect_range(self, "seq", self.seq, (1 << 63) - 1)
+        _expect_range(self, "pose_sigma", self.pose_sigma, MAX_POSE_SIGMA_M)
         _expect(self, "rgb", self.rgb, (*size, 3), np.uint8)
         _expect(self, "T_world_camera", self.T_world_camera, (4, 4), np.float64)
         if self.depth_m is not None:
             _expect(self, "depth_m", self.depth_m, size, np.float32)
         if self.label is not None:
             _expect(self, "label", self.label, size, np.uint8)
+
+
+def _expect_range(frame: PosedFrame, name: str, value: float, most: float) -> None:
+    if not 0 <= value <= most:  # NaN, too
+        raise FrameError(
+            f"frame seq={frame.seq} of camera '{frame.camera_id}': {name} must be from 0 to {most}, got {value}"
+        )
 
 
 def _expect(

@@ -44,10 +44,10 @@ def poses(draw: st.DrawFn) -> np.ndarray:
 @st.composite
 def cameras(draw: st.DrawFn) -> CameraIntrinsics:
     width, height = draw(st.integers(2, 40)), draw(st.integers(2, 40))
-    focal = st.floats(5, 500)
+    focal = st.floats(0.2, 20)  # image sides
     return CameraIntrinsics(
-        fx=draw(focal),
-        fy=draw(focal),
+        fx=draw(focal) * width,
+        fy=draw(focal) * height,
         cx=draw(st.floats(0, 1)) * (width - 1),
         cy=draw(st.floats(0, 1)) * (height - 1),
         width=width,
@@ -257,3 +257,19 @@ def test_depth_of_another_size_than_the_camera_is_refused() -> None:
 def test_looking_straight_along_up_is_refused() -> None:
     with pytest.raises(PoseError, match="up"):
         look_at(np.array([0.0, 0, 2]), np.zeros(3), np.array([0.0, 0, 1]))
+
+
+@pytest.mark.parametrize("far_m", [1.1e5, -1e9, 1e300])
+def test_a_position_that_float32_cannot_resolve_is_refused(far_m: float) -> None:
+    pose = np.eye(4)
+    pose[1, 3] = far_m
+    with pytest.raises(PoseError, match="nearer origin"):
+        check_pose(pose, "frame 1")
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e160, 1e300])
+def test_a_rotation_of_huge_numbers_is_refused_without_overflow(scale: float) -> None:
+    pose = np.eye(4)
+    pose[:3, :3] *= scale
+    with pytest.raises(PoseError, match="not a rotation"):
+        check_pose(pose, "frame 1")

@@ -63,4 +63,4 @@ def test_four_quarters_are_none():
 
 def test_a_distorted_image_is_refused():
     with pytest.raises(FrameError, match="rectify"):
-        turned_intrinsics(replace(INTRINSICS, distortion=(0.1,)), 1)
+        turned_intrinsics(replace(INTRINSICS, distortion=(0.1, 0.0, 0.0, 0.0)), 1)

@@ -88,3 +88,55 @@ def test_updates_do_not_share_their_timings() -> None:
 
 def test_frame_errors_belong_to_the_one_tree() -> None:
     assert issubclass(FrameError, SemanticMapperError) and issubclass(FrameError, ValueError)
+
+
+VGA = CameraIntrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"cy": 1e19},
+        {"cx": 1e5},
+        {"cx": -700.0},
+        {"cx": 1300.0},
+        {"fx": 0.01, "fy": 0.01},
+        {"fx": 1e-320},
+        {"fx": 60.0},  # wider than a pinhole image can be
+        {"fy": 1e6},
+        {"width": 1 << 15, "height": 1},
+        {"width": 1 << 14, "height": 1 << 14, "fx": 1e4, "fy": 1e4},
+        {"distortion": (0.1, 0.0, 0.0)},
+        {"distortion": (1e9, 0.0, 0.0, 0.0)},
+    ],
+)
+def test_intrinsics_that_no_camera_has_are_refused(change: dict[str, float]) -> None:
+    with pytest.raises(FrameError, match=r"fit a 640x480|too large|distortion"):
+        dataclasses.replace(VGA, **change)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"fx": 90.0, "fy": 90.0},  # rectified fisheye, 148 degrees
+        {"fx": 30000.0, "fy": 30000.0},  # tele lens
+        {"cx": -300.0, "cy": 700.0},  # crop away from the optical axis
+        {"distortion": (-12.0, 45.0, 0.001, 0.001, -80.0, -12.0, 44.0, -79.0)},  # rational model
+    ],
+)
+def test_unusual_but_real_cameras_are_accepted(change: dict[str, float]) -> None:
+    dataclasses.replace(VGA, **change)
+
+
+def test_normalised_intrinsics_are_named_and_the_pixels_given() -> None:
+    with pytest.raises(FrameError, match=r"normalised.*multiply fx and cx by the width.*fx=512 .*cx=320 cy=240"):
+        CameraIntrinsics(0.8, 1.07, 0.5, 0.5, 640, 480)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("stamp_ns", -1), ("stamp_ns", 2**62 + 1), ("seq", -1), ("seq", 2**63), ("pose_sigma", float("nan"))],
+)
+def test_a_number_out_of_its_range_is_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(FrameError, match=name):
+        frame(**{name: value})

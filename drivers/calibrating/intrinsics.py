@@ -13,7 +13,7 @@ from drivers.calibrating.config import CalibrationConfig
 from drivers.calibrating.coverage import area_counts, shortfalls, tilt_degrees
 from drivers.calibrating.views import BoardView
 from drivers.poses.board import board_poses, pose_of_vector
-from semantic_mapper.errors import CameraError
+from semantic_mapper.errors import CameraError, FrameError
 from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.types import CameraIntrinsics, Float64
 
@@ -148,7 +148,10 @@ def _calibrate(views: Sequence[BoardView], size: tuple[int, int], config: Calibr
             f"the views lead to an impossible camera (fx {fx:.0f}, centre {cx:.0f}, {cy:.0f}); are board and its sizes "
             "the right ones, and is it flat?"
         )
-    intrinsics = CameraIntrinsics(fx, fy, cx, cy, *size, distortion)
+    try:
+        intrinsics = CameraIntrinsics(fx, fy, cx, cy, *size, distortion)
+    except FrameError as error:
+        raise CameraError(f"the views lead to an impossible camera: {error}; are board and its sizes right?") from error
     names = ("fx", "fy", "cx", "cy", *COEFFICIENT_NAMES[: config.coefficients])
     told: dict[str, float] = dict(zip(names, (float(v) for v in np.ravel(sigmas)), strict=False))
     vectors = [

@@ -14,8 +14,8 @@ import numpy as np
 
 from drivers.base import CameraImage
 from drivers.oak.library import load_depthai
-from semantic_mapper.errors import CameraError
-from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
+from semantic_mapper.errors import CameraError, FrameError
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 DEPTH_UNIT_M = 1e-3  # the stereo node's default
 NO_DEPTH = 65535  # beyond what 16 bits hold
@@ -29,7 +29,7 @@ def read_intrinsics(calibration: Any, socket: str, width: int, height: int) -> C
     """Intrinsics of an undistorted image, from a ``dai.CalibrationHandler``; what does not fit the ratio is cropped.
 
     Raises:
-        CameraError: the calibration knows no such camera.
+        CameraError: the calibration knows no such camera, or does not fit the image.
     """
     dai = load_depthai()
     try:
@@ -41,9 +41,7 @@ def read_intrinsics(calibration: Any, socket: str, width: int, height: int) -> C
         ) from error
     if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
         raise CameraError(f"the OAK's calibration of the camera at {socket} is empty: calibrate the device")
-    return CameraIntrinsics(
-        fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]), width=width, height=height
-    )
+    return _pinhole(K, width, height)
 
 
 def told_intrinsics(frame: Any) -> CameraIntrinsics | None:
@@ -51,6 +49,9 @@ def told_intrinsics(frame: Any) -> CameraIntrinsics | None:
 
     Returns:
         None where it carries none.
+
+    Raises:
+        CameraError: they do not fit the image.
     """
     transformation = frame.getTransformation()
     K = np.array(transformation.getIntrinsicMatrix(), np.float64)
@@ -59,9 +60,16 @@ def told_intrinsics(frame: Any) -> CameraIntrinsics | None:
     if K[0, 0] <= 0 or K[1, 1] <= 0:
         return None
     width, height = transformation.getSize()
-    return CameraIntrinsics(
-        fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]), width=width, height=height
-    )
+    return _pinhole(K, width, height)
+
+
+def _pinhole(K: Float64, width: int, height: int) -> CameraIntrinsics:
+    try:
+        return CameraIntrinsics(
+            fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]), width=width, height=height
+        )
+    except FrameError as error:
+        raise CameraError(f"the OAK's calibration cannot be used: {error}; calibrate the device") from error
 
 
 def geometry_trouble(rgb: Any, depth: Any | None) -> str:

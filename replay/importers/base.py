@@ -20,7 +20,7 @@ from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.compression import depth_from_uint16
 from semantic_mapper.transport.images import decode_image_file
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
+from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,9 +346,9 @@ def seconds_to_ns(text: str) -> int:
     """Seconds as decimal text -> nanoseconds, exactly (a float would lose them).
 
     Raises:
-        ValueError: no number.
+        ValueError: no number, or too large for a stamp.
     """
-    match = re.fullmatch(r"\s*(\d+)(?:\.(\d*))?\s*", text)
-    if match is None:
-        raise ValueError(f"'{text[:40]}' is not a time in seconds")
+    match = re.fullmatch(r"\s*(\d{1,12})(?:\.(\d*))?\s*", text)
+    if match is None or int(match[1]) >= MAX_STAMP_NS // 1_000_000_000:
+        raise ValueError(f"'{text[:40]}' is not a time in seconds (0 to {MAX_STAMP_NS // 1_000_000_000})")
     return int(match[1]) * 1_000_000_000 + int((match[2] or "0")[:9].ljust(9, "0"))

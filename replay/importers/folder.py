@@ -35,7 +35,7 @@ from semantic_mapper.config import read_json
 from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError, LabelError
 from semantic_mapper.labels import MAX_NAME, PROVIDED, LabelSet, make_label_set
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
+from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64, PosedFrame
 
 DEFAULT_HZ = 6.0  # of a recording without timestamps.txt
 DEPTH_SCALE = DepthScale(1000.0, convention="millimetres; another one belongs into intrinsics.json as depth_scale")
@@ -162,7 +162,9 @@ class FolderRecording:
             stamps = [seconds_to_ns(t) if "." in t else int(t) for _, t in read_lines(file)]
         except ValueError as error:
             raise ImportSourceError(f"{file}: {error}") from error
-        if len(stamps) < count or any(b <= a for a, b in pairwise(stamps)) or min(stamps) < 0:
+        if any(not 0 <= stamp <= MAX_STAMP_NS for stamp in stamps):
+            raise ImportSourceError(f"{file}: a stamp is not from 0 to {MAX_STAMP_NS} ns; write capture times")
+        if len(stamps) < count or any(b <= a for a, b in pairwise(stamps)):
             raise ImportSourceError(f"{file}: needs a rising stamp for each of {count} frames, has {len(stamps)} rows")
         return stamps
 

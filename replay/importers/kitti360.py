@@ -217,10 +217,11 @@ def rectified_camera(values: dict[str, list[float]], which: str, file: Path) -> 
     K = matrix[:, :3]
     try:
         intrinsics = CameraIntrinsics(K[0, 0], K[1, 1], K[0, 2], K[1, 2], int(size[0]), int(size[1]))
-    except FrameError as error:
-        raise ImportSourceError(f"{file}: {error}") from error
+        offset = np.linalg.solve(K, matrix[:, 3])
+    except (FrameError, ValueError, OverflowError, np.linalg.LinAlgError) as error:  # int() of NaN or infinity, too
+        raise ImportSourceError(f"{file}: P_rect_{which} and S_rect_{which}: {error}") from error
     T_cam0_camera = np.eye(4)
-    T_cam0_camera[:3, 3] = -np.linalg.solve(K, matrix[:, 3])  # P = K [I | t] takes points of the left camera
+    T_cam0_camera[:3, 3] = -offset  # P = K [I | t] takes points of the left camera
     return intrinsics, T_cam0_camera
 
 

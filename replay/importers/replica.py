@@ -33,7 +33,7 @@ from replay.importers.base import (
     read_rgb,
 )
 from semantic_mapper.config import read_json
-from semantic_mapper.errors import ConfigError, ImportSourceError, LabelError
+from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError, LabelError
 from semantic_mapper.labels import LabelSet, make_label_set
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
@@ -141,7 +141,10 @@ class ReplicaRecording:
             except BadFrameError:  # reported when its turn comes
                 continue
             f = width / 2 / np.tan(np.deg2rad(HFOV_DEG) / 2)
-            return CameraIntrinsics(f, f, (width - 1) / 2, (height - 1) / 2, width, height)
+            try:
+                return CameraIntrinsics(f, f, (width - 1) / 2, (height - 1) / 2, width, height)
+            except FrameError as error:
+                raise ImportSourceError(f"{file}: {error}") from error
         raise ImportSourceError(f"{self._folder / 'rgb'}: none of its images can be read; download them anew")
 
     def _pose(self, name: int) -> Float64:

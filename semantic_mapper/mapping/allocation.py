@@ -6,6 +6,7 @@ smooth the ray through the middle of a small tile of pixels stands for theirs.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,10 @@ _BANDS = 8  # image bands with a key set of their own: enough to share among cor
 _FIRST_CAPACITY = 1 << 13
 _LEVELS = 3  # tiles of 1, 2 and 4 pixels a side: of the largest that is smooth one ray speaks for all pixels
 _STRIP = 1 << (_LEVELS - 1)  # rows of pixels looked at together
+# Real frames touch up to 3,200 blocks of 2 cm voxels and 13,200 of 1 cm, up to 10 m away: what needs several times
+# that is noise or a wrong camera, and would fill memory and map at once.
+FRAME_SHARE, LEAST_FRAME_BUDGET = 8, 1 << 14
+MAX_CROSSINGS = 1024  # blocks that one ray may cross within the truncation band
 _TRAIL = 8  # blocks of the rays before that are kept in mind
 
 
@@ -48,20 +53,41 @@ def make_camera(intrinsics: CameraIntrinsics, T_world_camera: Float64) -> Camera
     )
 
 
+def frame_budget(max_blocks: int) -> int:
+    """How many blocks one frame may touch in a map of at most ``max_blocks``."""
+    return max(LEAST_FRAME_BUDGET, max_blocks // FRAME_SHARE)
+
+
 def blocks_in_band(
-    depth_m: Float32, camera: Camera, voxel_size_m: float, truncation_m: float, depth_max_m: float
+    depth_m: Float32,
+    camera: Camera,
+    voxel_size_m: float,
+    truncation_m: float,
+    depth_max_m: float,
+    budget: int = LEAST_FRAME_BUDGET,
 ) -> NDArray[np.int64]:
     """Packed keys (B,) of the blocks that rays cross within ``truncation_m`` of their depth, sorted, each once.
 
+    Time and memory are bounded: by the pixels times ``MAX_CROSSINGS``, and by ``budget``.
+
     Raises:
-        FrameError: the camera stands so far from the origin that block coordinates overflow.
+        FrameError: the camera stands so far from the origin that block coordinates overflow, a ray would cross more
+            than ``MAX_CROSSINGS`` blocks, or all rays together more than ``budget``.
     """
     block_m = voxel_size_m * BLOCK_SIDE
-    reach = float(np.abs(camera.t).max()) + 4 * (depth_max_m + truncation_m)
-    if reach / block_m >= KEY_LIMIT:
+    slope = _steepest(camera, depth_m.shape)
+    reach = float(np.abs(camera.t).max()) + slope * (depth_max_m + truncation_m)
+    if not reach / block_m < KEY_LIMIT:  # NaN, too
         raise FrameError(
-            f"the camera is at {camera.t} m, beyond the {KEY_LIMIT * block_m / 1000:.0f} km that a map of "
-            f"{voxel_size_m} m voxels can address; give poses relative to a nearer origin"
+            f"the camera is at {camera.t} m and sees up to {slope * depth_max_m:.4g} m far, beyond the "
+            f"{KEY_LIMIT * block_m / 1000:.0f} km that a map of {voxel_size_m} m voxels can address; give poses "
+            "relative to a nearer origin, and check the intrinsics"
+        )
+    crossings = slope * 2 * (truncation_m + voxel_size_m) / block_m * 3**0.5
+    if crossings > MAX_CROSSINGS:
+        raise FrameError(
+            f"a ray at the edge of the image crosses {crossings:.3g} blocks near the surface, at most {MAX_CROSSINGS} "
+            "are accepted; check the intrinsics, or lower voxel_map.truncation_voxels"
         )
     capacity = _FIRST_CAPACITY
     while True:
@@ -70,8 +96,25 @@ def blocks_in_band(
         counts = np.zeros(_BANDS, np.int64)
         _collect_bands(_BANDS, depth_m, camera, voxel_size_m, truncation_m, depth_max_m, slots, keys, counts)
         if counts.max() <= capacity:
-            return np.unique(np.concatenate([row[:count] for row, count in zip(keys, counts, strict=True)]))
+            found = np.unique(np.concatenate([row[:count] for row, count in zip(keys, counts, strict=True)]))
+            if len(found) <= budget:
+                return found
+        if counts.max() <= capacity or capacity >= budget:
+            raise FrameError(
+                f"the frame touches more than {budget} blocks of {voxel_size_m} m voxels, its budget (1/{FRAME_SHARE} "
+                f"of voxel_map.max_blocks, at least {LEAST_FRAME_BUDGET}); check the depth and the intrinsics, use "
+                "larger voxels or a smaller voxel_map.depth_max_m, or raise voxel_map.max_blocks"
+            )
         capacity *= 4  # a band of the image crosses unusually many blocks (fine voxels): again with more room
+
+
+def _steepest(camera: Camera, shape: tuple[int, ...]) -> float:
+    """Length of the longest ray of an image (H, W) per metre of z: that of a corner."""
+    y, x = (
+        max(abs(-0.5 - center), abs(size - 0.5 - center)) / focal
+        for size, center, focal in zip(shape, (camera.cy, camera.cx), (camera.fy, camera.fx), strict=True)
+    )
+    return math.hypot(1.0, x, y)
 
 
 def blocks_in_view(
@@ -243,6 +286,8 @@ def _collect_band(band, bands, depth, camera, voxel, truncation, depth_max, slot
     for k in range(1, _LEVELS):
         wide[k] = 2 * voxel * min(camera.fx, camera.fy) / (1 << k)
     for strip in range(band * strips // bands, (band + 1) * strips // bands):
+        if count > len(keys):
+            return count
         _fill_tiles(depth, strip * _STRIP, np.float32(depth_max), least, most)
         for k in range(_LEVELS):
             for v in range(_STRIP >> k):

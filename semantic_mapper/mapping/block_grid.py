@@ -9,6 +9,7 @@ A block holds 8 x 8 x 8 voxels in the order [z][y][x]; voxel (i, j, k) of block 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -82,7 +83,7 @@ class BlockGrid:
             self._max_resident = min(max_blocks, max(LEAST_RESIDENT, memory_bytes // self.block_bytes))
             initial_blocks = self._max_resident  # at once: growing needs room for the old memory beside the new
         self._channels = channels
-        self._grid = make_open3d_grid(voxel_size_m, channels, max(1, min(initial_blocks, max_blocks)), evidence)
+        self._grid = self._make_grid(max(1, min(initial_blocks, max_blocks)))
         self._map = self._grid.hashmap()
         self._index = make_block_index(np.empty((0, 3), np.int32), np.empty(0, np.int32))
         self._store: BlockStore | None = None
@@ -373,11 +374,28 @@ class BlockGrid:
         finally:  # also where the disk is full: blocks that are there have left memory
             self._index = make_block_index(*self.sorted_blocks())
 
+    def _make_grid(self, capacity: int) -> Any:
+        """An empty Open3D grid.
+
+        Raises:
+            MapError: the machine does not have so much memory, or none that is free.
+        """
+        needed, there = capacity * self.block_bytes, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        mend = "lower voxel_map.initial_blocks, max_blocks or memory_mb, or use larger voxels"
+        if needed > there:
+            raise MapError(
+                f"memory for {capacity} blocks is {needed / 1e9:.1f} GB, this machine has {there / 1e9:.1f} GB; {mend}"
+            )
+        try:
+            return make_open3d_grid(self._voxel_size_m, self._channels, capacity, self.evidence)
+        except RuntimeError as error:
+            raise MapError(f"no memory for {capacity} blocks ({needed / 1e9:.1f} GB): {error}; {mend}") from error
+
     def _grow(self, needed: int) -> None:
         capacity = min(max(needed, self.capacity + self.capacity // 2), self._max_resident)
         _log.debug("map_grows", blocks=self.block_count, capacity=capacity)
         keys, before = self.sorted_blocks()
-        larger = make_open3d_grid(self._voxel_size_m, self._channels, capacity, self.evidence)
+        larger = self._make_grid(capacity)
         indices = copy_blocks(self.buffers(), keys, before, larger.hashmap())
         used, version = self._used[before], self._version[before]
         self._grid, self._map = larger, larger.hashmap()

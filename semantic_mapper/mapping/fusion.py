@@ -28,6 +28,16 @@ FULL_TRUST_RANGE_M = 2.0  # a vote from farther counts (2 m / z)^2: a pixel cove
 LEAST_COSINE = 0.2  # of the angle between ray and surface normal; grazing looks count this much, never nothing
 
 
+_BOUNDS = {  # of the settings of a map: what is beyond is a slip of units or digits, and would overflow or never end
+    "voxel_size_m": (1e-4, 10.0),
+    "truncation_voxels": (1e-3, 100.0),
+    "depth_max_m": (1e-3, 1000.0),
+    "initial_blocks": (1, 1 << 27),
+    "max_blocks": (1, 1 << 27),
+    "max_weight": (1.0, 1e6),
+}
+
+
 class FusionLimits(NamedTuple):
     """Lengths in metres, and the caps.
 
@@ -52,12 +62,10 @@ def make_limits(config: VoxelMapConfig) -> FusionLimits:
     Raises:
         ConfigError: a value that no map can be built with.
     """
-    for name in ("voxel_size_m", "truncation_voxels", "depth_max_m", "initial_blocks", "max_blocks"):
+    for name, (least, most) in _BOUNDS.items():
         value = getattr(config, name)
-        if not (np.isfinite(value) and value > 0):
-            raise ConfigError(f"voxel_map.{name} must be above 0, got {value}")
-    if not config.max_weight >= 1:
-        raise ConfigError(f"voxel_map.max_weight must be at least 1, got {config.max_weight}")
+        if not least <= value <= most:  # NaN, too
+            raise ConfigError(f"voxel_map.{name} must be from {least:g} to {most:g}, got {value}")
     if not (config.vote_discount >= 0 and config.vote_band_voxels >= 0):
         raise ConfigError("voxel_map.vote_discount and vote_band_voxels must not be negative")
     return FusionLimits(

@@ -36,6 +36,7 @@ from semantic_mapper.types import CameraIntrinsics, Float32, MapUpdate, PosedFra
 _log = get_logger(__name__)
 
 ODD_FRAMES = 2  # frames of another size that are refused before the new size is believed
+MAX_CAMERAS = 64  # as in a stream's information; something is kept of each
 VIRTUAL_SIZE = 2  # times the size of a coarse view: how finely the map is looked at in a virtual one
 SURE = 0.8  # confidence from which on the map is believed where another field is compared with it
 COVERAGE_WIDTH = 80  # width of the depth image that a keyframe keeps for the choice of source views
@@ -244,7 +245,10 @@ class MappingPipeline:
         virtual = self.config.virtual
         if virtual.every_n_frames and self._steps % virtual.every_n_frames == 0:
             with self._stage("virtual"):
-                self.look_around(virtual.views)
+                try:
+                    self.look_around(virtual.views)
+                except FrameError as error:  # the frame itself is in the map
+                    _log.warning("virtual_view_refused", seq=frame.seq, reason=str(error))
         return MapUpdate(
             stamp_ns=frame.stamp_ns,
             seq=frame.seq,
@@ -265,6 +269,11 @@ class MappingPipeline:
     def _check(self, frame: PosedFrame) -> None:
         where = f"frame seq={frame.seq} of camera '{frame.camera_id}'"
         check_pose(frame.T_world_camera, where)
+        if frame.camera_id not in self._intrinsics and len(self._intrinsics) >= MAX_CAMERAS:
+            raise FrameError(
+                f"{where}: this map has frames of {MAX_CAMERAS} cameras already, the most it takes; give all frames of "
+                "one camera the same camera_id"
+            )
         size, scale = (frame.intrinsics.width, frame.intrinsics.height), self.config.render.scale
         if round(min(size) * scale) < 1:
             raise FrameError(

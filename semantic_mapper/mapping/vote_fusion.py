@@ -57,7 +57,8 @@ def add_votes(
     with voxel_map.locked() as grid:
         votes = frame_votes(depth, checked, camera, limits.depth_max, classes, where)
         votes = votes._replace(weights=votes.weights * np.float32(config.weight))
-        packed = blocks_in_band(depth, camera, limits.voxel_size, limits.truncation, limits.depth_max)
+        budget = voxel_map.config.max_blocks  # no block is added
+        packed = blocks_in_band(depth, camera, limits.voxel_size, limits.truncation, limits.depth_max, budget)
         packed = packed[np.isin(packed, pack_keys(grid.all_keys()))]  # existing ones alone
         max_votes, moment = np.float32(config.max_votes), voxel_map.version
         for blocks in voxel_map.changing(packed) if len(packed) else ():

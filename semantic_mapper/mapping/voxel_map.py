@@ -15,7 +15,7 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.allocation import blocks_in_band, make_camera
+from semantic_mapper.mapping.allocation import blocks_in_band, frame_budget, make_camera
 from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys
 from semantic_mapper.mapping.changes import (
@@ -62,6 +62,7 @@ class VoxelMap:
 
     Raises:
         ConfigError: a value of ``config`` that no map can be built with.
+        MapError: there is no memory for ``initial_blocks``, or for ``memory_mb``.
         DependencyError: Open3D cannot be loaded.
     """
 
@@ -178,7 +179,14 @@ class VoxelMap:
         camera = make_camera(frame.intrinsics, frame.T_world_camera)
         with _KERNEL_LOCK:
             votes = frame_votes(depth, table, camera, self.config.depth_max_m, len(self.label_set), where, weights)
-            packed = blocks_in_band(depth, camera, self.config.voxel_size_m, self.truncation_m, self.config.depth_max_m)
+            packed = blocks_in_band(
+                depth,
+                camera,
+                self.config.voxel_size_m,
+                self.truncation_m,
+                self.config.depth_max_m,
+                frame_budget(self.config.max_blocks),
+            )
             rgb = np.ascontiguousarray(frame.rgb)
             for blocks in self.changing(packed):
                 fuse_blocks(
@@ -329,7 +337,7 @@ class VoxelMap:
             try:
                 loaded = cls(config, saved.label_set)
                 loaded._grid.reserve(saved.blocks)
-            except (ConfigError, RuntimeError) as error:  # RuntimeError: Open3D gets no memory
+            except (ConfigError, MapError) as error:
                 raise MapError(
                     f"{path}: the saved configuration cannot be used: {error}. Where memory is short, load with a "
                     "memory_mb of your own"

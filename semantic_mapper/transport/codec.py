@@ -370,6 +370,7 @@ def _open_frame(parts: Parts) -> tuple[headers.FrameHeader, Parts]:
     check_source(parts, header.camera_id)
     what = message_name("frame", header.camera_id, header.seq)
     headers.check_image_size(header.intrinsics.width, header.intrinsics.height, what)
+    to_intrinsics(header.intrinsics, what)
     specs = [s for s in (header.rgb, header.depth, header.label) if s is not None]
     return header, open_buffers(parts, [s.bytes for s in specs], what)
 

@@ -8,11 +8,11 @@ from typing import cast
 import msgpack
 
 from semantic_mapper.errors import CodecError
+from semantic_mapper.types import MAX_PIXELS
 
 Buffer = bytes | bytearray | memoryview
 
 MAX_PARTS = 8
-MAX_PIXELS = 1 << 25  # 8192 x 4096; what is announced above this is refused before anything is allocated
 MAX_KEYFRAME_PIXELS = 1 << 23  # 4096 x 2048: dozens of them are kept while a finetuner learns
 MAX_PART_BYTES = 4 * MAX_PIXELS + (1 << 16)  # one float32 image and some room for a codec's overhead
 

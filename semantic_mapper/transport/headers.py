@@ -11,10 +11,11 @@ import msgspec
 from msgspec import Meta
 
 from semantic_mapper.errors import CodecError
-from semantic_mapper.transport.framing import MAX_KEYFRAME_PIXELS, MAX_PART_BYTES, MAX_PIXELS, Buffer
+from semantic_mapper.transport.framing import MAX_KEYFRAME_PIXELS, MAX_PART_BYTES, Buffer
 from semantic_mapper.transport.images import ImageEncoding
 from semantic_mapper.transport.messages import EndReason, NodeState
 from semantic_mapper.transport.topics import SOURCE_PATTERN
+from semantic_mapper.types import MAX_PIXELS, MAX_POSE_SIGMA_M, MAX_SIDE, MAX_STAMP_NS
 
 MAX_DAMAGES = 50  # damaged places of a recording that its end tells of
 PROTOCOL_VERSION = 1  # raise it when a header changes its meaning; readers refuse what they do not know
@@ -22,13 +23,13 @@ MAX_HEADER_BYTES = 1 << 18
 MAX_KEYFRAME_BYTES = 8 * MAX_KEYFRAME_PIXELS + 2 * MAX_HEADER_BYTES  # raw colour, float32 depth, labels: all of it
 MAX_WEIGHTS_BYTES = 1 << 26  # of a weights file on the wire: five times the shipped one
 
-_MAX_SIDE = 1 << 14
 _MAX_ENTRIES = 1024
 
 Source = Annotated[str, Meta(pattern=SOURCE_PATTERN)]
 Stamp = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+CaptureStamp = Annotated[int, Meta(ge=0, le=MAX_STAMP_NS)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-Side = Annotated[int, Meta(ge=1, le=_MAX_SIDE)]
+Side = Annotated[int, Meta(ge=1, le=MAX_SIDE)]
 PartBytes = Annotated[int, Meta(ge=0, le=MAX_PART_BYTES)]
 Word = Annotated[str, Meta(max_length=128)]
 Sentence = Annotated[str, Meta(max_length=4096)]
@@ -93,13 +94,13 @@ class Header(Plain, frozen=True, kw_only=True):
 class FrameHeader(Header, frozen=True, kw_only=True):
     """Header of ``PosedFrame``; buffers: rgb, depth, label, those that there are."""
 
-    stamp_ns: Stamp
+    stamp_ns: CaptureStamp
     seq: Count
     camera_id: Source
     intrinsics: IntrinsicsHeader
     T_world_camera: Pose  # row by row, float64, exact
     pose_source: Word
-    pose_sigma: float
+    pose_sigma: Annotated[float, Meta(ge=0, le=MAX_POSE_SIGMA_M)]
     rgb: RgbSpec
     depth: DepthSpec | None = None
     label: LabelSpec | None = None

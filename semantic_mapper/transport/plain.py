@@ -25,7 +25,7 @@ def to_intrinsics(h: headers.IntrinsicsHeader, what: str) -> CameraIntrinsics:
     """Inverse of ``intrinsics_header``.
 
     Raises:
-        CodecError: focal length not positive.
+        CodecError: they do not fit the image; see ``CameraIntrinsics``.
     """
     try:
         return CameraIntrinsics(h.fx, h.fy, h.cx, h.cy, h.width, h.height, h.distortion)

@@ -3,8 +3,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from semantic_mapper.errors import FrameError
 from semantic_mapper.geometry import look_at, unproject
-from semantic_mapper.mapping.allocation import blocks_in_band, blocks_in_view, make_camera, view_bounds
+from semantic_mapper.mapping.allocation import (
+    blocks_in_band,
+    blocks_in_view,
+    frame_budget,
+    make_camera,
+    view_bounds,
+)
 from semantic_mapper.mapping.block_index import pack_keys, unpack_keys
 from semantic_mapper.types import CameraIntrinsics
 from tests.mapping.views import INTRINSICS, frame, plane_depth, small_map
@@ -57,8 +64,28 @@ def test_no_measurement_no_blocks() -> None:
 
 def test_more_blocks_than_the_first_guess_has_room_for(rng: np.random.Generator) -> None:
     depth = rng.uniform(0.5, 5.0, (120, 160)).astype(np.float32)
-    found = blocks_in_band(depth, make_camera(INTRINSICS, POSE), 0.004, 0.3, 5.0)
+    found = blocks_in_band(depth, make_camera(INTRINSICS, POSE), 0.004, 0.3, 5.0, 1 << 20)
     assert len(found) > 8 * (1 << 13)
+
+
+def test_a_frame_that_needs_more_blocks_than_its_budget_is_refused(rng: np.random.Generator) -> None:
+    depth, camera = rng.uniform(0.5, 5.0, (120, 160)).astype(np.float32), make_camera(INTRINSICS, POSE)
+    needed = len(blocks_in_band(depth, camera, 0.02, 0.08, 5.0))
+    assert len(blocks_in_band(depth, camera, 0.02, 0.08, 5.0, needed)) == needed
+    for budget in (needed - 1, 1):
+        with pytest.raises(FrameError, match=f"more than {budget} blocks"):
+            blocks_in_band(depth, camera, 0.02, 0.08, 5.0, budget)
+
+
+@pytest.mark.parametrize("change", [{"cy": 1e19}, {"fx": 1e-3}, {"cx": 1e6}, {"fx": 1e-320}, {"cx": float("nan")}])
+def test_a_camera_whose_rays_are_endless_is_refused_before_they_are_followed(change: dict[str, float]) -> None:
+    camera = make_camera(INTRINSICS, POSE)._replace(**change)
+    with pytest.raises(FrameError, match="check the intrinsics"):
+        blocks_in_band(np.ones((120, 160), np.float32), camera, 0.02, 0.08, 5.0)
+
+
+def test_the_budget_is_a_fraction_of_the_map() -> None:
+    assert frame_budget(200_000) == 25_000 and frame_budget(1000) == 1 << 14
 
 
 def test_an_image_of_one_pixel_is_enough() -> None:

@@ -6,6 +6,7 @@ import pytest
 from semantic_mapper.errors import FrameError, PoseError, WeightsError
 from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
 from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.types import PosedFrame
@@ -46,6 +47,45 @@ def test_same_frames_give_the_same_map_bit_for_bit():
     assert same_map(a, b)
 
 
+@pytest.mark.parametrize("value", [1e-40, 1e4, 1e30, 3.4e38, np.inf, np.nan, -1.0])
+def test_depth_that_no_sensor_measures_counts_as_none(value: float):
+    hostile, blank = make_pipeline(), make_pipeline()
+    for number, frame in enumerate(tiny_frames(3)):
+        assert frame.depth_m is not None
+        wild, none = frame.depth_m.copy(), frame.depth_m.copy()
+        part = np.s_[::2] if number else np.s_[:]
+        wild[part], none[part] = value, 0
+        hostile.step(replace(frame, depth_m=wild))
+        blank.step(replace(frame, depth_m=none))
+    assert same_map(hostile, blank)
+
+
+def test_a_frame_beyond_its_budget_is_refused_and_the_run_goes_on(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+):
+    monkeypatch.setattr("semantic_mapper.mapping.allocation.LEAST_FRAME_BUDGET", 400)
+    a, b = (make_pipeline(voxel_map={"voxel_size_m": 0.02, "max_blocks": 3200}) for _ in range(2))
+    good = replace(tiny_frames()[0], depth_m=np.full((72, 96), 1.0, np.float32))
+    noise = replace(good, seq=1, depth_m=rng.uniform(0.5, 5, (72, 96)).astype(np.float32))
+    a.step(good)
+    with pytest.raises(FrameError, match=r"more than 400 blocks of 0\.02 m voxels, its budget"):
+        a.step(noise)
+    a.step(replace(good, seq=2))
+    b.step(good)
+    b.step(replace(good, seq=2))
+    assert same_map(a, b)
+
+
+def test_a_map_takes_frames_of_so_many_cameras_and_no_more(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("semantic_mapper.mapping.pipeline.MAX_CAMERAS", 2)
+    pipeline, frame = make_pipeline(), tiny_frames()[0]
+    for name in ("left", "right", "left"):
+        pipeline.step(replace(frame, camera_id=name))
+    with pytest.raises(FrameError, match="frames of 2 cameras already"):
+        pipeline.step(replace(frame, camera_id="third"))
+    pipeline.step(replace(frame, camera_id="right"))
+
+
 def test_ground_truth_labels_have_no_influence():
     a, b = make_pipeline(), make_pipeline()
     for frame in tiny_frames():
@@ -63,7 +103,7 @@ def test_too_small_a_frame_is_refused_by_the_size_that_it_has():
             rgb=frame.rgb[:size, :size].copy(),
             depth_m=frame.depth_m[:size, :size].copy(),
             label=None,
-            intrinsics=replace(frame.intrinsics, width=size, height=size),
+            intrinsics=scale_intrinsics(frame.intrinsics, size, size),
         )
 
     for size in (1, 2):

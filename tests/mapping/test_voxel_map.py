@@ -252,7 +252,7 @@ def test_what_is_no_probability_is_refused_and_changes_nothing(wrong: float) -> 
 
 def test_unrectified_and_far_away_frames_are_refused() -> None:
     depth = np.ones((120, 160), np.float32)
-    distorted = CameraIntrinsics(130, 130, 80, 60, 160, 120, (0.1, 0.0))
+    distorted = CameraIntrinsics(130, 130, 80, 60, 160, 120, (0.1, 0.0, 0.0, 0.0))
     with pytest.raises(FrameError, match="rectified"):
         small_map().integrate(frame(intrinsics=distorted), depth, None, None)
     far = np.eye(4)
@@ -326,3 +326,26 @@ def test_impossible_configurations_are_refused_by_name() -> None:
             VoxelMap(VoxelMapConfig(**change), LABELS)
     with pytest.raises(MapError, match="min_weight"):
         small_map().points(0)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"voxel_size_m": 1e-9}, "voxel_size_m"),
+        ({"depth_max_m": 1e9}, "depth_max_m"),
+        ({"truncation_voxels": 1e6}, "truncation_voxels"),
+        ({"max_blocks": 10**12}, "max_blocks"),
+        ({"max_weight": 1e30}, "max_weight"),
+    ],
+)
+def test_a_setting_that_no_map_has_is_refused_by_name(change: dict[str, float], named: str) -> None:
+    with pytest.raises(ConfigError, match=f"voxel_map.{named} must be from"):
+        small_map(**change)
+
+
+@pytest.mark.parametrize(
+    "change", [{"initial_blocks": 10**8, "max_blocks": 10**8}, {"memory_mb": 10**9, "max_blocks": 10**8}]
+)
+def test_more_memory_than_the_machine_has_is_refused_before_it_is_taken(change: dict[str, float]) -> None:
+    with pytest.raises(MapError, match="GB, this machine has"):
+        small_map(**change)

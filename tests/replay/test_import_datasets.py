@@ -17,16 +17,16 @@ from tests.replay import recordings as rec
 
 DRIVE = "2013_05_28_drive_0000_sync"
 W, H = 640, 480
-# The published file, but for the image size; the right camera stands 0.594 m to the right of the left one.
+# The published file with a size, focal length and centre of small images; the right camera stands 0.594 m to the right.
 PERSPECTIVE = """calib_time: 18-Dec-2013 10:13:35
 corner_dist: 9.950000e-02
 S_00: 1.408000e+03 5.120000e+02
 K_00: 7.884311e+02 0.0 6.873046e+02 0.0 7.867554e+02 2.437552e+02 0.0 0.0 1.0
 R_rect_00: 0.999974 -0.007141 -0.000089 0.007141 0.999969 -0.003247 0.000112 0.003247 0.999995
-P_rect_00: 552.554261 0.0 682.049453 0.0 0.0 552.554261 238.769549 0.0 0.0 0.0 1.0 0.0
+P_rect_00: 52.554261 0.0 31.049453 0.0 0.0 52.554261 11.769549 0.0 0.0 0.0 1.0 0.0
 S_rect_00: {w}.0 {h}.0
 R_rect_01: 0.999778 0.012120 -0.017290 -0.012117 0.999926 0.000302 0.017292 -0.000092 0.999850
-P_rect_01: 552.554261 0.0 682.049453 -328.318735 0.0 552.554261 238.769549 0.0 0.0 0.0 1.0 0.0
+P_rect_01: 52.554261 0.0 31.049453 -31.2269 0.0 52.554261 11.769549 0.0 0.0 0.0 1.0 0.0
 S_rect_01: {w}.0 {h}.0
 """
 
@@ -124,7 +124,7 @@ def test_a_kitti360_drive_is_imported_with_both_cameras(tmp_path: Path) -> None:
             ("image_01", 252),
         ]
         for f in frames:
-            assert f.depth_m is None and (f.intrinsics.fx, f.intrinsics.cx) == (552.554261, 682.049453)
+            assert f.depth_m is None and (f.intrinsics.fx, f.intrinsics.cx) == (52.554261, 31.049453)
             assert (f.intrinsics.width, f.intrinsics.height) == (64, 24) and log.info.cameras[f.camera_id]
             seconds = f.seq // 10
             second = datetime(2013, 5, 28, 8, 46, seconds, tzinfo=UTC).timestamp()
@@ -179,6 +179,8 @@ def test_what_is_wrong_with_a_kitti360_folder_is_told(tmp_path: Path) -> None:
     for file, text, complaint in (
         (poses, "250 1 0 0 0 0 1 0 0 0 0 1 0\n", "poses.txt, with 12, is another file"),
         (poses, "", "holds no pose"),
+        (root / "calibration" / "perspective.txt", PERSPECTIVE.format(w="nan", h=24), "perspective.txt"),
+        (root / "calibration" / "perspective.txt", PERSPECTIVE.format(w=640, h=480), "perspective.txt.*do not fit"),
         (root / "calibration" / "perspective.txt", "P_rect_00: 1 2 3\n", "needs 'P_rect_00:' with 12 numbers"),
     ):
         file.write_text(text)

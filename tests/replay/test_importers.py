@@ -182,6 +182,14 @@ def test_stamps_come_from_timestamps_txt_where_there_is_one(folder: Path, text: 
         ("intrinsics.json", " " * (1 << 20) + "{}", "larger than the limit"),
         ("labels.json", f'{{"classes": {{"1": "{"x" * 5000}"}}}}', "labels.json: .*name of class 1 has 5,000 letters"),
         ("labels.json", f'{{"id_space": "{"x" * 5000}", "classes": {{"1": "x"}}}}', "labels.json: .*its own name has"),
+        (
+            "intrinsics.json",
+            '{"width": 32, "height": 24, "fx": 0.8, "fy": 1.1, "cx": 0.5, "cy": 0.5}',
+            "intrinsics.json.*normalised",
+        ),
+        ("intrinsics.json", '{"width": 32, "height": 24, "fx": 31, "fy": 31, "cx": 1e19, "cy": 12}', "intrinsics.json"),
+        ("timestamps.txt", "1\n2\n3\n4\n5\n9223372036854775808", "timestamps.txt.*a stamp is not from 0"),
+        ("timestamps.txt", "1.0\n2.0\n3.0\n4.0\n5.0\n99999999999.0", "timestamps.txt.*not a time"),
         ("labels.json", '{"classes": {"one": "wall"}}', "labels.json"),
         ("labels.json", '{"classes": ' + '{"a":' * 100_000, "labels.json: "),
         ("labels.json", " " * (1 << 20) + "{}", "larger than the limit"),
@@ -397,6 +405,13 @@ def test_raw_scannet_ids_need_the_table_of_the_data_set(scannet: Path) -> None:
     assert report.labelled == 6
     expected = np.where(rec.label(0) == 5, 40, rec.label(0))
     assert np.array_equal(log.frame(0).label, expected)
+
+
+@pytest.mark.parametrize("which", ["color", "depth"])
+def test_scannet_intrinsics_that_do_not_fit_are_refused_by_their_file(scannet: Path, which: str) -> None:
+    (scannet / f"intrinsic/intrinsic_{which}.txt").write_text("0.8 0 0.5 0 0 1.1 0.5 0 0 0 1 0 0 0 0 1")
+    with pytest.raises(ImportSourceError, match=f"intrinsic_{which}.txt: .*normalised"):
+        imported(scannet)
 
 
 @pytest.mark.parametrize("missing", ["intrinsic/intrinsic_depth.txt", "intrinsic/intrinsic_color.txt"])

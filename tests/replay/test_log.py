@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import random
 import signal
 import subprocess
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from drivers.base import FrameSource
+from nodes.log_info import describe_log
 from replay.log import LogReader, LogWriter
 from replay.recover import recover
 from semantic_mapper.errors import CodecError, LogError
@@ -327,4 +329,36 @@ def test_a_file_of_another_kind_is_named(tmp_path: Path, start: bytes, says: str
     path = tmp_path / "file.mcap"
     path.write_bytes(start + bytes(100))
     with pytest.raises(LogError, match=f"not an MCAP log \\(it is {says}\\)"):
+        LogReader(path)
+
+
+def hostile_log(path: Path, monkeypatch: pytest.MonkeyPatch, *, info: bool) -> Path:
+    """Three frames, the second with ``cy`` far beyond its image; with ``info``, the stream information has that too."""
+    with monkeypatch.context() as patch:
+        patch.setattr("semantic_mapper.types._check_lens", lambda k: None)  # as written before intrinsics were checked
+        wild = dataclasses.replace(samples.INTRINSICS, cy=1e19)
+        cameras = {samples.CAMERA: wild if info else samples.INTRINSICS}
+        with LogWriter(path, StreamInfo("test", cameras, NYU40)) as writer:
+            for seq in range(3):
+                frame = samples.make_frame(seq)
+                writer.write_frame(dataclasses.replace(frame, intrinsics=wild) if seq == 1 else frame)
+    return path
+
+
+def test_a_frame_whose_intrinsics_do_not_fit_is_reported_as_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = hostile_log(tmp_path / "wild.mcap", monkeypatch, info=False)
+    found = describe_log([path], lambda: None)
+    assert found["frames"] == 2 and len(found["damage"]) == 1
+    assert "frame 1" in found["damage"][0] and "cy=1e+19" in found["damage"][0]
+    with LogReader(path) as reader:
+        assert seqs(reader) == [0, 2]
+
+
+def test_stream_information_whose_intrinsics_do_not_fit_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = hostile_log(tmp_path / "wild.mcap", monkeypatch, info=True)
+    with pytest.raises(LogError, match=r"stream information .* cannot be used: .*camera 'front'.*cy=1e\+19"):
         LogReader(path)

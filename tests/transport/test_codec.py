@@ -59,13 +59,20 @@ def frames(draw: st.DrawFn) -> PosedFrame:
     metres = hnp.arrays(np.float32, (height, width), elements=st.floats(width=32))
     units = hnp.arrays(np.uint16, (height, width)).map(lambda raw: depth_from_uint16(raw, 1000.0))
     return PosedFrame(
-        stamp_ns=draw(st.integers(0, 2**63 - 1)),
+        stamp_ns=draw(st.integers(0, 2**62)),
         seq=draw(st.integers(0, 2**63 - 1)),
         camera_id=draw(camera_ids),
         rgb=draw(hnp.arrays(np.uint8, (height, width, 3))),
         depth_m=draw(st.none() | units | metres),
         label=draw(st.none() | hnp.arrays(np.uint8, (height, width))),
-        intrinsics=CameraIntrinsics(draw(st.floats(1e-3, 1e5)), 3.0, draw(st.floats(-1e5, 1e5)), 0.5, width, height),
+        intrinsics=CameraIntrinsics(
+            draw(st.floats(0.1, 100)) * width,
+            draw(st.floats(0.1, 100)) * height,
+            draw(st.floats(-1, 1)),
+            0.5,
+            width,
+            height,
+        ),
         T_world_camera=draw(hnp.arrays(np.float64, (4, 4), elements=finite)),
         pose_source=draw(st.text(max_size=20)),
         pose_sigma=draw(st.floats(0, 10)),
@@ -201,9 +208,7 @@ def test_the_envelope_tells_what_a_message_is_without_decoding_it() -> None:
 
 def test_a_keyframe_is_bounded_as_a_whole_before_anything_is_allocated() -> None:
     parts = encode_keyframe(LabelledKeyframe(samples.make_frame(), NYU40))
-    inner = with_header([b"", parts[2]], intrinsics={**msgpack.unpackb(parts[2])["intrinsics"], "width": 1 << 12})
-    intrinsics = {**msgpack.unpackb(inner[1])["intrinsics"], "height": (1 << 11) + 1}
-    wide = with_header(inner, intrinsics=intrinsics)[1]
+    wide = with_header([b"", parts[2]], intrinsics=lens(1 << 12, (1 << 11) + 1))[1]
     padding = bytes(MAX_KEYFRAME_BYTES // 2)
     rgb, label = {"encoding": "png", "bytes": len(padding)}, {"encoding": "u8_zstd", "bytes": len(padding)}
     long = with_header([b"", parts[2]], rgb=rgb, depth=None, label=label)[1]
@@ -224,7 +229,7 @@ def test_a_keyframe_is_bounded_as_a_whole_before_anything_is_allocated() -> None
         rgb=np.broadcast_to(np.uint8(0), (*size, 3)),
         depth_m=None,
         label=np.broadcast_to(np.uint8(1), size),
-        intrinsics=dataclasses.replace(small.intrinsics, width=size[1], height=size[0]),
+        intrinsics=CameraIntrinsics(**lens(size[1], size[0])),
     )
     with pytest.raises(CodecError, match="4096x4096"):
         encode_keyframe(LabelledKeyframe(large, NYU40))
@@ -235,16 +240,25 @@ def with_header(parts: list[bytes], **changes: object) -> list[bytes]:
     return [parts[0], msgpack.packb(header), *parts[2:]]
 
 
+def lens(width: int, height: int) -> dict[str, float]:
+    """Intrinsics of an ordinary camera, as the header has them."""
+    return {"fx": width, "fy": width, "cx": width / 2, "cy": height / 2, "width": width, "height": height}
+
+
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
+        ({"intrinsics": {**lens(24, 18), "cy": 1e19}}, "cy=1e.19 do not fit a 24x18 image"),
+        ({"intrinsics": {**lens(24, 18), "fx": 1e-320}}, "do not fit"),
+        ({"stamp_ns": 2**62 + 1}, "stamp_ns"),
+        ({"pose_sigma": -1.0}, "pose_sigma"),
         ({"v": 2}, "protocol version 2"),
         ({"v": None}, "protocol version"),
         ({"seq": "three"}, "seq"),
         ({"seq": -1}, "seq"),
         ({"seq": True}, "seq"),
         ({"stamp_ns": 2**64 - 1}, "stamp_ns"),
-        ({"pose_sigma": float("nan")}, "pose_sigma is nan"),
+        ({"pose_sigma": float("nan")}, "pose_sigma"),
         ({"T_world_camera": [float("inf")] * 16}, r"T_world_camera\[0\] is inf"),
         ({"T_world_camera": [0.0] * 15}, "T_world_camera"),
         ({"colour": 1}, "unknown field `colour`"),
@@ -284,9 +298,8 @@ def test_an_absurd_size_is_refused_before_anything_is_allocated(width: int, heig
 @pytest.mark.parametrize("options", [CodecOptions(rgb="raw", depth="raw"), CodecOptions(), CodecOptions(rgb="jpeg")])
 def test_buffers_that_do_not_fit_the_announced_size_are_refused(options: CodecOptions) -> None:
     parts = encode_frame(samples.make_frame(), options)
-    intrinsics = {**msgpack.unpackb(parts[1])["intrinsics"], "width": 4000, "height": 3000}
     with pytest.raises(CodecError, match="4000x3000"):
-        decode_frame(with_header(parts, intrinsics=intrinsics))
+        decode_frame(with_header(parts, intrinsics=lens(4000, 3000)))
 
 
 def test_a_compression_bomb_is_refused_before_it_unfolds() -> None:
@@ -307,8 +320,6 @@ def test_a_frame_that_could_not_be_decoded_is_not_encoded() -> None:
         encode_frame(dataclasses.replace(frame, T_world_camera=pose))
     with pytest.raises(CodecError, match="cannot be the name of a camera"):
         encode_frame(dataclasses.replace(frame, camera_id="left eye"))
-    with pytest.raises(CodecError):
-        encode_frame(dataclasses.replace(frame, stamp_ns=-1))
 
 
 @pytest.mark.parametrize("cut", [1, 20, 60])
