@@ -227,7 +227,8 @@ def read_plane(
     if image.ndim != 2 or image.dtype.name not in wanted.split(" or "):
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise BadFrameError(
-            file, f"a {what} image has one {wanted} channel, this one has {channels} of {image.dtype.name}"
+            file,
+            f"a {what} image has one {wanted} channel, this one has {channels} of {image.dtype.name}; export it so",
         )
     if size is not None and image.shape != size:
         raise BadFrameError(
@@ -303,7 +304,7 @@ def read_lines(file: Path) -> list[tuple[int, str]]:
         ImportSourceError: missing, or not text.
     """
     try:
-        lines = file.read_text(encoding="utf-8").splitlines()
+        lines = file.read_text(encoding="utf-8-sig").splitlines()  # Windows editors begin a file with a mark
     except OSError as error:
         raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
     except UnicodeDecodeError as error:
@@ -329,9 +330,12 @@ def seconds_to_ns(text: str) -> int:
     """Seconds as decimal text -> nanoseconds, exactly (a float would lose them).
 
     Raises:
-        ValueError: no number.
+        ValueError: no number, or one beyond int64 nanoseconds.
     """
     match = re.fullmatch(r"\s*(\d+)(?:\.(\d*))?\s*", text)
     if match is None:
         raise ValueError(f"'{text[:40]}' is not a time in seconds")
-    return int(match[1]) * 1_000_000_000 + int((match[2] or "0")[:9].ljust(9, "0"))
+    ns = int(match[1]) * 1_000_000_000 + int((match[2] or "0")[:9].ljust(9, "0"))
+    if ns >= 1 << 63:
+        raise ValueError(f"'{text[:40]}' is no time in seconds; divide nanoseconds by 1e9")
+    return ns
