@@ -225,4 +225,4 @@ def test_every_image_of_a_video_file_is_mapped(tmp_path: Path, weights: Path, co
     done = run("up", REPLAY_LAUNCH.with_name("video.toml"), *options, "--out", out)
     assert done.returncode == 0, done.stderr
     frames = json.loads((out / "summary.json").read_text())["frames"]
-    assert (frames["published"], frames["fused"], frames["dropped"]) == (40, 40, 0)
+    assert (frames["published"], frames["without_depth"], frames["dropped"], frames["refused"]) == (40, 40, 0, 0)
