@@ -244,7 +244,8 @@ def read_plane(
     if image.ndim != 2 or image.dtype.name not in wanted.split(" or "):
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise BadFrameError(
-            file, f"a {what} image has one {wanted} channel, this one has {channels} of {image.dtype.name}"
+            file,
+            f"a {what} image has one {wanted} channel, this one has {channels} of {image.dtype.name}; export it so",
         )
     if size is not None and image.shape != size:
         raise BadFrameError(
@@ -320,7 +321,7 @@ def read_lines(file: Path) -> list[tuple[int, str]]:
         ImportSourceError: missing, or not text.
     """
     try:
-        lines = read_bytes(file).decode().splitlines()
+        lines = read_bytes(file).decode("utf-8-sig").splitlines()  # Windows editors begin a file with a mark
     except OSError as error:
         raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
     except UnicodeDecodeError as error:
@@ -348,7 +349,11 @@ def seconds_to_ns(text: str) -> int:
     Raises:
         ValueError: no number, or too large for a stamp.
     """
-    match = re.fullmatch(r"\s*(\d{1,12})(?:\.(\d*))?\s*", text)
-    if match is None or int(match[1]) >= MAX_STAMP_NS // 1_000_000_000:
-        raise ValueError(f"'{text[:40]}' is not a time in seconds (0 to {MAX_STAMP_NS // 1_000_000_000})")
+    match = re.fullmatch(r"\s*(\d{1,20})(?:\.(\d*))?\s*", text)
+    if match is None:
+        raise ValueError(f"'{text[:40]}' is not a time in seconds")
+    if int(match[1]) >= MAX_STAMP_NS // 1_000_000_000:
+        raise ValueError(
+            f"'{text[:40]}' is not a time in seconds (0 to {MAX_STAMP_NS // 1_000_000_000}); divide nanoseconds by 1e9"
+        )
     return int(match[1]) * 1_000_000_000 + int((match[2] or "0")[:9].ljust(9, "0"))

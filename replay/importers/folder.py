@@ -37,6 +37,7 @@ from semantic_mapper.labels import MAX_NAME, PROVIDED, LabelSet, make_label_set
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64, PosedFrame
 
+LEAST_PERIOD_NS = 100_000  # no camera is quicker: then stamps are in another unit
 DEFAULT_HZ = 6.0  # of a recording without timestamps.txt
 DEPTH_SCALE = DepthScale(1000.0, convention="millimetres; another one belongs into intrinsics.json as depth_scale")
 _COLOR = (".jpg", ".jpeg", ".png")
@@ -166,6 +167,11 @@ class FolderRecording:
             raise ImportSourceError(f"{file}: a stamp is not from 0 to {MAX_STAMP_NS} ns; write capture times")
         if len(stamps) < count or any(b <= a for a, b in pairwise(stamps)):
             raise ImportSourceError(f"{file}: needs a rising stamp for each of {count} frames, has {len(stamps)} rows")
+        if count > 1 and (stamps[count - 1] - stamps[0]) / (count - 1) < LEAST_PERIOD_NS:
+            raise ImportSourceError(
+                f"{file}: frames are {(stamps[count - 1] - stamps[0]) / (count - 1):g} ns apart; whole numbers are "
+                "nanoseconds: write seconds with a point (1.0), or convert milliseconds"
+            )
         return stamps
 
     def _read_label_set(self) -> LabelSet | None:

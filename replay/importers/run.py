@@ -41,6 +41,20 @@ _MARKS = {
     "kitti360": ("calibration/perspective.txt", "data_2d_raw", "data_poses"),
 }
 
+LISTED = 5  # recordings that an error names
+_SEE = "replay/importers/ says what each format consists of"
+_CONVERT = "bags are not read: export its images, depth and poses as a TUM RGB-D folder, and import that"
+_VIDEO = (
+    "is a video, which has no poses: `semantic-mapper up launch/video.toml` maps it with poses from a board or a socket"
+)
+_PACKED = "is packed; unpack it, and name the folder that comes out"
+_FILES = {
+    ".bag": f"is a ROS 1 bag, and {_CONVERT}",
+    ".db3": f"is a ROS 2 bag, and {_CONVERT}",
+    **dict.fromkeys((".mp4", ".avi", ".mkv", ".mov", ".webm"), _VIDEO),
+    **dict.fromkeys((".zip", ".tgz", ".gz", ".tar", ".7z"), _PACKED),
+}
+
 _DEFAULTS = ImportOptions()
 
 
@@ -54,22 +68,42 @@ def detect_format(src: Path) -> str:
         raise ImportSourceError(f"{src}: no such folder")
     if src.is_file():
         raise ImportSourceError(f"{src}: {_what_file(src)}")
-    missing: list[str] = []
-    for name, marks in _MARKS.items():
-        lacks = [mark for mark in marks if not (src / mark).exists()]
-        if not lacks:
+    for name in _MARKS:
+        if not _lacks(src, name):
             return name
-        missing.append(f"{name} (lacks {', '.join(lacks)})")
     if src.resolve().parent.name == "data_2d_raw":
         return "kitti360"
+    raise ImportSourceError(f"{src}: {_what_folder(src)}")
+
+
+def _lacks(src: Path, name: str) -> list[str]:
+    """Files and folders of a format that a folder does not have."""
+    return [mark for mark in _MARKS[name] if not (src / mark).exists()]
+
+
+def _what_folder(src: Path) -> str:
+    """Why a folder is not imported."""
     sequences = sorted(path.parent for path in src.glob("*/traj_w_c.txt"))
     if sequences:
-        raise ImportSourceError(f"{src}: is a scene of Replica; name one sequence: {', '.join(map(str, sequences))}")
-    raise ImportSourceError(f"{src}: is no recording of a known format: {'; '.join(missing)}")
+        return f"is a scene of Replica; name one sequence: {', '.join(map(str, sequences))}"
+    below = [
+        folder for folder in sorted(src.iterdir()) if folder.is_dir() and any(not _lacks(folder, n) for n in _MARKS)
+    ]
+    if below:
+        return f"holds recordings; name one of them: {', '.join(map(str, below[:LISTED]))}"
+    if (src / "metadata.yaml").exists() and any((*src.glob("*.db3"), *src.glob("*.mcap"))):
+        return f"is a ROS 2 bag, and {_CONVERT}"
+    name = min(_MARKS, key=lambda n: len(_lacks(src, n)))
+    if len(_lacks(src, name)) < len(_MARKS[name]):
+        return f"is nearest to a recording of format '{name}', but lacks {', '.join(_lacks(src, name))}; {_SEE}"
+    known = "; ".join(f"{name} (lacks {', '.join(_lacks(src, name))})" for name in _MARKS)
+    return f"is no recording of a known format: {known}; {_SEE}"
 
 
 def _what_file(src: Path) -> str:
     """Why a file is not imported."""
+    if src.suffix.lower() in _FILES:
+        return _FILES[src.suffix.lower()]
     if src.suffix != LOG_SUFFIX:
         return "is a file, not the folder of a recording"
     try:
@@ -129,7 +163,8 @@ def import_recording(
         tally = _copy(recording, writer, total, changed, on_progress, keep_files=keep_files)
         frames = writer.frames
         if frames == 0:
-            reasons = "; ".join(f"{s.file}: {s.reason}" for s in tally.skipped[:3])
+            different = {s.reason: s for s in reversed(tally.skipped)}  # the first of each reason
+            reasons = "; ".join(f"{s.file}: {s.reason}" for s in list(different.values())[::-1][:3])
             raise ImportSourceError(f"{src}: none of its {total} frames can be used: {reasons}")
     return ImportReport(
         frames=frames,

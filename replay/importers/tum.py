@@ -33,6 +33,7 @@ from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
 DEPTH_SCALE = DepthScale(5000.0, convention="TUM's; another one belongs into intrinsics.json as depth_scale")
+MAX_NORM_ERROR = 0.1  # of a unit quaternion: files have few digits, and are normalised; more is no rotation
 _POSE_GAP_NS = 200_000_000  # poses come at 100 Hz; over a longer gap nothing is interpolated
 
 _CALIBRATIONS = {
@@ -62,7 +63,9 @@ class TumRecording:
         self._intrinsics = self._read_intrinsics()
         self._color = self._read_list(folder / "rgb.txt")
         if not self._color:
-            raise ImportSourceError(f"{folder / 'rgb.txt'}: holds no line 'stamp file'")
+            raise ImportSourceError(
+                "; ".join((f"{folder / 'rgb.txt'}: holds no line 'stamp file'", *self.notices[-1:]))
+            )
         depth = self._read_depth_list()
         self._pose_stamps, self._poses = read_trajectory(folder / "groundtruth.txt", self.notices)
         self._depth_of = match_nearest(
@@ -161,19 +164,25 @@ def read_trajectory(file: Path, notices: list[str]) -> tuple[NDArray[np.int64], 
     """
     stamps: list[int] = []
     rows: list[list[float]] = []
+    first = ""
     for line, text in read_lines(file):
         words = text.split()
         try:
             stamp, row = seconds_to_ns(words[0]), [float(word) for word in words[1:]]
-            if len(row) != 7 or not np.isfinite(row).all() or np.linalg.norm(row[3:]) < 0.5:
+            if len(row) != 7 or not np.isfinite(row).all():
                 raise ValueError("not 3 numbers of a position and 4 of a unit quaternion")
+            if abs(np.linalg.norm(row[3:]) - 1) > MAX_NORM_ERROR:
+                raise ValueError(
+                    f"its quaternion has length {np.linalg.norm(row[3:]):.3g}, not 1; the order is qx qy qz qw"
+                )
         except (ValueError, IndexError) as error:
             notices.append(f"{file}, line {line} is passed over: {error}")
+            first = first or f"; line {line}: {error}"
             continue
         stamps.append(stamp)
         rows.append(row)
     if not rows:
-        raise ImportSourceError(f"{file}: holds no pose 'stamp tx ty tz qx qy qz qw'")
+        raise ImportSourceError(f"{file}: holds no pose 'stamp tx ty tz qx qy qz qw'{first}")
     order = np.argsort(stamps, kind="stable")
     return np.array(stamps, np.int64)[order], np.array(rows, np.float64)[order]
 

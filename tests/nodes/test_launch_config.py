@@ -177,7 +177,7 @@ def test_the_map_of_the_remote_viewer_is_answered_for_with_keys() -> None:
 
 def test_launch_files_for_cameras_are_as_the_docs_say() -> None:
     live = 0
-    for path in REPLAY_LAUNCH.parent.glob("*.toml"):
+    for path in set(REPLAY_LAUNCH.parent.glob("*.toml")) - {REPLAY_LAUNCH.with_name("video.toml")}:  # a film waits
         file = load_config(path, LaunchFile)
         if not any(node.kind == "camera" and "camera" in node.options for node in file.node):
             continue

@@ -9,6 +9,7 @@ import os
 import signal
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -208,3 +209,20 @@ def test_a_log_without_a_usable_frame_fails_as_replay_does(weights: Path, config
     log = write_log(tmp_path / "skewed.mcap", skewed)
     done = run("up", REPLAY_LAUNCH, *_settings(log, weights, config), "--out", tmp_path / "up")
     assert done.returncode == 1 and "none of 2 frames was mapped" in error_line(done.stderr)
+
+
+def test_every_image_of_a_video_file_is_mapped(tmp_path: Path, weights: Path, config: Path) -> None:
+    film, lens = tmp_path / "a film.avi", tmp_path / "lens.toml"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 30, (96, 72))
+    noise = np.random.default_rng(2).integers(0, 255, (72, 96, 3), np.uint8)
+    for shift in range(40):  # more than wait for the mapper while it compiles
+        writer.write(np.roll(noise, shift, axis=1))
+    writer.release()
+    lens.write_text("fx = 80.0\nfy = 80.0\ncx = 47.5\ncy = 35.5\nwidth = 96\nheight = 72\n")
+    settings = {"video": film, "calibration": lens, "poses": "fixed", "weights": weights, "config": config}
+    options = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
+    out = tmp_path / "out"
+    done = run("up", REPLAY_LAUNCH.with_name("video.toml"), *options, "--out", out)
+    assert done.returncode == 0, done.stderr
+    frames = json.loads((out / "summary.json").read_text())["frames"]
+    assert (frames["published"], frames["without_depth"], frames["dropped"], frames["refused"]) == (40, 40, 0, 0)

@@ -161,7 +161,7 @@ def test_labels_without_names_are_left_out_and_said_so(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "stamps"),
     [
-        ("10\n25\n47\n50\n60\n70", [10, 25, 47]),
+        ("10000000\n25000000\n47000000\n50000000\n60000000\n70000000", [10**7, 25 * 10**6, 47 * 10**6]),
         ("0.5\n1.25\n2.000000001\n3.\n4.0\n5.0", [5 * 10**8, 125 * 10**7, 2 * 10**9 + 1]),
     ],
 )
@@ -198,6 +198,8 @@ def test_stamps_come_from_timestamps_txt_where_there_is_one(folder: Path, text: 
         ("timestamps.txt", "1\n2", "rising stamp"),
         ("timestamps.txt", "1\n2\n2\n3\n4\n5", "rising stamp"),
         ("timestamps.txt", "1\n2\n3\n4\n5\nsoon", "soon"),
+        ("timestamps.txt", "1\n2\n3\n4\n5\n6", "1 ns apart; whole numbers are nanoseconds"),
+        ("timestamps.txt", "1700\n1733\n1766\n1800\n1833\n1866", "or convert milliseconds"),
     ],
 )
 def test_a_file_that_concerns_all_frames_stops_the_import(
@@ -240,10 +242,19 @@ def test_a_destination_that_cannot_be_written_is_a_clear_error(folder: Path) -> 
 
 def test_formats_are_told_apart(folder: Path, tum: Path, scannet: Path, tmp_path: Path) -> None:
     assert [detect_format(src) for src in (folder, tum, scannet)] == ["folder", "tum", "scannet"]
-    (tmp_path / "nothing").mkdir()
+    for name in ("nothing", "half/color", "bag"):
+        (tmp_path / name).mkdir(parents=True)
+    for name in ("half/poses.txt", "bag/metadata.yaml", "bag/day_0.db3", "day.bag", "film.MP4", "day.zip"):
+        (tmp_path / name).touch()
     (tmp_path / "log.mcap").touch()
     for src, complaint in (
         ("nothing", "no recording of a known format"),
+        (".", "holds recordings; name one of them: .*desk, .*kitchen, .*scene0000_00"),
+        ("half", "nearest to a recording of format 'folder', but lacks intrinsics.json"),
+        ("bag", "is a ROS 2 bag"),
+        ("day.bag", "is a ROS 1 bag"),
+        ("film.MP4", "is a video, which has no poses"),
+        ("day.zip", "is packed; unpack it"),
         ("no", "no such folder"),
         ("log.mcap", "nor a log of semantic-mapper"),
     ):
@@ -329,6 +340,28 @@ def test_tum_calibrations_go_by_the_name_of_the_sequence(tmp_path: Path) -> None
         report, _ = imported(src)
         assert report.info.cameras["camera"].fx == fx
         assert notice in " ".join(report.notices)
+
+
+def test_windows_marks_and_line_ends_cost_nothing(tum: Path) -> None:
+    for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
+        lines = (tum / name).read_text().splitlines()[1:]
+        (tum / name).write_bytes(b"\xef\xbb\xbf" + "\r\n".join(lines).encode())
+    report, _ = imported(tum)
+    assert (report.frames, report.with_depth, report.notices) == (6, 6, ())
+
+
+@pytest.mark.parametrize(
+    ("pose", "says"),
+    [
+        ("1305031102175304000 0 0 0 0 0 0 1", "divide nanoseconds by 1e9"),
+        ("1305031102.1 0 0 0 0 0 0 2", "its quaternion has length 2, not 1"),
+        ("1305031102.1,0,0,0,0,0,0,1", "is not a time in seconds"),
+    ],
+)
+def test_a_trajectory_of_another_form_is_refused_with_its_first_mistake(tum: Path, pose: str, says: str) -> None:
+    (tum / "groundtruth.txt").write_text(f"# stamp tx ty tz qx qy qz qw\n{pose}\n")
+    with pytest.raises(ImportSourceError, match=f"holds no pose .*; line 2: .*{says}"):
+        imported(tum)
 
 
 def test_tum_lists_cannot_reach_outside_the_recording(tum: Path) -> None:
