@@ -33,7 +33,12 @@ AtLeastZero = Annotated[float, msgspec.Meta(ge=0)]
 AtLeastOne = Annotated[int, msgspec.Meta(ge=1, le=MAX_COUNT)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 AtLeastTwo = Annotated[int, msgspec.Meta(ge=2, le=MAX_COUNT)]
-Samples = Annotated[int, msgspec.Meta(ge=2, le=1024)]  # of one ray
+# Counts that memory is taken by, bounded before it is: no network, ray or store of use has more.
+Channels = Annotated[int, msgspec.Meta(ge=1, le=1024)]
+Layers = Annotated[int, msgspec.Meta(ge=0, le=64)]
+Samples = Annotated[int, msgspec.Meta(ge=1, le=1024)]
+SamplesOfTwo = Annotated[int, msgspec.Meta(ge=2, le=1024)]
+Metres = Annotated[float, msgspec.Meta(gt=0, le=1000)]
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -45,16 +50,21 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 class EncoderConfig(Config, frozen=True):
     """Shape of the image encoder that all kinds of fields share."""
 
-    channels: tuple[int, ...] = (32, 64, 128, 192)  # of each stage; the first works at half the size of the image
-    blocks: tuple[int, ...] = (1, 2, 3, 3)  # residual blocks a stage
+    channels: Annotated[tuple[Channels, ...], msgspec.Meta(max_length=8)] = (
+        32,
+        64,
+        128,
+        192,
+    )  # of each stage; the first works at half the size of the image
+    blocks: Annotated[tuple[Layers, ...], msgspec.Meta(max_length=8)] = (1, 2, 3, 3)  # residual blocks a stage
     depth: bool = False  # whether it sees measured depth (as ``fields.surface`` puts it) beside colours
 
 
 class SRayConfig(Config, frozen=True):
     """Shape of the S-Ray network; part of every checkpoint."""
 
-    feature_dim: AtLeastOne = 32  # C of the paper
-    heads: AtLeastOne = 4  # H; d_k = C / H
+    feature_dim: Channels = 32  # C of the paper
+    heads: Channels = 4  # H; d_k = C / H
     encoder: EncoderConfig = EncoderConfig(depth=True)
     tau: float = 0.02  # Eq. 12: view weights lie in (tau / m, 1 / (tau m))
     positional_encoding: bool = False  # sinusoid along the ray; the paper uses none
@@ -69,39 +79,41 @@ class SRayConfig(Config, frozen=True):
 class UNetFieldConfig(Config, frozen=True):
     """Shape of the per-image U-Net; the encoder is S-Ray's."""
 
-    feature_dim: int = 32  # channels that the classifier reads
+    feature_dim: Channels = 32  # channels that the classifier reads
     encoder: EncoderConfig = EncoderConfig()
 
 
 class NeuRayConfig(Config, frozen=True):
     """Shape of NeuRay with a semantic head; the encoder is S-Ray's."""
 
-    feature_dim: int = 32  # C
+    feature_dim: Channels = 32  # C
     encoder: EncoderConfig = EncoderConfig()
 
 
 class MVSNeRFConfig(Config, frozen=True):
     """Shape of MVSNeRF with a semantic head; the encoder is S-Ray's."""
 
-    feature_dim: int = 32  # channels whose variance the cost volume holds
+    feature_dim: Channels = 32  # channels whose variance the cost volume holds
     encoder: EncoderConfig = EncoderConfig()
-    views: int = 3  # source views used: those nearest to the query; the first of them is the reference
-    planes: int = 64  # of the sweep, uniform in inverse depth
+    views: Annotated[int, msgspec.Meta(ge=1, le=16)] = (
+        3  # source views used: those nearest to the query; the first of them is the reference
+    )
+    planes: Samples = 64  # of the sweep, uniform in inverse depth
     plane_near_m: float = 0.3
     plane_far_m: float = 8.0
-    volume_channels: int = 8  # of the neural encoding volume
-    width: int = 64  # of the MLP
-    depth: int = 4  # layers of the MLP
-    position_frequencies: int = 6
+    volume_channels: Channels = 8  # of the neural encoding volume
+    width: Channels = 64  # of the MLP
+    depth: Layers = 4  # layers of the MLP
+    position_frequencies: Layers = 6
 
 
 class SemanticNeRFConfig(Config, frozen=True):
     """Shape of Semantic-NeRF, and the box that it can describe: one scene."""
 
-    width: int = 128
-    depth: int = 4  # layers before the heads; the encoded position enters the middle one again
-    position_frequencies: int = 10
-    direction_frequencies: int = 4
+    width: Channels = 128
+    depth: Layers = 4  # layers before the heads; the encoded position enters the middle one again
+    position_frequencies: Layers = 10
+    direction_frequencies: Layers = 4
     centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the box, world
     half_extent_m: float = 8.0  # half the side of the box
 
@@ -110,15 +122,15 @@ class SamplingConfig(Config, frozen=True):
     """Where a ray is sampled."""
 
     mode: Literal["reference", "streaming"] = "streaming"
-    coarse: Samples = 64  # reference: uniform in inverse depth
-    fine: Annotated[int, msgspec.Meta(ge=1, le=1024)] = 64  # reference: drawn from the coarse weights
-    guided: Samples = 8  # streaming: round the depth prior, or uniform in inverse depth where there is none
+    coarse: SamplesOfTwo = 64  # reference: uniform in inverse depth
+    fine: Samples = 64  # reference: drawn from the coarse weights
+    guided: SamplesOfTwo = 8  # streaming: round the depth prior, or uniform in inverse depth where there is none
     free_space: NotNegative = 1  # of the guided samples: between the camera and the guided interval
     guided_sigma: Positive = 0.02  # half width of the guided interval: guided_sigma * z + guided_floor_m
     guided_floor_m: Positive = 0.04
     least_weight: Share = 0.0  # streaming: samples of a smaller share of their ray's weight get no look of their own
-    near_m: Positive = 0.3
-    far_m: Positive = 8.0
+    near_m: Metres = 0.3
+    far_m: Metres = 8.0
 
     def __post_init__(self) -> None:
         if self.far_m <= self.near_m:
@@ -187,13 +199,13 @@ class RenderConfig(Config, frozen=True):
     scale: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.25
     # 1 = rays for all its pixels; below, for every fourth a side and, up to this share, where these do not tell enough.
     share: Share = 0.2
-    blind_samples: Samples = 32  # a ray, of views of which neither sensor nor map knows any depth
+    blind_samples: SamplesOfTwo = 32  # a ray, of views of which neither sensor nor map knows any depth
     target_hz: Annotated[float, msgspec.Meta(ge=0, le=1000)] = (
         0.0  # hold this rate by fewer rays and samples than set; 0 = off, for maps that repeat
     )
     # Of the source images when they are encoded; 0 = what the weights were trained at.
-    encode_width: Annotated[int, msgspec.Meta(ge=0, le=1 << 14)] = 0
-    rays_per_chunk: Annotated[int, msgspec.Meta(ge=0, le=1 << 22)] = 0  # 0 = 2,048 on a CPU, 32,768 on a GPU
+    encode_width: Annotated[int, msgspec.Meta(ge=0, le=4096)] = 0
+    rays_per_chunk: Annotated[int, msgspec.Meta(ge=0, le=1 << 20)] = 0  # 0 = 2,048 on a CPU, 32,768 on a GPU
     device: Literal["cpu", "cuda"] = "cpu"  # where views are encoded and rendered; the map is always the CPU's
     bfloat16: bool = False  # on a GPU: networks compute in bfloat16; geometry and logits never do
 

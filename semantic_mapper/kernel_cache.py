@@ -12,15 +12,16 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numba
-import structlog
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+from semantic_mapper.log_events import get_logger
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
 _PACKAGE = Path(__file__).resolve().parent
 _MARKS = (b"njit", b"_kernel", b"@kernel")
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 def kernel(

@@ -9,18 +9,18 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 import numba
-import structlog
 import torch
 from numba.core import event as numba_event
 
 from semantic_mapper.kernel_cache import kernel
+from semantic_mapper.log_events import get_logger
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 P = ParamSpec("P")
 
 MAX_POOL_THREADS = 64  # enough for every caller to have its own; threads start only when they are needed
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class _CompileNotice(numba_event.Listener):

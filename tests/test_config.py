@@ -152,6 +152,13 @@ def test_configs_cannot_be_changed() -> None:
         ({"render": {"rays_per_chunk": -1}}, "rays_per_chunk"),
         ({"voxel_map": {"voxel_size_m": -0.02}}, "voxel_size_m"),
         ({"voxel_map": {"vote_discount": 1.5}}, "vote_discount"),
+        ({"sampling": {"coarse": 10**9}}, "coarse"),
+        ({"sampling": {"far_m": 1e9}}, "far_m"),
+        ({"keyframes": {"capacity": 10**9}}, "capacity"),
+        ({"render": {"blind_samples": 10**9}}, "blind_samples"),
+        ({"render": {"rays_per_chunk": 10**12}}, "rays_per_chunk"),
+        ({"render": {"encode_width": 10**6}}, "encode_width"),
+        ({"virtual": {"views": 10**9}}, "views"),
     ],
 )
 def test_values_that_make_no_sense_are_refused_by_name(section: dict[str, Any], what: str) -> None:

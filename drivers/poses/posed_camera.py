@@ -17,7 +17,7 @@ from semantic_mapper.errors import PoseError, ShapeError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import Float64, PosedFrame
+from semantic_mapper.types import MAX_POSE_SIGMA_M, Float64, PosedFrame
 
 _DEFAULTS = PoseChecks()
 EXACT = ("fixed",)  # sources whose poses come from the settings: the first one is not doubted
@@ -156,7 +156,7 @@ class PosedCamera:
             check_pose(estimate.T_world_camera, f"image {image.seq} of '{image.camera_id}'")
         except (PoseError, ShapeError) as error:
             return self._refuse(image, "not_rotation", str(error))
-        if not np.isfinite(estimate.sigma) or estimate.sigma < 0:
+        if not 0 <= estimate.sigma <= MAX_POSE_SIGMA_M:  # NaN, too
             return self._refuse(image, "not_rotation", f"its pose has an uncertainty of {estimate.sigma} m")
         return estimate
 

@@ -35,6 +35,7 @@ FORMAT = "semantic-mapper-weights"
 VERSION = 3
 MESSAGE = 300  # characters of torch's message, which names every tensor
 NEW_ROW_SPREAD = 0.2
+MAX_WIDTH = 4096  # as ``render.encode_width``
 DEFAULT_WIDTH = 320  # of weights whose recipe does not say
 DEPTH_UNITS_PER_M = 4000.0  # anchors' depth as uint16: a quarter of a millimetre, up to 16 m
 
@@ -224,7 +225,7 @@ def _checked_recipe(recipe: Any) -> dict[str, Any]:
     """
     if not isinstance(recipe, dict):
         raise TypeError(f"the recipe is {type(recipe).__name__}, not a table")
-    if not int(recipe.get("width", DEFAULT_WIDTH)) >= 4:
+    if not 4 <= int(recipe.get("width", DEFAULT_WIDTH)) <= MAX_WIDTH:
         raise ValueError(f"the recipe's width is {recipe['width']}")
     _ = [int(stamp) for stamp in recipe.get("train_stamps_ns", ())]
     return recipe

@@ -23,8 +23,8 @@ from msgspec import Meta
 from semantic_mapper.errors import CodecError
 from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.transport.framing import Buffer
-from semantic_mapper.transport.headers import Header, Stamp, pack_header, unpack_header
-from semantic_mapper.types import Float64
+from semantic_mapper.transport.headers import CaptureStamp, Header, pack_header, unpack_header
+from semantic_mapper.types import MAX_POSE_SIGMA_M, Float64
 
 MAX_POSE_BYTES = 2048
 QUATERNION_TOLERANCE = 1e-2  # of its length from 1: what is further off is no rounding error
@@ -38,10 +38,10 @@ Four = Annotated[tuple[float, ...], Meta(min_length=4, max_length=4)]
 class PoseMessage(Header, frozen=True, kw_only=True):
     """Where frame ``child`` was in frame ``parent`` at ``stamp_ns``; fields as in the module's words."""
 
-    stamp_ns: Stamp
+    stamp_ns: CaptureStamp
     position: Three
     quaternion: Four  # x y z w
-    sigma: Annotated[float, Meta(ge=0)] = 0.0
+    sigma: Annotated[float, Meta(ge=0, le=MAX_POSE_SIGMA_M)] = 0.0
     parent: FrameName = ""
     child: FrameName = ""
 

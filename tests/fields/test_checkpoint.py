@@ -145,3 +145,17 @@ def test_the_shipped_checkpoint_is_small_and_says_where_it_comes_from():
     checkpoint = load_checkpoint(path)
     assert checkpoint.label_set == ROOMS and not checkpoint.anchors
     assert {"kind", "config", "steps", "rooms", "validation_miou", "history", "width"} <= set(checkpoint.recipe)
+
+
+@pytest.mark.parametrize(
+    "change", [{"feature_dim": 2048}, {"encoder": {"channels": [2048, 16]}}, {"encoder": {"blocks": [65, 1]}}]
+)
+def test_a_network_too_large_for_any_use_is_refused_before_it_is_made(tmp_path, change):
+    path = tmp_path / "w.safetensors"
+    save_checkpoint(Checkpoint(tiny_field()), path)
+    with safe_open(path, framework="pt") as stored:
+        metadata, tensors = stored.metadata(), {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
+    metadata["model_config"] = json.dumps({**json.loads(metadata["model_config"]), **change})
+    save_file(tensors, path, metadata)
+    with pytest.raises(WeightsError, match=r"metadata is damaged: ConfigError: .*Expected"):
+        load_checkpoint(path)

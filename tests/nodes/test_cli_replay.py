@@ -98,6 +98,21 @@ def test_impossible_and_damaged_frames_are_named_and_the_rest_is_mapped(
         assert reason.removeprefix("mapped, but not scored: ")[:40] in done.stderr
 
 
+def test_a_frame_whose_intrinsics_do_not_fit_is_refused_and_the_rest_is_mapped(
+    tmp_path: Path, weights: Path, config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = list(tiny_frames(3))
+    with monkeypatch.context() as patch:
+        patch.setattr("semantic_mapper.types._check_lens", lambda k: None)  # as written before intrinsics were checked
+        frames[1] = dataclasses.replace(frames[1], intrinsics=dataclasses.replace(frames[1].intrinsics, cy=1e19))
+        log = write_log(tmp_path / "wild.mcap", frames)
+    done = run("replay", log, "--out", tmp_path / "out", "--weights", weights, "--config", config, "--json")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    assert (summary["frames"]["published"], summary["frames"]["fused"], summary["frames"]["refused"]) == (3, 2, 1)
+    assert "cy=1e+19" in summary["refusals"][0]["reason"]
+
+
 def test_interrupted_replay_still_writes_the_map_so_far(tmp_path: Path, weights: Path, config: Path) -> None:
     log = write_log(tmp_path / "long.mcap", repeated_frames(400))
     out = tmp_path / "out"

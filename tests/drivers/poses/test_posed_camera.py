@@ -73,7 +73,7 @@ def test_an_image_without_a_pose_is_left_out_and_counted() -> None:
     assert camera.counters == {"frames": 3, "no_pose": 2, "stale": 0, "not_rotation": 0, "jumping": 0, "unsettled": 0}
 
 
-@pytest.mark.parametrize("what", ["nan", "mirror", "scale", "row", "shape", "sigma"])
+@pytest.mark.parametrize("what", ["nan", "mirror", "scale", "row", "shape", "far", "sigma", "huge sigma"])
 def test_what_is_no_pose_is_left_out_and_counted(what: str) -> None:
     bad = {
         "nan": np.full((4, 4), np.nan),
@@ -82,11 +82,13 @@ def test_what_is_no_pose_is_left_out_and_counted(what: str) -> None:
         "row": np.eye(4) + np.eye(4)[[3, 0, 1, 2]] * 0 + np.outer((0, 0, 0, 1), (1, 0, 0, 0)),
         "shape": np.eye(3),
         "sigma": np.eye(4),
+        "huge sigma": np.eye(4),
+        "far": np.array([[1, 0, 0, 1e9], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]),
     }[what]
     source = Told(lambda i: bad if i.seq == 1 else np.eye(4))
     camera = PosedCamera(ListCamera(images(3)), source)
-    if what == "sigma":
-        source.sigma = np.nan
+    if "sigma" in what:
+        source.sigma = np.nan if what == "sigma" else 1e300
         assert run(camera) == [] and camera.counters["not_rotation"] == 3
         return
     assert run(camera) == [0, 2]
