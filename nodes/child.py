@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections import deque
+from contextlib import ExitStack
 
 import msgspec
 import structlog
@@ -156,20 +157,34 @@ class Child:
 
 
 def _start_process(kind: str, job: NodeJob, beats: int) -> subprocess.Popen[bytes]:
-    told = _in_memory(msgspec.json.encode(msgspec.structs.replace(job, heartbeat_fd=beats)))
-    try:
-        return subprocess.Popen(
+    # Pipes are made here: before Python 3.12, Popen leaves those open that it made before one is not to be had.
+    with ExitStack() as theirs, ExitStack() as ours:
+        given = _in_memory(msgspec.json.encode(msgspec.structs.replace(job, heartbeat_fd=beats)))
+        theirs.callback(os.close, given)
+        output, written = os.pipe()
+        ours.callback(os.close, output)
+        theirs.callback(os.close, written)
+        call = None
+        if job.waits:
+            read, call = os.pipe()
+            ours.callback(os.close, call)
+        else:
+            read = os.open(os.devnull, os.O_RDONLY)
+        theirs.callback(os.close, read)
+        process = subprocess.Popen(
             # -I: a sourced workspace on PYTHONPATH, or a file in the current folder, cannot shadow our modules.
-            [sys.executable, "-I", "-m", f"nodes.{kind}", f"{JOB_PREFIX}{told}"],
-            stdin=subprocess.PIPE if job.waits else subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
+            [sys.executable, "-I", "-m", f"nodes.{kind}", f"{JOB_PREFIX}{given}"],
+            stdin=read,
+            stdout=written,
             stderr=subprocess.STDOUT,
-            pass_fds=(beats, told),
+            pass_fds=(beats, given),
             env={k: v for k, v in os.environ.items() if k not in SYSTEMD_VARIABLES},
             process_group=0,  # Ctrl-C in the terminal reaches the launcher only, which then stops all in order
         )
-    finally:
-        os.close(told)
+        ours.pop_all()
+        process.stdout = os.fdopen(output, "rb")
+        process.stdin = None if call is None else os.fdopen(call, "wb")
+        return process
 
 
 def _in_memory(job: bytes) -> int:
