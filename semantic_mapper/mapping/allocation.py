@@ -118,9 +118,11 @@ def _steepest(camera: Camera, shape: tuple[int, ...]) -> float:
 
 
 def blocks_in_view(
-    camera: Camera, intrinsics: CameraIntrinsics, keys: NDArray[np.int32], voxel_size_m: float, reach_m: float
+    camera: Camera, size: tuple[int, int], keys: NDArray[np.int32], voxel_size_m: float, reach_m: float
 ) -> NDArray[np.int64]:
     """Packed keys of those blocks of ``keys`` (B, 3) that a camera may see up to ``reach_m`` of z, the nearest first.
+
+    ``size`` is (height, width) of the image, which may be a small part of one far from the optical axis.
 
     A block counts whose bounding sphere touches the frustum; the sphere is that of the block and a voxel more on each
     side, for a point between two blocks is interpolated from both.
@@ -129,11 +131,11 @@ def blocks_in_view(
     p = ((keys + 0.5) * side - camera.t) @ camera.R
     z = p[:, 2]
     seen = (z > -radius) & (z < reach_m + radius)
-    for at, focal, center, size in (
-        (p[:, 0], camera.fx, camera.cx, intrinsics.width),
-        (p[:, 1], camera.fy, camera.cy, intrinsics.height),
+    for at, focal, center, side_px in (
+        (p[:, 0], camera.fx, camera.cx, size[1]),
+        (p[:, 1], camera.fy, camera.cy, size[0]),
     ):
-        for edge, sign in ((-0.5, 1.0), (size - 0.5, -1.0)):
+        for edge, sign in ((-0.5, 1.0), (side_px - 0.5, -1.0)):
             slope = (edge - center) / focal  # of the plane through the camera and this edge of the image
             seen &= sign * (at - slope * z) / np.hypot(1.0, slope) > -radius
     order = np.argsort(z[seen], kind="stable")

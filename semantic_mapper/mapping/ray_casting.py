@@ -7,7 +7,6 @@ block to block, steps by the TSDF and finds the zero crossing on the interpolate
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -175,9 +174,8 @@ def _windows(
     waiting = [(whole, grid.keys_between(*view_bounds(camera, intrinsics, voxel, reach)))]
     while waiting:
         window, keys = waiting.pop()
-        of_window = replace(intrinsics, height=window.height, width=window.width)
         moved = camera._replace(cx=camera.cx - window.left, cy=camera.cy - window.top)
-        seen = blocks_in_view(moved, of_window, keys, voxel, reach)
+        seen = blocks_in_view(moved, (window.height, window.width), keys, voxel, reach)
         if len(seen) <= grid.room or window.height * window.width == 1:
             yield window, seen
         else:

@@ -97,7 +97,7 @@ def test_blocks_in_view_are_all_that_a_camera_sees_the_nearest_first() -> None:
     camera, side = make_camera(INTRINSICS, POSE), 0.16
     grid = np.arange(-14, 15)
     keys = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), -1).reshape(-1, 3).astype(np.int32)
-    found = unpack_keys(blocks_in_view(camera, INTRINSICS, keys, 0.02, 1.5))
+    found = unpack_keys(blocks_in_view(camera, (120, 160), keys, 0.02, 1.5))
     z = ((found + 0.5) * side - camera.t) @ camera.R[:, 2]
     assert np.diff(z).min() > -1e-9
     depth = np.linspace(0.01, 1.5, 100, dtype=np.float32)
@@ -116,6 +116,6 @@ def test_the_bounds_of_a_view_hold_all_its_blocks_and_little_more(rng: np.random
         camera = make_camera(INTRINSICS, look_at(eye, target, up))
         low, high = view_bounds(camera, INTRINSICS, 0.02, 1.0)
         near = keys[((keys >= low) & (keys <= high)).all(axis=1)]
-        seen = blocks_in_view(camera, INTRINSICS, keys, 0.02, 1.0)
-        np.testing.assert_array_equal(blocks_in_view(camera, INTRINSICS, near, 0.02, 1.0), seen)
+        seen = blocks_in_view(camera, (120, 160), keys, 0.02, 1.0)
+        np.testing.assert_array_equal(blocks_in_view(camera, (120, 160), near, 0.02, 1.0), seen)
         assert (high - low <= 2 * 1.6 / 0.16 + 6).all(), "no wider than the sphere round the camera"

@@ -270,10 +270,13 @@ def test_mirrors_see_every_block_as_changed_and_a_new_epoch_after_a_swap():
 
 def test_a_pose_out_of_reach_of_any_voxel_is_given_up_and_mapping_goes_on():
     frames = tiny_frames(8)
-    pipeline = mapped(frames[:6], max_frames=20)
+    pipeline = mapped(frames[:6], max_frames=20, voxel_map={"voxel_size_m": 0.01, "initial_blocks": 200})
     before = bits(pipeline.voxel_map)
     far = frames[3].T_world_camera.copy()
     far[0, 3] = 1e7
+    with pytest.raises(PoseError, match="nearer origin"):
+        pipeline.correct_poses({frames[3].stamp_ns: far})
+    far[0, 3] = 9e4  # keys of 1 cm voxels reach 84 km
     assert pipeline.correct_poses({frames[3].stamp_ns: far}).running
     with pytest.raises(MapError, match="given up, the map stays as it is"):
         finish(pipeline)

@@ -13,7 +13,7 @@ from structlog.testing import capture_logs
 
 from semantic_mapper.config import VirtualViewConfig
 from semantic_mapper.errors import MapError
-from semantic_mapper.geometry import look_at
+from semantic_mapper.geometry import look_at, scale_intrinsics
 from semantic_mapper.mapping.block_grid import EVICTED_AT_ONCE, EVICTED_SHARE, BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys
 from semantic_mapper.mapping.block_store import BlockStore
@@ -134,6 +134,15 @@ def test_frames_that_memory_has_no_room_for_make_the_same_map(wide: tuple[VoxelM
     assert same(free.block_state(), paged.block_state())
     for version in range(free.version + 1):
         np.testing.assert_array_equal(free.changed_since(version), paged.changed_since(version))
+
+
+def test_a_view_cast_pixel_by_pixel_is_the_same(
+    both: tuple[VoxelMap, VoxelMap], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free, paged = both
+    small, pose = scale_intrinsics(INTRINSICS, 12, 9), along_the_wall(2.5)
+    monkeypatch.setattr(BlockGrid, "room", property(lambda grid: 1))
+    np.testing.assert_array_equal(paged.ray_cast(pose, small).depth_m, free.ray_cast(pose, small).depth_m)
 
 
 def test_a_view_that_memory_has_no_room_for_is_the_same(wide: tuple[VoxelMap, VoxelMap]) -> None:
