@@ -35,6 +35,7 @@ def faults(*, keep: bool) -> int:
     return int(lines[-1])
 
 
+@pytest.mark.slow
 def test_freed_memory_is_used_again() -> None:
     assert faults(keep=True) < 100 < faults(keep=False)
 

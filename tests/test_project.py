@@ -33,6 +33,7 @@ def test_the_version_is_the_same_everywhere() -> None:
     assert f"## {declared}" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_every_module_can_be_imported_and_none_loads_a_vendor_library() -> None:
     names = list(PACKAGES)
     for package in PACKAGES:
@@ -117,6 +118,7 @@ def test_every_relative_link_of_the_documentation_leads_somewhere() -> None:
     assert not broken
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", ["os.abort()", "ctypes.PyDLL(None).sleep(1000)"], ids=["crash", "hang"])
 def test_a_test_that_crashes_or_hangs_in_native_code_ends_the_run_with_an_error(end: str, tmp_path: Path) -> None:
     for name, line in (("bad", end), ("good", "pass")):

@@ -34,6 +34,7 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
     torch.set_num_threads(before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wanted", [1, 2])
 def test_kernels_neither_change_torchs_thread_count_nor_start_numbas_threads(wanted: int) -> None:
     """OneDNN plans for one count and would run, and sometimes crash, with another."""
@@ -47,7 +48,8 @@ def test_kernels_neither_change_torchs_thread_count_nor_start_numbas_threads(wan
 
 
 NOTICE = """
-import sys
+import logging, sys
+logging.basicConfig(level=logging.INFO)
 import numpy as np
 sys.path.insert(0, sys.argv[1])
 from kernels import add
@@ -64,6 +66,7 @@ def add(x):
 """
 
 
+@pytest.mark.slow
 def test_compiling_is_logged_once_and_not_where_kernels_are_cached(tmp_path: Path) -> None:
     (tmp_path / "kernels.py").write_text(KERNELS, encoding="utf-8")
     said: list[list[str]] = []

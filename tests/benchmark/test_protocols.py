@@ -56,6 +56,7 @@ def score(contestant: Contestant, suite: SuiteConfig, on_fit: Callable[[float], 
     return result
 
 
+@pytest.mark.slow
 def test_generalizing_scores_whole_views_from_sources_that_are_not_the_query() -> None:
     room = tiny_room()
     record = score(tiny_contestant(), tiny_suite()).record
@@ -148,6 +149,7 @@ def test_a_guard_of_none_still_keeps_the_queries_out() -> None:
     assert not {*chosen.labelled, *chosen.unlabelled} & set(tiny_room().queries)
 
 
+@pytest.mark.slow
 def test_further_frames_take_part_without_their_labels() -> None:
     scene = {"keyframes": 2, "unlabelled": 4, "guard": 1, "seconds": 0, "steps": 2, "shares": (1.0,)}
     suite = tiny_suite(protocol="finetune", scene=scene, views=6)

@@ -34,6 +34,7 @@ def environment() -> Iterator[dict[str, str]]:
         yield {**os.environ, "PYTHONPATH": str(ROOT), "XDG_RUNTIME_DIR": folder}
 
 
+@pytest.mark.slow
 def test_its_own_tests_pass(environment: dict[str, str], tmp_path: Path) -> None:
     plugins = ("-p", "semantic_mapper.testing", "-p", "no:dash", "-p", "no:cacheprovider")
     command = [sys.executable, "-m", "pytest", "-q", *plugins, "--basetemp", str(tmp_path / "tests")]
@@ -56,6 +57,7 @@ def node(kind: str, **options: object) -> tuple[str, ...]:
     return "-m", f"nodes.{kind}", json.dumps({"name": kind, "options": options})
 
 
+@pytest.mark.slow
 def test_it_follows_a_running_mapper_and_asks_it(environment: dict[str, str], tmp_path: Path) -> None:
     log = write_log(tmp_path / "room.mcap", repeated_frames(FRAMES))
     config = tmp_path / "mapper.toml"

@@ -62,6 +62,7 @@ def test_the_ablations_differ_from_each_other_at_the_same_weights():
     assert all((seen[i] - seen[j]).abs().max() > 1e-4 for i in range(4) for j in range(i))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(SWITCHES))
 def test_the_whole_field_passes_gradcheck(name: str):
     assert_gradients_are_right(tiny(name))

@@ -123,6 +123,7 @@ def train(field: MVSNeRF, steps: int, generator: torch.Generator) -> None:
         optimiser.step()
 
 
+@pytest.mark.slow
 def test_it_learns_to_tell_near_from_far_in_worlds_that_it_has_never_seen():
     """No depth anywhere, and no colour or place has a class: what tells is where the views agree."""
     field, generator = calibrated_field()
@@ -133,6 +134,7 @@ def test_it_learns_to_tell_near_from_far_in_worlds_that_it_has_never_seen():
     assert accuracy > 0.75 and unexplained < 0.6
 
 
+@pytest.mark.slow
 def test_the_volume_tells_at_the_depth_of_the_sample(monkeypatch: pytest.MonkeyPatch):
     """Colours of the views at a sample tell near from far, too, so here it does without them."""
     fill = mvsnerf.colours_and_masks

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 RENDER = """
 import hashlib
 from semantic_mapper.config import SamplingConfig
@@ -25,6 +27,7 @@ for name in ("logits", "depth_m", "rgb", "opacity"):
 """
 
 
+@pytest.mark.slow
 def test_kernels_compiled_anew_render_the_same_bits_as_those_on_disk(tmp_path: Path) -> None:
     """A machine's first run, which compiles, and its second must not differ: maps and tests are compared to the bit."""
     said: list[list[str]] = []

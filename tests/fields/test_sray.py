@@ -316,6 +316,7 @@ def test_reference_sampling_concentrates_fine_samples_on_the_wall():
     assert ((z - WALL_M).abs() < 0.2).float().mean() > 0.4
 
 
+@pytest.mark.slow
 def test_the_whole_field_passes_gradcheck():
     torch.manual_seed(1)
     field = SRay(SRayConfig(feature_dim=8, heads=2, encoder=ONE_STAGE), LABELS).double().eval()

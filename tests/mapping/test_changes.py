@@ -114,6 +114,7 @@ def test_a_version_of_another_map_is_refused(walked: VoxelMap) -> None:
             walked.changes(since, limit)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("memory_mb", "evidence"), [(0, "float32"), (MEMORY_MB, "float32"), (0, "int16")])
 def test_a_copy_is_made_compact_later_and_is_of_its_moment(memory_mb: int, evidence: str) -> None:
     voxel_map = small_map(voxel_size_m=0.01, memory_mb=memory_mb, evidence=evidence)

@@ -31,6 +31,7 @@ def maps(tmp_path: Path) -> list[Path]:
     return paths
 
 
+@pytest.mark.slow
 def test_a_killed_save_leaves_the_old_map_or_the_new_one(maps: list[Path], tmp_path: Path) -> None:
     contents = [path.read_bytes() for path in maps]
     assert [describe_map(path).frames for path in maps] == [3, 5, 7]
@@ -56,6 +57,7 @@ def test_a_killed_save_leaves_the_old_map_or_the_new_one(maps: list[Path], tmp_p
     assert out.read_bytes() == contents[0]
 
 
+@pytest.mark.slow
 def test_a_killed_mapper_with_blocks_on_disk_leaves_the_map_of_some_frame(tmp_path: Path) -> None:
     reference = small_map(voxel_size_m=0.01)
     rng = random.Random(1)

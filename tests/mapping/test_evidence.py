@@ -102,6 +102,7 @@ def agree(a: VoxelMap, b: VoxelMap) -> None:
     np.testing.assert_allclose(ours.confidence, theirs.confidence, atol=0.002)
 
 
+@pytest.mark.slow
 def test_a_map_says_the_same_in_less_memory(maps: dict[str, VoxelMap]) -> None:
     agree(maps["int16"], maps["float32"])
     state = maps["int16"].block_state()
@@ -132,6 +133,7 @@ def test_paging_saving_and_going_on_give_the_same_bits(maps: dict[str, VoxelMap]
     assert not same(loaded.block_state(), maps["int16"].block_state())
 
 
+@pytest.mark.slow
 def test_maps_of_either_kind_merge_into_either(maps: dict[str, VoxelMap]) -> None:
     shift = np.eye(4)
     shift[0, 3] = 0.034  # no whole number of voxels

@@ -40,7 +40,7 @@ def test_open3d_reads_it(tmp_path: Path) -> None:
     assert (cloud.point["confidence"].numpy().ravel() == POINTS.confidence).all()
 
 
-@pytest.mark.parametrize("name", ["Tür", "a\nend_header", "a\r\x00\x1b[31m", "back\\slash", "椅子", "x" * 5000])
+@pytest.mark.parametrize("name", ["Tür", "a\nend_header", "a\r\x00\x1b[31m", "back\\slash", "椅子", "椅" * 128])
 def test_any_class_name_is_one_readable_comment(tmp_path: Path, name: str) -> None:
     """Open3D ends the process at lines of more than 1,000 characters."""
     path = tmp_path / "map.ply"
@@ -49,7 +49,8 @@ def test_any_class_name_is_one_readable_comment(tmp_path: Path, name: str) -> No
     assert all(line.isprintable() for line in header)
     number, text = header[2].removeprefix("comment label ").split(" ", 1)
     assert number == "7" and header[3] == "comment label 9 table"
-    assert text.encode().decode("unicode_escape") == name[:200]
+    shown = text.encode().decode("unicode_escape")
+    assert name.startswith(shown) and (shown == name or 190 < len(text) <= 200)
     cloud = load_open3d().t.io.read_point_cloud(str(path))
     assert (cloud.point["label"].numpy().ravel() == POINTS.label).all()
 

@@ -23,6 +23,7 @@ from tests.nodes.support import REPLAY_LAUNCH, Running, eventually, repeated_fra
 ALWAYS = 1e-9  # seconds
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("replayed")  # kernels of the process that compiles them differ in the last bits
 def test_a_killed_mapper_leaves_the_map_of_a_frame(weights: Path, tmp_path: Path) -> None:
     log = write_log(tmp_path / "long.mcap", repeated_frames(400))

@@ -18,6 +18,7 @@ from tests.small import tiny_config
 CONFIG = tiny_config(keyframes={"source_views": 2}, sampling={"guided": 4})
 
 
+@pytest.mark.slow
 def test_every_kind_of_question_is_asked_while_frames_are_mapped(tmp_path: Path, weights: Path, config: Path) -> None:
     file = tmp_path / "bench.json"
     options = ("--weights", weights, "--config", config, "--frames", "12", "--rate", "400", "--width", "96")
@@ -41,6 +42,7 @@ def test_every_kind_of_question_is_asked_while_frames_are_mapped(tmp_path: Path,
     assert found["size"] == "96x72" and found["frames"] == 12 and found["blocks"] > 50
 
 
+@pytest.mark.slow
 def test_a_mapper_that_waited_for_an_answer_would_be_found_out(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     follow = QueryService.follow
 

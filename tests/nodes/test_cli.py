@@ -28,6 +28,7 @@ VERBS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", VERBS)
 def test_every_verb_explains_itself_with_an_example(verb: str) -> None:
     done = run(verb, "--help")
@@ -46,6 +47,7 @@ def test_version_is_that_of_the_package() -> None:
     assert run("--version").stdout == f"semantic-mapper {__version__}\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [

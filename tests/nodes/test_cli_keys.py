@@ -21,6 +21,7 @@ def keys(*arguments: object) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_a_map_is_asked_from_another_machine(tmp_path: Path) -> None:
     robot, desk = tmp_path / "robot", tmp_path / "desk"
     public = {folder: keys("make", "--keys", folder).split()[0] for folder in (robot, desk)}

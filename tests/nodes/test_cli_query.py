@@ -28,6 +28,7 @@ def ask(map_file: Path, *arguments: object) -> tuple[dict, str]:
     return json.loads(answer.read_text()), done.stdout
 
 
+@pytest.mark.slow
 def test_info(map_file: Path) -> None:
     found, shown = ask(map_file, "info")
     assert (found["frames"], found["blocks"], found["label_set"]) == (14, whole_map().block_count, "known")
@@ -47,6 +48,7 @@ def test_a_folder_with_a_map_is_that_map(map_file: Path) -> None:
     assert code == 1 and "is a map alone; give the folder" in said
 
 
+@pytest.mark.slow
 def test_at_points_below_zero_too(map_file: Path) -> None:
     x, y, z = BOX + np.array([0.0, 0.0, HALF[2]])
     assert x < 0
@@ -57,6 +59,7 @@ def test_at_points_below_zero_too(map_file: Path) -> None:
     assert (found["class"], found["state"], found["surface_distance_m"]) == (None, "unknown", None)
 
 
+@pytest.mark.slow
 def test_nearest(map_file: Path) -> None:
     above = BALL + np.array([0.0, 0.0, 1.0])
     found, shown = ask(map_file, "nearest", "cup", *above)
@@ -69,6 +72,7 @@ def test_nearest(map_file: Path) -> None:
     assert done.returncode == 1 and "floor, table, cup, lamp" in done.stderr.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_instances(map_file: Path) -> None:
     found, shown = ask(map_file, "instances", "--up", "0", "0", "-1")
     large = {thing["class"]: thing for thing in found["instances"] if thing["voxels"] > 200}
@@ -78,6 +82,7 @@ def test_instances(map_file: Path) -> None:
     assert "table" in shown and str(large["cup"]["voxels"]) in shown
 
 
+@pytest.mark.slow
 def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
     with a_folder() as folder, answering(f"ipc://{folder / 'query'}", whole_map()) as service:
         for question, name, point in (
@@ -96,6 +101,7 @@ def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
         assert wrong.returncode == 1 and "floor, table, cup, lamp" in wrong.stderr.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_what_cannot_be_asked_is_said(map_file: Path, tmp_path: Path) -> None:
     missing = run("query", tmp_path / "none.npz", "info")
     assert missing.returncode == 1 and "no such map file" in missing.stderr

@@ -48,6 +48,7 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return paths
 
 
+@pytest.mark.slow
 def test_weights_side_by_side_with_maps_and_a_second_call_that_continues(
     suite: Path, two: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -69,6 +70,7 @@ def test_weights_side_by_side_with_maps_and_a_second_call_that_continues(
     assert out.with_suffix(".png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_fitting_shows_its_curve(suite: Path, two: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "fit.json"
     options = ("--protocol", "scratch", "--steps", "2", "--rooms", "1", "--depth", "off")
@@ -89,6 +91,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_a_room_is_made(suite: P
     assert "benchmark" not in refused.stderr, "no room was begun"
 
 
+@pytest.mark.slow
 def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Path) -> None:
     out = tmp_path / "kind.json"
     options = ("--suite", "rooms", "--config", suite, "--kind", "semantic_nerf", "--json", out)
@@ -100,6 +103,7 @@ def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Pat
     assert refused.returncode == 1 and "--protocol scratch" in refused.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [

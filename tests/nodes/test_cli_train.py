@@ -47,6 +47,7 @@ def recipe(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_training_into_a_folder_leaves_weights_state_history_and_curves(recipe: Path, tmp_path: Path) -> None:
     out = tmp_path / "made" / "run"
     done = run("train", "--config", recipe, "--out", out, "--seed", "3", "--half")
@@ -60,6 +61,7 @@ def test_training_into_a_folder_leaves_weights_state_history_and_curves(recipe: 
     assert checkpoint.recipe["seed"] == 3 and checkpoint.recipe["steps"] == 4 and checkpoint.width == 48
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_what_resume_goes_on_with(recipe: Path, tmp_path: Path) -> None:
     recipe.write_text(f'keep = "last"\n{CONFIG}', encoding="utf-8")
     out = tmp_path / "rooms.safetensors"

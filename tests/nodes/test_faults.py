@@ -74,6 +74,7 @@ def frame_numbers(log: Path) -> list[int]:
         return [envelope.seq for envelope, _ in reader.frame_parts()]
 
 
+@pytest.mark.slow
 def test_every_node_that_is_killed_or_frozen_comes_back_and_the_others_go_on(
     long_log: Path, weights: Path, config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -130,6 +131,7 @@ def test_restart_limit_ends_the_launch_with_the_reason(long_log: Path, tmp_path:
         assert "it was restarted 2 times within 60 s, and is not any more" in line
 
 
+@pytest.mark.slow
 def test_a_mapper_that_reaches_its_restart_limit_leaves_the_results_of_the_map_it_saved(
     long_log: Path, weights: Path, config: Path, tmp_path: Path
 ) -> None:
@@ -153,6 +155,7 @@ def test_a_mapper_that_reaches_its_restart_limit_leaves_the_results_of_the_map_i
     assert {"map.ply", "overview.png", "report.html"} <= {path.name for path in out.iterdir()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
 def test_node_that_a_stranger_sends_away_comes_back(long_log: Path, tmp_path: Path, signum: signal.Signals) -> None:
     with Running("up", alone(tmp_path, long_log)) as running:
@@ -179,12 +182,14 @@ def test_node_that_is_not_to_come_back_and_is_sent_away_ends_the_launch_with_the
     assert re.search(r"\beye\].* played .*stopped=True", running.text)  # in order all the same
 
 
+@pytest.mark.slow
 def test_log_that_is_at_its_end_ends_a_live_launch_in_order(log: Path, tmp_path: Path) -> None:
     done = run("up", alone(tmp_path, log))
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("node_started") == 1 and "node_ended" not in done.stderr
 
 
+@pytest.mark.slow
 def test_node_that_never_was_ready_and_says_why_is_not_tried_again(tmp_path: Path) -> None:
     done = run("up", alone(tmp_path, tmp_path / "none.mcap"))
     assert done.returncode == 1 and "none.mcap" in error_line(done.stderr)
@@ -248,6 +253,7 @@ def watched(long_log: Path, tmp_path: Path) -> Iterator[Running]:
         yield running
 
 
+@pytest.mark.slow
 def test_top_shows_a_running_launch(watched: Running) -> None:
     sockets = watched.wait_for_line("sockets=").split("sockets=")[1].split()[0]
     pid = wait_for_start(watched, "eye", 0)
@@ -265,6 +271,7 @@ def test_top_shows_a_running_launch(watched: Running) -> None:
     assert re.search(rf"eye +\w+ +{pid} ", table)
 
 
+@pytest.mark.slow
 def test_top_says_where_there_is_nothing_to_see(tmp_path: Path) -> None:
     assert "no socket folder of a launch" in error_line(run("top", str(tmp_path), "--once").stderr)
     assert run("top", "--json").returncode == 2

@@ -116,6 +116,7 @@ def played_mapper(start: Path) -> Iterator[tuple[Heard, Publisher]]:
             yield heard, mapper
 
 
+@pytest.mark.slow
 def test_keyframes_become_weights_and_what_the_mapper_says_of_them_counts(start: Path, tmp_path: Path) -> None:
     with played_mapper(start) as (heard, mapper):
         wide = dataclasses.replace(FRAMES[0], label=FRAMES[0].label + 200)
@@ -147,6 +148,7 @@ def test_keyframes_become_weights_and_what_the_mapper_says_of_them_counts(start:
         assert eventually(lambda: heard.counters() and "does not know" in heard.last.degraded[-1])  # pyright: ignore
 
 
+@pytest.mark.slow
 def test_a_restarted_finetuner_goes_on_with_the_weights_and_keyframes_of_the_one_before(start: Path, tmp_path: Path):
     config, out = tmp_path / "learning.toml", tmp_path / "out"
     config.write_text("least_gain = 0.0\n" + LEARNING, encoding="utf-8")

@@ -78,6 +78,7 @@ def test_info_shows_all_names_as_they_are(hostile: Path) -> None:
         assert "".join(name.split()) in "".join(said.split()).replace("│", ""), name
 
 
+@pytest.mark.slow
 def test_names_in_results_maps_and_scores_are_text(hostile: Path, results: Path, config: Path, tmp_path: Path) -> None:
     log, weights = hostile / "log.mcap", hostile / "tiny.safetensors"
     for arguments in (

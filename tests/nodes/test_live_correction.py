@@ -194,6 +194,7 @@ def test_where_odometry_goes_on_frames_to_come_move_too_and_the_end_waits_for_th
     assert summary["metrics"]["map_miou"] is not None
 
 
+@pytest.mark.slow
 def test_a_file_is_sent_from_the_command_line(weights, tmp_path):
     frames = tiny_frames(8)
     with running_robot(weights, tmp_path / "out") as robot, MapClient(robot.query, timeout_s=60) as client:

@@ -101,6 +101,7 @@ def misled(path: Path) -> Checkpoint:
     return Checkpoint(model, tuple(permuted(a) for a in start.anchors), start.recipe)
 
 
+@pytest.mark.slow
 def test_better_weights_are_taken_between_two_frames_and_given_back(learned, tmp_path):
     with learning_robot(learned, tmp_path / "out") as learner:
         before = learner.in_use()
@@ -139,6 +140,7 @@ def test_better_weights_are_taken_between_two_frames_and_given_back(learned, tmp
     assert summary["frames"]["scored"] == 4 and summary["frames"]["excluded_from_scores"] == 4
 
 
+@pytest.mark.slow
 def test_what_is_no_good_is_refused_and_told(learned, tmp_path):
     good = better(learned)
     other_set = Checkpoint(SRay(SMALL_MODEL, NYU40).eval(), (), {"width": 96})
@@ -188,6 +190,7 @@ def test_where_agreement_does_not_count_the_learner_has_the_last_word(learned, t
         learner.robot.end(6)
 
 
+@pytest.mark.slow
 def test_a_restarted_mapper_goes_on_with_the_weights_that_its_forerunner_used(learned, tmp_path):
     notes = tmp_path / "notes"
     notes.mkdir()

@@ -111,6 +111,7 @@ def test_a_standby_that_cannot_be_started_leaves_the_node_at_work(log: Path, tmp
     assert open_files() == before
 
 
+@pytest.mark.slow
 def test_wherever_a_start_fails_nothing_is_left_behind(log: Path) -> None:
     job = NodeJob(name="eye", options={"log": str(log)}, waits=True)
     highest = max(map(int, os.listdir("/proc/self/fd")))

@@ -70,6 +70,7 @@ def test_recorder_keeps_every_frame_byte_for_byte(recorded: Path, log: Path) -> 
         assert "status" in {envelope.topic for envelope, _ in after.messages()}
 
 
+@pytest.mark.slow
 def test_ctrl_c_writes_the_map_so_far_and_leaves_no_process(
     long_log: Path, weights: Path, config: Path, tmp_path: Path
 ) -> None:
@@ -89,6 +90,7 @@ def test_ctrl_c_writes_the_map_so_far_and_leaves_no_process(
         assert recorded.finished and len(recorded) < 600
 
 
+@pytest.mark.slow
 def test_killed_mapper_is_named_and_nothing_is_left(
     long_log: Path, weights: Path, config: Path, tmp_path: Path
 ) -> None:
@@ -100,6 +102,7 @@ def test_killed_mapper_is_named_and_nothing_is_left(
         assert error_line(running.text).startswith("error: node 'mapper' (mapper) ended: killed by SIGKILL")
 
 
+@pytest.mark.slow
 def test_mapper_that_cannot_start_is_named_with_its_reason(log: Path, config: Path, tmp_path: Path) -> None:
     missing = tmp_path / "none.safetensors"
     done = run("up", REPLAY_LAUNCH, *_settings(log, missing, config), "--out", tmp_path / "up")
@@ -110,6 +113,7 @@ def test_mapper_that_cannot_start_is_named_with_its_reason(log: Path, config: Pa
     assert "camera" not in line  # it was waiting for the mapper, and ended when asked to
 
 
+@pytest.mark.slow
 def test_nodes_of_a_killed_launcher_write_their_results_and_end(
     long_log: Path, weights: Path, config: Path, tmp_path: Path
 ) -> None:
@@ -126,6 +130,7 @@ def test_nodes_of_a_killed_launcher_write_their_results_and_end(
     assert summary["stopped_by"]
 
 
+@pytest.mark.slow
 def test_frozen_node_is_found_out_and_killed(long_log: Path, weights: Path, config: Path, tmp_path: Path) -> None:
     launch = tmp_path / "impatient.toml"
     launch.write_text("heartbeat_s = 6.0\n" + REPLAY_LAUNCH.read_text())
@@ -138,6 +143,7 @@ def test_frozen_node_is_found_out_and_killed(long_log: Path, weights: Path, conf
         assert not any(is_alive(pid) for pid in running.node_pids())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mode", "delivery"), [("fast", "all"), ("realtime", "newest")])
 def test_without_lockstep_every_frame_is_fused_or_counted_as_dropped(
     mode: str, delivery: str, weights: Path, config: Path, tmp_path: Path
@@ -154,6 +160,7 @@ def test_without_lockstep_every_frame_is_fused_or_counted_as_dropped(
     assert delivery == "newest" or frames["dropped"] == 0
 
 
+@pytest.mark.slow
 def test_refused_frame_does_not_stop_the_lockstep(weights: Path, config: Path, tmp_path: Path) -> None:
     frames = list(tiny_frames(4))
     skewed = frames[1].T_world_camera.copy()
@@ -170,6 +177,7 @@ def test_refused_frame_does_not_stop_the_lockstep(weights: Path, config: Path, t
         assert "refused" in {envelope.topic for envelope, _ in recorded.messages()}
 
 
+@pytest.mark.slow
 def test_damage_of_a_played_log_stands_in_the_summary(weights: Path, config: Path, tmp_path: Path) -> None:
     log = write_log(tmp_path / "hurt.mcap", repeated_frames(6))
     data = bytearray(log.read_bytes())
@@ -181,6 +189,7 @@ def test_damage_of_a_played_log_stands_in_the_summary(weights: Path, config: Pat
     assert summary["frames"]["fused"] == 5 and "hurt.mcap" in summary["damaged_stretches"][0]
 
 
+@pytest.mark.slow
 def test_camera_that_cannot_start_ends_the_launch_at_once(weights: Path, config: Path, tmp_path: Path) -> None:
     missing = tmp_path / "none.mcap"
     done = run("up", REPLAY_LAUNCH, *_settings(missing, weights, config), "--out", tmp_path / "up")
@@ -189,6 +198,7 @@ def test_camera_that_cannot_start_ends_the_launch_at_once(weights: Path, config:
     assert "node 'camera'" in line and "none.mcap" in line and "did not end within" not in line
 
 
+@pytest.mark.slow
 def test_recording_to_a_file_that_exists_touches_neither_it_nor_the_map(
     log: Path, weights: Path, config: Path, tmp_path: Path
 ) -> None:
@@ -204,6 +214,7 @@ def _digests(folder: Path) -> dict[str, str]:
     return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.iterdir() if p.is_file()}
 
 
+@pytest.mark.slow
 def test_a_log_without_a_usable_frame_fails_as_replay_does(weights: Path, config: Path, tmp_path: Path) -> None:
     skewed = [dataclasses.replace(f, T_world_camera=f.T_world_camera * 2) for f in tiny_frames(2)]
     log = write_log(tmp_path / "skewed.mcap", skewed)
@@ -211,6 +222,7 @@ def test_a_log_without_a_usable_frame_fails_as_replay_does(weights: Path, config
     assert done.returncode == 1 and "none of 2 frames was mapped" in error_line(done.stderr)
 
 
+@pytest.mark.slow
 def test_every_image_of_a_video_file_is_mapped(tmp_path: Path, weights: Path, config: Path) -> None:
     film, lens = tmp_path / "a film.avi", tmp_path / "lens.toml"
     writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 30, (96, 72))

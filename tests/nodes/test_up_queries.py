@@ -18,6 +18,7 @@ from tests.nodes.support import REPLAY_LAUNCH, Running, repeated_frames, write_l
 from tests.nodes.test_query_service import a_folder
 
 
+@pytest.mark.slow
 def test_a_mapper_is_asked_while_it_replays(weights: Path, config: Path, tmp_path: Path) -> None:
     log = write_log(tmp_path / "long.mcap", repeated_frames(600))
     with a_folder() as folder:

@@ -110,6 +110,7 @@ def test_the_page_is_served_here_alone_and_may_speak_to_nobody_else() -> None:
     assert not settings.exists()
 
 
+@pytest.mark.slow
 def test_what_cannot_be_shown_is_refused_before_a_page_is_promised(tmp_path: Path) -> None:
     for name in ("map.npz", "log.mcap", "text"):
         (tmp_path / name).write_bytes(b"neither of these" * 100)

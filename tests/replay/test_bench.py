@@ -29,6 +29,7 @@ def test_bench_reports_ratios_of_renderers_that_agree():
     assert found["speedup_fast"] > found["speedup_all_rays"] > 0 and wall["fast"] > 0
 
 
+@pytest.mark.slow
 def test_a_gpu_has_rows_of_its_own(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(bench, "find_gpu", lambda: torch.device("cpu"))
     found = bench_render(Checkpoint(tiny_field()), room_scenes(1, INTRINSICS), repeats=1, reference_rays=640)

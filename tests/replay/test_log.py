@@ -166,6 +166,7 @@ def test_a_log_without_frames_is_refused_unless_asked_for(tmp_path: Path) -> Non
         assert len(reader) == 0 and reader.info.source == "test"
 
 
+@pytest.mark.slow
 def test_a_flipped_bit_costs_one_frame_wherever_it_strikes(small_log: Path, tmp_path: Path) -> None:
     rng = random.Random(0)
     data = small_log.read_bytes()

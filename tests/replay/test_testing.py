@@ -53,6 +53,7 @@ def room(root: Path, tmp_path_factory: pytest.TempPathFactory) -> ReplayedMap:
     return made("room.mcap", weights="tiny.safetensors", config="mapper.toml")
 
 
+@pytest.mark.slow
 def test_the_map_is_that_of_the_command_line(room: ReplayedMap, root: Path, tmp_path: Path) -> None:
     arguments = ("--weights", root / "tiny.safetensors", "--config", root / "mapper.toml")
     done = run("replay", root / "room.mcap", "--out", tmp_path, *arguments)
@@ -142,6 +143,7 @@ def pytest_run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_a_project_stores_a_run_passes_and_fails_when_the_map_changes(root: Path) -> None:
     (root / "pyproject.toml").write_text("[tool.pytest.ini_options]\n")
     test = root / "test_room.py"

@@ -51,6 +51,7 @@ def test_a_frustum_is_narrower_at_its_top_than_at_its_foot() -> None:
 COMPARED = (1, 2, 10, 14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", COMPARED)
 def test_fast_and_plain_renderer_agree(seed: int) -> None:
     scene = make_room(seed)

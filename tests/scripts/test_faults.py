@@ -6,6 +6,8 @@ import itertools
 import json
 from pathlib import Path
 
+import pytest
+
 from replay.log import LogReader
 from scripts import fault_finetuner, fault_frames, fault_inputs, fault_table, long_log, soak
 from scripts.fault_table import Outcome
@@ -30,6 +32,7 @@ def test_a_camera_that_was_unplugged_comes_back() -> None:
     assert outcome.others == 0
 
 
+@pytest.mark.slow
 def test_a_finetuner_that_is_killed_or_frozen_is_back_with_its_keyframes(tmp_path: Path) -> None:
     log = long_log.write_long_log(tmp_path / "long.mcap", 400.0, 5.0)
     killed, frozen = fault_finetuner.finetuner_faults([f"log={log}"], tmp_path / "launch", 1)

@@ -33,6 +33,7 @@ def scores(field: LearnedField, width: int) -> Scores:
     return validate(field.eval(), rooms, config, TrainStepConfig(), ALONE)
 
 
+@pytest.mark.slow
 def test_they_know_rooms_that_they_have_never_seen_with_depth_and_without(shipped: Checkpoint):
     able = scores(shipped.model, shipped.width)
     assert able.miou > 0.5 and able.accuracy > 0.75

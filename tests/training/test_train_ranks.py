@@ -13,6 +13,7 @@ from semantic_mapper.training.ranks import Ranks, ranks_from_environment
 ROOT = Path(__file__).resolve().parents[2]
 
 
+@pytest.mark.slow
 def test_two_processes_hold_the_same_weights_and_see_different_rooms(tmp_path: Path):
     starter = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     done = subprocess.run(

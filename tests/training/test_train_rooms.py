@@ -31,6 +31,7 @@ def test_the_pool_after_n_draws_follows_from_its_seed_and_n():
     assert drawn[0][1] == (5, 6) and drawn[-1][1] == (8, 9, 10)
 
 
+@pytest.mark.slow
 def test_workers_give_the_very_rooms_that_inline_rendering_gives():
     def collect(workers: int) -> list[RoomViews]:
         with RoomPool(CONFIG, 0, workers=workers) as pool:
@@ -84,6 +85,7 @@ def test_a_packed_room_holds_the_views_without_loss():
     assert view.rgb.shape == (3, 36, 48) and view.rgb.max() <= 1 and view.channel.dtype == torch.int64
 
 
+@pytest.mark.slow
 def test_workers_are_gone_when_the_pool_is_closed():
     with RoomPool(CONFIG, 0, workers=1) as pool:
         seeds_drawn(pool, 1)

@@ -82,4 +82,6 @@ def _write(path: Path, vertices: NDArray[np.void], faces: NDArray[np.void], labe
 
 def _escaped(name: str) -> str:
     """One line of printable ASCII; Open3D's reader writes past its buffer at lines above 1,000 characters."""
-    return name.encode("unicode_escape").decode("ascii")[:MAX_NAME]
+    while len(escaped := name.encode("unicode_escape").decode("ascii")) > MAX_NAME:
+        name = name[:-1]  # a whole letter, however long its escape is
+    return escaped

@@ -80,6 +80,7 @@ def test_matrices_must_be_rigid(kind: str, name: str) -> None:
         read_pose_config({"kind": "topic", "endpoint": "ipc:///tmp/x", "cameras": {"left": scaled}})
 
 
+@pytest.mark.slow
 def test_open3d_is_loaded_by_odometry_alone() -> None:
     program = (
         "import sys\n"
