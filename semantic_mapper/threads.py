@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+import functools
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
@@ -12,6 +14,7 @@ import numba
 import torch
 from numba.core import event as numba_event
 
+import semantic_mapper
 from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.log_events import get_logger
 
@@ -58,6 +61,7 @@ class ParallelKernel(Generic[P]):
         if threads <= 1:
             self._run(0, count, *args, **kwargs)
             return
+        _stop_spinning()
         chunks = min(threads * self._chunks_per_thread, count)
         ranges = iter([(count * n // chunks, count * (n + 1) // chunks) for n in range(chunks)])
 
@@ -102,6 +106,27 @@ def inlined_kernel(function: FunctionT) -> FunctionT:
     """
     decorate: Any = numba.njit(fastmath=True, nogil=True, forceinline=True)
     return decorate(function)
+
+
+@functools.cache
+def _stop_spinning() -> None:
+    """Make torch's OpenMP threads sleep between operations where torch was loaded before this package.
+
+    By default GNU OpenMP lets its threads spin for about 3 ms after each operation; a step of the mapper then takes 15
+    times as long. It lets them spin for next to nothing once it manages more threads than there are cores. One more
+    team of threads, which belongs to a thread that sleeps for good, sees to that.
+    """
+    if not semantic_mapper.SPINNING_THREADS:
+        return
+    started = threading.Event()
+
+    def start_team() -> None:
+        torch.ones(1 << 20).add_(1)  # large enough for torch to use all its threads
+        started.set()
+        threading.Event().wait()
+
+    threading.Thread(target=start_team, name="idle OpenMP team", daemon=True).start()
+    started.wait()
 
 
 def _submit(work: Callable[[], None]) -> Future[None]:

@@ -172,3 +172,48 @@ def test_importing_the_package_keeps_torchs_threads_from_spinning(given: dict[st
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=200, env=inherited | given, check=True
     )
     assert done.stdout.strip() == policy
+
+
+SPIN = """
+import statistics, sys, time
+import torch
+
+def idle_cpu_s():
+    x, costs = torch.ones(1 << 20), []
+    for _ in range(21):
+        x.add_(1)
+        began = time.process_time()
+        time.sleep(0.02)
+        costs.append(time.process_time() - began)
+    return statistics.median(costs)
+
+before = idle_cpu_s()
+sys.path.insert(0, sys.argv[1])
+import kernels
+kernels.run()
+print(before, idle_cpu_s())
+"""
+SPIN_KERNELS = """
+import numpy as np
+from semantic_mapper.threads import parallel_kernel
+
+@parallel_kernel()
+def add(start, stop, x):
+    for i in range(start, stop):
+        x[i] += 1
+
+def run():
+    add(10, np.zeros(10))
+"""
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="on one core OpenMP's threads do not spin")
+def test_torchs_threads_stop_spinning_where_torch_was_imported_first(tmp_path: Path) -> None:
+    (tmp_path / "kernels.py").write_text(SPIN_KERNELS, encoding="utf-8")
+    cores = len(os.sched_getaffinity(0))
+    inherited = {k: v for k, v in os.environ.items() if not k.startswith("OMP_")} | {"OMP_NUM_THREADS": str(cores)}
+    done = subprocess.run(
+        [sys.executable, "-c", SPIN, str(tmp_path)], capture_output=True, text=True, timeout=200, env=inherited
+    )
+    before, after = map(float, done.stdout.split()[-2:])
+    assert after < before / 2, f"CPU time while idle after an operation: {before} s before, {after} s after"
