@@ -169,7 +169,9 @@ def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tel
         if snapshot is None:
             return
         log = RerunLog(stream, snapshot.label_set, snapshot.voxel_size_m)
-        following = _Following(client, _MapShow(log), refresh_s)
+        show = _MapShow(log)
+        show.show(snapshot, time.monotonic_ns())
+        following = _Following(client, show, refresh_s)
         thread = threading.Thread(target=following.run, name="map", daemon=True)
         thread.start()
         try:
