@@ -13,6 +13,7 @@ from semantic_mapper.mapping.grid_snapshot import warm_up
 from semantic_mapper.mapping.map_saving import MapSaving
 from semantic_mapper.mapping.voxel_map import VoxelMap
 
+FIRST_S = 2.0  # until the first save, twice as long until each further one: who is killed often still gets somewhere
 REST_SHARE = 1.0  # rests as long as it works, so that the next frame finds the processor free half of the time
 
 _log = structlog.get_logger(__name__)
@@ -30,7 +31,7 @@ class Autosave:
     Args:
         voxel_map: To be saved, where it has changed.
         path: The file; replaced each time.
-        every_s: From the beginning of one save to the next.
+        every_s: From the beginning of one save to the next; the first ones come sooner.
     """
 
     def __init__(self, voxel_map: VoxelMap, path: Path, every_s: float) -> None:
@@ -40,6 +41,7 @@ class Autosave:
         self._path = path
         self._every_s = every_s
         self._begun = time.monotonic()
+        self._begins = 0  # of saves
         self._saved_version = voxel_map.version
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
@@ -50,11 +52,13 @@ class Autosave:
         if self._ending.is_set():
             return
         version = self._map.version
-        if time.monotonic() - self._begun < self._every_s or self._saved_version == version:
+        pause_s = min(self._every_s, FIRST_S * 2**self._begins)
+        if time.monotonic() - self._begun < pause_s or self._saved_version == version:
             return
         if self._thread is not None and self._thread.is_alive():
             return
         self._begun = time.monotonic()
+        self._begins = min(self._begins + 1, 30)
         saving = self._map.begin_save()
         self._thread = threading.Thread(target=self._save, args=(saving, version), name="autosave", daemon=True)
         self._thread.start()

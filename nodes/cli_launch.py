@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -40,7 +42,7 @@ def list_(
         return
     table = Table("name", "what", box=SIMPLE, pad_edge=False)
     for name, path in files.items():
-        table.add_row(name, path.read_text(encoding="utf-8").partition("\n")[0].lstrip("# "))
+        table.add_row(name, _first_sentence(path))
     output.print(table)
 
 
@@ -84,3 +86,9 @@ def _find(name: str) -> Path:
 
     files = launch_files()
     return files[name] if name in files else find_launch(Path(name))
+
+
+def _first_sentence(path: Path) -> str:
+    """Of the comment that a file begins with."""
+    lines = itertools.takewhile(lambda line: line.startswith("# "), path.read_text(encoding="utf-8").splitlines())
+    return re.split(r"[.:;](?:\s|$)", " ".join(line[2:].strip() for line in lines), maxsplit=1)[0]

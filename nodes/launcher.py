@@ -126,11 +126,13 @@ class Launcher:
         """Wait for all nodes of a kind; ask them as soon as there is a reason not to wait for the end of the stream."""
         patience = self._patience_s(kind)
         members = [m for m in self._members if m.kind == kind]
-        if kind == "mapper":  # its map was saved, the results that people look at were not
-            for member in members:
-                member.start_to_finish()
         began = time.monotonic()
-        while time.monotonic() - began < patience and any(m.runs for m in members):
+        while time.monotonic() - began < patience:
+            if kind == "mapper":  # its map was saved, the results that people look at were not
+                for member in members:
+                    member.start_to_finish()
+            if not any(m.runs for m in members):
+                break
             late = time.monotonic() - began > END_HEARD_S and any(m.restarts for m in self._members)
             for member in members:
                 if stop or kind in NO_END or self._failures() or (late and member.state != "stopping"):

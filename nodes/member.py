@@ -53,7 +53,7 @@ class Member:
         self.child: Child | None = None
         self._standby: Child | None = None
         self._standby_due = 0.0
-        self._finishes = False
+        self._finishes = self._hopeless = False
         self._start()
 
     @property
@@ -134,19 +134,20 @@ class Member:
         self.child.ask_to_stop()
 
     def start_to_finish(self) -> None:
-        """Start a node that reached its restart limit once more, to be stopped: it writes results of what it saved."""
-        if not self.failure or self._entry.restart == "never" or not self.restarts:
+        """Start a node that is given up once more, to be stopped: it writes results of what it saved."""
+        if not self.failure or self._finishes or self._hopeless or self._entry.restart == "never":
             return
-        job = msgspec.structs.replace(self._job, restarts=self.restarts, subscribers=0)
+        self._finishes = True
+        restarts = self.restarts + 1  # it goes on from what this launch saved
+        job = msgspec.structs.replace(self._job, restarts=restarts, subscribers=0)
         try:
-            child = self._wake_standby(self.restarts) or Child(self.kind, job)
+            child = self._wake_standby(restarts) or Child(self.kind, job)
         except OSError as error:
             _log.error("results_not_written", node=self.name, reason=str(error))
             return
         if self.child is not None:
             self.child.close()
         self.child = child
-        self._finishes = True
         _log.info("node_finishes", node=self.name, pid=child.pid)
 
     def close(self) -> None:
@@ -228,6 +229,7 @@ class Member:
         child.pulse.listen()
         fell = code is not None and code > 0 and not child.sent_away  # by itself
         hopeless = fell and not child.pulse.ready and not self.restarts
+        self._hopeless |= hopeless
         if last or hopeless or self._entry.restart == "never":
             self._give_up(text)
             return

@@ -132,22 +132,32 @@ def test_restart_limit_ends_the_launch_with_the_reason(long_log: Path, tmp_path:
 
 
 @pytest.mark.slow
-def test_a_mapper_that_reaches_its_restart_limit_leaves_the_results_of_the_map_it_saved(
-    long_log: Path, weights: Path, config: Path, tmp_path: Path
+@pytest.mark.parametrize(
+    ("policy", "kills", "reason"),
+    [
+        ("max_restarts = 1", 2, "it was restarted 1 times within 60 s"),
+        ("backoff_s = 60\nbackoff_max_s = 60", 1, "it had not been restarted yet when the launch ended"),
+    ],
+)
+def test_a_mapper_that_is_given_up_leaves_the_results_of_the_map_it_saved(
+    long_log: Path, weights: Path, config: Path, tmp_path: Path, policy: str, kills: int, reason: str
 ) -> None:
     launch, out = tmp_path / "limit.toml", tmp_path / "up"
     text = LIVE_LAUNCH.read_text(encoding="utf-8")
-    launch.write_text(text.replace('restart = "on-failure"', 'restart = "on-failure"\nmax_restarts = 1'))
+    launch.write_text(text.replace('restart = "on-failure"', f'restart = "on-failure"\n{policy}'))
     settings = [f"log={long_log}", f"weights={weights}", f"config={config}", "save_every=1"]
     words = [word for setting in settings for word in ("--set", setting)]
     with Running("up", launch, *words, "--out", out) as running:
         running.wait_for_line("map_saved")
-        for restarts in range(2):
+        for restarts in range(kills):
             os.kill(wait_for_start(running, "mapper", restarts), signal.SIGKILL)
+        if "backoff_s" in policy:
+            running.wait_for_line("node_restarts .*node=mapper")
+            running.process.send_signal(signal.SIGINT)
         assert running.wait() == 1, running.text
         assert not any(map(is_alive, processes(running)))
     assert (out / "summary.json").exists(), running.text
-    assert "it was restarted 1 times within 60 s" in error_line(running.text)
+    assert reason in error_line(running.text)
     saved = VoxelMap.load(out / "map.npz")
     summary = json.loads((out / "summary.json").read_text())
     assert summary["map"]["blocks"] == saved.block_count > 0

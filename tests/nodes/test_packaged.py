@@ -81,6 +81,7 @@ def test_launch_files_are_listed_shown_and_copied(tmp_path: Path, monkeypatch: p
     monkeypatch.chdir(tmp_path)
     code, said = run_here("launch", "list")
     assert code == 0 and all(name in said for name in launch_files())
+    assert "goes through the same processes as a live camera would" in said and "would:" not in said, "one sentence"
     shown = run("launch", "show", "replay")
     assert shown.stdout == (TOP / "launch" / "replay.toml").read_text(encoding="utf-8")
     assert run_here("launch", "copy", "oak", "robot.toml") == (0, "robot.toml")
