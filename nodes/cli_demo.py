@@ -48,7 +48,6 @@ def demo(
         output.print(summary_table({"demo": summary}))
         for line in (*notes(summary), *result_lines(out), f"  {log}  (the log it was made from)"):
             output.print(line)
-        stderr_console().print(
-            f"{'stopped after' if stop else 'done in'} {time.monotonic() - began:.0f} s; next: README.md, `semantic-mapper --help`"
-        )
+        ended = "stopped after" if stop else "done in"
+        stderr_console().print(f"{ended} {time.monotonic() - began:.0f} s; next: README.md, `semantic-mapper --help`")
         return stop.exit_code
