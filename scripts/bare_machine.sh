@@ -52,7 +52,9 @@ done
 rm -rf --one-file-system "${root:?}/build"
 mkdir -p "$root/build"
 git clone -q "$checkout" "$root/build/$name"
+certificates=/etc/ssl/certs/ca-certificates.crt  # this machine's, copied above: a proxy may have its own
 variables=(PATH=/usr/local/bin:/usr/bin:/bin:/usr/sbin:/sbin LANG=C.UTF-8)
+variables+=("PIP_CERT=$certificates" "SSL_CERT_FILE=$certificates")
 while IFS= read -r variable; do variables+=("$variable"); done < <(
   env | grep -E '^(SSL_CERT_[A-Z]+|PIP_CERT|PIP_INDEX_URL|PIP_EXTRA_INDEX_URL|PIP_DEFAULT_TIMEOUT|UV_[A-Z_]+|REQUESTS_CA_BUNDLE|CURL_CA_BUNDLE|GIT_SSL_[A-Z]+|[a-z]+_proxy|[A-Z]+_PROXY)=' || true)
 if $as_user; then
