@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from nodes.cli_query import Asked, Question, ask_file, ask_mapper
-from tests.nodes.support import run, run_here
+from semantic_mapper.errors import TransportError
+from tests.nodes.support import eventually, run, run_here
 from tests.nodes.test_query_service import a_folder, answering
 from tests.queries.scene import BALL, BOX, HALF, RADIUS, whole_map
 
@@ -82,9 +83,18 @@ def test_instances(map_file: Path) -> None:
     assert "table" in shown and str(large["cup"]["voxels"]) in shown
 
 
+def answers(endpoint: str) -> bool:
+    try:
+        ask_mapper(endpoint, Asked(Question.INFO, "", ()))
+    except TransportError:
+        return False
+    return True
+
+
 @pytest.mark.slow
 def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
     with a_folder() as folder, answering(f"ipc://{folder / 'query'}", whole_map()) as service:
+        assert eventually(lambda: answers(service.endpoint), 120), "no answer, not even once kernels are compiled"
         for question, name, point in (
             (Question.INFO, "", ()),
             (Question.AT, "", (*BOX[:2], 0.4)),
