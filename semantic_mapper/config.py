@@ -419,7 +419,7 @@ _TOML_WORDS = {
 
 
 def _explain(message: str, kind: type[msgspec.Struct]) -> str:
-    """msgspec's message in the words of whoever writes the file: which key, what it must be, the nearest valid name."""
+    """msgspec's message for the author of the file: which key, what it must be, the nearest valid name."""
     what, _, path = message.rpartition(" - at `$") if " - at `$" in message else (message, "", "")
     path = path.rstrip("`").removeprefix(".")
     named = re.search(r"`([^`]*)`|'([^']*)'", what)
