@@ -6,6 +6,7 @@ SHELL := /bin/bash
 
 PYTHON ?= python3
 READY := .venv/.ready
+KERNELS := $(wildcard semantic_mapper/kernels/src/*)
 
 # One thread of computation for each of two test processes. A worker that crashes ends the run with an error.
 PYTEST := OMP_NUM_THREADS=1 .venv/bin/python -m pytest tests -n 2 --dist worksteal --max-worker-restart 0
@@ -17,7 +18,7 @@ help:  ## list the targets
 
 setup: $(READY)  ## make .venv as uv.lock says, with everything that Open3D needs
 
-$(READY): pyproject.toml uv.lock scripts/setup.sh scripts/system_libs.py
+$(READY): pyproject.toml uv.lock setup.py $(KERNELS) scripts/setup.sh scripts/system_libs.py
 	PYTHON=$(PYTHON) scripts/setup.sh
 	@touch $@
 

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
+Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
 
 MAX_SIDE = 1 << 14  # pixels
 MAX_PIXELS = 1 << 25  # 8192 x 4096

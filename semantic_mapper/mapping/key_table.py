@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.kernel_cache import kernel
-from semantic_mapper.mapping.block_index import first_slot
+from semantic_mapper.kernels import kernel
+from semantic_mapper.types import Int64
 
 ABSENT = -1  # packed keys and versions are never negative
 _LEAST_SLOTS = 64
@@ -24,7 +24,9 @@ class KeyTable:
 
     def find(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
         """Versions (B,) of keys (B,), ``ABSENT`` where there is none."""
-        return _find(self._keys, self._versions, keys)
+        found = np.empty(len(keys), np.int64)
+        key_table_find(self._keys, self._versions, np.ascontiguousarray(keys), found)
+        return found
 
     def items(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Keys (B,) and versions (B,), in no order that means anything."""
@@ -36,63 +38,32 @@ class KeyTable:
         if 2 * (self._count + len(keys)) > len(self._keys):
             held = self.items()
             self._keys, self._versions = _slots(1 << int(4 * (self._count + len(keys)) - 1).bit_length())
-            _put(self._keys, self._versions, *held)
-        self._count += _put(self._keys, self._versions, keys, versions)
+            key_table_put(self._keys, self._versions, *held)
+        keys, versions = np.ascontiguousarray(keys), np.ascontiguousarray(versions)
+        self._count += key_table_put(self._keys, self._versions, keys, versions)
 
     def remove(self, keys: NDArray[np.int64]) -> None:
         """Forget keys (B,); those that are not there do no harm."""
-        self._count -= _remove(self._keys, self._versions, keys)
+        self._count -= key_table_remove(self._keys, self._versions, np.ascontiguousarray(keys))
 
 
 def _slots(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return np.full(count, ABSENT, np.int64), np.full(count, ABSENT, np.int64)
 
 
-@kernel(inline=True)
-def _slot_of(slot_keys, key):
-    """Where a key is, or where it would go."""
-    last = len(slot_keys) - 1
-    slot = first_slot(key, len(slot_keys))
-    while slot_keys[slot] != ABSENT and slot_keys[slot] != key:
-        slot = (slot + 1) & last
-    return slot
+@kernel
+def key_table_find(slot_keys: Int64, slot_versions: Int64, keys: Int64, found: Int64) -> None:
+    """Versions of keys."""
+    ...
 
 
-@kernel()
-def _find(slot_keys, slot_versions, keys):
-    found = np.empty(len(keys), np.int64)
-    for i in range(len(keys)):
-        found[i] = slot_versions[_slot_of(slot_keys, keys[i])]
-    return found
-
-
-@kernel()
-def _put(slot_keys, slot_versions, keys, versions):
+@kernel
+def key_table_put(slot_keys: Int64, slot_versions: Int64, keys: Int64, versions: Int64) -> int:
     """Returns how many are new."""
-    new = 0
-    for i in range(len(keys)):
-        slot = _slot_of(slot_keys, keys[i])
-        new += slot_keys[slot] == ABSENT
-        slot_keys[slot] = keys[i]
-        slot_versions[slot] = versions[i]
-    return new
+    ...
 
 
-@kernel()
-def _remove(slot_keys, slot_versions, keys):
-    """Returns how many were there. What comes after a gap moves up, so that no search ends too early."""
-    gone, last = 0, len(slot_keys) - 1
-    for i in range(len(keys)):
-        gap = _slot_of(slot_keys, keys[i])
-        if slot_keys[gap] == ABSENT:
-            continue
-        gone += 1
-        slot = (gap + 1) & last
-        while slot_keys[slot] != ABSENT:
-            first = first_slot(slot_keys[slot], len(slot_keys))
-            if ((slot - first) & last) >= ((slot - gap) & last):  # its search begins at the gap or before
-                slot_keys[gap], slot_versions[gap] = slot_keys[slot], slot_versions[slot]
-                gap = slot
-            slot = (slot + 1) & last
-        slot_keys[gap] = slot_versions[gap] = ABSENT
-    return gone
+@kernel
+def key_table_remove(slot_keys: Int64, slot_versions: Int64, keys: Int64) -> int:
+    """Returns how many were there."""
+    ...

@@ -1,0 +1,169 @@
+"""Calls the C kernels of ``src/``: one Python declaration a kernel says its arguments, and is what callers call."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import inspect
+import platform
+import struct
+import typing
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Generic, ParamSpec, TypeVar
+
+import numpy as np
+
+from semantic_mapper.errors import DependencyError, ShapeError
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+LIBRARY_FOLDER = Path(__file__).resolve().parent / "lib"
+MAX_DIMENSIONS = 4
+_NO_SHAPE = (1,) * MAX_DIMENSIONS
+_Words = list[Any]
+_Pack = Callable[[Any, _Words], None]
+
+
+class Kernel(Generic[P, R]):
+    """A function of the compiled library; see `kernel`. Any number of threads may call it at once, without the GIL."""
+
+    def __init__(self, declaration: Callable[P, R], skip: int = 0) -> None:
+        functools.update_wrapper(self, declaration)
+        self.name = declaration.__name__.lstrip("_")
+        self._declaration = declaration
+        self._skip = skip
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """Run it once, over no range."""
+        result = self.function(0, 0, self.pack(*args, **kwargs))
+        return None if self._returns_nothing else result  # pyright: ignore[reportReturnType]
+
+    @functools.cached_property
+    def function(self) -> Callable[[int, int, bytes], int]:
+        """The C function: start and stop of its loop, and the packed arguments."""
+        library = load_library()
+        function = getattr(library, self.name)
+        function.argtypes, function.restype = (ctypes.c_int64, ctypes.c_int64, ctypes.c_char_p), ctypes.c_int64
+        size = ctypes.c_int64.in_dll(library, f"{self.name}_size").value
+        if size != self._struct.size:
+            raise DependencyError(
+                f"kernel {self.name} takes {size} bytes of arguments, its declaration says {self._struct.size}; "
+                "the library is of another version: run `make setup`, or install the package again"
+            )
+        return function
+
+    def pack(self, *args: Any, **kwargs: Any) -> bytes:
+        """Arguments as C takes them; the arrays must live until the kernel has ended.
+
+        Raises:
+            ShapeError: an array has another dtype, more than 4 dimensions, or is not contiguous.
+        """
+        if kwargs:
+            args = self._signature.bind(*(None,) * self._skip, *args, **kwargs).args[self._skip :]
+        words: _Words = []
+        for (name, add), value in zip(self._parameters, args, strict=True):
+            try:
+                add(value, words)
+            except ShapeError as error:
+                raise ShapeError(f"kernel {self.name}, argument {name}: {error}") from None
+        return self._struct.pack(*words)
+
+    @functools.cached_property
+    def _signature(self) -> inspect.Signature:
+        return inspect.signature(self._declaration)
+
+    @functools.cached_property
+    def _returns_nothing(self) -> bool:
+        return self._hints["return"] is type(None)
+
+    @functools.cached_property
+    def _hints(self) -> dict[str, Any]:
+        return typing.get_type_hints(self._declaration)
+
+    @functools.cached_property
+    def _parameters(self) -> list[tuple[str, _Pack]]:
+        names = list(self._signature.parameters)[self._skip :]
+        return [(name, _packer(self._hints[name])[1]) for name in names]
+
+    @functools.cached_property
+    def _struct(self) -> struct.Struct:
+        names = list(self._signature.parameters)[self._skip :]
+        return struct.Struct("@" + "".join(_packer(self._hints[name])[0] for name in names))
+
+
+def kernel(declaration: Callable[P, R]) -> Kernel[P, R]:
+    """Bind a declaration without a body to the C function of its name (a leading underscore aside).
+
+    Its annotations say how each argument is passed: ``NDArray`` of one dtype as the array struct of that type in C,
+    ``NDArray[Any]`` as an ``AnyArray``, ``int``, ``bool`` and ``float`` as numbers of 8 bytes, a named tuple as a
+    struct of its fields. It returns None or an int.
+    """
+    return Kernel(declaration)
+
+
+@functools.cache
+def load_library() -> ctypes.CDLL:
+    """The kernels, compiled for the best of the processors that they are there for and this one is.
+
+    Raises:
+        DependencyError: they are not there, or not for this machine.
+    """
+    for name in _variants():
+        path = LIBRARY_FOLDER / f"{name}.so"
+        if path.exists():
+            try:
+                return ctypes.CDLL(str(path))
+            except OSError as error:
+                raise DependencyError(f"cannot load the compiled kernels {path}: {error}") from error
+    raise DependencyError(
+        f"no compiled kernels for {platform.machine()} in {LIBRARY_FOLDER}; in a checkout run `make setup`, otherwise "
+        "install the package with pip, which compiles them"
+    )
+
+
+def _variants() -> list[str]:
+    machine = platform.machine()
+    names = [f"kernels-{machine}"]
+    if machine == "x86_64":
+        import torch  # it knows what the processor can do, and ATEN_CPU_CAPABILITY holds for both
+
+        if torch.backends.cpu.get_cpu_capability() != "DEFAULT":  # AVX2 and FMA, at least
+            names.insert(0, "kernels-x86_64-avx2")
+    return names
+
+
+def _packer(hint: Any) -> tuple[str, _Pack]:
+    """Format of one argument and how to add its words."""
+    if hint is float:
+        return "d", _add_number
+    if hint in (int, bool):
+        return "q", _add_number
+    if typing.get_origin(hint) is np.ndarray:
+        (dtype,) = typing.get_args(typing.get_args(hint)[1])
+        return "Pq" + MAX_DIMENSIONS * "q", functools.partial(_add_array, None if dtype is Any else np.dtype(dtype))
+    if isinstance(hint, type) and issubclass(hint, tuple):
+        fields = [_packer(field) for field in typing.get_type_hints(hint).values()]
+        adders = [add for _, add in fields]
+
+        def add_fields(value: Any, words: _Words) -> None:
+            for add, field in zip(adders, value, strict=True):
+                add(field, words)
+
+        return "".join(code for code, _ in fields), add_fields
+    raise TypeError(f"a kernel cannot take a {hint}")
+
+
+def _add_number(value: Any, words: _Words) -> None:
+    words.append(value)
+
+
+def _add_array(dtype: np.dtype[Any] | None, value: Any, words: _Words) -> None:
+    if not isinstance(value, np.ndarray) or (dtype is not None and value.dtype != dtype):
+        raise ShapeError(f"expected an array of {dtype}, got {getattr(value, 'dtype', type(value))}")
+    if not value.flags.c_contiguous or value.ndim > MAX_DIMENSIONS:
+        raise ShapeError(f"expected a contiguous array of at most {MAX_DIMENSIONS} dimensions, got shape {value.shape}")
+    words.append(value.__array_interface__["data"][0])
+    words.append(value.itemsize)
+    words.extend(value.shape + _NO_SHAPE[value.ndim :])

@@ -1,0 +1,38 @@
+/* What all kernels share: arrays as Python passes them, and the form of a kernel.
+ *
+ * A kernel has one struct of arguments, in the order of its Python declaration (see binding.py): an array is an
+ * `Array` of its element type, an int or a bool is an int64_t, a float is a double, a named tuple is a struct of its
+ * fields. All members are 8 bytes wide, so there is no padding. Every kernel is called with the range of its loop.
+ */
+#pragma once
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#define ARRAY(type, name)                                                                                             \
+    typedef struct {                                                                                                  \
+        type *data;                                                                                                   \
+        int64_t itemsize; /* in bytes: tells element types apart where a kernel takes several */                      \
+        int64_t shape[4]; /* C order, contiguous; beyond the last dimension 1 */                                      \
+    } name
+
+ARRAY(float, F32);
+ARRAY(double, F64);
+ARRAY(uint8_t, U8); /* bool arrays, too */
+ARRAY(int16_t, I16);
+ARRAY(uint16_t, U16);
+ARRAY(int32_t, I32);
+ARRAY(int64_t, I64);
+ARRAY(void, AnyArray);
+
+/* KERNEL(name, Arguments) { ... } defines one with `start`, `stop` and `a`; NAME_size lets Python check the struct. */
+#define KERNEL(name, Arguments)                                                                                       \
+    __attribute__((visibility("default"))) const int64_t name##_size = sizeof(Arguments);                            \
+    __attribute__((visibility("default"))) int64_t name(__attribute__((unused)) int64_t start, __attribute__((unused)) int64_t stop, const Arguments *a)
+
+static inline int64_t min_i(int64_t a, int64_t b) { return a < b ? a : b; }
+static inline int64_t max_i(int64_t a, int64_t b) { return a > b ? a : b; }
+static inline float min_f(float a, float b) { return b < a ? b : a; }
+static inline float max_f(float a, float b) { return b > a ? b : a; }
+static inline double min_d(double a, double b) { return b < a ? b : a; }
+static inline double max_d(double a, double b) { return b > a ? b : a; }
