@@ -176,7 +176,7 @@ def _bench_scene(
         eager_render, eager = _timed(
             lambda: _in_chunks(lambda r, s: _eager(reference, r, s), few, sources, 512), reference_rays, repeats
         )
-    few_render = streaming.render(few, sources)  # also compiles
+    few_render = streaming.render(few, sources)
     _, fast = _timed(lambda: streaming.render(every, sources), len(pixels), repeats)
     assert query.label is not None
     truth = labels.to_ids(labels.channel_map_from(scene.label_set)[query.label.reshape(-1)[some.numpy()]])

@@ -6,9 +6,8 @@ colour, and where the field is in doubt, there is.
 
 from __future__ import annotations
 
-# torch leaves parts of its interface untyped, and so is what is compiled.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportUntypedFunctionDecorator=false
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,9 +15,8 @@ from numpy.typing import NDArray
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.fields.base import EncodedViews, SemanticField
 from semantic_mapper.fields.render import chunk_size
-from semantic_mapper.geometry import pixel_rays
-from semantic_mapper.kernel_cache import kernel
-from semantic_mapper.threads import parallel_kernel
+from semantic_mapper.geometry import expect_shape, pixel_rays
+from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 COARSEST = 4  # pixels between the first rays, a power of two
@@ -47,8 +45,14 @@ def render_sparse_view(
     Returns:
         Class probabilities (H, W, L), known (H, W), depth (H, W) in metres, and the number of rays rendered. Pixels
         without a ray hold the mean of the known ones round them.
+
+    Raises:
+        ShapeError: images of another size than the view.
     """
     height, width = intrinsics.height, intrinsics.width
+    expect_shape(rgb, f"{height} {width} 3", "view rgb")
+    expect_shape(prior_depth_m, f"{height} {width}", "depth prior")
+    rgb, prior_depth_m = np.ascontiguousarray(rgb), np.ascontiguousarray(prior_depth_m)
     probabilities = np.zeros((height, width, len(field.label_set)), np.float32)
     known, depth_m = np.zeros((height, width), np.bool_), np.zeros((height, width), np.float32)
     pose = torch.tensor(T_world_camera, device=sources.feature.device, dtype=torch.float32)
@@ -71,66 +75,43 @@ def render_sparse_view(
     trace(v, u)
     traced, step = len(v), COARSEST
     while step > 1:
-        doubt = np.zeros((height, width), np.float32)
+        uncertainty = np.zeros((height, width), np.float32)
         half = step // 2
-        lines = (len(rgb) + half - 1) // half
-        _fill_between(lines, step, probabilities, known, depth_m, prior_depth_m, rgb, doubt)
-        flat = np.flatnonzero(doubt)
+        images = (probabilities, known, depth_m, prior_depth_m, rgb, uncertainty)
+        fill_between_rays((height + half - 1) // half, step, *images, DEPTH_STEP, COLOUR_STEP, UNSURE)
+        flat = np.flatnonzero(uncertainty)
         left = max(int(share * height * width) - traced, 0)
         if len(flat) > left:
-            flat = flat[np.argsort(-doubt.ravel()[flat], kind="stable")[:left]]
+            flat = flat[np.argsort(-uncertainty.ravel()[flat], kind="stable")[:left]]
         if len(flat):
-            trace(*np.unravel_index(np.sort(flat), doubt.shape))
+            trace(*np.unravel_index(np.sort(flat), uncertainty.shape))
         traced, step = traced + len(flat), step // 2
     return probabilities, known, depth_m, traced
 
 
 @parallel_kernel()
-def _fill_between(start, stop, step, probabilities, known, depth, prior, rgb, doubt):  # pragma: no cover - compiled
+def fill_between_rays(
+    count: int,
+    step: int,
+    probabilities: Float32,
+    known: NDArray[np.bool_],
+    depth: Float32,
+    prior: Float32,
+    rgb: UInt8,
+    uncertainty: Float32,
+    depth_step: float,
+    colour_step: float,
+    unsure: float,
+) -> None:
     """Give the pixels half way between those of a grid the mean of the known grid pixels round them; in place.
 
-    Fills ``doubt`` (H, W) with how little those tell of such a pixel: 0 = enough.
+    Args:
+        count: Rows of pixels, half a step apart.
+        step: Pixels between those of the grid.
+        probabilities: (H, W, L) float32, zeros but at the grid; written between it, as are ``known`` (H, W) bool and
+            ``depth`` (H, W) float32 in metres.
+        prior: (H, W) float32 depth prior in metres.
+        rgb: (H, W, 3) uint8.
+        uncertainty: (H, W) float32, written: how little the grid says of such a pixel, 0 = enough.
     """
-    width, half = depth.shape[1], step // 2
-    for line in range(start, stop):
-        v = line * half
-        for u in range(0, width, half):
-            if v % step > 0 or u % step > 0:
-                _fill_pixel(v, u, step, probabilities, known, depth, prior, rgb, doubt)
-
-
-@kernel()
-def _fill_pixel(v, u, step, probabilities, known, depth, prior, rgb, doubt):  # pragma: no cover - compiled
-    height, width, classes = probabilities.shape
-    count, first, differs = 0, -2, False
-    depth_sum, prior_sum, colour_sum = np.float32(0.0), np.float32(0.0), np.zeros(3, np.float32)
-    for corner in range(4):
-        j = v // step * step if corner < 2 else (v + step - 1) // step * step
-        i = u // step * step if corner % 2 == 0 else (u + step - 1) // step * step
-        j, i = (j if j < height else j - step), (i if i < width else i - step)
-        prior_sum += prior[j, i]
-        for c in range(3):
-            colour_sum[c] += rgb[j, i, c]
-        top = -1
-        if known[j, i]:
-            count += 1
-            depth_sum += depth[j, i]
-            top = 0
-            for c in range(classes):
-                probabilities[v, u, c] += probabilities[j, i, c]
-                if probabilities[j, i, c] > probabilities[j, i, top]:
-                    top = c
-        differs = differs or (first > -2 and top != first)
-        first = top
-    best = np.float32(0.0)
-    if count > 0:
-        known[v, u], depth[v, u] = True, depth_sum / count
-        for c in range(classes):
-            probabilities[v, u, c] /= count
-            best = max(best, probabilities[v, u, c])
-    jump = abs(prior_sum / 4 - prior[v, u]) > DEPTH_STEP * prior[v, u]
-    edge = np.float32(0.0)
-    for c in range(3):
-        edge += abs(colour_sum[c] / 4 - rgb[v, u, c])
-    if differs or jump or edge > COLOUR_STEP or 1 - best > UNSURE:
-        doubt[v, u] = (2.0 if differs else 0.0) + (1.0 if jump else 0.0) + min(edge / 255, 1.0) + (1 - best)
+    ...

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-# torch and safetensors leave parts of their interface untyped.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false
 import math
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.errors import ConfigError, ShapeError
 from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.geometry_net import GEOMETRY_CHANNELS, LEAST_VISIBILITY, OWN_DENSITY_OFFSET
+from semantic_mapper.fields.projection import MIN_DEPTH_M
 from semantic_mapper.fields.sampling import sample_guided
-from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.sray_kernel import render_rays
+from semantic_mapper.fields.sray import DOUBT, HIDDEN, SRay
+from semantic_mapper.geometry import expect_shape
+from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, Float32, RayBatch, SourceViews
 
@@ -44,7 +48,8 @@ class StreamingSRay:
             )
         self.model = model
         self.sampling = sampling or SamplingConfig()
-        self._weights = pack_weights(model)
+        self._weights = _pack_weights(model)
+        self._settings = _settings(model)
 
     @property
     def label_set(self) -> LabelSet:
@@ -78,38 +83,20 @@ class StreamingSRay:
         """
         if z.shape[1] < 2:
             raise ShapeError(f"a ray needs at least 2 samples for its intervals to have a length, got {z.shape[1]}")
-        count, channels = len(z), sources.feature.shape[1]
+        count, channels = len(z), self.model.config.feature_dim
+        expect_shape(rays.origin, f"{count} 3", "ray origins")
+        expect_shape(rays.direction, f"{count} 3", "ray directions")
         # Torch's buffers are aligned alike every time; the matrix product of _classify rounds differently otherwise.
         rendered, colour = torch.empty(count, channels), torch.empty(count, 3)
         depth, opacity, known = torch.empty(count), torch.empty(count), torch.empty(count, dtype=torch.bool)
         carried = torch.empty(count, len(self.label_set))
-        config = self.model.config
-        keep = 1.0 if config.attention_residual else 0.0
-        poses = sources.T_camera_world[:, :3, :]
-        maps = torch.cat((sources.feature, sources.rgb), dim=1).permute(0, 2, 3, 1)
-        # With the logarithm of the first scale, which is a cue: it is the same for all samples at a pixel.
-        geometry = torch.cat((sources.geometry, sources.geometry[:, 1:2].log()), dim=1)
-        channel = sources.channel if (sources.channel >= 0).any() else sources.channel[:, :0, :0]
-        K = torch.stack((sources.K[:, 0, 0], sources.K[:, 1, 1], sources.K[:, 0, 2], sources.K[:, 1, 2]), dim=1)
-        render_rays(
+        render_sray(
             count,
-            (_array(rays.origin), _array(rays.direction), _array(z)),
-            (
-                _array(maps),
-                _array(geometry.permute(0, 2, 3, 1)),
-                _array(K),
-                _array(poses),
-                channel.numpy(),
-            ),
-            (
-                config.heads,
-                np.float32(keep),
-                np.float32(math.log(1 / config.tau)),
-                config.occlusion,
-                np.float32(least_weight),
-            ),
+            _Rays(_array(rays.origin), _array(rays.direction), _array(z)),
+            _source_maps(sources, channels),
+            self._settings._replace(least_weight=least_weight),
             self._weights,
-            tuple(t.numpy() for t in (rendered, colour, depth, opacity, known, carried)),
+            _Rendered(*(t.numpy() for t in (rendered, colour, depth, opacity, known, carried))),
         )
         return self._classify(rendered, colour, depth, opacity, known, carried)
 
@@ -133,25 +120,138 @@ class StreamingSRay:
         return FieldRender(logits, depth, opacity, colour, entropy, known)
 
 
-def pack_weights(model: SRay) -> tuple[Any, ...]:
-    """Weights as contiguous float32 arrays, grouped as ``sray_kernel.render_rays`` reads them: (in, out), and (out, in)
-    of layers with two outputs."""
-    off = np.zeros((0, 0), np.float32)
+class _Rays(NamedTuple):
+    origin: Float32  # (R, 3)
+    direction: Float32  # (R, 3)
+    z: Float32  # (R, N) ascending
+
+
+class _SourceMaps(NamedTuple):
+    feature: Float32  # (m, h, w, C)
+    rgb: Float32  # (m, h, w, 3)
+    geometry: Float32  # (m, h, w, 5)
+    log_scale: Float32  # (m, h, w) logarithm of the first scale, which is a cue
+    K: Float32  # (m, 4) fx fy cx cy
+    T_camera_world: Float32  # (m, 3, 4)
+    labels: NDArray[np.int16]  # (m, H, W) known labels, -1 = none; (m, 0, 0) where no view has any
+
+
+class _Settings(NamedTuple):
+    heads: int
+    residual: bool  # attention adds to the features instead of replacing them
+    occlusion: bool  # views count by their visibility
+    log_ratio: float  # ln(1 / tau) of Eq. 12
+    least_weight: float  # samples of a smaller fraction of their ray's weight take no part in the attention
+    hidden_below: float
+    least_visibility: float
+    label_doubt: float
+    own_density_offset: float
+    min_depth_m: float
+
+
+class _Layer(NamedTuple):
+    weight: Float32  # (in, out); (2, in) of layers with two outputs
+    bias: Float32  # (out,)
+
+
+class _Attention(NamedTuple):
+    qkv: Float32  # (C, 3 C); (0, 0) where the model has no such attention
+    out: Float32  # (C, C)
+
+
+class _Weights(NamedTuple):
+    radial: _Attention
+    cross: _Attention
+    view_hidden: _Layer
+    view_scores: _Layer  # (2, in)
+    density_hidden: _Layer
+    density_token: _Layer
+    density_qkv: Float32
+    density_out_hidden: _Layer
+    density_out: _Layer  # (2, in)
+    semantic_hidden: _Layer
+    semantic_out: _Layer
+
+
+class _Rendered(NamedTuple):
+    feature: Float32  # (R, C)
+    colour: Float32  # (R, 3)
+    depth_m: Float32  # (R,)
+    opacity: Float32  # (R,)
+    known: NDArray[np.bool_]  # (R,)
+    carried: Float32  # (R, L) labels that the views carry over
+
+
+@parallel_kernel(chunks_per_thread=4)
+def render_sray(
+    count: int, rays: _Rays, maps: _SourceMaps, settings: _Settings, weights: _Weights, out: _Rendered
+) -> None:
+    """Render ``count`` rays into ``out``, before the classifier; see ``SRay.render_samples``."""
+    ...
+
+
+def _settings(model: SRay) -> _Settings:
     config = model.config
-    radial = (
-        (_transposed(model.radial.qkv), _transposed(model.radial.out)) if config.intra_view_attention else (off, off)
+    return _Settings(
+        heads=config.heads,
+        residual=config.attention_residual,
+        occlusion=config.occlusion,
+        log_ratio=math.log(1 / config.tau),
+        least_weight=0.0,
+        hidden_below=HIDDEN,
+        least_visibility=LEAST_VISIBILITY,
+        label_doubt=DOUBT,
+        own_density_offset=OWN_DENSITY_OFFSET,
+        min_depth_m=MIN_DEPTH_M,
     )
-    cross = (_transposed(model.cross.qkv), _transposed(model.cross.out)) if config.cross_view_attention else (off, off)
-    blend = (*_pair(model.weights.net[0]), *_rows(model.weights.net[2]))
-    density = (
-        *_pair(model.density.token[0]),
-        *_pair(model.density.token[2]),
-        _transposed(model.density.qkv),
-        *_pair(model.density.out[0]),
-        *_rows(model.density.out[2]),
+
+
+def _source_maps(sources: EncodedViews, channels: int) -> _SourceMaps:
+    """The maps as the kernel takes them: without a copy where they are channels-last.
+
+    Raises:
+        ShapeError: maps that do not fit together, or not the model.
+    """
+    sizes = expect_shape(sources.feature, f"M {channels} H W", "source features")
+    m, h, w = sizes["M"], sizes["H"], sizes["W"]
+    expect_shape(sources.rgb, f"{m} 3 {h} {w}", "source rgb")
+    expect_shape(sources.geometry, f"{m} {GEOMETRY_CHANNELS} {h} {w}", "source geometry")
+    expect_shape(sources.K, f"{m} 3 3", "source K")
+    expect_shape(sources.T_camera_world, f"{m} 4 4", "source T_camera_world")
+    expect_shape(sources.channel, f"{m} H W", "source channel")
+    labels = sources.channel if (sources.channel >= 0).any() else sources.channel[:, :0, :0]
+    K = sources.K
+    return _SourceMaps(
+        _array(sources.feature.permute(0, 2, 3, 1)),
+        _array(sources.rgb.permute(0, 2, 3, 1)),
+        _array(sources.geometry.permute(0, 2, 3, 1)),
+        _array(sources.geometry[:, 1].log()),
+        _array(torch.stack((K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]), dim=1)),
+        _array(sources.T_camera_world[:, :3]),
+        labels.to(torch.int16).contiguous().numpy(),
     )
-    semantic = (*_pair(model.semantic[0]), *_pair(model.semantic[2]))
-    return (radial, cross, blend, density, semantic)
+
+
+def _pack_weights(model: SRay) -> _Weights:
+    off = _Attention(np.zeros((0, 0), np.float32), np.zeros((0, 0), np.float32))
+    config, density = model.config, model.density
+    return _Weights(
+        radial=_Attention(_transposed(model.radial.qkv), _transposed(model.radial.out))
+        if config.intra_view_attention
+        else off,
+        cross=_Attention(_transposed(model.cross.qkv), _transposed(model.cross.out))
+        if config.cross_view_attention
+        else off,
+        view_hidden=_layer(model.weights.net[0]),
+        view_scores=_two_outputs(model.weights.net[2]),
+        density_hidden=_layer(density.token[0]),
+        density_token=_layer(density.token[2]),
+        density_qkv=_transposed(density.qkv),
+        density_out_hidden=_layer(density.out[0]),
+        density_out=_two_outputs(density.out[2]),
+        semantic_hidden=_layer(model.semantic[0]),
+        semantic_out=_layer(model.semantic[2]),
+    )
 
 
 def _array(tensor: torch.Tensor) -> Float32:
@@ -163,11 +263,11 @@ def _transposed(layer: nn.Module) -> Float32:
     return np.ascontiguousarray(layer.weight.detach().float().cpu().numpy().T)
 
 
-def _pair(layer: nn.Module) -> tuple[Float32, Float32]:
+def _layer(layer: nn.Module) -> _Layer:
     assert isinstance(layer, nn.Linear)
-    return _transposed(layer), np.ascontiguousarray(layer.bias.detach().float().cpu().numpy())
+    return _Layer(_transposed(layer), _array(layer.bias).copy())
 
 
-def _rows(layer: nn.Module) -> tuple[Float32, Float32]:
+def _two_outputs(layer: nn.Module) -> _Layer:
     assert isinstance(layer, nn.Linear)
-    return _array(layer.weight), _array(layer.bias)
+    return _Layer(_array(layer.weight).copy(), _array(layer.bias).copy())

@@ -29,10 +29,10 @@ class ParallelKernel(Generic[P]):
 
     def __call__(self, count: int, /, *args: P.args, **kwargs: P.kwargs) -> None:
         """Run iterations 0 to ``count`` on as many threads as torch uses, this one included; returns when all ended."""
-        packed, run = self._kernel.pack(*args, **kwargs), self._kernel.function
+        packed = self._kernel.pack(*args, **kwargs)
         threads = min(torch.get_num_threads(), count)
         if threads <= 1:
-            run(0, count, packed)
+            self._run(0, count, packed)
             return
         _stop_spinning()
         chunks = min(threads * self._chunks_per_thread, count)
@@ -40,7 +40,7 @@ class ParallelKernel(Generic[P]):
 
         def work() -> None:
             for start, stop in ranges:
-                run(start, stop, packed)
+                self._run(start, stop, packed)
 
         others = [_submit(work) for _ in range(threads - 1)]
         try:
@@ -50,6 +50,10 @@ class ParallelKernel(Generic[P]):
         for other in others:
             other.result()
 
+    def _run(self, start: int, stop: int, packed: bytes) -> None:
+        if self._kernel.function(start, stop, packed):
+            raise MemoryError(f"kernel {self._kernel.name}: no memory for its buffers")
+
 
 def parallel_kernel(
     chunks_per_thread: int = 1,
@@ -57,8 +61,8 @@ def parallel_kernel(
     """A `kernel` whose loop runs on several threads.
 
     The declaration's first argument is the number of iterations; C gets the range of a part of them as ``start`` and
-    ``stop``. Iterations must not depend on each other: the result is then the same to the bit for any number of
-    threads.
+    ``stop``, and returns 0, or 1 where it lacks memory for its buffers, which raises MemoryError. Iterations must not
+    depend on each other: the result is then the same to the bit for any number of threads.
 
     Args:
         chunks_per_thread: More than 1 where iterations differ in cost. A chunk costs some 20 microseconds.

@@ -1,9 +1,7 @@
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -28,18 +26,11 @@ for name in ("logits", "depth_m", "rgb", "opacity"):
 
 
 @pytest.mark.slow
-def test_kernels_compiled_anew_render_the_same_bits_as_those_on_disk(tmp_path: Path) -> None:
-    """A machine's first run, which compiles, and its second must not differ: maps and tests are compared to the bit."""
+def test_two_processes_render_the_same_bits() -> None:
+    """Maps and tests are compared to the bit."""
     said: list[list[str]] = []
-    for run in range(2):
-        assert run == 0 or list(tmp_path.rglob("*.nbc"))
-        done = subprocess.run(
-            [sys.executable, "-c", RENDER],
-            capture_output=True,
-            text=True,
-            timeout=900,
-            env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
-        )
+    for _ in range(2):
+        done = subprocess.run([sys.executable, "-c", RENDER], capture_output=True, text=True, timeout=900)
         assert done.returncode == 0, done.stderr
         said.append(done.stdout.splitlines()[-4:])  # after the log
     assert [line.split()[1] for line in said[0]] == ["True"] * 4, said[0]

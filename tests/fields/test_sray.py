@@ -5,14 +5,13 @@ import pytest
 import torch
 
 from semantic_mapper.config import EncoderConfig, SamplingConfig, SRayConfig
-from semantic_mapper.errors import ConfigError, ShapeError
+from semantic_mapper.errors import ShapeError
 from semantic_mapper.fields.base import EncodedViews, stack_views
 from semantic_mapper.fields.contextual import contextual_space
 from semantic_mapper.fields.geometry_net import hit_and_visibility
 from semantic_mapper.fields.projection import gather, reproject
-from semantic_mapper.fields.sampling import sample_guided, sample_inverse_depth
+from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.types import RayBatch, SourceViews
 from tests.fields.peers import assert_gradients_are_right, tiny
@@ -180,102 +179,6 @@ def test_mismatched_sources_give_a_shape_error():
     views = wall_sources(POSES)
     with pytest.raises(ShapeError, match="source depth_m"):
         small_field().encode(SourceViews(views.rgb, views.depth_m[:2], views.K, views.T_world_camera))
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {},
-        {"intra_view_attention": False},
-        {"cross_view_attention": False},
-        {"attention_residual": False},
-        {"occlusion": False},
-        {"intra_view_attention": False, "cross_view_attention": False},
-    ],
-)
-@pytest.mark.parametrize("guided", [True, False])
-def test_streaming_renderer_equals_the_reference_at_the_same_samples(changes: dict[str, bool], guided: bool):
-    field = small_field(3, **changes)
-    for p in field.parameters():
-        p.data += 0.05 * torch.randn_like(p)
-    streaming = StreamingSRay(field)
-    views = wall_sources([*POSES, pose_at(1.5), pose_at(0.0, 3.0)])
-    channel = torch.randint(-1, 3, views.depth_m.shape)
-    encoded = streaming.encode(replace(views, channel=channel))
-    rays = wall_rays(pose_at(0.2, 0.3), step=3)
-    z = sample_guided(rays, SamplingConfig()) if guided else sample_inverse_depth(rays.near_m, rays.far_m, 24)
-    with torch.inference_mode():
-        reference, _ = field.render_samples(rays, z, encoded)
-    fast = streaming.render_samples(rays, z, encoded)
-    assert torch.equal(fast.known, reference.known)
-    for name in ("logits", "depth_m", "opacity", "rgb", "entropy"):
-        torch.testing.assert_close(getattr(fast, name), getattr(reference, name), atol=1e-4, rtol=1e-4)
-
-
-def test_streaming_renderer_leaves_out_the_same_hidden_views():
-    field = small_field(4)
-    for p in field.parameters():
-        p.data += 0.05 * torch.randn_like(p)
-    views = wall_sources(POSES)
-    depth_m = views.depth_m.clone()
-    depth_m[1, :, ::2] *= 0.6  # bars before the second camera, a post before the fourth
-    depth_m[3, :, 10:16] *= 0.4
-    streaming = StreamingSRay(field)
-    encoded = streaming.encode(replace(views, depth_m=depth_m))
-    rays = wall_rays(pose_at(0.1), step=3, prior=WALL_M)
-    z = sample_guided(rays, SamplingConfig())
-    space = contextual_space(rays, z, encoded)
-    left_out = space.valid & ~field.without_hidden(space).valid
-    assert 0.02 < left_out.float().mean() < 0.5
-    with torch.inference_mode():
-        reference, _ = field.render_samples(rays, z, encoded)
-    fast = streaming.render_samples(rays, z, encoded)
-    for name in ("logits", "depth_m", "opacity", "rgb", "entropy"):
-        torch.testing.assert_close(getattr(fast, name), getattr(reference, name), atol=1e-4, rtol=1e-4)
-
-
-@pytest.mark.parametrize("least", [0.02, 0.3])
-@pytest.mark.parametrize("occlusion", [True, False])
-def test_streaming_renderer_leaves_out_the_same_faint_samples(least: float, occlusion: bool):
-    field = small_field(4, occlusion=occlusion)
-    for p in field.parameters():
-        p.data += 0.05 * torch.randn_like(p)
-    streaming = StreamingSRay(field)
-    encoded = streaming.encode(wall_sources(POSES))
-    rays = wall_rays(pose_at(0.1), step=3, prior=WALL_M)
-    z = sample_guided(rays, SamplingConfig())
-    with torch.inference_mode():
-        whole, weights = field.render_samples(rays, z, encoded)
-        reference, _ = field.render_samples(rays, z, encoded, least)
-        faint = (weights < least * weights.sum(1, keepdim=True)).float().mean()
-        assert 0.1 < faint < 0.98
-        # All of the ray's weight still says something, and geometry is what it was.
-        assert torch.equal(reference.opacity, whole.opacity) and torch.equal(reference.depth_m, whole.depth_m)
-        assert 1e-4 < (reference.logits - whole.logits).abs().max() < 20 * least
-    fast = streaming.render_samples(rays, z, encoded, least)
-    for name in ("logits", "depth_m", "opacity", "rgb", "entropy"):
-        torch.testing.assert_close(getattr(fast, name), getattr(reference, name), atol=1e-4, rtol=1e-4)
-
-
-def test_streaming_renderer_covers_the_narrowest_features():
-    torch.manual_seed(2)
-    field = SRay(SRayConfig(feature_dim=4, heads=2, encoder=ONE_STAGE), LABELS).eval()
-    streaming = StreamingSRay(field)
-    encoded, rays = streaming.encode(wall_sources(POSES)), wall_rays(pose_at(0.1), step=5)
-    with torch.inference_mode():
-        reference = field.render(rays, encoded)
-    torch.testing.assert_close(streaming.render(rays, encoded).logits, reference.logits, atol=1e-4, rtol=1e-4)
-
-
-def test_a_ray_of_one_sample_has_no_interval_and_is_refused():
-    streaming, rays = StreamingSRay(small_field()), wall_rays(pose_at(0.1), step=5)
-    with pytest.raises(ShapeError, match="at least 2 samples"):
-        streaming.render_samples(rays, rays.prior_depth_m[:, None], streaming.encode(wall_sources(POSES)))
-
-
-def test_streaming_renderer_refuses_variants_it_does_not_cover():
-    with pytest.raises(ConfigError, match="parity"):
-        StreamingSRay(small_field(parity="published"))
 
 
 def test_published_parity_runs_and_differs_from_the_paper():

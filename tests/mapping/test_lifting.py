@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 
+from semantic_mapper.errors import ShapeError
 from semantic_mapper.mapping.lifting import COLOUR_RATE, DEPTH_SIGMA, LARGEST_STEP, LEAST_WEIGHT, lift
 
 
@@ -93,3 +94,60 @@ def test_pixels_without_a_known_neighbour_stay_unknown():
     rows = lift(p, known, rgb[::4, ::4].copy(), depth[::4, ::4].copy(), rgb, depth)
     assert rows[0, 0] == 0
     assert (rows[20:, 20:] == -1).all()
+
+
+@pytest.mark.parametrize(("size", "full"), [((1, 1), (5, 3)), ((1, 7), (2, 20)), ((5, 3), (17, 14)), ((9, 8), (4, 5))])
+def test_images_of_any_size_follow_the_rule_up_to_their_borders(size: tuple[int, int], full: tuple[int, int]):
+    rng = np.random.default_rng(sum(size))
+    p = rng.random((*size, 4)).astype(np.float32)
+    known = rng.random(size) < 0.8
+    low = rng.integers(0, 60, (*size, 3), dtype=np.uint8), (1 + 0.05 * rng.random(size)).astype(np.float32)
+    rgb, depth = rng.integers(0, 60, (*full, 3), dtype=np.uint8), (1 + 0.05 * rng.random(full)).astype(np.float32)
+    rows = lift(p, known, *low, rgb, depth)
+    expected = [[spoken_by(v, u, p, known, *low, rgb, depth) for u in range(full[1])] for v in range(full[0])]
+    np.testing.assert_array_equal(rows, expected)
+
+
+def test_depths_that_are_no_numbers_leave_every_pixel_with_one_of_its_neighbours():
+    rng = np.random.default_rng(4)
+    p = rng.random((6, 8, 3)).astype(np.float32)
+    rgb, low = rng.integers(0, 255, (24, 32, 3), dtype=np.uint8), rng.integers(0, 255, (6, 8, 3), dtype=np.uint8)
+    odd = np.array([np.nan, np.inf, -np.inf, -1, 0, 1e-30, 1e30, 2], np.float32)
+    depth, depth_low = rng.choice(odd, (24, 32)), rng.choice(odd, (6, 8))
+    rows = lift(p, np.ones((6, 8), bool), low, depth_low, rgb, depth)
+    row, column = np.divmod(rows, 8)
+    v, u = np.mgrid[0:24, 0:32] // 4
+    near = (np.abs(row - v) <= 1) & (np.abs(column - u) <= 1)
+    assert ((rows == -1) | near).all() and near.mean() > 0.5
+
+
+def test_nothing_to_upsample_and_nothing_to_upsample_to():
+    none, some = np.zeros((0, 8, 2), np.float32), np.zeros((6, 8, 2), np.float32)
+    rgb, depth = np.zeros((24, 32, 3), np.uint8), np.ones((24, 32), np.float32)
+    rows = lift(none, np.zeros((0, 8), bool), np.zeros((0, 8, 3), np.uint8), np.zeros((0, 8), np.float32), rgb, depth)
+    assert (rows == -1).all() and rows.shape == (24, 32)
+    known, low = np.ones((6, 8), bool), (np.zeros((6, 8, 3), np.uint8), np.ones((6, 8), np.float32))
+    assert lift(some, known, *low, rgb[:0], depth[:0]).shape == (0, 32)
+
+
+def test_images_need_not_be_contiguous():
+    rng = np.random.default_rng(5)
+    p, known = rng.random((8, 6, 3), np.float32).transpose(1, 0, 2), rng.random((8, 6)).T > 0.1
+    rgb, depth = rng.integers(0, 99, (24, 64, 3), dtype=np.uint8)[:, ::2], rng.random((32, 24), np.float32).T + 1
+    low = rng.integers(0, 99, (6, 16, 3), dtype=np.uint8)[:, ::2], rng.random((8, 6), np.float32).T + 1
+    copies = (a.copy("C") for a in (p, known, *low, rgb, depth))
+    np.testing.assert_array_equal(lift(p, known, *low, rgb, depth), lift(*copies))
+
+
+def test_images_that_do_not_fit_together_are_refused():
+    p, known = np.zeros((6, 8, 2), np.float32), np.ones((6, 8), bool)
+    low, depth_low = np.zeros((6, 8, 3), np.uint8), np.ones((6, 8), np.float32)
+    rgb, depth = np.zeros((24, 32, 3), np.uint8), np.ones((24, 32), np.float32)
+    for name, images in {
+        "coarse known": (p, known[:5], low, depth_low, rgb, depth),
+        "coarse rgb": (p, known, low[:, :7], depth_low, rgb, depth),
+        "coarse depth": (p, known, low, depth_low[:, :7], rgb, depth),
+        "rgb": (p, known, low, depth_low, rgb[:23], depth),
+    }.items():
+        with pytest.raises(ShapeError, match=name):
+            lift(*images)
