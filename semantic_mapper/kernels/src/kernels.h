@@ -6,6 +6,7 @@
  */
 #pragma once
 
+#include <math.h>
 #include <stdbool.h>
 #include <stdint.h>
 
@@ -19,16 +20,19 @@
 ARRAY(float, F32);
 ARRAY(double, F64);
 ARRAY(uint8_t, U8); /* bool arrays, too */
+ARRAY(int8_t, I8);
 ARRAY(int16_t, I16);
 ARRAY(uint16_t, U16);
 ARRAY(int32_t, I32);
 ARRAY(int64_t, I64);
+ARRAY(uint64_t, U64);
 ARRAY(void, AnyArray);
 
 /* KERNEL(name, Arguments) { ... } defines one with `start`, `stop` and `a`; NAME_size lets Python check the struct. */
 #define KERNEL(name, Arguments)                                                                                       \
-    __attribute__((visibility("default"))) const int64_t name##_size = sizeof(Arguments);                            \
-    __attribute__((visibility("default"))) int64_t name(__attribute__((unused)) int64_t start, __attribute__((unused)) int64_t stop, const Arguments *a)
+    __attribute__((visibility("default"))) const int64_t name##_size = sizeof(Arguments);                             \
+    __attribute__((visibility("default"))) int64_t name(__attribute__((unused)) int64_t start,                        \
+                                                        __attribute__((unused)) int64_t stop, const Arguments *a)
 
 static inline int64_t min_i(int64_t a, int64_t b) { return a < b ? a : b; }
 static inline int64_t max_i(int64_t a, int64_t b) { return a > b ? a : b; }
@@ -36,3 +40,16 @@ static inline float min_f(float a, float b) { return b < a ? b : a; }
 static inline float max_f(float a, float b) { return b > a ? b : a; }
 static inline double min_d(double a, double b) { return b < a ? b : a; }
 static inline double max_d(double a, double b) { return b > a ? b : a; }
+
+/* Conversions are undefined in C beyond the range of the type: NaN and what no int64 holds become the lowest here. */
+static inline int64_t to_int(double x) { return x >= -0x1p63 && x < 0x1p63 ? (int64_t)x : INT64_MIN; }
+static inline int64_t floor_int(double x) { return to_int(floor(x)); }
+
+/* A whole number as one of n pixels; NaN is the first. */
+static inline int64_t clip_pixel(double x, int64_t n) { return x > 0 ? (x < (double)n ? (int64_t)x : n - 1) : 0; }
+
+/* A color value as a byte, rounded and clipped; NaN becomes 0. */
+static inline uint8_t to_byte(double x) {
+    double clipped = min_d(max_d(x + 0.5, 0.0), 255.0);
+    return clipped >= 0.0 ? (uint8_t)clipped : 0;
+}
