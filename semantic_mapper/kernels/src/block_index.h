@@ -13,8 +13,10 @@ typedef struct {
     I32 slot_values; /* (S,) buffer indices */
 } BlockIndex;
 
+/* Unsigned: coordinates beyond the limit give some key, nothing worse. */
 static inline int64_t pack_key(int64_t x, int64_t y, int64_t z) {
-    return (x + KEY_LIMIT) << (2 * KEY_BITS) | (y + KEY_LIMIT) << KEY_BITS | (z + KEY_LIMIT);
+    uint64_t limit = (uint64_t)KEY_LIMIT, high = (uint64_t)x + limit, middle = (uint64_t)y + limit;
+    return (int64_t)(high << (2 * KEY_BITS) | middle << KEY_BITS | ((uint64_t)z + limit));
 }
 
 /* What to add to a packed key for the next block along an axis, in the direction of `sign`. */
@@ -38,7 +40,7 @@ static inline int64_t find_block(const BlockIndex *index, int64_t packed) {
     int64_t slots = index->slot_keys.shape[0];
     for (int64_t slot = first_slot(packed, slots);; slot = (slot + 1) & (slots - 1)) {
         int64_t key = index->slot_keys.data[slot];
+        if (key == EMPTY_KEY) return -1; /* first: a key of coordinates beyond the limit may look like it */
         if (key == packed) return index->slot_values.data[slot];
-        if (key == EMPTY_KEY) return -1;
     }
 }

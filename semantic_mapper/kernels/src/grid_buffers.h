@@ -1,0 +1,23 @@
+/* The memory of the voxel grid; see mapping/grid_buffers.py. */
+#pragma once
+
+#include "block_index.h"
+
+#define BLOCK_SIDE 8
+#define BLOCK_VOXELS 512
+#define MAX_CLASSES 256 /* class ids are bytes */
+
+typedef struct {
+    I32 keys;          /* (capacity, 3) block coordinates */
+    F32 tsdf;          /* (capacity, 512) signed distance over truncation, -1 to 1 */
+    F32 weight;        /* (capacity, 512) */
+    F32 color;         /* (capacity, 512, 3) 0 to 255 */
+    AnyArray evidence; /* (capacity, 512, L) float32 or int16; see evidence.h */
+    F32 votes;         /* (capacity, 512) */
+} GridBuffers;
+
+/* Key of the block that a voxel of the world lies in, and which one of the block it is. */
+static inline int64_t key_of_voxel(int64_t x, int64_t y, int64_t z) { return pack_key(x >> 3, y >> 3, z >> 3); }
+static inline int64_t voxel_in_block(int64_t x, int64_t y, int64_t z) {
+    return ((z & 7) << 6) | ((y & 7) << 3) | (x & 7);
+}

@@ -1,0 +1,115 @@
+/* Reading the map at any point: interpolation over the eight voxels around it; see mapping/readout.py. */
+#pragma once
+
+#include "evidence.h"
+
+#define LEAST_FRACTION 1e-3 /* corners that count less are rounding dust of a point that lies on a voxel edge */
+#define NOT_OBSERVED 2.0    /* a TSDF value that no voxel has */
+
+/* Signed distances of a grid, or of a snapshot of one, where they are bytes. */
+typedef struct {
+    const void *tsdf;   /* (B, 512) float32 or int8 */
+    const void *weight; /* (B, 512) float32 or uint8; > 0 where observed */
+    bool bytes;         /* which of both; a constant in the caller, so that the compiler makes a function for each */
+} TsdfField;
+
+static inline TsdfField tsdf_of_grid(const GridBuffers *buffers) {
+    return (TsdfField){buffers->tsdf.data, buffers->weight.data, false};
+}
+
+static inline double tsdf_at(const TsdfField *field, int64_t at) {
+    return field->bytes ? (double)((const int8_t *)field->tsdf)[at] : (double)((const float *)field->tsdf)[at];
+}
+
+static inline bool is_observed(const TsdfField *field, int64_t at) {
+    return field->bytes ? ((const uint8_t *)field->weight)[at] > 0 : ((const float *)field->weight)[at] > 0;
+}
+
+/* Interpolated TSDF at a point (voxel units) over its observed corners; NOT_OBSERVED where there is none. */
+static inline double sample_tsdf(const double *p, const BlockIndex *index, const TsdfField *field) {
+    int64_t x0 = floor_int(p[0]), y0 = floor_int(p[1]), z0 = floor_int(p[2]), last_key = EMPTY_KEY, block = -1;
+    double fx = p[0] - (double)x0, fy = p[1] - (double)y0, fz = p[2] - (double)z0, total = 0.0, fraction_sum = 0.0;
+    for (int corner = 0; corner < 8; corner++) {
+        int i = corner & 1, j = (corner >> 1) & 1, k = corner >> 2;
+        double fraction = (i ? fx : 1 - fx) * (j ? fy : 1 - fy) * (k ? fz : 1 - fz);
+        if (fraction <= 0) continue;
+        int64_t x = x0 + i, y = y0 + j, z = z0 + k, key = key_of_voxel(x, y, z);
+        if (key != last_key) last_key = key, block = find_block(index, key);
+        if (block < 0) continue;
+        int64_t at = block * BLOCK_VOXELS + voxel_in_block(x, y, z);
+        if (is_observed(field, at)) {
+            total += fraction * tsdf_at(field, at);
+            fraction_sum += fraction;
+        }
+    }
+    return fraction_sum > 0 ? total / fraction_sum : NOT_OBSERVED;
+}
+
+/* Interpolates color (3,) and evidence (L,) at a point; returns the interpolated votes. */
+static inline double gather(const double *p, const BlockIndex *index, const GridBuffers *buffers, double *color,
+                            double *evidence) {
+    int64_t classes = buffers->evidence.shape[2], itemsize = buffers->evidence.itemsize;
+    int64_t x0 = floor_int(p[0]), y0 = floor_int(p[1]), z0 = floor_int(p[2]);
+    double fx = p[0] - (double)x0, fy = p[1] - (double)y0, fz = p[2] - (double)z0;
+    double color_sum = 0.0, vote_sum = 0.0, votes = 0.0;
+    for (int c = 0; c < 3; c++) color[c] = 0.0;
+    for (int64_t c = 0; c < classes; c++) evidence[c] = 0.0;
+    for (int corner = 0; corner < 8; corner++) {
+        int i = corner & 1, j = (corner >> 1) & 1, k = corner >> 2;
+        double fraction = (i ? fx : 1 - fx) * (j ? fy : 1 - fy) * (k ? fz : 1 - fz);
+        if (fraction < LEAST_FRACTION) continue;
+        int64_t x = x0 + i, y = y0 + j, z = z0 + k, block = find_block(index, key_of_voxel(x, y, z));
+        if (block < 0) continue;
+        int64_t at = block * BLOCK_VOXELS + voxel_in_block(x, y, z);
+        if (buffers->weight.data[at] > 0) {
+            color_sum += fraction;
+            for (int c = 0; c < 3; c++) color[c] += fraction * (double)buffers->color.data[3 * at + c];
+        }
+        float voxel_votes = buffers->votes.data[at];
+        if (voxel_votes > 0) {
+            vote_sum += fraction;
+            votes += fraction * (double)voxel_votes;
+            double scale = fraction * evidence_scale(itemsize, voxel_votes);
+            for (int64_t c = 0; c < classes; c++)
+                evidence[c] += scale * evidence_at(buffers->evidence.data, itemsize, at * classes + c);
+        }
+    }
+    if (color_sum > 0)
+        for (int c = 0; c < 3; c++) color[c] /= color_sum;
+    if (vote_sum > 0) {
+        for (int64_t c = 0; c < classes; c++) evidence[c] /= vote_sum;
+        votes /= vote_sum;
+    }
+    return votes;
+}
+
+/* How much more evidence there is for one class than for another, in the precision of the array. */
+static inline double evidence_difference(const void *evidence, int64_t itemsize, int64_t a, int64_t b) {
+    if (itemsize == 4) return ((const float *)evidence)[a] - ((const float *)evidence)[b];
+    return evidence_at(evidence, itemsize, a) - evidence_at(evidence, itemsize, b);
+}
+
+/* Channel and confidence of one voxel's evidence (L,), of any type; -1 and 0 without votes. */
+static inline int64_t decide(const void *evidence, int64_t itemsize, int64_t classes, double votes,
+                             double vote_discount, double *confidence) {
+    *confidence = 0.0;
+    if (votes <= 0) return -1;
+    double worth = votes > 1 ? 1.0 / (1.0 + vote_discount * (votes - 1.0)) : 1.0 / votes; /* n_eff / n */
+    worth *= evidence_scale(itemsize, votes);
+    int64_t best = 0;
+    for (int64_t c = 1; c < classes; c++)
+        if (evidence_difference(evidence, itemsize, c, best) > 0) best = c;
+    double total = 0.0;
+    for (int64_t c = 0; c < classes; c++) total += exp(evidence_difference(evidence, itemsize, c, best) * worth);
+    *confidence = 1.0 / total;
+    return best;
+}
+
+/* Channel and confidence of a point; writes its color to `rgb` (3,). At most MAX_CLASSES classes. */
+static inline int64_t read_point(const double *p, const BlockIndex *index, const GridBuffers *buffers,
+                                 double vote_discount, uint8_t *rgb, double *confidence) {
+    double color[3], evidence[MAX_CLASSES];
+    double votes = gather(p, index, buffers, color, evidence);
+    for (int c = 0; c < 3; c++) rgb[c] = to_byte(color[c]);
+    return decide(evidence, sizeof(double), buffers->evidence.shape[2], votes, vote_discount, confidence);
+}
