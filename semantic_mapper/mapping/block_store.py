@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.kernel_cache import kernel
+from semantic_mapper.kernels import kernel
 from semantic_mapper.mapping.evidence import EVIDENCE_DTYPES
 from semantic_mapper.mapping.key_table import ABSENT, KeyTable
-from semantic_mapper.types import Float32
+from semantic_mapper.types import Float32, Int32, Int64
 
 BLOCK_VOXELS = 512
 MASK_BYTES = BLOCK_VOXELS // 8
@@ -196,90 +196,48 @@ def _empty(count: int, classes: int, evidence: type[np.generic]) -> BlockValues:
 
 def pack_blocks(values: BlockValues, rows: NDArray[np.int32]) -> PackedBlocks:
     """Copy blocks ``rows`` (B,) of ``values`` in one compiled pass, without the voxels that hold nothing."""
-    ends = _ends(values.weight, values.votes, rows, evidence_words(values.evidence.shape[2], values.evidence))
+    rows, ends = np.ascontiguousarray(rows), np.empty(len(rows) + 1, np.int64)
+    packed_block_ends(values.weight, values.votes, rows, ends, evidence_floats(values.evidence))
     data = np.zeros(ends[-1], np.float32)
-    _pack(values, rows, ends, (data, data.view(np.uint8), data.view(values.evidence.dtype)))
+    pack_block_values(values, rows, ends, data)
     return PackedBlocks(data, ends, values.evidence.dtype)
 
 
-@kernel()
-def evidence_words(classes, evidence):
-    """How many float32 the evidence of one voxel takes up in packed blocks, for an array of its type."""
-    return (classes * evidence.itemsize + 3) // 4
-
-
-@kernel()
-def _ends(weight, votes, rows, width):
-    """Where the packed blocks begin and end (B + 1,), in units of float32."""
-    ends = np.zeros(len(rows) + 1, np.int64)
-    for n in range(len(rows)):
-        measured, voted = 0, 0
-        for voxel in range(BLOCK_VOXELS):
-            measured += weight[rows[n], voxel] > 0
-            voted += votes[rows[n], voxel] > 0
-        ends[n + 1] = ends[n] + MASK_BYTES // 2 + 5 * measured + (width + 1) * voted
-    return ends
-
-
-@kernel()
-def _pack(values, rows, ends, out_views):
-    """Write blocks as ``PackedBlocks`` says to zeros; ``out_views`` are float32, bytes, evidence of the same memory."""
-    out, out_bytes, out_evidence = out_views
-    classes, each = values.evidence.shape[2], 4 // out_evidence.itemsize
-    width = evidence_words(classes, out_evidence)
-    for n in range(len(rows)):
-        block, masks = rows[n], 4 * ends[n]
-        measured = 0
-        for voxel in range(BLOCK_VOXELS):
-            bit = np.uint8(0x80 >> (voxel & 7))
-            if values.weight[block, voxel] > 0:
-                out_bytes[masks + (voxel >> 3)] |= bit
-                measured += 1
-            if values.votes[block, voxel] > 0:
-                out_bytes[masks + MASK_BYTES + (voxel >> 3)] |= bit
-        tsdf = ends[n] + MASK_BYTES // 2
-        weight, color, evidence = tsdf + measured, tsdf + 2 * measured, tsdf + 5 * measured
-        votes = ends[n + 1] - (ends[n + 1] - evidence) // (width + 1)
-        for voxel in range(BLOCK_VOXELS):
-            if values.weight[block, voxel] > 0:
-                out[tsdf], out[weight] = values.tsdf[block, voxel], values.weight[block, voxel]
-                for c in range(3):
-                    out[color + c] = values.color[block, voxel, c]
-                tsdf, weight, color = tsdf + 1, weight + 1, color + 3
-            if values.votes[block, voxel] > 0:
-                for c in range(classes):
-                    out_evidence[each * evidence + c] = values.evidence[block, voxel, c]
-                out[votes] = values.votes[block, voxel]
-                evidence, votes = evidence + width, votes + 1
-
-
 def unpack_block(voxels: bytes | memoryview, values: BlockValues, n: int) -> None:
-    """Fill block ``n``, whose voxels are all zero, with what ``pack_blocks`` has packed of one."""
-    data = np.frombuffer(voxels, np.float32)
-    _unpack_block((data, data.view(np.uint8), data.view(values.evidence.dtype)), values, n)
+    """Fill block ``n``, whose voxels are all zero, with what ``pack_blocks`` has packed of one.
+
+    Raises:
+        MapError: the bytes are no packed block with as many classes.
+    """
+    if len(voxels) % 4 or not unpack_block_values(np.frombuffer(voxels, np.float32), values, n):
+        raise MapError(f"a packed block of {len(voxels)} bytes does not hold the voxels that it says; its disk fails")
 
 
-@kernel()
-def _unpack_block(views, values, n):
-    """The reverse of ``_pack`` for one block, onto voxels that are zero."""
-    data, data_bytes, said = views
-    classes, each = values.evidence.shape[2], 4 // said.itemsize
-    width = evidence_words(classes, said)
-    measured = 0
-    for voxel in range(BLOCK_VOXELS):
-        measured += (data_bytes[voxel >> 3] >> (7 - (voxel & 7))) & 1
-    tsdf = MASK_BYTES // 2
-    weight, color, evidence = tsdf + measured, tsdf + 2 * measured, tsdf + 5 * measured
-    votes = len(data) - (len(data) - evidence) // (width + 1)
-    for voxel in range(BLOCK_VOXELS):
-        shift = 7 - (voxel & 7)
-        if (data_bytes[voxel >> 3] >> shift) & 1:
-            values.tsdf[n, voxel], values.weight[n, voxel] = data[tsdf], data[weight]
-            for c in range(3):
-                values.color[n, voxel, c] = data[color + c]
-            tsdf, weight, color = tsdf + 1, weight + 1, color + 3
-        if (data_bytes[MASK_BYTES + (voxel >> 3)] >> shift) & 1:
-            for c in range(classes):
-                values.evidence[n, voxel, c] = said[each * evidence + c]
-            values.votes[n, voxel] = data[votes]
-            evidence, votes = evidence + width, votes + 1
+def evidence_floats(evidence: NDArray[Any]) -> int:
+    """How many float32 the evidence (..., L) of one voxel takes up in packed blocks."""
+    return (evidence.shape[-1] * evidence.itemsize + 3) // 4
+
+
+@kernel
+def packed_block_ends(weight: Float32, votes: Float32, rows: Int32, ends: Int64, evidence_floats: int) -> None:
+    """Where packed blocks begin and end, in units of float32.
+
+    Args:
+        weight, votes: (capacity, 512).
+        rows: (B,) blocks to pack.
+        ends: (B + 1,) to fill.
+        evidence_floats: Of one voxel.
+    """
+    ...
+
+
+@kernel
+def pack_block_values(values: BlockValues, rows: Int32, ends: Int64, data: Float32) -> None:
+    """Write blocks ``rows`` (B,) as ``PackedBlocks`` says to ``data`` (N,), which is zero; ``ends`` (B + 1,)."""
+    ...
+
+
+@kernel
+def unpack_block_values(data: Float32, values: BlockValues, row: int) -> int:
+    """The reverse for one block, onto voxels that are zero; returns 0 where the data (N,) are none, else 1."""
+    ...

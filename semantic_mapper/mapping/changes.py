@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.kernel_cache import kernel
+from semantic_mapper.kernels import kernel
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_grid import BLOCK_VOXELS, BlockGrid
 from semantic_mapper.mapping.block_index import unpack_keys
-from semantic_mapper.mapping.block_store import MASK_BYTES, PackedBlocks, evidence_words
-from semantic_mapper.mapping.readout import decide
-from semantic_mapper.types import UInt8
+from semantic_mapper.mapping.block_store import PackedBlocks
+from semantic_mapper.types import Float32, Int64, UInt8
 
 TSDF_STEPS = 127  # of the quantised TSDF, a truncation
 UNOBSERVED = -128  # in the quantised TSDF
@@ -181,46 +180,44 @@ def _room_for(chosen: ChosenBlocks) -> BlockChanges:
 def _compact_into(out: BlockChanges, rows: NDArray[np.int64], blocks: PackedBlocks, chosen: ChosenBlocks) -> None:
     labels = chosen.label_set
     ids = np.array((*labels.ids, labels.ignore_id), np.uint8)
-    limits = (ids, chosen.vote_discount, chosen.min_weight)
-    arrays = (out.tsdf, out.label, out.confidence, out.rgb)
-    data = (blocks.data, blocks.data.view(np.uint8), blocks.data.view(blocks.evidence))
-    _compact(data, blocks.ends, rows, *limits, *arrays)
+    _compact_blocks(
+        blocks.data,
+        blocks.ends,
+        blocks.evidence.itemsize,
+        np.ascontiguousarray(rows),
+        ids,
+        chosen.vote_discount,
+        chosen.min_weight,
+        out.tsdf,
+        out.label,
+        out.confidence,
+        out.rgb,
+    )
 
 
 # Serial: it runs beside the mapper, which needs the other threads.
-@kernel()
-def _compact(views, ends, rows, ids, vote_discount, min_weight, tsdf, label, confidence, rgb):
-    """Write packed blocks (B,) to ``rows`` (B,) of the output."""
-    data, masks, said = views
-    classes = len(ids) - 1
-    each = data.itemsize // said.itemsize
-    width = evidence_words(classes, said)
-    for n in range(len(rows)):
-        row, first = rows[n], 4 * ends[n]
-        measured = 0
-        for voxel in range(BLOCK_VOXELS):
-            measured += (masks[first + (voxel >> 3)] >> (7 - (voxel & 7))) & 1
-        distance = ends[n] + MASK_BYTES // 2
-        weight, color, evidence = distance + measured, distance + 2 * measured, distance + 5 * measured
-        votes = ends[n + 1] - (ends[n + 1] - evidence) // (width + 1)
-        for voxel in range(BLOCK_VOXELS):
-            tsdf[row, voxel] = UNOBSERVED
-            label[row, voxel] = ids[-1]
-            confidence[row, voxel] = 0
-            rgb[row, voxel, 0] = rgb[row, voxel, 1] = rgb[row, voxel, 2] = 0
-            at, shift = first + (voxel >> 3), 7 - (voxel & 7)
-            seen = False
-            if (masks[at] >> shift) & 1:
-                seen = data[weight] >= min_weight
-                if seen:
-                    steps = int(np.rint(min(max(data[distance], -1.0), 1.0) * TSDF_STEPS))
-                    tsdf[row, voxel] = max(steps, 1) if data[distance] > 0 else steps
-                    for c in range(3):
-                        rgb[row, voxel, c] = np.uint8(min(max(data[color + c] + 0.5, 0.0), 255.0))
-                distance, weight, color = distance + 1, weight + 1, color + 3
-            if (masks[at + MASK_BYTES] >> shift) & 1:
-                if seen:
-                    best, p = decide(said[each * evidence : each * evidence + classes], data[votes], vote_discount)
-                    label[row, voxel] = ids[best]
-                    confidence[row, voxel] = np.uint8(p * CONFIDENCE_STEPS + 0.5)
-                evidence, votes = evidence + width, votes + 1
+@kernel
+def _compact_blocks(
+    data: Float32,
+    ends: Int64,
+    evidence_itemsize: int,
+    rows: Int64,
+    ids: UInt8,
+    vote_discount: float,
+    min_weight: float,
+    tsdf: NDArray[np.int8],
+    label: UInt8,
+    confidence: UInt8,
+    rgb: UInt8,
+) -> None:
+    """Write packed blocks (B,) to ``rows`` (B,) of the output.
+
+    Args:
+        data, ends: Of ``PackedBlocks``.
+        evidence_itemsize: 4 (float32) or 2 (int16).
+        rows: (B,) of the output.
+        ids: (L + 1,) of the classes, and the ignore id.
+        vote_discount, min_weight: See ``ChosenBlocks``.
+        tsdf, label, confidence, rgb: As in ``BlockChanges``.
+    """
+    ...

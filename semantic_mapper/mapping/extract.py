@@ -8,17 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.kernel_cache import kernel
+from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.block_grid import BlockGrid
-from semantic_mapper.mapping.block_index import BlockIndex, find_block, find_blocks, pack_key, pack_keys, unpack_keys
+from semantic_mapper.mapping.block_index import BlockIndex, find_blocks, pack_keys, unpack_keys
 from semantic_mapper.mapping.grid_buffers import BLOCK_SIDE, GridBuffers, make_open3d_grid
 from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.mapping.open3d_loader import load_open3d
-from semantic_mapper.threads import parallel_kernel
-from semantic_mapper.types import Float32, Float64
+from semantic_mapper.types import Float32, Float64, Int32, Int64
 
 MESH_TILE_BLOCKS = 16_384  # Open3D fails past 262,100 blocks of 8^3 (int32), and needs 8 KiB a block to mesh
-LARGEST_STEP = 0.95  # two neighbours that differ by more straddle a depth edge, not a surface
 
 
 def surface_voxels(keys: NDArray[np.int32], blocks: NDArray[np.int32], grid: BlockGrid, min_weight: float) -> Float64:
@@ -29,69 +27,42 @@ def surface_voxels(keys: NDArray[np.int32], blocks: NDArray[np.int32], grid: Blo
         grid: The map's storage.
         min_weight: Both ends of an edge need this TSDF weight.
     """
-    buffers = grid.buffers()
-    counts = np.zeros(len(blocks), np.int64)
-    _count_crossings(len(blocks), keys, blocks, grid.index, buffers, min_weight, counts)
-    starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
+    keys, blocks, buffers = np.ascontiguousarray(keys), np.ascontiguousarray(blocks), grid.buffers()
+    starts = np.zeros(len(blocks) + 1, np.int64)
+    _count_crossings(len(blocks), keys, blocks, grid.index, buffers, min_weight, starts[1:])
+    np.cumsum(starts, out=starts)
     points = np.empty((int(starts[-1]), 3), np.float64)
     _write_crossings(len(blocks), keys, blocks, grid.index, buffers, min_weight, starts, points)
     return points
 
 
-@kernel()
-def _neighbours(key, block, index, found):
-    """Buffer indices of the blocks at +x, +y, +z of ``key``."""
-    x, y, z = key[0], key[1], key[2]
-    found[0] = find_block(index, pack_key(x + 1, y, z))
-    found[1] = find_block(index, pack_key(x, y + 1, z))
-    found[2] = find_block(index, pack_key(x, y, z + 1))
-
-
-@kernel(inline=True)
-def _crossing(buffers, block, voxel, axis, neighbours, min_weight):
-    """Where along the edge from ``voxel`` to the next along ``axis`` the TSDF is zero, in [0, 1); -1 = nowhere."""
-    step = 1 << (3 * axis)
-    position = (voxel >> (3 * axis)) & 7
-    other_block, other = (block, voxel + step) if position < 7 else (neighbours[axis], voxel - 7 * step)
-    if other_block < 0 or buffers.weight[other_block, other] < min_weight:
-        return -1.0
-    a, b = buffers.tsdf[block, voxel], buffers.tsdf[other_block, other]
-    if (a > 0) == (b > 0) or abs(a - b) > LARGEST_STEP:
-        return -1.0
-    return np.float64(a) / (np.float64(a) - np.float64(b))
+@parallel_kernel()
+def _count_crossings(
+    count: int,
+    keys: Int32,
+    blocks: Int32,
+    index: BlockIndex,
+    buffers: GridBuffers,
+    min_weight: float,
+    counts: Int64,
+) -> None:
+    """Crossings of each block (B,); keys (B, 3), buffer indices (B,)."""
+    ...
 
 
 @parallel_kernel()
-def _count_crossings(start, stop, keys, blocks, index, buffers, min_weight, counts):
-    for n in range(start, stop):
-        counts[n] = _block_crossings(keys[n], blocks[n], index, buffers, min_weight, np.empty((0, 3), np.float64))
-
-
-@parallel_kernel()
-def _write_crossings(start, stop, keys, blocks, index, buffers, min_weight, starts, points):
-    for n in range(start, stop):
-        _block_crossings(keys[n], blocks[n], index, buffers, min_weight, points[starts[n] : starts[n + 1]])
-
-
-@kernel()
-def _block_crossings(key, block, index, buffers, min_weight, points):
-    """Number of crossings of one block; writes as many of them as ``points`` has room for."""
-    neighbours = np.empty(3, np.int64)
-    _neighbours(key, block, index, neighbours)
-    count = 0
-    for voxel in range(512):
-        if buffers.weight[block, voxel] < min_weight or abs(buffers.tsdf[block, voxel]) > LARGEST_STEP:
-            continue
-        for axis in range(3):
-            along = _crossing(buffers, block, voxel, axis, neighbours, min_weight)
-            if along < 0:
-                continue
-            if count < len(points):
-                points[count, 0] = key[0] * BLOCK_SIDE + (voxel & 7) + (along if axis == 0 else 0.0)
-                points[count, 1] = key[1] * BLOCK_SIDE + ((voxel >> 3) & 7) + (along if axis == 1 else 0.0)
-                points[count, 2] = key[2] * BLOCK_SIDE + (voxel >> 6) + (along if axis == 2 else 0.0)
-            count += 1
-    return count
+def _write_crossings(
+    count: int,
+    keys: Int32,
+    blocks: Int32,
+    index: BlockIndex,
+    buffers: GridBuffers,
+    min_weight: float,
+    starts: Int64,
+    points: Float64,
+) -> None:
+    """The crossings of block n, in units of voxels, into ``points[starts[n] : starts[n + 1]]``; points (N, 3)."""
+    ...
 
 
 def triangle_mesh(

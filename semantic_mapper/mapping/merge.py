@@ -19,22 +19,17 @@ from numpy.typing import NDArray
 
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import MapError
-from semantic_mapper.kernel_cache import kernel
+from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_grid import BlockGrid
-from semantic_mapper.mapping.block_index import find_block, pack_key, pack_keys, unpack_keys
+from semantic_mapper.mapping.block_index import BlockIndex, pack_keys, unpack_keys
 from semantic_mapper.mapping.block_store import BLOCK_VOXELS, BlockValues
-from semantic_mapper.mapping.evidence import evidence_scale, stored_evidence
-from semantic_mapper.mapping.extract import LARGEST_STEP
-from semantic_mapper.mapping.grid_buffers import BLOCK_SIDE
-from semantic_mapper.threads import parallel_kernel
-from semantic_mapper.types import Float64
+from semantic_mapper.mapping.grid_buffers import BLOCK_SIDE, GridBuffers
+from semantic_mapper.types import Float64, Int32
 
 MERGED_AT_ONCE = 128  # blocks
 SNAP_VOXELS = 1e-6  # a shift nearer than this to whole voxels is one: metres have been rounded on their way here
 SNAP_ROTATION = 1e-9  # likewise for rotations by quarter turns
-_DUST = 1e-6  # voxels with less share are there by rounding alone
-LEAST_SHARE = 0.5  # of the eight voxels around a point, by their weights in the interpolation, that were observed
 
 
 class VoxelTransform(NamedTuple):
@@ -94,13 +89,14 @@ def add_blocks(target: BlockGrid, source: BlockGrid, T_target_source: VoxelTrans
     for wanted, needed in _parts(pairs):
         grid = source.holding(needed)
         moved = _empty_blocks(len(wanted), grid.buffers().evidence.shape[2])
-        _resample(
+        _resample_blocks(
             len(wanted), unpack_keys(wanted), R_source_target, T_target_source.t, grid.index, grid.buffers(), moved
         )
         holds = (moved.weight > 0).any(axis=1)  # votes come with weight
         if holds.any():
             blocks = target.activate(wanted[holds])
-            _add(len(blocks), blocks, target.buffers(), BlockValues(*(part[holds] for part in moved)), cap)
+            added = BlockValues(*(part[holds] for part in moved))
+            _add_block_values(len(blocks), blocks, target.buffers(), added, cap)
             target.mark_changed(blocks, version)
 
 
@@ -163,128 +159,22 @@ def _empty_blocks(count: int, classes: int) -> BlockValues:
 
 
 @parallel_kernel()
-def _resample(start, stop, keys, R, t, index, buffers, moved):
-    """Fill blocks ``moved``, which lie at ``keys`` (B, 3): their point p is the source's ``R @ (p - t)``, in voxels."""
-    for n in range(start, stop):
-        blocks, voxels, shares = np.empty(8, np.int64), np.empty(8, np.int64), np.empty(8, np.float64)
-        for voxel in range(BLOCK_VOXELS):
-            x = keys[n, 0] * BLOCK_SIDE + (voxel & 7) - t[0]
-            y = keys[n, 1] * BLOCK_SIDE + ((voxel >> 3) & 7) - t[1]
-            z = keys[n, 2] * BLOCK_SIDE + (voxel >> 6) - t[2]
-            sx = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
-            sy = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
-            sz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
-            count = _corners(sx, sy, sz, index, blocks, voxels, shares)
-            if count == 0:
-                continue
-            total = _nearest_at_edges(count, blocks, voxels, shares, buffers)
-            _blend_geometry(count, blocks, voxels, shares, total, buffers, moved, n, voxel)
-            _blend_votes(count, blocks, voxels, shares, total, buffers, moved, n, voxel)
+def _resample_blocks(
+    count: int, keys: Int32, R: Float64, t: Float64, index: BlockIndex, buffers: GridBuffers, moved: BlockValues
+) -> None:
+    """Interpolate a source at the voxels of other blocks.
 
-
-@kernel()
-def _corners(x, y, z, index, blocks, voxels, shares):
-    """The voxels around a point that lie in blocks of the map, with their shares; returns how many."""
-    x0, y0, z0 = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
-    fx, fy, fz = x - x0, y - y0, z - z0
-    count = 0
-    last_key, block = np.int64(-1), np.int64(-1)
-    for corner in range(8):
-        i, j, k = corner & 1, (corner >> 1) & 1, corner >> 2
-        share = (fx if i else 1 - fx) * (fy if j else 1 - fy) * (fz if k else 1 - fz)
-        if share < _DUST:
-            continue
-        u, v, w = x0 + i, y0 + j, z0 + k
-        key = pack_key(u >> 3, v >> 3, w >> 3)
-        if key != last_key:
-            last_key, block = key, find_block(index, key)
-        if block >= 0:
-            blocks[count], voxels[count], shares[count] = block, ((w & 7) << 6) | ((v & 7) << 3) | (u & 7), share
-            count += 1
-    return count
-
-
-@kernel()
-def _nearest_at_edges(count, blocks, voxels, shares, buffers):
-    """Across a depth edge, take all share from all but the nearest observed voxel; returns what they then sum up to.
-
-    That is 1 where nothing changes: voxels without a block count as not observed.
+    Args:
+        count: B.
+        keys: (B, 3) of the blocks.
+        R, t: (3, 3) and (3,): their point p is the source's ``R @ (p - t)``, in voxels.
+        index, buffers: Of the source.
+        moved: B blocks of zeros, to fill; evidence float32, sums.
     """
-    least, most, nearest = np.float32(2), np.float32(-2), 0
-    for i in range(count):
-        if buffers.weight[blocks[i], voxels[i]] > 0:
-            value = buffers.tsdf[blocks[i], voxels[i]]
-            if most < least or shares[i] > shares[nearest]:
-                nearest = i
-            least, most = min(least, value), max(most, value)
-    if most - least <= LARGEST_STEP:
-        return 1.0
-    for i in range(count):
-        if i != nearest:
-            shares[i] = 0
-    return shares[nearest]
-
-
-@kernel()
-def _blend_geometry(count, blocks, voxels, shares, total, buffers, moved, n, voxel):
-    tsdf, weight, red, green, blue, observed = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(count):
-        b, v, share = blocks[i], voxels[i], shares[i]
-        if buffers.weight[b, v] > 0:
-            observed += share
-            weight += share * buffers.weight[b, v]
-            tsdf += share * buffers.tsdf[b, v]
-            red += share * buffers.color[b, v, 0]
-            green += share * buffers.color[b, v, 1]
-            blue += share * buffers.color[b, v, 2]
-    if observed >= LEAST_SHARE * total:
-        moved.weight[n, voxel] = weight / observed
-        moved.tsdf[n, voxel] = tsdf / observed
-        moved.color[n, voxel, 0] = red / observed
-        moved.color[n, voxel, 1] = green / observed
-        moved.color[n, voxel, 2] = blue / observed
-
-
-@kernel()
-def _blend_votes(count, blocks, voxels, shares, total, buffers, moved, n, voxel):
-    votes, voted = 0.0, 0.0
-    for i in range(count):
-        if buffers.votes[blocks[i], voxels[i]] > 0:
-            voted += shares[i]
-            votes += shares[i] * buffers.votes[blocks[i], voxels[i]]
-    if voted == 0 or voted < LEAST_SHARE * total:
-        return
-    moved.votes[n, voxel] = votes / voted
-    for c in range(moved.evidence.shape[2]):
-        evidence = 0.0
-        for i in range(count):
-            if buffers.votes[blocks[i], voxels[i]] > 0:
-                scale = evidence_scale(buffers.evidence, buffers.votes[blocks[i], voxels[i]])
-                evidence += shares[i] * scale * buffers.evidence[blocks[i], voxels[i], c]
-        moved.evidence[n, voxel, c] = evidence / voted
+    ...
 
 
 @parallel_kernel()
-def _add(start, stop, blocks, buffers, added, cap):
-    """Add blocks ``added`` to those with buffer indices ``blocks``, in place."""
-    for n in range(start, stop):
-        _add_block(blocks[n], buffers, n, added, cap)  # numba drops what is written to a tuple's arrays right here
-
-
-@kernel()
-def _add_block(b, buffers, n, added, cap):
-    for v in range(BLOCK_VOXELS):
-        mine, theirs = np.float64(buffers.weight[b, v]), np.float64(added.weight[n, v])
-        if theirs > 0:
-            weight = mine + theirs
-            buffers.tsdf[b, v] = (mine * buffers.tsdf[b, v] + theirs * added.tsdf[n, v]) / weight
-            for c in range(3):
-                buffers.color[b, v, c] = (mine * buffers.color[b, v, c] + theirs * added.color[n, v, c]) / weight
-            buffers.weight[b, v] = min(weight, cap)
-        votes = np.float64(buffers.votes[b, v]) + np.float64(added.votes[n, v])
-        if added.votes[n, v] > 0:
-            keep, scale = min(1.0, cap / votes), evidence_scale(buffers.evidence, buffers.votes[b, v])
-            buffers.votes[b, v] = votes * keep
-            for c in range(buffers.evidence.shape[2]):
-                said = scale * buffers.evidence[b, v, c] + np.float64(added.evidence[n, v, c])
-                buffers.evidence[b, v, c] = stored_evidence(buffers.evidence, said, votes, keep)
+def _add_block_values(count: int, blocks: Int32, buffers: GridBuffers, added: BlockValues, cap: float) -> None:
+    """Add blocks ``added`` (evidence float32, sums) to those with buffer indices ``blocks`` (B,), in place."""
+    ...

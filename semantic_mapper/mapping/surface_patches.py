@@ -7,13 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.mapping.block_grid import BLOCK_VOXELS
+from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.block_index import pack_keys
-from semantic_mapper.mapping.grid_buffers import BLOCK_SIDE
-from semantic_mapper.mapping.readout import decide
+from semantic_mapper.mapping.grid_buffers import GridBuffers
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.threads import parallel_kernel
-from semantic_mapper.types import Float64
+from semantic_mapper.types import Float64, Int32, Int64
 
 SURFACE_VOXELS = 0.75  # voxels at most this many of their edges from the surface are of it
 
@@ -46,25 +44,37 @@ def surface_patches(voxel_map: VoxelMap, max_votes: float) -> SurfacePatches:
         near = SURFACE_VOXELS / config.truncation_voxels
         total, need = np.zeros((len(blocks), 3)), np.zeros(len(blocks))
         count = np.zeros(len(blocks), np.int64)
-        _sum_up(len(blocks), keys, blocks, grid.buffers(), near, config.vote_discount, max_votes, total, need, count)
+        _sum_surface_patches(
+            len(blocks), keys, blocks, grid.buffers(), near, config.vote_discount, max_votes, total, need, count
+        )
     has = count > 0
     xyz = total[has] / count[has, None] * config.voxel_size_m
     return SurfacePatches(pack_keys(keys[has]), xyz, need[has])
 
 
 @parallel_kernel()
-def _sum_up(start, stop, keys, blocks, buffers, near, vote_discount, max_votes, total, need, count):
-    """Sums over the surface voxels of blocks (B,): positions (B, 3) in voxels, need (B,), and their number (B,)."""
-    for n in range(start, stop):
-        block = blocks[n]
-        for voxel in range(BLOCK_VOXELS):
-            if buffers.weight[block, voxel] <= 0 or abs(buffers.tsdf[block, voxel]) > near:
-                continue
-            votes = np.float64(buffers.votes[block, voxel])
-            if votes < max_votes:
-                _, confidence = decide(buffers.evidence[block, voxel], votes, vote_discount)
-                need[n] += (1.0 - confidence) / (1.0 + votes)
-            total[n, 0] += keys[n, 0] * BLOCK_SIDE + (voxel & 7)
-            total[n, 1] += keys[n, 1] * BLOCK_SIDE + ((voxel >> 3) & 7)
-            total[n, 2] += keys[n, 2] * BLOCK_SIDE + (voxel >> 6)
-            count[n] += 1
+def _sum_surface_patches(
+    blocks_count: int,
+    keys: Int32,
+    blocks: Int32,
+    buffers: GridBuffers,
+    near: float,
+    vote_discount: float,
+    max_votes: float,
+    total: Float64,
+    need: Float64,
+    count: Int64,
+) -> None:
+    """Sums over the surface voxels of blocks: keys (B, 3), buffer indices (B,).
+
+    Args:
+        blocks_count: B.
+        keys, blocks, buffers: Of the grid.
+        near: TSDF of voxels of the surface, at most.
+        vote_discount: rho.
+        max_votes: See ``surface_patches``.
+        total: (B, 3) zeros: sum of positions, in voxels.
+        need: (B,) zeros: see ``SurfacePatches``.
+        count: (B,) zeros: number of surface voxels.
+    """
+    ...

@@ -9,15 +9,15 @@ import numpy as np
 
 from semantic_mapper.config import VirtualViewConfig
 from semantic_mapper.geometry import check_pose
-from semantic_mapper.kernel_cache import kernel
+from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.allocation import Camera, blocks_in_band, make_camera
 from semantic_mapper.mapping.block_index import pack_keys
-from semantic_mapper.mapping.evidence import add_vote, dither_seed
+from semantic_mapper.mapping.evidence import DITHER
 from semantic_mapper.mapping.frame_votes import ProbabilityTable, check_depth, frame_votes, probability_table
-from semantic_mapper.mapping.fusion import look_up_voxels, make_limits, voxel_offsets
+from semantic_mapper.mapping.fusion import FusionLimits, Votes, make_limits
+from semantic_mapper.mapping.grid_buffers import GridBuffers
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.threads import parallel_kernel
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int32
 
 
 def add_votes(
@@ -60,31 +60,32 @@ def add_votes(
         budget = voxel_map.config.max_blocks  # no block is added
         packed = blocks_in_band(depth, camera, limits.voxel_size, limits.truncation, limits.depth_max, budget)
         packed = packed[np.isin(packed, pack_keys(grid.all_keys()))]  # existing ones alone
-        max_votes, moment = np.float32(config.max_votes), voxel_map.version
+        most, moment = config.max_votes, voxel_map.version
         for blocks in voxel_map.changing(packed) if len(packed) else ():
-            _vote_blocks(len(blocks), blocks, grid.buffers(), camera, limits, depth, votes, max_votes, moment)
+            args = (blocks, grid.buffers(), camera, limits, depth, votes, most, DITHER, moment)
+            _vote_into_blocks(len(blocks), *args)
     return len(packed)
 
 
 @parallel_kernel()
-def _vote_blocks(start, stop, indices, buffers, camera, limits, depth, votes, max_votes, moment):
-    offsets = voxel_offsets(camera, limits.voxel_size)
-    for i in range(start, stop):
-        _vote_block(indices[i], offsets, buffers, camera, limits, depth, votes, max_votes, moment)
+def _vote_into_blocks(
+    count: int,
+    indices: Int32,
+    buffers: GridBuffers,
+    camera: Camera,
+    limits: FusionLimits,
+    depth: Float32,
+    votes: Votes,
+    max_votes: float,
+    dither: Float32,
+    moment: int,
+) -> None:
+    """Vote as ``fusion.fuse_blocks`` does, at measured voxels with fewer than ``max_votes``, and change nothing else.
 
-
-@kernel()
-def _vote_block(block, offsets, buffers, camera: Camera, limits, depth, frame_votes, max_votes, moment):
-    """As ``fusion._fuse_block`` votes, at voxels that a frame has measured before."""
-    band, cap = np.float32(limits.vote_band), np.float32(limits.max_weight)
-    depth_max, place = np.float32(limits.depth_max), (buffers.keys[block], offsets, camera, limits.voxel_size)
-    count, voxels, pixels, distances = look_up_voxels(*place, depth, band, depth_max)
-    weight, evidence, votes = buffers.weight[block], buffers.evidence[block], buffers.votes[block]
-    rows, weights = frame_votes.rows.reshape(-1), frame_votes.weights.reshape(-1)
-    seed = dither_seed(buffers.keys[block], moment)
-    for k in range(count):
-        voxel, pixel = voxels[k], pixels[k]
-        if weights[pixel] <= 0 or abs(distances[k]) > band:
-            continue
-        if weight[voxel] > 0 and votes[voxel] < max_votes:
-            add_vote(evidence, votes, voxel, frame_votes.log_p, rows[pixel], weights[pixel], cap, seed)
+    Args:
+        count: B.
+        indices: (B,) buffer indices, each once.
+        buffers, camera, limits, depth, votes, dither, moment: As of ``fusion.fuse_blocks``.
+        max_votes: Voxels with so many take none.
+    """
+    ...

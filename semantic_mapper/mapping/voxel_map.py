@@ -190,7 +190,6 @@ class VoxelMap:
             rgb = np.ascontiguousarray(frame.rgb)
             for blocks in self.changing(packed):
                 fuse_blocks(
-                    len(blocks),
                     blocks,
                     self._grid.buffers(),
                     camera,

@@ -10,7 +10,6 @@ from semantic_mapper.mapping.block_index import (
     has_room,
     insert_blocks,
     make_block_index,
-    pack_key,
     pack_keys,
     unpack_keys,
 )
@@ -25,7 +24,6 @@ def test_packing_is_lossless_and_sorts_like_the_triples(keys: list[tuple[int, in
     packed = pack_keys(array)
     assert (unpack_keys(packed) == array).all()
     assert [tuple(k) for k in unpack_keys(np.sort(packed)).tolist()] == sorted(keys)
-    assert pack_key(*keys[0]) == packed[0]
 
 
 @given(triples)

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numba import njit
 
 from semantic_mapper.config import VirtualViewConfig, VoxelMapConfig
-from semantic_mapper.mapping.evidence import PROBABILITY_FLOOR, STEPS_PER_NAT, add_vote, evidence_scale
+from semantic_mapper.mapping.evidence import DITHER, PROBABILITY_FLOOR, STEPS_PER_NAT, add_votes_in_turn
 from semantic_mapper.mapping.map_file import describe_map
 from semantic_mapper.mapping.map_manifest import encode_manifest, parse_manifest
 from semantic_mapper.mapping.readout import decide
@@ -23,23 +22,31 @@ from tests.mapping.test_voxel_map import same
 from tests.mapping.views import INTRINSICS, LABELS, plane_depth, small_map, sure
 
 
-@njit
-def vote_often(evidence, votes, log_p, weights, cap, first):
-    for n in range(len(weights)):
-        add_vote(evidence, votes, 0, log_p, n % len(log_p), weights[n], cap, first + n)
-
-
-@njit
-def sum_of(evidence, votes):
-    return evidence[0] * evidence_scale(evidence, votes[0])
-
-
 def after(dtype: type, p: np.ndarray, weights: np.ndarray, cap: float = 255.0, first: int = 0) -> np.ndarray:
-    """Sum of log probabilities (L,) that a voxel says after votes of rows ``p`` in turns."""
-    evidence, votes = np.zeros((1, p.shape[1]), dtype), np.zeros(1, np.float64)
-    vote_often(evidence, votes, np.log(p).astype(dtype if dtype != np.int16 else np.float32), weights, cap, first)
-    assert votes[0] == pytest.approx(min(weights.sum(dtype=np.float64), cap), rel=1e-4)
-    return sum_of(evidence, votes) / votes[0]
+    """Mean of log probabilities (L,) that a voxel holds after votes of rows ``p`` in turns."""
+    rows = np.resize(p, (len(weights), p.shape[1]))
+    if dtype == np.float64:
+        return exact_mean(np.log(rows), weights, cap)
+    evidence, votes = np.zeros((1, 1, p.shape[1]), dtype), np.zeros((1, 1), np.float32)
+    add_votes_in_turn(evidence, votes, np.log(rows).astype(np.float32), weights, cap, DITHER, first)
+    assert votes[0, 0] == pytest.approx(min(weights.sum(dtype=np.float64), cap), rel=1e-3)
+    return evidence[0, 0] / (STEPS_PER_NAT if dtype == np.int16 else votes[0, 0])
+
+
+def exact_mean(log_p: np.ndarray, weights: np.ndarray, cap: float) -> np.ndarray:
+    """The same in plain numpy and float64: past the cap, old votes fade."""
+    total, votes = np.zeros(log_p.shape[1]), 0.0
+    for row, weight in zip(log_p, weights.astype(np.float64), strict=True):
+        keep = (cap - weight) / votes if votes + weight > cap else 1.0
+        total, votes = keep * total + weight * row, min(votes + weight, cap)
+    return total / votes
+
+
+@pytest.mark.parametrize("cap", [255.0, 7.0])
+def test_sums_of_floats_are_those_of_plain_numpy(cap: float, rng: np.random.Generator) -> None:
+    p = np.maximum(rng.dirichlet(np.full(5, 0.3), 200), PROBABILITY_FLOOR)
+    weights = rng.uniform(0.1, 1.0, 200).astype(np.float32)
+    np.testing.assert_allclose(after(np.float32, p, weights, cap), after(np.float64, p, weights, cap), rtol=1e-5)
 
 
 def test_many_votes_too_small_for_a_step_add_up_to_what_they_say() -> None:

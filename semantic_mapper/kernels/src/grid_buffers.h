@@ -5,7 +5,8 @@
 
 #define BLOCK_SIDE 8
 #define BLOCK_VOXELS 512
-#define MAX_CLASSES 256 /* class ids are bytes */
+#define MAX_CLASSES 256   /* class ids are bytes */
+#define LARGEST_STEP 0.95 /* of the TSDF: two neighbours that differ by more straddle a depth edge, not a surface */
 
 typedef struct {
     I32 keys;          /* (capacity, 3) block coordinates */

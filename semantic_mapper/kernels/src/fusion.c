@@ -1,0 +1,132 @@
+/* Fusion of one frame: TSDF, color and class evidence in one pass; see mapping/fusion.py. */
+#include "voxel_lookup.h"
+
+#define PROBABILITY_FLOOR 1e-4f /* of mapping/evidence.py */
+#define FULL_TRUST_RANGE_M 2.0f /* of mapping/fusion.py, as the next */
+#define LEAST_COSINE 0.2f
+
+typedef struct {
+    F32 probabilities, logs; /* (K, L) */
+    U8 proper;               /* (K,) bool */
+} LogRowsArguments;
+
+/* Floored log of rows, and whether each is of numbers that are not negative and sum to 1. */
+KERNEL(log_probability_rows, LogRowsArguments) {
+    int64_t classes = a->probabilities.shape[1];
+    for (int64_t n = start; n < stop; n++) {
+        const float *row = a->probabilities.data + n * classes;
+        float *logs = a->logs.data + n * classes, least = 0.0f;
+        double total = 0.0;
+        for (int64_t c = 0; c < classes; c++) {
+            total += row[c];
+            least = min_f(least, row[c]);
+            logs[c] = logf(max_f(row[c], PROBABILITY_FLOOR));
+        }
+        a->proper.data[n] = fabs(total - 1.0) < 1e-2 && least >= 0;
+    }
+    return 0;
+}
+
+/* Nearness of a look, 0 where the depth is no measurement. */
+static inline float near_weight(float z, float far) {
+    float near = FULL_TRUST_RANGE_M / z, weight = min_f(near * near, 1.0f);
+    return ((z > 0) & (z <= far)) ? weight : 0.0f;
+}
+
+/* Vote weights of row v (W,): |cos| between ray and surface normal, from four neighbours, and nearness. */
+static void weigh_row(const F32 *depth, int64_t v, const Camera *camera, float far, float *restrict weights) {
+    int64_t height = depth->shape[0], width = depth->shape[1], last = width - 1;
+    const float *row = depth->data + v * width;
+    const float *up = depth->data + max_i(v - 1, 0) * width, *down = depth->data + min_i(v + 1, height - 1) * width;
+    bool inside = 0 < v && v < height - 1;
+    float fx = (float)camera->fx, fy = (float)camera->fy, cx = (float)camera->cx;
+    float y = ((float)v - (float)camera->cy) / fy;
+    for (int64_t u = 1; u < last; u++) { /* without branches, for eight at a time */
+        float z = row[u], left = row[u - 1], right = row[u + 1];
+        float x = ((float)(int32_t)u - cx) / fx;
+        /* With slopes dz/du, dz/dv the normal is (fx dz/du, fy dz/dv, -(z + x fx dz/du + y fy dz/dv)), unnormalised;
+         * its product with the ray (x, y, 1) is -z. */
+        float nx = fx * 0.5f * (right - left), ny = fy * 0.5f * (down[u] - up[u]);
+        float nz = z + x * nx + y * ny;
+        float cosine = z / sqrtf((nx * nx + ny * ny + nz * nz) * (x * x + y * y + 1.0f));
+        bool known = inside & (left > 0) & (right > 0) & (up[u] > 0) & (down[u] > 0) & (cosine > LEAST_COSINE);
+        float near = FULL_TRUST_RANGE_M / z, weight = (known ? cosine : LEAST_COSINE) * min_f(near * near, 1.0f);
+        weights[u] = ((z > 0) & (z <= far)) ? weight : 0.0f;
+    }
+    weights[0] = LEAST_COSINE * near_weight(row[0], far);
+    weights[last] = LEAST_COSINE * near_weight(row[last], far);
+}
+
+typedef struct {
+    F32 depth; /* (H, W) metres */
+    I32 rows;  /* (H, W), -1 = unknown */
+    U8 proper; /* (K,) bool, of log_probability_rows */
+    Camera camera;
+    double depth_max; /* metres */
+    F32 weights;      /* (H, W) to fill */
+    I64 bad;          /* (H,) zeros; to count known pixels of each row whose probabilities are not proper */
+} VoteWeightsArguments;
+
+KERNEL(vote_weights, VoteWeightsArguments) {
+    int64_t width = a->depth.shape[1];
+    for (int64_t v = start; v < stop; v++) {
+        float *weights = a->weights.data + v * width;
+        weigh_row(&a->depth, v, &a->camera, (float)a->depth_max, weights);
+        for (int64_t u = 0; u < width; u++) {
+            int32_t row = a->rows.data[v * width + u];
+            if (row < 0) {
+                weights[u] = 0;
+            } else if (!a->proper.data[row] && weights[u] > 0) {
+                weights[u] = 0;
+                a->bad.data[v]++;
+            }
+        }
+    }
+    return 0;
+}
+
+typedef struct {
+    I32 indices; /* (B,) buffer indices of blocks, each once */
+    GridBuffers buffers;
+    Camera camera;
+    FusionLimits limits;
+    F32 depth; /* (H, W) metres */
+    U8 rgb;    /* (H, W, 3) */
+    F32 trust; /* (H, W) weight of each depth, or (0, 0): 1 */
+    Votes votes;
+    F32 dither; /* see evidence.h */
+    int64_t moment;
+} FuseArguments;
+
+static void fuse_block(const FuseArguments *a, int64_t block, const VoxelOffsets *offsets) {
+    const GridBuffers *buffers = &a->buffers;
+    const int32_t *key = buffers->keys.data + 3 * block;
+    float truncation = (float)a->limits.truncation, band = (float)a->limits.vote_band;
+    float cap = (float)a->limits.max_weight;
+    bool weighted = a->trust.shape[0] > 0;
+    int64_t classes = a->votes.log_p.shape[1];
+    uint64_t seed = dither_seed(key, a->moment);
+    VoxelsInView found;
+    int64_t count = look_up_voxels(key, offsets, &a->camera, a->limits.voxel_size, &a->depth, truncation,
+                                   (float)a->limits.depth_max, &found);
+    for (int64_t k = 0; k < count; k++) {
+        int64_t voxel = found.voxel[k], pixel = found.pixel[k], at = block * BLOCK_VOXELS + voxel;
+        float *tsdf = buffers->tsdf.data + at, *color = buffers->color.data + 3 * at;
+        float old = buffers->weight.data[at], new = weighted ? a->trust.data[pixel] : 1.0f;
+        float fraction = 1.0f / (old + new);
+        *tsdf = (old * *tsdf + new * min_f(found.distance[k] / truncation, 1.0f)) * fraction;
+        for (int c = 0; c < 3; c++) color[c] = (old * color[c] + new * a->rgb.data[3 * pixel + c]) * fraction;
+        buffers->weight.data[at] = min_f(old + new, cap);
+        float weight = a->votes.weights.data[pixel];
+        if (weight > 0 && fabsf(found.distance[k]) <= band)
+            add_vote(buffers, at, a->votes.log_p.data + a->votes.rows.data[pixel] * classes, weight, cap,
+                     a->dither.data, first_dither(seed, voxel));
+    }
+}
+
+KERNEL(fuse_frame_into_blocks, FuseArguments) {
+    VoxelOffsets offsets;
+    find_offsets(&a->camera, a->limits.voxel_size, &offsets);
+    for (int64_t i = start; i < stop; i++) fuse_block(a, a->indices.data[i], &offsets);
+    return 0;
+}

@@ -1,0 +1,51 @@
+/* Blocks without the voxels that hold nothing, one behind the other; see PackedBlocks of mapping/block_store.py. */
+#pragma once
+
+#include <string.h>
+
+#include "grid_buffers.h"
+
+#define MASK_BYTES (BLOCK_VOXELS / 8)
+#define MASK_FLOATS (2 * MASK_BYTES / 4) /* both masks, in units of float32 */
+
+/* The voxels of B blocks: BlockValues of mapping/block_store.py. */
+typedef struct {
+    F32 tsdf, weight;  /* (B, 512) */
+    F32 color;         /* (B, 512, 3) */
+    AnyArray evidence; /* (B, 512, L) float32 or int16 */
+    F32 votes;         /* (B, 512) */
+} BlockValues;
+
+/* Where the parts of one packed block lie. */
+typedef struct {
+    uint8_t *measured, *voted;     /* bit masks of 512 bits, of a byte the highest first */
+    float *tsdf, *weight, *color;  /* of the voxels that were measured */
+    float *evidence, *votes;       /* of those with votes */
+} PackedBlock;
+
+static inline bool in_mask(const uint8_t *mask, int64_t voxel) { return mask[voxel >> 3] >> (7 - (voxel & 7)) & 1; }
+
+static inline int64_t count_mask(const uint8_t *mask) {
+    int64_t count = 0;
+    for (int i = 0; i < MASK_BYTES; i++) count += __builtin_popcount(mask[i]);
+    return count;
+}
+
+/* How many float32 the evidence of one voxel takes up: whole ones. */
+static inline int64_t evidence_floats(int64_t classes, int64_t itemsize) { return (classes * itemsize + 3) / 4; }
+
+/* The parts of a packed block with so many measured and voted voxels. */
+static inline PackedBlock packed_parts(float *data, int64_t measured, int64_t voted, int64_t width) {
+    float *tsdf = data + MASK_FLOATS, *evidence = tsdf + 5 * measured;
+    uint8_t *masks = (uint8_t *)data;
+    return (PackedBlock){masks,    masks + MASK_BYTES,     tsdf, tsdf + measured, tsdf + 2 * measured,
+                         evidence, evidence + voted * width};
+}
+
+/* The parts of a packed block as its masks say; false where it has not the size that they ask for. */
+static inline bool open_packed(float *data, int64_t floats, int64_t width, PackedBlock *block) {
+    if (floats < MASK_FLOATS) return false;
+    int64_t measured = count_mask((uint8_t *)data), voted = count_mask((uint8_t *)data + MASK_BYTES);
+    *block = packed_parts(data, measured, voted, width);
+    return floats == MASK_FLOATS + 5 * measured + (width + 1) * voted;
+}
