@@ -32,7 +32,7 @@ HELD_OUT_HUES = ((0.28, 0.38), (0.60, 0.70), (0.86, 0.96))
 
 
 class Pattern(IntEnum):
-    """How a material varies over a surface; ``textures`` and ``fast_textures`` both draw these."""
+    """How a material varies over a surface; ``textures`` and fast_textures.h both draw these."""
 
     PLAIN = 0  # low-contrast clouds
     WOOD = 1  # grain along the longest side

@@ -15,10 +15,16 @@ from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.scenes.config import NoiseConfig
 from semantic_mapper.scenes.fast_cast import NEAR_M
-from semantic_mapper.scenes.fast_shade import CORNER_DIM, CORNER_REACH_M, LIGHT_RADIUS_SQ, SHADOW_BIAS_M
+from semantic_mapper.scenes.fast_shade import (
+    CORNER_DIM,
+    CORNER_REACH_M,
+    LIGHT_RADIUS_SQ,
+    SHADOW_BIAS_M,
+    LightArrays,
+)
 from semantic_mapper.scenes.primitives import Shape
 from semantic_mapper.scenes.render import RenderedView, Sensor, finish_view
-from semantic_mapper.scenes.scene import LightArrays, Scene, kernel_arrays
+from semantic_mapper.scenes.scene import Scene, kernel_arrays
 from semantic_mapper.scenes.shots import Shot
 from semantic_mapper.scenes.textures import albedo
 from semantic_mapper.types import CameraIntrinsics, Float64
@@ -171,7 +177,7 @@ def _interval_of_quadric(o: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor
 
 
 def _interval_of_cone(o: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where rays are inside the lower half of the cone of radius 0.8 - 0.2 z; see ``fast_cast._hit_frustum``."""
+    """Where rays are inside the lower half of the cone of radius 0.8 - 0.2 z; see ``hit_frustum`` of fast_cast.h."""
     radius, slope = 0.8 - 0.2 * o[..., 2], -0.2 * d[..., 2]
     a = (d[..., :2] ** 2).sum(-1) - slope**2
     b = (o[..., :2] * d[..., :2]).sum(-1) - radius * slope
@@ -232,7 +238,7 @@ def _shade_points(
 
 
 def _openness(t: _Tensors, world: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:
-    """Share of the ambient light that reaches points (N, 3); see ``fast_shade._openness``."""
+    """Share of the ambient light that reaches points (N, 3); see ``openness`` of fast_shade.c."""
     low, high = world / CORNER_REACH_M, (t.room - world) / CORNER_REACH_M
     share = (1 - CORNER_DIM / (1 + low**2)) * (1 - CORNER_DIM / (1 + high**2))
     return torch.where(normal.abs() < 0.7, share, 1.0).prod(-1)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.scenes.fast_cast import cast_pixels
+from semantic_mapper.scenes.fast_shade import LightArrays, MaterialArrays, PrimitiveArrays
 from semantic_mapper.scenes.materials import MaterialTable
 from semantic_mapper.scenes.primitives import Primitives
 from semantic_mapper.types import Float32, Float64
@@ -64,44 +64,8 @@ class Scene:
         return ROOMS
 
 
-class PrimitiveArrays(NamedTuple):
-    """What the compiled shading reads of ``Primitives``."""
-
-    shape: np.ndarray
-    center: Float64
-    half: Float64
-    rotation: Float64
-    material: np.ndarray
-
-
-class MaterialArrays(NamedTuple):
-    """What it reads of ``MaterialTable``."""
-
-    pattern: np.ndarray
-    color_a: Float64
-    color_b: Float64
-    scale_m: Float64
-    seed: np.ndarray
-    emission: Float64
-    gloss: Float64
-    mirror: Float64
-
-
-class LightArrays(NamedTuple):
-    """What it reads of ``Lights``, and the size (3,) of the room."""
-
-    position: Float64
-    color: Float64
-    shadow: Float32
-    softness: Float64
-    ambient: Float64
-    room: Float64
-    low: Float32
-    high: Float32
-
-
 def kernel_arrays(scene: Scene) -> tuple[PrimitiveArrays, MaterialArrays, LightArrays]:
-    """The scene as named tuples of arrays, which compiled functions take as arguments."""
+    """The scene as named tuples of arrays, which kernels take as arguments."""
     p, m, light = scene.primitives, scene.materials, scene.lights
     return (
         PrimitiveArrays(p.shape, p.center, p.half, p.rotation, p.material),

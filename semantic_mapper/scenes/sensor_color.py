@@ -5,16 +5,15 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from semantic_mapper.geometry import invert_pose
-from semantic_mapper.kernel_cache import kernel
+from semantic_mapper.geometry import expect_shape, invert_pose
+from semantic_mapper.kernels import kernel
 from semantic_mapper.scenes.config import NoiseConfig
 from semantic_mapper.scenes.shots import Shot
-from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 _TABLE_SIZE = 4096
 _TABLE_TOP = 4.0  # linear light that the tone table ends at
 _WELL_EXPOSED = 0.42  # mean linear light that the automatic exposure aims at
-_TAPS = 7  # samples along the motion of a pixel
 _LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 
@@ -44,74 +43,82 @@ def expose(
     mean = float(moved[::4, ::4].mean(axis=(0, 1)) @ _LUMA)
     auto = float(np.clip(_WELL_EXPOSED / max(mean, 1e-3), 0.4, 3.0)) ** config.auto_exposure
     gain = (shot.gain * auto).astype(np.float32)
-    grain = rng.standard_normal(linear.shape, np.float32)
+    noise = rng.standard_normal(linear.shape, np.float32)
     # Noise scales with the gain that the camera applies to what reaches the sensor.
-    shot_noise = np.float32(config.shot_noise * shot.iso * max(auto, 1.0))
-    read_noise = np.float32(config.read_noise * np.sqrt(shot.iso) * max(auto, 1.0))
+    shot_noise = config.shot_noise * shot.iso * max(auto, 1.0)
+    read_noise = config.read_noise * float(np.sqrt(shot.iso)) * max(auto, 1.0)
     table = _tone_table(shot.contrast)
-    corner = np.float32(shot.vignetting)
-    return _develop(moved, grain, gain, corner, np.float32(shot.saturation), shot_noise, read_noise, table)
+    return _develop(moved, noise, gain, shot.vignetting, shot.saturation, shot_noise, read_noise, table)
 
 
 def blur_motion(linear: Float32, depth_m: Float32, intrinsics: CameraIntrinsics, shot: Shot) -> Float32:
-    """Mean of ``_TAPS`` samples of (H, W, 3) along each pixel's motion while the shutter is open."""
+    """Mean of 7 samples of (H, W, 3) along each pixel's motion while the shutter is open."""
     if np.array_equal(shot.T_open_close, np.eye(4)):
         return linear
     i = intrinsics
-    return _blur(linear, depth_m, invert_pose(shot.T_open_close), i.fx, i.fy, i.cx, i.cy)
-
-
-@kernel(error_model="numpy")
-def _blur(linear, depth_m, T_close_open, fx, fy, cx, cy):  # type: ignore[no-untyped-def]
-    height, width = depth_m.shape
-    out = linear.copy()
-    R, t = T_close_open[:3, :3], T_close_open[:3, 3]
-    for v in range(height):
-        for u in range(width):
-            z = depth_m[v, u]
-            if z <= 0:
-                continue
-            x, y = (u - cx) / fx * z, (v - cy) / fy * z
-            depth_then = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
-            if depth_then <= 0.02:
-                continue
-            du = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]) / depth_then * fx + cx - u
-            dv = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]) / depth_then * fy + cy - v
-            if du * du + dv * dv < 0.25:
-                continue
-            r, g, b = 0.0, 0.0, 0.0
-            for k in range(_TAPS):
-                share = k / (_TAPS - 1) - 0.5
-                col = min(max(int(np.floor(u + share * du + 0.5)), 0), width - 1)
-                row = min(max(int(np.floor(v + share * dv + 0.5)), 0), height - 1)
-                r += linear[row, col, 0]
-                g += linear[row, col, 1]
-                b += linear[row, col, 2]
-            out[v, u, 0], out[v, u, 1], out[v, u, 2] = r / _TAPS, g / _TAPS, b / _TAPS
+    expect_shape(linear, f"{i.height} {i.width} 3", "linear")
+    expect_shape(depth_m, f"{i.height} {i.width}", "depth_m")
+    linear, depth_m, out = np.ascontiguousarray(linear), np.ascontiguousarray(depth_m), linear.copy()
+    T_close_open = np.ascontiguousarray(invert_pose(shot.T_open_close), np.float64)
+    _blur_motion(linear, depth_m, T_close_open, i.fx, i.fy, i.cx, i.cy, out)
     return out
 
 
-@kernel(error_model="numpy")
-def _develop(linear, grain, gain, corner, saturation, shot_noise, read_noise, table):  # type: ignore[no-untyped-def]
-    height, width, _ = linear.shape
-    out = np.empty((height, width, 3), np.uint8)
-    scale = np.float32((table.shape[0] - 1) / np.sqrt(_TABLE_TOP))
-    last = table.shape[0] - 1
-    row_span, col_span = np.float32(2.0 / (height - 1 + 1e-6)), np.float32(2.0 / (width - 1 + 1e-6))
-    for v in range(height):
-        y = v * row_span - np.float32(1.0)
-        for u in range(width):
-            x = u * col_span - np.float32(1.0)
-            light = np.float32(1.0) - corner * np.float32(0.5) * (x * x + y * y)
-            r, g, b = linear[v, u, 0] * gain[0], linear[v, u, 1] * gain[1], linear[v, u, 2] * gain[2]
-            grey = np.float32(0.299) * r + np.float32(0.587) * g + np.float32(0.114) * b
-            for i in range(3):
-                value = r if i == 0 else (g if i == 1 else b)
-                value = max((grey + saturation * (value - grey)) * light, np.float32(0.0))
-                value += grain[v, u, i] * np.sqrt(shot_noise * value + read_noise * read_noise)
-                position = np.sqrt(max(value, np.float32(0.0))) * scale + np.float32(0.5)
-                out[v, u, i] = table[min(int(position), last)]
+def _develop(
+    linear: Float32,
+    noise: Float32,
+    gain: Float32,
+    corner: float,
+    saturation: float,
+    shot_noise: float,
+    read_noise: float,
+    table: UInt8,
+) -> UInt8:
+    """(H, W, 3) uint8 of linear RGB (H, W, 3) and as many numbers of the normal distribution.
+
+    Args:
+        linear, noise: (H, W, 3) float32.
+        gain: (3,) float32.
+        corner, saturation, shot_noise, read_noise: Rounded to float32.
+        table: (T,) uint8 grey levels; see ``_tone_table``.
+    """
+    out = np.empty(linear.shape, np.uint8)
+    scale = (len(table) - 1) / _TABLE_TOP**0.5
+    linear = np.ascontiguousarray(linear)
+    develop_image(linear, noise, gain, corner, saturation, shot_noise, read_noise, scale, table, out)
     return out
+
+
+@kernel
+def _blur_motion(
+    linear: Float32,
+    depth_m: Float32,
+    T_close_open: Float64,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    out: Float32,
+) -> None:
+    """Write the mean of samples of ``linear`` (H, W, 3) along each pixel's motion to ``out``, which is a copy of it."""
+    ...
+
+
+@kernel
+def develop_image(
+    linear: Float32,
+    noise: Float32,
+    gain: Float32,
+    corner: float,
+    saturation: float,
+    shot_noise: float,
+    read_noise: float,
+    scale: float,
+    table: UInt8,
+    out: UInt8,
+) -> None:
+    """Write ``out``; see ``_develop``. ``scale``: entries of the table a square root of linear light."""
+    ...
 
 
 def _tone_table(contrast: float) -> UInt8:

@@ -1,4 +1,4 @@
-"""The procedural patterns in plain torch; ``fast_textures`` holds the compiled twins."""
+"""The procedural patterns in plain torch; fast_textures.h holds the compiled twins."""
 
 from __future__ import annotations
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semantic_mapper.geometry import check_pose
+from semantic_mapper.errors import ShapeError
+from semantic_mapper.geometry import check_pose, invert_pose
 from semantic_mapper.scenes import (
     CameraPathConfig,
     NoiseConfig,
@@ -18,10 +19,11 @@ from semantic_mapper.scenes import (
     render_view,
 )
 from semantic_mapper.scenes.pose_noise import drifting_poses
+from semantic_mapper.scenes.primitives import rotation_x, rotation_z
 from semantic_mapper.scenes.sensor_color import blur_motion, develop, expose
 from semantic_mapper.scenes.sensor_depth import STEREO_SENSORS, depth_edges, hidden_from_other_eye, measure_depth
 from semantic_mapper.scenes.shots import Shot, sequence_shots
-from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 CAMERA = CameraIntrinsics(fx=220.6, fy=220.6, cx=159.5, cy=119.5, width=320, height=240)
 SIZE = (240, 320)
@@ -168,6 +170,77 @@ def test_motion_blur_follows_the_motion_and_spares_what_is_far() -> None:
     T[:2, 3] = 0.0, 0.05
     up = blur_motion(linear, flat(2.0), CAMERA, shot(T_open_close=T))
     np.testing.assert_allclose(up[20:-20], linear[20:-20], atol=1e-6)  # along the line itself nothing changes
+
+
+def plain_blur(linear: Float32, depth_m: Float32, T_close_open: Float64) -> Float32:
+    """``blur_motion`` in numpy, for 7 samples."""
+    height, width = depth_m.shape
+    v, u = np.indices(depth_m.shape)
+    z = depth_m.astype(np.float64)
+    point = np.stack(((u - CAMERA.cx) / CAMERA.fx * z, (v - CAMERA.cy) / CAMERA.fy * z, z), -1)
+    then = point @ T_close_open[:3, :3].T + T_close_open[:3, 3]
+    safe = np.where((z > 0) & (then[..., 2] > 0.02), then[..., 2], np.nan)
+    du, dv = (then[..., 0] / safe * CAMERA.fx + CAMERA.cx - u, then[..., 1] / safe * CAMERA.fy + CAMERA.cy - v)
+    moved = du**2 + dv**2 >= 0.25
+    du, dv = np.where(moved, du, 0), np.where(moved, dv, 0)
+    total = np.zeros(linear.shape)
+    for moment in np.arange(7) / 6 - 0.5:
+        column = np.clip(np.floor(u + moment * du + 0.5), 0, width - 1).astype(int)
+        row = np.clip(np.floor(v + moment * dv + 0.5), 0, height - 1).astype(int)
+        total += linear[row, column]
+    return np.where(moved[..., None], total / 7, linear).astype(np.float32)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_motion_blur_is_as_in_numpy(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    linear = rng.random((*SIZE, 3), np.float32)
+    depth_m = rng.uniform(-0.2, 5.0, SIZE).astype(np.float32)  # without a measurement, and behind the camera later on
+    T = np.eye(4)
+    T[:3, :3] = rotation_z(float(rng.normal(0, 0.02))) @ rotation_x(float(rng.normal(0, 0.02)))
+    T[:3, 3] = rng.normal(0, 0.05, 3)
+    blurred = blur_motion(linear, depth_m, CAMERA, shot(T_open_close=T))
+    expected = plain_blur(linear, depth_m, invert_pose(T))
+    off = np.abs(blurred - expected).max(-1) > 1e-6
+    assert off.mean() < 1e-4  # samples on the edge between two pixels may fall either way
+    assert (blurred != linear).any(-1).mean() > 0.5
+
+
+def test_motion_blur_refuses_a_depth_image_of_another_size() -> None:
+    T = np.eye(4)
+    T[0, 3] = 0.05
+    with pytest.raises(ShapeError, match="depth_m"):
+        blur_motion(np.zeros((*SIZE, 3), np.float32), flat(2.0)[1:], CAMERA, shot(T_open_close=T))
+
+
+def plain_expose(linear: Float32, how: Shot, noise: Float32) -> np.ndarray:
+    """Grey levels (H, W, 3), before rounding, of a camera with a neutral tone curve."""
+    y, x = np.meshgrid(np.linspace(-1, 1, SIZE[0]), np.linspace(-1, 1, SIZE[1]), indexing="ij")
+    light = linear * how.gain
+    grey = (light @ [0.299, 0.587, 0.114])[..., None]
+    light = np.maximum(
+        (grey + how.saturation * (light - grey)) * (1 - how.vignetting / 2 * (x**2 + y**2))[..., None], 0
+    )
+    light = light + noise * np.sqrt(0.002 * light + 0.01**2)
+    light = np.clip(light, 0, 4)
+    return np.minimum(light * (1 + light / 9) / (1 + light), 1) ** (1 / 2.2) * 255
+
+
+def test_exposure_is_as_in_numpy() -> None:
+    rng = np.random.default_rng(0)
+    linear = rng.gamma(0.5, 1.0, (*SIZE, 3)).astype(np.float32)
+    config = NoiseConfig(auto_exposure=0.0, shot_noise=0.002, read_noise=0.01)
+    how = shot(gain=np.array([0.8, 1.0, 1.3]), saturation=0.7, vignetting=0.3)
+    expected = plain_expose(linear, how, np.random.default_rng(0).standard_normal(linear.shape, np.float32))
+    # The tone curve is a table of 4096 entries: near black one is up to 3 grey levels wide.
+    assert np.quantile(np.abs(taken(linear, how, config) - expected), 0.99) < 1.0
+
+
+def test_light_that_is_no_number_is_black() -> None:
+    linear = np.full((*SIZE, 3), 0.3, np.float32)
+    linear[0, 0, 1] = np.nan
+    picture = taken(linear, shot())
+    assert (picture[0, 0] == 0).all() and (picture[0, 1:] > 0).all()
 
 
 def test_exposure_and_white_balance_drift_along_a_sequence_without_jumps() -> None:

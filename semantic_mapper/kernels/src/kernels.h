@@ -25,6 +25,7 @@ ARRAY(int16_t, I16);
 ARRAY(uint16_t, U16);
 ARRAY(int32_t, I32);
 ARRAY(int64_t, I64);
+ARRAY(uint64_t, U64);
 ARRAY(void, AnyArray);
 
 /* KERNEL(name, Arguments) { ... } defines one with `start`, `stop` and `a`; NAME_size lets Python check the struct. */
@@ -43,6 +44,9 @@ static inline double max_d(double a, double b) { return b > a ? b : a; }
 /* Conversions are undefined in C beyond the range of the type: NaN and what no int64 holds become the lowest here. */
 static inline int64_t to_int(double x) { return x >= -0x1p63 && x < 0x1p63 ? (int64_t)x : INT64_MIN; }
 static inline int64_t floor_int(double x) { return to_int(floor(x)); }
+
+/* A whole number as one of n pixels; NaN is the first. */
+static inline int64_t clip_pixel(double x, int64_t n) { return x > 0 ? (x < (double)n ? (int64_t)x : n - 1) : 0; }
 
 /* A color value as a byte, rounded and clipped; NaN becomes 0. */
 static inline uint8_t to_byte(double x) {
