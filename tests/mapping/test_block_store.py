@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.mapping.block_store import BLOCK_VOXELS, BlockStore, BlockValues
+from semantic_mapper.mapping.block_store import (
+    BLOCK_VOXELS,
+    BlockStore,
+    BlockValues,
+    pack_blocks,
+    unpack_block,
+)
 
 CLASSES = 3
 
@@ -154,3 +160,33 @@ def test_a_drop_that_fails_forgets_nothing():
         store.drop(np.arange(10))
     store._database.execute("PRAGMA query_only = OFF")
     expect(store, held)
+
+
+@pytest.mark.parametrize(("evidence", "classes"), [("float32", 3), ("int16", 3), ("int16", 4)])
+def test_packed_blocks_are_masks_and_the_voxels_that_they_name(evidence: str, classes: int):
+    blocks = some_blocks(6, 4, evidence)
+    blocks = blocks._replace(evidence=np.ascontiguousarray(blocks.evidence[..., np.arange(classes) % CLASSES]))
+    blocks.weight[2], blocks.votes[2] = 0, 0
+    rows = np.array([4, 2, 0], np.int32)
+    packed = pack_blocks(blocks, rows)
+    assert packed.ends[0] == 0 and len(packed.blobs()) == 3
+    for row, blob in zip(rows, packed.blobs(), strict=True):
+        measured, voted = blocks.weight[row] > 0, blocks.votes[row] > 0
+        said = blocks.evidence[row][voted]
+        padded = np.zeros((len(said), -(-classes * said.itemsize // 4) * 4 // said.itemsize), said.dtype)
+        padded[:, :classes] = said
+        parts = (blocks.tsdf[row][measured], blocks.weight[row][measured], blocks.color[row][measured], padded)
+        expected = [np.packbits(measured), np.packbits(voted), *parts, blocks.votes[row][voted]]
+        assert bytes(blob) == b"".join(part.tobytes() for part in expected)
+
+
+def test_bytes_that_are_no_packed_block_are_refused():
+    blocks = some_blocks(1, 5)
+    blob = bytes(pack_blocks(blocks, np.zeros(1, np.int32)).blobs()[0])
+    empty = BlockValues(*(np.zeros_like(values) for values in blocks))
+    for wrong in (b"", blob[:100], blob[:-4], blob[:-1], blob + bytes(4), b"\xff" * len(blob)):
+        with pytest.raises(MapError, match="packed block"):
+            unpack_block(wrong, empty, 0)
+    assert not any(values.any() for values in empty)
+    unpack_block(blob, empty, 0)
+    assert empty.tsdf.tobytes() == blocks.tsdf.tobytes()

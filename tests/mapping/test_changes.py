@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.mapping import changes as changes_module
+from semantic_mapper.mapping.block_store import BlockValues, pack_blocks
 from semantic_mapper.mapping.changes import BlockChanges, oldest_first
+from semantic_mapper.mapping.readout import decide
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from tests.mapping.grids import random_grid
 from tests.mapping.test_paging import MEMORY_MB, walk
 from tests.mapping.views import LABELS, small_map
 
@@ -130,3 +134,32 @@ def test_a_copy_is_made_compact_later_and_is_of_its_moment(memory_mb: int, evide
     assert (voxel_map.stored_blocks > 0) == (memory_mb > 0)
     with pytest.raises(MapError, match="from 0 to 12"):
         voxel_map.copy_changes(13)
+
+
+@pytest.mark.parametrize("evidence", ["float32", "int16"])
+def test_voxels_are_rounded_as_plain_numpy_rounds_them(evidence: str, rng: np.random.Generator) -> None:
+    _, buffers = random_grid(rng, evidence)
+    values = BlockValues(*(getattr(buffers, name).copy() for name in BlockValues._fields))
+    values.weight[0, :8] = 5.0
+    values.tsdf[0, :8] = (0.0, 1e-9, -1e-9, 3.0, -3.0, 0.5 / 127, -0.5 / 127, np.nan)
+    values.color[0, :4, 0] = (np.nan, -7.0, 300.0, 254.5)
+    order, ids = np.array([3, 0, 6], np.int32), np.array([9, 5, 7, 2, 0], np.uint8)
+    packed = pack_blocks(values, order)
+    rows = np.array([1, 2, 0])
+    tsdf, label, confidence = np.empty((3, 512), np.int8), np.empty((3, 512), np.uint8), np.empty((3, 512), np.uint8)
+    rgb, itemsize = np.empty((3, 512, 3), np.uint8), packed.evidence.itemsize
+    changes_module._compact_blocks(
+        packed.data, packed.ends, itemsize, rows, ids, 0.3, 2.0, tsdf, label, confidence, rgb
+    )
+    for row, block in zip(rows, order, strict=True):
+        seen, value = values.weight[block] >= 2.0, values.tsdf[block].astype(float)
+        steps = np.nan_to_num(np.rint(np.clip(value, -1, 1) * 127))
+        steps = np.where((value > 0) & (steps == 0), 1, steps)
+        np.testing.assert_array_equal(tsdf[row], np.where(seen, steps, -128))
+        color = np.nan_to_num(np.clip(values.color[block] + 0.5, 0, 255))
+        np.testing.assert_array_equal(rgb[row], np.where(seen[:, None], color, 0).astype(np.uint8))
+        for voxel in range(512):
+            best, p = -1, 0.0
+            if seen[voxel]:
+                best, p = decide(values.evidence[block, voxel], float(values.votes[block, voxel]), 0.3)
+            assert (label[row, voxel], confidence[row, voxel]) == (ids[best], int(p * 255 + 0.5))

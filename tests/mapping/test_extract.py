@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 
 from semantic_mapper.mapping import extract
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from tests.mapping.grids import random_grid
 from tests.mapping.views import around, frame, plane_depth, small_map, sphere_depth, sure
 
 CENTER = np.array([0.31, -0.17, 0.52])
@@ -59,3 +63,39 @@ def test_depth_edge_is_not_bridged_by_a_false_surface() -> None:
     z = voxel_map.points().xyz[:, 2]
     between = (z > 1.02) & (z < 1.48)
     assert between.mean() < 0.005
+
+
+@pytest.mark.parametrize("min_weight", [0.1, 4.0])
+def test_crossings_are_those_of_a_dense_grid(min_weight: float, rng: np.random.Generator) -> None:
+    index, buffers = random_grid(rng)
+    blocks = rng.permutation(len(buffers.keys)).astype(np.int32)[:7]
+    grid = cast("Any", SimpleNamespace(index=index, buffers=lambda: buffers))
+    found = extract.surface_voxels(buffers.keys[blocks], blocks, grid, min_weight)
+    low = buffers.keys.min(axis=0)
+    size = 8 * (buffers.keys.max(axis=0) - low + 2)
+    tsdf, seen, asked = np.zeros(size, np.float32), np.zeros(size, bool), np.zeros(size, bool)  # [x, y, z]
+    for n, (x, y, z) in enumerate(((buffers.keys - low) * 8).tolist()):
+        part = (slice(x, x + 8), slice(y, y + 8), slice(z, z + 8))
+        tsdf[part] = buffers.tsdf[n].reshape(8, 8, 8).T
+        seen[part] = (buffers.weight[n] >= min_weight).reshape(8, 8, 8).T
+        asked[part] = n in blocks
+    expected: list[np.ndarray] = []
+    for axis in range(3):
+        here, there = (np.moveaxis(a, axis, 0)[part] for part in (slice(-1), slice(1, None)) for a in (tsdf,))
+        both = np.moveaxis(seen, axis, 0)[:-1] & np.moveaxis(seen, axis, 0)[1:] & np.moveaxis(asked, axis, 0)[:-1]
+        both &= ((here > 0) != (there > 0)) & (np.abs(here - there) <= 0.95) & (np.abs(here) <= 0.95)
+        at = np.argwhere(both).astype(float)
+        a, b = here[both].astype(float), there[both].astype(float)
+        at[:, 0] += a / (a - b)
+        order = [axis, *(i for i in range(3) if i != axis)]
+        expected.append(at[:, np.argsort(order)])
+    points = np.concatenate(expected) + low * 8
+    assert len(found) == len(points) > 100
+    in_order = [p[np.lexsort(np.round(p, 6).T)] for p in (found, points)]
+    np.testing.assert_allclose(*in_order, atol=1e-9)
+
+
+def test_no_blocks_have_no_crossings(rng: np.random.Generator) -> None:
+    index, buffers = random_grid(rng)
+    grid = cast("Any", SimpleNamespace(index=index, buffers=lambda: buffers))
+    assert extract.surface_voxels(buffers.keys[:0], np.empty(0, np.int32), grid, 1.0).shape == (0, 3)

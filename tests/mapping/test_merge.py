@@ -10,10 +10,13 @@ import pytest
 from semantic_mapper.errors import MapError, PoseError
 from semantic_mapper.geometry import invert_pose, look_at
 from semantic_mapper.labels import make_label_set
+from semantic_mapper.mapping import merge
 from semantic_mapper.mapping.block_index import pack_keys
+from semantic_mapper.mapping.block_store import BlockValues
 from semantic_mapper.mapping.merge import count_empty
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float64
+from tests.mapping.grids import corners, random_grid, sums_of
 from tests.mapping.test_paging import MEMORY_MB, walk
 from tests.mapping.test_voxel_map import CENTER, same
 from tests.mapping.views import LABELS, around, frame, plane_depth, small_map, sphere_depth, sure
@@ -203,3 +206,68 @@ def test_maps_that_do_not_fit_are_refused(halves: tuple[VoxelMap, VoxelMap]) -> 
         a.merged(a, np.diag((1.0, 1.0, -1.0, 1.0)))
     with pytest.raises(MapError, match="max_blocks"):
         small_map(max_blocks=100).merged(a, np.eye(4))
+
+
+@pytest.mark.parametrize("evidence", ["float32", "int16"])
+def test_resampled_voxels_are_those_of_plain_numpy(evidence: str, rng: np.random.Generator) -> None:
+    index, buffers = random_grid(rng, evidence)
+    T = turned((20.0, -35.0, 50.0), (0.6, -2.3, 1.9))
+    R, t, sums = np.ascontiguousarray(T[:3, :3].T), T[:3, 3].copy(), sums_of(buffers)
+    keys = np.array([[0, 0, 0], [-1, 0, -1]], np.int32)
+    moved = merge._empty_blocks(2, 4)
+    merge._resample_blocks(2, keys, R, t, index, buffers, moved)
+    assert (moved.weight > 0).mean() > 0.3 and (moved.votes > 0).mean() > 0.2
+    for n, voxel in np.ndindex(2, 512):
+        p = R @ (keys[n] * 8 + np.array([voxel % 8, voxel // 8 % 8, voxel // 64]) - t)
+        around = [(f, at) for f, at in corners(buffers, p) if f >= 1e-6]
+        seen = [(f, at) for f, at in around if buffers.weight[at] > 0]
+        total = 1.0
+        values = [buffers.tsdf[at] for _, at in seen]
+        if values and max(values) - min(values) > 0.95:  # a depth edge: the nearest voxel alone
+            around = seen = [max(seen, key=lambda one: one[0])]
+            total = seen[0][0]
+        share = sum(f for f, _ in seen)
+        if around and share >= 0.5 * total:
+            mean = {
+                name: sum(f * getattr(buffers, name)[at] for f, at in seen) / share
+                for name in ("weight", "tsdf", "color")
+            }
+        else:
+            mean = {"weight": 0.0, "tsdf": 0.0, "color": np.zeros(3)}
+        for name, value in mean.items():
+            np.testing.assert_allclose(getattr(moved, name)[n, voxel], value, rtol=1e-5, atol=1e-6)
+        voted = [(f, at) for f, at in around if buffers.votes[at] > 0]
+        share = sum(f for f, _ in voted)
+        votes, said = 0.0, np.zeros(4)
+        if voted and share >= 0.5 * total:
+            votes = sum(f * buffers.votes[at] for f, at in voted) / share
+            said = sum(f * sums[at] for f, at in voted) / share
+        np.testing.assert_allclose(moved.votes[n, voxel], votes, rtol=1e-5)
+        np.testing.assert_allclose(moved.evidence[n, voxel], said, rtol=1e-5)
+
+
+@pytest.mark.parametrize("evidence", ["float32", "int16"])
+def test_added_voxels_are_those_of_plain_numpy(evidence: str, rng: np.random.Generator) -> None:
+    (_, buffers), (_, others) = random_grid(rng, evidence), random_grid(rng)
+    before = type(buffers)(*(values.copy() for values in buffers))
+    blocks, cap = np.array([5, 0, 8], np.int32), 6.0
+    added = BlockValues(others.tsdf[:3], others.weight[:3], others.color[:3], others.evidence[:3], others.votes[:3])
+    merge._add_block_values(3, blocks, buffers, added, cap)
+    mine, theirs = before.weight[blocks].astype(float), added.weight.astype(float)
+    new = theirs > 0
+    weight = np.where(new, mine + theirs, 1.0)
+    np.testing.assert_allclose(buffers.weight[blocks], np.where(new, np.minimum(weight, cap), mine), rtol=1e-6)
+    for name in ("tsdf", "color"):
+        a, b, tail = getattr(before, name)[blocks], getattr(added, name), (..., None) if name == "color" else (...,)
+        mean = np.where(new[tail], (mine[tail] * a + theirs[tail] * b) / weight[tail], a)
+        np.testing.assert_allclose(getattr(buffers, name)[blocks], mean, rtol=1e-5, atol=1e-6)
+    votes = before.votes[blocks].astype(float) + added.votes
+    new = added.votes > 0
+    keep = np.where(new, np.minimum(1.0, cap / np.maximum(votes, 1e-9)), 1.0)
+    np.testing.assert_allclose(buffers.votes[blocks], votes * keep, rtol=1e-6)
+    said = (sums_of(before)[blocks] + added.evidence * new[..., None]) * keep[..., None]
+    step = buffers.votes[blocks].max() / 3500 if evidence == "int16" else 1e-5
+    np.testing.assert_allclose(sums_of(buffers)[blocks], said, rtol=1e-5, atol=0.51 * step)
+    untouched = np.setdiff1d(np.arange(9), blocks)
+    for now, then in zip(buffers, before, strict=True):
+        assert now[untouched].tobytes() == then[untouched].tobytes()

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from semantic_mapper.geometry import look_at, scale_intrinsics
+from semantic_mapper.mapping.grid_buffers import GridBuffers
 from semantic_mapper.types import CameraIntrinsics
-from tests.mapping.views import INTRINSICS, around, frame, plane_depth, small_map, sphere_depth, sure
+from tests.mapping.grids import corners
+from tests.mapping.views import INTRINSICS, around, frame, plane_depth, ray_directions, small_map, sphere_depth, sure
 
 WALL = ((0.1, 0.05, 1.0), 1.013)
 
@@ -65,3 +67,28 @@ def test_views_of_another_size_agree_with_the_full_one() -> None:
     truth = plane_depth(np.eye(4), *WALL, intrinsics=small)
     assert view.depth_m.shape == (30, 40)
     assert np.abs(view.depth_m - truth)[2:-2, 2:-2].max() < 0.005
+
+
+def test_hits_lie_on_the_first_zero_of_the_interpolated_field() -> None:
+    center = np.array([0.3, -0.2, 0.5])
+    voxel_map = small_map()
+    for seq, pose in enumerate(around(center, 1.2, 12)):
+        voxel_map.integrate(frame(pose, seq=seq), sphere_depth(pose, center, 0.4), None, None)
+    small, pose = scale_intrinsics(INTRINSICS, 16, 12), around(center, 1.3, 7)[3]
+    depth = voxel_map.ray_cast(pose, small).depth_m
+    with voxel_map.locked() as grid:
+        _, rows = grid.sorted_blocks()
+        buffers = GridBuffers(*(np.ascontiguousarray(values[rows]) for values in grid.buffers()))
+
+    def field(z: float, direction: np.ndarray) -> float:
+        """TSDF at z of a ray, interpolated over the observed voxels; NaN where there is none."""
+        around = [(f, at) for f, at in corners(buffers, (pose[:3, 3] + z * direction) / 0.02) if buffers.weight[at] > 0]
+        share = sum(f for f, _ in around)
+        return sum(f * float(buffers.tsdf[at]) for f, at in around) / share if share else np.nan
+
+    directions, hits = ray_directions(small, pose), np.argwhere(depth > 0)
+    assert len(hits) > 30
+    for v, u in hits[::3]:
+        assert abs(field(depth[v, u], directions[v, u])) < 5e-3
+        before = np.array([field(z, directions[v, u]) for z in depth[v, u] - np.arange(0.01, 0.2, 0.01)])
+        assert (before > 0).any() and not (before < -0.05).any()

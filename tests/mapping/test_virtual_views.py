@@ -12,7 +12,8 @@ from semantic_mapper.geometry import invert_pose, transform
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.block_index import unpack_keys
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.mapping.surface_patches import surface_patches
+from semantic_mapper.mapping.readout import decide
+from semantic_mapper.mapping.surface_patches import SURFACE_VOXELS, surface_patches
 from semantic_mapper.mapping.virtual_views import MARGIN_M, ViewpointChooser, in_free_space
 from semantic_mapper.mapping.vote_fusion import add_votes
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -60,6 +61,26 @@ def test_need_is_one_a_voxel_without_votes_and_nothing_where_there_are_enough():
     assert (patches.need[left & inner] == 0).all()
     # A block of 16 cm has 8 x 8 voxels of the wall, in one or two layers.
     assert np.isin(patches.need[right & inner], (64, 128)).all() and (right & inner).sum() > 20
+
+
+def test_patches_are_sums_over_their_voxels():
+    made = wall_map(80)
+    near, rho = SURFACE_VOXELS / made.config.truncation_voxels, made.config.vote_discount
+    patches, state = surface_patches(made, max_votes=0.2), made.block_state()
+    keys, count = state["keys"], len(state["keys"])
+    tsdf, weight, votes = (state[name].reshape(count, 512) for name in ("tsdf", "weight", "votes"))
+    said = state["evidence"].reshape(count, 512, 3)
+    surface = (weight > 0) & (np.abs(tsdf) <= near)
+    has = surface.any(axis=1)
+    np.testing.assert_array_equal(unpack_keys(patches.packed), keys[has])
+    z, y, x = np.unravel_index(np.arange(512), (8, 8, 8))
+    for n, block in enumerate(np.flatnonzero(has)):
+        chosen = np.flatnonzero(surface[block])
+        at = keys[block] * 8 + np.stack((x, y, z), 1)[chosen]
+        np.testing.assert_allclose(patches.xyz[n], at.mean(axis=0) * made.config.voxel_size_m)
+        few = chosen[votes[block, chosen] < 0.2]
+        need = [(1 - decide(said[block, i], float(votes[block, i]), rho)[1]) / (1 + votes[block, i]) for i in few]
+        assert patches.need[n] == pytest.approx(sum(need))
 
 
 def test_the_view_looks_at_the_part_without_votes_from_free_space():
