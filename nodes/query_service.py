@@ -24,7 +24,6 @@ from semantic_mapper.mapping.changes import CopiedChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.relay import MirrorRelay
-from semantic_mapper.queries.warm_up import warm_up
 from semantic_mapper.transport.query_codec import encode_error
 from semantic_mapper.transport.query_sockets import QueryServer
 from semantic_mapper.transport.security import Keys
@@ -168,7 +167,6 @@ class QueryService:
         self._delivery_came.set()
 
     def _serve(self) -> None:
-        warm_up()
         _log.info("questions_welcome", endpoint=self.endpoint)
         while not self._closed.is_set():
             self._server.wait(_WAIT_S / 10 if self._parked else _WAIT_S)

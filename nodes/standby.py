@@ -8,7 +8,6 @@ from replay.session import PipelineBundle
 from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.mapping.grid_snapshot import warm_up as warm_up_saving
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.queries.warm_up import warm_up as warm_up_queries
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
 _WIDTH, _HEIGHT = 160, 120
@@ -16,16 +15,15 @@ _FRAMES = 3  # the second is rendered from the first; the third meets what the s
 
 
 def warm_up_mapper(bundle: PipelineBundle) -> None:
-    """Map a wall in a pipeline that is thrown away, and ask and copy a map once.
+    """Map a wall in a pipeline that is thrown away, and copy a map once.
 
-    Compiled kernels are loaded, and what computes allocates what it keeps. The pipeline of ``bundle`` is as it was.
+    What computes loads its code and allocates what it keeps. The pipeline of ``bundle`` is as it was.
     """
     own = bundle.pipeline
     pipeline = MappingPipeline(own.config, own.field, own.label_set)
     for number in range(_FRAMES):
         pipeline.step(_wall(number))
     warm_up_saving(len(own.label_set), own.config.voxel_map.evidence)
-    warm_up_queries()
 
 
 def _wall(number: int) -> PosedFrame:

@@ -12,9 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.kernels import kernel
-from semantic_mapper.mapping.numba_walk import find_block as find_block
-from semantic_mapper.mapping.numba_walk import key_part as key_part
-from semantic_mapper.mapping.numba_walk import pack_key as pack_key
 from semantic_mapper.types import Int32, Int64
 
 KEY_BITS = 21

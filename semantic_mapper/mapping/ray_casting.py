@@ -19,7 +19,6 @@ from semantic_mapper.mapping.allocation import Camera, blocks_in_view, view_boun
 from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.block_index import BlockIndex, unpack_keys
 from semantic_mapper.mapping.grid_buffers import GridBuffers
-from semantic_mapper.mapping.numba_walk import march as march
 from semantic_mapper.types import CameraIntrinsics, Float32, Int64, UInt8
 
 

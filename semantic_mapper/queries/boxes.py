@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.block_index import find_blocks
 from semantic_mapper.mapping.block_store import BlockValues
@@ -13,7 +12,7 @@ from semantic_mapper.mapping.changes import TSDF_STEPS
 from semantic_mapper.mapping.extract import triangle_mesh
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints
 from semantic_mapper.queries.checks import check_box, rows_in_box
-from semantic_mapper.queries.rays import speaker
+from semantic_mapper.queries.rays import nearest_corners
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import SurfaceVoxels, surface_points, surface_voxels
 
@@ -56,8 +55,8 @@ def mesh_in_box(snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike) -> Ma
     faces = faces[((center >= low) & (center <= high)).all(axis=1)]
     kept, renumbered = np.unique(faces, return_inverse=True)
     vertices = corners[kept]
-    places, ignore_id = vertices.astype(np.float64) / snapshot.voxel_size_m, snapshot.label_set.ignore_id
-    label, confidence, rgb = snapshot.read(*_speakers(places, snapshot.index, snapshot.voxels, ignore_id))
+    places = vertices.astype(np.float64) / snapshot.voxel_size_m  # between observed voxels: each has one
+    label, confidence, rgb = snapshot.read(*nearest_corners(places, snapshot))
     return MapMesh(vertices, renumbered.reshape(-1, 3).astype(np.int32), rgb, label, confidence)
 
 
@@ -74,11 +73,3 @@ def _values(snapshot: MapSnapshot, rows: NDArray[np.int64]) -> BlockValues:
         np.broadcast_to(none, (*tsdf.shape, 1)),
         np.broadcast_to(none, tsdf.shape),
     )
-
-
-@kernel()
-def _speakers(points, index, voxels, ignore_id):
-    slots, chosen = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
-    for n in range(len(points)):  # vertices lie between observed voxels: there always is one
-        slots[n], chosen[n] = speaker(points[n], index, voxels, ignore_id)
-    return slots, chosen

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.kernel_cache import kernel
-from semantic_mapper.mapping.block_index import key_part
-from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.queries.surface import neighbour_slots, surface_offset
-from semantic_mapper.types import Float64, UInt8
+from semantic_mapper.kernels import kernel
+from semantic_mapper.mapping.block_index import BlockIndex
+from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
+from semantic_mapper.types import Bool, Float64, Int32, Int64, UInt8
+
+ScalarT = TypeVar("ScalarT", bound=np.generic)
 
 _ROOM = 1 << 14  # voxels that the first memory for new ones holds
 
@@ -51,13 +52,11 @@ def class_surface(snapshot: MapSnapshot, wanted: NDArray[np.bool_], before: Clas
     before = before or _nothing()
     row_of = np.empty(len(snapshot.voxels.tsdf), np.int32)
     row_of[snapshot.slots] = np.arange(snapshot.block_count, dtype=np.int32)
-    source = _find_sources(snapshot.packed, snapshot.serials, snapshot.index, row_of, before.packed, before.serials)
-    return ClassSurface(
-        snapshot.packed,
-        snapshot.serials,
-        source < 0,
-        *_collect(snapshot.packed, snapshot.slots, source, snapshot.index, snapshot.voxels, wanted, before),
-    )
+    source = np.empty(snapshot.block_count, np.int64)
+    changed = np.empty(snapshot.block_count + len(before.packed), np.int64)
+    packed, serials = snapshot.packed, snapshot.serials
+    find_block_sources(packed, serials, snapshot.index, row_of, before.packed, before.serials, changed, source)
+    return ClassSurface(packed, serials, source < 0, *_collect(snapshot, source, np.ascontiguousarray(wanted), before))
 
 
 def _nothing() -> ClassSurface:
@@ -66,72 +65,69 @@ def _nothing() -> ClassSurface:
     return ClassSurface(none, none, np.empty(0, np.bool_), start, voxel, np.empty((0, 3)), byte, byte)
 
 
-@kernel()
-def _find_sources(packed, serials, index, row_of, old_packed, old_serials):
-    """Row (B,) of each block in the earlier state, -1 where it or one of its six neighbours is not what it was."""
-    source = np.full(len(packed), -1, np.int64)
-    moved = np.empty(len(packed) + len(old_packed), np.int64)
-    count, old = 0, 0
-    for row in range(len(packed)):
-        while old < len(old_packed) and old_packed[old] < packed[row]:  # gone
-            moved[count] = old_packed[old]
-            count, old = count + 1, old + 1
-        if old < len(old_packed) and old_packed[old] == packed[row]:
-            if old_serials[old] == serials[row]:
-                source[row] = old
-            old += 1
-        if source[row] < 0:
-            moved[count] = packed[row]
-            count += 1
-    moved[count : count + len(old_packed) - old] = old_packed[old:]
-    count += len(old_packed) - old
-    near = np.empty(6, np.int64)
-    for key in moved[:count]:
-        neighbour_slots(key_part(key, 0), key_part(key, 1), key_part(key, 2), index, near)
-        for slot in near:
-            if slot >= 0:
-                source[row_of[slot]] = -1
-    return source
-
-
-@kernel()
-def _collect(packed, slots, source, index, voxels, wanted, before):
+def _collect(
+    snapshot: MapSnapshot, source: Int64, wanted: Bool, before: ClassSurface
+) -> tuple[Int64, Int32, Float64, UInt8, UInt8]:
     """``start``, ``voxel``, ``point``, ``label`` and ``confidence`` of a ``ClassSurface``."""
-    start = np.zeros(len(packed) + 1, np.int64)
-    room = len(before.voxel) + _ROOM
+    start, room = np.zeros(snapshot.block_count + 1, np.int64), len(before.voxel) + _ROOM
     voxel, point = np.empty(room, np.int32), np.empty((room, 3))
     label, confidence = np.empty(room, np.uint8), np.empty(room, np.uint8)
-    near, offset = np.empty(6, np.int64), np.empty(3)
-    at = 0
-    for row in range(len(packed)):
-        if at + 512 > room:
-            room *= 2
-            voxel, point = _grown(voxel, room), _grown(point, room)
-            label, confidence = _grown(label, room), _grown(confidence, room)
-        if source[row] >= 0:
-            a, b = before.start[source[row]], before.start[source[row] + 1]
-            end = at + b - a
-            voxel[at:end], point[at:end] = before.voxel[a:b], before.point[a:b]
-            label[at:end], confidence[at:end] = before.label[a:b], before.confidence[a:b]
-            at = end
-        else:
-            slot, key = np.int64(slots[row]), packed[row]
-            x, y, z = key_part(key, 0), key_part(key, 1), key_part(key, 2)
-            neighbour_slots(x, y, z, index, near)
-            for v in range(512):
-                c = voxels.label[slot, v]
-                if wanted[c] and surface_offset(slot, v, near, voxels, offset):
-                    voxel[at], label[at], confidence[at] = v, c, voxels.confidence[slot, v]
-                    point[at, 0] = x * 8 + (v & 7) + offset[0]
-                    point[at, 1] = y * 8 + ((v >> 3) & 7) + offset[1]
-                    point[at, 2] = z * 8 + (v >> 6) + offset[2]
-                    at += 1
-        start[row + 1] = at
-    return start, voxel[:at].copy(), point[:at].copy(), label[:at].copy(), confidence[:at].copy()
+    blocks, row = (snapshot.packed, snapshot.slots, source, snapshot.index, snapshot.voxels), 0
+    while True:
+        row = collect_class_surface(*blocks, wanted, before, row, start, voxel, point, label, confidence)
+        count = int(start[row])
+        if row == snapshot.block_count:
+            return start, voxel[:count].copy(), point[:count].copy(), label[:count].copy(), confidence[:count].copy()
+        room *= 2
+        voxel, point = _enlarge(voxel, room, count), _enlarge(point, room, count)
+        label, confidence = _enlarge(label, room, count), _enlarge(confidence, room, count)
 
 
-@kernel()
-def _grown(values: Any, room: int) -> Any:
-    more = np.empty((room, *values.shape[1:]), values.dtype)
-    more[: len(values)] = values
-    return more
+def _enlarge(values: NDArray[ScalarT], room: int, count: int) -> NDArray[ScalarT]:
+    """An array of ``room`` rows with the first ``count`` of ``values``."""
+    larger = np.empty((room, *values.shape[1:]), values.dtype)
+    larger[:count] = values[:count]
+    return larger
+
+
+@kernel
+def find_block_sources(
+    packed: Int64,
+    serials: Int64,
+    index: BlockIndex,
+    row_of: Int32,
+    old_packed: Int64,
+    old_serials: Int64,
+    changed: Int64,
+    source: Int64,
+) -> None:
+    """Write the row (B,) of each block in an earlier state, -1 where it or one of its six neighbours has changed.
+
+    Args:
+        packed, serials, index: Of the B blocks.
+        row_of: (S,) row of the block that lies in each slot.
+        old_packed, old_serials: (A,) of the earlier state.
+        changed: (A + B,) scratch.
+        source: (B,) written.
+    """
+    ...
+
+
+@kernel
+def collect_class_surface(
+    packed: Int64,
+    slots: Int32,
+    source: Int64,
+    index: BlockIndex,
+    voxels: BlockVoxels,
+    wanted: Bool,
+    before: ClassSurface,
+    first_row: int,
+    start: Int64,
+    voxel: Int32,
+    point: Float64,
+    label: UInt8,
+    confidence: UInt8,
+) -> int:
+    """Write the arrays of a ``ClassSurface`` from a row on, as far as there is room; returns the row it came to."""
+    ...

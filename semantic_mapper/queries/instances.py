@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.kernel_cache import kernel
+from semantic_mapper.kernels import kernel
 from semantic_mapper.labels import STUFF_NAMES
 from semantic_mapper.mapping.block_index import unpack_keys
 from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
@@ -20,7 +20,7 @@ from semantic_mapper.queries.class_surface import ClassSurface, class_surface
 from semantic_mapper.queries.components import Components, find_components
 from semantic_mapper.queries.oriented_box import OrientedBox, upright_box
 from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.types import Float64
+from semantic_mapper.types import Float64, Int32, Int64
 
 MIN_VOXELS = 30  # 120 cm^2 of surface at 2 cm: less is mostly stray votes
 LEAST_OVERLAP = 0.1  # of an instance's voxels must be found again in what it became
@@ -56,6 +56,15 @@ class _Found(NamedTuple):
     ids: NDArray[np.int64]
     sizes: NDArray[np.int64]
     things: tuple[Instance, ...]
+
+
+class _LabelledVoxels(NamedTuple):
+    """``packed``, ``start`` and ``voxel`` of a ``ClassSurface``, and the components (N,) of its voxels."""
+
+    packed: Int64
+    start: Int64
+    voxel: Int32
+    component: Int64
 
 
 class InstanceTracker:
@@ -126,12 +135,14 @@ class InstanceTracker:
     ) -> None:
         """Write the id that each component had, and which component of the last update it still is, bit for bit."""
         sizes, count = np.diff(found.ends, prepend=0), len(found.ends)
-        held = _overlaps(
-            (last.surface.packed, last.surface.start, last.surface.voxel, last.components.component),
-            (surface.packed, surface.start, surface.voxel, found.component),
+        held = np.empty(len(surface.voxel), np.int64)
+        overlap_count = find_overlaps(
+            _LabelledVoxels(last.surface.packed, last.surface.start, last.surface.voxel, last.components.component),
+            _LabelledVoxels(surface.packed, surface.start, surface.voxel, found.component),
             count,
+            held,
         )
-        pairs, overlaps = np.unique(held, return_counts=True)
+        pairs, overlaps = np.unique(held[:overlap_count], return_counts=True)
         changed = _changed(surface.fresh, surface.start, found.component, count)
         ends = np.searchsorted(pairs, count * np.arange(len(last.ids) + 1))
         for old in np.argsort(last.ids):  # so that the oldest of several has its component first
@@ -170,39 +181,20 @@ class InstanceTracker:
         )
 
 
-@kernel()
-def _overlaps(old, new, count):
-    """``old component * count + new component`` of every voxel (M,) that has both.
+@kernel
+def find_overlaps(old: _LabelledVoxels, new: _LabelledVoxels, count: int, pairs: Int64) -> int:
+    """Write ``old component * count + new component`` of every voxel that has both; returns how many there are.
 
     Args:
-        old, new: ``packed``, ``start`` and ``voxel`` of a ``ClassSurface``, and ``component``.
+        old, new: Two states of a map.
         count: Of new components.
+        pairs: (N,) written, for the N voxels of ``new``.
     """
-    old_packed, old_start, old_voxel, old_component = old
-    packed, start, voxel, component = new
-    pairs = np.empty(len(voxel), np.int64)
-    at, old_row = 0, 0
-    for row in range(len(packed)):
-        while old_row < len(old_packed) and old_packed[old_row] < packed[row]:
-            old_row += 1
-        if old_row == len(old_packed) or old_packed[old_row] != packed[row]:
-            continue
-        j, end = old_start[old_row], old_start[old_row + 1]
-        for i in range(start[row], start[row + 1]):
-            while j < end and old_voxel[j] < voxel[i]:
-                j += 1
-            if j < end and old_voxel[j] == voxel[i] and old_component[j] >= 0 and component[i] >= 0:
-                pairs[at] = old_component[j] * count + component[i]
-                at += 1
-    return pairs[:at]
+    ...
 
 
-@kernel()
-def _changed(fresh, start, component, count):
+def _changed(fresh: NDArray[np.bool_], start: Int64, component: Int64, count: int) -> NDArray[np.bool_]:
     """Whether each component (C,) has voxels in blocks that were computed anew."""
-    changed = np.zeros(count, np.bool_)
-    for row in np.flatnonzero(fresh):
-        for i in range(start[row], start[row + 1]):
-            if component[i] >= 0:
-                changed[component[i]] = True
-    return changed
+    changed = np.zeros(count + 1, np.bool_)  # the last is for voxels without a component
+    changed[component[np.repeat(fresh, np.diff(start))]] = True
+    return changed[:count]

@@ -5,16 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.kernel_cache import kernel
-from semantic_mapper.mapping.block_index import find_block, pack_key
+from semantic_mapper.kernels import kernel
+from semantic_mapper.mapping.block_index import BlockIndex
 from semantic_mapper.queries.checks import check_points, check_positive
 from semantic_mapper.queries.occupancy import read_states
-from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.queries.surface import neighbour_slots, surface_offset
-from semantic_mapper.types import Float32, UInt8
+from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
+from semantic_mapper.types import Float32, Float64, Int64, UInt8
 
 RADIUS_VOXELS = 2.5  # default: bridges half a voxel of rounding and a little noise, not the gap between two objects
 MAX_RADIUS_VOXELS = 25.0  # work grows with its cube; ``nearest`` searches farther
@@ -57,39 +56,25 @@ def at(snapshot: MapSnapshot, points: ArrayLike, radius_m: float | None = None) 
     if radius > MAX_RADIUS_VOXELS:
         most = MAX_RADIUS_VOXELS * snapshot.voxel_size_m
         raise MapError(f"at: radius_m must be at most {most:g} in this map, got {radius_m}; `nearest` searches farther")
-    slot, voxel, distance = _nearest_voxels(p, radius, snapshot.index, snapshot.voxels)
+    slot, voxel, distance = np.empty(len(p), np.int64), np.empty(len(p), np.int64), np.empty(len(p))
+    find_nearest_voxels(p, radius, snapshot.index, snapshot.voxels, slot, voxel, distance)
     label, confidence, _ = snapshot.read(slot, voxel)
-    places: NDArray[np.int64] = np.floor(p + 0.5).astype(np.int64)
-    state = read_states(places, snapshot.index, snapshot.voxels, snapshot.voxels_per_step)
-    return PointAnswers(label, confidence, (distance * snapshot.voxel_size_m).astype(np.float32), state)
+    distance_m = (distance * snapshot.voxel_size_m).astype(np.float32)
+    return PointAnswers(label, confidence, distance_m, read_states(p, snapshot))
 
 
-@kernel()
-def _nearest_voxels(points, radius, index, voxels):
-    """Slot and voxel (N,) of the nearest surface point within ``radius`` (voxels), slot -1 = none; distances (N,)."""
-    slots, chosen = np.full(len(points), -1, np.int64), np.zeros(len(points), np.int64)
-    distances = np.full(len(points), np.inf)
-    near, offset = np.empty(6, np.int64), np.empty(3)
-    reach = radius + 0.5  # a surface point is at most half a voxel from its voxel's centre
-    for n in range(len(points)):
-        px, py, pz = points[n]
-        best = radius * radius
-        last_key, slot = np.int64(-1), np.int64(-1)
-        for z in range(int(np.ceil(pz - reach)), int(np.floor(pz + reach)) + 1):
-            for y in range(int(np.ceil(py - reach)), int(np.floor(py + reach)) + 1):
-                for x in range(int(np.ceil(px - reach)), int(np.floor(px + reach)) + 1):
-                    key = pack_key(x >> 3, y >> 3, z >> 3)
-                    if key != last_key:
-                        last_key, slot = key, find_block(index, key)
-                        if slot >= 0:
-                            neighbour_slots(x >> 3, y >> 3, z >> 3, index, near)
-                    if slot < 0:
-                        continue
-                    voxel = ((z & 7) << 6) | ((y & 7) << 3) | (x & 7)
-                    if not surface_offset(slot, voxel, near, voxels, offset):
-                        continue
-                    d = (x + offset[0] - px) ** 2 + (y + offset[1] - py) ** 2 + (z + offset[2] - pz) ** 2
-                    if d < best or (d == best and slots[n] < 0):
-                        best = d
-                        slots[n], chosen[n], distances[n] = slot, voxel, np.sqrt(d)
-    return slots, chosen, distances
+@kernel
+def find_nearest_voxels(
+    points: Float64,
+    radius: float,
+    index: BlockIndex,
+    voxels: BlockVoxels,
+    slots: Int64,
+    chosen: Int64,
+    distances: Float64,
+) -> None:
+    """Write slot (-1 = none) and voxel (N,) of the surface point nearest to points (N, 3), and its distance (N,).
+
+    All in units of voxels; surface points beyond ``radius`` do not count.
+    """
+    ...

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import LabelError, MapError
-from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.block_index import KEY_LIMIT, make_block_index, pack_keys, unpack_keys
 from semantic_mapper.mapping.block_store import BLOCK_VOXELS
@@ -23,6 +22,7 @@ from semantic_mapper.mapping.changes import BlockChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
 from semantic_mapper.queries.surface import NEAREST_STEPS
+from semantic_mapper.types import UInt8
 
 LEAST_SPARE = 256  # blocks that a new pool has room for beyond the living ones; or half of these, if that is more
 
@@ -139,19 +139,16 @@ def _write(pool: BlockVoxels, start: int, changes: BlockChanges, ignore_id: int)
     pool.label[part] = changes.label
     pool.confidence[part] = changes.confidence
     pool.rgb[part] = changes.rgb
-    _collect_classes(pool.tsdf[part], pool.weight[part], pool.label[part], ignore_id, pool.classes[part])
+    pool.classes[part] = _collect_classes(pool.tsdf[part], pool.weight[part], pool.label[part], ignore_id)
 
 
-@kernel()
-def _collect_classes(tsdf, weight, label, ignore_id, classes):
-    """Classes (B, 4) of the voxels that lie near enough to a surface to be one of its own (``surface_offset``)."""
-    for block in range(len(tsdf)):
-        classes[block] = 0
-        for voxel in range(BLOCK_VOXELS):
-            c = label[block, voxel]
-            if c == ignore_id or not weight[block, voxel] or abs(np.int64(tsdf[block, voxel])) > NEAREST_STEPS:
-                continue
-            classes[block, c >> 6] |= np.uint64(1) << np.uint64(c & 63)
+def _collect_classes(tsdf: NDArray[np.int8], weight: UInt8, label: UInt8, ignore_id: int) -> NDArray[np.uint64]:
+    """Classes (B, 4) of the voxels that lie near enough to a surface to be one of its own (``surface_voxels``)."""
+    near = (label != ignore_id) & (weight != 0) & (tsdf <= NEAREST_STEPS) & (tsdf >= -NEAREST_STEPS)
+    at = np.flatnonzero(near)
+    has_class = np.zeros((len(tsdf), 256), np.bool_)
+    has_class[at // BLOCK_VOXELS, label.ravel()[at]] = True
+    return np.packbits(has_class, axis=1, bitorder="little").view("<u8").astype(np.uint64)
 
 
 def _check(changes: BlockChanges, label_set: LabelSet) -> NDArray[np.int64]:

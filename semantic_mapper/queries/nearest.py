@@ -5,16 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.kernel_cache import kernel
-from semantic_mapper.mapping.block_index import key_part
+from semantic_mapper.kernels import kernel
+from semantic_mapper.mapping.block_index import BlockIndex
 from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_point
-from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.queries.surface import neighbour_slots, surface_offset
-from semantic_mapper.types import Float64
+from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
+from semantic_mapper.types import Float64, Int32, Int64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,62 +50,81 @@ def nearest(
     p = check_point(point, snapshot)
     if not 0 <= min_confidence <= 1:
         raise MapError(f"min_confidence must be 0..1, got {min_confidence}")
-    xyz, least = np.empty(3), np.uint8(np.ceil(min_confidence * CONFIDENCE_STEPS - 1e-9))
-    table = (snapshot.packed, snapshot.slots, snapshot.index, snapshot.voxels)
-    slot, voxel, distance = _search(p, class_id, least, *table, xyz)
-    if slot < 0:
+    least = int(np.ceil(min_confidence * CONFIDENCE_STEPS - 1e-9))
+    found, place = _search(snapshot, p, class_id, least)
+    if place < 0:
         return None
-    confidence = float(snapshot.voxels.confidence[slot, voxel]) / CONFIDENCE_STEPS
-    return NearestSurface(xyz * snapshot.voxel_size_m, float(distance) * snapshot.voxel_size_m, confidence)
+    confidence = float(snapshot.voxels.confidence.ravel()[place]) / CONFIDENCE_STEPS
+    distance = float(np.sqrt(found[3]))
+    return NearestSurface(found[:3] * snapshot.voxel_size_m, distance * snapshot.voxel_size_m, confidence)
 
 
-@kernel()
-def _bounds(p, class_id, packed, slots, classes):
-    """Rows of the blocks that may have surface of a class, and the square of the least distance it may have."""
-    rows, bounds = np.empty(len(packed), np.int64), np.empty(len(packed), np.float64)
-    count = 0
-    bit = np.uint64(1) << np.uint64(class_id & 63)
-    for n in range(len(packed)):
-        if classes[slots[n], class_id >> 6] & bit:
-            bound = 0.0
-            for axis in range(3):
-                first = key_part(packed[n], axis) * 8.0
-                gap = max(first - 0.5 - p[axis], p[axis] - first - 7.5, 0.0)
-                bound += gap * gap
-            rows[count], bounds[count] = n, bound
-            count += 1
-    return rows[:count], bounds[:count]
-
-
-@kernel()
-def _search(p, class_id, least, packed, slots, index, voxels, xyz):
-    """Slot and voxel of the nearest surface voxel of a class, and its distance; slot -1 = none. Writes ``xyz`` (3,).
+def _search(snapshot: MapSnapshot, p: Float64, class_id: int, least: int) -> tuple[Float64, int]:
+    """The nearest surface point of a class and the square of its distance, (4,) in units of voxels; and slot * 512 +
+    voxel of it, -1 = none.
 
     Blocks are gone through in the order of the least distance that their surface may have, until that is more than
     what was found. The first alone leaves few of the others to be put in order.
     """
-    rows, bounds = _bounds(p, class_id, packed, slots, voxels.classes)
-    near, offset, q = np.empty(6, np.int64), np.empty(3), np.empty(3)
-    best, best_slot, best_voxel = np.inf, np.int64(-1), np.int64(-1)
-    order = np.full(min(len(rows), 1), np.argmin(bounds) if len(rows) else 0)
-    for _ in range(2):
-        for i in order:
-            if bounds[i] > best:
-                break
-            slot, key = np.int64(slots[rows[i]]), packed[rows[i]]
-            x, y, z = key_part(key, 0), key_part(key, 1), key_part(key, 2)
-            neighbour_slots(x, y, z, index, near)
-            for voxel in range(512):
-                if voxels.label[slot, voxel] != class_id or voxels.confidence[slot, voxel] < least:
-                    continue
-                if not surface_offset(slot, voxel, near, voxels, offset):
-                    continue
-                q[0], q[1], q[2] = x * 8 + (voxel & 7), y * 8 + ((voxel >> 3) & 7), z * 8 + (voxel >> 6)
-                q += offset
-                d = (q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2 + (q[2] - p[2]) ** 2
-                if d < best:
-                    best, best_slot, best_voxel = d, slot, np.int64(voxel)
-                    xyz[:] = q
-        left = np.flatnonzero(bounds <= best)
-        order = left[np.argsort(bounds[left], kind="mergesort")]
-    return best_slot, best_voxel, np.sqrt(best)
+    rows, bounds = np.empty(snapshot.block_count, np.int64), np.empty(snapshot.block_count)
+    count = bound_blocks(p, class_id, snapshot.packed, snapshot.slots, snapshot.voxels.classes, rows, bounds)
+    found = np.array((0.0, 0.0, 0.0, np.inf))
+    if count == 0:
+        return found, -1
+    rows, bounds = rows[:count], bounds[:count]
+    first = np.array([bounds.argmin()])
+    place = _search_rows(snapshot, p, class_id, least, rows[first], bounds[first], found)
+    left = np.flatnonzero(bounds <= found[3])
+    left = left[np.argsort(bounds[left], kind="stable")]
+    nearer = _search_rows(snapshot, p, class_id, least, rows[left], bounds[left], found)
+    return found, nearer if nearer >= 0 else place
+
+
+def _search_rows(
+    snapshot: MapSnapshot, p: Float64, class_id: int, least: int, rows: Int64, bounds: Float64, found: Float64
+) -> int:
+    packed, slots = snapshot.packed[rows], snapshot.slots[rows]
+    return search_blocks(p, class_id, least, packed, slots, bounds, snapshot.index, snapshot.voxels, found)
+
+
+@kernel
+def bound_blocks(
+    p: Float64, class_id: int, packed: Int64, slots: Int32, classes: NDArray[np.uint64], rows: Int64, bounds: Float64
+) -> int:
+    """Find the blocks that may have surface of a class; returns how many there are.
+
+    Args:
+        p: (3,) in units of voxels.
+        class_id: The class.
+        packed, slots: (B,) of the snapshot.
+        classes: (S, 4) of its ``BlockVoxels``.
+        rows: (B,) written: positions of these blocks in ``packed``, ascending.
+        bounds: (B,) written: squares of the least distances that their surfaces may have.
+    """
+    ...
+
+
+@kernel
+def search_blocks(
+    p: Float64,
+    class_id: int,
+    least: int,
+    packed: Int64,
+    slots: Int32,
+    bounds: Float64,
+    index: BlockIndex,
+    voxels: BlockVoxels,
+    found: Float64,
+) -> int:
+    """Look for a surface point nearer than ``found``; returns slot * 512 + voxel of it, -1 where there is none.
+
+    Args:
+        p: (3,) in units of voxels, as all that follows.
+        class_id: The class that is looked for.
+        least: Places of less confidence, times 255, do not count.
+        packed, slots: (R,) blocks in the order of ``bounds``.
+        bounds: (R,) squares of the least distances that their surfaces may have.
+        index, voxels: Of the snapshot.
+        found: (4,) the nearest surface point and the square of its distance; updated.
+    """
+    ...

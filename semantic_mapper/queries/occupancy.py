@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.kernel_cache import kernel
-from semantic_mapper.mapping.block_index import find_block, pack_key
+from semantic_mapper.kernels import kernel
+from semantic_mapper.mapping.block_index import BlockIndex
 from semantic_mapper.queries.checks import check_box, check_points
-from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.types import Float32, Float64, UInt8
+from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
+from semantic_mapper.types import Float32, Float64, Int64, UInt8
 
 MAX_BOX_VOXELS = 1 << 24  # 134 m^3 at 2 cm; about 0.5 GB while the distances are computed
 
@@ -56,7 +56,7 @@ def occupancy(snapshot: MapSnapshot, points: ArrayLike) -> UInt8:
         MapError: see ``checks.check_points``.
     """
     p = check_points(points, snapshot)
-    return read_states(np.floor(p + 0.5).astype(np.int64), snapshot.index, snapshot.voxels, snapshot.voxels_per_step)
+    return read_states(p, snapshot)
 
 
 def distance_field(
@@ -83,8 +83,8 @@ def distance_field(
             f"distance_field: the box holds {' x '.join(map(str, shape))} voxels of {snapshot.voxel_size_m} m, "
             f"allowed are 1 to {MAX_BOX_VOXELS}; take a {'smaller' if count else 'larger'} box"
         )
-    state = np.zeros(tuple(shape), np.uint8)
-    _fill_box(first, state, snapshot.index, snapshot.voxels, snapshot.voxels_per_step)
+    state = np.empty(tuple(shape), np.uint8)
+    fill_box_states(first, snapshot.index, snapshot.voxels, snapshot.voxels_per_step, state)
     obstacle = (state == State.OCCUPIED) | ((state == State.UNKNOWN) & unknown_is_occupied)
     if obstacle.any():
         distance = ndimage.distance_transform_edt(~obstacle, sampling=snapshot.voxel_size_m)
@@ -94,37 +94,24 @@ def distance_field(
     return DistanceField(origin, snapshot.voxel_size_m, np.asarray(distance, np.float32), state)
 
 
-@kernel(inline=True)
-def _state(slot, x, y, z, voxels, voxels_per_step):
-    """``State`` of voxel (x, y, z), which lies in block ``slot``."""
-    voxel = ((z & 7) << 6) | ((y & 7) << 3) | (x & 7)
-    if not voxels.weight[slot, voxel]:
-        return 0
-    return 2 if voxels.tsdf[slot, voxel] * voxels_per_step <= 0.5 else 1
-
-
-@kernel()
-def read_states(places, index, voxels, voxels_per_step):
-    """``State`` (N,) uint8 of voxels with integer coordinates (N, 3)."""
-    states = np.zeros(len(places), np.uint8)
-    for n in range(len(places)):
-        x, y, z = places[n, 0], places[n, 1], places[n, 2]
-        slot = find_block(index, pack_key(x >> 3, y >> 3, z >> 3))
-        if slot >= 0:
-            states[n] = _state(slot, x, y, z, voxels, voxels_per_step)
+def read_states(points: Float64, snapshot: MapSnapshot) -> UInt8:
+    """``State`` (N,) of the voxels in which points (N, 3), units of voxels, lie."""
+    places, states = np.floor(points + 0.5).astype(np.int64), np.empty(len(points), np.uint8)
+    read_voxel_states(places, snapshot.index, snapshot.voxels, snapshot.voxels_per_step, states)
     return states
 
 
-@kernel()
-def _fill_box(first, states, index, voxels, voxels_per_step):
-    """Write ``State`` of all voxels (X, Y, Z) from ``first`` (3,) on; what is unknown stays as it is."""
-    for i in range(states.shape[0]):
-        for j in range(states.shape[1]):
-            x, y = first[0] + i, first[1] + j
-            last, slot = np.int64(0), np.int64(-1)
-            for k in range(states.shape[2]):
-                z = first[2] + k
-                if k == 0 or z >> 3 != last:
-                    last, slot = z >> 3, find_block(index, pack_key(x >> 3, y >> 3, z >> 3))
-                if slot >= 0:
-                    states[i, j, k] = _state(slot, x, y, z, voxels, voxels_per_step)
+@kernel
+def read_voxel_states(
+    places: Int64, index: BlockIndex, voxels: BlockVoxels, voxels_per_step: float, states: UInt8
+) -> None:
+    """Write ``State`` (N,) of voxels with coordinates (N, 3)."""
+    ...
+
+
+@kernel
+def fill_box_states(
+    first: Int64, index: BlockIndex, voxels: BlockVoxels, voxels_per_step: float, states: UInt8
+) -> None:
+    """Write ``State`` of all voxels (X, Y, Z) from ``first`` (3,) on."""
+    ...

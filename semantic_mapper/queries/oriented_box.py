@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from semantic_mapper.kernel_cache import kernel
 from semantic_mapper.types import Float64
 
 
@@ -61,18 +61,12 @@ def _turn(yaw: float) -> Float64:
     return np.array(((np.cos(yaw), -np.sin(yaw)), (np.sin(yaw), np.cos(yaw))))
 
 
-@kernel()
-def _best_yaw(hull):
+def _best_yaw(hull: Float64) -> float:
     """Of the directions of a hull's (N, 2) sides, below 90 degrees, the one with the least area; the smaller of two."""
-    best, least = 0.0, np.inf
-    for i in range(len(hull)):
-        x, y = hull[(i + 1) % len(hull)] - hull[i]
-        if x == 0 and y == 0:
-            continue
-        yaw = np.arctan2(y, x) % (np.pi / 2)
-        c, s = np.cos(yaw), np.sin(yaw)
-        along, across = hull[:, 0] * c + hull[:, 1] * s, hull[:, 1] * c - hull[:, 0] * s
-        area = (along.max() - along.min()) * (across.max() - across.min())
-        if area < least or (area == least and yaw < best):
-            best, least = yaw, area
-    return best
+    sides = np.roll(hull, -1, axis=0) - hull
+    yaws = [math.atan2(y, x) % (math.pi / 2) for x, y in sides if x or y]
+    if not yaws:  # one point
+        return 0.0
+    c, s = np.array([[math.cos(yaw)] for yaw in yaws]), np.array([[math.sin(yaw)] for yaw in yaws])
+    along, across = hull[:, 0] * c + hull[:, 1] * s, hull[:, 1] * c - hull[:, 0] * s  # (sides, N)
+    return min(zip(np.ptp(along, axis=1) * np.ptp(across, axis=1), yaws, strict=True))[1]

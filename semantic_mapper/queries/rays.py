@@ -1,4 +1,4 @@
-"""What a camera or a ray meets: the map's own way of walking along rays (``ray_casting.march``) on a snapshot."""
+"""What a camera or a ray meets: the map's own way of walking along rays (``march`` of ray_casting.h) on a snapshot."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import check_pose
-from semantic_mapper.kernel_cache import kernel
-from semantic_mapper.mapping.block_index import find_block, pack_key
+from semantic_mapper.kernels import kernel
+from semantic_mapper.mapping.block_index import BlockIndex
 from semantic_mapper.mapping.map_types import MapView
-from semantic_mapper.mapping.ray_casting import march
 from semantic_mapper.queries.checks import as_numbers, check_direction, check_points, check_positive
-from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
+from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int64, UInt8
 
 MAX_RANGE_M = 100.0  # beyond, a ray through nothing takes long
 
@@ -96,7 +95,9 @@ def _cast(snapshot: MapSnapshot, origin: Float64, direction: Float64, max_m: flo
     if check_positive(max_m, "max_m") > MAX_RANGE_M:
         raise MapError(f"max_m must be at most {MAX_RANGE_M:g}, got {max_m}")
     step = np.ascontiguousarray(direction / snapshot.voxel_size_m)
-    distance, slot, voxel = _march_all(
+    count = len(step)
+    distance, slot, voxel = np.empty(count, np.float32), np.empty(count, np.int64), np.empty(count, np.int64)
+    march_rays(
         np.ascontiguousarray(origin),
         step,
         snapshot.voxels_per_step,
@@ -104,43 +105,53 @@ def _cast(snapshot: MapSnapshot, origin: Float64, direction: Float64, max_m: flo
         snapshot.index,
         snapshot.voxels,
         snapshot.label_set.ignore_id,
+        distance,
+        slot,
+        voxel,
     )
     label, confidence, rgb = snapshot.read(slot, voxel)
     return RayHits(distance, label, confidence, rgb)
 
 
-@kernel()
-def _march_all(origins, directions, voxels_per_step, max_m, index, voxels, ignore_id):
-    """Distance (N,) float32, 0 = miss, and slot (-1 = none) and voxel (N,) that speak for the place that was hit."""
-    count = len(origins)
-    distance = np.zeros(count, np.float32)
-    slots, chosen = np.full(count, -1, np.int64), np.zeros(count, np.int64)
-    p = np.empty(3)
-    for n in range(count):
-        d = march(origins[n], directions[n], voxels_per_step, max_m, index, voxels, p)
-        if d > 0:
-            for axis in range(3):
-                p[axis] = origins[n, axis] + d * directions[n, axis]
-            distance[n] = d
-            slots[n], chosen[n] = speaker(p, index, voxels, ignore_id)
-    return distance, slots, chosen
+def nearest_corners(points: Float64, snapshot: MapSnapshot) -> tuple[Int64, Int64]:
+    """Slot (-1 = none) and voxel (N,) of the observed voxel nearest to points (N, 3), units of voxels, among the eight
+    round each; of those with a class if any has one."""
+    points = np.ascontiguousarray(points)
+    slot, voxel = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
+    find_nearest_corners(points, snapshot.index, snapshot.voxels, snapshot.label_set.ignore_id, slot, voxel)
+    return slot, voxel
 
 
-@kernel()
-def speaker(p, index, voxels, ignore_id):
-    """Slot (-1 = none) and voxel of the observed corner nearest to a point; of those with a class if any is."""
-    x0, y0, z0 = int(np.floor(p[0])), int(np.floor(p[1])), int(np.floor(p[2]))
-    best, best_slot, best_voxel, best_voted = -1.0, np.int64(-1), np.int64(0), False
-    for corner in range(8):
-        x, y, z = x0 + (corner & 1), y0 + ((corner >> 1) & 1), z0 + (corner >> 2)
-        slot = find_block(index, pack_key(x >> 3, y >> 3, z >> 3))
-        if slot < 0:
-            continue
-        voxel = ((z & 7) << 6) | ((y & 7) << 3) | (x & 7)
-        if not voxels.weight[slot, voxel]:
-            continue
-        share = (1 - abs(p[0] - x)) * (1 - abs(p[1] - y)) * (1 - abs(p[2] - z))
-        voted = voxels.label[slot, voxel] != ignore_id
-        if (voted and not best_voted) or (voted == best_voted and share > best):
-            best, best_slot, best_voxel, best_voted = share, slot, np.int64(voxel), voted
-    return best_slot, best_voxel
+@kernel
+def march_rays(
+    origins: Float64,
+    directions: Float64,
+    voxels_per_step: float,
+    max_m: float,
+    index: BlockIndex,
+    voxels: BlockVoxels,
+    ignore_id: int,
+    distance: Float32,
+    slots: Int64,
+    chosen: Int64,
+) -> None:
+    """Write distances (N,), 0 = miss, and what ``nearest_corners`` gives for the places that were hit.
+
+    Args:
+        origins: (N, 3) in units of voxels.
+        directions: (N, 3) voxels a unit of the distance.
+        voxels_per_step: Length of one step of the quantised TSDF.
+        max_m: Where rays end, in units of the distance.
+        index, voxels: Of the snapshot.
+        ignore_id: Of its label set.
+        distance, slots, chosen: (N,) written.
+    """
+    ...
+
+
+@kernel
+def find_nearest_corners(
+    points: Float64, index: BlockIndex, voxels: BlockVoxels, ignore_id: int, slots: Int64, chosen: Int64
+) -> None:
+    """Write slots and voxels (N,); see ``nearest_corners``."""
+    ...

@@ -9,16 +9,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import ndimage
+from scipy import ndimage, sparse
+from scipy.spatial import KDTree
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.queries import class_surface as class_surface_module
 from semantic_mapper.queries.class_surface import class_surface
 from semantic_mapper.queries.components import find_components
-from semantic_mapper.queries.instances import Instance, InstanceTracker, _Found
+from semantic_mapper.queries.instances import Instance, InstanceTracker, _Found, _LabelledVoxels, find_overlaps
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.oriented_box import upright_box
+from semantic_mapper.queries.surface import surface_voxels
 from semantic_mapper.types import UInt8
 from tests.mapping.views import small_map
+from tests.queries.random_map import random_changes, random_map, voxel_places
 from tests.queries.scene import (
     BALL,
     BOX,
@@ -241,3 +245,97 @@ def test_settings_that_mean_nothing_are_refused() -> None:
     for up in ((0, 0, 0), (0, np.nan, 1), (1, 0), ((0, 0, 1),)):
         with pytest.raises(MapError, match="up"):
             InstanceTracker(up=up)
+
+
+WANTED = np.isin(np.arange(256), (TABLE, CUP))
+
+
+def block_rows(start: np.ndarray) -> np.ndarray:
+    """Row of the block of each voxel."""
+    return np.repeat(np.arange(len(start) - 1), np.diff(start))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_surface_of_some_classes_is_that_of_the_map_with_little_memory_too(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(class_surface_module, "_ROOM", 256)
+    snapshot = random_map(seed)
+    surface, every = class_surface(snapshot, WANTED), surface_voxels(snapshot)
+    slot = snapshot.slots[every.row]
+    mine = WANTED[snapshot.voxels.label[slot, every.voxel]]
+    assert len(surface.voxel) > 700  # the memory grew twice
+    np.testing.assert_array_equal(block_rows(surface.start), every.row[mine])
+    np.testing.assert_array_equal(surface.voxel, every.voxel[mine])
+    np.testing.assert_array_equal(surface.point, every.point[mine])
+    np.testing.assert_array_equal(surface.label, snapshot.voxels.label[slot, every.voxel][mine])
+    np.testing.assert_array_equal(surface.confidence, snapshot.voxels.confidence[slot, every.voxel][mine])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_surface_that_is_kept_from_state_to_state_is_that_of_the_last_state(seed: int) -> None:
+    mirror = MapMirror(0.02, 4.0, LABELS)
+    kept = None
+    for version in range(5):
+        snapshot = mirror.apply(random_changes(10 * seed + version, version, blocks=5))
+        kept, new = class_surface(snapshot, WANTED, kept), class_surface(snapshot, WANTED)
+        for name in set(kept._fields) - {"fresh"}:
+            np.testing.assert_array_equal(getattr(kept, name), getattr(new, name), err_msg=name)
+        assert new.fresh.all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("least", [1, 4])
+def test_components_of_random_blocks_are_those_of_a_graph_of_all_pairs(seed: int, least: int) -> None:
+    snapshot = random_map(seed)
+    surface = class_surface(snapshot, WANTED)
+    found = find_components(surface, least)
+    places = voxel_places(snapshot, block_rows(surface.start), surface.voxel)
+    pairs = KDTree(places).query_pairs(1, np.inf, output_type="ndarray")
+    a, b = pairs[surface.label[pairs[:, 0]] == surface.label[pairs[:, 1]]].T
+    count = len(places)
+    graph = sparse.coo_array((np.ones(len(a)), (a, b)), shape=(count, count))
+    _, expected = sparse.csgraph.connected_components(graph, directed=False)
+    members = {number: np.flatnonzero(expected == number) for number in np.unique(expected)}
+    large = sorted((part for part in members.values() if len(part) >= least), key=lambda part: part[0])
+    parts = np.split(found.order, found.ends)[:-1]
+    assert len(parts) == len(large) > 1
+    for number, (part, expected_part) in enumerate(zip(parts, large, strict=True)):
+        np.testing.assert_array_equal(part, expected_part)
+        assert (found.component[part] == number).all()
+    assert (found.component >= 0).sum() == sum(map(len, large))
+
+
+def test_no_surface_has_no_components() -> None:
+    snapshot = MapMirror(0.02, 4.0, LABELS).snapshot()
+    found = find_components(class_surface(snapshot, WANTED), 1)
+    assert [len(values) for values in found] == [0, 0, 0]
+
+
+def random_voxels(rng: np.random.Generator) -> _LabelledVoxels:
+    packed = np.sort(rng.choice(10, 7, replace=False))
+    parts = [np.sort(rng.choice(30, rng.choice([0, 10, 25]), replace=False)).astype(np.int32) for _ in packed]
+    start = np.cumsum([0, *map(len, parts)])
+    return _LabelledVoxels(packed, start, np.concatenate(parts), rng.integers(-1, 5, start[-1]))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_overlaps_are_the_voxels_that_both_states_have(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    old, new = random_voxels(rng), random_voxels(rng)
+    pairs = np.empty(len(new.voxel), np.int64)
+    count = find_overlaps(old, new, 5, pairs)
+    components = {
+        (key, voxel): component
+        for key, voxel, component in zip(
+            old.packed[block_rows(old.start)].tolist(), old.voxel.tolist(), old.component.tolist(), strict=True
+        )
+    }
+    expected = []
+    for key, voxel, now in zip(new.packed[block_rows(new.start)], new.voxel, new.component, strict=True):
+        before = components.get((int(key), int(voxel)), -1)
+        if before >= 0 and now >= 0:
+            expected.append(before * 5 + now)
+    assert pairs[:count].tolist() == expected and count > 0
+    none = _LabelledVoxels(pairs[:0], np.zeros(1, np.int64), np.empty(0, np.int32), pairs[:0])
+    assert find_overlaps(none, new, 5, pairs) == find_overlaps(new, none, 5, pairs) == 0

@@ -21,6 +21,7 @@ from semantic_mapper.queries.rays import cast_rays
 from semantic_mapper.queries.snapshot import MapSnapshot
 from tests.mapping.test_paging import MEMORY_MB, walk
 from tests.mapping.views import small_map
+from tests.queries.random_map import random_map
 from tests.queries.scene import FLOOR, LABELS, TABLE, integrate, painted, poses, whole_map
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -184,3 +185,13 @@ def test_a_mirror_needs_no_open3d() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.stdout.split() == ["64", "1", "False"], done.stderr
+
+
+def test_classes_of_a_block_are_those_of_its_voxels_near_the_surface() -> None:
+    snapshot = random_map(0)
+    voxels = snapshot.voxels
+    for slot in snapshot.slots:
+        near = (voxels.weight[slot] > 0) & (np.abs(voxels.tsdf[slot].astype(int)) <= 60)
+        expected = set(voxels.label[slot][near].tolist()) - {LABELS.ignore_id}
+        bits = [int(word) >> bit & 1 for word in voxels.classes[slot] for bit in range(64)]
+        assert set(np.flatnonzero(bits).tolist()) == expected

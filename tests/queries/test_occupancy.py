@@ -7,7 +7,9 @@ import pytest
 from scipy.spatial import KDTree
 
 from semantic_mapper.queries.occupancy import State, distance_field, occupancy
+from tests.queries.random_map import random_map
 from tests.queries.scene import BALL, RADIUS, whole
+from tests.queries.test_surface import dense
 
 LOWER, UPPER = (-0.05, -0.35, -0.1), (1.23, 0.41, 0.57)
 
@@ -41,3 +43,18 @@ def test_a_box_without_obstacles_is_infinitely_free() -> None:
     field = distance_field(whole(), (5, 5, 5), (5.1, 5.1, 5.1))
     assert np.isinf(field.distance_m).all() and not field.state.any()
     assert not distance_field(whole(), (5, 5, 5), (5.1, 5.1, 5.1), unknown_is_occupied=True).distance_m.any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_states_of_random_blocks_are_those_of_their_voxels(seed: int) -> None:
+    snapshot = random_map(seed)
+    tsdf, observed, first = dense(snapshot)
+    expected = np.where(observed, np.where(tsdf * 4.0 / 127 <= 0.5, State.OCCUPIED, State.FREE), State.UNKNOWN)
+    last = first + np.array(tsdf.shape) - 1
+    np.testing.assert_array_equal(distance_field(snapshot, first * 0.02, last * 0.02).state, expected)
+    centers = (first + np.indices(tsdf.shape).reshape(3, -1).T) * 0.02
+    np.testing.assert_array_equal(occupancy(snapshot, centers), expected.ravel())
+
+
+def test_no_points_have_no_state() -> None:
+    assert occupancy(random_map(0), np.zeros((0, 3))).shape == (0,)

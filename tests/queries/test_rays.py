@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from semantic_mapper.geometry import look_at
-from semantic_mapper.queries.rays import cast_rays, ray_cast
+from semantic_mapper.queries.rays import cast_rays, nearest_corners, ray_cast
 from tests.mapping.views import INTRINSICS, ray_directions
+from tests.queries.random_map import random_map
 from tests.queries.scene import BALL, CUP, MIDDLE, RADIUS, poses, seen, whole, whole_map
+from tests.queries.test_surface import dense
 
 POSE = look_at(MIDDLE + np.array([0.8, 0.9, 0.7]), MIDDLE, np.array([0.0, 0.0, 1.0]))
 
@@ -60,3 +63,55 @@ def test_rays_that_go_too_short_or_nowhere_miss() -> None:
     up = cast_rays(whole(), above, (0, 0, 1))
     assert (up.distance_m[0], up.label[0], up.confidence[0]) == (0, 0, 0)
     assert len(cast_rays(whole(), np.empty((0, 3)), np.empty((0, 3))).label) == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_hits_in_random_blocks_lie_on_a_zero_of_the_interpolated_field(seed: int) -> None:
+    snapshot = random_map(seed)
+    tsdf, observed, first = dense(snapshot)
+
+    def field(p: np.ndarray) -> float:
+        """TSDF at a point (voxel units), interpolated over the observed voxels."""
+        low, total, fractions = np.floor(p).astype(int), 0.0, 0.0
+        for corner in np.ndindex(2, 2, 2):
+            at = low + corner
+            if observed[tuple(at - first)]:
+                fraction = float(np.prod(1 - np.abs(p - at)))
+                total, fractions = total + fraction * tsdf[tuple(at - first)] / 127, fractions + fraction
+        return total / fractions
+
+    rng = np.random.default_rng(seed)
+    origins, directions = rng.uniform(-0.3, 0.3, (300, 3)), rng.normal(size=(300, 3))
+    directions[::10] = np.eye(3)[rng.integers(0, 3, 30)]  # along blocks and voxels
+    origins[::20] = np.round(origins[::20] / 0.02) * 0.02
+    hits = cast_rays(snapshot, origins, directions)
+    met = np.flatnonzero(hits.distance_m)
+    assert len(met) > 30
+    places = origins + hits.distance_m[:, None] * directions / np.linalg.norm(directions, axis=1)[:, None]
+    off = np.array([abs(field(places[n] / 0.02)) for n in met])
+    assert np.median(off) < 2e-3 and np.quantile(off, 0.9) < 0.1  # a root may not be reached where noise is strong
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_nearest_corner_with_a_class_speaks_for_a_point(seed: int) -> None:
+    snapshot, rng = random_map(seed), np.random.default_rng(seed)
+    _, observed, first = dense(snapshot)
+    row_of = {tuple(key): row for row, key in enumerate(snapshot.keys.tolist())}
+    points = rng.uniform(-18, 18, (300, 3))
+    points[::3] = np.round(points[::3])
+    slots, voxels = nearest_corners(points, snapshot)
+    for p, slot, voxel in zip(points, slots, voxels, strict=True):
+        candidates = []
+        for corner in np.ndindex(2, 2, 2):
+            at = np.floor(p).astype(int) + corner[::-1]
+            if ((at < first) | (at >= first + observed.shape)).any() or not observed[tuple(at - first)]:
+                continue
+            x, y, z = at % 8
+            mine = snapshot.slots[row_of[tuple((at // 8).tolist())]], 64 * z + 8 * y + x
+            has_class = snapshot.voxels.label[mine] != 0
+            candidates.append((has_class, float(np.prod(1 - np.abs(p - at))), mine))
+        best = max((c[:2] for c in candidates), default=None)
+        if best is None:
+            assert slot == -1
+        else:
+            assert (slot, voxel) in [mine for *score, mine in candidates if tuple(score) == best]

@@ -5,9 +5,11 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+import pytest
 
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_voxels
+from tests.queries.random_map import random_map, voxel_places
 from tests.queries.scene import CUP, FLOOR, TABLE, surface_of, truth_distance, whole
 
 
@@ -76,3 +78,14 @@ def test_points_lie_on_the_shape_of_their_class() -> None:
 def test_nothing_has_no_surface() -> None:
     surface = surface_voxels(whole(), np.empty(0, np.int64))
     assert [len(part) for part in surface] == list(itertools.repeat(0, 3))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_surface_voxels_of_random_blocks_are_all_found(seed: int) -> None:
+    snapshot = random_map(seed)
+    surface = surface_voxels(snapshot)
+    places = voxel_places(snapshot, surface.row, surface.voxel)
+    order = np.lexsort(places.T[::-1])
+    expected, points = brute_force(snapshot)
+    np.testing.assert_array_equal(places[order], expected)
+    np.testing.assert_allclose(surface.point[order], points, atol=1e-12)

@@ -76,7 +76,7 @@ static void to_own_coordinates(const CastArguments *a, int64_t p, double *from, 
 
 /* `shape` is a constant in the caller: the compiler makes a loop for each, and runs it on several pixels at once where
  * it can. */
-static inline void cast_one(const CastArguments *a, int64_t p, int64_t shape) {
+ALWAYS_INLINE void cast_one(const CastArguments *a, int64_t p, int64_t shape) {
     int64_t width = a->depth.shape[1], u0, u1, v0, v1;
     double from[3], turn[3][3];
     to_own_coordinates(a, p, from, turn);

@@ -25,7 +25,7 @@ static inline void point_at(const double *origin, const double *d, double z, dou
     for (int axis = 0; axis < 3; axis++) p[axis] = origin[axis] + z * d[axis];
 }
 
-static inline double value_at(double z, const double *origin, const double *d, const BlockIndex *index,
+ALWAYS_INLINE double value_at(double z, const double *origin, const double *d, const BlockIndex *index,
                               const TsdfField *field) {
     double p[3];
     point_at(origin, d, z, p);

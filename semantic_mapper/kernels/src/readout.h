@@ -26,7 +26,7 @@ static inline bool is_observed(const TsdfField *field, int64_t at) {
 }
 
 /* Interpolated TSDF at a point (voxel units) over its observed corners; NOT_OBSERVED where there is none. */
-static inline double sample_tsdf(const double *p, const BlockIndex *index, const TsdfField *field) {
+ALWAYS_INLINE double sample_tsdf(const double *p, const BlockIndex *index, const TsdfField *field) {
     int64_t x0 = floor_int(p[0]), y0 = floor_int(p[1]), z0 = floor_int(p[2]), last_key = EMPTY_KEY, block = -1;
     double fx = p[0] - (double)x0, fy = p[1] - (double)y0, fz = p[2] - (double)z0, total = 0.0, fraction_sum = 0.0;
     for (int corner = 0; corner < 8; corner++) {
