@@ -7,7 +7,7 @@ import enum
 import hashlib
 import json
 from base64 import b64decode
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -77,6 +77,21 @@ def plain(value: Any) -> Any:
     return value
 
 
+def leaves(value: Any) -> dict[str, list[str]]:
+    """All values of a structure, whatever their fields are called: these may get other names in Python."""
+    found: list[str] = []
+    left = [plain(value)]
+    while left:
+        item = left.pop()
+        if isinstance(item, Mapping):
+            left += item.values()
+        elif isinstance(item, list):
+            left += item
+        else:
+            found.append(json.dumps(item))
+    return {"leaves": sorted(found)}
+
+
 def parts_of(texts: Sequence[str]) -> list[bytes]:
     """Base 64 -> parts of a message."""
     return [b64decode(text) for text in texts]
@@ -115,6 +130,8 @@ def lacking(then: Any, now: Any, where: str = "") -> list[str]:
 def differences(then: Any, now: Any, where: str = "") -> list[str]:
     """Values of ``then`` that ``now`` lacks or has otherwise, to the last digit; keys that came since are welcome."""
     if isinstance(then, Mapping) and isinstance(now, Mapping):
+        if "leaves" in then:
+            return [f"{where}: has no {leaf} any more" for leaf in Counter(then["leaves"]) - Counter(now["leaves"])]
         return [line for key in then for line in differences(then[key], now.get(key, "<missing>"), f"{where}.{key}")]
     if isinstance(then, list) and isinstance(now, list) and len(then) == len(now):
         return [

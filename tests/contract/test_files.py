@@ -21,6 +21,7 @@ from tests.contract.golden import (
     STORED_SETTINGS,
     WEIGHTS,
     differences,
+    leaves,
     plain,
     read,
 )
@@ -204,7 +205,7 @@ def look_at_map(path: Path) -> dict[str, Any]:
         "frames": voxel_map.frames,
         "last_stamp_ns": voxel_map.last_stamp_ns,
         "blocks": voxel_map.block_count,
-        "config": plain(voxel_map.config),
+        "config": leaves(voxel_map.config),
         "label_set": plain(voxel_map.label_set),
         "state": plain(voxel_map.block_state()),
         "surface": {
@@ -228,7 +229,7 @@ def look_at_weights(_: Path) -> dict[str, Any]:
         "stamps": sorted(checkpoint.train_stamps_ns),
         "label_set": plain(checkpoint.label_set),
         "anchors": [plain(frame) for frame in checkpoint.anchors],
-        "config": plain(checkpoint.model.config),
+        "config": leaves(checkpoint.model.config),
         "tensors": tensors,
     }
 
@@ -260,7 +261,12 @@ def look_at_corrections(_: Path) -> dict[str, Any]:
 def look_at_launch(_: Path) -> dict[str, Any]:
     """Nodes with their options."""
     launch = api.load_launch(LAUNCH_FILE, ["now=then"])
-    return plain(launch)
+    return {
+        "nodes": {node.name: {"kind": node.kind, "entry": leaves(node)} for node in launch.nodes},
+        "options": {name: leaves(options) for name, options in launch.options.items()},
+        "inputs": {node.name: list(launch.inputs(node.name)) for node in launch.nodes},
+        "all": leaves(launch),
+    }
 
 
 def look_at_learning(folder: Path) -> dict[str, Any]:
@@ -269,7 +275,7 @@ def look_at_learning(folder: Path) -> dict[str, Any]:
     shutil.copytree(LEARNING, copy)
     pool = api.KeyframePool(api.ROOMS, held_out_every=2, capacity=8)
     progress = api.LearningStore(copy, api.ROOMS).restore(pool)
-    return {"kept": [plain(kept) for kept in pool.kept], "progress": plain(progress)}
+    return {"kept": {str(k.frame.stamp_ns): leaves(k) for k in pool.kept}, "progress": leaves(progress)}
 
 
 _LOOKS: dict[str, Callable[[Path], dict[str, Any]]] = {
