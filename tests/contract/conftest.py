@@ -1,0 +1,15 @@
+"""One replay of the golden log for all tests that look at what it leaves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.contract.runs import replay_room
+
+
+@pytest.fixture(scope="session")
+def room_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of ``replay``."""
+    return replay_room(tmp_path_factory.mktemp("contract"))

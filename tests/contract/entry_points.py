@@ -1,0 +1,245 @@
+"""Every import of the project that the contract tests make. A module that moves is mended here, and nowhere else.
+
+The tests speak to what users have: the command, files, sockets, and the Python names of the README and how-tos. What
+they need beyond these (the codec, the table of commands, the structs of the settings) has a name of its own here.
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import msgspec
+import typer.main
+from typer.testing import CliRunner
+
+import drivers.oak.config
+import drivers.opencv.config
+import drivers.poses.config
+import drivers.v4l2.config
+from drivers.calibration import CalibrationFile, load_calibration, load_mount
+from nodes import cli
+from nodes.calibration_report import CalibrationSettings
+from nodes.console import Output
+from nodes.launch_config import LaunchFile, NodeEntry, load_launch
+from nodes.learning_store import LearningStore, Progress
+from nodes.options import CameraOptions, FinetunerOptions, LiveCamera, MapperOptions, RecorderOptions
+from replay.corrections import read_corrections
+from replay.importers.base import RenameConfig
+from replay.log import LogReader, LogWriter
+from replay.tolerances import Tolerances
+from semantic_mapper.benchmark.config import SuiteConfig
+from semantic_mapper.config import MapperConfig, SRayConfig, convert_config, load_config
+from semantic_mapper.errors import SemanticMapperError
+from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.sray import SRay
+from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.scenes import VALIDATION_SEEDS, NoiseConfig, room_frames
+from semantic_mapper.testing import LogReplays
+from semantic_mapper.training.finetune import FinetuneConfig, finetune
+from semantic_mapper.training.keyframe_pool import Kept, KeyframePool
+from semantic_mapper.training.online import OnlineConfig
+from semantic_mapper.training.train_config import TrainConfig
+from semantic_mapper.transport import codec, pose_message, query_codec, query_messages
+from semantic_mapper.transport.messages import (
+    EndOfStream,
+    FrameRefused,
+    LabelledKeyframe,
+    Status,
+    StreamInfo,
+    WeightsInUse,
+    WeightsUpdate,
+)
+from semantic_mapper.transport.plain import label_set_header
+from semantic_mapper.transport.security import load_keys
+from semantic_mapper.transport.topics import TOPICS
+from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
+
+__all__ = [
+    "COMMAND",
+    "ROOMS",
+    "TOPICS",
+    "VALIDATION_SEEDS",
+    "CameraIntrinsics",
+    "Checkpoint",
+    "EndOfStream",
+    "FinetuneConfig",
+    "FrameRefused",
+    "Kept",
+    "KeyframePool",
+    "LabelSet",
+    "LabelledKeyframe",
+    "LearningStore",
+    "LogReader",
+    "LogReplays",
+    "LogWriter",
+    "MapUpdate",
+    "MapperConfig",
+    "NoiseConfig",
+    "OnlineConfig",
+    "PosedFrame",
+    "SRay",
+    "SRayConfig",
+    "SemanticMapperError",
+    "Status",
+    "StreamInfo",
+    "SuiteConfig",
+    "Tolerances",
+    "TrainConfig",
+    "VoxelMap",
+    "WeightsInUse",
+    "WeightsUpdate",
+    "convert_config",
+    "default_checkpoint_path",
+    "finetune",
+    "label_set_header",
+    "load_calibration",
+    "load_checkpoint",
+    "load_config",
+    "load_keys",
+    "load_launch",
+    "load_mount",
+    "read_corrections",
+    "room_frames",
+    "save_checkpoint",
+]
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+LAUNCH, RECIPES = REPOSITORY / "launch", REPOSITORY / "recipes"
+COMMAND = Path(sys.executable).parent / "semantic-mapper"
+TIMEOUT_S = 300.0  # kernels may have to be compiled, on a busy machine
+
+
+@dataclass(frozen=True)
+class Ran:
+    """A command that has come to its end; ``stdout`` holds results alone, ``stderr`` all that click and logs said."""
+
+    code: int
+    stdout: str
+    stderr: str
+
+
+def run_here(*arguments: str | Path) -> Ran:
+    """The command in this process."""
+    stdout = io.StringIO()
+    with patch.object(Output, "guarded", lambda: Output(stdout)):
+        done = CliRunner().invoke(cli.app, [str(a) for a in arguments])
+    return Ran(done.exit_code, stdout.getvalue(), done.output)
+
+
+def run_command(*arguments: str | Path) -> Ran:
+    """The installed command, in a process of its own."""
+    done = subprocess.run(
+        [str(COMMAND), *map(str, arguments)], capture_output=True, text=True, timeout=TIMEOUT_S, check=False
+    )
+    return Ran(done.returncode, done.stdout, done.stderr)
+
+
+def command_tree() -> Any:
+    """The click command that holds all verbs."""
+    return typer.main.get_command(cli.app)
+
+
+# Wire.
+
+decode_message = codec.decode
+encode_message: Mapping[str, Callable[..., list[bytes]]] = {
+    "info": codec.encode_info,
+    "frame": codec.encode_frame,
+    "end": codec.encode_end,
+    "map": codec.encode_map_update,
+    "refused": codec.encode_refused,
+    "status": codec.encode_status,
+    "keyframe": codec.encode_keyframe,
+    "weights": codec.encode_weights,
+    "in_use": codec.encode_in_use,
+}
+TAKES_OPTIONS = ("frame", "keyframe", "map")  # their encoders know how to pack images
+CodecOptions = codec.CodecOptions
+decode_pose, encode_pose = pose_message.decode_pose, pose_message.encode_pose
+QUESTIONS = query_messages.QUESTIONS
+WeightsEntry = query_messages.WeightsEntry
+
+
+def decode_question(parts: Sequence[bytes]) -> tuple[Any, dict[str, Any]]:
+    """Header and arrays."""
+    _, header, arrays = query_codec.decode_request(parts)
+    return header, arrays
+
+
+def encode_question(kind: str, header: Any, arrays: Mapping[str, Any]) -> list[bytes]:
+    """Parts of a question."""
+    return query_codec.encode_request(kind, header, arrays)
+
+
+def decode_answer(kind: str, parts: Sequence[bytes]) -> tuple[Any, dict[str, Any]]:
+    """Header and arrays; raises what the other side has answered in place of these."""
+    return query_codec.decode_answer(kind, QUESTIONS[kind].answer, parts)
+
+
+def encode_answer(kind: str, header: Any, arrays: Mapping[str, Any]) -> list[bytes]:
+    """Parts of an answer."""
+    return query_codec.encode_answer(kind, header, arrays)
+
+
+encode_error = query_codec.encode_error
+
+
+def keep_learning(store: LearningStore, kept: Sequence[Kept]) -> None:
+    """Write keyframes of a finetuner that is in the midst of a round."""
+    store.keep(kept, Progress(rolled_back=1, failures=2, learning=True))
+
+
+# Settings: each table that a TOML file of users may hold, and what has to be given in it.
+
+_CAMERA = {"kind": "v4l2", "poses": {"kind": "fixed"}}
+_NODE = {"name": "a", "kind": "camera"}
+SETTINGS: dict[str, tuple[type[msgspec.Struct], dict[str, Any]]] = {
+    "launch": (LaunchFile, {"node": [_NODE]}),
+    "launch.node": (NodeEntry, _NODE),
+    "launch.camera": (CameraOptions, {"log": "a.mcap"}),
+    "launch.camera.camera": (LiveCamera, _CAMERA),
+    "launch.mapper": (MapperOptions, {"out": "a"}),
+    "launch.recorder": (RecorderOptions, {"out": "a"}),
+    "launch.finetuner": (FinetunerOptions, {}),
+    "camera.v4l2": (drivers.v4l2.config.Config, {}),
+    "camera.opencv": (drivers.opencv.config.Config, {"source": "a.mp4"}),
+    "camera.oak": (drivers.oak.config.Config, {}),
+    **{f"poses.{kind}": (struct, {}) for kind, struct in drivers.poses.config.KINDS.items()},
+    "poses.checks": (drivers.poses.config.PoseChecks, {}),
+    "mapper": (MapperConfig, {}),
+    "online": (OnlineConfig, {}),
+    "finetune": (FinetuneConfig, {}),
+    "train": (TrainConfig, {}),
+    "suite": (SuiteConfig, {}),
+    "tolerances": (Tolerances, {}),
+    "calibrate": (CalibrationSettings, {}),
+    "rename": (RenameConfig, {"classes": {"couch": "sofa"}}),
+    "calibration": (
+        CalibrationFile,
+        {"fx": 80.0, "fy": 80.0, "cx": 47.5, "cy": 35.5, "width": 96, "height": 72},
+    ),
+}
+
+
+def parse_settings(name: str, values: Mapping[str, Any]) -> Any:
+    """Values as they stand in a TOML file -> the settings; an unknown key is a ``ConfigError``."""
+    return convert_config(dict(values), SETTINGS[name][0], name)
+
+
+def load_launch_values(path: Path) -> dict[str, Any]:
+    """A launch file's [set] table."""
+    return dict(load_config(path, LaunchFile).set)
+
+
+def importable(module: str, name: str) -> Any:
+    """What ``from module import name`` gives."""
+    return getattr(importlib.import_module(module), name)

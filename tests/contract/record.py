@@ -1,0 +1,223 @@
+"""Write the golden data of the contract tests from the code as it is.
+
+    OMP_NUM_THREADS=1 python -m tests.contract.record             # all but the inputs
+    OMP_NUM_THREADS=1 python -m tests.contract.record map cli     # some groups
+    OMP_NUM_THREADS=1 python -m tests.contract.record inputs      # the log and the weights, which take minutes to train
+
+Golden data says what users have. Record again only what was meant to change, look at `git diff` of the JSON files, and
+say in the commit why users can live with it. Old bytes of the wire are never replaced: where a message is packed
+otherwise now, the new bytes are added beside the old ones, and files of the first recording stay (delete one by hand to
+make it anew). The group ``kitchen`` needs the recording redkitchen (SEMANTIC_MAPPER_SHARED_DATA); only numbers of it
+are kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import shutil
+import tempfile
+from base64 import b64encode
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import torch
+
+from tests.contract import entry_points as api
+from tests.contract import golden, runs, samples
+from tests.contract.golden import FOLDER, FRAMES, LOG, MAP, MAP_INT16, POINTS, REFUSED_SEQ, STORED, WEIGHTS
+
+CAMERA = api.CameraIntrinsics(66.0, 66.0, 47.5, 35.5, 96, 72)
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+def record_inputs(folder: Path) -> None:
+    """A furnished room filmed by a noisy sensor; every other frame is the log, the others taught the weights."""
+    frames = list(api.room_frames(api.VALIDATION_SEEDS[0], 24, CAMERA, noise=api.NoiseConfig()))
+    kept = frames[: 2 * (FRAMES - 1) : 2]
+    skewed = kept[0].T_world_camera.copy()
+    skewed[:3, :3] *= 1.5
+    black = np.zeros_like(kept[0].rgb)
+    stamp = (kept[REFUSED_SEQ - 1].stamp_ns + kept[REFUSED_SEQ].stamp_ns) // 2
+    wrong = dataclasses.replace(kept[0], stamp_ns=stamp, rgb=black, depth_m=None, label=None, T_world_camera=skewed)
+    kept.insert(REFUSED_SEQ, wrong)
+    info = api.StreamInfo("a golden room", {"rooms": CAMERA}, api.ROOMS, FRAMES, 7.5, {"made_by": "tests.contract"})
+    with api.LogWriter(LOG, info, overwrite=True) as log:
+        for seq, frame in enumerate(kept):
+            log.write_frame(dataclasses.replace(frame, seq=seq))
+    torch.manual_seed(0)
+    shape = api.convert_config(
+        {"feature_dim": 16, "heads": 2, "encoder": {"channels": [8, 16], "blocks": [1, 1], "depth": True}},
+        api.SRayConfig,
+        "golden weights",
+    )
+    settings = api.FinetuneConfig(seconds=0, steps=300, width=96)
+    fitted = api.finetune(frames[1::2], api.ROOMS, api.SRay(shape, api.ROOMS), settings)
+    api.save_checkpoint(dataclasses.replace(fitted, anchors=fitted.anchors[:1]), WEIGHTS)
+
+
+def record_wire(folder: Path) -> None:
+    """Bytes of every message, and what they say."""
+    known: dict[str, Any] = golden.read("wire") if (FOLDER / "wire.json").exists() else {}
+    wire: dict[str, Any] = {group: known.get(group, {}) for group in ("messages", "questions", "answers", "errors")}
+    for name, (topic, message, options) in samples.messages().items():
+        packing = (api.CodecOptions(**options),) if topic in api.TAKES_OPTIONS else ()
+        parts = api.encode_message[topic](message, *packing)
+        decoded: Any = api.decode_message(parts)
+        said, more = golden.plain(decoded), {}
+        if "jpeg" in name:
+            del said["rgb"]["digest"]
+            more = {"pixels": b64encode(decoded.rgb.tobytes()).decode()}
+        _keep(wire["messages"], name, parts, said, "jpeg" not in name, topic=topic, options=options, **more)
+    for kind, (fields, arrays) in samples.questions().items():
+        parts = api.encode_question(kind, api.QUESTIONS[kind].request(**fields), arrays)
+        header, found = api.decode_question(parts)
+        _keep(wire["questions"], kind, parts, _said(header, found), True, kind=kind)
+    for kind, (fields, arrays) in samples.answers().items():
+        parts = api.encode_answer(kind, api.QUESTIONS[kind].answer(**fields), arrays)
+        header, found = api.decode_answer(kind, parts)
+        _keep(wire["answers"], kind, parts, _said(header, found), True, kind=kind)
+    for name in ("MapError", "LabelError", "CodecError", "ShapeError", "PoseError", "WeightsError"):
+        parts = api.encode_error(api.importable("semantic_mapper.errors", name)("the box is empty"))
+        try:
+            api.decode_answer("at", parts)
+        except api.SemanticMapperError as error:
+            wire["errors"].setdefault(name, {"parts": _texts(parts), "raises": type(error).__name__})
+    wire["poses"] = known.get("poses", {})
+    for name, parts in samples.pose_messages().items():
+        message = api.decode_pose(parts)
+        said = {**golden.meaning(message), "matrix": golden.plain(message.matrix)}
+        _keep(wire["poses"], name, parts, said, name == "msgpack")
+    wire["topics"] = {
+        name: {"queue": t.queue, "latched": t.latched, "logged": t.logged, "closes": t.closes}
+        for name, t in api.TOPICS.items()
+    }
+    golden.write("wire", wire)
+
+
+def _keep(entries: dict[str, Any], name: str, parts: list[bytes], said: Any, exact: bool, **more: Any) -> None:
+    """Add bytes, unless they are there; those of before are for reading alone from then on."""
+    texts = _texts(parts)
+    versions = [n for n in entries if n == name or n.startswith(f"{name}@")]
+    if any(entries[n]["parts"] == texts for n in versions):
+        return
+    for n in versions:
+        entries[n]["exact"] = False
+    new = f"{name}@{len(versions) + 1}" if versions else name
+    entries[new] = {"parts": texts, "says": said, "exact": exact, **more}
+
+
+def _texts(parts: list[bytes]) -> list[str]:
+    return [b64encode(part).decode() for part in parts]
+
+
+def _said(header: Any, arrays: Mapping[str, Any]) -> dict[str, Any]:
+    return {"header": golden.meaning(header), "arrays": golden.plain(arrays)}
+
+
+def record_map(folder: Path) -> None:
+    """Numbers, summary and surface of the room."""
+    run = runs.replay_room(folder)
+    points, header, _ = runs.read_ply(run / "map.ply")
+    runs.save_points(POINTS, points)
+    summary = runs.summary_of(run)
+    values = {"numbers": runs.numbers_of(run), "ply_header": header, "summary": golden.form(summary)}
+    golden.write("map", {**values, "files": sorted(p.name for p in run.iterdir())})
+
+
+def record_kitchen(folder: Path) -> None:
+    """Numbers of a real recording."""
+    shared = Path(os.environ.get("SEMANTIC_MAPPER_SHARED_DATA", SHARED))
+    run = runs.replay_kitchen(shared / "redkitchen", folder)
+    weights = golden.digest(api.default_checkpoint_path().read_bytes())
+    golden.write("kitchen", {"numbers": runs.numbers_of(run), "weights": weights})
+
+
+def record_files(folder: Path) -> None:
+    """Files of today; those that are there stay."""
+    from tests.contract import test_files
+
+    if not MAP.exists():
+        replays = api.LogReplays(FOLDER, lambda name: folder / name)
+        made = replays(LOG, weights=WEIGHTS, config=golden.STORED_SETTINGS, max_frames=golden.STORED_FRAMES)
+        made.store(STORED)
+    if not MAP_INT16.exists():
+        config = folder / "int16.toml"
+        config.write_text(
+            '[render]\nscale = 0.5\n[voxel_map]\nvoxel_size_m = 0.12\ninitial_blocks = 100\nevidence = "int16"\n'
+        )
+        out = folder / "int16"
+        ran = api.run_here("replay", LOG, "--weights", WEIGHTS, "--config", config, "--out", out, "--max-frames", "2")
+        assert ran.code == 0, ran.stderr
+        shutil.copyfile(out / "map.npz", MAP_INT16)
+    test_files.make_small_files()
+    golden.write("files", test_files.observe(folder))
+
+
+def record_log(folder: Path) -> None:
+    """What the golden log says."""
+    from tests.contract import test_log
+
+    golden.write("log", test_log.observe())
+
+
+def record_exporters(folder: Path) -> None:
+    """Structure and numbers of exported files."""
+    from tests.contract import test_exporters
+
+    golden.write("exporters", test_exporters.observe(folder))
+
+
+def record_cli(folder: Path) -> None:
+    """Verbs, options and exit codes."""
+    from tests.contract import test_command_line
+
+    golden.write("command_line", test_command_line.observe(folder))
+
+
+def record_settings(folder: Path) -> None:
+    """Names and defaults of all settings."""
+    from tests.contract import test_settings
+
+    golden.write("settings", test_settings.observe())
+
+
+def record_python(folder: Path) -> None:
+    """Names that programs import, and their arguments."""
+    from tests.contract import test_python
+
+    golden.write("python", test_python.observe())
+
+
+GROUPS: dict[str, Callable[[Path], None]] = {
+    "inputs": record_inputs,
+    "wire": record_wire,
+    "map": record_map,
+    "kitchen": record_kitchen,
+    "files": record_files,
+    "log": record_log,
+    "exporters": record_exporters,
+    "cli": record_cli,
+    "settings": record_settings,
+    "python": record_python,
+}
+
+
+def main() -> None:
+    """Record."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("group", nargs="*", choices=[*GROUPS, []], help="by default all but inputs")
+    wanted = parser.parse_args().group or [name for name in GROUPS if name != "inputs"]
+    STORED.mkdir(parents=True, exist_ok=True)
+    for name in wanted:
+        with tempfile.TemporaryDirectory(prefix="contract-") as folder, patch.dict(os.environ):
+            GROUPS[name](Path(folder))
+        print(f"{name} recorded")  # noqa: T201 - a script
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,251 @@
+"""The command line: every verb, option and default of then, and exit codes.
+
+An option that gets another name keeps the old one as a hidden alias that warns: hidden options count here, so that they
+must stay. Help texts are free.
+"""
+
+from __future__ import annotations
+
+import enum
+import json
+import shutil
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+import pytest
+
+from tests.contract import entry_points as api
+from tests.contract.golden import LOG, MAP, MAP_INT16, STORED, WEIGHTS, form, lacking, read
+
+# {..} are places of golden files and of a folder of its own for each recording or test, in which the commands run in
+# this order: later ones use what earlier ones have made.
+COMMANDS: dict[str, str] = {
+    "version": "--version",
+    "help": "--help",
+    "nothing at all": "",
+    "help of a verb": "replay --help",
+    "unknown verb": "fly",
+    "unknown option": "info {log} --colour",
+    "info of a log": "info {log}",
+    "info of a log as JSON": "info {log} --json",
+    "info of a map": "info {map}",
+    "info of a map as JSON": "info {map} --json",
+    "info of a folder of results": "info {stored}",
+    "info of nothing": "info {tmp}/none.mcap",
+    "info of a damaged log": "info {damaged}",
+    "info without a file": "info",
+    "recover": "recover {cut} {tmp}/mended.mcap",
+    "recover what is no log": "recover {map} {tmp}/no.mcap",
+    "export a log as folder": "export {log} --out {tmp}/sequence --format folder --max-frames 2",
+    "import the folder": "import {tmp}/sequence {tmp}/back.mcap",
+    "import again": "import {tmp}/sequence {tmp}/back.mcap",
+    "import nothing": "import {tmp}/none {tmp}/none.mcap",
+    "import with an impossible turn": "import {tmp}/sequence {tmp}/turned.mcap --rotate 45",
+    "query info": "query {map} info",
+    "query at": "query {map} at 0.5 -0.5 0.25 --json {tmp}/at.json",
+    "query nearest": "query {stored} nearest wall 0 0 1 --json {tmp}/nearest.json",
+    "query instances": "query {map} instances --up 0 0 1 --json {tmp}/instances.json",
+    "query of an unknown class": "query {map} nearest unicorn 0 0 1",
+    "query with too few numbers": "query {map} at 1 2",
+    "query of an unknown kind": "query {map} why",
+    "query of a mapper that is not there": "query ipc://{tmp}/none info",
+    "export points": "export {map} --out {tmp}/map.ply",
+    "export over itself": "export {stored} --out {map}",
+    "export a log as mesh": "export {log} --out {tmp}/log.glb",
+    "export to an unknown format": "export {map} --out {tmp}/map.stl",
+    "export without a file": "export {map}",
+    "merge": "merge {map} {stored} --transform 1.2|0|0|90 --out {tmp}/both.npz",
+    "merge maps of other voxels": "merge {map} {tmp}/none.npz --out {tmp}/no.npz",
+    "compare equal runs": "compare {stored} {map} --picture {tmp}/a.png --json",
+    "compare other runs": "compare {map} {int16} --picture {tmp}/b.png",
+    "compare with a tolerance that is none": "compare {map} {map} -t labels",
+    "compare a log": "compare {log} {map}",
+    "compare exactly with tolerances": "compare {map} {map} --exact -t labels=1",
+    "launch list": "launch list --json",
+    "launch show": "launch show replay",
+    "launch show nothing": "launch show nothing",
+    "launch copy": "launch copy record {tmp}/record.toml",
+    "launch copy again": "launch copy record {tmp}/record.toml",
+    "up with an unknown setting": "up replay --set log={log} --set colour=red",
+    "up without a log": "up replay",
+    "up of what is no launch file": "up {tmp}/none.toml",
+    "keys make": "keys make --keys {tmp}/keys",
+    "keys make again": "keys make --keys {tmp}/keys",
+    "keys allow": "keys allow robot rq:rM>}}U?@Lns47E1%kR.o@n%FcmmsL/@{{H8]yf7 --keys {tmp}/keys",
+    "keys allow what is none": "keys allow robot hello --keys {tmp}/keys",
+    "keys show": "keys show --keys {tmp}/keys --json",
+    "keys forget": "keys forget robot --keys {tmp}/keys",
+    "keys forget nobody": "keys forget robot --keys {tmp}/keys",
+    "keys show where there are none": "keys show --keys {tmp}/none",
+    "replay without a folder": "replay {log}",
+    "replay nothing": "replay {tmp}/none.mcap --out {tmp}/run",
+    "replay with missing weights": "replay {log} --out {tmp}/run --weights {tmp}/none.safetensors",
+    "replay with voxels of five metres": "replay {log} --out {tmp}/run --voxel-size 5",
+    "replay with an unknown quality": "replay {log} --out {tmp}/run --quality best",
+    "replay with an unknown setting": "replay {log} --out {tmp}/run --config {wrong}",
+    "finetune without keyframes": "finetune {log} --out {tmp}/a.safetensors",
+    "finetune with one keyframe": "finetune {log} --out {tmp}/a.safetensors --keyframes 1",
+    "weights of nobody": "weights ipc://{tmp}/none",
+    "weights back to what": "weights ipc://{tmp}/none --to 1",
+    "correct nobody": "correct ipc://{tmp}/none {corrections}",
+    "correct a saved map": "correct {map} {corrections}",
+    "label without a finetuner": "label {log} --to",
+}
+JSON_FILES = {"query at": "at", "query nearest": "nearest", "query instances": "instances"}
+
+
+def observe(folder: Path) -> dict[str, Any]:
+    """Options by verb; exit codes, and the form of what is written as JSON."""
+    codes, forms = run_all(folder)
+    return {"verbs": verbs(), "codes": codes, "json": forms}
+
+
+def verbs() -> dict[str, Any]:
+    """Each verb and sub-verb with its arguments and options."""
+    found: dict[str, Any] = {}
+    _walk(api.command_tree(), "", found)
+    return found
+
+
+def _walk(command: Any, path: str, found: dict[str, Any]) -> None:
+    parameters = [_describe(p) for p in command.params]
+    found[path or "semantic-mapper"] = {
+        "options": {name: entry for names, entry in parameters for name in names if entry["kind"] == "option"},
+        "arguments": [entry for _, entry in parameters if entry["kind"] == "argument"],
+    }
+    for name, inner in getattr(command, "commands", {}).items():
+        _walk(inner, f"{path} {name}".strip(), found)
+
+
+def _describe(parameter: Any) -> tuple[list[str], dict[str, Any]]:
+    """Names of a parameter, and what else scripts rely on."""
+    default = parameter.default
+    if isinstance(default, enum.Enum):
+        default = default.value
+    elif isinstance(default, Path):
+        default = default.as_posix()
+    elif callable(default):  # a folder of the user, say
+        default = "computed"
+    kind, choices = _type_of(parameter.type_descriptor.annotation)
+    entry = {
+        "kind": parameter.param_type_name,
+        "type": kind,
+        "choices": choices,
+        "nargs": parameter.nargs,
+        "required": parameter.required,
+        "many": getattr(parameter, "multiple", False),
+        "flag": getattr(parameter, "is_flag", False),
+        "default": list(default) if isinstance(default, tuple) else default,
+        "least": getattr(parameter, "min", None),
+        "most": getattr(parameter, "max", None),
+    }
+    return [*parameter.opts, *parameter.secondary_opts], entry
+
+
+def _type_of(annotation: Any) -> tuple[str, list[str]]:
+    """What a text must be, and the only ones that there are."""
+    if get_origin(annotation) is Literal:
+        return "choice", list(map(str, get_args(annotation)))
+    if get_origin(annotation) in (list, tuple):
+        return _type_of(get_args(annotation)[0])
+    if isinstance(annotation, type) and issubclass(annotation, enum.Enum):
+        return "choice", [str(item.value) for item in annotation]
+    return {"str": "text", "Path": "text"}.get(annotation.__name__, annotation.__name__), []
+
+
+def run_all(folder: Path) -> tuple[dict[str, int], dict[str, Any]]:
+    """Exit code of each command, and the form of the JSON that it gives."""
+    codes: dict[str, int] = {}
+    forms: dict[str, Any] = {}
+    places = make_places(folder)
+    for name, line in COMMANDS.items():
+        words = [word.replace("|", " ").format_map(places) for word in line.split()]
+        ran = api.run_here(*words)
+        codes[name] = ran.code
+        assert "Traceback" not in ran.stderr, ran.stderr
+        if name in JSON_FILES:
+            forms[name] = form(json.loads((folder / f"{JSON_FILES[name]}.json").read_text()))
+        elif "--json" in words:
+            forms[name] = form(json.loads(ran.stdout))
+        elif ran.code and words[:1] not in ([], ["info"], ["compare"]):
+            assert not ran.stdout, f"{name}: failed, and wrote results: {ran.stdout}"
+    return codes, forms
+
+
+def make_places(folder: Path) -> dict[str, str]:
+    """What the names in braces stand for."""
+    data = bytearray(LOG.read_bytes())
+    (folder / "cut.mcap").write_bytes(data[:-20_000])
+    data[len(data) // 2] ^= 0xFF
+    (folder / "damaged.mcap").write_bytes(data)
+    (folder / "wrong.toml").write_text("[voxel_map]\nvoxel_sise_m = 0.1\n")
+    stored = folder / "stored"  # commands that would write there by mistake must not reach golden files
+    shutil.copytree(STORED, stored)
+    shutil.copyfile(MAP_INT16, folder / "int16.npz")
+    made = {"cut": "cut.mcap", "damaged": "damaged.mcap", "wrong": "wrong.toml", "int16": "int16.npz"}
+    given = {"log": LOG, "map": stored / MAP.name, "stored": stored, "weights": WEIGHTS, "tmp": folder}
+    given["corrections"] = LOG.parent / "corrections.tum"
+    return {name: str(path) for name, path in ({n: folder / f for n, f in made.items()} | given).items()}
+
+
+_GOLDEN: dict[str, Any] = read("command_line")
+
+
+def unlike_option(then: dict[str, Any], now: dict[str, Any], *, hidden: bool) -> list[str]:
+    """In what a parameter does not take what it took."""
+    found = [key for key in ("kind", "nargs", "many", "flag") if then[key] != now[key]]
+    if now["required"] and not then["required"]:
+        found.append("required")
+    if set(then["choices"]) - set(now["choices"]):
+        found.append("choices")
+    if not then["choices"] and not _takes(now["type"], then["type"]):
+        found.append("type")
+    if then["default"] != now["default"] and not (hidden and now["default"] in (None, False)):
+        found.append("default")  # an alias has none of its own
+    for bound, stricter in (("least", lambda a, b: b > a), ("most", lambda a, b: b < a)):
+        a, b = then[bound], now[bound]
+        if b is not None and (a is None or stricter(a, b)) and not now["choices"]:
+            found.append(bound)
+    return [f"{key}: was {then[key]!r}, is {now[key]!r}" for key in found]
+
+
+def _takes(now: str, then: str) -> bool:
+    """Whether all texts of one type are texts of the other."""
+    return now == then or now == "text" or (now, then) == ("float", "int")
+
+
+@pytest.mark.parametrize("verb", _GOLDEN["verbs"])
+def test_a_verb_takes_what_it_took(verb: str) -> None:
+    now = verbs()
+    assert verb in now
+    hidden = hidden_options(verb)
+    wrong: list[str] = []
+    for name, then in _GOLDEN["verbs"][verb]["options"].items():
+        if name not in now[verb]["options"]:
+            wrong.append(f"{name}: is no option any more")
+            continue
+        wrong += [f"{name}: {w}" for w in unlike_option(then, now[verb]["options"][name], hidden=name in hidden)]
+    given = {name for name, entry in now[verb]["options"].items() if entry["required"]}
+    wrong += [f"{name}: has to be given" for name in given - set(_GOLDEN["verbs"][verb]["options"])]
+    was, has = _GOLDEN["verbs"][verb]["arguments"], now[verb]["arguments"]
+    for n, then in enumerate(was):
+        wrong += [f"argument {n}: {w}" for w in unlike_option(then, has[n], hidden=False)] if n < len(has) else [f"{n}"]
+    wrong += [f"argument {n} is new and required" for n in range(len(was), len(has)) if has[n]["required"]]
+    assert wrong == []
+
+
+def hidden_options(verb: str) -> set[str]:
+    """Names of options that help texts do not show: old names."""
+    command = api.command_tree()
+    for word in verb.split() if verb != "semantic-mapper" else []:
+        command = command.commands[word]
+    options = [p for p in command.params if getattr(p, "hidden", False)]
+    return {name for p in options for name in (*p.opts, *p.secondary_opts)}
+
+
+def test_exit_codes_and_json_are_those_of_then(tmp_path: Path) -> None:
+    codes, forms = run_all(tmp_path)
+    then = _GOLDEN["codes"]
+    assert {n: codes.get(n) for n in then if codes.get(n) != then[n]} == {}, {n: then[n] for n in then}
+    assert lacking(_GOLDEN["json"], forms) == []
+    assert sorted(set(then.values())) == [0, 1, 2]

@@ -1,0 +1,350 @@
+"""Files that earlier versions wrote are read: maps, results, weights, calibrations, keys, corrections, keyframes."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.contract import entry_points as api
+from tests.contract.golden import (
+    FOLDER,
+    LOG,
+    MAP,
+    MAP_INT16,
+    STORED,
+    STORED_FRAMES,
+    STORED_SETTINGS,
+    WEIGHTS,
+    differences,
+    leaves,
+    plain,
+    read,
+)
+
+CALIBRATIONS = FOLDER / "calibrations"
+KEYS, LEARNING = FOLDER / "keys", FOLDER / "learning"
+CORRECTIONS, LAUNCH_FILE = FOLDER / "corrections.tum", FOLDER / "all-kinds.toml"
+POINT_M = 1e-5  # of points read out of a saved map: it is the same map, so float32 rounding at some metres
+
+_RIG = """fx = 80.25
+fy = 80.5
+cx = 47.5
+cy = 35.25
+width = 96
+height = 72
+distortion = [0.1, -0.02, 0.001, 0.002, 0.01]
+T_rig_camera = [
+    [1.0, 0.0, 0.0, 0.1],
+    [0.0, 0.0, 1.0, -0.2],
+    [0.0, -1.0, 0.0, 0.3],
+    [0.0, 0.0, 0.0, 1.0],
+]
+
+[about]
+made_by = "semantic-mapper 0.1.0 calibrate"
+rms_px = 0.21
+"""
+_JSON = '{"fx": 80, "fy": 80, "cx": 47.5, "cy": 35.5, "width": 96, "height": 72, "distortion": [0, 0, 0, 0]}'
+_ALL_KINDS = """# One node of each kind, each kind of camera and of poses, with what launch files of then say.
+heartbeat_s = 1.5
+stall_s = 120.0
+start_s = 200.0
+stop_s = 10.0
+finish_s = 100.0
+publish = "tcp://127.0.0.1:5571"
+
+[set]
+out = "runs/live/{now}"
+rate = 0.5
+device = ""
+
+[[node]]
+name = "log"
+kind = "camera"
+[node.options]
+log = "room.mcap"
+mode = "realtime"
+rate = "{rate}"
+max_frames = 9
+subscriber_timeout_s = 60.0
+ack_timeout_s = 60.0
+
+[[node]]
+name = "oak"
+kind = "camera"
+restart = "on-failure"
+backoff_s = 0.2
+max_restarts = 5
+standby = true
+[node.options.camera]
+kind = "oak"
+id = "oak"
+open_s = 3.0
+T_rig_camera = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+[node.options.camera.config]
+device = "{device}"
+fps = 20.0
+odometry = true
+[node.options.camera.poses]
+kind = "device"
+
+[[node]]
+name = "web"
+kind = "camera"
+[node.options]
+camera = { kind = "v4l2", id = "web", config = { uncalibrated = true }, poses = { kind = "board" } }
+
+[[node]]
+name = "film"
+kind = "camera"
+[node.options.camera]
+kind = "opencv"
+id = "film"
+config = { source = "a.mp4", pace = "fast", uncalibrated = true }
+poses = { kind = "topic", endpoint = "tcp://127.0.0.1:5560" }
+
+[[node]]
+name = "still"
+kind = "camera"
+[node.options.camera]
+kind = "v4l2"
+id = "still"
+config = { uncalibrated = true }
+poses = { kind = "fixed" }
+
+[[node]]
+name = "moving"
+kind = "camera"
+[node.options.camera]
+kind = "oak"
+id = "moving"
+poses = { kind = "rgbd" }
+
+[[node]]
+name = "mapper"
+kind = "mapper"
+[node.options]
+input = ["log", "oak", "web", "film", "still", "moving"]
+delivery = "newest"
+out = "{out}"
+weights = ""
+config = ""
+voxel_size_m = 0.03
+save_every_s = 60.0
+query = "query"
+learner = "finetuner"
+least_agreement = 0.5
+publish = "tcp://127.0.0.1:5572"
+
+[[node]]
+name = "recorder"
+kind = "recorder"
+[node.options]
+sources = ["log", "oak", "mapper"]
+streams = 2
+topics = ["info", "frame", "refused", "status", "map"]
+out = "{out}/recorded.mcap"
+split_mb = 100.0
+disk_full = "delete-oldest"
+reserve_mb = 100.0
+rgb = "jpeg"
+jpeg_quality = 80
+
+[[node]]
+name = "finetuner"
+kind = "finetuner"
+[node.options]
+mapper = "mapper"
+labels = "labels"
+share = 0.25
+threads = 1
+niceness = 18
+out = "{out}"
+"""
+
+
+def make_small_files() -> None:
+    """Write those that are not there yet."""
+    CALIBRATIONS.mkdir(exist_ok=True)
+    for path, text in (
+        (CALIBRATIONS / "rig.toml", _RIG),
+        (CALIBRATIONS / "plain.json", _JSON),
+        (LAUNCH_FILE, _ALL_KINDS),
+    ):
+        if not path.exists():
+            path.write_text(text, encoding="utf-8")
+    if not CORRECTIONS.exists():
+        assert (
+            api.run_here("export", LOG, "--out", CORRECTIONS, "--format", "trajectory", "--max-frames", "4").code == 0
+        )
+    if not KEYS.exists():  # a secret key that guards nothing: it is public from the day it was made
+        assert api.run_here("keys", "make", "--keys", KEYS).code == 0
+        key = "rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7"
+        assert api.run_here("keys", "allow", "robot", key, "--keys", KEYS).code == 0
+    if not LEARNING.exists():
+        with api.LogReader(LOG) as log:
+            kept = api.Kept(log.frame(0), True, 3, 1), api.Kept(log.frame(2), False)
+        api.keep_learning(api.LearningStore(LEARNING, api.ROOMS), kept)
+
+
+def observe(folder: Path) -> dict[str, Any]:
+    """What the files of today hold."""
+    return {name: look(folder) for name, look in _LOOKS.items()}
+
+
+def look_at_map(path: Path) -> dict[str, Any]:
+    """Frames, settings, classes, all voxels and the surface of a saved map."""
+    voxel_map = api.VoxelMap.load(path)
+    points = voxel_map.points()
+    return {
+        "frames": voxel_map.frames,
+        "last_stamp_ns": voxel_map.last_stamp_ns,
+        "blocks": voxel_map.block_count,
+        "config": leaves(voxel_map.config),
+        "label_set": plain(voxel_map.label_set),
+        "state": plain(voxel_map.block_state()),
+        "surface": {
+            "points": len(points.xyz),
+            "least": points.xyz.min(0).tolist(),
+            "most": points.xyz.max(0).tolist(),
+            "mean": points.xyz.mean(0, dtype=np.float64).tolist(),
+            "labels": np.bincount(points.label).tolist(),
+            "confidence": float(points.confidence.mean(dtype=np.float64)),
+        },
+    }
+
+
+def look_at_weights(_: Path) -> dict[str, Any]:
+    """Classes, training and network of the golden weights."""
+    checkpoint = api.load_checkpoint(WEIGHTS)
+    tensors = {name: plain(tensor.numpy()) for name, tensor in checkpoint.model.state_dict().items()}
+    return {
+        "kind": checkpoint.model.kind,
+        "width": checkpoint.width,
+        "stamps": sorted(checkpoint.train_stamps_ns),
+        "label_set": plain(checkpoint.label_set),
+        "anchors": [plain(frame) for frame in checkpoint.anchors],
+        "config": leaves(checkpoint.model.config),
+        "tensors": tensors,
+    }
+
+
+def look_at_calibrations(_: Path) -> dict[str, Any]:
+    """Intrinsics and mounts."""
+    return {
+        path.name: {"intrinsics": plain(api.load_calibration(path)), "mount": plain(api.load_mount(path))}
+        for path in sorted(CALIBRATIONS.iterdir())
+    }
+
+
+def look_at_keys(folder: Path) -> dict[str, Any]:
+    """Public keys; git does not keep that the secret one is for its owner alone."""
+    copy = folder / "keys"
+    shutil.copytree(KEYS, copy)
+    (copy / "own.key_secret").chmod(0o600)
+    keys = api.load_keys(copy)
+    peers = {name: key.decode() for name, key in keys.peers().items()}
+    return {"public": keys.public.decode(), "secret": plain(keys.secret), "peers": peers}
+
+
+def look_at_corrections(_: Path) -> dict[str, Any]:
+    """Stamps and poses."""
+    found = api.read_corrections(CORRECTIONS)
+    return {"stamps_ns": found.stamps_ns.tolist(), "poses": found.poses.round(12).ravel().tolist()}
+
+
+def look_at_launch(_: Path) -> dict[str, Any]:
+    """Nodes with their options."""
+    launch = api.load_launch(LAUNCH_FILE, ["now=then"])
+    return {
+        "nodes": {node.name: {"kind": node.kind, "entry": leaves(node)} for node in launch.nodes},
+        "options": {name: leaves(options) for name, options in launch.options.items()},
+        "inputs": {node.name: list(launch.inputs(node.name)) for node in launch.nodes},
+        "all": leaves(launch),
+    }
+
+
+def look_at_learning(folder: Path) -> dict[str, Any]:
+    """Keyframes and progress that a finetuner keeps."""
+    copy = folder / "learning"
+    shutil.copytree(LEARNING, copy)
+    pool = api.KeyframePool(api.ROOMS, held_out_every=2, capacity=8)
+    progress = api.LearningStore(copy, api.ROOMS).restore(pool)
+    return {"kept": {str(k.frame.stamp_ns): leaves(k) for k in pool.kept}, "progress": leaves(progress)}
+
+
+_LOOKS: dict[str, Callable[[Path], dict[str, Any]]] = {
+    "map": lambda _: look_at_map(MAP),
+    "map_int16": lambda _: look_at_map(MAP_INT16),
+    "weights": look_at_weights,
+    "calibrations": look_at_calibrations,
+    "keys": look_at_keys,
+    "corrections": look_at_corrections,
+    "launch": look_at_launch,
+    "learning": look_at_learning,
+}
+
+
+@pytest.mark.parametrize("name", [name for name in _LOOKS if "map" not in name])
+def test_a_file_of_then_says_what_it_said(name: str, tmp_path: Path) -> None:
+    assert differences(read("files")[name], _LOOKS[name](tmp_path)) == []
+
+
+@pytest.mark.parametrize("name", ["map", "map_int16"])
+def test_a_map_of_then_is_the_same_map(name: str, tmp_path: Path) -> None:
+    then, now = read("files")[name], _LOOKS[name](tmp_path)
+    surface, found = then.pop("surface"), now.pop("surface")
+    assert differences(then, now) == []  # what is stored, bit for bit
+    assert (found["points"], found["labels"]) == (surface["points"], surface["labels"])
+    for key in ("least", "most", "mean", "confidence"):
+        np.testing.assert_allclose(found[key], surface[key], atol=POINT_M, rtol=0)
+
+
+@pytest.mark.parametrize("path", [MAP, MAP_INT16], ids=lambda p: p.stem)
+def test_a_map_of_then_can_go_on(path: Path, tmp_path: Path) -> None:
+    voxel_map = api.VoxelMap.load(path)
+    with api.LogReader(LOG) as log:
+        frame = log.frame(8)
+    before = voxel_map.frames
+    assert voxel_map.integrate(frame, frame.depth_m, None) > 0
+    voxel_map.save(tmp_path / "map.npz")
+    assert api.VoxelMap.load(tmp_path / "map.npz").frames == before + 1
+
+
+def test_what_a_killed_mapper_leaves_can_be_asked(tmp_path: Path) -> None:
+    """A folder with the map that was saved while mapping, and no summary."""
+    shutil.copyfile(MAP, tmp_path / "map.npz")
+    for arguments in (("info", tmp_path), ("query", tmp_path, "nearest", "wall", "0", "0", "1")):
+        ran = api.run_here(*arguments)
+        assert ran.code == 0, ran.stderr
+    ran = api.run_here("compare", tmp_path, STORED, "--picture", tmp_path / "a.png")
+    assert ran.code == 0, ran.stdout
+
+
+def test_corrections_of_then_move_the_map(tmp_path: Path) -> None:
+    moved = tmp_path / "moved.tum"  # the whole path half a metre further along x
+    rows = [line.split() for line in CORRECTIONS.read_text().splitlines() if not line.startswith("#")]
+    moved.write_text("".join(f"{r[0]} {float(r[1]) + 0.5} {' '.join(r[2:])}\n" for r in rows))
+    settings = ("--weights", WEIGHTS, "--voxel-size", "0.1", "--max-frames", "4")
+    means = []
+    for n, corrections in enumerate((CORRECTIONS, moved)):
+        out = tmp_path / str(n)
+        ran = api.run_here("replay", LOG, "--out", out, *settings, "--corrections", corrections)
+        assert ran.code == 0, ran.stderr
+        means.append(api.VoxelMap.load(out / "map.npz").points().xyz.mean(0))
+    np.testing.assert_allclose(means[1] - means[0], (0.5, 0, 0), atol=1e-3)  # five whole voxels
+
+
+def test_a_stored_run_of_then_is_what_the_plugin_gets(tmp_path: Path) -> None:
+    replays = api.LogReplays(FOLDER, lambda name: tmp_path / name)
+    made = replays("room.mcap", weights="small.safetensors", config=STORED_SETTINGS, max_frames=STORED_FRAMES)
+    made.assert_like("stored")
+    assert made.mapped == STORED_FRAMES and made.refused == []
+    fewer = replays("room.mcap", weights="small.safetensors", config=STORED_SETTINGS, max_frames=STORED_FRAMES - 1)
+    with pytest.raises(AssertionError, match="is not as"):
+        fewer.assert_like("stored")

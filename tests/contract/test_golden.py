@@ -1,0 +1,20 @@
+"""Golden data is all there, and small."""
+
+from __future__ import annotations
+
+from tests.contract.golden import FOLDER, LOG, MAP, MAP_INT16, POINTS, STORED, WEIGHTS
+from tests.contract.record import GROUPS
+
+MOST_BYTES = 1_500_000
+NAMES = {"cli": "command_line"}
+
+
+def test_every_group_is_recorded() -> None:
+    for group in GROUPS:
+        assert group == "inputs" or (FOLDER / f"{NAMES.get(group, group)}.json").is_file()
+    for path in (LOG, MAP, MAP_INT16, POINTS, STORED / "summary.json", WEIGHTS):
+        assert path.is_file()
+
+
+def test_golden_data_is_small() -> None:
+    assert sum(path.stat().st_size for path in FOLDER.rglob("*") if path.is_file()) < MOST_BYTES
