@@ -9,7 +9,6 @@ from pathlib import Path
 import structlog
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.mapping.grid_snapshot import warm_up
 from semantic_mapper.mapping.map_saving import MapSaving
 from semantic_mapper.mapping.voxel_map import VoxelMap
 
@@ -45,7 +44,6 @@ class Autosave:
         self._saved_version = voxel_map.version
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
-        warm_up(len(voxel_map.label_set), voxel_map.config.evidence)  # else the first save's frame compiles
 
     def follow(self) -> None:
         """Begin a save if it is time; to be called between two frames."""

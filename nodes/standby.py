@@ -6,7 +6,6 @@ import numpy as np
 
 from replay.session import PipelineBundle
 from semantic_mapper.geometry import pose_matrix
-from semantic_mapper.mapping.grid_snapshot import warm_up as warm_up_saving
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
@@ -23,7 +22,6 @@ def warm_up_mapper(bundle: PipelineBundle) -> None:
     pipeline = MappingPipeline(own.config, own.field, own.label_set)
     for number in range(_FRAMES):
         pipeline.step(_wall(number))
-    warm_up_saving(len(own.label_set), own.config.voxel_map.evidence)
 
 
 def _wall(number: int) -> PosedFrame:

@@ -30,7 +30,7 @@ from semantic_mapper.fields.checkpoint import default_checkpoint_path
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.memory import keep_freed_memory
 
-PACKAGES = ("torch", "numpy", "numba")
+PACKAGES = ("torch", "numpy")
 
 
 def run_suite_verb(

@@ -29,7 +29,7 @@ if TYPE_CHECKING:  # session imports this module
 ItemT = TypeVar("ItemT")
 OVERVIEW_FRAMES = 2
 MAX_LISTED = 50  # refused frames, refused labels and damages: the first ones are told in the summary
-PACKAGES = ("torch", "open3d", "numpy", "numba", "opencv-contrib-python-headless", "pyzmq", "msgpack", "mcap")
+PACKAGES = ("torch", "open3d", "numpy", "opencv-contrib-python-headless", "pyzmq", "msgpack", "mcap")
 
 
 def write_artifacts(session: MapSession, out: Path, rerun: RerunLog | None) -> dict[str, Any]:

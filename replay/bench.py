@@ -278,7 +278,7 @@ def _row(timing: Timing, intrinsics: CameraIntrinsics) -> dict[str, float]:
     view = timing.scaled_to(intrinsics.width * intrinsics.height)  # a mean over the views
     return {
         "pixels_per_s": round(timing.rays / timing.wall_s, 1),
-        "view_wall_s": round(view.wall_s, 2),
-        "view_cpu_s": round(view.cpu_s, 2),
+        "view_wall_s": float(f"{view.wall_s:.3g}"),
+        "view_cpu_s": float(f"{view.cpu_s:.3g}"),
         "cpu_s_per_2048_pixels": round(timing.scaled_to(2048).cpu_s, 3),
     }

@@ -90,19 +90,3 @@ class GridSnapshot:
             self._kept = BlockStore(self._classes, self._grid.evidence)
         keys = np.array(list(islice(self._aside, count)), np.int64)
         self._kept.put_packed(keys, np.zeros(count, np.int64), [self._aside.pop(key) for key in keys.tolist()])
-
-
-def warm_up(classes: int, evidence: str) -> None:
-    """Load what a snapshot needs once in a process, which would else be the first frame's to wait for.
-
-    Args:
-        classes: L.
-        evidence: Key of ``EVIDENCE_DTYPES``.
-    """
-    grid = BlockGrid(1.0, classes, 1, 2, evidence=evidence)
-    key = pack_keys(np.zeros((1, 3), np.int32))
-    grid.activate(key)
-    snapshot = GridSnapshot(grid, classes)
-    grid.activate(key)
-    snapshot.read(1)
-    snapshot.close()

@@ -22,7 +22,6 @@ from typing import Any
 
 import cv2  # noqa: F401  (loaded once, before the fork)
 import msgspec  # noqa: F401
-import numba  # noqa: F401
 import torch  # noqa: F401
 
 from semantic_mapper.mapping.open3d_loader import load_open3d

@@ -25,7 +25,6 @@ def test_importing_the_library_does_not_import_open3d() -> None:
 
 
 def test_nothing_is_printed_when_kernels_start() -> None:
-    """Numba would warn of Open3D's old TBB."""
     code = (
         "import structlog; structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(40))\n"
         "from tests.mapping.views import *\nimport numpy as np\n"

@@ -14,7 +14,7 @@ from nodes.process import STOP_SIGNAL, StopRequest
 
 
 def _python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    inherited = {k: v for k, v in os.environ.items() if not k.startswith(("OMP_", "NUMBA_"))}
+    inherited = {k: v for k, v in os.environ.items() if not k.startswith("OMP_")}
     return subprocess.run(
         [sys.executable, "-I", "-c", code], capture_output=True, text=True, check=False, env=inherited | environment
     )

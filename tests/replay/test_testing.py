@@ -161,7 +161,7 @@ def test_a_project_stores_a_run_passes_and_fails_when_the_map_changes(root: Path
 def test_the_plugin_costs_nothing_until_it_is_used() -> None:
     program = (
         "import sys, semantic_mapper.testing\n"
-        "heavy = {'numpy', 'torch', 'open3d', 'numba', 'scipy', 'cv2', 'zmq', 'msgspec', 'structlog'}\n"
+        "heavy = {'numpy', 'torch', 'open3d', 'scipy', 'cv2', 'zmq', 'msgspec', 'structlog'}\n"
         "print(sorted(heavy & set(sys.modules)))\n"
     )
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
