@@ -37,7 +37,7 @@ TOLERANCES = {
     "surface_points": 5,  # of 9,428; rounding: none; truncation + 5 %: 99
     "classes": 5,  # of one class; rounding: none; truncation + 5 %: 37
     "confidence": 1e-4,  # of a quantile; rounding: 4e-6; votes + 2 %: 9e-4
-    "miou": 2e-3,  # a ray that goes to another class is 4 pixels, perhaps of a rare one; rounding: none; frame left out: 4e-3
+    "miou": 2e-3,  # one ray is 4 pixels, perhaps of a rare class; rounding: none; frame left out: 4e-3
     "map_miou": 2e-3,  # rounding: none; frame left out: 4e-3; half a voxel off: 6e-3
     "total_accuracy": 5e-4,  # 35 of 69,120 pixels; rounding: none; frame left out: 1e-3
     "votes": 5.0,  # 1e-4 of all; rounding: 1e-3; votes + 2 %: 1,000
