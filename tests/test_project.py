@@ -90,7 +90,7 @@ def test_no_file_names_a_machine_or_a_package_index() -> None:
         path = ROOT / name
         if (
             name == "uv.lock"
-            or path.suffix in {".png", ".jpg", ".safetensors", ".mcap", ".bin", ".msg"}
+            or path.suffix in {".png", ".jpg", ".safetensors", ".mcap", ".npz", ".keyframe", ".bin", ".msg"}
             or not path.is_file()
         ):
             continue
