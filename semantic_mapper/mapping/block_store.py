@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sqlite3
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -144,10 +144,10 @@ class BlockStore:
         except sqlite3.Error as error:
             raise MapError(f"blocks on disk cannot be read: {error}") from error
         values = _empty(len(wanted), self._classes, self._evidence)
-        for n, key in enumerate(wanted):
+        for key in wanted:
             if key not in found or zlib.crc32(found[key][1]) != found[key][0]:
                 raise MapError(f"block {key} on disk is {'damaged' if key in found else 'missing'}; its disk fails")
-            unpack_block(found[key][1], values, n)
+        unpack_blocks([found[key][1] for key in wanted], values, np.arange(len(wanted)))
         return values
 
     def drop(self, keys: NDArray[np.int64]) -> None:
@@ -203,14 +203,19 @@ def pack_blocks(values: BlockValues, rows: NDArray[np.int32]) -> PackedBlocks:
     return PackedBlocks(data, ends, values.evidence.dtype)
 
 
-def unpack_block(voxels: bytes | memoryview, values: BlockValues, n: int) -> None:
-    """Fill block ``n``, whose voxels are all zero, with what ``pack_blocks`` has packed of one.
+def unpack_blocks(blobs: Sequence[bytes | memoryview], values: BlockValues, rows: NDArray[np.int64]) -> None:
+    """Fill blocks ``rows`` (B,), whose voxels are all zero, with those that ``pack_blocks`` has packed.
 
     Raises:
-        MapError: the bytes are no packed block with as many classes.
+        MapError: bytes are no packed block with as many classes.
     """
-    if len(voxels) % 4 or not unpack_block_values(np.frombuffer(voxels, np.float32), values, n):
-        raise MapError(f"a packed block of {len(voxels)} bytes does not hold the voxels that it says; its disk fails")
+    sizes = np.array([0, *map(len, blobs)], np.int64)
+    count = 0
+    if not (sizes % 4).any():
+        ends = np.cumsum(sizes // 4)
+        count = unpack_block_values(np.frombuffer(b"".join(blobs), np.float32), ends, values, rows)
+    if count < len(rows):
+        raise MapError(f"a packed block of {len(blobs[count])} bytes does not hold what it says; its disk fails")
 
 
 def evidence_floats(evidence: NDArray[Any]) -> int:
@@ -238,6 +243,16 @@ def pack_block_values(values: BlockValues, rows: Int32, ends: Int64, data: Float
 
 
 @kernel
-def unpack_block_values(data: Float32, values: BlockValues, row: int) -> int:
-    """The reverse for one block, onto voxels that are zero; returns 0 where the data (N,) are none, else 1."""
+def unpack_block_values(data: Float32, ends: Int64, values: BlockValues, rows: Int64) -> int:
+    """The reverse, onto voxels that are zero.
+
+    Args:
+        data: (N,) packed blocks.
+        ends: (B + 1,) where they begin and end.
+        values: To fill.
+        rows: (B,) blocks of ``values``.
+
+    Returns:
+        How many were unpacked, fewer than B where one is damaged.
+    """
     ...

@@ -104,7 +104,7 @@ def make_votes(
     """
     log_p, proper = np.empty_like(probabilities), np.empty(len(probabilities), np.bool_)
     _log_probability_rows(len(probabilities), probabilities, log_p, proper)
-    weights, bad = np.zeros(depth.shape, np.float32), np.zeros(len(depth), np.int64)
+    weights, bad = np.empty(depth.shape, np.float32), np.empty(len(depth), np.int64)
     _vote_weights(len(depth), depth, rows, proper, camera, depth_max, weights, bad)
     return Votes(log_p, rows, weights), int(bad.sum())
 
@@ -160,9 +160,17 @@ def _vote_weights(
     weights: Float32,
     bad: Int64,
 ) -> None:
-    """Weights (H, W) of votes, and ``bad`` (H,), zeros, counts pixels of each row whose probabilities are not proper.
+    """Weigh votes: |cos| of the angle between ray and surface normal, from four neighbours, times nearness.
 
-    A vote weighs |cos| of the angle between ray and surface normal, from four neighbours, times nearness.
+    Args:
+        height: H.
+        depth: (H, W) metres.
+        rows: (H, W) row of each pixel, -1 = unknown.
+        proper: (K,) of ``_log_probability_rows``.
+        camera: Of the frame.
+        depth_max: Farther depth is ignored.
+        weights: (H, W) to fill.
+        bad: (H,) to fill: known pixels of each row of the image whose probabilities are not proper.
     """
     ...
 

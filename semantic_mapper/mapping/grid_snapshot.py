@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.block_grid import BlockGrid
 from semantic_mapper.mapping.block_index import pack_keys, unpack_keys
-from semantic_mapper.mapping.block_store import BlockStore, BlockValues, unpack_block
+from semantic_mapper.mapping.block_store import BlockStore, BlockValues, unpack_blocks
 
 MOST_ASIDE = 2048  # blocks in memory that frames have changed, some 20 KB each; of more, the first go to disk
 
@@ -55,12 +55,10 @@ class GridSnapshot:
             for now, then in zip(values, kept.get(part[old]), strict=True):
                 now[old] = then
             kept.drop(part[old])
-        for n, key in enumerate(part.tolist()):
-            voxels = self._aside.pop(key, None)
-            if voxels is not None:
-                for now in values:
-                    now[n] = 0
-                unpack_block(voxels, values, n)
+        aside = [n for n, key in enumerate(part.tolist()) if key in self._aside]
+        for now in values:
+            now[aside] = 0
+        unpack_blocks([self._aside.pop(key) for key in part[aside].tolist()], values, np.array(aside, np.int64))
         return unpack_keys(part), values
 
     def close(self) -> None:

@@ -12,7 +12,7 @@ from semantic_mapper.mapping.block_store import (
     BlockStore,
     BlockValues,
     pack_blocks,
-    unpack_block,
+    unpack_blocks,
 )
 
 CLASSES = 3
@@ -186,7 +186,7 @@ def test_bytes_that_are_no_packed_block_are_refused():
     empty = BlockValues(*(np.zeros_like(values) for values in blocks))
     for wrong in (b"", blob[:100], blob[:-4], blob[:-1], blob + bytes(4), b"\xff" * len(blob)):
         with pytest.raises(MapError, match="packed block"):
-            unpack_block(wrong, empty, 0)
+            unpack_blocks([wrong], empty, np.zeros(1, np.int64))
     assert not any(values.any() for values in empty)
-    unpack_block(blob, empty, 0)
+    unpack_blocks([memoryview(blob)], empty, np.zeros(1, np.int64))
     assert empty.tsdf.tobytes() == blocks.tsdf.tobytes()

@@ -68,30 +68,34 @@ KERNEL(pack_block_values, PackArguments) {
 }
 
 typedef struct {
-    F32 data; /* (N,) one packed block */
+    F32 data; /* (N,) packed blocks */
+    I64 ends; /* (B + 1,) where they begin and end */
     BlockValues values;
-    int64_t row; /* of the block to fill, whose voxels are all zero */
+    I64 rows; /* (B,) of the blocks to fill, whose voxels are all zero */
 } UnpackArguments;
 
-/* Returns 1, or 0 where the data are no packed block of so many classes. */
+/* Returns how many were unpacked: fewer than B where the data of the next are no packed block of so many classes. */
 KERNEL(unpack_block_values, UnpackArguments) {
     const BlockValues *values = &a->values;
     int64_t classes = values->evidence.shape[2], voxel_bytes = classes * values->evidence.itemsize;
     int64_t width = evidence_floats(classes, values->evidence.itemsize);
-    PackedBlock block;
-    if (!open_packed(a->data.data, a->data.shape[0], width, &block)) return 0;
-    for (int64_t voxel = 0; voxel < BLOCK_VOXELS; voxel++) {
-        int64_t at = a->row * BLOCK_VOXELS + voxel;
-        if (in_mask(block.measured, voxel)) {
-            values->tsdf.data[at] = *block.tsdf++;
-            values->weight.data[at] = *block.weight++;
-            for (int c = 0; c < 3; c++) values->color.data[3 * at + c] = *block.color++;
-        }
-        if (in_mask(block.voted, voxel)) {
-            memcpy((char *)values->evidence.data + at * voxel_bytes, block.evidence, (size_t)voxel_bytes);
-            values->votes.data[at] = *block.votes++;
-            block.evidence += width;
+    for (int64_t n = 0; n < a->rows.shape[0]; n++) {
+        PackedBlock block;
+        int64_t begin = a->ends.data[n], end = a->ends.data[n + 1];
+        if (!open_packed(a->data.data + begin, end - begin, width, &block)) return n;
+        for (int64_t voxel = 0; voxel < BLOCK_VOXELS; voxel++) {
+            int64_t at = a->rows.data[n] * BLOCK_VOXELS + voxel;
+            if (in_mask(block.measured, voxel)) {
+                values->tsdf.data[at] = *block.tsdf++;
+                values->weight.data[at] = *block.weight++;
+                for (int c = 0; c < 3; c++) values->color.data[3 * at + c] = *block.color++;
+            }
+            if (in_mask(block.voted, voxel)) {
+                memcpy((char *)values->evidence.data + at * voxel_bytes, block.evidence, (size_t)voxel_bytes);
+                values->votes.data[at] = *block.votes++;
+                block.evidence += width;
+            }
         }
     }
-    return 1;
+    return a->rows.shape[0];
 }

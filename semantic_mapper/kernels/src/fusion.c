@@ -1,4 +1,6 @@
 /* Fusion of one frame: TSDF, color and class evidence in one pass; see mapping/fusion.py. */
+#include <string.h>
+
 #include "voxel_lookup.h"
 
 #define PROBABILITY_FLOOR 1e-4f /* of mapping/evidence.py */
@@ -38,18 +40,17 @@ static void weigh_row(const F32 *depth, int64_t v, const Camera *camera, float f
     int64_t height = depth->shape[0], width = depth->shape[1], last = width - 1;
     const float *row = depth->data + v * width;
     const float *up = depth->data + max_i(v - 1, 0) * width, *down = depth->data + min_i(v + 1, height - 1) * width;
-    bool inside = 0 < v && v < height - 1;
+    float least_known = 0 < v && v < height - 1 ? LEAST_COSINE : INFINITY; /* the first and last row lack a neighbour */
     float fx = (float)camera->fx, fy = (float)camera->fy, cx = (float)camera->cx;
     float y = ((float)v - (float)camera->cy) / fy;
     for (int64_t u = 1; u < last; u++) { /* without branches, for eight at a time */
-        float z = row[u], left = row[u - 1], right = row[u + 1];
-        float x = ((float)(int32_t)u - cx) / fx;
+        float x = ((float)(int32_t)u - cx) / fx, z = row[u], left = row[u - 1], right = row[u + 1];
         /* With slopes dz/du, dz/dv the normal is (fx dz/du, fy dz/dv, -(z + x fx dz/du + y fy dz/dv)), unnormalised;
          * its product with the ray (x, y, 1) is -z. */
         float nx = fx * 0.5f * (right - left), ny = fy * 0.5f * (down[u] - up[u]);
         float nz = z + x * nx + y * ny;
         float cosine = z / sqrtf((nx * nx + ny * ny + nz * nz) * (x * x + y * y + 1.0f));
-        bool known = inside & (left > 0) & (right > 0) & (up[u] > 0) & (down[u] > 0) & (cosine > LEAST_COSINE);
+        bool known = (left > 0) & (right > 0) & (up[u] > 0) & (down[u] > 0) & (cosine > least_known);
         float near = FULL_TRUST_RANGE_M / z, weight = (known ? cosine : LEAST_COSINE) * min_f(near * near, 1.0f);
         weights[u] = ((z > 0) & (z <= far)) ? weight : 0.0f;
     }
@@ -64,22 +65,22 @@ typedef struct {
     Camera camera;
     double depth_max; /* metres */
     F32 weights;      /* (H, W) to fill */
-    I64 bad;          /* (H,) zeros; to count known pixels of each row whose probabilities are not proper */
+    I64 bad;          /* (H,) to fill: known pixels of each row of the image whose probabilities are not proper */
 } VoteWeightsArguments;
 
 KERNEL(vote_weights, VoteWeightsArguments) {
     int64_t width = a->depth.shape[1];
+    bool all_proper = !memchr(a->proper.data, 0, (size_t)a->proper.shape[0]); /* as a rule */
     for (int64_t v = start; v < stop; v++) {
-        float *weights = a->weights.data + v * width;
+        float *restrict weights = a->weights.data + v * width;
         weigh_row(&a->depth, v, &a->camera, (float)a->depth_max, weights);
-        for (int64_t u = 0; u < width; u++) {
-            int32_t row = a->rows.data[v * width + u];
-            if (row < 0) {
-                weights[u] = 0;
-            } else if (!a->proper.data[row] && weights[u] > 0) {
-                weights[u] = 0;
-                a->bad.data[v]++;
-            }
+        const int32_t *rows = a->rows.data + v * width;
+        for (int64_t u = 0; u < width; u++) weights[u] = rows[u] < 0 ? 0.0f : weights[u];
+        a->bad.data[v] = 0;
+        for (int64_t u = 0; u < width && !all_proper; u++) {
+            if (rows[u] < 0 || a->proper.data[rows[u]]) continue;
+            a->bad.data[v] += weights[u] > 0;
+            weights[u] = 0.0f;
         }
     }
     return 0;

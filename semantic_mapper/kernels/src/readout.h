@@ -97,9 +97,11 @@ static inline int64_t decide(const void *evidence, int64_t itemsize, int64_t cla
     double worth = votes > 1 ? 1.0 / (1.0 + vote_discount * (votes - 1.0)) : 1.0 / votes; /* n_eff / n */
     worth *= evidence_scale(itemsize, votes);
     int64_t best = 0;
-    for (int64_t c = 1; c < classes; c++)
-        if (evidence_difference(evidence, itemsize, c, best) > 0) best = c;
-    double total = 0.0;
+    double most = evidence_at(evidence, itemsize, 0), total = 0.0;
+    for (int64_t c = 1; c < classes; c++) {
+        double value = evidence_at(evidence, itemsize, c);
+        if (value > most) most = value, best = c;
+    }
     for (int64_t c = 0; c < classes; c++) total += exp(evidence_difference(evidence, itemsize, c, best) * worth);
     *confidence = 1.0 / total;
     return best;
