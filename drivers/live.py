@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol, Self
 
-from drivers.base import CameraImage
-from drivers.calibration import Rectifier, guess_intrinsics
+from semantic_mapper.drivers.base import CameraImage
+from semantic_mapper.drivers.calibration import Rectifier, guess_intrinsics
 from semantic_mapper.errors import CameraError
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.transport.messages import StreamInfo

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.calibration import Matrix, load_mount, rigid_matrix
-from drivers.poses.config import PoseConfig, tells_of_rig
+from semantic_mapper.drivers.calibration import Matrix, load_mount, rigid_matrix
+from semantic_mapper.drivers.poses.config import PoseConfig, tells_of_rig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.types import Float64
 

@@ -13,8 +13,8 @@ from typing import Any, Protocol, cast
 
 import msgspec
 
-from drivers.base import Camera
 from semantic_mapper.config import convert_config
+from semantic_mapper.drivers.base import Camera
 from semantic_mapper.errors import ConfigError, DependencyError, SemanticMapperError
 
 KINDS = ("v4l2", "opencv", "oak")
@@ -71,7 +71,7 @@ def load_driver(kind: str) -> Driver:
         hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(KINDS)}"
         raise ConfigError(f"no kind of camera is called '{kind}'; {hint}")
     try:
-        return cast(Driver, importlib.import_module(f"drivers.{kind}"))
+        return cast(Driver, importlib.import_module(f"semantic_mapper.drivers.{kind}"))
     except ImportError as error:
         raise DependencyError(f"cameras of kind '{kind}' cannot be used here: {error}") from error
 

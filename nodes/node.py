@@ -14,13 +14,13 @@ from typing import NoReturn, TypeVar
 import msgspec
 import structlog
 
-from nodes.child import FAILURE_EVENT, JOB_PREFIX
-from nodes.heartbeat import Heart, end_with_launcher
-from nodes.options import Call, CameraOptions, NodeJob, NodeOptions
-from nodes.process import STOP_SIGNAL, StopRequest, prepare_process
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.memory import is_out_of_memory, memory_message
+from semantic_mapper.nodes.options import Call, CameraOptions, NodeJob, NodeOptions
+from semantic_mapper.nodes.process import STOP_SIGNAL, StopRequest, prepare_process
+from semantic_mapper.nodes.supervisor.heartbeat import Heart, end_with_launcher
+from semantic_mapper.nodes.supervisor.node_process import FAILURE_EVENT, JOB_PREFIX
 
 _log = structlog.get_logger(__name__)
 

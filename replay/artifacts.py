@@ -18,13 +18,13 @@ from semantic_mapper.evaluation.metrics import confusion_of
 from semantic_mapper.evaluation.report import ViewStrip, write_overview
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.files import write_bytes
-from semantic_mapper.mapping.formats.ply import write_ply
+from semantic_mapper.mapping.files.formats.ply import write_ply
 from semantic_mapper.mapping.map_types import MapPoints
 
 if TYPE_CHECKING:  # session imports this module
-    from replay.rerun_log import RerunLog
-    from replay.session import MapSession, Refusal
-    from replay.tallies import StepTimes
+    from semantic_mapper.replay.exporters.rerun_log import RerunLog
+    from semantic_mapper.replay.session import MapSession, Refusal
+    from semantic_mapper.replay.stats import StepTimes
 
 ItemT = TypeVar("ItemT")
 OVERVIEW_FRAMES = 2

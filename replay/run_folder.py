@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from replay.summary import SUMMARY_FILE, read_summary
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.replay.summary import SUMMARY_FILE, read_summary
 
 MAP_FILE = "map.npz"
 

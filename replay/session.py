@@ -11,9 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from replay.artifacts import MAX_LISTED, write_artifacts
-from replay.tallies import FirstAndLast, StepTimes
-from replay.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.config import MapperConfig, convert_config, to_plain, with_quality
 from semantic_mapper.errors import FrameError, LabelError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, ImageMeans, confusion_of
@@ -27,10 +24,13 @@ from semantic_mapper.fields.sray_streaming import StreamingSRay, compiled_covers
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.pipeline import MappingPipeline
+from semantic_mapper.replay.artifacts import MAX_LISTED, write_artifacts
+from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
+from semantic_mapper.replay.stats import FirstAndLast, StepTimes
 from semantic_mapper.types import MapUpdate, PosedFrame
 
 if TYPE_CHECKING:
-    from replay.rerun_log import RerunLog
+    from semantic_mapper.replay.exporters.rerun_log import RerunLog
 
 _log = get_logger(__name__)
 
@@ -229,6 +229,9 @@ def open_recording(path: Path | None, pipeline: MappingPipeline) -> RerunLog | N
     """A Rerun recording (.rrd) of a session with this pipeline; None where no path is given."""
     if path is None:
         return None
-    from replay.rerun_log import RerunLog, recording_file  # loads for over a second, and few sessions need it
+    from semantic_mapper.replay.exporters.rerun_log import (  # loads for over a second, and few sessions need it
+        RerunLog,
+        recording_file,
+    )
 
     return RerunLog(recording_file(path), pipeline.label_set, pipeline.voxel_map.config.voxel_size_m)

@@ -17,11 +17,11 @@ from semantic_mapper.errors import LogError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from replay.compare import Comparison
     from semantic_mapper.config import MapperConfig
     from semantic_mapper.mapping.voxel_map import VoxelMap
     from semantic_mapper.queries.nearest import NearestSurface
     from semantic_mapper.queries.snapshot import MapSnapshot
+    from semantic_mapper.replay.compare.runs import Comparison
 
 UPDATE_OPTION = "--update-runs"
 
@@ -131,16 +131,16 @@ class ReplayedMap:
 
         Args:
             stored: The run; a relative path begins at pytest's root folder.
-            tolerances: By field, as of ``replay.tolerances.Tolerances``.
+            tolerances: By field, as of ``semantic_mapper.replay.compare.tolerances.Tolerances``.
 
         Raises:
             ConfigError: no such field, or a folder without a run.
             MapError: no such map, or a damaged one.
         """
-        from replay.compare import compare_runs
-        from replay.run_folder import Run, read_run
-        from replay.tolerances import Tolerances
         from semantic_mapper.config import convert_config
+        from semantic_mapper.replay.compare.runs import compare_runs
+        from semantic_mapper.replay.compare.tolerances import Tolerances
+        from semantic_mapper.replay.run_folder import Run, read_run
 
         allowed = convert_config(tolerances, Tolerances, "tolerances")
         earlier = read_run(self.root / stored)
@@ -152,8 +152,8 @@ class ReplayedMap:
         Raises:
             OSError: it cannot be written.
         """
-        from replay.run_folder import MAP_FILE
-        from replay.summary import SUMMARY_FILE
+        from semantic_mapper.replay.run_folder import MAP_FILE
+        from semantic_mapper.replay.summary import SUMMARY_FILE
 
         folder = self.root / target
         folder.mkdir(parents=True, exist_ok=True)
@@ -168,8 +168,8 @@ class ReplayedMap:
         Raises:
             AssertionError: it differs, or no run is stored there.
         """
-        from replay.compare_picture import draw_comparison
         from semantic_mapper.evaluation.sheet import write_picture
+        from semantic_mapper.replay.compare.picture import draw_comparison
 
         target = self.root / stored
         if self.update:
@@ -249,8 +249,8 @@ class LogReplays:
         return mapper
 
     def _replay(self, path: Path, weights: Path | None, config: MapperConfig, max_frames: int) -> ReplayedMap:
-        from replay.sequence import open_log
-        from replay.session import MapSession, load_pipeline
+        from semantic_mapper.replay.log.sequence import open_log
+        from semantic_mapper.replay.session import MapSession, load_pipeline
         from semantic_mapper.types import PosedFrame
 
         with open_log(path) as log:

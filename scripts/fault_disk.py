@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from replay.recording import Recording, RecordingRules
-from replay.sequence import open_log, parts_on_disk
 from scripts.fault_table import Outcome
+from semantic_mapper.replay.log.recording import Recording, RecordingRules
+from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
 from semantic_mapper.transport.codec import encode_frame
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, PosedFrame

@@ -14,16 +14,16 @@ from typing import Self
 import numpy as np
 import pytest
 
-from drivers.base import CameraImage, PoseEstimate
-from drivers.poses.config import DevicePoses, FixedPose
-from drivers.poses.posed_camera import PosedCamera
-from drivers.poses.sources import make_poses
-from drivers.registry import open_camera
-from nodes.run_replay import mapper_config
-from replay.session import MapSession, load_pipeline
 from scripts.fault_table import Outcome
 from scripts.long_log import INTRINSICS, distinct_frames
+from semantic_mapper.drivers.base import CameraImage, PoseEstimate
+from semantic_mapper.drivers.poses.config import DevicePoses, FixedPose
+from semantic_mapper.drivers.poses.posed_camera import PosedCamera
+from semantic_mapper.drivers.poses.sources import make_poses
+from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.nodes.cli.run_replay import mapper_config
+from semantic_mapper.replay.session import MapSession, load_pipeline
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 from tests.drivers.fake_v4l2 import Sensor, make_machine, write_calibration

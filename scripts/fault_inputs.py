@@ -13,21 +13,21 @@ from pathlib import Path
 import numpy as np
 import zmq
 
-from drivers.base import CameraImage
-from drivers.poses.config import TopicPoses
-from drivers.poses.topic import TopicPoseSource
-from nodes.child import Child
-from nodes.options import NodeJob
-from nodes.process_figures import process_figures
-from nodes.query_service import QueryService
 from scripts.fault_table import Outcome
 from scripts.fuzz_targets import TARGETS, flip
 from scripts.long_log import INTRINSICS, distinct_frames
 from semantic_mapper.client import MapClient
 from semantic_mapper.config import VoxelMapConfig
+from semantic_mapper.drivers.base import CameraImage
+from semantic_mapper.drivers.poses.config import TopicPoses
+from semantic_mapper.drivers.poses.topic import TopicPoseSource
 from semantic_mapper.errors import CodecError, SemanticMapperError, TransportError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.mapper.query_service import QueryService
+from semantic_mapper.nodes.options import NodeJob
+from semantic_mapper.nodes.supervisor.node_process import Child
+from semantic_mapper.nodes.supervisor.process_stats import process_figures
 from semantic_mapper.transport.codec import decode, encode_frame, encode_info
 from semantic_mapper.transport.framing import unpack_parts
 from semantic_mapper.transport.messages import StreamInfo

@@ -20,9 +20,9 @@ import msgpack
 import numpy as np
 from mcap.opcode import Opcode
 
-from replay.log import LogReader, LogWriter
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.labels import NYU40
+from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.transport import codec, query_codec
 from semantic_mapper.transport.framing import pack_parts, unpack_parts
 from semantic_mapper.transport.headers import HeaderT

@@ -21,7 +21,6 @@ import msgpack
 import numpy as np
 import torch
 
-from replay.session import MapSession, PipelineBundle, make_field
 from semantic_mapper.config import EncoderConfig, MapperConfig, SRayConfig, convert_config
 from semantic_mapper.errors import CodecError, MapError
 from semantic_mapper.fields.checkpoint import Checkpoint
@@ -29,6 +28,7 @@ from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.memory import give_back_freed_memory
+from semantic_mapper.replay.session import MapSession, PipelineBundle, make_field
 from semantic_mapper.transport import codec
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 

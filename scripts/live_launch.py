@@ -14,8 +14,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
-from replay.log import LogReader
 from semantic_mapper.errors import LogError
+from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.transport.codec import decode_map_update, read_envelope
 from semantic_mapper.transport.sockets import LosslessSubscriber
 from semantic_mapper.transport.topics import TOPICS

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from replay.log import LogWriter
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.scenes import TRAIN_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.compression import depth_from_uint16

@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from drivers.base import CameraImage
-from drivers.poses.config import OdometryPoses
-from drivers.poses.odometry import OdometryPoseSource
-from replay.log import LogReader, LogWriter
 from semantic_mapper.config import convert_config, read_toml, to_plain
+from semantic_mapper.drivers.base import CameraImage
+from semantic_mapper.drivers.poses.config import OdometryPoses
+from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
 from semantic_mapper.evaluation.path_plot import draw_top_view
 from semantic_mapper.evaluation.sheet import write_picture
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, align_rigid, relative_pose_error
+from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.types import Float64, PosedFrame
 
 

@@ -26,12 +26,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from nodes.child import Child
-from nodes.learning_round import file_of
-from nodes.options import NodeJob
-from replay.artifacts import write_json
-from replay.log import LogReader
-from replay.truth import TruthMapper
 from scripts.paired_steps import LAP, Turn, slowdown
 from semantic_mapper.client import MapClient
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, confusion_of
@@ -39,6 +33,12 @@ from semantic_mapper.evaluation.plot import Curve, Panel, draw_panels
 from semantic_mapper.evaluation.sheet import write_picture
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.nodes.finetuner.finetune_round import file_of
+from semantic_mapper.nodes.options import NodeJob
+from semantic_mapper.nodes.supervisor.node_process import Child
+from semantic_mapper.replay.artifacts import write_json
+from semantic_mapper.replay.evaluate.truth import TruthMapper
+from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info, encode_keyframe, encode_weights
 from semantic_mapper.transport.learning_messages import digest_of

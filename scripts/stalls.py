@@ -18,15 +18,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from nodes.query_service import QueryService
 from semantic_mapper.client import MapClient
 from semantic_mapper.config import HistoryConfig, KeyframeConfig, VoxelMapConfig
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.mapping.correction import MapCorrector
-from semantic_mapper.mapping.history import FusedFrame
+from semantic_mapper.mapping.correction.corrected_map import MapCorrector
+from semantic_mapper.mapping.correction.history import FusedFrame
 from semantic_mapper.mapping.keyframes import KeyframeStore
-from semantic_mapper.mapping.lifting import lift
+from semantic_mapper.mapping.views.upsample import lift
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 

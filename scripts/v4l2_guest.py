@@ -17,9 +17,9 @@ from pathlib import Path
 
 sys.modules["torch"] = types.ModuleType("torch")  # the library names its types, the driver computes nothing with it
 
-from drivers.base import Camera  # noqa: E402
-from drivers.registry import find_cameras, open_camera  # noqa: E402
-from drivers.v4l2 import ioctls, paths  # noqa: E402
+from semantic_mapper.drivers.base import Camera  # noqa: E402
+from semantic_mapper.drivers.registry import find_cameras, open_camera  # noqa: E402
+from semantic_mapper.drivers.v4l2 import ioctls, paths  # noqa: E402
 from semantic_mapper.errors import CameraError  # noqa: E402
 
 DRIVER = Path("/sys/bus/platform/drivers/vivid")

@@ -12,10 +12,10 @@ from browser import Browser
 from live_launch import COMMAND, LiveLaunch, Told
 from web_pictures import empty_images, map_pixels, take, what_is_missing
 
-from replay.log import LogReader, LogWriter
 from semantic_mapper.evaluation.legend import legend_rows
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.scenes import TEST_SEEDS, room_frames
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, PosedFrame

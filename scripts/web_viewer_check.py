@@ -18,15 +18,15 @@ from browser import ROOT, Browser, provide_browser
 from web_live import look_at_live
 from web_pictures import LARGEST, take, what_is_missing
 
-from nodes.html_page import HtmlPage
-from nodes.watching import show_saved
-from nodes.web_viewer import WebViewer
-from replay.rerun_log import recording_server
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.evaluation.legend import legend_rows
 from semantic_mapper.evaluation.plot import Bar, draw_bars
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.cli.html_page import HtmlPage
+from semantic_mapper.nodes.viewer.server import WebViewer
+from semantic_mapper.nodes.viewer.sources import show_saved
+from semantic_mapper.replay.exporters.rerun_log import recording_server
 from semantic_mapper.scenes import TEST_SEEDS, room_frames
 from semantic_mapper.types import CameraIntrinsics
 

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import CodecError, ShapeError
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.changes import BlockChanges
+from semantic_mapper.mapping.correction.pose_correction import CorrectedPoses
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.mapping.pose_correction import CorrectedPoses
+from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.queries.checks import as_numbers
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.lookup import PointAnswers

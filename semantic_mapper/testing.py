@@ -7,7 +7,8 @@
         kitchen.assert_like("runs/kitchen", labels=0.02)  # stored by `pytest --update-runs`
 
 pytest finds it by itself where semantic-mapper is installed (``-p no:semantic_mapper.testing`` leaves it out), and it
-costs nothing until a test asks for the fixture. This is the name under which others import ``replay.testing``; nothing
+costs nothing until a test asks for the fixture. This is the name under which others import
+``semantic_mapper.replay.testing``; nothing
 of this project imports it.
 """
 
@@ -15,7 +16,7 @@ from __future__ import annotations
 
 import pytest
 
-from replay.testing import UPDATE_OPTION, LogReplays, ReplayedMap
+from semantic_mapper.replay.testing import UPDATE_OPTION, LogReplays, ReplayedMap
 
 __all__ = ["LogReplays", "ReplayedMap", "replay_log"]
 

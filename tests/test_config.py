@@ -7,7 +7,6 @@ from typing import Any
 import msgspec
 import pytest
 
-from nodes.run_replay import mapper_config
 from semantic_mapper.config import (
     MAX_FILE_BYTES,
     Config,
@@ -23,6 +22,7 @@ from semantic_mapper.config import (
     to_plain,
 )
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.nodes.cli.run_replay import mapper_config
 
 
 def write(folder: Path, text: str) -> Path:

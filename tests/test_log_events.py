@@ -51,7 +51,8 @@ def test_structlog_that_the_program_sets_up_later_is_used_as_it_is() -> None:
 
 def test_library_code_says_nothing_on_stdout() -> None:
     done = run(
-        "import semantic_mapper.training.rooms, replay.recording, replay.session, drivers.live\n"
+        "import semantic_mapper.training.rooms, semantic_mapper.replay.log.recording\n"
+        "import semantic_mapper.replay.session, semantic_mapper.drivers.live\n"
         "from semantic_mapper.transport.subscribers import log\n"
         "from semantic_mapper.benchmark.store import RecordStore\n"
         "import pathlib, tempfile\n"

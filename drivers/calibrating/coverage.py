@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.calibrating.config import CalibrationConfig
+from semantic_mapper.drivers.calibrating.config import CalibrationConfig
 from semantic_mapper.types import Float64
 
 CELLS = 6  # a side; the image is divided into so many cells

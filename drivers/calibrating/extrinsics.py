@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.calibrating.config import CalibrationConfig
-from drivers.calibrating.intrinsics import ideal_pixels
-from drivers.calibrating.views import BoardView
-from drivers.poses.board import board_poses, pose_of_vector
+from semantic_mapper.drivers.calibrating.config import CalibrationConfig
+from semantic_mapper.drivers.calibrating.intrinsics import ideal_pixels
+from semantic_mapper.drivers.calibrating.views import BoardView
+from semantic_mapper.drivers.poses.board import board_poses, pose_of_vector
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import invert_pose, transform
 from semantic_mapper.types import CameraIntrinsics, Float64

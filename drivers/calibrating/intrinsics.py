@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.calibrating.config import CalibrationConfig
-from drivers.calibrating.coverage import area_counts, shortfalls, tilt_degrees
-from drivers.calibrating.views import BoardView
-from drivers.poses.board import board_poses, pose_of_vector
+from semantic_mapper.drivers.calibrating.config import CalibrationConfig
+from semantic_mapper.drivers.calibrating.coverage import area_counts, shortfalls, tilt_degrees
+from semantic_mapper.drivers.calibrating.views import BoardView
+from semantic_mapper.drivers.poses.board import board_poses, pose_of_vector
 from semantic_mapper.errors import CameraError, FrameError
 from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.types import CameraIntrinsics, Float64

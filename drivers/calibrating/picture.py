@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from drivers.calibrating.config import CalibrationConfig
-from drivers.calibrating.coverage import CELLS
-from drivers.calibrating.intrinsics import CameraCalibration
+from semantic_mapper.drivers.calibrating.config import CalibrationConfig
+from semantic_mapper.drivers.calibrating.coverage import CELLS
+from semantic_mapper.drivers.calibrating.intrinsics import CameraCalibration
 from semantic_mapper.evaluation.canvas import (
     DIM_TEXT,
     GAP,

@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from drivers.poses.board import make_board
-from drivers.poses.config import BoardPoses
+from semantic_mapper.drivers.poses.board import make_board
+from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.types import UInt8
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-from drivers.calibrating.config import CalibrationConfig
-from drivers.calibrating.extrinsics import RigCalibration, calibrate_rig
-from drivers.calibrating.intrinsics import CameraCalibration, calibrate_camera, compare_camera
-from drivers.calibrating.views import ViewGatherer, simultaneous
+from semantic_mapper.drivers.calibrating.config import CalibrationConfig
+from semantic_mapper.drivers.calibrating.extrinsics import RigCalibration, calibrate_rig
+from semantic_mapper.drivers.calibrating.intrinsics import CameraCalibration, calibrate_camera, compare_camera
+from semantic_mapper.drivers.calibrating.views import ViewGatherer, simultaneous
 from semantic_mapper.errors import CameraError
 
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from drivers.base import CameraImage
-from drivers.calibrating.config import CalibrationConfig
-from drivers.calibrating.coverage import area_counts, shortfalls, tilt_degrees
-from drivers.calibration import guess_intrinsics
-from drivers.poses.board import BoardFinder, board_poses, pose_of_vector
-from drivers.poses.config import BoardPoses
+from semantic_mapper.drivers.base import CameraImage
+from semantic_mapper.drivers.calibrating.config import CalibrationConfig
+from semantic_mapper.drivers.calibrating.coverage import area_counts, shortfalls, tilt_degrees
+from semantic_mapper.drivers.calibration import guess_intrinsics
+from semantic_mapper.drivers.poses.board import BoardFinder, board_poses, pose_of_vector
+from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import CameraError
 from semantic_mapper.types import CameraIntrinsics, Float64
 

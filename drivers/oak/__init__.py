@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from drivers.oak.config import Config
-from drivers.oak.devices import list_devices
+from semantic_mapper.drivers.oak.config import Config
+from semantic_mapper.drivers.oak.devices import list_devices
 
 if TYPE_CHECKING:
-    from drivers.base import Camera
+    from semantic_mapper.drivers.base import Camera
 
 __all__ = ["Config", "list_devices", "open_camera"]
 
@@ -20,6 +20,6 @@ def open_camera(config: Config, camera_id: str) -> Camera:
         config: What to open, and how.
         camera_id: Name in the images.
     """
-    from drivers.oak.camera import OakCamera  # loads OpenCV and SciPy
+    from semantic_mapper.drivers.oak.camera import OakCamera  # loads OpenCV and SciPy
 
     return OakCamera(config, camera_id)

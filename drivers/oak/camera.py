@@ -13,12 +13,12 @@ from typing import Any, Self
 
 import msgspec
 
-from drivers.base import CameraImage
-from drivers.oak.config import Config
-from drivers.oak.device import connect_device
-from drivers.oak.images import ImageMaker, geometry_trouble, read_intrinsics, told_intrinsics
-from drivers.oak.odometry import Odometry
-from drivers.oak.stream import Sources, Stream, StreamEnded
+from semantic_mapper.drivers.base import CameraImage
+from semantic_mapper.drivers.oak.config import Config
+from semantic_mapper.drivers.oak.device import connect_device
+from semantic_mapper.drivers.oak.images import ImageMaker, geometry_trouble, read_intrinsics, told_intrinsics
+from semantic_mapper.drivers.oak.odometry import Odometry
+from semantic_mapper.drivers.oak.stream import Sources, Stream, StreamEnded
 from semantic_mapper.errors import CameraError, PoseError
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.transport.messages import StreamInfo
@@ -36,7 +36,7 @@ _log = get_logger(__name__)
 
 
 class OakCamera:
-    """One OAK device; see ``drivers.base.Camera``. One process a camera.
+    """One OAK device; see ``semantic_mapper.drivers.base.Camera``. One process a camera.
 
     Args:
         config: What to open, and how.

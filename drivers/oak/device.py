@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from drivers.oak.config import Config
-from drivers.oak.devices import find_device
-from drivers.oak.library import load_depthai
-from drivers.oak.stream import OdometryPorts, Sources
+from semantic_mapper.drivers.oak.config import Config
+from semantic_mapper.drivers.oak.devices import find_device
+from semantic_mapper.drivers.oak.library import load_depthai
+from semantic_mapper.drivers.oak.stream import OdometryPorts, Sources
 from semantic_mapper.errors import CameraError
 from semantic_mapper.types import Float64
 

@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from drivers.oak.library import load_depthai
-from drivers.registry import FoundCamera
+from semantic_mapper.drivers.oak.library import load_depthai
+from semantic_mapper.drivers.registry import FoundCamera
 from semantic_mapper.errors import CameraError
 
 USB_VENDOR = "03e7"

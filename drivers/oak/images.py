@@ -12,8 +12,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from drivers.base import CameraImage
-from drivers.oak.library import load_depthai
+from semantic_mapper.drivers.base import CameraImage
+from semantic_mapper.drivers.oak.library import load_depthai
 from semantic_mapper.errors import CameraError, FrameError
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 

@@ -10,10 +10,10 @@ import threading
 import time
 from typing import Any
 
-from drivers.oak.config import Config
-from drivers.oak.images import capture_ns, clock_offset_ns
-from drivers.oak.stream import Sources, StreamEnded, synced_queue, take
-from drivers.oak.tracking import PoseTrack, basalt_pose
+from semantic_mapper.drivers.oak.config import Config
+from semantic_mapper.drivers.oak.images import capture_ns, clock_offset_ns
+from semantic_mapper.drivers.oak.stream import Sources, StreamEnded, synced_queue, take
+from semantic_mapper.drivers.oak.tracking import PoseTrack, basalt_pose
 from semantic_mapper.errors import CameraError, PoseError
 
 ANSWER_S = 2.0  # a pair without a pose for so long will have none

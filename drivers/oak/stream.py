@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from datetime import timedelta
 from typing import Any
 
-from drivers.oak.config import Config
-from drivers.oak.library import load_depthai
+from semantic_mapper.drivers.oak.config import Config
+from semantic_mapper.drivers.oak.library import load_depthai
 from semantic_mapper.errors import CameraError
 from semantic_mapper.types import Float64
 

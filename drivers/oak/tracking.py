@@ -8,7 +8,7 @@ from collections import deque
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from drivers.base import PoseEstimate
+from semantic_mapper.drivers.base import PoseEstimate
 from semantic_mapper.errors import PoseError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.types import Float64

@@ -1,8 +1,8 @@
 """Whatever else OpenCV reads: video files, and streams by their URL (RTSP, HTTP)."""
 
-from drivers.opencv.camera import open_camera
-from drivers.opencv.config import Config
-from drivers.registry import FoundCamera
+from semantic_mapper.drivers.opencv.camera import open_camera
+from semantic_mapper.drivers.opencv.config import Config
+from semantic_mapper.drivers.registry import FoundCamera
 
 __all__ = ["Config", "list_devices", "open_camera"]
 

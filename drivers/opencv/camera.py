@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from functools import partial
 
-from drivers.base import Camera
-from drivers.calibration import require_calibration
-from drivers.live import LiveCamera
-from drivers.opencv.config import Config
-from drivers.opencv.file import VideoFile
-from drivers.opencv.stream import StreamDevice
-from drivers.urls import hide_password
+from semantic_mapper.drivers.base import Camera
+from semantic_mapper.drivers.calibration import require_calibration
+from semantic_mapper.drivers.live import LiveCamera
+from semantic_mapper.drivers.opencv.config import Config
+from semantic_mapper.drivers.opencv.file import VideoFile
+from semantic_mapper.drivers.opencv.stream import StreamDevice
+from semantic_mapper.drivers.urls import hide_password
 from semantic_mapper.errors import CameraError
 
 

@@ -12,10 +12,10 @@ from typing import Self
 import cv2
 import numpy as np
 
-from drivers.base import CameraImage
-from drivers.calibration import Rectifier, guess_intrinsics
-from drivers.opencv.config import Config
-from drivers.opencv.stream import nominal_hz
+from semantic_mapper.drivers.base import CameraImage
+from semantic_mapper.drivers.calibration import Rectifier, guess_intrinsics
+from semantic_mapper.drivers.opencv.config import Config
+from semantic_mapper.drivers.opencv.stream import nominal_hz
 from semantic_mapper.errors import CameraError
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.transport.messages import StreamInfo

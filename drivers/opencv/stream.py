@@ -7,10 +7,10 @@ import time
 import cv2
 import numpy as np
 
-from drivers.live import Shot
-from drivers.opencv.clock import StreamClock
-from drivers.opencv.config import Config
-from drivers.urls import hide_password
+from semantic_mapper.drivers.live import Shot
+from semantic_mapper.drivers.opencv.clock import StreamClock
+from semantic_mapper.drivers.opencv.config import Config
+from semantic_mapper.drivers.urls import hide_password
 from semantic_mapper.errors import CameraError
 
 

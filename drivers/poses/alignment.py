@@ -14,8 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from drivers.poses.config import OdometryPoses
-from drivers.poses.depth_view import Level
+from semantic_mapper.drivers.poses.config import OdometryPoses
+from semantic_mapper.drivers.poses.depth_view import Level
 from semantic_mapper.geometry import camera_matrix, invert_pose, nearest_pixels, transform
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.types import Float64

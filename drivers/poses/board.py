@@ -9,8 +9,8 @@ from typing import Any, Self
 import cv2
 import numpy as np
 
-from drivers.base import CameraImage, PoseEstimate
-from drivers.poses.config import BoardPoses, matrix
+from semantic_mapper.drivers.base import CameraImage, PoseEstimate
+from semantic_mapper.drivers.poses.config import BoardPoses, matrix
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import camera_matrix, invert_pose
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8

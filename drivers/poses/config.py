@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from drivers.calibration import Matrix
 from semantic_mapper.config import AtLeastOne, AtLeastZero, Config, NotNegative, Positive, Share
+from semantic_mapper.drivers.calibration import Matrix
 from semantic_mapper.types import Float64
 
 IDENTITY: Matrix = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))

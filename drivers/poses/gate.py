@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.poses.config import PoseChecks
-from drivers.poses.motion import StampedPose, turn_between
+from semantic_mapper.drivers.poses.config import PoseChecks
+from semantic_mapper.drivers.poses.motion import StampedPose, turn_between
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import PosedFrame
 

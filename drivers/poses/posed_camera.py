@@ -10,9 +10,9 @@ from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from drivers.base import Camera, CameraImage, PoseEstimate, PoseSource
-from drivers.poses.config import PoseChecks
-from drivers.poses.gate import PoseGate, Verdict
+from semantic_mapper.drivers.base import Camera, CameraImage, PoseEstimate, PoseSource
+from semantic_mapper.drivers.poses.config import PoseChecks
+from semantic_mapper.drivers.poses.gate import PoseGate, Verdict
 from semantic_mapper.errors import PoseError, ShapeError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.log_events import get_logger
@@ -28,7 +28,7 @@ _log = get_logger(__name__)
 
 @runtime_checkable
 class TellingPoseSource(PoseSource, Protocol):
-    """A pose source that tells what is the matter; all of ``drivers.poses`` do."""
+    """A pose source that tells what is the matter; all of ``semantic_mapper.drivers.poses`` do."""
 
     @property
     def troubles(self) -> tuple[str, ...]:

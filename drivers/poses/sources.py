@@ -6,8 +6,9 @@ import difflib
 from collections.abc import Mapping
 from typing import Any
 
-from drivers.calibration import rigid_matrix
-from drivers.poses.config import (
+from semantic_mapper.config import convert_config
+from semantic_mapper.drivers.calibration import rigid_matrix
+from semantic_mapper.drivers.poses.config import (
     KINDS,
     BoardPoses,
     DevicePoses,
@@ -17,8 +18,7 @@ from drivers.poses.config import (
     PoseConfig,
     TopicPoses,
 )
-from drivers.poses.posed_camera import TellingPoseSource
-from semantic_mapper.config import convert_config
+from semantic_mapper.drivers.poses.posed_camera import TellingPoseSource
 from semantic_mapper.errors import ConfigError
 
 
@@ -53,23 +53,23 @@ def make_poses(config: PoseConfig) -> TellingPoseSource:
     """The source that checked settings stand for."""
     match config:
         case DevicePoses():
-            from drivers.poses.still import DevicePoseSource
+            from semantic_mapper.drivers.poses.still import DevicePoseSource
 
             return DevicePoseSource(config)
         case FixedPose():
-            from drivers.poses.still import FixedPoseSource
+            from semantic_mapper.drivers.poses.still import FixedPoseSource
 
             return FixedPoseSource(config)
         case TopicPoses():
-            from drivers.poses.topic import TopicPoseSource
+            from semantic_mapper.drivers.poses.topic import TopicPoseSource
 
             return TopicPoseSource(config)
         case BoardPoses():
-            from drivers.poses.board import BoardPoseSource
+            from semantic_mapper.drivers.poses.board import BoardPoseSource
 
             return BoardPoseSource(config)
         case OdometryPoses():
-            from drivers.poses.odometry import OdometryPoseSource
+            from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
 
             return OdometryPoseSource(config)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from types import TracebackType
 from typing import Self
 
-from drivers.base import CameraImage, PoseEstimate
-from drivers.poses.config import DevicePoses, FixedPose, matrix
+from semantic_mapper.drivers.base import CameraImage, PoseEstimate
+from semantic_mapper.drivers.poses.config import DevicePoses, FixedPose, matrix
 from semantic_mapper.errors import CameraError
 
 WAYS_OUT = (

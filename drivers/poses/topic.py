@@ -11,9 +11,9 @@ from typing import Self
 
 import zmq
 
-from drivers.base import CameraImage, PoseEstimate
-from drivers.poses.config import TopicPoses, matrix
-from drivers.poses.motion import PoseTrack, StampedPose
+from semantic_mapper.drivers.base import CameraImage, PoseEstimate
+from semantic_mapper.drivers.poses.config import TopicPoses, matrix
+from semantic_mapper.drivers.poses.motion import PoseTrack, StampedPose
 from semantic_mapper.errors import CameraError, CodecError, TransportError
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.transport.endpoints import check_connect

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.calibration import require_calibration
-from drivers.live import LiveCamera
-from drivers.v4l2.config import Config
-from drivers.v4l2.device import V4l2Device
-from drivers.v4l2.paths import stable_path
+from semantic_mapper.drivers.calibration import require_calibration
+from semantic_mapper.drivers.live import LiveCamera
+from semantic_mapper.drivers.v4l2.config import Config
+from semantic_mapper.drivers.v4l2.device import V4l2Device
+from semantic_mapper.drivers.v4l2.paths import stable_path
 from semantic_mapper.errors import CameraError
 
 

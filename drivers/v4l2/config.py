@@ -6,9 +6,9 @@ from typing import Annotated
 
 import msgspec
 
-from drivers.v4l2.ioctls import HIGHEST, LOWEST
 from semantic_mapper import config
 from semantic_mapper.config import NotNegative, Positive
+from semantic_mapper.drivers.v4l2.ioctls import HIGHEST, LOWEST
 
 _MAX_EXPOSURE_MS = HIGHEST // 10  # the control counts tenths of a millisecond
 

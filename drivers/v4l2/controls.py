@@ -6,9 +6,9 @@ import difflib
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.v4l2 import ioctls
-from drivers.v4l2.config import Config
-from drivers.v4l2.ioctls import Control
+from semantic_mapper.drivers.v4l2 import ioctls
+from semantic_mapper.drivers.v4l2.config import Config
+from semantic_mapper.drivers.v4l2.ioctls import Control
 
 
 @dataclass(frozen=True, slots=True)

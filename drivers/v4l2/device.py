@@ -9,11 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from drivers.live import Shot
-from drivers.v4l2 import ioctls
-from drivers.v4l2.config import Config
-from drivers.v4l2.controls import apply_controls
-from drivers.v4l2.listing import SHOWN_FORMATS
+from semantic_mapper.drivers.live import Shot
+from semantic_mapper.drivers.v4l2 import ioctls
+from semantic_mapper.drivers.v4l2.config import Config
+from semantic_mapper.drivers.v4l2.controls import apply_controls
+from semantic_mapper.drivers.v4l2.listing import SHOWN_FORMATS
 from semantic_mapper.errors import CameraError
 
 OLDEST_STAMP_S = 10.0  # a buffer is never older; a stamp that is comes from another clock

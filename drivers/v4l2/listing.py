@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.registry import FoundCamera
-from drivers.v4l2 import ioctls, paths
+from semantic_mapper.drivers.registry import FoundCamera
+from semantic_mapper.drivers.v4l2 import ioctls, paths
 
 SHOWN_FORMATS = 8
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from replay.exporters.base import ExportFrame, LeftOut, depth_units, quaternion, seconds, write_png
-from replay.importers.tum import DEPTH_SCALE
+from semantic_mapper.replay.exporters.base import ExportFrame, LeftOut, depth_units, quaternion, seconds, write_png
+from semantic_mapper.replay.importers.tum import DEPTH_SCALE
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 

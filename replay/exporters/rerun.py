@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from replay.exporters.base import ExportFrame
-from replay.rerun_log import RerunLog, recording_file
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.replay.exporters.base import ExportFrame
+from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import MapUpdate, PosedFrame
 

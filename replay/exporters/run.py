@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from replay.exporters.base import Exporter, ExportFrame, LeftOut, encoded, whole_place
-from replay.exporters.folder import FolderExporter, TrajectoryExporter, TumExporter
-from replay.sequence import Log
 from semantic_mapper.errors import CodecError, ConfigError, LogError
+from semantic_mapper.replay.exporters.base import Exporter, ExportFrame, LeftOut, encoded, whole_place
+from semantic_mapper.replay.exporters.folder import FolderExporter, TrajectoryExporter, TumExporter
+from semantic_mapper.replay.log.sequence import Log
 from semantic_mapper.transport.codec import EncodedImage, Envelope, decode_frame
 from semantic_mapper.transport.images import sniff_image
 from semantic_mapper.transport.messages import StreamInfo
@@ -121,11 +121,11 @@ def export_log(log: Log, out: Path, request: LogExportRequest, on_frame: Callabl
 
 def _exporter(place: Path, info: StreamInfo, name: LogFormat) -> Exporter:
     if name == "foxglove":
-        from replay.exporters.foxglove import FoxgloveExporter
+        from semantic_mapper.replay.exporters.foxglove import FoxgloveExporter
 
         return FoxgloveExporter(place, info)
     if name == "rrd":
-        from replay.exporters.rerun import RerunExporter
+        from semantic_mapper.replay.exporters.rerun import RerunExporter
 
         return RerunExporter(place, info)
     if name == "trajectory":

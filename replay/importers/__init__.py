@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from replay.importers.base import DepthScale, ImportOptions, ImportReport, RenameConfig, Skipped
-from replay.importers.run import FORMATS, detect_format, import_recording
+from semantic_mapper.replay.importers.base import DepthScale, ImportOptions, ImportReport, RenameConfig, Skipped
+from semantic_mapper.replay.importers.run import FORMATS, detect_format, import_recording
 
 __all__ = [
     "FORMATS",

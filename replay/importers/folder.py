@@ -16,7 +16,10 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from replay.importers.base import (
+from semantic_mapper.config import read_json
+from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError, LabelError
+from semantic_mapper.labels import MAX_NAME, PROVIDED, LabelSet, make_label_set
+from semantic_mapper.replay.importers.base import (
     BadFrameError,
     DepthScale,
     ImportOptions,
@@ -31,9 +34,6 @@ from replay.importers.base import (
     read_rgb,
     seconds_to_ns,
 )
-from semantic_mapper.config import read_json
-from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError, LabelError
-from semantic_mapper.labels import MAX_NAME, PROVIDED, LabelSet, make_label_set
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64, PosedFrame
 

@@ -20,7 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
-from replay.importers.base import (
+from semantic_mapper.errors import FrameError, ImportSourceError, LabelError
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.replay.importers.base import (
     BadFrameError,
     DepthScale,
     ImportOptions,
@@ -33,8 +35,6 @@ from replay.importers.base import (
     read_plane,
     read_rgb,
 )
-from semantic_mapper.errors import FrameError, ImportSourceError, LabelError
-from semantic_mapper.labels import LabelSet
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame, UInt8
 

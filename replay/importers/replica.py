@@ -18,7 +18,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from replay.importers.base import (
+from semantic_mapper.config import read_json
+from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError, LabelError
+from semantic_mapper.labels import LabelSet, make_label_set
+from semantic_mapper.replay.importers.base import (
     BadFrameError,
     DepthScale,
     ImportOptions,
@@ -32,9 +35,6 @@ from replay.importers.base import (
     read_lines,
     read_rgb,
 )
-from semantic_mapper.config import read_json
-from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError, LabelError
-from semantic_mapper.labels import LabelSet, make_label_set
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 

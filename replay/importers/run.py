@@ -9,16 +9,23 @@ from pathlib import Path
 
 import numpy as np
 
-from replay.importers.base import BadFrameError, ImportOptions, ImportReport, LoadedFrame, Recording, Skipped
-from replay.importers.folder import FolderRecording
-from replay.importers.kitti360 import Kitti360Recording
-from replay.importers.replica import ReplicaRecording
-from replay.importers.scannet import ScanNetRecording
-from replay.importers.tum import TumRecording
-from replay.log import LogReader, LogWriter
-from replay.sequence import SUFFIX as LOG_SUFFIX
-from replay.whole_log import whole_log
 from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LabelError, LogError
+from semantic_mapper.replay.importers.base import (
+    BadFrameError,
+    ImportOptions,
+    ImportReport,
+    LoadedFrame,
+    Recording,
+    Skipped,
+)
+from semantic_mapper.replay.importers.folder import FolderRecording
+from semantic_mapper.replay.importers.kitti360 import Kitti360Recording
+from semantic_mapper.replay.importers.replica import ReplicaRecording
+from semantic_mapper.replay.importers.scannet import ScanNetRecording
+from semantic_mapper.replay.importers.tum import TumRecording
+from semantic_mapper.replay.log.atomic_log import whole_log
+from semantic_mapper.replay.log.format import LogReader, LogWriter
+from semantic_mapper.replay.log.sequence import SUFFIX as LOG_SUFFIX
 from semantic_mapper.transport.codec import CodecOptions
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.turning import turned_frame, turned_intrinsics

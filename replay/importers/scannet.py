@@ -20,7 +20,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.importers.base import (
+from semantic_mapper.errors import FrameError, ImportSourceError, LabelError
+from semantic_mapper.geometry import scale_intrinsics
+from semantic_mapper.labels import NYU40
+from semantic_mapper.replay.importers.base import (
     BadFrameError,
     DepthScale,
     ImportOptions,
@@ -33,9 +36,6 @@ from replay.importers.base import (
     read_plane,
     read_rgb,
 )
-from semantic_mapper.errors import FrameError, ImportSourceError, LabelError
-from semantic_mapper.geometry import scale_intrinsics
-from semantic_mapper.labels import NYU40
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame, UInt8

@@ -14,7 +14,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.importers.base import (
+from semantic_mapper.errors import ImportSourceError
+from semantic_mapper.geometry import pose_matrix
+from semantic_mapper.replay.importers.base import (
     BadFrameError,
     DepthScale,
     ImportOptions,
@@ -26,9 +28,7 @@ from replay.importers.base import (
     read_rgb,
     seconds_to_ns,
 )
-from replay.importers.folder import read_intrinsics
-from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.geometry import pose_matrix
+from semantic_mapper.replay.importers.folder import read_intrinsics
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.mapping.files.up_axis import turn_onto
 from semantic_mapper.mapping.map_types import MapPoints
-from semantic_mapper.mapping.up import turn_onto
 from semantic_mapper.types import Float64
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1  # as in ROS's OccupancyGrid

@@ -21,15 +21,15 @@ from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
 from semantic_mapper.imaging import fill_holes, resize_depth, resize_label, resize_rgb, working_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.correction import CorrectedPoses, CorrectionStatus, MapCorrector
-from semantic_mapper.mapping.depth_trust import depth_trust
-from semantic_mapper.mapping.history import FusedFrame
+from semantic_mapper.mapping.correction.corrected_map import CorrectedPoses, CorrectionStatus, MapCorrector
+from semantic_mapper.mapping.correction.history import FusedFrame
+from semantic_mapper.mapping.fusion.depth_trust import depth_trust
+from semantic_mapper.mapping.fusion.vote_fusion import add_votes
 from semantic_mapper.mapping.keyframes import EncodedSize, Keyframe, KeyframeStore
-from semantic_mapper.mapping.lifting import lift
 from semantic_mapper.mapping.pose_check import PoseCheck
-from semantic_mapper.mapping.view_renderer import RenderedView, ViewRenderer
-from semantic_mapper.mapping.virtual_views import ViewpointChooser, VirtualLook
-from semantic_mapper.mapping.vote_fusion import add_votes
+from semantic_mapper.mapping.views.upsample import lift
+from semantic_mapper.mapping.views.view_renderer import RenderedView, ViewRenderer
+from semantic_mapper.mapping.views.virtual_views import ViewpointChooser, VirtualLook
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import CameraIntrinsics, Float32, MapUpdate, PosedFrame, SourceViews, UInt8
 

@@ -15,10 +15,18 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.allocation import blocks_in_band, frame_budget, make_camera
-from semantic_mapper.mapping.block_grid import BlockGrid
-from semantic_mapper.mapping.block_index import pack_keys
-from semantic_mapper.mapping.changes import (
+from semantic_mapper.mapping.files.extract import join_meshes, surface_voxels, triangle_mesh
+from semantic_mapper.mapping.files.map_file import open_map
+from semantic_mapper.mapping.files.map_manifest import MapManifest
+from semantic_mapper.mapping.files.map_saving import MapSaving
+from semantic_mapper.mapping.files.merge import add_blocks, check_fit, copy_blocks, voxel_transform
+from semantic_mapper.mapping.fusion.allocation import blocks_in_band, frame_budget, make_camera
+from semantic_mapper.mapping.fusion.frame_votes import check_depth, frame_votes, probability_table, trusted_depth
+from semantic_mapper.mapping.fusion.fuse import fuse_blocks, make_limits
+from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView
+from semantic_mapper.mapping.storage.block_grid import BlockGrid
+from semantic_mapper.mapping.storage.block_index import pack_keys
+from semantic_mapper.mapping.storage.changes import (
     BlockChanges,
     ChosenBlocks,
     CopiedChanges,
@@ -26,17 +34,9 @@ from semantic_mapper.mapping.changes import (
     copy_changes,
     read_changes,
 )
-from semantic_mapper.mapping.extract import join_meshes, surface_voxels, triangle_mesh
-from semantic_mapper.mapping.frame_votes import check_depth, frame_votes, probability_table, trusted_depth
-from semantic_mapper.mapping.fusion import fuse_blocks, make_limits
-from semantic_mapper.mapping.grid_buffers import BLOCK_SIDE
-from semantic_mapper.mapping.map_file import open_map
-from semantic_mapper.mapping.map_manifest import MapManifest
-from semantic_mapper.mapping.map_saving import MapSaving
-from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView
-from semantic_mapper.mapping.merge import add_blocks, check_fit, copy_blocks, voxel_transform
-from semantic_mapper.mapping.ray_casting import cast_view
-from semantic_mapper.mapping.readout import read_points
+from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE
+from semantic_mapper.mapping.views.ray_casting import cast_view
+from semantic_mapper.mapping.views.readout import read_points
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 
 # One lock for all maps of a process: growth moves the memory that readers look at, and merging takes two maps at once.

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from semantic_mapper.mapping.block_grid import BlockGrid
-from semantic_mapper.mapping.block_index import find_blocks
-from semantic_mapper.mapping.block_store import BlockValues
-from semantic_mapper.mapping.changes import TSDF_STEPS
-from semantic_mapper.mapping.extract import triangle_mesh
+from semantic_mapper.mapping.files.extract import triangle_mesh
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints
+from semantic_mapper.mapping.storage.block_grid import BlockGrid
+from semantic_mapper.mapping.storage.block_index import find_blocks
+from semantic_mapper.mapping.storage.block_store import BlockValues
+from semantic_mapper.mapping.storage.changes import TSDF_STEPS
 from semantic_mapper.queries.checks import check_box, rows_in_box
 from semantic_mapper.queries.rays import nearest_corners
 from semantic_mapper.queries.snapshot import MapSnapshot

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.kernels import kernel
-from semantic_mapper.mapping.block_index import BlockIndex
+from semantic_mapper.mapping.storage.block_index import BlockIndex
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
 from semantic_mapper.types import Bool, Float64, Int32, Int64, UInt8
 

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
 from semantic_mapper.labels import STUFF_NAMES
-from semantic_mapper.mapping.block_index import unpack_keys
-from semantic_mapper.mapping.changes import CONFIDENCE_STEPS
+from semantic_mapper.mapping.storage.block_index import unpack_keys
+from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_direction
 from semantic_mapper.queries.class_surface import ClassSurface, class_surface
 from semantic_mapper.queries.components import Components, find_components

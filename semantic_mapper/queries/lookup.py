@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
-from semantic_mapper.mapping.block_index import BlockIndex
+from semantic_mapper.mapping.storage.block_index import BlockIndex
 from semantic_mapper.queries.checks import check_points, check_positive
 from semantic_mapper.queries.occupancy import read_states
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.kernels import kernel
-from semantic_mapper.mapping.block_index import BlockIndex
 from semantic_mapper.mapping.map_types import MapView
+from semantic_mapper.mapping.storage.block_index import BlockIndex
 from semantic_mapper.queries.checks import as_numbers, check_direction, check_points, check_positive
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int64, UInt8

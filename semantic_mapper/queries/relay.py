@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.mapping.block_index import pack_keys
-from semantic_mapper.mapping.changes import BlockChanges, oldest_first
+from semantic_mapper.mapping.storage.block_index import pack_keys
+from semantic_mapper.mapping.storage.changes import BlockChanges, oldest_first
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.snapshot import MapSnapshot
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.block_index import BlockIndex, unpack_keys
-from semantic_mapper.mapping.changes import CONFIDENCE_STEPS, TSDF_STEPS
+from semantic_mapper.mapping.storage.block_index import BlockIndex, unpack_keys
+from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS, TSDF_STEPS
 from semantic_mapper.types import Float32, UInt8
 
 

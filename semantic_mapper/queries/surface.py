@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.kernels import kernel
-from semantic_mapper.mapping.block_index import BlockIndex
 from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.storage.block_index import BlockIndex
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
 from semantic_mapper.types import Float64, Int32, Int64
 

@@ -112,7 +112,7 @@ def test_the_benchmark_needs_nothing_that_a_training_machine_lacks() -> None:
     program = (
         "import sys\n"
         "for name in ('scipy', 'open3d', 'depthai', 'zmq', 'mcap', 'zstandard'): sys.modules[name] = None\n"
-        "import semantic_mapper.benchmark.run, semantic_mapper.benchmark.contestants, nodes.suite\n"
+        "import semantic_mapper.benchmark.run, semantic_mapper.benchmark.contestants, semantic_mapper.nodes.cli.suite\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.returncode == 0, done.stderr

@@ -20,28 +20,28 @@ import msgspec
 import typer.main
 from typer.testing import CliRunner
 
-import drivers.oak.config
-import drivers.opencv.config
-import drivers.poses.config
-import drivers.v4l2.config
-from drivers.calibration import CalibrationFile, load_calibration, load_mount
-from nodes import cli
-from nodes.calibration_report import CalibrationSettings
-from nodes.console import Output
-from nodes.launch_config import LaunchFile, NodeEntry, load_launch
-from nodes.learning_store import LearningStore, Progress
-from nodes.options import CameraOptions, FinetunerOptions, LiveCamera, MapperOptions, RecorderOptions
-from replay.corrections import read_corrections
-from replay.importers.base import RenameConfig
-from replay.log import LogReader, LogWriter
-from replay.tolerances import Tolerances
+import semantic_mapper.drivers.oak.config
+import semantic_mapper.drivers.opencv.config
+import semantic_mapper.drivers.poses.config
+import semantic_mapper.drivers.v4l2.config
 from semantic_mapper.benchmark.config import SuiteConfig
 from semantic_mapper.config import MapperConfig, SRayConfig, convert_config, load_config
+from semantic_mapper.drivers.calibration import CalibrationFile, load_calibration, load_mount
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.calibration.report import CalibrationSettings
+from semantic_mapper.nodes.cli import main as cli
+from semantic_mapper.nodes.cli.console import Output
+from semantic_mapper.nodes.finetuner.keyframe_store import LearningStore, Progress
+from semantic_mapper.nodes.options import CameraOptions, FinetunerOptions, LiveCamera, MapperOptions, RecorderOptions
+from semantic_mapper.nodes.supervisor.launch_config import LaunchFile, NodeEntry, load_launch
+from semantic_mapper.replay.compare.tolerances import Tolerances
+from semantic_mapper.replay.corrected_poses import read_corrections
+from semantic_mapper.replay.importers.base import RenameConfig
+from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.scenes import VALIDATION_SEEDS, NoiseConfig, room_frames
 from semantic_mapper.testing import LogReplays
 from semantic_mapper.training.finetune import FinetuneConfig, finetune
@@ -210,11 +210,11 @@ SETTINGS: dict[str, tuple[type[msgspec.Struct], dict[str, Any]]] = {
     "launch.mapper": (MapperOptions, {"out": "a"}),
     "launch.recorder": (RecorderOptions, {"out": "a"}),
     "launch.finetuner": (FinetunerOptions, {}),
-    "camera.v4l2": (drivers.v4l2.config.Config, {}),
-    "camera.opencv": (drivers.opencv.config.Config, {"source": "a.mp4"}),
-    "camera.oak": (drivers.oak.config.Config, {}),
-    **{f"poses.{kind}": (struct, {}) for kind, struct in drivers.poses.config.KINDS.items()},
-    "poses.checks": (drivers.poses.config.PoseChecks, {}),
+    "camera.v4l2": (semantic_mapper.drivers.v4l2.config.Config, {}),
+    "camera.opencv": (semantic_mapper.drivers.opencv.config.Config, {"source": "a.mp4"}),
+    "camera.oak": (semantic_mapper.drivers.oak.config.Config, {}),
+    **{f"poses.{kind}": (struct, {}) for kind, struct in semantic_mapper.drivers.poses.config.KINDS.items()},
+    "poses.checks": (semantic_mapper.drivers.poses.config.PoseChecks, {}),
     "mapper": (MapperConfig, {}),
     "online": (OnlineConfig, {}),
     "finetune": (FinetuneConfig, {}),

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.v4l2 import ioctls, paths
-from drivers.v4l2.ioctls import Control
+from semantic_mapper.drivers.v4l2 import ioctls, paths
+from semantic_mapper.drivers.v4l2.ioctls import Control
 
 SELECT_S = 0.15  # how long OpenCV waits for a stream that has stalled; 10 s by default
 CAPTURE, METADATA = 0x00000001, 0x00800000

@@ -2,9 +2,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from drivers.base import FrameSource
-from replay.importers import import_recording
-from replay.log import LogReader
+from semantic_mapper.drivers.base import FrameSource
+from semantic_mapper.replay.importers import import_recording
+from semantic_mapper.replay.log.format import LogReader
 from tests.replay import recordings
 
 

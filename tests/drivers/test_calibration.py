@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.calibration import Rectifier, guess_intrinsics, load_calibration
+from semantic_mapper.drivers.calibration import Rectifier, guess_intrinsics, load_calibration
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import camera_matrix, project
 from semantic_mapper.types import CameraIntrinsics

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.calibration import load_calibration, load_mount, save_calibration
-from drivers.mounts import mount_of
-from drivers.poses.config import FixedPose
-from drivers.poses.posed_camera import PosedCamera
-from drivers.poses.sources import make_poses, read_pose_config
-from drivers.poses.still import FixedPoseSource
+from semantic_mapper.drivers.calibration import load_calibration, load_mount, save_calibration
+from semantic_mapper.drivers.mounts import mount_of
+from semantic_mapper.drivers.poses.config import FixedPose
+from semantic_mapper.drivers.poses.posed_camera import PosedCamera
+from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
+from semantic_mapper.drivers.poses.still import FixedPoseSource
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.types import CameraIntrinsics
 from tests.drivers.poses.images import ListCamera, image, rigid

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.base import Camera
-from drivers.opencv import list_devices
-from drivers.opencv.clock import StreamClock
-from drivers.registry import open_camera
-from drivers.urls import hide_password
+from semantic_mapper.drivers.base import Camera
+from semantic_mapper.drivers.opencv import list_devices
+from semantic_mapper.drivers.opencv.clock import StreamClock
+from semantic_mapper.drivers.registry import open_camera
+from semantic_mapper.drivers.urls import hide_password
 from semantic_mapper.errors import CameraError, ConfigError
 from tests.drivers.fake_v4l2 import write_calibration
 

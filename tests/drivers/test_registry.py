@@ -7,7 +7,7 @@ from types import ModuleType
 
 import pytest
 
-from drivers.registry import FoundCamera, find_cameras, load_driver, open_camera
+from semantic_mapper.drivers.registry import FoundCamera, find_cameras, load_driver, open_camera
 from semantic_mapper.errors import CameraError, ConfigError, DependencyError
 
 
@@ -21,7 +21,9 @@ def test_an_unknown_kind_is_told_with_those_that_there_are(kind: str, says: str)
 
 
 def test_a_kind_whose_packages_are_missing_says_so_and_the_others_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "drivers.oak", None)  # what an import of it then raises is an ImportError
+    monkeypatch.setitem(
+        sys.modules, "semantic_mapper.drivers.oak", None
+    )  # what an import of it then raises is an ImportError
     with pytest.raises(DependencyError, match="kind 'oak' cannot be used here"):
         load_driver("oak")
     found, unknown = find_cameras(("oak", "opencv"))
@@ -29,7 +31,7 @@ def test_a_kind_whose_packages_are_missing_says_so_and_the_others_are_listed(mon
 
 
 def test_a_kind_that_cannot_search_is_told_and_the_others_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
-    broken, whole = ModuleType("drivers.oak"), ModuleType("drivers.v4l2")
+    broken, whole = ModuleType("semantic_mapper.drivers.oak"), ModuleType("semantic_mapper.drivers.v4l2")
 
     def cannot() -> list[FoundCamera]:
         raise CameraError("the bus is gone")
@@ -37,8 +39,8 @@ def test_a_kind_that_cannot_search_is_told_and_the_others_are_listed(monkeypatch
     camera = FoundCamera("v4l2", "HD Webcam", "/dev/video0")
     vars(broken)["list_devices"] = cannot
     vars(whole)["list_devices"] = lambda: [camera]
-    monkeypatch.setitem(sys.modules, "drivers.oak", broken)
-    monkeypatch.setitem(sys.modules, "drivers.v4l2", whole)
+    monkeypatch.setitem(sys.modules, "semantic_mapper.drivers.oak", broken)
+    monkeypatch.setitem(sys.modules, "semantic_mapper.drivers.v4l2", whole)
     assert find_cameras(("oak", "v4l2")) == ([camera], {"oak": "the bus is gone"})
 
 

@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers import live
-from drivers.base import Camera, CameraImage
-from drivers.calibration import Rectifier, load_calibration
-from drivers.registry import open_camera
-from drivers.v4l2 import ioctls, list_devices
-from drivers.v4l2.ioctls import Capability
+from semantic_mapper.drivers import live
+from semantic_mapper.drivers.base import Camera, CameraImage
+from semantic_mapper.drivers.calibration import Rectifier, load_calibration
+from semantic_mapper.drivers.registry import open_camera
+from semantic_mapper.drivers.v4l2 import ioctls, list_devices
+from semantic_mapper.drivers.v4l2.ioctls import Capability
 from semantic_mapper.errors import CameraError, ConfigError
 from tests.drivers.fake_v4l2 import METADATA, Capture, Machine, Sensor, make_machine, write_calibration
 
@@ -324,7 +324,7 @@ def test_a_camera_that_may_not_be_opened_is_listed_with_the_mend(
     def refuse(*arguments: object) -> Capability:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("drivers.v4l2.ioctls.query_capability", refuse)
+    monkeypatch.setattr("semantic_mapper.drivers.v4l2.ioctls.query_capability", refuse)
     assert "group `video`" in list_devices()[0].note
 
 

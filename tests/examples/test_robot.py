@@ -54,7 +54,7 @@ def process(*arguments: str, env: dict[str, str], output: Path) -> Iterator[subp
 
 
 def node(kind: str, **options: object) -> tuple[str, ...]:
-    return "-m", f"nodes.{kind}", json.dumps({"name": kind, "options": options})
+    return "-m", f"semantic_mapper.nodes.{kind}", json.dumps({"name": kind, "options": options})
 
 
 @pytest.mark.slow

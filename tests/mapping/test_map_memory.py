@@ -10,10 +10,10 @@ import pytest
 
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.labels import LabelSet, make_label_set
-from semantic_mapper.mapping.block_store import BLOCK_VOXELS, BlockValues
-from semantic_mapper.mapping.map_file import BlockPart, describe_map, write_map
-from semantic_mapper.mapping.map_manifest import CHUNK_BLOCKS, MapManifest
-from tests.mapping.crash_child import measure_memory, start_child
+from semantic_mapper.mapping.files.map_file import BlockPart, describe_map, write_map
+from semantic_mapper.mapping.files.map_manifest import CHUNK_BLOCKS, MapManifest
+from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS, BlockValues
+from tests.mapping.files.crash_child import measure_memory, start_child
 
 CLASSES = 20
 LABELS = make_label_set("many", tuple(f"class {i}" for i in range(CLASSES)), ids=tuple(range(1, CLASSES + 1)))

@@ -10,12 +10,12 @@ import pytest
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.geometry import look_at, transform
-from semantic_mapper.mapping.formats.map_server import write_map_server
+from semantic_mapper.mapping.files.formats.map_server import write_map_server
+from semantic_mapper.mapping.files.up_axis import turn_onto
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, floor_height, occupancy_grid
-from semantic_mapper.mapping.up import turn_onto
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
-from tests.mapping.views import frame, ray_directions, small_map
+from tests.mapping.rendered_views import frame, ray_directions, small_map
 
 WIDE = CameraIntrinsics(80.0, 80.0, 79.5, 59.5, 160, 120)
 UP = np.array((0.0, 0.0, 1.0))

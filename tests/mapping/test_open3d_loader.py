@@ -27,7 +27,7 @@ def test_importing_the_library_does_not_import_open3d() -> None:
 def test_nothing_is_printed_when_kernels_start() -> None:
     code = (
         "import structlog; structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(40))\n"
-        "from tests.mapping.views import *\nimport numpy as np\n"
+        "from tests.mapping.rendered_views import *\nimport numpy as np\n"
         "small_map().integrate(frame(), np.ones((120, 160), np.float32), None, None)"
     )
     done = run_python(code)

@@ -63,7 +63,7 @@ def test_depth_that_no_sensor_measures_counts_as_none(value: float):
 def test_a_frame_beyond_its_budget_is_refused_and_the_run_goes_on(
     monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
 ):
-    monkeypatch.setattr("semantic_mapper.mapping.allocation.LEAST_FRAME_BUDGET", 400)
+    monkeypatch.setattr("semantic_mapper.mapping.fusion.allocation.LEAST_FRAME_BUDGET", 400)
     a, b = (make_pipeline(voxel_map={"voxel_size_m": 0.02, "max_blocks": 3200}) for _ in range(2))
     good = replace(tiny_frames()[0], depth_m=np.full((72, 96), 1.0, np.float32))
     noise = replace(good, seq=1, depth_m=rng.uniform(0.5, 5, (72, 96)).astype(np.float32))

@@ -13,7 +13,7 @@ from semantic_mapper.geometry import look_at
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import CameraIntrinsics
-from tests.mapping.views import INTRINSICS, LABELS, around, frame, plane_depth, small_map, sphere_depth, sure
+from tests.mapping.rendered_views import INTRINSICS, LABELS, around, frame, plane_depth, small_map, sphere_depth, sure
 
 State = dict[str, NDArray[np.generic]]
 CENTER = np.array([0.3, -0.2, 0.5])

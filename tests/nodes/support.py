@@ -17,11 +17,11 @@ from unittest.mock import patch
 
 from typer.testing import CliRunner
 
-from nodes import cli
-from nodes.console import Output
-from replay.log import LogWriter
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.nodes.cli import main as cli
+from semantic_mapper.nodes.cli.console import Output
+from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 from tests.small import INTRINSICS, tiny_field, tiny_frames

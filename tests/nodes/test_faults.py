@@ -15,11 +15,11 @@ from pathlib import Path
 
 import pytest
 
-from nodes.child import Child
-from nodes.options import Call, NodeJob
-from replay.log import LogReader
-from replay.recover import recover
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.options import Call, NodeJob
+from semantic_mapper.nodes.supervisor.node_process import Child
+from semantic_mapper.replay.log.format import LogReader
+from semantic_mapper.replay.log.recover import recover
 from tests.nodes.support import (
     REPLAY_LAUNCH,
     Running,
@@ -227,7 +227,7 @@ def test_killed_launcher_leaves_no_process_even_where_one_is_frozen(long_log: Pa
 
 HUNG = """
 import ctypes, os, sys
-from nodes.heartbeat import Heart
+from semantic_mapper.nodes.supervisor.heartbeat import Heart
 heart = Heart(int(sys.argv[1]), 1)
 heart.start()
 heart.ready()

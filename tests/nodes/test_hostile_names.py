@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 from rich.table import Table
 
-from nodes.child import Child
-from nodes.console import Output, frame_progress, stderr_console
-from nodes.html_page import HtmlPage
-from nodes.options import NodeJob
-from replay.log import LogAttachment, LogWriter
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
+from semantic_mapper.nodes.cli.html_page import HtmlPage
+from semantic_mapper.nodes.options import NodeJob
+from semantic_mapper.nodes.supervisor.node_process import Child
 from semantic_mapper.plain_text import visible
+from semantic_mapper.replay.log.format import LogAttachment, LogWriter
 from semantic_mapper.transport.messages import StreamInfo
 from tests.nodes.support import error_line, run, run_here
 from tests.small import INTRINSICS, tiny_field, tiny_frames

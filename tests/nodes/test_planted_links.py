@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from nodes.outputs import hold_folder
-from replay.whole_file import WholeFile
+from semantic_mapper.nodes.cli.outputs import hold_folder
+from semantic_mapper.replay.log.atomic_file import WholeFile
 from semantic_mapper.training.folder_lock import LOCK_FILE, sole_use_of
 from tests.nodes.support import run_here
 

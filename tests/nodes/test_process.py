@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from nodes.process import STOP_SIGNAL, StopRequest
+from semantic_mapper.nodes.process import STOP_SIGNAL, StopRequest
 
 
 def _python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -52,7 +52,7 @@ def test_handlers_are_given_back() -> None:
 def test_threads_are_set_before_anything_heavy_is_loaded_and_the_users_choice_is_kept() -> None:
     code = """
 import json, os, sys
-from nodes.process import prepare_process
+from semantic_mapper.nodes.process import prepare_process
 prepare_process()
 print(json.dumps([os.environ["OMP_NUM_THREADS"], "torch" in sys.modules]))
 """
@@ -64,7 +64,7 @@ print(json.dumps([os.environ["OMP_NUM_THREADS"], "torch" in sys.modules]))
 def test_stray_prints_never_reach_stdout() -> None:
     code = """
 import atexit, ctypes, os
-from nodes.console import Output
+from semantic_mapper.nodes.cli.console import Output
 output = Output.guarded()
 print("python print")
 os.write(1, b"raw write\\n")
@@ -82,7 +82,7 @@ output.json({"a": 1})
 def test_one_event_is_one_line_even_when_a_message_has_several() -> None:
     code = """
 import structlog
-from nodes.process import prepare_process
+from semantic_mapper.nodes.process import prepare_process
 prepare_process()
 structlog.get_logger("x").error("broken", reason="first\\nsecond")
 """
@@ -94,7 +94,7 @@ structlog.get_logger("x").error("broken", reason="first\\nsecond")
 def test_log_events_survive_a_closed_stderr() -> None:
     code = """
 import os, structlog
-from nodes.process import prepare_process
+from semantic_mapper.nodes.process import prepare_process
 prepare_process()
 read, write = os.pipe()
 os.dup2(write, 2); os.close(write); os.close(read)

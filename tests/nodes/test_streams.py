@@ -13,18 +13,18 @@ from pathlib import Path
 
 import pytest
 
-from nodes.gaps import Gaps
-from nodes.heartbeat import Heart
-from nodes.mapper import run_mapper
-from nodes.node import NodeContext
-from nodes.options import MapperOptions, RecorderOptions
-from nodes.process import StopRequest
-from nodes.public_publisher import PublicPublisher
-from nodes.recorder import run_recorder
-from nodes.streams import Streams
-from replay.log import LogReader
 from semantic_mapper.errors import NodeError, TransportError
 from semantic_mapper.labels import NYU40, ROOMS
+from semantic_mapper.nodes.frame_gaps import Gaps
+from semantic_mapper.nodes.mapper.node import run_mapper
+from semantic_mapper.nodes.node import NodeContext
+from semantic_mapper.nodes.options import MapperOptions, RecorderOptions
+from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.public_publisher import PublicPublisher
+from semantic_mapper.nodes.recorder.node import run_recorder
+from semantic_mapper.nodes.streams import Streams
+from semantic_mapper.nodes.supervisor.heartbeat import Heart
+from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info, encode_status
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
 from semantic_mapper.transport.security import ServerIdentity, allow, make_keys

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
-from replay.log import LogReader
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.replay.log.format import LogReader
 from tests.nodes.support import (
     REPLAY_LAUNCH,
     Running,

@@ -8,14 +8,14 @@ import numpy as np
 
 from semantic_mapper.geometry import look_at
 from semantic_mapper.labels import make_label_set
-from semantic_mapper.mapping.block_index import pack_keys
-from semantic_mapper.mapping.changes import UNOBSERVED, BlockChanges
+from semantic_mapper.mapping.storage.block_index import pack_keys
+from semantic_mapper.mapping.storage.changes import UNOBSERVED, BlockChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_voxels
 from semantic_mapper.types import Float32, Float64, UInt8
-from tests.mapping.views import INTRINSICS, frame, plane_depth, ray_directions, small_map, sphere_depth
+from tests.mapping.rendered_views import INTRINSICS, frame, plane_depth, ray_directions, small_map, sphere_depth
 
 LABELS = make_label_set("known", ("floor", "table", "cup", "lamp"), ids=(2, 5, 9, 11), ignore_id=0)
 FLOOR, TABLE, CUP, LAMP = LABELS.ids

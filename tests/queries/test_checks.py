@@ -10,7 +10,7 @@ import pytest
 
 from semantic_mapper.errors import MapError, PoseError
 from semantic_mapper.queries import boxes, lookup, nearest, occupancy, rays
-from tests.mapping.views import INTRINSICS
+from tests.mapping.rendered_views import INTRINSICS
 from tests.queries.scene import whole
 
 NAN = float("nan")

@@ -21,7 +21,7 @@ from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.oriented_box import upright_box
 from semantic_mapper.queries.surface import surface_voxels
 from semantic_mapper.types import UInt8
-from tests.mapping.views import small_map
+from tests.mapping.rendered_views import small_map
 from tests.queries.random_map import random_changes, random_map, voxel_places
 from tests.queries.scene import (
     BALL,

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import LabelError, MapError
-from semantic_mapper.mapping.changes import BlockChanges
+from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.queries import mirror as mirror_module
 from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.nearest import nearest
 from semantic_mapper.queries.rays import cast_rays
 from semantic_mapper.queries.snapshot import MapSnapshot
-from tests.mapping.test_paging import MEMORY_MB, walk
-from tests.mapping.views import small_map
+from tests.mapping.rendered_views import small_map
+from tests.mapping.storage.test_paging import MEMORY_MB, walk
 from tests.queries.random_map import random_map
 from tests.queries.scene import FLOOR, LABELS, TABLE, integrate, painted, poses, whole_map
 

@@ -7,7 +7,7 @@ import pytest
 
 from semantic_mapper.geometry import look_at
 from semantic_mapper.queries.rays import cast_rays, nearest_corners, ray_cast
-from tests.mapping.views import INTRINSICS, ray_directions
+from tests.mapping.rendered_views import INTRINSICS, ray_directions
 from tests.queries.random_map import random_map
 from tests.queries.scene import BALL, CUP, MIDDLE, RADIUS, poses, seen, whole, whole_map
 from tests.queries.test_surface import dense

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from replay.log import LogWriter
 from semantic_mapper.labels import NYU40
+from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
 from tests.transport import samples
 

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from replay.run_folder import Run
-from replay.session import MapSession, load_pipeline
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.replay.run_folder import Run
+from semantic_mapper.replay.session import MapSession, load_pipeline
 from semantic_mapper.types import PosedFrame
-from tests.mapping import views
+from tests.mapping import rendered_views as views
 from tests.small import tiny_config
 
 VOXEL_M = 0.02

@@ -16,15 +16,15 @@ import pytest
 import rerun.chunk
 from scipy.spatial.transform import Rotation
 
-from nodes.console import Output
-from nodes.export_recording import export_recording
-from nodes.saved_maps import is_log
-from replay.exporters import LogExportReport, LogExportRequest, export_log, log_format_of
-from replay.importers import ImportOptions, import_recording
-from replay.importers.tum import read_trajectory
-from replay.log import LogReader, LogWriter
 from semantic_mapper.errors import ConfigError, ImportSourceError, LogError
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.nodes.cli.console import Output
+from semantic_mapper.nodes.cli.export_log import export_recording
+from semantic_mapper.nodes.cli.saved_maps import is_log
+from semantic_mapper.replay.exporters import LogExportReport, LogExportRequest, export_log, log_format_of
+from semantic_mapper.replay.importers import ImportOptions, import_recording
+from semantic_mapper.replay.importers.tum import read_trajectory
+from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.transport.codec import CodecOptions, encode_frame
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame

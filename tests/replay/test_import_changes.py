@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from replay.importers import ImportOptions, import_recording
-from replay.log import LogReader
 from semantic_mapper.errors import LabelError
+from semantic_mapper.replay.importers import ImportOptions, import_recording
+from semantic_mapper.replay.log.format import LogReader
 
 from . import recordings as rec
 

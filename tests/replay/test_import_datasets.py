@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from replay.importers import ImportOptions, detect_format, import_recording
-from replay.importers.kitti360 import LABELS
-from replay.log import LogReader
 from semantic_mapper.errors import ImportSourceError
+from semantic_mapper.replay.importers import ImportOptions, detect_format, import_recording
+from semantic_mapper.replay.importers.kitti360 import LABELS
+from semantic_mapper.replay.log.format import LogReader
 from tests.replay import recordings as rec
 
 DRIVE = "2013_05_28_drive_0000_sync"

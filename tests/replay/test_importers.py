@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from replay.importers import ImportOptions, ImportReport, detect_format, import_recording
-from replay.importers.tum import match_nearest
-from replay.log import LogReader
 from semantic_mapper.errors import ImportSourceError, LogError
 from semantic_mapper.labels import NYU40
+from semantic_mapper.replay.importers import ImportOptions, ImportReport, detect_format, import_recording
+from semantic_mapper.replay.importers.tum import match_nearest
+from semantic_mapper.replay.log.format import LogReader
 
 from . import recordings as rec
 

@@ -7,12 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from nodes.summary_table import notes, summary_table
-from replay import artifacts
-from replay.evaluate import baseline_predictors, evaluate_frames, field_predictors
-from replay.session import SNAPSHOTS, MapSession, load_pipeline, make_field, open_recording
-from replay.tallies import StepTimes
-from replay.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.config import MapperConfig, convert_config, to_plain
 from semantic_mapper.errors import LabelError, WeightsError
 from semantic_mapper.evaluation.metrics import confusion_of
@@ -23,6 +17,12 @@ from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import NYU40, ROOMS, make_label_set
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.cli.summary_table import notes, summary_table
+from semantic_mapper.replay import artifacts
+from semantic_mapper.replay.evaluate.methods import baseline_predictors, evaluate_frames, field_predictors
+from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
+from semantic_mapper.replay.session import SNAPSHOTS, MapSession, load_pipeline, make_field, open_recording
+from semantic_mapper.replay.stats import StepTimes
 from tests.small import SMALL_ENCODER, tiny_config, tiny_field, tiny_frames
 
 

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from replay.testing import LogReplays, ReplayedMap
 from semantic_mapper.errors import ConfigError, LabelError, LogError, MapError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.occupancy import State, occupancy
+from semantic_mapper.replay.testing import LogReplays, ReplayedMap
 from semantic_mapper.types import PosedFrame
 from tests.nodes.support import CONFIG, run, write_config, write_log, write_weights
 from tests.small import tiny_frames

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from replay.log import LogReader
 from scripts import fault_finetuner, fault_frames, fault_inputs, fault_table, long_log, soak
 from scripts.fault_table import Outcome
+from semantic_mapper.replay.log.format import LogReader
 
 
 def test_the_table_shows_the_worst_of_each_case(tmp_path: Path) -> None:

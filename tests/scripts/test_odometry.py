@@ -6,9 +6,9 @@ from pathlib import Path
 import cv2
 import pytest
 
-from replay.log import LogReader, LogWriter
 from scripts import odometry
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.scenes import TRAIN_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics

@@ -7,9 +7,9 @@ from functools import cache
 import cv2
 import numpy as np
 
-from drivers.base import CameraImage
-from drivers.poses.board import make_board
-from drivers.poses.config import BoardPoses
+from semantic_mapper.drivers.base import CameraImage
+from semantic_mapper.drivers.poses.board import make_board
+from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.geometry import camera_matrix, invert_pose, look_at
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drivers.calibrating.config import CalibrationConfig
-from drivers.calibrating.extrinsics import calibrate_rig
-from drivers.calibrating.solve import solve
-from drivers.calibrating.views import BoardView, ViewGatherer, simultaneous
+from semantic_mapper.drivers.calibrating.config import CalibrationConfig
+from semantic_mapper.drivers.calibrating.extrinsics import calibrate_rig
+from semantic_mapper.drivers.calibrating.solve import solve
+from semantic_mapper.drivers.calibrating.views import BoardView, ViewGatherer, simultaneous
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.types import Float64

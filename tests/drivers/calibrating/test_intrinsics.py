@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drivers.calibrating.config import CalibrationConfig
-from drivers.calibrating.coverage import REGIONS, area_counts, missing_regions
-from drivers.calibrating.intrinsics import calibrate_camera, compare_camera, ideal_pixels
-from drivers.calibrating.picture import draw_calibration
-from drivers.calibrating.views import BoardView, ViewGatherer
-from drivers.poses.board import BoardFinder
+from semantic_mapper.drivers.calibrating.config import CalibrationConfig
+from semantic_mapper.drivers.calibrating.coverage import REGIONS, area_counts, missing_regions
+from semantic_mapper.drivers.calibrating.intrinsics import calibrate_camera, compare_camera, ideal_pixels
+from semantic_mapper.drivers.calibrating.picture import draw_calibration
+from semantic_mapper.drivers.calibrating.views import BoardView, ViewGatherer
+from semantic_mapper.drivers.poses.board import BoardFinder
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import camera_matrix, project
 from semantic_mapper.types import CameraIntrinsics, Float64

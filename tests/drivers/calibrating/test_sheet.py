@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.calibrating.sheet import MARGIN_M, draw_sheet, sheet_png
-from drivers.poses.board import BoardFinder
-from drivers.poses.config import BoardPoses
+from semantic_mapper.drivers.calibrating.sheet import MARGIN_M, draw_sheet, sheet_png
+from semantic_mapper.drivers.poses.board import BoardFinder
+from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError
 
 BOARDS = [BoardPoses(), BoardPoses(pattern="tags", columns=3, rows=2, square_m=0.06, marker_m=0.045)]

@@ -14,9 +14,9 @@ import depthai as dai
 import numpy as np
 from mcap.reader import make_reader
 
-from drivers.oak.camera import OakCamera
-from drivers.oak.config import Config
-from drivers.oak.stream import OdometryPorts, Sources
+from semantic_mapper.drivers.oak.camera import OakCamera
+from semantic_mapper.drivers.oak.config import Config
+from semantic_mapper.drivers.oak.stream import OdometryPorts, Sources
 from semantic_mapper.types import Float64
 
 WIDTH, HEIGHT, FPS = 64, 48, 50.0

@@ -9,9 +9,9 @@ import depthai as dai
 import numpy as np
 import pytest
 
-from drivers.base import Camera, CameraImage
-from drivers.oak.images import MAX_DAMAGED
-from drivers.oak.stream import Sources
+from semantic_mapper.drivers.base import Camera, CameraImage
+from semantic_mapper.drivers.oak.images import MAX_DAMAGED
+from semantic_mapper.drivers.oak.stream import Sources
 from semantic_mapper.errors import CameraError
 from tests.drivers.oak import host
 from tests.drivers.oak.host import HEIGHT, PERIOD, WIDTH, depth_message, long_ago, rgb_message

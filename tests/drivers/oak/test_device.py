@@ -12,9 +12,9 @@ import depthai as dai
 import numpy as np
 import pytest
 
-from drivers.oak.config import Config, Preset, Socket
-from drivers.oak.device import load_calibration, rgb_to_left
-from drivers.oak.images import read_intrinsics
+from semantic_mapper.drivers.oak.config import Config, Preset, Socket
+from semantic_mapper.drivers.oak.device import load_calibration, rgb_to_left
+from semantic_mapper.drivers.oak.images import read_intrinsics
 from semantic_mapper.errors import CameraError
 from tests.drivers.oak.host import RGB_IN_LEFT_CM
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import depthai as dai
 import pytest
 
-from drivers import oak
-from drivers.oak import devices
-from drivers.oak.config import Config
-from drivers.registry import FoundCamera
 from semantic_mapper.config import convert_config
+from semantic_mapper.drivers import oak
+from semantic_mapper.drivers.oak import devices
+from semantic_mapper.drivers.oak.config import Config
+from semantic_mapper.drivers.registry import FoundCamera
 from semantic_mapper.errors import CameraError, ConfigError
 
 NOWHERE = "192.0.2.1"  # an address that no machine has

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivers.base import CameraImage
-from drivers.oak import odometry
-from drivers.oak.stream import Sources
-from drivers.oak.tracking import GAP_NS, T_BODY_LEFT, PoseTrack, basalt_pose
+from semantic_mapper.drivers.base import CameraImage
+from semantic_mapper.drivers.oak import odometry
+from semantic_mapper.drivers.oak.stream import Sources
+from semantic_mapper.drivers.oak.tracking import GAP_NS, T_BODY_LEFT, PoseTrack, basalt_pose
 from semantic_mapper.errors import CameraError, PoseError
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.types import Float64

@@ -9,7 +9,7 @@ from typing import Self
 import cv2
 import numpy as np
 
-from drivers.base import CameraImage, PoseEstimate
+from semantic_mapper.drivers.base import CameraImage, PoseEstimate
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.poses.motion import PoseTrack, StampedPose, along, turn_between
+from semantic_mapper.drivers.poses.motion import PoseTrack, StampedPose, along, turn_between
 from semantic_mapper.types import Float64
 
 from .images import MS, rigid

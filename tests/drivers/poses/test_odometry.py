@@ -6,14 +6,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from drivers.base import CameraImage, PoseEstimate
-from drivers.poses.alignment import Aligner, Target, fit
-from drivers.poses.config import OdometryPoses
-from drivers.poses.depth_view import make_levels, thin_depth, thinned
-from drivers.poses.features import find_features, pose_from_features
-from drivers.poses.keyframe_map import KeyframeMap, OdometryKeyframe
-from drivers.poses.motion import turn_between
-from drivers.poses.odometry import OdometryPoseSource
+from semantic_mapper.drivers.base import CameraImage, PoseEstimate
+from semantic_mapper.drivers.poses.alignment import Aligner, Target, fit
+from semantic_mapper.drivers.poses.config import OdometryPoses
+from semantic_mapper.drivers.poses.depth_view import make_levels, thin_depth, thinned
+from semantic_mapper.drivers.poses.features import find_features, pose_from_features
+from semantic_mapper.drivers.poses.keyframe_map import KeyframeMap, OdometryKeyframe
+from semantic_mapper.drivers.poses.motion import turn_between
+from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
 from semantic_mapper.errors import CameraError
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
 from semantic_mapper.geometry import invert_pose, unproject

@@ -8,10 +8,10 @@ from typing import Self
 import numpy as np
 import pytest
 
-from drivers.base import Camera, CameraImage, FrameSource, PoseEstimate, PoseSource
-from drivers.poses.config import DevicePoses, FixedPose, PoseChecks
-from drivers.poses.posed_camera import PosedCamera
-from drivers.poses.still import DevicePoseSource, FixedPoseSource
+from semantic_mapper.drivers.base import Camera, CameraImage, FrameSource, PoseEstimate, PoseSource
+from semantic_mapper.drivers.poses.config import DevicePoses, FixedPose, PoseChecks
+from semantic_mapper.drivers.poses.posed_camera import PosedCamera
+from semantic_mapper.drivers.poses.still import DevicePoseSource, FixedPoseSource
 from semantic_mapper.errors import CameraError
 from semantic_mapper.types import Float64
 

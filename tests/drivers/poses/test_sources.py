@@ -8,14 +8,14 @@ from typing import Any
 
 import pytest
 
-from drivers.base import PoseSource
-from drivers.poses.board import BoardPoseSource
-from drivers.poses.config import IDENTITY, KINDS
-from drivers.poses.odometry import OdometryPoseSource
-from drivers.poses.posed_camera import TellingPoseSource
-from drivers.poses.sources import open_poses, read_pose_config
-from drivers.poses.still import DevicePoseSource, FixedPoseSource
-from drivers.poses.topic import TopicPoseSource
+from semantic_mapper.drivers.base import PoseSource
+from semantic_mapper.drivers.poses.board import BoardPoseSource
+from semantic_mapper.drivers.poses.config import IDENTITY, KINDS
+from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
+from semantic_mapper.drivers.poses.posed_camera import TellingPoseSource
+from semantic_mapper.drivers.poses.sources import open_poses, read_pose_config
+from semantic_mapper.drivers.poses.still import DevicePoseSource, FixedPoseSource
+from semantic_mapper.drivers.poses.topic import TopicPoseSource
 from semantic_mapper.errors import ConfigError
 
 
@@ -84,7 +84,7 @@ def test_matrices_must_be_rigid(kind: str, name: str) -> None:
 def test_open3d_is_loaded_by_odometry_alone() -> None:
     program = (
         "import sys\n"
-        "from drivers.poses.sources import open_poses\n"
+        "from semantic_mapper.drivers.poses.sources import open_poses\n"
         "open_poses({'kind': 'fixed'}), open_poses({'kind': 'board'}), open_poses({'kind': 'device'})\n"
         "print('open3d' in sys.modules)\n"
         "open_poses({'kind': 'rgbd'})\n"

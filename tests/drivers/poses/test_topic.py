@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import zmq
 
-from drivers.poses import topic
-from drivers.poses.config import TopicPoses
-from drivers.poses.topic import TopicPoseSource
+from semantic_mapper.drivers.poses import topic
+from semantic_mapper.drivers.poses.config import TopicPoses
+from semantic_mapper.drivers.poses.topic import TopicPoseSource
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.transport.pose_message import PoseMessage, encode_pose

@@ -1,0 +1,1 @@
+"""Calibration of lenses and rigs from the command line."""

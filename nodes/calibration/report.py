@@ -1,0 +1,170 @@
+"""What a calibration tells people and programs, and the files it writes."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rich.table import Table
+
+from semantic_mapper import __version__
+from semantic_mapper.config import Config
+from semantic_mapper.drivers.calibrating.config import CalibrationConfig
+from semantic_mapper.drivers.calibrating.coverage import CELLS, missing_regions
+from semantic_mapper.drivers.calibrating.intrinsics import COEFFICIENT_NAMES, CameraCalibration
+from semantic_mapper.drivers.calibrating.picture import draw_calibration
+from semantic_mapper.drivers.calibrating.solve import Calibration
+from semantic_mapper.drivers.calibrating.views import ViewGatherer
+from semantic_mapper.drivers.calibration import save_calibration
+from semantic_mapper.drivers.poses.config import BoardPoses
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.files import write_bytes
+
+
+class CalibrationSettings(Config, frozen=True):
+    """The file that ``calibrate --config`` takes."""
+
+    board: BoardPoses = BoardPoses()
+    calibration: CalibrationConfig = CalibrationConfig()
+
+
+def write_files(out: Path, found: Calibration, settings: CalibrationSettings) -> list[Path]:
+    """A TOML file and a picture of each camera; returns their paths.
+
+    Raises:
+        ConfigError: a file cannot be written; it is as it was.
+    """
+    written: list[Path] = []
+    b = settings.board
+    for name, camera in found.cameras.items():
+        about: dict[str, str | float] = {
+            "made_by": f"semantic-mapper {__version__} calibrate",
+            "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
+            "board": f"{b.pattern} {b.columns}x{b.rows}, {1000 * b.square_m:g} mm",
+            "views": len(camera.views),
+            "rms_px": round(camera.rms_px, 4),
+        }
+        about |= {f"sigma_{key}": float(f"{sigma:.3g}") for key, sigma in camera.sigmas.items()}
+        mount = None
+        if found.rig is not None:
+            mount = found.rig.T_rig_camera[name]
+            about["rig"] = f"that of camera {next(iter(found.cameras))}; {', '.join(found.cameras)}"
+            about["rig_position_sigma_mm"] = float(f"{1000 * found.rig.position_sigma_m[name]:.3g}")
+            about["rig_turn_sigma_deg"] = float(f"{found.rig.turn_sigma_deg[name]:.3g}")
+        with _explained(out / f"{name}.toml"):
+            save_calibration(out / f"{name}.toml", camera.intrinsics, mount, about)
+        picture = out / f"{name}.png"
+        drawn = draw_calibration(name, camera, settings.calibration)
+        write_whole(picture, cv2.imencode(".png", np.ascontiguousarray(drawn[..., ::-1]))[1].tobytes())
+        written += [out / f"{name}.toml", picture]
+    return written
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file, or leave it as it was.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
+    with _explained(path):
+        write_bytes(path, data)
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Make of what the system says an error that says what to do."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or error
+        raise ConfigError(f"{path}: cannot be written ({reason}); make room, or choose another place") from error
+
+
+def report(found: Calibration, gathered: Mapping[str, ViewGatherer], worst: int) -> Iterator[Any]:
+    """Tables and lines for people."""
+    for name, camera in found.cameras.items():
+        yield _camera_table(name, camera, gathered[name], worst)
+    if found.rig is not None:
+        table = Table(title="rig", title_justify="left")
+        for title in ("camera", "moments", "x, y, z on the rig (mm)", "+- mm", "turned (deg)", "+- deg"):
+            table.add_column(title)
+        for name, T in found.rig.T_rig_camera.items():
+            turned = np.degrees(np.linalg.norm(cv2.Rodrigues(T[:3, :3])[0]))
+            place = ", ".join(f"{1000 * v:.1f}" for v in T[:3, 3])
+            sigmas = found.rig.position_sigma_m[name] * 1000, found.rig.turn_sigma_deg[name]
+            moments = str(found.rig.instants[name])
+            table.add_row(name, moments, place, f"{sigmas[0]:.2f}", f"{turned:.2f}", f"{sigmas[1]:.3f}")
+        table.caption = f"{found.rig.rms_px:.3f} px RMS of all corners at once"
+        yield table
+
+
+def report_json(found: Calibration, gathered: Mapping[str, ViewGatherer], files: list[Path]) -> dict[str, Any]:
+    """The same for programs."""
+    cameras = {name: _camera_json(camera, gathered[name]) for name, camera in found.cameras.items()}
+    rig = None
+    if found.rig is not None:
+        rig = {
+            "rms_px": found.rig.rms_px,
+            "cameras": {
+                name: {
+                    "T_rig_camera": T.tolist(),
+                    "moments": found.rig.instants[name],
+                    "position_sigma_m": found.rig.position_sigma_m[name],
+                    "turn_sigma_deg": found.rig.turn_sigma_deg[name],
+                }
+                for name, T in found.rig.T_rig_camera.items()
+            },
+        }
+    return {"cameras": cameras, "rig": rig, "files": [str(path) for path in files]}
+
+
+def _values(camera: CameraCalibration) -> dict[str, float]:
+    i = camera.intrinsics
+    values = {"fx": i.fx, "fy": i.fy, "cx": i.cx, "cy": i.cy}
+    return values | dict(zip(COEFFICIENT_NAMES, i.distortion, strict=False))
+
+
+def _camera_table(name: str, camera: CameraCalibration, views: ViewGatherer, worst: int) -> Table:
+    i = camera.intrinsics
+    table = Table(title=f"{name}, {i.width} x {i.height}", title_justify="left", show_header=False)
+    table.add_column()
+    table.add_column(overflow="fold")
+    left_out = f"; {len(camera.left_out)} did not fit: {', '.join(camera.left_out)}" if camera.left_out else ""
+    used = f"{views.images} looked at, {views.seen} with the board, {len(camera.views)} used{left_out}"
+    table.add_row("images", used)
+    table.add_row("error", f"{camera.rms_px:.3f} px RMS")
+    order = sorted(zip(camera.errors_px, camera.views, strict=True), key=lambda pair: -pair[0])
+    table.add_row("worst images", ", ".join(f"{view.name} {error:.2f} px" for error, view in order[:worst]))
+    if not camera.estimated:
+        table.add_row("intrinsics", "as the source tells them")
+    for key, value in _values(camera).items():
+        sigma = f" +- {camera.sigmas[key]:.2g}" if key in camera.sigmas else ""
+        table.add_row(key, f"{value:.2f}{sigma}" if key in ("fx", "fy", "cx", "cy") else f"{value:.5f}{sigma}")
+    cells = int((camera.counts > 0).sum())
+    missing = ", ".join(missing_regions(camera.counts))
+    seen = f"{cells} of {CELLS * CELLS} cells" + (f"; hardly: {missing}" if missing else "")
+    table.add_row("image area seen", seen)
+    up, side = np.abs(camera.tilts).max(axis=0)
+    table.add_row("board leaned", f"up to {up:.0f} degrees up or down, {side:.0f} to a side")
+    return table
+
+
+def _camera_json(camera: CameraCalibration, views: ViewGatherer) -> dict[str, Any]:
+    up, side = np.abs(camera.tilts).max(axis=0)
+    return {
+        "size": [camera.intrinsics.width, camera.intrinsics.height],
+        "estimated": camera.estimated,
+        **_values(camera),
+        "sigmas": camera.sigmas,
+        "rms_px": camera.rms_px,
+        "images": {"looked_at": views.images, "with_board": views.seen, "left_out": list(camera.left_out)},
+        "errors_px": {view.name: error for view, error in zip(camera.views, camera.errors_px, strict=True)},
+        "cells_seen": int((camera.counts > 0).sum()),
+        "cells": CELLS * CELLS,
+        "leaned_deg": [float(up), float(side)],
+    }

@@ -1,0 +1,53 @@
+"""What the frames of a camera node are called: readers tell cameras apart by that alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from semantic_mapper.errors import ConfigError, LogError
+from semantic_mapper.nodes.options import CameraOptions
+
+
+def check_camera_ids(reader: str, cameras: Mapping[str, CameraOptions], where: str) -> None:
+    """Refuse frames of one name from two cameras at one node.
+
+    Args:
+        reader: Name of the node.
+        cameras: Those whose frames it takes, by node name.
+        where: For messages.
+
+    Raises:
+        ConfigError: two cameras of one name.
+    """
+    if len(cameras) < 2:
+        return
+    taken: dict[str, str] = {}
+    for node, options in cameras.items():
+        for name in _camera_ids(options):
+            other = taken.setdefault(name, node)
+            if other == node:
+                continue
+            mend = "give each its own `id`"
+            if options.log is not None or cameras[other].log is not None:
+                mend = (
+                    "frames of a log keep the names that they were recorded under: record one again with another `id`, "
+                    "or give each log a mapper of its own; parts of one recording are one node, whose `log` is their "
+                    "folder"
+                )
+            raise ConfigError(
+                f"{where}: two cameras of node '{reader}', '{other}' and '{node}', have the id '{name}'; {mend}"
+            )
+
+
+def _camera_ids(options: CameraOptions) -> tuple[str, ...]:
+    """Of a camera, or of those in a log; none where the log cannot be read, which its node will say."""
+    if options.camera is not None:
+        return (options.camera.id,)
+    from semantic_mapper.replay.log.sequence import open_log
+
+    try:
+        with open_log(Path(str(options.log))) as log:
+            return tuple(log.info.cameras)
+    except (LogError, OSError):
+        return ()

@@ -1,0 +1,51 @@
+"""What a node that publishes frames waits for: listeners before the first one, delivery after the last."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from semantic_mapper.errors import TransportError
+from semantic_mapper.nodes.node import NodeContext
+
+if TYPE_CHECKING:
+    from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
+
+DRAIN_S = 600.0  # how long subscribers may take to work off what waits for them after the last frame
+WAIT_SLICE_S = 0.2
+STOP_DRAIN_S = 3.0  # the same after a stop request
+REMIND_S = 2.0  # how often the end is said again meanwhile
+
+
+def wait_for_listeners(
+    context: NodeContext, publisher: Publisher, timeout_s: float, acks: LosslessSubscriber | None = None
+) -> bool:
+    """Wait until all others are there, in slices: False where a stop request came first.
+
+    Raises:
+        TransportError: too few within the time.
+    """
+    deadline = time.monotonic() + timeout_s
+    while not context.stop:
+        try:
+            publisher.wait_for_subscribers("frame", context.subscribers, WAIT_SLICE_S)
+            if acks is not None:
+                acks.wait_until_heard(WAIT_SLICE_S)
+            return True
+        except TransportError:
+            if time.monotonic() > deadline:
+                raise
+    return False
+
+
+def drain(context: NodeContext, publisher: Publisher) -> None:
+    """Stay until the subscribers have left, which they do after the end of the stream: only then is all delivered.
+
+    The end is said again and again: who was suspended, or too slow for a live stream, may have had no room for it.
+    """
+    began = reminded = time.monotonic()
+    while publisher.subscribers("frame") and time.monotonic() - began < (STOP_DRAIN_S if context.stop else DRAIN_S):
+        if time.monotonic() - reminded > REMIND_S:
+            reminded = time.monotonic()
+            publisher.remind("end")
+        time.sleep(0.05)

@@ -1,0 +1,344 @@
+"""The camera node over a camera: posed frames go out, and its troubles with them.
+
+Frames of a live camera are dropped rather than held back; those of a video file wait for their readers.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Protocol, Self
+
+import structlog
+
+from semantic_mapper.errors import CameraError, ConfigError, TransportError
+from semantic_mapper.nodes.camera.listeners import drain, wait_for_listeners
+from semantic_mapper.nodes.node import NodeContext
+from semantic_mapper.nodes.options import CameraOptions, LiveCamera
+
+if TYPE_CHECKING:
+    from semantic_mapper.drivers.base import Camera, FrameSource
+    from semantic_mapper.drivers.mounts import Mount
+    from semantic_mapper.transport.codec import Parts
+    from semantic_mapper.transport.messages import EndReason, NodeState
+    from semantic_mapper.transport.sockets import Publisher
+    from semantic_mapper.types import PosedFrame
+
+    class LiveSource(FrameSource, Protocol):
+        """A camera with poses, such as ``semantic_mapper.drivers.poses.PosedCamera``."""
+
+        @property
+        def troubles(self) -> tuple[str, ...]:
+            """As of ``Camera``."""
+            ...
+
+        @property
+        def can_wait(self) -> bool:
+            """As of ``Camera``."""
+            ...
+
+        @property
+        def turned_at(self) -> float:
+            """As of ``Camera``."""
+            ...
+
+        @property
+        def counters(self) -> Mapping[str, int]:
+            """Images that got no pose, by reason, and what else it counts."""
+            ...
+
+        def stop(self) -> None:
+            """As of ``Camera``."""
+            ...
+
+
+STATUS_PERIOD_S = 1.0
+POLL_S = 0.05  # how soon a stop request is passed on
+SEND_SLICE_S = 0.2  # between two looks at whether to stop, while a reader has no room for the next frame
+FIRST_PAUSE_S = 0.2  # before a camera that could not be opened is tried again; doubles each time
+MAX_PAUSE_S = 2.0
+
+_log = structlog.get_logger(__name__)
+
+
+def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCamera) -> None:
+    """Publish a camera's frames until it ends (a video) or somebody asks to stop.
+
+    Raises:
+        ConfigError: of the camera or of the poses: unknown keys, wrong values; or the node is to be started anew, and
+            the world of its poses would be another one then.
+        CameraError: the camera can never work with its config, or was not there within ``open_s``.
+        DependencyError: the kind needs something that is not installed.
+        TransportError: the endpoint is taken.
+    """
+    from semantic_mapper.transport.sockets import Publisher
+
+    policy = "block" if make_source(live).can_wait else "drop"  # mistakes in the config are found here, before any wait
+    if context.comes_back:
+        check_world(context.name, live)
+    context = context.await_turn()
+    with Publisher(context.endpoint(context.name), policy=policy) as publisher, _Teller(context, publisher) as teller:
+        context.heart.ready()  # a camera may be plugged in much later
+        with ExitStack() as stack:
+            source = _open(context, live, teller, stack)
+            if source is None:
+                return
+            _listeners(context, options, publisher)
+            with teller.watching_driver():
+                _publish(context, options, publisher, teller, source)
+        context.heart.ending()
+        drain(context, publisher)
+
+
+def check_world(name: str, live: LiveCamera) -> None:
+    """A camera that tracks itself must not come back: its next process would put frames where they do not belong.
+
+    Raises:
+        ConfigError: it is to be started anew.
+    """
+    from semantic_mapper.drivers.poses.config import begins_world
+    from semantic_mapper.drivers.poses.sources import read_pose_config
+
+    config, where = table_of(live.poses, "camera.poses")
+    poses = read_pose_config({key: value for key, value in config.items() if key != "checks"}, where)
+    if begins_world(poses):
+        raise ConfigError(
+            f"node '{name}' is to be started anew where it fails, but poses of kind '{poses.kind}' begin in "
+            'another world then, and its frames would spoil the map: set restart = "never" (the launch ends then, and '
+            "the map is written), or take poses from a topic or a board"
+        )
+
+
+def make_source(live: LiveCamera) -> LiveSource:
+    """The camera with its poses, not open yet.
+
+    Raises:
+        ConfigError, CameraError, DependencyError: see ``run_live_camera``.
+    """
+    from semantic_mapper.drivers.mounts import mount_of
+    from semantic_mapper.drivers.registry import open_camera
+
+    config, where = table_of(live.config, "camera.config")
+    camera = open_camera(live.kind, config, live.id, where)
+    mount = mount_of(live.T_rig_camera, live.kind, config, f"camera '{live.id}'")
+    return with_poses(camera, table_of(live.poses, "camera.poses")[0], mount)
+
+
+def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> LiveSource:
+    """A camera whose frames get their poses from the source that a config names; its ``checks`` say what is refused.
+
+    Raises:
+        ConfigError, CameraError: see ``run_live_camera``.
+    """
+    from semantic_mapper.config import convert_config
+    from semantic_mapper.drivers.poses.config import PoseChecks
+    from semantic_mapper.drivers.poses.posed_camera import PosedCamera
+    from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
+
+    config = dict(config)
+    checks = convert_config(config.pop("checks", {}), PoseChecks, "poses: checks")
+    poses = read_pose_config(config)
+    return PosedCamera(camera, make_poses(poses), checks=checks, T_rig_camera=mount.for_poses(poses))
+
+
+def table_of(named: str | dict[str, Any], where: str) -> tuple[dict[str, Any], str]:
+    """A table of the launch file, or of the file that it names, and what to call it in messages."""
+    from semantic_mapper.config import read_toml
+
+    if isinstance(named, dict):
+        return named, where
+    return (read_toml(Path(named)), named) if named else ({}, where)
+
+
+def _open(context: NodeContext, live: LiveCamera, teller: _Teller, stack: ExitStack) -> LiveSource | None:
+    """An open source, which ``stack`` closes; None where a stop request came first.
+
+    Raises:
+        CameraError: it could not be opened within ``live.open_s``.
+    """
+    began, pause_s, told = time.monotonic(), FIRST_PAUSE_S, ""
+    while not context.stop:
+        source = make_source(live)
+        try:
+            with teller.watching_driver():
+                stack.enter_context(source)
+        except CameraError as error:
+            if live.open_s and time.monotonic() - began > live.open_s:
+                raise
+            if str(error) != told:
+                _log.warning("camera_not_open", reason=str(error))
+            told = teller.waiting_for = str(error)
+        else:
+            teller.watch(source)
+            return source
+        _pause(context, pause_s)
+        pause_s = min(2 * pause_s, MAX_PAUSE_S)
+    return None
+
+
+def _pause(context: NodeContext, seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    while not context.stop and time.monotonic() < deadline:
+        time.sleep(POLL_S)
+
+
+def _listeners(context: NodeContext, options: CameraOptions, publisher: Publisher) -> None:
+    """Give the others time to start; a camera does not end because one of them does not come."""
+    try:
+        wait_for_listeners(context, publisher, options.subscriber_timeout_s)
+    except TransportError as error:
+        _log.warning("some_do_not_listen", reason=str(error))
+
+
+def _publish(
+    context: NodeContext, options: CameraOptions, publisher: Publisher, teller: _Teller, source: LiveSource
+) -> None:
+    from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info
+    from semantic_mapper.transport.messages import EndOfStream
+
+    publisher.publish(encode_info(source.info, context.name))
+    _log.info("publishing", source=source.info.source)
+    reason: EndReason = "error"
+    detail = "the camera node failed"
+    try:
+        for frame in source:
+            if context.stop:
+                break
+            if not _send_frame(context, options, publisher, encode_frame(frame)):
+                break
+            teller.sent(frame)
+            if options.max_frames and teller.published >= options.max_frames:
+                break
+        reason, detail = ("stopped" if context.stop else "end"), ""
+    except CameraError as error:
+        detail = str(error)
+        raise
+    finally:
+        if reason != "error" or not context.comes_back:  # else the stream goes on with the process after this one
+            _send_end(publisher, encode_end(EndOfStream(context.name, reason, teller.published, detail)))
+        _log.info("published", frames=teller.published, reason=reason)
+
+
+def _send_frame(context: NodeContext, options: CameraOptions, publisher: Publisher, parts: Parts) -> bool:
+    """Publish one frame, and wait for readers that must not lose any; False where a stop request came first.
+
+    Raises:
+        TransportError: a reader has had no room for it within ``ack_timeout_s``.
+    """
+    deadline = time.monotonic() + options.ack_timeout_s
+    while not context.stop:
+        try:
+            publisher.publish(parts, SEND_SLICE_S)
+            return True
+        except TransportError as error:
+            if time.monotonic() > deadline:
+                raise TransportError(
+                    f"camera node '{context.name}': a reader has taken no frame for {options.ack_timeout_s:g} s "
+                    "(ack_timeout_s); it hangs, or needs longer than that for one frame"
+                ) from error
+        context.heart.turn()
+    return False
+
+
+def _send_end(publisher: Publisher, parts: Parts) -> None:
+    """Publish the end of the stream; readers without room for it now are reminded of it while the node drains."""
+    with suppress(TransportError):  # the publisher keeps it for ``remind``
+        publisher.publish(parts, SEND_SLICE_S)
+
+
+class _Teller:
+    """Says once a second how the camera is, whatever the camera does, and passes the stop request on to it.
+
+    To the launcher it tells turns of the main loop for as long as no call into the driver hangs.
+    """
+
+    def __init__(self, context: NodeContext, publisher: Publisher) -> None:
+        self.published = 0
+        self.waiting_for = ""  # why the camera could not be opened yet
+        self._context = context
+        self._publisher = publisher
+        self._source: LiveSource | None = None
+        self._first_seq = self._last_seq = -1
+        self._sent_at: float | None = None
+        self._in_driver = False
+        self._turned_at = 0.0
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="status", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        self._thread.join()
+        self._tell("ended")
+
+    @contextmanager
+    def watching_driver(self) -> Iterator[None]:
+        """While it is entered, only a driver that comes round counts as a turn."""
+        self._in_driver = True
+        try:
+            yield
+        finally:
+            self._in_driver = False
+
+    def watch(self, source: LiveSource) -> None:
+        """The camera is open."""
+        self.waiting_for = ""
+        self._source = source
+
+    def sent(self, frame: PosedFrame) -> None:
+        """A frame has been published."""
+        if self._first_seq < 0:
+            self._first_seq = frame.seq
+        self._last_seq = frame.seq
+        self.published += 1
+        self._sent_at = time.monotonic()
+
+    def _run(self) -> None:
+        told_at = 0.0
+        while not self._ended.wait(POLL_S):
+            source = self._source
+            if self._comes_round(source):
+                self._context.heart.turn()
+            if self._context.stop and source is not None:
+                source.stop()
+            if time.monotonic() - told_at >= STATUS_PERIOD_S:
+                told_at = time.monotonic()
+                self._tell(self._state())
+
+    def _comes_round(self, source: LiveSource | None) -> bool:
+        if not self._in_driver:
+            return True
+        before, self._turned_at = self._turned_at, source.turned_at if source is not None else 0.0
+        return self._turned_at != before
+
+    def _state(self) -> NodeState:
+        if self._context.stop:
+            return "stopping"
+        if self._source is None:
+            return "starting"
+        return "degraded" if self._source.troubles else "running"
+
+    def _tell(self, state: NodeState) -> None:
+        from semantic_mapper.transport.codec import encode_status
+        from semantic_mapper.transport.messages import Status
+
+        counters = {"published": self.published}
+        if self._first_seq >= 0:
+            counters["missing"] = self._last_seq - self._first_seq + 1 - self.published
+        troubles = (self.waiting_for,) if self.waiting_for else ()
+        if self._source is not None:
+            counters |= self._source.counters
+            troubles = self._source.troubles
+        ages = {} if self._sent_at is None else {"frame": time.monotonic() - self._sent_at}
+        status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, troubles)
+        with suppress(TransportError):  # a reader has no room for it: the next status says what this one did
+            self._publisher.publish(encode_status(status), 0.0)

@@ -1,0 +1,1 @@
+"""The command ``semantic-mapper``: one file a verb, and what verbs share."""

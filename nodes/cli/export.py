@@ -1,0 +1,130 @@
+"""Verbs about saved maps: ``export`` (also of logs), ``merge``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from semantic_mapper.nodes.cli.console import Output
+from semantic_mapper.nodes.cli.verb import verb
+
+if TYPE_CHECKING:
+    from semantic_mapper.replay.exporters.map_files import ExportRequest
+
+
+@verb
+def export(
+    source: Annotated[
+        Path, typer.Argument(metavar="MAP|LOG", help="Saved map, log, or a folder: of results, or with parts of a log.")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="File to write; its ending says the format.")],
+    format: Annotated[  # noqa: A002 - the name of the option
+        Literal["ply", "ply-mesh", "obj", "glb", "npz", "grid", "rrd", "foxglove", "trajectory", "tum", "folder"]
+        | None,
+        typer.Option(help="Where the ending does not say it: ply and npz are points, ply-mesh, obj and glb meshes."),
+    ] = None,
+    color: Annotated[
+        Literal["rgb", "class", "confidence"] | None, typer.Option(help="Of points and meshes.  [default: rgb]")
+    ] = None,
+    min_weight: Annotated[float, typer.Option(help="Leave voxels with fewer depth measurements out.")] = 1.0,
+    min_confidence: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Leave surface with a less sure label out.")
+    ] = 0.0,
+    up: Annotated[
+        str, typer.Option(help="glb, grid: up in the world: x, -y, ..., or three numbers; auto = away from the floor.")
+    ] = "auto",
+    height: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="LOW HIGH", help="grid: what is in a robot's way, above the floor.  [default: 0.1 1.8]"),
+    ] = None,
+    resolution: Annotated[float | None, typer.Option(help="grid: side of a cell in metres.  [default: 0.05]")] = None,
+    floor: Annotated[float | None, typer.Option(help="grid: height of the floor; found when not given.")] = None,
+    camera: Annotated[str, typer.Option(help="Logs: the frames of this camera only.")] = "",
+    max_frames: Annotated[int, typer.Option(min=0, help="Logs: stop after so many; 0 = all.")] = 0,
+) -> None:
+    """Write a saved map, or a log, in a format of other programs.
+
+    Maps: .ply points (with --format ply-mesh a mesh), .obj mesh with materials, .glb mesh for viewers, .npz arrays for
+    numpy, .yaml/.pgm floor plan for nav2 and map_server, .rrd for Rerun. In a floor plan a cell is free only where the
+    floor was seen.
+
+    Logs: .mcap with Foxglove's schemas, .rrd for Rerun, .txt trajectory (TUM), a folder that `import` reads again
+    without loss, or with --format tum a TUM RGB-D sequence.
+
+    Example: semantic-mapper export runs/kitchen --out kitchen.glb --color class
+    Example: semantic-mapper export runs/kitchen/map.npz --out plan.yaml --height 0.1 1.2
+    Example: semantic-mapper export kitchen.mcap --out kitchen-foxglove.mcap
+    """
+    output = Output.guarded()
+    from semantic_mapper.errors import ConfigError
+    from semantic_mapper.nodes.cli.export_log import export_recording
+    from semantic_mapper.nodes.cli.saved_maps import is_log
+    from semantic_mapper.replay.exporters.map_files import ExportRequest, format_of, parse_up
+
+    if is_log(source):
+        given = {"--color": color, "--height": height, "--resolution": resolution, "--floor": floor}
+        given |= {"--up": up != "auto", "--min-weight": min_weight != 1.0, "--min-confidence": min_confidence > 0}
+        map_options = [name for name, value in given.items() if value]
+        return export_recording(output, source, out, format, camera, max_frames, map_options)
+    if camera or max_frames:
+        raise ConfigError("--camera and --max-frames are for logs; a map has no frames")
+    kind = format_of(out, format)
+    request = ExportRequest(kind, min_weight, min_confidence, color, parse_up(up), height, resolution, floor)
+    return _export_map(output, source, out, request)
+
+
+def _export_map(output: Output, folder_or_map: Path, out: Path, request: ExportRequest) -> None:
+    from semantic_mapper.mapping.voxel_map import VoxelMap
+    from semantic_mapper.nodes.cli.outputs import prepare_file
+    from semantic_mapper.nodes.cli.saved_maps import map_path, refuse_overwriting
+    from semantic_mapper.replay.exporters.map_files import export_map
+
+    source = map_path(folder_or_map)
+    refuse_overwriting(out, source)
+    prepare_file(out)
+    report = export_map(VoxelMap.load(source), out, request)
+    output.print(f"{' and '.join(map(str, report.files))}: {report.content}")
+    for line in report.found:
+        output.print(f"  {line}")
+
+
+@verb
+def merge(
+    a: Annotated[Path, typer.Argument(metavar="A", help="Saved map, or a folder of results with one.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="Another one of the same voxel size and classes.")],
+    out: Annotated[Path, typer.Option("--out", help="Map to write (.npz), in the frame of A.")],
+    transform: Annotated[
+        str,
+        typer.Option(help='Where B lies in A: "x y z yaw_deg" (metres; about +z), or a file with T_A_B, 4 rows of 4.'),
+    ] = "0 0 0 0",
+) -> None:
+    """Make one map of two: what both have measured adds up.
+
+    Shifts by whole voxels are exact; for others, B's voxels are interpolated. The maps have to be aligned already:
+    nothing is searched for. Settings are those of A.
+
+    Example: semantic-mapper merge runs/east runs/west --transform "3.2 0 0 90" --out house.npz
+    """
+    output = Output.guarded()
+    from semantic_mapper.mapping.files.merge import count_empty
+    from semantic_mapper.mapping.voxel_map import VoxelMap
+    from semantic_mapper.nodes.cli.outputs import prepare_file
+    from semantic_mapper.nodes.cli.saved_maps import map_path, parse_transform, refuse_overwriting
+
+    T_a_b = parse_transform(transform)
+    sources = map_path(a), map_path(b)
+    refuse_overwriting(out, *sources)
+    prepare_file(out)
+    one, other = map(VoxelMap.load, sources)
+    joined = one.merged(other, T_a_b)
+    joined.save(out)
+    empty = 0
+    for source in (one, other):
+        with source.locked() as grid:
+            empty += count_empty(grid)
+    blocks = f"{one.block_count} and {other.block_count} made {joined.block_count} blocks"
+    if empty:
+        blocks += f"; {empty} empty blocks of the two, in which nothing was measured, are left out"
+    output.print(f"{out}: {joined.frames} frames; {blocks}")

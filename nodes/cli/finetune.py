@@ -1,0 +1,68 @@
+"""``semantic-mapper finetune``: fit the field to a few labelled keyframes of a log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from semantic_mapper.memory import keep_freed_memory
+from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
+from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.process import StopRequest
+
+
+@verb
+def finetune(
+    log: Annotated[Path, typer.Argument(help="Log with label images (.mcap).")],
+    keyframes: Annotated[int, typer.Option("--keyframes", min=2, help="How many labelled frames to use.")],
+    out: Annotated[Path, typer.Option("--out", help="Weights file to write (.safetensors).")],
+    seconds: Annotated[
+        float | None, typer.Option(min=0, help="Time for training [300]; 0 = only --steps counts.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=0, help="Steps of training; 0 = only --seconds counts.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of everything that is drawn at random [0].")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="TOML file with a FinetuneConfig; options here go before it.")
+    ] = None,
+    weights: Annotated[
+        Path | None, typer.Option(help="Weights to start from; without it the small ones in the package.")
+    ] = None,
+    from_scratch: Annotated[bool, typer.Option("--from-scratch", help="Start from random weights.")] = False,
+) -> int:
+    """Fit the field to a few labelled keyframes of a log.
+
+    The keyframes are those that together show most of what the log shows; no other label is trained on. The weights
+    remember them, so that `replay` and `eval` never score on them. Ctrl-C writes the
+    best weights so far (exit code 130).
+
+    Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors
+    """
+    if from_scratch and weights is not None:
+        raise typer.BadParameter("goes with random weights only", param_hint="--weights")
+    output = Output.guarded()
+    import msgspec
+
+    from semantic_mapper.config import load_config
+    from semantic_mapper.nodes.cli.run_finetune import FinetuneRequest, finetune_log
+    from semantic_mapper.training.finetune import FinetuneConfig
+
+    given = {"seconds": seconds, "steps": steps, "seed": seed}
+    settings = load_config(config, FinetuneConfig) if config is not None else FinetuneConfig()
+    settings = msgspec.structs.replace(settings, **{name: v for name, v in given.items() if v is not None})
+    if settings.seconds == 0 and settings.steps == 0:
+        raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
+    keep_freed_memory()
+    request = FinetuneRequest(log, keyframes, out, settings, weights, from_scratch)
+    with StopRequest() as stop, frame_progress("finetune", None, unit="%") as bar:
+        checkpoint, chosen = finetune_log(request, stop, bar)
+    recipe = checkpoint.recipe
+    output.print(f"{out}: finetuned on frames {', '.join(map(str, chosen))} of {log.name}")
+    output.print(
+        f"  {recipe['steps']} steps in {recipe['seconds']} s, best at step {recipe['best_step']}: held-out loss "
+        f"{recipe['held_out_loss']:.3f}, accuracy {recipe['held_out_accuracy'] * 100:.1f} %"
+    )
+    if stop:
+        stderr_console().print(f"stopped by {stop.name}; the best weights so far are in {out}", style="yellow")
+    return stop.exit_code

@@ -1,0 +1,136 @@
+"""Labelled keyframes for a finetuner: which ones, and on their way to it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from semantic_mapper.errors import LabelError, LogError, TransportError
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.nodes.cli.console import FrameProgress
+from semantic_mapper.nodes.cli.run_finetune import FinetuneRequest, choose_labelled
+from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.supervisor.running_launches import running_launches
+from semantic_mapper.replay.importers.base import BadFrameError, read_label
+from semantic_mapper.replay.importers.folder import read_label_set
+from semantic_mapper.replay.log.sequence import open_log
+from semantic_mapper.training.finetune import FinetuneConfig
+from semantic_mapper.transport.codec import encode_keyframe
+from semantic_mapper.transport.messages import LabelledKeyframe
+from semantic_mapper.transport.sockets import Publisher
+from semantic_mapper.types import PosedFrame
+
+LABELS = "labels"  # what launch files call the socket where keyframes come; see ``FinetunerOptions.labels``
+DELIVERY_MS = 60_000  # that the last keyframes may take to be read, after which they are lost
+SLICE_S = 0.2
+
+
+def choose_keyframes(
+    path: Path, count: int, frames: Iterable[int], images: Path | None, stop: StopRequest, bar: FrameProgress
+) -> tuple[list[PosedFrame], LabelSet]:
+    """Frames of a log with their labels.
+
+    Args:
+        path: The log.
+        count: Of its labelled frames, so many that together show most of what it shows, where nothing names others.
+        frames: By number in the log.
+        images: Folder of label images NNNNNN.png in place of the log's, each named by the number of its frame, with a
+            labels.json or in the log's classes; without ``frames``, those are meant that have one.
+        stop: Ends it.
+        bar: Shows how far it is.
+
+    Raises:
+        LogError: the log, a frame or the labels of one are missing.
+        LabelError: nobody knows what the labels mean.
+        ImportSourceError: a labels.json that is none.
+        KeyboardInterrupt: a stop request came.
+    """
+    with open_log(path) as log:
+        label_set = log.info.label_set
+        if images is not None and (images / "labels.json").exists():
+            label_set = read_label_set(images / "labels.json")
+        if label_set is None:
+            raise LabelError(f"{path}: has no label images; give --images with a folder that has labels.json")
+        numbers = sorted(set(frames)) or ([] if images is None else _numbered(images))
+        if images is None and not numbers:
+            request = FinetuneRequest(path, count, path, FinetuneConfig(), None, from_scratch=False)
+            return choose_labelled(log, label_set, request, stop, bar), label_set
+        bar.start(len(numbers))
+        chosen: list[PosedFrame] = []
+        for number in numbers:
+            if stop:
+                raise KeyboardInterrupt
+            if number >= len(log):
+                raise LogError(f"{path}: has no frame {number}; it has {len(log)}")
+            chosen.append(_labelled(log.frame(number), number, images, label_set, path))
+            bar.advance()
+    return chosen, label_set
+
+
+def labels_endpoint(place: str) -> str:
+    """Where a finetuner listens.
+
+    Args:
+        place: An endpoint, or the socket folder of a launch; empty = that of the one launch that runs.
+
+    Raises:
+        TransportError: none runs, or several do.
+    """
+    if "://" in place:
+        return place
+    folders = [Path(place).absolute()] if place else running_launches()
+    if len(folders) != 1:
+        which = f"several launches run: {', '.join(map(str, folders))}" if folders else "no launch runs here"
+        raise TransportError(f"{which}; say with --to where the finetuner listens (its option `labels`)")
+    return f"ipc://{folders[0]}/{LABELS}"
+
+
+@contextmanager
+def sending(endpoint: str, timeout_s: float, stop: StopRequest) -> Iterator[Callable[[LabelledKeyframe], None]]:
+    """What sends keyframes, once a finetuner is there.
+
+    Raises:
+        TransportError: none within the time, or another labelling tool is at work there.
+        KeyboardInterrupt: a stop request came.
+    """
+    with Publisher(endpoint, policy="block", linger_ms=DELIVERY_MS) as publisher:
+        waited = 0.0
+        while not publisher.subscribers("keyframe"):
+            if stop:
+                raise KeyboardInterrupt
+            if waited > timeout_s:
+                raise TransportError(f"{endpoint}: no finetuner listens there (waited {timeout_s:g} s); does one run?")
+            _wait(publisher, SLICE_S)
+            waited += SLICE_S
+        yield lambda keyframe: publisher.publish(encode_keyframe(keyframe))
+
+
+def _wait(publisher: Publisher, seconds: float) -> None:
+    try:
+        publisher.wait_for_subscribers("keyframe", timeout_s=seconds)
+    except TransportError:
+        return
+
+
+def _numbered(images: Path) -> list[int]:
+    numbers = sorted(int(file.stem) for file in images.glob("*.png") if file.stem.isdigit())
+    if not numbers:
+        raise LogError(f"{images}: has no label images; they are called by the number of their frame, 000012.png")
+    return numbers
+
+
+def _labelled(frame: PosedFrame, number: int, images: Path | None, label_set: LabelSet, path: Path) -> PosedFrame:
+    if images is None:
+        if frame.label is None:
+            raise LogError(f"{path}: frame {number} has no label image; give one in a folder with --images")
+        return frame
+    file = next((f for f in images.glob("*.png") if f.stem.isdigit() and int(f.stem) == number), None)
+    if file is None:
+        raise LogError(f"{images}: has no label image of frame {number}, {number:06d}.png")
+    try:
+        label = read_label(file, label_set, (frame.intrinsics.height, frame.intrinsics.width))
+    except BadFrameError as error:
+        raise LogError(str(error)) from error
+    return dataclasses.replace(frame, label=label)

@@ -1,0 +1,163 @@
+"""Verbs about what is on disk: ``import``, ``info``, ``recover``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from semantic_mapper.nodes.cli.console import Output, frame_progress
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
+
+if TYPE_CHECKING:
+    from semantic_mapper.replay.importers import ImportReport
+
+LISTED = 10  # skipped files and damages that are shown one by one
+
+
+@verb
+def import_(
+    source: Annotated[Path, typer.Argument(metavar="SRC", help="Folder of the recording.")],
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log to write (.mcap).")],
+    format: Annotated[  # noqa: A002 - the name of the option
+        Literal["folder", "tum", "scannet", "replica", "kitti360"] | None,
+        typer.Option(help="Found out when not given."),
+    ] = None,
+    max_frames: Annotated[int, typer.Option(min=0, help="Stop after so many; 0 = all.")] = 0,
+    rename: Annotated[
+        Path | None, typer.Option(help='TOML: [classes] couch = "sofa", ...; classes that get one name become one.')
+    ] = None,
+    rotate: Annotated[
+        Literal["0", "90", "180", "270"], typer.Option(help="Turn every image clockwise by so many degrees.")
+    ] = "0",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a log that is there.")] = False,
+) -> None:
+    """Make a log of a recording: sequence folder, TUM RGB-D, exported ScanNet, Replica (Semantic-NeRF), KITTI-360.
+
+    Frames that cannot be used are left out, each with its file and the reason. --rotate is for cameras that are mounted
+    on their side: the weights know upright rooms. Poses and intrinsics turn with the images.
+
+    Example: semantic-mapper import path/to/redkitchen kitchen.mcap
+    Example: semantic-mapper import path/to/adt flat.mcap --rotate 90 --rename recipes/classes/adt-to-rooms.toml
+    """
+    output = Output.guarded()
+    from semantic_mapper.config import load_config
+    from semantic_mapper.replay.importers import ImportOptions, RenameConfig, import_recording
+
+    renames = load_config(rename, RenameConfig).classes if rename is not None else None
+
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with frame_progress("import", None) as bar:
+
+        def on_progress(done: int, total: int) -> None:
+            if done == 1:
+                bar.start(total)
+            bar.set(done)
+
+        options = ImportOptions(max_frames=max_frames or None, quarters=int(rotate) // 90)
+        report = import_recording(
+            source, log, format, on_progress, options=options, renames=renames, overwrite=overwrite
+        )
+    labels = "no labels" if not report.labelled else f"{report.labelled} of them labelled"
+    output.print(f"{log}: {report.frames} frames ({labels}), {report.bytes / 1e6:.1f} MB, from a '{report.format}'")
+    output.print(f"  depth: {_depth_line(report)}")
+    for notice in report.notices:
+        output.print(f"  note: {notice}")
+    for skipped in report.skipped[:LISTED]:
+        what = "label left out" if skipped.label_only else "frame left out"
+        output.print(f"  {what}: frame {skipped.frame}: {skipped.file}: {skipped.reason}")
+    if len(report.skipped) > LISTED:
+        output.print(f"  and {len(report.skipped) - LISTED} more")
+
+
+def _depth_line(report: ImportReport) -> str:
+    if not report.with_depth:
+        return "no frame has a depth image"
+    missing = report.frames - report.with_depth
+    without = f"; {missing} of {report.frames} frames have no depth image" if missing else ""
+    median = f"; half of the first image is nearer than {report.median_depth_m:.2f} m" if report.median_depth_m else ""
+    return f"{report.depth_scale}{median}{without}"
+
+
+@verb
+def info(
+    file: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...",
+            help="Recorded log (.mcap), its parts or their folder; or saved map, or a folder with map.npz.",
+        ),
+    ],
+    json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
+) -> int:
+    """Say what a log holds (topics, frames, cameras, duration, gaps, damage), or a map (frames, size, blocks, classes).
+
+    Of a log it reads every message, so that damage anywhere is found; exit code 1 where there is any. Of a map it reads
+    what the file says of itself, which is quick however large the map is.
+
+    Example: semantic-mapper info kitchen.mcap
+    Example: semantic-mapper info runs/demo
+    """
+    output = Output.guarded()
+    from semantic_mapper.nodes.cli.saved_maps import is_map, map_path
+
+    if is_map(file[0]):
+        if len(file) > 1:
+            raise typer.BadParameter("one map at a time")
+        return _map_info(output, map_path(file[0]), json)
+    from semantic_mapper.nodes.cli.log_info import describe_log, info_table
+
+    with frame_progress("read", None, unit="messages") as bar:
+        found = describe_log(file, bar.advance)
+    if json:
+        output.json(found)
+    else:
+        output.print(info_table(found))
+        _print_damage(output, found)
+    return EXIT_FAILED if found["damage"] else 0
+
+
+def _map_info(output: Output, file: Path, json: bool) -> int:
+    from semantic_mapper.nodes.cli.map_info import map_summary, map_table
+
+    found = map_summary(file)
+    if json:
+        output.json(found)
+    else:
+        output.print(map_table(found))
+    return 0
+
+
+def _print_damage(output: Output, found: dict[str, Any]) -> None:
+    for notice in found["notices"]:
+        output.print(f"note: {notice}")
+    for damage in found["damage"][:LISTED]:
+        output.print(f"damaged: {damage}")
+    if len(found["damage"]) > LISTED:
+        output.print(f"and {len(found['damage']) - LISTED} more")
+    if found["damage"] or not found["finished"]:
+        log = Path(found["parts"][0])  # parts are mended one by one
+        output.print(
+            f"`semantic-mapper recover {log} {log.with_stem(log.stem + '-recovered')}` makes a clean log of it"
+        )
+
+
+@verb
+def recover(
+    source: Annotated[Path, typer.Argument(metavar="SRC", help="Damaged or unfinished log; is not changed.")],
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="New log to write.")],
+) -> None:
+    """Make a clean log of a damaged or unfinished one: every intact message is kept.
+
+    Example: semantic-mapper recover cut-off.mcap clean.mcap
+    """
+    output = Output.guarded()
+    from semantic_mapper.replay.log.recover import recover as recover_log
+
+    report = recover_log(source, log)
+    output.print(f"{log}: {report.frames} frames, {report.messages} messages; {len(report.lost)} could not be saved")
+    if not report.finished:
+        output.print("  the old log had not been closed by its writer")
+    for error in report.lost[:LISTED]:
+        output.print(f"  lost: {error}")

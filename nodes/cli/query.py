@@ -1,0 +1,157 @@
+"""``semantic-mapper query``: ask a saved map, or that of a running mapper."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import typer
+
+from semantic_mapper.nodes.cli.console import Output
+from semantic_mapper.nodes.cli.outputs import prepare_file
+from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
+from semantic_mapper.nodes.cli.verb import verb
+
+
+class Question(StrEnum):
+    """What can be asked."""
+
+    INFO = "info"
+    AT = "at"
+    NEAREST = "nearest"
+    INSTANCES = "instances"
+
+
+ARGUMENTS = {Question.INFO: "", Question.AT: "X Y Z", Question.NEAREST: "CLASS X Y Z", Question.INSTANCES: ""}
+
+
+class Asked(NamedTuple):
+    """A question and what it may need; see the options of ``query``."""
+
+    question: Question
+    class_name: str = ""
+    point: tuple[float, ...] = ()
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    min_confidence: float = 0.0
+    server: str = ""
+    keys: Path | None = None
+
+
+@verb
+def query(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="MAP", help="Saved map or folder of results, or where a mapper answers (ipc://PATH, tcp://...)."
+        ),
+    ],
+    question: Annotated[Question, typer.Argument(metavar="QUESTION", help="info, at, nearest or instances.")],
+    arguments: Annotated[
+        list[str] | None, typer.Argument(metavar="[CLASS] [X Y Z]", help="Class, and world coordinates in metres.")
+    ] = None,
+    up: Annotated[
+        tuple[float, float, float], typer.Option(metavar="X Y Z", help="instances: which way is up in the world.")
+    ] = (0.0, 0.0, 1.0),
+    min_confidence: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="nearest: places less sure of the class do not count.")
+    ] = 0.0,
+    server: ServerOption = "",
+    keys: KeysOption = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Also write the answer here.")
+    ] = None,
+) -> None:
+    """Ask a saved map, or that of a running mapper, what is where.
+
+    info: size, classes and how much surface each has. at: class and confidence of the surface at a point, and whether
+    the point is free, occupied or unknown. nearest: the surface of a class that is nearest to a point. instances: all
+    things, that is, connected pieces of one class that is not wall, floor or the like, with upright boxes.
+
+    Example: semantic-mapper query runs/demo info
+    Example: semantic-mapper query runs/demo/map.npz at 1.2 -0.4 0.8
+    Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1 --min-confidence 0.5
+    Example: semantic-mapper query runs/demo/map.npz instances --up 0 0 1 --json things.json
+    Example: semantic-mapper query ipc:///run/robot/query nearest chair 0 0 1
+    Example: semantic-mapper query tcp://robot:5570 info --server robot
+    """
+    class_name, point = _read_arguments(question, arguments or [])
+    output = Output.guarded()
+    from semantic_mapper.nodes.cli.map_answers import answer_table
+    from semantic_mapper.replay.artifacts import write_json
+
+    if json_file is not None:
+        prepare_file(json_file)
+    ask = ask_mapper if "://" in source else ask_file
+    asked = Asked(question, class_name, point, up, min_confidence, server, keys)
+    found = {"map": source, **ask(source, asked)}
+    output.print(answer_table(found))
+    if json_file is not None:
+        write_json(json_file, found)
+        output.print(f"written to {json_file}")
+
+
+def ask_file(source: str, asked: Asked) -> dict[str, Any]:
+    """Answer of a saved map.
+
+    Raises:
+        ConfigError, MapError, LabelError: no map there, or a question that cannot be answered.
+    """
+    from semantic_mapper.mapping.voxel_map import VoxelMap
+    from semantic_mapper.nodes.cli import map_answers
+    from semantic_mapper.nodes.cli.saved_maps import map_path
+    from semantic_mapper.queries.instances import InstanceTracker
+    from semantic_mapper.queries.lookup import at
+    from semantic_mapper.queries.mirror import MapMirror
+    from semantic_mapper.queries.nearest import nearest
+
+    snapshot = MapMirror.of(VoxelMap.load(map_path(Path(source)))).snapshot()
+    match asked.question:
+        case Question.INFO:
+            return map_answers.describe_map(snapshot)
+        case Question.AT:
+            return map_answers.answer_at(snapshot.label_set, asked.point, at(snapshot, [asked.point]))
+        case Question.NEAREST:
+            hit = nearest(snapshot, asked.class_name, asked.point, asked.min_confidence)
+            return map_answers.answer_nearest(asked.class_name, asked.point, hit)
+        case Question.INSTANCES:
+            return map_answers.answer_instances(asked.up, InstanceTracker(up=asked.up).update(snapshot))
+
+
+def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
+    """The same of a running mapper.
+
+    Raises:
+        TransportError: nobody answers there.
+        MapError, LabelError: a question that cannot be answered.
+    """
+    from semantic_mapper.client import MapClient
+    from semantic_mapper.nodes.cli import map_answers
+    from semantic_mapper.nodes.supervisor.running_launches import refuse_missing_socket
+
+    refuse_missing_socket(source)
+    with MapClient(source, identity=server_identity(asked.server, asked.keys)) as client:
+        match asked.question:
+            case Question.INFO:
+                return map_answers.describe_map(client.mirror().snapshot())
+            case Question.AT:
+                return map_answers.answer_at(client.info().label_set, asked.point, client.at([asked.point]))
+            case Question.NEAREST:
+                hit = client.nearest(asked.class_name, asked.point, asked.min_confidence)
+                return map_answers.answer_nearest(asked.class_name, asked.point, hit)
+            case Question.INSTANCES:
+                return map_answers.answer_instances(asked.up, client.instances(asked.up))
+
+
+def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tuple[float, ...]]:
+    """Class name and point, as far as the question has them."""
+    expected = ARGUMENTS[question].split()
+    if len(arguments) != len(expected):
+        raise typer.BadParameter(
+            f"`{question.value}` takes {ARGUMENTS[question] or 'nothing more'}, got {' '.join(arguments) or 'nothing'}"
+        )
+    name = arguments[0] if question is Question.NEAREST else ""
+    try:
+        return name, tuple(float(a) for a in arguments[-3:])
+    except ValueError as error:
+        raise typer.BadParameter(f"X Y Z must be numbers, got {' '.join(arguments[-3:])}") from error

@@ -1,0 +1,153 @@
+"""``semantic-mapper record``: what a running launch publishes becomes a log."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from semantic_mapper.nodes.cli.console import FrameProgress, Output, frame_progress
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
+from semantic_mapper.nodes.process import StopRequest
+
+if TYPE_CHECKING:
+    from semantic_mapper.nodes.node import NodeContext
+    from semantic_mapper.nodes.options import RecorderOptions
+    from semantic_mapper.nodes.recorder.node import Recorder
+
+HEAR_S = 10.0  # how long the nodes, which run already, may take to answer
+
+
+@verb
+def record(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log to write (.mcap); further parts: -1, -2, ...")],
+    launch: Annotated[str, typer.Option(help="Socket folder of the launch; by default the one that runs here.")] = "",
+    source: Annotated[
+        list[str] | None, typer.Option(help="Node to record, may be repeated; by default cameras and mappers.")
+    ] = None,
+    topic: Annotated[
+        list[str] | None, typer.Option(help="May be repeated; by default info, frame, refused and status; or map.")
+    ] = None,
+    duration: Annotated[float, typer.Option(min=0, help="Seconds; 0 = to the end of the stream, or Ctrl-C.")] = 0.0,
+    split_mb: Annotated[float, typer.Option(min=0, help="Begin a new part before one grows beyond this.")] = 0.0,
+    split_s: Annotated[float, typer.Option(min=0, help="Begin a new part after so many seconds.")] = 0.0,
+    disk_full: Annotated[
+        Literal["stop", "delete-oldest"], typer.Option(help="Stop, or delete the oldest parts of this recording.")
+    ] = "stop",
+    reserve_mb: Annotated[float, typer.Option(min=0, help="With so much left, the disk counts as full.")] = 500.0,
+    jpeg: Annotated[
+        int, typer.Option(min=0, max=100, help="Colour images as JPEG of this quality; 0 = as they are, lossless.")
+    ] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a recording that is there.")] = False,
+) -> int:
+    """Record what the nodes of a running launch publish, from outside.
+
+    A live launch does not notice. One that plays a log in lockstep or fast waits for this reader, too: it gets no
+    faster than the disk here, and fails where this reads nothing for 30 s (lockstep: 300 s), such as after Ctrl-Z.
+
+    The log keeps the calibration and the launch's settings as attachments. Exit code 1 where the disk was full and
+    something is missing; what was written is whole. A launch can also have a recorder of its own (launch/record.toml).
+
+    Example: semantic-mapper record runs/kitchen.mcap --split-mb 1000 --disk-full delete-oldest
+    """
+    output = Output.guarded()
+    from semantic_mapper.nodes.cli.outputs import prepare_file
+    from semantic_mapper.nodes.recorder.node import record as record_until_end
+    from semantic_mapper.nodes.supervisor.running_launches import launch_folder
+
+    prepare_file(log)
+    wanted = {
+        "out": str(log),
+        "source_timeout_s": HEAR_S,
+        "split_mb": split_mb,
+        "split_s": split_s,
+        "disk_full": disk_full,
+        "reserve_mb": reserve_mb,
+        "overwrite": overwrite,
+        **({"topics": topic} if topic else {}),
+        **({"rgb": "jpeg", "jpeg_quality": jpeg} if jpeg else {}),
+    }
+    with StopRequest() as stop, frame_progress("record", None) as bar:
+        context, options = _join(launch_folder(launch), tuple(source or ()), wanted, stop)
+        recorder = record_until_end(context, options, _Watch(bar, duration).follow)
+    return _tell(output, log, recorder)
+
+
+def _tell(output: Output, log: Path, recorder: Recorder) -> int:
+    """Say what is recorded, and what is not; the exit code.
+
+    Raises:
+        LogError: nothing is.
+    """
+    from semantic_mapper.errors import LogError
+
+    done = recorder.recording
+    if done is None:
+        raise LogError(f"{log}: nothing was recorded: no stream has begun; `semantic-mapper top` shows the nodes")
+    parts = f" in {done.parts} parts" if done.parts > 1 else ""
+    output.print(f"{log}: {done.frames} frames, {done.messages} messages{parts}")
+    if recorder.gaps.missed:
+        output.print(
+            f"  note: {recorder.gaps.missed} frames never came: sent before they were read, or lost on the way"
+        )
+    if done.deleted:
+        output.print(f"  note: {done.deleted} parts were deleted to make room")
+    if not done.lost:
+        return 0
+    output.print(f"  {done.lost} messages were not recorded: {done.trouble or 'the disk was full for a while'}")
+    return EXIT_FAILED
+
+
+class _Watch:
+    """Shows how recording goes, and says when it is enough."""
+
+    def __init__(self, bar: FrameProgress, duration_s: float) -> None:
+        self._bar = bar
+        self._duration_s = duration_s
+        self._began: float | None = None
+
+    def follow(self, recorder: Recorder) -> bool:
+        """True where recording is to end."""
+        recording = recorder.recording
+        if recording is None:
+            return False
+        now = time.monotonic()
+        self._began = now if self._began is None else self._began
+        self._bar.set(recording.frames, recording.trouble)
+        return recording.ended or bool(self._duration_s and now - self._began >= self._duration_s)
+
+
+def _join(
+    folder: Path, sources: tuple[str, ...], wanted: dict[str, Any], stop: StopRequest
+) -> tuple[NodeContext, RecorderOptions]:
+    """What a recorder node would be told by the launcher.
+
+    Raises:
+        TransportError: the launch does not say what it is.
+        ConfigError: a source that is none of its nodes, or options that do not go together.
+    """
+    from semantic_mapper.config import convert_config
+    from semantic_mapper.errors import ConfigError
+    from semantic_mapper.nodes.node import NodeContext
+    from semantic_mapper.nodes.options import RecorderOptions
+    from semantic_mapper.nodes.supervisor.heartbeat import Heart
+    from semantic_mapper.nodes.supervisor.launch_note import read_launch_note
+
+    note = read_launch_note(folder)
+    names = [node.name for node in note.nodes]
+    for name in sources:
+        if name not in names:
+            raise ConfigError(f"--source {name}: no node of {note.launch}; there are {', '.join(names)}")
+    cameras = note.names("camera")
+    sources = sources or (*cameras, *note.names("mapper"))
+    sources = tuple(sorted(sources, key=lambda name: name not in cameras))  # the recorder's order
+    streams = sum(name in cameras for name in sources)
+    if not streams:
+        raise ConfigError(f"--source: name a camera, too, whose end ends the recording: {', '.join(cameras)}")
+    endpoints = {name: f"ipc://{folder}/{name}" for name in names}
+    heart = Heart(-1, 0)
+    context = NodeContext(f"record-{os.getpid()}", endpoints, 0, stop, heart, folder=folder)
+    return context, convert_config({**wanted, "sources": sources, "streams": streams}, RecorderOptions, "record")

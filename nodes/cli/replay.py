@@ -1,0 +1,81 @@
+"""``semantic-mapper replay``: a log becomes a map, in this process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
+from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.process import StopRequest
+
+OutOption = Annotated[Path, typer.Option("--out", help="Folder for the results; made if missing.")]
+WeightsOption = Annotated[
+    Path | None, typer.Option("--weights", help="Weights file; without it the small one in the package.")
+]
+VoxelSizeOption = Annotated[
+    float | None, typer.Option("--voxel-size", min=0.002, max=1.0, help="Edge of a voxel in metres.  [default: 0.02]")
+]
+MaxFramesOption = Annotated[int, typer.Option("--max-frames", min=0, help="Stop after so many; 0 = all.")]
+QualityOption = Annotated[
+    Literal["fast", "balanced", "reference"] | None,
+    typer.Option("--quality", help="Rays and samples: fewer, some or all; without it as --config says."),
+]
+ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with settings of the mapper.")]
+
+
+@verb
+def replay(
+    log: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG...", help="Recorded log (.mcap), the parts of one, or a folder with them."),
+    ],
+    out: OutOption,
+    weights: WeightsOption = None,
+    voxel_size: VoxelSizeOption = None,
+    max_frames: MaxFramesOption = 0,
+    eval_exclude: Annotated[
+        Path | None,
+        typer.Option(help="Leave frames that these weights were finetuned on out of the scores, too."),
+    ] = None,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print the summary as JSON, and nothing else, on stdout.")
+    ] = False,
+    rerun: Annotated[Path | None, typer.Option(help="Also write a Rerun recording (.rrd).")] = None,
+    config: ConfigOption = None,
+    quality: QualityOption = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of everything that is drawn at random.")] = None,
+    corrections: Annotated[
+        Path | None,
+        typer.Option(help="Corrected poses (TUM: stamp tx ty tz qx qy qz qw); the map moves to them at the end."),
+    ] = None,
+) -> int:
+    """Map a recorded log: writes report.html, summary.json, map.ply, map.npz and overview.png.
+
+    Frames that the weights were finetuned on are mapped, but never scored. Damaged or impossible frames are refused
+    with the reason; the rest is mapped. Ctrl-C still writes the map of the frames so far (exit code 130).
+
+    Example: semantic-mapper replay kitchen.mcap --out runs/kitchen --weights kitchen.safetensors
+    """
+    output = Output.guarded()
+    from semantic_mapper.nodes.cli.run_replay import ReplayRequest, mapper_config, replay_log
+    from semantic_mapper.nodes.cli.summary_table import notes, result_lines, summary_table
+
+    settings = mapper_config(config, voxel_size, seed, quality)
+    request = ReplayRequest(
+        log[0], out, weights, settings, max_frames, eval_exclude, rerun, corrections, tuple(log[1:])
+    )
+    with StopRequest() as stop:
+        with frame_progress("replay", None) as bar:
+            summary = replay_log(request, stop, bar.start, bar.set)
+        if json:
+            output.json(summary)
+        else:
+            output.print(summary_table({out.name: summary}))
+            for line in (*notes(summary), *result_lines(out)):
+                output.print(line)
+        if stop:
+            stderr_console().print(f"stopped by {stop.name}; the map so far is in {out}", style="yellow")
+        return stop.exit_code

@@ -1,0 +1,102 @@
+"""Score a log with several methods: progress, and the figures as plain data and as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from semantic_mapper.errors import LabelError, WeightsError
+from semantic_mapper.nodes.cli.console import frame_progress
+from semantic_mapper.nodes.cli.run_replay import mapper_config
+from semantic_mapper.nodes.cli.summary_table import percent
+from semantic_mapper.replay.evaluate.methods import baseline_predictors, evaluate_frames, field_predictors
+from semantic_mapper.replay.log.sequence import Log, open_log
+from semantic_mapper.replay.session import load_pipeline
+from semantic_mapper.types import PosedFrame
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreRequest:
+    """What the verb was asked for; ``weights`` None = those in the package, ``max_frames`` 0 = all."""
+
+    log: Path
+    weights: Path | None
+    baselines: bool
+    seconds: float
+    max_frames: int
+    config: Path | None
+    seed: int
+
+
+def score_log(request: ScoreRequest) -> dict[str, Any]:
+    """Run the methods over a log.
+
+    Returns:
+        ``methods`` (metrics by name), ``scored``, ``excluded``, ``refused``, ``damaged``, ``weights``.
+
+    Raises:
+        LogError, LabelError, WeightsError: nothing can be scored.
+    """
+    with open_log(request.log) as log:
+        stream_labels = log.info.label_set
+        if stream_labels is None:
+            raise LabelError(f"{request.log}: has no label images to score against")
+        bundle = load_pipeline(request.weights, mapper_config(request.config, None, request.seed))
+        predictors = field_predictors(bundle)
+        stamps = bundle.checkpoint.train_stamps_ns
+        if request.baselines:
+            keyframes = _frames_at(log, stamps)
+            with frame_progress("fit the U-Net", 100, unit="%") as bar:
+                predictors |= baseline_predictors(
+                    keyframes,
+                    bundle.checkpoint.label_set,
+                    request.seconds,
+                    request.seed,
+                    lambda fraction: bar.set(int(fraction * 100)),
+                )
+        total = min(len(log), request.max_frames or len(log))
+        frames = (frame for _, frame in zip(range(total), log, strict=False))
+        with frame_progress("score", total) as bar:
+            found = evaluate_frames(
+                frames, predictors, stream_labels, bundle.checkpoint.label_set, stamps, on_frame=bar.set
+            )
+        return {**asdict(found), "damaged": len(log.errors), "weights": bundle.weights_path.name}
+
+
+def _frames_at(log: Log, stamps: frozenset[int]) -> list[PosedFrame]:
+    numbers = [i for i, (envelope, _) in enumerate(log.frame_parts()) if envelope.stamp_ns in stamps]
+    if len(numbers) < 2:
+        raise WeightsError(
+            f"--baselines are fitted to the keyframes that the weights were finetuned on, but {len(numbers)} of them "
+            f"are in {log.path}; give --weights that `semantic-mapper finetune` has made from this log"
+        )
+    return [log.frame(i) for i in numbers]
+
+
+def score_table(title: str, scores: Mapping[str, Any]) -> Table:
+    """One column a method."""
+    methods: Mapping[str, Mapping[str, Any]] = scores["methods"]
+    counts = f"{scores['scored']} frames scored, {scores['excluded']} left out as keyframes"
+    table = Table(title=f"{title}: {counts}", title_justify="left")
+    table.add_column("")
+    for name in methods:
+        table.add_column(name, justify="right")
+    for key, text in (
+        ("miou", "mIoU"),
+        ("total_accuracy", "total accuracy"),
+        ("average_accuracy", "average accuracy"),
+        ("coverage", "coverage"),
+    ):
+        table.add_row(text, *(_show(m.get(key)) for m in methods.values()))
+    table.add_section()
+    for name in dict.fromkeys(n for m in methods.values() for n in m["per_class"]):
+        table.add_row(f"IoU {name}", *(_show(m["per_class"].get(name)) for m in methods.values()))
+    return table
+
+
+def _show(value: float | None) -> str:
+    return "-" if value is None else percent(value)

@@ -1,0 +1,185 @@
+"""Run a benchmark from the command line: progress, tables, JSON and the contact sheet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import metadata
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+from semantic_mapper import __version__
+from semantic_mapper.benchmark.config import SuiteConfig, settings_digest, suite_seeds
+from semantic_mapper.benchmark.contestants import load_contestants
+from semantic_mapper.benchmark.figures import compare, map_figures, view_figures
+from semantic_mapper.benchmark.fit_plot import draw_fit_curves
+from semantic_mapper.benchmark.protocols import Contestant
+from semantic_mapper.benchmark.records import MapRecord
+from semantic_mapper.benchmark.run import Progress, room_records, run_suite, sheet_rows
+from semantic_mapper.benchmark.store import RecordStore
+from semantic_mapper.config import to_plain
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.evaluation.sheet import draw_sheet, write_picture
+from semantic_mapper.fields.checkpoint import default_checkpoint_path
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.memory import keep_freed_memory
+from semantic_mapper.nodes.cli.console import FrameProgress, Output, frame_progress, stderr_console
+from semantic_mapper.nodes.cli.outputs import prepare_file
+from semantic_mapper.nodes.cli.report import write_suite_report
+from semantic_mapper.nodes.cli.suite_table import difference_lines, suite_table
+from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.replay.artifacts import write_json
+
+PACKAGES = ("torch", "numpy")
+
+
+def run_suite_verb(
+    suite: SuiteConfig, weights: Sequence[Path], kinds: Sequence[str], maps: bool, json_file: Path | None
+) -> int:
+    """Run what is missing, then print, write and draw what there is.
+
+    Beside the JSON lie the records of the rooms (``.jsonl``), their pictures (``.views``), the sheet (``.png``)
+    and, of what was fitted, mIoU against seconds (``.curves.png``).
+
+    Args:
+        weights: Files under test; the shipped ones where neither these nor ``kinds`` are given.
+        kinds: Fields with random weights that are fitted to each room; protocol "scratch" only.
+
+    Returns:
+        The exit code: 0, or that of the signal that ended the run.
+
+    Raises:
+        WeightsError, ConfigError, MapError: with what is wrong and the mend.
+    """
+    if maps and suite.protocol != "generalize":
+        raise ConfigError(f"maps are made with weights as they are; protocol '{suite.protocol}' makes none, drop --map")
+    if kinds and suite.protocol != "scratch":
+        raise ConfigError(
+            f"--kind has random weights, which protocol '{suite.protocol}' does not fit; --protocol scratch"
+        )
+    output = Output.guarded()
+    keep_freed_memory()
+    paths = list(weights) or ([] if kinds else [default_checkpoint_path()])
+    out = json_file or Path("runs") / f"{_file_stem(suite)}.json"
+    prepare_file(out)
+    contestants = load_contestants(paths, kinds)
+    store, pictures = RecordStore(out.with_suffix(".jsonl")), out.with_suffix(".views")
+    with StopRequest() as stop:
+        with frame_progress("benchmark", None, unit="%") as bar:
+            bar.start(100)
+            run_suite(suite, contestants, store, pictures, lambda p: _show(bar, p), lambda: stop)
+        if maps and not stop:
+            with frame_progress("map the rooms", None, unit="maps") as bar:
+                _map_rooms(suite, contestants, paths, store, bar, stop)
+        found = _collect(suite, contestants, store, maps)
+        write_json(out, found)
+        table, lines = suite_table(found), difference_lines(found)
+        output.print(table)
+        for line in lines:
+            output.print(line)
+        output.print(f"written to {out}")
+        pictures = list(_draw(suite, contestants, store, found, out))
+        for picture in pictures:
+            output.print(f"picture: {picture}")
+        write_suite_report(page := out.with_suffix(".html"), table, lines, pictures, found)
+        output.print(f"page: {page}")
+        if stop:
+            stderr_console().print(f"stopped by {stop.name}; the same command goes on from here", style="yellow")
+        return stop.exit_code
+
+
+def _draw(
+    suite: SuiteConfig, contestants: Sequence[Contestant], store: RecordStore, found: Mapping[str, Any], out: Path
+) -> Iterator[Path]:
+    """Write the contact sheet, and the curves of what was fitted; yields the files."""
+    if rows := sheet_rows(suite, contestants, store, out.with_suffix(".views")):
+        names = [c.name for c in contestants]
+        write_picture(sheet := out.with_suffix(".png"), draw_sheet(rows, names, ROOMS, title=found["title"]))
+        yield sheet
+    figures = {name: entry["figures"] for name, entry in found["weights"].items()}
+    if (picture := draw_fit_curves(figures, found["title"])) is not None:
+        write_picture(curves := out.with_suffix(".curves.png"), picture)
+        yield curves
+
+
+def _file_stem(suite: SuiteConfig) -> str:
+    """One file for each table that a comparison usually has."""
+    depth = "depth" if suite.depth else "no-depth"
+    views = f"{suite.baseline}-" if suite.protocol == "generalize" else ""
+    return f"rooms-{suite.split}-{suite.protocol}-{views}{depth}-{suite.tier.width}"
+
+
+def _show(bar: FrameProgress, progress: Progress) -> None:
+    bar.set(int(100 * progress.done / max(progress.total, 1)), progress.note)
+
+
+def _map_rooms(
+    suite: SuiteConfig,
+    contestants: Sequence[Contestant],
+    paths: Sequence[Path],
+    store: RecordStore,
+    bar: FrameProgress,
+    stop: StopRequest,
+) -> None:
+    """Make the map records that are missing."""
+    from semantic_mapper.replay.evaluate.room_map import (
+        map_room,  # loads the mapping pipeline, which the rest of a run does without
+    )
+
+    settings, seeds = settings_digest(suite, "map"), suite_seeds(suite)
+    bar.start(len(seeds) * len(contestants))
+    for seed in seeds:
+        for contestant, path in zip(contestants, paths, strict=True):
+            if stop:
+                return
+            if store.find(MapRecord, settings, contestant.digest, seed) is None:
+                store.add(map_room(seed, path, contestant.digest, suite))
+            bar.advance()
+
+
+def _collect(suite: SuiteConfig, contestants: Sequence[Contestant], store: RecordStore, maps: bool) -> dict[str, Any]:
+    """All figures of the run as plain data."""
+    seeds = suite_seeds(suite)
+    records = {c.name: room_records(suite, c, store) for c in contestants}
+    found: dict[str, Any] = {"title": _title(suite, len(seeds)), "suite": to_plain(suite), "weights": {}}
+    for contestant in contestants:
+        field = contestant.field
+        found["weights"][contestant.name] = {
+            "file": contestant.file or None,
+            "digest": contestant.digest,
+            "kind": field.kind,
+            "parameters": sum(p.numel() for p in field.parameters()),
+            "figures": view_figures(records[contestant.name]),
+            "map": map_figures(_map_records(suite, contestant, store)) if maps else None,
+        }
+    pairs = combinations(records, 2)
+    found["differences"] = [
+        {"first": a, "second": b, **difference}
+        for a, b in pairs
+        if (difference := compare(records[a], records[b], seed=suite.seed)) is not None
+    ]
+    found["complete"] = all(len(r) == len(seeds) for r in records.values())
+    found["versions"] = {"semantic_mapper": __version__} | {name: metadata.version(name) for name in PACKAGES}
+    return found
+
+
+def _map_records(suite: SuiteConfig, contestant: Contestant, store: RecordStore) -> list[MapRecord]:
+    settings = settings_digest(suite, "map")
+    records = (store.find(MapRecord, settings, contestant.digest, seed) for seed in suite_seeds(suite))
+    return [record for record in records if record is not None]
+
+
+def _title(suite: SuiteConfig, rooms: int) -> str:
+    sources = f"{suite.views} {suite.baseline} views" if suite.protocol == "generalize" else _fit_title(suite)
+    depth = "with depth" if suite.depth else "without depth"
+    width, count = suite.tier.width, "1 room" if rooms == 1 else f"{rooms} rooms"
+    return f"ROOMS {suite.split}, {count}, {suite.protocol}: {sources}, {depth}, {width}x{width * 3 // 4}"
+
+
+def _fit_title(suite: SuiteConfig) -> str:
+    """What a field was fitted to, and for how long."""
+    scene = suite.scene
+    budget = " or ".join([f"{scene.seconds:g} s"] * (scene.seconds > 0) + [f"{scene.steps} steps"] * (scene.steps > 0))
+    more = f" and {scene.unlabelled} without labels" if scene.unlabelled else ""
+    known = "" if scene.labelled_sources else ", labels kept back"
+    return f"{scene.keyframes} keyframes{more}{known}, {budget}, {suite.views} views"

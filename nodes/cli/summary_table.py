@@ -1,0 +1,111 @@
+"""A summary as a table for people; several side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from semantic_mapper.replay.summary import dig
+
+
+def summary_table(summaries: Mapping[str, Mapping[str, Any]]) -> Table:
+    """One column a summary, by name; classes that any of them has scored come last."""
+    table = Table(title="replay", title_justify="left")
+    table.add_column("")
+    for name in summaries:
+        table.add_column(name, justify="right")
+    columns = list(summaries.values())
+    for name, path, show in _ROWS:
+        values = [dig(s, path) for s in columns]
+        if any(v is not None for v in values):
+            table.add_row(name, *(show(v) if v is not None else "-" for v in values))
+    classes = [dig(s, "metrics.per_class") or {} for s in columns]
+    names = list(dict.fromkeys(n for c in classes for n in c))
+    if names:
+        table.add_section()
+    for name in names:
+        table.add_row(f"IoU {name}", *(percent(c[name]) if c.get(name) is not None else "-" for c in classes))
+    return table
+
+
+def result_lines(out: Path) -> list[str]:
+    """Where the results are."""
+    what = {
+        "overview.png": "picture",
+        "map.ply": "point cloud: x y z red green blue label confidence; class names as comments",
+        "map.npz": "the map itself",
+        "report.html": "report on one page, for a browser",
+        "summary.json": "all figures",
+    }
+    return [f"  {out / name}  ({text})" for name, text in what.items() if (out / name).exists()]
+
+
+def notes(summary: Mapping[str, Any]) -> list[str]:
+    """What a reader of the figures has to know."""
+    frames, lines = summary["frames"], []
+    if dig(summary, "pose_check.warning"):
+        lines.append(f"warning: {summary['pose_check']['warning']}")
+    if fraction := dig(summary, "depth.rendered_fraction"):
+        lines.append(
+            f"depth: rendered by the field for {percent(fraction)} of the frames, which have no sensor depth; geometry "
+            "is less exact than with a depth sensor"
+        )
+    if frames.get("excluded_from_scores"):
+        lines.append(
+            f"{frames['excluded_from_scores']} frames are left out of the scores: weights were finetuned on them"
+        )
+    if frames.get("refused"):
+        first = summary["refusals"][0]["reason"] if summary.get("refusals") else ""
+        lines.append(f"{frames['refused']} frames refused; the first: {first}")
+    if frames.get("labels_refused"):
+        lines.append(f"{frames['labels_refused']} frames mapped, but not scored: their labels cannot be used")
+    if summary.get("damaged_stretches"):
+        lines.append(f"{len(summary['damaged_stretches'])} damaged stretches of the log passed over")
+    if summary.get("map", {}).get("unfinished_correction"):
+        lines.append(summary["map"]["unfinished_correction"])
+    if summary.get("stopped_by"):
+        lines.append(f"stopped by {summary['stopped_by']}: the results are those of the frames so far")
+    if summary.get("restarted"):
+        lines.append(f"{summary['restarted']}; frames are counted since then")
+    return lines
+
+
+def percent(value: float) -> str:
+    """0.1234 -> 12.3 %."""
+    return f"{value * 100:.1f} %"
+
+
+def _ms(value: float) -> str:
+    return f"{value:.0f} ms"
+
+
+_DEPTH_SOURCES = {
+    "sensor": "sensor",
+    "rendered": "rendered by the field (no depth sensor)",
+    "mixed": "rendered by the field for {} of the frames",
+}
+_ROWS: Sequence[tuple[str, str, Any]] = (
+    ("log", "source", str),
+    ("weights", "weights.file", str),
+    ("frames published", "frames.published", str),
+    ("frames fused", "frames.fused", str),
+    ("frames dropped", "frames.dropped", str),
+    ("frames refused", "frames.refused", str),
+    ("frames scored", "frames.scored", str),
+    ("depth", "depth", lambda d: _DEPTH_SOURCES[d["source"]].format(percent(d["rendered_fraction"]))),
+    ("depth disagreement", "pose_check.depth_disagreement", percent),
+    ("latency p50", "latency_ms.p50", _ms),
+    ("latency p95", "latency_ms.p95", _ms),
+    ("voxel size", "map.voxel_size_m", lambda v: f"{v * 100:g} cm"),
+    ("blocks", "map.blocks", str),
+    ("surface points", "map.surface_points", str),
+    ("map memory", "map.memory_mb", lambda v: f"{v} MB"),
+    ("mIoU", "metrics.miou", percent),
+    ("total accuracy", "metrics.total_accuracy", percent),
+    ("average accuracy", "metrics.average_accuracy", percent),
+    ("mIoU a frame", "metrics_per_image.miou", percent),
+    ("mIoU of the map", "metrics.map_miou", percent),
+)

@@ -1,0 +1,69 @@
+"""``semantic-mapper up``: the nodes of a launch file as processes."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from semantic_mapper.errors import LogError
+from semantic_mapper.nodes.cli.console import Output
+from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.process import StopRequest
+
+LaunchArgument = Annotated[
+    Path, typer.Argument(metavar="LAUNCH", help="Launch file, or one of the package: `semantic-mapper launch list`.")
+]
+
+
+@verb
+def up(
+    launch: LaunchArgument,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Replace a value of the file's [set] table; may be repeated."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the results; the same as --set out=DIR.")
+    ] = None,
+) -> None:
+    """Start the nodes of a launch file as processes and watch over them until they end.
+
+    Ctrl-C ends all nodes in order, the map so far is written, and the exit code is 0; a second Ctrl-C kills them. When
+    a node fails, the others are ended in order too, the error says which one it was and why, and the exit code is 1;
+    where the launch file says so it is started anew first (`restart`). `semantic-mapper top` shows how the nodes are.
+
+    Example: semantic-mapper up replay --set log=kitchen.mcap --out runs/up
+    Example: semantic-mapper up launch/replay.toml --set log=kitchen.mcap --out runs/up
+    """
+    output = Output.guarded()
+    from semantic_mapper.nodes.cli.outputs import hold_folder
+    from semantic_mapper.nodes.cli.results import print_results
+    from semantic_mapper.nodes.options import MapperOptions
+    from semantic_mapper.nodes.supervisor.launch_config import load_launch
+    from semantic_mapper.nodes.supervisor.launcher import Launcher
+    from semantic_mapper.nodes.supervisor.packaged_files import find_launch
+    from semantic_mapper.nodes.supervisor.systemd import Notifier
+
+    checked = load_launch(find_launch(launch), settings or (), out)
+    folders = [Path(o.out) for o in checked.options.values() if isinstance(o, MapperOptions)]
+    before = [_written(f) for f in folders]
+    with StopRequest() as stop, ExitStack() as stack:
+        for folder in dict.fromkeys(f.resolve() for f in folders):
+            stack.enter_context(hold_folder(folder))
+        stack.enter_context(Launcher(checked, Notifier.from_environment())).run(stop)
+    fresh = [f for f, stamp in zip(folders, before, strict=True) if _written(f) not in (0, stamp)]
+    results = print_results(output, fresh)
+    for name, summary in results.items():
+        if not summary["frames"]["fused"] and not stop:
+            why = [r["reason"] for r in summary["refusals"]] or summary["damaged_stretches"] or ["no frames came"]
+            count = summary["frames"]["published"]
+            raise LogError(f"{name}: none of {count} frames was mapped; the first: {why[0]}")
+
+
+def _written(folder: Path) -> int:
+    """When the folder's summary was written, 0 = there is none."""
+    file = folder / "summary.json"
+    return file.stat().st_mtime_ns if file.exists() else 0

@@ -1,0 +1,95 @@
+"""What all verbs of the command line share: process set-up, one clear line for an error, exit codes.
+
+0 done; 1 failed; 2 wrong usage; 130 after Ctrl-C, 143 after SIGTERM (what was done so far is written where a verb says
+so); 1 too where a result is negative (``doctor`` finds something missing).
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from typing import ParamSpec
+
+import structlog
+import typer
+from rich.text import Text
+
+from semantic_mapper.errors import SemanticMapperError
+from semantic_mapper.memory import is_out_of_memory, memory_message
+from semantic_mapper.nodes.cli.console import stderr_console
+from semantic_mapper.nodes.process import prepare_process
+from semantic_mapper.plain_text import visible
+
+EXIT_FAILED = 1
+EXIT_INTERRUPTED = 130
+MAX_OPTION = 1e6  # of lengths, times and sizes; that many seconds are eleven days
+
+_log = structlog.get_logger(__name__)
+
+ParamsT = ParamSpec("ParamsT")
+
+
+class Settings:
+    """Options that stand before the verb."""
+
+    verbose = False
+
+
+def verb(function: Callable[ParamsT, int | None]) -> Callable[ParamsT, None]:
+    """Make a command of a function that returns an exit code (None = 0) and raises ``SemanticMapperError``."""
+
+    @functools.wraps(function)
+    def command(*args: ParamsT.args, **kwargs: ParamsT.kwargs) -> None:
+        prepare_process(verbose=Settings.verbose)
+        _check_numbers(kwargs)
+        try:
+            code = function(*args, **kwargs)
+        except SemanticMapperError as error:
+            if Settings.verbose:
+                _log.exception("failed", error=str(error))
+            show_error(str(error))
+            code = EXIT_FAILED
+        except (MemoryError, ImportError, RuntimeError) as error:
+            if not is_out_of_memory(error):
+                raise
+            if Settings.verbose:
+                _log.exception("failed")
+            show_error(memory_message(error))
+            code = EXIT_FAILED
+        except KeyboardInterrupt:
+            show_error("interrupted")
+            code = EXIT_INTERRUPTED
+        except BrokenPipeError:  # the reader of our stdout is gone (`... | head`): nothing is left to be said
+            code = EXIT_FAILED
+        except OSError as error:  # disk full, permission denied: the operating system's own words and the file
+            if Settings.verbose:
+                _log.exception("failed")
+            show_error(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+            code = EXIT_FAILED
+        sys.stderr.flush()
+        raise typer.Exit(code or 0)
+
+    # Click joins the lines of a paragraph but for those after a backspace: an example is there to be copied.
+    command.__doc__ = inspect.cleandoc(function.__doc__ or "").replace("\n\nExample:", "\n\n\b\nExample:", 1)
+    return command
+
+
+def _check_numbers(options: Mapping[str, object]) -> None:
+    """Options know lower bounds only, and NaN passes these.
+
+    Raises:
+        typer.BadParameter: a number that nothing can be computed with.
+    """
+    for name, value in options.items():
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, float) and not -MAX_OPTION <= number <= MAX_OPTION:
+                hint = f"--{name.replace('_', '-')}"
+                raise typer.BadParameter(f"{number:g}: give a number of at most {MAX_OPTION:g}", param_hint=hint)
+
+
+def show_error(message: str) -> None:
+    """One red line on stderr."""
+    line = Text.assemble(("error: ", "bold red"), (visible(" ".join(message.split("\n"))), "red"))
+    stderr_console().print(line, soft_wrap=True)

@@ -1,0 +1,1 @@
+"""The finetuner node: labelled keyframes in, better weights out."""

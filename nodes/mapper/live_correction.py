@@ -1,0 +1,189 @@
+"""Corrected poses that reach a mapper while it maps: any thread hands them in, the mapper's thread carries them out."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import structlog
+from numpy.typing import NDArray
+
+from semantic_mapper.errors import CodecError, MapError
+from semantic_mapper.mapping.correction.pose_correction import CorrectedPoses
+from semantic_mapper.mapping.pipeline import MappingPipeline
+from semantic_mapper.replay.corrected_poses import match_frames
+from semantic_mapper.replay.session import MapSession
+from semantic_mapper.transport.query_codec import Arrays
+from semantic_mapper.transport.query_messages import CorrectPosesRequest
+from semantic_mapper.types import Float64
+
+HISTORY_A_STEP = 2  # frames of the history for each step where no time is to spare: more than come, so that it ends
+STOPPED_S = 30.0  # how long a mapper that was asked to stop goes on with a correction
+_REMEMBERED = 64  # requests whose answer may have been lost
+
+_log = structlog.get_logger(__name__)
+
+
+class LiveCorrection:
+    """Takes requests to correct poses, and rebuilds the map in the time between two frames.
+
+    Args:
+        pipeline: Its map is corrected.
+    """
+
+    def __init__(self, pipeline: MappingPipeline) -> None:
+        self._pipeline = pipeline
+        self._lock = threading.Lock()  # of what requests change
+        self._outcomes: dict[str, tuple[int, int]] = {}  # by id of the request, the newest last: poses used, left out
+        self._ended = False
+        self._followed = 0  # corrections that the session knows of
+        self._since_step = 0  # frames of the history
+
+    @property
+    def running(self) -> bool:
+        """Whether a correction is under way."""
+        return self._pipeline.corrector.status.running
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """For the mapper's status; empty where no history is kept."""
+        status = self._pipeline.corrector.status
+        if not self._pipeline.corrector.records:
+            return {}
+        return {"corrections": status.completed, "correction_done": status.done, "correction_left": status.left}
+
+    @property
+    def degraded(self) -> tuple[str, ...]:
+        """What does not work as it should, for the mapper's status."""
+        failure = self._pipeline.corrector.status.failure
+        return (f"the last correction of poses was given up: {failure}",) if failure else ()
+
+    def begin(self, request: CorrectPosesRequest, arrays: Arrays) -> dict[str, Any]:
+        """Begin a correction, unless this very request has done so before; see ``MappingPipeline.correct_poses``.
+
+        Returns:
+            Fields of the answer, see ``describe``.
+
+        Raises:
+            CodecError: arrays that do not go together.
+            MapError, PoseError: refused; nothing has changed.
+        """
+        with self._lock:
+            if request.id not in self._outcomes:
+                if self._ended:
+                    raise MapError("poses can be corrected no more: the stream has ended, and the map is being written")
+                self._outcomes[request.id] = self._begin(request, arrays)
+                for old in list(self._outcomes)[:-_REMEMBERED]:
+                    del self._outcomes[old]
+            return self.describe(*self._outcomes[request.id])
+
+    def describe(self, used: int = 0, left_out: int = 0) -> dict[str, Any]:
+        """Fields of a ``CorrectionAnswer``: how far corrections are."""
+        status = self._pipeline.corrector.status
+        names = ("running", "done", "total", "completed", "poses", "frozen", "lost")
+        fields = {name: getattr(status, name) for name in names}
+        epoch = self._pipeline.voxel_map.epoch
+        return {**fields, "failure": status.failure[:4096], "map_epoch": epoch, "used": used, "left_out": left_out}
+
+    def carry_on(self, session: MapSession | None, *, mapped: bool) -> None:
+        """Go on with a correction, for about the time of one frame; for the mapper's thread, between two frames.
+
+        Args:
+            session: Follows the map once the correction is done.
+            mapped: A frame was mapped since the last call: then the history goes on by as much as it must, which is
+                nothing where there was time to spare before this frame. Otherwise no frame waits.
+        """
+        if self.running:
+            self._advance(max(0, HISTORY_A_STEP - self._since_step) if mapped else 1)
+        self._since_step = 0 if mapped else self._since_step + 1
+        self._follow(session)
+
+    def finish(self, session: MapSession, stopped: Callable[[], bool], on_wait: Callable[[], None]) -> None:
+        """End a correction that is under way, before the results are written; refuse those that come later.
+
+        Once somebody has asked to stop, it goes on for ``STOPPED_S`` at most; what is left then is told in the log and
+        in ``session.unfinished_correction``.
+
+        Args:
+            session: As for ``carry_on``.
+            stopped: Whether somebody has asked to stop.
+            on_wait: Called now and then.
+        """
+        with self._lock:
+            self._ended = True
+        deadline: float | None = None
+        while self.running and (deadline is None or time.monotonic() < deadline):
+            if deadline is None and stopped():
+                deadline = time.monotonic() + STOPPED_S
+            self._advance(1)
+            on_wait()
+        self._follow(session)
+        status = self._pipeline.corrector.status
+        if status.running:
+            session.unfinished_correction = (
+                f"the last correction of poses is not in the map: stopped after {status.done} of {status.total} frames"
+            )
+        elif status.failure:
+            session.unfinished_correction = f"the last correction of poses is not in the map: {status.failure}"
+        if session.unfinished_correction:
+            _log.error("correction_unfinished", reason=session.unfinished_correction)
+
+    def _begin(self, request: CorrectPosesRequest, arrays: Arrays) -> tuple[int, int]:
+        poses = self._to_frames(request, arrays)
+        known = self._pipeline.corrector.poses()
+        stamps = {stamp_ns for _, stamp_ns in known}
+        used = sum((key in known) if isinstance(key, tuple) else (key in stamps) for key in poses)
+        self._pipeline.correct_poses(poses, until_ns=request.until_ns)
+        return used, len(arrays["stamps_ns"]) - used
+
+    def _to_frames(self, request: CorrectPosesRequest, arrays: Arrays) -> CorrectedPoses:
+        """The poses by the frames they are of."""
+        stamps, poses = np.asarray(arrays["stamps_ns"], np.int64), np.asarray(arrays["poses"], np.float64)
+        camera, names = np.asarray(arrays["camera"], np.int64), list(request.cameras)
+        if not len(stamps) == len(poses) == len(camera):
+            raise CodecError(f"correct_poses: {len(stamps)} stamps, {len(camera)} cameras and {len(poses)} poses")
+        if len(set(names)) < len(names) or ("" in names and len(names) > 1) or (camera >= len(names)).any():
+            raise CodecError(f"correct_poses: cameras {names} must differ, and each pose be of one of them")
+        if len(set(zip(camera.tolist(), stamps.tolist(), strict=True))) < len(stamps):
+            raise MapError("correct_poses: a frame is given twice")
+        if request.within_ns:
+            return self._nearest_frames(request, stamps, camera, poses)
+        if names == [""]:
+            return dict(zip(stamps.tolist(), poses, strict=True))
+        keys = [(names[c], s) for c, s in zip(camera.tolist(), stamps.tolist(), strict=True)]
+        return dict(zip(keys, poses, strict=True))
+
+    def _nearest_frames(
+        self, request: CorrectPosesRequest, stamps: NDArray[np.int64], camera: NDArray[np.int64], poses: Float64
+    ) -> dict[tuple[str, int], Float64]:
+        known = self._pipeline.corrector.poses()
+        cameras = sorted({name for name, _ in known})
+        if request.cameras == ("",) and len(cameras) > 1:
+            raise MapError(f"correct_poses: the map has frames of the cameras {', '.join(cameras)}; name one")
+        found: dict[tuple[str, int], Float64] = {}
+        for number, name in enumerate(request.cameras):
+            keys = [key for key in known if name in ("", key[0])]
+            found |= match_frames(keys, stamps[camera == number], poses[camera == number], request.within_ns)
+        if not found and len(stamps) and self._pipeline.corrector.records:
+            raise MapError(
+                f"correct_poses: none of {len(stamps)} poses was taken within {request.within_ns / 1e6:g} ms of a "
+                f"frame in the history ({len(known)} frames"
+                + (f" from {min(s for _, s in known) / 1e9:.6f} s" if known else "")
+                + f"); the first is of {int(stamps[0]) / 1e9:.6f} s"
+            )
+        return found
+
+    def _advance(self, frames: int) -> None:
+        try:
+            self._pipeline.advance_correction(frames)
+        except MapError as error:  # given up and kept as ``failure``; mapping goes on
+            _log.warning("map_stays_uncorrected", reason=str(error))
+
+    def _follow(self, session: MapSession | None) -> None:
+        completed = self._pipeline.corrector.status.completed
+        if session is not None and completed != self._followed:
+            self._followed = completed
+            session.follow_correction()

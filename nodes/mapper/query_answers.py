@@ -1,0 +1,278 @@
+"""From a question's bytes to its answer's: which query is asked, and how much of it at once."""
+
+from __future__ import annotations
+
+import math
+import uuid
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import structlog
+
+from semantic_mapper.errors import MapError, SemanticMapperError
+from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
+from semantic_mapper.nodes.mapper.live_weights import LiveWeights
+from semantic_mapper.queries.boxes import points_in_box
+from semantic_mapper.queries.instances import Instance, InstanceTracker
+from semantic_mapper.queries.lookup import MAX_RADIUS_VOXELS, RADIUS_VOXELS, at
+from semantic_mapper.queries.nearest import nearest
+from semantic_mapper.queries.occupancy import distance_field, occupancy
+from semantic_mapper.queries.rays import cast_rays
+from semantic_mapper.queries.relay import MirrorRelay
+from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.transport import query_messages as messages
+from semantic_mapper.transport.opening import Parts
+from semantic_mapper.transport.plain import label_set_header
+from semantic_mapper.transport.query_codec import Arrays, decode_request, encode_answer, encode_error
+
+# One thread answers all that takes long: what would keep the others waiting for more than about a second is refused.
+MAX_VISITED_VOXELS = 1e8  # of `at`
+MAX_RAY_METRES = 2e5  # of `cast_rays`, all rays together
+MAX_FIELD_VOXELS = 1 << 22  # of `distance_field`
+MAX_CHANGED_BLOCKS = 1 << 14  # of `changes`, unless one delivery has more
+# What takes more than a few milliseconds takes long; the rest never waits for it.
+LONG_VISITED_VOXELS = 1e5  # of `at`
+LONG_RAY_METRES = 500.0  # of `cast_rays`
+LONG_POINTS = 1 << 14  # of `occupancy`
+LONG_BOX_VOXELS = 1 << 13  # of `distance_field` and `points_in_box`
+_MAX_TRACKERS = 4  # one for each direction that was called up
+
+_log = structlog.get_logger(__name__)
+
+Answer = tuple[messages.AnswerHeader, Arrays]
+
+
+class Question(NamedTuple):
+    """One question, ready to be answered.
+
+    Args:
+        answer: Gives the parts of its answer, which is an error where the question is no good; raises nothing.
+        header: What it says of itself and of who asks.
+        takes_long: Whether that may take more than a few milliseconds.
+        about_map: Whether the answer comes from the mirror, which has to be up to date for it.
+    """
+
+    answer: Callable[[], list[bytes]]
+    header: messages.RequestHeader
+    takes_long: bool
+    about_map: bool
+
+
+class _Tracked(NamedTuple):
+    """A tracker, and what it found last: in which version of the map."""
+
+    tracker: InstanceTracker
+    version: int
+    things: tuple[Instance, ...]
+
+
+class Answers:
+    """Answers questions about what a mirror holds. Those that take long are for one thread, all others for any.
+
+    Args:
+        relay: Of the mirror.
+        correction: Takes corrected poses; without it they are refused.
+        weights: Says which weights are in use, and exchanges them; without it such questions are refused.
+    """
+
+    def __init__(
+        self, relay: MirrorRelay, correction: LiveCorrection | None = None, weights: LiveWeights | None = None
+    ) -> None:
+        self.map_id = uuid.uuid4().hex
+        self._relay = relay
+        self._correction = correction
+        self._weights = weights
+        self._tracked: dict[messages.Point, _Tracked] = {}  # by direction; the last one asked stands last
+
+    def read(self, parts: Parts) -> Question:
+        """Parts of a question -> what answers it."""
+        try:
+            kind, header, arrays = decode_request(parts)
+            takes_long = _takes_long(self._relay.snapshot(), header, arrays)
+        except (SemanticMapperError, MemoryError) as error:
+            refusal = encode_error(_told(error))
+            return Question(lambda: refusal, messages.RequestHeader(), takes_long=False, about_map=False)
+        beside = messages.CorrectPosesRequest | messages.CorrectionRequest | messages.WeightsRequest
+        about_map = not isinstance(header, beside)
+        return Question(lambda: self._encoded(kind, header, arrays), header, takes_long, about_map)
+
+    def _encoded(self, kind: str, header: messages.RequestHeader, arrays: Arrays) -> list[bytes]:
+        try:
+            return encode_answer(kind, *self._answer(header, arrays))
+        except (SemanticMapperError, MemoryError) as error:
+            return encode_error(_told(error))
+        except Exception as error:  # noqa: BLE001 -- a bug of ours must not end a thread that all wait for
+            _log.exception("question_failed", question=kind)
+            return encode_error(MapError(f"the mapper could not compute this: {error}"))
+
+    def _answer(self, header: messages.RequestHeader, arrays: Arrays) -> Answer:
+        snapshot = self._relay.snapshot()
+        match header:
+            case messages.InfoRequest():
+                return self._describe(snapshot)
+            case messages.AtRequest():
+                _bound_points(snapshot, header, len(arrays["points"]))
+                return self._plain(snapshot, "at", at(snapshot, arrays["points"], header.radius_m))
+            case messages.NearestRequest():
+                return self._nearest(snapshot, header)
+            case messages.RaysRequest():
+                _bound_rays(header, max(len(a) for a in arrays.values()))
+                hits = cast_rays(snapshot, arrays["origins"], arrays["directions"], header.max_m)
+                return self._plain(snapshot, "cast_rays", hits)
+            case messages.BoxRequest():
+                return self._plain(snapshot, "points_in_box", points_in_box(snapshot, header.lower, header.upper))
+            case messages.InstancesRequest():
+                return self._instances(snapshot, header.up)
+            case messages.OccupancyRequest():
+                return messages.AnswerHeader(**self._about(snapshot)), {"state": occupancy(snapshot, arrays["points"])}
+            case messages.DistanceRequest():
+                return self._distances(snapshot, header)
+            case messages.ChangesRequest():
+                return self._changes(snapshot, header)
+            case messages.CorrectPosesRequest() | messages.CorrectionRequest():
+                return self._correct(snapshot, header, arrays)
+            case messages.WeightsRequest():
+                return self._exchange_weights(snapshot, header)
+            case _:
+                raise MapError(f"{type(header).__name__}: cannot be answered")
+
+    def _correct(
+        self,
+        snapshot: MapSnapshot,
+        header: messages.CorrectPosesRequest | messages.CorrectionRequest,
+        arrays: Arrays,
+    ) -> Answer:
+        correction = self._correction
+        if correction is None:
+            raise MapError("poses cannot be corrected here: this service only answers questions")
+        is_new = isinstance(header, messages.CorrectPosesRequest)
+        state = correction.begin(header, arrays) if is_new else correction.describe()
+        return messages.CorrectionAnswer(**self._about(snapshot), **state), {}
+
+    def _exchange_weights(self, snapshot: MapSnapshot, header: messages.WeightsRequest) -> Answer:
+        weights = self._weights
+        if weights is None:
+            raise MapError("this mapper takes no weights while it runs (option `learner`)")
+        state = weights.describe() if header.to is None else weights.ask_for(header.to)
+        return messages.WeightsAnswer(**self._about(snapshot), **state), {}
+
+    def _about(self, snapshot: MapSnapshot) -> dict[str, Any]:
+        return {"map_id": self.map_id, "version": snapshot.version, "epoch": snapshot.epoch}
+
+    def _plain(self, snapshot: MapSnapshot, kind: str, found: object) -> Answer:
+        """The fields of a query's result are the arrays of its answer."""
+        arrays: Arrays = {name: getattr(found, name) for name in messages.QUESTIONS[kind].gives}
+        return messages.AnswerHeader(**self._about(snapshot)), arrays
+
+    def _describe(self, snapshot: MapSnapshot) -> Answer:
+        header = messages.InfoAnswer(
+            **self._about(snapshot),
+            blocks=snapshot.block_count,
+            voxel_size_m=snapshot.voxel_size_m,
+            truncation_voxels=snapshot.truncation_voxels,
+            label_set=label_set_header(snapshot.label_set),
+        )
+        return header, {}
+
+    def _nearest(self, snapshot: MapSnapshot, header: messages.NearestRequest) -> Answer:
+        hit = nearest(snapshot, header.class_name, header.point, header.min_confidence)
+        answer = messages.NearestAnswer(
+            **self._about(snapshot),
+            found=hit is not None,
+            xyz=(0.0, 0.0, 0.0) if hit is None else tuple(hit.xyz.tolist()),
+            distance_m=0.0 if hit is None else hit.distance_m,
+            confidence=0.0 if hit is None else hit.confidence,
+        )
+        return answer, {}
+
+    def _instances(self, snapshot: MapSnapshot, up: messages.Point) -> Answer:
+        tracked = self._tracked.pop(up, None)  # out of here while it updates: one that fails half way is not used again
+        if tracked is None or tracked.version != snapshot.version:
+            tracker = tracked.tracker if tracked else InstanceTracker(up=up)
+            tracked = _Tracked(tracker, snapshot.version, tracker.update(snapshot))
+        self._tracked[up] = tracked
+        for old in list(self._tracked)[:-_MAX_TRACKERS]:
+            del self._tracked[old]
+        return messages.AnswerHeader(**self._about(snapshot)), _thing_arrays(tracked.things)
+
+    def _distances(self, snapshot: MapSnapshot, header: messages.DistanceRequest) -> Answer:
+        sides = _box_sides(snapshot, header)
+        if min(sides) > 0 and math.prod(sides) > MAX_FIELD_VOXELS:
+            raise MapError(
+                f"distance_field: a box of {' x '.join(f'{s:.0f}' for s in sides)} voxels; over a socket at most "
+                f"{MAX_FIELD_VOXELS} are computed at once; keep a mirror for more"
+            )
+        found = distance_field(snapshot, header.lower, header.upper, unknown_is_occupied=header.unknown_is_occupied)
+        origin: messages.Point = tuple(found.origin_m.tolist())
+        about = self._about(snapshot)
+        answer = messages.DistanceAnswer(**about, origin_m=origin, voxel_size_m=found.voxel_size_m)
+        return answer, {"distance_m": found.distance_m, "state": found.state}
+
+    def _changes(self, snapshot: MapSnapshot, header: messages.ChangesRequest) -> Answer:
+        since = header.since if header.map_id in ("", self.map_id) else 0
+        found = self._relay.changes(since, min(header.limit or MAX_CHANGED_BLOCKS, MAX_CHANGED_BLOCKS))
+        answer = messages.ChangesAnswer(
+            map_id=self.map_id, version=found.version, epoch=found.epoch, since=found.since, newest=snapshot.version
+        )
+        return answer, {name: getattr(found, name) for name in messages.QUESTIONS["changes"].gives}
+
+
+def _told(error: SemanticMapperError | MemoryError) -> SemanticMapperError:
+    if isinstance(error, MemoryError):
+        return MapError("the mapper has no memory left to answer this; ask for less at once")
+    return error
+
+
+def _thing_arrays(things: Sequence[Instance]) -> Arrays:
+    numbers = [(t.id, t.class_id, len(t.voxels)) for t in things]
+    places = [
+        np.concatenate(([t.confidence], t.centroid, t.box.center, t.box.size, t.box.R_world_box.ravel()))
+        for t in things
+    ]
+    return {
+        "numbers": np.array(numbers, np.int64).reshape(-1, 3),
+        "places": np.array(places, np.float64).reshape(-1, 19),
+        "voxels": np.concatenate([np.empty((0, 3), np.int32), *(t.voxels for t in things)]),
+    }
+
+
+def _takes_long(snapshot: MapSnapshot, header: messages.RequestHeader, arrays: Arrays) -> bool:
+    match header:
+        case messages.AtRequest():
+            return _visited_voxels(snapshot, header, len(arrays["points"])) > LONG_VISITED_VOXELS
+        case messages.RaysRequest():
+            return max(len(a) for a in arrays.values()) * header.max_m > LONG_RAY_METRES
+        case messages.OccupancyRequest():
+            return len(arrays["points"]) > LONG_POINTS
+        case messages.BoxRequest() | messages.DistanceRequest():
+            return math.prod(_box_sides(snapshot, header)) > LONG_BOX_VOXELS
+        case messages.InstancesRequest() | messages.ChangesRequest() | messages.CorrectPosesRequest():
+            return True
+        case _:
+            return False
+
+
+def _box_sides(snapshot: MapSnapshot, header: messages.BoxRequest | messages.DistanceRequest) -> list[float]:
+    return [(b - a) / snapshot.voxel_size_m for a, b in zip(header.lower, header.upper, strict=True)]
+
+
+def _visited_voxels(snapshot: MapSnapshot, header: messages.AtRequest, count: int) -> float:
+    radius = RADIUS_VOXELS if header.radius_m is None else header.radius_m / snapshot.voxel_size_m
+    return count * (2 * min(max(radius, 0), MAX_RADIUS_VOXELS) + 2) ** 3
+
+
+def _bound_points(snapshot: MapSnapshot, header: messages.AtRequest, count: int) -> None:
+    if _visited_voxels(snapshot, header, count) > MAX_VISITED_VOXELS:
+        raise MapError(
+            f"at: {count} points with a radius of {header.radius_m} m are too much for one question; ask for fewer "
+            "points at once, or keep a mirror"
+        )
+
+
+def _bound_rays(header: messages.RaysRequest, count: int) -> None:
+    if count * header.max_m > MAX_RAY_METRES:
+        raise MapError(
+            f"cast_rays: {count} rays of {header.max_m:g} m are too much for one question; at most "
+            f"{MAX_RAY_METRES:g} m together, or keep a mirror"
+        )

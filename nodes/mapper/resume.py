@@ -1,0 +1,102 @@
+"""How a mapper that replaces a killed one goes on from its map, and how maps of earlier launches are kept."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import structlog
+
+from semantic_mapper.errors import MapError
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.cli.outputs import free_name
+from semantic_mapper.nodes.node import NodeContext
+
+_EARLIER, _UNSOUND = "earlier", "unsound"  # notes
+_NO_FILE = "none"
+_RESULTS = ("map.npz", "map.ply", "overview.png", "report.html", "summary.json")  # the map first: it is all that counts
+
+_log = structlog.get_logger(__name__)
+
+
+def take_up(context: NodeContext, path: Path, voxel_map: VoxelMap) -> str:
+    """In a restarted mapper, make ``voxel_map`` the one that its forerunner has saved in the course of this launch.
+
+    Frames come with poses in the same world as before, so a saved map goes on as if the frames after it had never come.
+    A saved map that cannot be gone on with is put aside, so that nothing is written over it.
+
+    Args:
+        context: Of the mapper.
+        path: Of the map that is saved now and then.
+        voxel_map: Empty; of the settings and classes of this run.
+
+    Returns:
+        A sentence that says what became of the map; empty where the mapper was not restarted.
+
+    Raises:
+        OSError: notes cannot be written, or a map cannot be put aside.
+    """
+    if not context.restarts:
+        context.leave_note(_EARLIER, _identity(path))
+        return ""
+    earlier = context.note(_EARLIER)
+    if not earlier or _identity(path) == earlier:
+        why = "none had been saved (see save_every_s)"
+    elif not (why := context.note(_UNSOUND)):
+        try:
+            voxel_map.take_over(VoxelMap.load(path))
+        except MapError as error:
+            why = str(error)
+        else:
+            _log.info("map_taken_up", map=str(path), frames=voxel_map.frames, blocks=voxel_map.block_count)
+            return f"the mapper was restarted and went on from the map saved after {voxel_map.frames} frames"
+    kept = _put_aside(context, path) if earlier and _identity(path) not in (earlier, _NO_FILE) else ""
+    _log.warning("map_begun_anew", reason=why)
+    return f"the mapper was restarted and began an empty map: {why}{kept}"
+
+
+def forbid(context: NodeContext, why: str) -> bool:
+    """From now on a saved map is not to be gone on with; False where that cannot be noted."""
+    return context.try_to_leave_note(_UNSOUND, why, "a mapper that replaces it goes on from a map that it should not")
+
+
+def keep_earlier(context: NodeContext, path: Path) -> None:
+    """Move the results of an earlier launch into a folder of their own, before others take their place.
+
+    Live frames do not come again, so that their map is not to be lost to a launch that is started anew.
+
+    Args:
+        context: Of a mapper that has written nothing yet.
+        path: Of its map; one that was saved in the course of this launch stays.
+
+    Raises:
+        OSError: something cannot be moved.
+    """
+    there = _identity(path)
+    if there == _NO_FILE or context.note(_EARLIER) not in ("", there):
+        return
+    saved = datetime.fromtimestamp(path.stat().st_mtime, UTC)
+    kept = free_name(path.parent / f"earlier-{saved:%Y%m%dT%H%M%SZ}")
+    kept.mkdir()
+    for file in (*map(path.with_name, _RESULTS), *path.parent.glob(f"{path.stem}-before-restart-*{path.suffix}")):
+        if file.exists():
+            file.rename(kept / file.name)
+    context.leave_note(_EARLIER, _NO_FILE)
+    _log.warning("earlier_results_kept", folder=str(kept))
+
+
+def _put_aside(context: NodeContext, path: Path) -> str:
+    aside = free_name(path.with_name(f"{path.stem}-before-restart-{context.restarts}{path.suffix}"))
+    path.replace(aside)
+    context.leave_note(_EARLIER, _NO_FILE)
+    context.leave_note(_UNSOUND, "")
+    return f"; the one before is kept as {aside.name}"
+
+
+def _identity(path: Path) -> str:
+    """Tells one file of this name from the next."""
+    try:
+        stat = path.stat()
+    except FileNotFoundError:
+        return _NO_FILE
+    return f"{stat.st_ino} {stat.st_mtime_ns} {stat.st_size}"

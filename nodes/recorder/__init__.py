@@ -1,0 +1,1 @@
+"""The recorder node: writes what other nodes publish to a log."""

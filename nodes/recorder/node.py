@@ -1,0 +1,339 @@
+"""The recorder node: writes what other nodes publish to a log, and loses nothing that the disk has room for."""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+import structlog
+
+from semantic_mapper.errors import CodecError, TransportError
+from semantic_mapper.nodes.frame_gaps import Gaps
+from semantic_mapper.nodes.node import NodeContext, run_node
+from semantic_mapper.nodes.options import RecorderOptions
+from semantic_mapper.nodes.streams import Streams
+
+if TYPE_CHECKING:
+    from semantic_mapper.replay.log.reader import LogAttachment
+    from semantic_mapper.replay.log.recording import Recording
+    from semantic_mapper.transport.messages import NodeState, StreamInfo
+    from semantic_mapper.transport.publisher import Publisher
+    from semantic_mapper.transport.sockets import LosslessSubscriber
+    from semantic_mapper.types import CameraIntrinsics
+
+PACKAGES = (
+    "semantic_mapper.nodes.recorder.backlog",
+    "semantic_mapper.replay.log.recording",
+    "semantic_mapper.transport.sockets",
+)
+POLL_S = 0.05
+WAIT_SLICE_S = 0.2
+QUIET_S = 0.5  # after the end of the stream, answers from other nodes may still be on their way
+MAX_WAITING = 256  # messages that may wait to be written, while the disk or the processor is busy
+MAX_EARLY = 1000  # messages kept while no stream has begun
+STATUS_PERIOD_S = 1.0
+DRAIN_S = 5.0  # after a stop, for what has come before it; less than the `stop_s` of launches
+COUNT_S = 1.0  # then, for counting what is left
+DRAINED_S = 0.005  # nothing for so long: all is written; what a camera that runs on sends comes later
+NOTE = "recording"  # the name of the recording, for the process that takes over
+
+_log = structlog.get_logger(__name__)
+
+
+def run_recorder(context: NodeContext, options: RecorderOptions) -> None:
+    """Record until the stream ends or somebody asks to stop, and tell how it goes.
+
+    Raises:
+        LogError: the log cannot be begun, or somebody has removed it meanwhile. A disk that is full later ends the
+            recording, not the node.
+        TransportError: a source cannot be subscribed to, or the endpoint is taken.
+    """
+    from semantic_mapper.transport.publisher import Publisher
+
+    with ExitStack() as stack:
+        # Opened once it is at work: a process in waiting must leave the endpoint to the one before it.
+        teller = StatusTeller(context.name, lambda: stack.enter_context(Publisher(context.endpoint(context.name))))
+        recorder = record(context, options, teller.follow)
+        teller.tell(recorder, "ended")
+
+
+def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Recorder], bool]) -> Recorder:
+    """Record until the stream ends or somebody asks to stop.
+
+    Args:
+        context: Who asks to stop, and where the sources are.
+        options: See there.
+        follow: Called at least some twenty times a second; True = it is enough.
+
+    Raises:
+        LogError: the log cannot be begun, or somebody has removed it meanwhile.
+        TransportError: a source cannot be subscribed to.
+    """
+    from semantic_mapper.errors import LogError
+    from semantic_mapper.nodes.recorder.backlog import listen_while_waiting
+    from semantic_mapper.transport.sockets import LosslessSubscriber
+
+    topics = tuple(dict.fromkeys(("info", *options.topics, "end")))
+    cameras = [context.endpoint(name) for name in options.cameras]
+    others = [context.endpoint(name) for name in options.sources[options.streams :]]
+    # At once, so that nothing begins where there is a log already.
+    recorder = None if context.waits else Recorder(context, options)
+    with ExitStack() as stack:
+        answers = None
+        if others:
+            answers = stack.enter_context(LosslessSubscriber(others, topics, hwm=MAX_WAITING))
+            _wait_until_heard(context, options, answers)
+        # Cameras begin once they have all their subscribers, so this one comes last: by now nothing can be missed.
+        frames = stack.enter_context(LosslessSubscriber(cameras, topics, hwm=MAX_WAITING))
+        backlog = listen_while_waiting(context, options.streams, frames, answers)
+        context = context.await_turn()
+        recorder = recorder or Recorder(context, options)
+        stack.callback(recorder.close)
+        context.heart.ready()
+        for parts in backlog.missing_in_logs(Path(options.out)):
+            recorder.take(parts)
+        sources = [frames, *([answers] if answers is not None else [])]
+        ended_at = 0.0
+        while not (ended_at and time.monotonic() - ended_at > QUIET_S) and not context.stop and not backlog.ended:
+            context.heart.turn()
+            recorder.rejected = sum(source.rejected for source in sources)
+            if follow(recorder):
+                break
+            parts = frames.receive_parts(POLL_S)
+            if parts is not None and recorder.take(parts):
+                ended_at = ended_at or time.monotonic()
+            while answers is not None and (parts := answers.receive_parts(0)) is not None:
+                recorder.take(parts)
+        if context.stop and not backlog.ended:
+            _drain(context, recorder, sources)
+        context.heart.ending()
+    if recorder.recording is not None and recorder.recording.gone:
+        raise LogError(f"{recorder.recording.path}: was removed while it was written, and what it held is lost")
+    return recorder
+
+
+def _drain(context: NodeContext, recorder: Recorder, sources: Sequence[LosslessSubscriber]) -> None:
+    """Write what had come before somebody asked to stop; what there is no time for is counted."""
+    from semantic_mapper.transport.opening import topic_name
+
+    deadline = time.monotonic() + DRAIN_S
+    for source in sources:
+        while (parts := source.receive_parts(DRAINED_S)) is not None:
+            context.heart.turn()
+            now = time.monotonic()
+            if now < deadline:
+                recorder.take(parts)
+            elif now < deadline + COUNT_S:
+                recorder.left += topic_name(parts) not in ("info", "end")
+            else:  # a camera that publishes on and on
+                break
+    recorder.rejected = sum(source.rejected for source in sources)
+
+
+def _wait_until_heard(context: NodeContext, options: RecorderOptions, answers: LosslessSubscriber) -> None:
+    """Wait, in slices, until the other sources know of us; return early on a stop request.
+
+    Raises:
+        TransportError: they do not answer within ``options.source_timeout_s``.
+    """
+    deadline = time.monotonic() + options.source_timeout_s
+    while not context.stop:
+        try:
+            return answers.wait_until_heard(WAIT_SLICE_S)
+        except TransportError:
+            if time.monotonic() > deadline:
+                raise
+    return None
+
+
+class Recorder:
+    """The recording, opened once it is known what the stream is.
+
+    Args:
+        context: Of the node; where it was killed before, the recording goes on in the next part.
+        options: See there.
+
+    Attributes:
+        recording: None while no stream has begun.
+        rejected: Messages that could not be read.
+        unpacked: Frames that were kept as they came, because they could not be packed as ``options.rgb`` says.
+        left: Messages that had come when there was no more time to write them.
+
+    Raises:
+        LogError: the log is there already, and must not be replaced.
+    """
+
+    def __init__(self, context: NodeContext, options: RecorderOptions) -> None:
+        from semantic_mapper.replay.log.recording import RecordingRules, make_way
+        from semantic_mapper.transport.codec import CodecOptions
+
+        self._context = context
+        self._options = options
+        self._path = Path(options.out)
+        self._goes_on = bool(context.note(NOTE))  # else the one before was killed before it had begun
+        self._rules = RecordingRules(
+            split_bytes=round(options.split_mb * 1e6),
+            split_s=options.split_s,
+            disk_full=options.disk_full,
+            reserve_bytes=round(options.reserve_mb * 1e6),
+        )
+        if not self._goes_on:  # before the stream begins, so that nothing else is overwritten
+            make_way(self._path, overwrite=options.overwrite, dry=True)
+        self._packing = None
+        if options.rgb != "as-sent":
+            self._packing = CodecOptions(rgb=options.rgb, jpeg_quality=options.jpeg_quality)
+        self.recording: Recording | None = None
+        self.rejected = self.unpacked = self.left = 0
+        self.gaps = Gaps()
+        self._streams = Streams(options.streams)
+        self._cameras: dict[str, CameraIntrinsics] = {}  # of all streams so far
+        self._told: set[bytes] = set()  # what the recording holds of streams
+        self._early: deque[list[bytes]] = deque(maxlen=MAX_EARLY)
+
+    @property
+    def log_bytes(self) -> int:
+        """Of all parts that are on the disk by now."""
+        from semantic_mapper.replay.log.sequence import parts_on_disk
+
+        size = 0
+        for file in parts_on_disk(self._path).values():
+            with suppress(FileNotFoundError):  # somebody has just deleted it
+                size += file.stat().st_size
+        return size
+
+    def take(self, parts: list[bytes]) -> bool:
+        """Keep one message; True where all streams have ended."""
+        from semantic_mapper.transport.codec import decode_end, decode_info
+        from semantic_mapper.transport.topics import parse_topic
+
+        topic, _ = parse_topic(parts[0])
+        if topic.name == "info":
+            info = decode_info(parts)
+            self._cameras |= info.cameras
+            if self.recording is None:
+                self._begin(info)
+            elif bytes(parts[1]) not in self._told:  # of another camera, or of one that was started anew
+                self.recording.announce(parts, self._calibration())
+            self._told.add(bytes(parts[1]))
+        elif topic.name != "end":
+            if self.recording is None:
+                self._early.append(parts)
+            else:
+                self.recording.write(self._packed(parts, topic.name))
+        return topic.name == "end" and self._streams.end(decode_end(parts))
+
+    def close(self) -> None:
+        """Finish the log."""
+        if self.recording is None:
+            _log.warning("nothing_recorded", reason="no stream has begun")
+            return
+        self.recording.close()
+        r = self.recording
+        _log.info("recorded", log=str(r.path), frames=r.frames, messages=r.messages, parts=r.parts, deleted=r.deleted)
+        if r.lost:
+            _log.error("recording_incomplete", lost=r.lost, reason=r.trouble or "the disk was full for a while")
+        if self.left:
+            _log.error("recording_incomplete", lost=self.left, reason=f"not written {DRAIN_S:g} s after the stop")
+
+    def _begin(self, info: StreamInfo) -> None:
+        from semantic_mapper.replay.log.recording import Recording
+
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        before = self._context.note(NOTE) if self._goes_on else ""
+        name = before or uuid.uuid4().hex
+        self._context.try_to_leave_note(NOTE, name, "who replaces it begins another recording beside")
+        self.recording = Recording(
+            self._path,
+            info,
+            self._rules,
+            recording=name,
+            attachments=self._attachments(),
+            overwrite=self._options.overwrite,
+            goes_on=self._goes_on,
+        )
+        _log.info("recording", log=str(self.recording.path))
+        for early in self._early:
+            self.recording.write(early)
+        self._early.clear()
+
+    def _calibration(self) -> LogAttachment:
+        import msgspec
+
+        from semantic_mapper.replay.log.reader import LogAttachment
+
+        cameras = msgspec.json.format(msgspec.json.encode({"cameras": self._cameras}), indent=1)
+        return LogAttachment("calibration.json", "application/json", cameras)
+
+    def _attachments(self) -> list[LogAttachment]:
+        from semantic_mapper.nodes.supervisor.launch_note import NOTE as LAUNCH
+        from semantic_mapper.replay.log.reader import LogAttachment
+
+        kept = [self._calibration()]
+        folder = self._context.folder
+        if folder is not None and (folder / LAUNCH).exists():
+            kept.append(LogAttachment(LAUNCH, "application/json", (folder / LAUNCH).read_bytes()))
+        return kept
+
+    def _packed(self, parts: list[bytes], topic: str) -> list[bytes]:
+        from semantic_mapper.transport.codec import read_envelope, repack_rgb
+
+        if topic != "frame":
+            return parts
+        envelope = read_envelope(parts)
+        self.gaps.note(envelope.source, envelope.seq)
+        if self._packing is None:
+            return parts
+        try:
+            return repack_rgb(parts, self._packing)
+        except CodecError as error:  # whoever reads the log will judge it
+            self.unpacked += 1
+            _log.warning("frame_kept_as_sent", seq=envelope.seq, error=str(error))
+            return parts
+
+
+class StatusTeller:
+    """Publishes how a recorder is, about once a second.
+
+    Args:
+        node: Name of the recorder.
+        open_publisher: Called before the first word.
+    """
+
+    def __init__(self, node: str, open_publisher: Callable[[], Publisher]) -> None:
+        self._node = node
+        self._open_publisher = open_publisher
+        self._publisher: Publisher | None = None
+        self._told_at = 0.0
+
+    def follow(self, recorder: Recorder) -> bool:
+        """Tell, if it is time to; it is never enough."""
+        if time.monotonic() - self._told_at >= STATUS_PERIOD_S:
+            self.tell(recorder, "running")
+        return False
+
+    def tell(self, recorder: Recorder, state: NodeState) -> None:
+        """Tell now."""
+        from semantic_mapper.transport.codec import encode_status
+        from semantic_mapper.transport.messages import Status
+
+        self._told_at = time.monotonic()
+        counters = {"missed": recorder.gaps.missed, "rejected": recorder.rejected, "unpacked": recorder.unpacked}
+        degraded: tuple[str, ...] = ()
+        if (r := recorder.recording) is not None:
+            counters |= {"recorded": r.frames, "messages": r.messages, "lost": r.lost + recorder.left}
+            counters |= {"parts": r.parts, "deleted": r.deleted, "log_kb": recorder.log_bytes // 1024}
+            degraded = tuple(text for text in (r.trouble,) if text)
+        status = Status(self._node, state, time.monotonic_ns(), counters, degraded=degraded)
+        if self._publisher is None:
+            self._publisher = self._open_publisher()
+        self._publisher.publish(encode_status(status))
+
+
+def main() -> NoReturn:
+    """Run the node of this process to its end, then exit."""
+    run_node(RecorderOptions, run_recorder, PACKAGES)

@@ -1,0 +1,165 @@
+"""Rerun's own web viewer, served to browsers of this machine by a process of its own.
+
+The SDK could serve it from within this process, but on all interfaces; the program that comes with it listens where it
+is told to. It never calls home: analytics are switched off in a folder of settings that it alone uses, and the browser
+gets its pages through ``QuietPage``.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import socket
+import subprocess
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+from urllib.parse import quote
+
+import structlog
+
+from semantic_mapper.errors import DependencyError, TransportError
+from semantic_mapper.nodes.process_folder import OwnFolder
+from semantic_mapper.nodes.supervisor.heartbeat import end_with_launcher
+from semantic_mapper.nodes.viewer.privacy_proxy import QuietPage
+
+HOST = "127.0.0.1"  # what is seen has neither keys nor passwords: other machines come in by `ssh -L`
+WEB_PORT, DATA_PORT = 9090, 9876
+START_S = 20.0
+STOP_S = 3.0
+_POLL_S = 0.05
+
+_log = structlog.get_logger(__name__)
+
+
+class WebViewer:
+    """A web server with the viewer, and a data server that keeps what browsers are shown; a context manager.
+
+    Args:
+        web_port, data_port: Of these; 0 = any that is free.
+        memory_mb: What the data server may keep for browsers that come later; then the oldest goes.
+    """
+
+    def __init__(self, web_port: int = WEB_PORT, data_port: int = DATA_PORT, memory_mb: int = 512) -> None:
+        self._ports = web_port, data_port
+        self._memory_mb = memory_mb
+        self._process: subprocess.Popen[bytes] | None = None
+        self._page: QuietPage | None = None
+        self._folder = OwnFolder("view-")  # where we are killed, `up` removes it
+
+    def __enter__(self) -> Self:
+        """Start the servers and wait until they answer.
+
+        Raises:
+            DependencyError: the program is not there.
+            TransportError: a port is taken, or the servers do not come up.
+        """
+        try:
+            self._start()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def data_url(self) -> str:
+        """Where to send what is to be shown."""
+        return f"rerun+http://{HOST}:{self._ports[1]}/proxy"
+
+    @property
+    def page_url(self) -> str:
+        """What to open in a browser."""
+        shown = f"url={quote(self.data_url, safe='')}&hide_welcome_screen=1&persist=0&theme=dark"
+        return f"http://{HOST}:{self._ports[0]}/?{shown}"
+
+    @property
+    def pid(self) -> int:
+        """Of the servers' process."""
+        assert self._process is not None
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether it still serves."""
+        return self._process is not None and self._process.poll() is None
+
+    def close(self) -> None:
+        """End the servers. Harmless when repeated."""
+        if self._process is not None:
+            self._process.terminate()
+            try:
+                self._process.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        if self._page is not None:
+            self._page.close()
+            self._page = None
+        self._folder.close()
+
+    def _start(self) -> None:
+        program = _find_program()
+        settings = {f"XDG_{kind}_HOME": f"{self._folder.path}/{kind.lower()}" for kind in ("CONFIG", "DATA", "CACHE")}
+        environment = {**os.environ, **settings}
+        told = subprocess.run([program, "analytics", "disable"], env=environment, capture_output=True, check=False)
+        if told.returncode != 0:  # then it would call home
+            raise DependencyError(f"{program}: analytics cannot be switched off: {told.stderr.decode().strip()}")
+        self._ports = _choose_port(self._ports[0], "--port"), _choose_port(self._ports[1], "--data-port")
+        web, data = _choose_port(0, ""), self._ports[1]
+        command = [program, "--serve-web", "--bind", HOST, "--port", str(data), "--web-viewer-port", str(web)]
+        command += ["--server-memory-limit", f"{self._memory_mb}MB"]
+        log = self._folder.path / "log"
+        with log.open("wb") as file:
+            self._process = subprocess.Popen(
+                command,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                process_group=0,  # Ctrl-C is for us; we end it
+                preexec_fn=end_with_launcher,  # and where we are killed, the kernel does
+            )
+        deadline = time.monotonic() + START_S
+        while not (_answers(web) and _answers(data)):
+            if not self.alive or time.monotonic() > deadline:
+                words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-3:]
+                raise TransportError(f"the web viewer has not started; its last words: {' | '.join(words) or 'none'}")
+            time.sleep(_POLL_S)
+        self._page = QuietPage((HOST, self._ports[0]), (HOST, web), (f"http://{HOST}:{data}",))
+
+
+def _find_program() -> str:
+    spec = importlib.util.find_spec("rerun_cli")
+    program = None if spec is None or spec.origin is None else Path(spec.origin).parent / "rerun"
+    if program is None or not program.is_file():
+        raise DependencyError("the viewer comes with the package rerun-sdk, which is not installed; run `make setup`")
+    return str(program)
+
+
+def _choose_port(port: int, option: str) -> int:
+    """The port itself where it is free, a free one for 0.
+
+    Raises:
+        TransportError: it is taken.
+    """
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except OSError as error:
+            raise TransportError(
+                f"port {port} cannot be had ({error.strerror}); give another one with {option}, or 0 for any"
+            ) from error
+        return probe.getsockname()[1]
+
+
+def _answers(port: int) -> bool:
+    with socket.socket() as client:
+        client.settimeout(1.0)
+        return client.connect_ex((HOST, port)) == 0

@@ -1,0 +1,245 @@
+"""What the viewer is shown: a saved map, a log that is mapped, or the nodes and the map of a running system."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import structlog
+from numpy.typing import NDArray
+
+from semantic_mapper.client import MapClient
+from semantic_mapper.config import MapperConfig
+from semantic_mapper.errors import SemanticMapperError, TransportError
+from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.streams import Streams
+from semantic_mapper.queries.ages import BlockAges
+from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.surface import surface_points, surface_voxels
+from semantic_mapper.replay.exporters.rerun_log import RerunLog
+from semantic_mapper.replay.log.sequence import open_log
+from semantic_mapper.replay.session import MapSession, load_pipeline
+from semantic_mapper.transport.messages import EndOfStream
+from semantic_mapper.transport.security import ServerIdentity
+from semantic_mapper.transport.sockets import NewestSubscriber
+from semantic_mapper.types import CameraIntrinsics, Float32, MapUpdate, PosedFrame
+
+MAX_POINTS = 400_000  # of a map that is shown again and again: of a larger one every second point, or third, ...
+POLL_S = 0.1
+ASK_AGAIN_S = 1.0  # a mapper that does not answer yet
+
+Begin = Callable[[], rr.RecordingStream]  # what is to be shown is open: where does it go?
+
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Live:
+    """Where a running system is listened to.
+
+    Args:
+        query: Where its mapper answers questions.
+        nodes: Endpoints of cameras and mappers, whatever else is among them; none shows the map alone.
+        identity: Of a mapper that has keys.
+        streams: How many of the nodes are cameras; it is over when all of their streams have ended.
+    """
+
+    query: str
+    nodes: tuple[str, ...] = ()
+    identity: ServerIdentity | None = None
+    streams: int = 1
+
+
+class _MapShow:
+    """Shows one state of a map after the other."""
+
+    def __init__(self, log: RerunLog) -> None:
+        self._log = log
+        self._ages = BlockAges()
+        self._shown: NDArray[np.int64] | None = None  # contents of the blocks
+
+    def show(self, snapshot: MapSnapshot, stamp_ns: int) -> None:
+        """Show it as of a time; a map that has not changed since is left as it is."""
+        if self._shown is not None and np.array_equal(snapshot.serials, self._shown):
+            return
+        self._shown = snapshot.serials
+        ages_s = self._ages.follow(snapshot, stamp_ns / 1e9)
+        surface = surface_voxels(snapshot)
+        points = surface_points(snapshot, surface)
+        points, ages = thinned(points, ages_s[surface.row].astype(np.float32))
+        self._log.log_map(points, ages, stamp_ns)
+
+
+def thinned(points: MapPoints, ages: Float32) -> tuple[MapPoints, Float32]:
+    """Every n-th point and its age, so that there are at most ``MAX_POINTS``."""
+    step = max(1, -(-len(points.xyz) // MAX_POINTS))
+    few = MapPoints(points.xyz[::step], points.rgb[::step], points.label[::step], points.confidence[::step])
+    return few, ages[::step]
+
+
+def show_saved(path: Path, begin: Begin) -> None:
+    """Show a saved map; its ages are not known.
+
+    Raises:
+        MapError: it cannot be read.
+    """
+    voxel_map = VoxelMap.load(path)
+    log = RerunLog(begin(), voxel_map.label_set, voxel_map.config.voxel_size_m)
+    log.finish(voxel_map.points())
+
+
+def show_log(
+    path: Path,
+    weights: Path | None,
+    config: MapperConfig,
+    frames: int,
+    begin: Begin,
+    refresh_s: float,
+    going: Callable[[], bool],
+    on_start: Callable[[int], None],
+    on_frame: Callable[[int], None],
+) -> None:
+    """Map a log and show it meanwhile, its map every so many seconds and at the end.
+
+    Args:
+        path: The log.
+        weights, config: See ``load_pipeline``.
+        frames: At most so many; 0 = all.
+        begin: Says where to write it, once log and weights are open.
+        refresh_s: Time between two maps.
+        going: Whether to go on.
+        on_start: Told how many frames there are.
+        on_frame: Told how many are done.
+
+    Raises:
+        LogError, WeightsError, ConfigError, MapError: it cannot be mapped.
+    """
+    bundle = load_pipeline(weights, config)
+    pipeline = bundle.pipeline
+    voxel_map = pipeline.voxel_map
+    with open_log(path) as reader:
+        log = RerunLog(begin(), pipeline.label_set, voxel_map.config.voxel_size_m)
+        show, mirror = _MapShow(log), MapMirror.of(voxel_map)
+        session = MapSession(bundle, stream_labels=None, source=reader.info.source, rerun=log)
+        total = min(len(reader), frames or len(reader))
+        on_start(total)
+        shown_at, stamp_ns = time.monotonic(), 0
+        for done, item in enumerate(reader.frames_or_errors(total), 1):
+            if not going():
+                break
+            if isinstance(item, PosedFrame):
+                session.process(item)
+                stamp_ns = item.stamp_ns
+            else:
+                session.refuse(done - 1, 0, str(item))
+            on_frame(done)
+            if time.monotonic() - shown_at > refresh_s:
+                show.show(mirror.apply(voxel_map.changes(mirror.version)), stamp_ns)
+                shown_at = time.monotonic()
+        show.show(mirror.apply(voxel_map.changes(mirror.version)), stamp_ns)
+        log.close()
+
+
+def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tell: Callable[[str], None]) -> None:
+    """Show a running system until its streams have ended or somebody asks to stop.
+
+    The mapper is asked first, and waited for: a camera that waits for its listeners would else count this one in.
+
+    Args:
+        live: Where it is.
+        begin: Says where to write it, once the endpoint is known to be one.
+        refresh_s: Time between two maps.
+        stop: Somebody wants to end it.
+        tell: Told in words how it goes.
+
+    Raises:
+        TransportError: an endpoint that is none.
+    """
+    with MapClient(live.query, identity=live.identity, attempts=1) as client:
+        stream = begin()
+        snapshot = _first_snapshot(client, stop, tell)
+        if snapshot is None:
+            return
+        log = RerunLog(stream, snapshot.label_set, snapshot.voxel_size_m)
+        show = _MapShow(log)
+        show.show(snapshot, time.monotonic_ns())
+        following = _Following(client, show, refresh_s)
+        thread = threading.Thread(target=following.run, name="map", daemon=True)
+        thread.start()
+        try:
+            if live.nodes:
+                _follow_nodes(live, log, following, stop)
+                tell("the stream has ended" if not stop else "stopped")
+            while not stop and not live.nodes:
+                time.sleep(POLL_S)
+        finally:
+            following.ended.set()
+            thread.join()
+            log.close()
+
+
+def _first_snapshot(client: MapClient, stop: StopRequest, tell: Callable[[str], None]) -> MapSnapshot | None:
+    """The map as it is, once its mapper answers; None where a stop request came first."""
+    told = False
+    while not stop:
+        try:
+            return client.mirror().snapshot()
+        except TransportError as error:
+            if not told:
+                tell(f"waiting for the mapper: {error}")
+            told = True
+            time.sleep(ASK_AGAIN_S)
+    return None
+
+
+class _Following:
+    """Shows the map of a running mapper again and again, in a thread of its own."""
+
+    def __init__(self, client: MapClient, show: _MapShow, refresh_s: float) -> None:
+        self.ended = threading.Event()
+        self.stamp_ns = 0  # of the newest frame
+        self._client = client
+        self._show = show
+        self._refresh_s = refresh_s
+        self._troubled = False
+
+    def run(self) -> None:
+        """Until ``ended``; then once more, for what has come since."""
+        ended = False
+        while not ended:
+            ended = self.ended.wait(self._refresh_s)
+            try:
+                self._show.show(self._client.mirror().snapshot(), self.stamp_ns or time.monotonic_ns())
+                self._troubled = False
+            except SemanticMapperError as error:
+                if not (self._troubled or ended):  # a mapper that starts again has no map for a while
+                    _log.warning("map_not_shown", reason=str(error))
+                self._troubled = True
+
+
+def _follow_nodes(live: Live, log: RerunLog, following: _Following, stop: StopRequest) -> None:
+    """Show frames and what was rendered for them until all streams have ended: cameras wait for their listeners."""
+    intrinsics: dict[str, CameraIntrinsics] = {}
+    streams = Streams(live.streams)
+    with NewestSubscriber(live.nodes, ("frame", "map", "end")) as messages:
+        while not stop and not streams.ended:
+            message = messages.receive(POLL_S)
+            match message:
+                case PosedFrame():
+                    intrinsics[message.camera_id] = message.intrinsics
+                    following.stamp_ns = message.stamp_ns
+                    log.log_frame(message)
+                case MapUpdate() if message.camera_id in intrinsics:
+                    log.log_update(message, intrinsics[message.camera_id])
+                case EndOfStream():
+                    streams.end(message)
+                case _:
+                    pass

@@ -1,0 +1,116 @@
+"""Corrected poses of a log's frames, from a trajectory file, into the map of a session."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.config import MapperConfig
+from semantic_mapper.errors import ImportSourceError
+from semantic_mapper.geometry import pose_matrix
+from semantic_mapper.log_events import get_logger
+from semantic_mapper.mapping.correction.history import SEGMENTS
+from semantic_mapper.mapping.correction.pose_correction import ALWAYS
+from semantic_mapper.replay.importers.tum import match_nearest, read_trajectory
+from semantic_mapper.types import Float64
+
+if TYPE_CHECKING:
+    from semantic_mapper.replay.session import MapSession
+
+MATCH_NS = 5_000_000  # trajectories are written with microseconds, or with the stamp of another picture of the rig
+_PORTION = 8  # frames
+
+_log = get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Corrected poses in order of time.
+
+    Args:
+        path: Where they come from.
+        stamps_ns: (N,).
+        poses: (N, 4, 4) T_world_camera.
+    """
+
+    path: Path
+    stamps_ns: NDArray[np.int64]
+    poses: Float64
+
+
+def read_corrections(path: Path) -> Trajectory:
+    """Read a trajectory in TUM's format, ``stamp tx ty tz qx qy qz qw``: the poses of the camera, stamps in seconds.
+
+    Raises:
+        ImportSourceError: missing, empty, or with a line that is none.
+    """
+    notices: list[str] = []
+    stamps_ns, rows = read_trajectory(path, notices)
+    if notices:  # a recording can do without a frame; who corrects poses wants all of them
+        raise ImportSourceError(f"{notices[0]} ({len(notices)} lines); mend or remove them")
+    return Trajectory(path, stamps_ns, np.array([pose_matrix(row[:3], row[3:]) for row in rows]))
+
+
+def keeping_frames(config: MapperConfig, frames: int) -> MapperConfig:
+    """The config with a history that holds a log of so many frames, where it says nothing else."""
+    if config.history.max_frames:
+        return config
+    # One segment for all: none will leave, and so nothing has to be kept of what the map was before.
+    history = msgspec.structs.replace(config.history, max_frames=SEGMENTS * (frames + 1))
+    return msgspec.structs.replace(config, history=history)
+
+
+def match_frames(
+    keys: Iterable[tuple[str, int]], stamps_ns: NDArray[np.int64], poses: Float64, within_ns: int
+) -> dict[tuple[str, int], Float64]:
+    """Poses by the frames of one camera that were taken nearest to their stamps; those without one are left out.
+
+    Args:
+        keys: (camera_id, stamp_ns) of the frames.
+        stamps_ns, poses: (N,) and (N, 4, 4) T_world_camera.
+        within_ns: Largest difference.
+    """
+    rising = sorted(keys, key=lambda key: key[1])
+    stamps = np.array([stamp_ns for _, stamp_ns in rising], np.int64)
+    frame_of = match_nearest(stamps_ns, stamps, within_ns) if rising else [-1] * len(stamps_ns)
+    return {rising[i]: pose for i, pose in zip(frame_of, poses, strict=True) if i >= 0}
+
+
+def correct_session(session: MapSession, trajectory: Trajectory) -> int:
+    """Move the map to the corrected poses; frames between and after them move along. Returns how many poses were used.
+
+    Poses that no frame of the history was taken within 5 ms of are left out and counted in the log.
+
+    Raises:
+        ImportSourceError: that is true of all of them, or the session has frames of several cameras.
+        MapError: the map cannot be corrected.
+    """
+    keys = sorted(session.pipeline.corrector.poses(), key=lambda key: key[1])
+    cameras = sorted({camera_id for camera_id, _ in keys})
+    if len(cameras) > 1:
+        raise ImportSourceError(
+            f"{trajectory.path}: a trajectory is that of one camera, and this log has {', '.join(cameras)}"
+        )
+    poses = match_frames(keys, trajectory.stamps_ns, trajectory.poses, MATCH_NS)
+    given = len(trajectory.stamps_ns)
+    frozen = session.pipeline.corrector.status.frozen  # frames that have left the history, whose stamps are not known
+    if not poses:
+        raise ImportSourceError(
+            f"{trajectory.path}: none of its {given} stamps is that of a mapped frame "
+            f"(within {MATCH_NS / 1e6:g} ms); the first is {trajectory.stamps_ns[0] / 1e9:.6f} s"
+            + (f", that of the frames {keys[0][1] / 1e9:.6f} s" if keys else "")
+            + (f"; {frozen} frames have left the history, raise history.max_frames or max_disk_mb" if frozen else "")
+        )
+    if len(poses) < given:
+        _log.warning("corrections_without_a_frame", left_out=given - len(poses), used=len(poses), frozen=frozen)
+    session.pipeline.correct_poses(poses, until_ns=ALWAYS)  # the whole log was recorded in the old world
+    while session.pipeline.advance_correction(_PORTION):
+        pass
+    session.follow_correction()
+    return len(poses)

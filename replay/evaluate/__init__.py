@@ -1,0 +1,1 @@
+"""Labels and maps against ground truth."""

@@ -1,0 +1,172 @@
+"""The map of a procedural room against the room itself: frames through the real pipeline, then labels at surfaces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from semantic_mapper.benchmark.config import MAP_WIDTH, SuiteConfig, camera_of_width, settings_digest
+from semantic_mapper.benchmark.records import MapRecord
+from semantic_mapper.benchmark.rooms import as_given
+from semantic_mapper.benchmark.scoring import as_calibration, as_rows
+from semantic_mapper.errors import MapError
+from semantic_mapper.evaluation.metrics import (
+    ConfusionMatrix,
+    confusion_of,
+    map_confusion,
+    metrics_per_image,
+    nearest_labels,
+)
+from semantic_mapper.geometry import invert_pose, project, transform, unproject
+from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.mapping.map_types import MapView
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.replay.session import load_pipeline
+from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, Scene, make_room, render_view, room_frames
+from semantic_mapper.types import Float32, Float64, UInt8
+
+NEAR_M = 0.05  # a map point this near to the true surface speaks for it
+SEEN_M = 0.03  # a frame sees a map point that is this near, in depth, to where its ray meets the map
+UNSEEN = 255  # no id of ``ROOMS``
+TRUTH_VOXEL_M = 0.01  # the true surface is sampled this densely, where the camera saw it that densely
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueSurface:
+    """Points of a room's true surface that its camera has seen: xyz (N, 3) float32 metres, ids (N,) of ``ROOMS``."""
+
+    xyz: Float32
+    label: UInt8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """A frame of the sequence: pose, true labels (H, W) and those that the pipeline rendered, ids of ``ROOMS``."""
+
+    T_world_camera: Float64
+    truth: UInt8
+    label: UInt8
+
+
+def map_room(seed: int, weights: Path, digest: str, suite: SuiteConfig) -> MapRecord:
+    """Fuse a room's sequence and compare the map's labels with those of the nearest true surface.
+
+    Args:
+        seed: Of the room.
+        weights: File that the pipeline runs on.
+        digest: Of the weights, for the record.
+        suite: Gives the number of frames, their spacing, whether they have depth, and the settings of the mapper.
+
+    Raises:
+        WeightsError: see ``load_pipeline``.
+        MapError: the map came out empty.
+    """
+    pipeline = load_pipeline(weights, suite.mapper).pipeline
+    camera = camera_of_width(MAP_WIDTH)
+    path = CameraPathConfig(step_m=suite.sequence.step_m)
+    scene = make_room(seed)
+    views: list[_View] = []
+    for frame in room_frames(seed, suite.map_frames, camera, path=path, noise=NoiseConfig()):
+        label = in_rooms(pipeline.step(as_given(frame, depth=suite.depth)).label, pipeline.label_set)
+        assert frame.label is not None
+        views.append(_View(frame.T_world_camera, frame.label, label))
+    return _compare(scene, pipeline.voxel_map, views, digest, suite)
+
+
+def in_rooms(label: UInt8, label_set: LabelSet) -> UInt8:
+    """Ids of another label set as those of ``ROOMS`` with the same name; its ignore id where there is none."""
+    return ROOMS.to_ids(ROOMS.channel_map_from(label_set)[label])
+
+
+def true_surface(scene: Scene, poses: list[Float64]) -> TrueSurface:
+    """What a perfect camera at ``poses`` (each (4, 4)) sees of a room, one point a cubic centimetre."""
+    camera = camera_of_width(MAP_WIDTH)
+    xyz: list[Float32] = []
+    label: list[UInt8] = []
+    for T_world_camera in poses:
+        view = render_view(scene, camera, T_world_camera)
+        hit = view.depth_m > 0
+        xyz.append(transform(T_world_camera, unproject(view.depth_m, camera)[hit]).astype(np.float32))
+        label.append(view.label[hit])
+    points, labels = np.concatenate(xyz), np.concatenate(label)
+    cell = np.floor(points / TRUTH_VOXEL_M).astype(np.int64)
+    _, first = np.unique(cell @ np.array([1, 1 << 20, 1 << 40]), return_index=True)
+    return TrueSurface(points[first], labels[first])
+
+
+def _compare(scene: Scene, voxel_map: VoxelMap, views: list[_View], digest: str, suite: SuiteConfig) -> MapRecord:
+    points = voxel_map.points()
+    if not len(points.xyz):
+        raise MapError(f"room {scene.seed}: none of its {suite.map_frames} frames could be fused; the map is empty")
+    surface = true_surface(scene, [view.T_world_camera for view in views])
+    label = in_rooms(points.label, voxel_map.label_set)
+    truth = nearest_labels(points.xyz, surface.xyz, surface.label, ROOMS, max_distance_m=NEAR_M)
+    at_surface = map_confusion(surface.xyz, surface.label, points.xyz, label, ROOMS, max_distance_m=NEAR_M)
+    rendered = [confusion_of(v.truth, v.label, ROOMS, f"room {scene.seed}") for v in views]
+    camera = camera_of_width(MAP_WIDTH)
+    casts = [voxel_map.ray_cast(view.T_world_camera, camera) for view in views]
+    cast, cast_views = _seen_from_its_frames(casts, voxel_map.label_set, views)
+    one_frame = _label_of_one_frame(points.xyz, casts, views, scene.seed)
+    seen = np.where(one_frame == UNSEEN, ROOMS.ignore_id, truth)
+    answered = (truth != ROOMS.ignore_id) & (label != ROOMS.ignore_id)
+    return MapRecord(
+        settings=settings_digest(suite, "map"),
+        weights=digest,
+        room=scene.seed,
+        programme=scene.programme,
+        points=len(points.xyz),
+        on_surface=float((truth != ROOMS.ignore_id).mean()),
+        confusion=as_rows(confusion_of(truth, label, ROOMS, "map")),
+        surface_confusion=as_rows(at_surface),
+        view_confusion=as_rows(sum(rendered, ConfusionMatrix(ROOMS))),
+        view_miou=metrics_per_image(rendered).miou,
+        cast_confusion=as_rows(cast),
+        cast_view_confusion=as_rows(cast_views),
+        seen_confusion=as_rows(confusion_of(seen, label, ROOMS, "map")),
+        one_frame_confusion=as_rows(
+            confusion_of(seen, np.where(one_frame == UNSEEN, ROOMS.ignore_id, one_frame), ROOMS, "a frame")
+        ),
+        calibration=as_calibration(points.confidence[answered], label[answered] == truth[answered]),
+    )
+
+
+def _label_of_one_frame(xyz: Float32, casts: list[MapView], views: list[_View], seed: int) -> UInt8:
+    """For each map point (N, 3) what one of the frames that see it says, drawn at random; ``UNSEEN`` where none does.
+
+    That is the map without fusion: the same points, each counting once, labelled by a single look.
+    """
+    camera = camera_of_width(MAP_WIDTH)
+    rng = np.random.default_rng(seed)
+    chosen = np.full(len(xyz), UNSEEN, np.uint8)
+    looks = np.zeros(len(xyz), np.int64)
+    for view, cast in zip(views, casts, strict=True):
+        p = transform(invert_pose(view.T_world_camera), xyz.astype(np.float64))
+        front = np.flatnonzero(p[:, 2] > 0.05)
+        uv = np.rint(project(p[front], camera)).astype(np.int64)
+        inside = ((uv >= 0) & (uv < (camera.width, camera.height))).all(1)
+        index, (u, v) = front[inside], uv[inside].T
+        surface = cast.depth_m[v, u]
+        visible = (surface > 0) & (np.abs(surface - p[index, 2]) < SEEN_M)
+        index, label = index[visible], view.label[v[visible], u[visible]]
+        looks[index] += 1
+        taken = rng.random(len(index)) * looks[index] < 1  # so that in the end every look was as likely
+        chosen[index[taken]] = label[taken]
+    return chosen
+
+
+def _seen_from_its_frames(
+    casts: list[MapView], label_set: LabelSet, views: list[_View]
+) -> tuple[ConfusionMatrix, ConfusionMatrix]:
+    """The finished map as its own frames see it, and their rendered labels, both at the pixels where it has a label.
+
+    The two are each other's like: the same pixels of the same classes, so that their difference is what fusing brings.
+    """
+    fused, rendered = ConfusionMatrix(ROOMS), ConfusionMatrix(ROOMS)
+    for view, cast in zip(views, casts, strict=True):
+        label = in_rooms(cast.label, label_set)
+        truth = np.where(cast.label == label_set.ignore_id, ROOMS.ignore_id, view.truth)
+        fused = fused + confusion_of(truth, label, ROOMS, "map seen from a frame")
+        rendered = rendered + confusion_of(truth, view.label, ROOMS, "frame")
+    return fused, rendered

@@ -1,0 +1,199 @@
+"""A saved map for other programs: one file format each, chosen by the name of the file or by hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from semantic_mapper.errors import ConfigError, MapError
+from semantic_mapper.mapping.files.export import ColorBy, colored, sure_faces, sure_points
+from semantic_mapper.mapping.files.formats.files import whole_path
+from semantic_mapper.mapping.files.formats.glb import write_glb
+from semantic_mapper.mapping.files.formats.map_server import write_map_server
+from semantic_mapper.mapping.files.formats.npz import write_npz
+from semantic_mapper.mapping.files.formats.obj import write_obj
+from semantic_mapper.mapping.files.formats.ply import write_ply, write_ply_mesh
+from semantic_mapper.mapping.files.up_axis import find_up
+from semantic_mapper.mapping.map_types import MapMesh
+from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, occupancy_grid
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file
+from semantic_mapper.types import Float64
+
+Format = Literal["ply", "ply-mesh", "obj", "glb", "npz", "grid", "rrd"]
+SUFFIXES: dict[str, Format] = {
+    ".ply": "ply",
+    ".obj": "obj",
+    ".glb": "glb",
+    ".npz": "npz",
+    ".pgm": "grid",
+    ".yaml": "grid",
+    ".rrd": "rrd",
+}
+_TAKES: dict[Format, set[str]] = {  # besides min_weight and min_confidence
+    "ply": {"color"},
+    "ply-mesh": {"color"},
+    "obj": {"color"},
+    "glb": {"color", "up"},
+    "npz": set(),
+    "grid": {"up", "height", "resolution", "floor"},
+    "rrd": set(),
+}
+HEIGHT_M = (0.1, 1.8)  # what a robot of a person's height can hit; what is lower, it rolls over
+RESOLUTION_M = 0.05
+AXES = {sign + name: s * np.eye(3)[i] for sign, s in (("", 1.0), ("-", -1.0)) for i, name in enumerate("xyz")}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExportRequest:
+    """What to write; None = the default, and not asked for.
+
+    Args:
+        format: Of the file.
+        min_weight: Voxels with fewer depth measurements are left out.
+        min_confidence: Surface whose label is less sure is left out; 0 keeps what nothing voted for, too.
+        color: Points and meshes: what the colours show; the camera's by default.
+        up: GLB and grid: (3,) unit vector, up in the world; found by ``find_up`` by default, or refused.
+        height: Grid: LOW and HIGH in metres above the floor.
+        resolution: Grid: side of a cell in metres; 5 cm by default, or a voxel where that is larger.
+        floor: Grid: height of the floor along ``up`` in metres; found by default.
+    """
+
+    format: Format
+    min_weight: float = 1.0
+    min_confidence: float = 0.0
+    color: ColorBy | None = None
+    up: Float64 | None = None
+    height: tuple[float, float] | None = None
+    resolution: float | None = None
+    floor: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ExportReport:
+    """What was written: the files, what is in them, and what had to be found out for it."""
+
+    files: tuple[Path, ...]
+    content: str
+    found: tuple[str, ...] = ()
+
+
+def format_of(path: Path, given: str | None) -> Format:
+    """The format of a file to write.
+
+    Raises:
+        ConfigError: nothing is given, and the name does not tell.
+    """
+    for name in get_args(Format):
+        if given == name:
+            return name
+    if given is not None or path.suffix.lower() not in SUFFIXES:
+        raise ConfigError(
+            f"{path}: which format is that? The name may end in {' '.join(SUFFIXES)}, or give --format "
+            f"{'|'.join(get_args(Format))}"
+        )
+    return SUFFIXES[path.suffix.lower()]
+
+
+def parse_up(text: str) -> Float64 | None:
+    """``auto`` (None), an axis of the world (x, -y, ...), or three numbers.
+
+    Raises:
+        ConfigError: none of these.
+    """
+    if text == "auto":
+        return None
+    if text in AXES:
+        return AXES[text]
+    try:
+        direction = np.array([float(word) for word in text.replace(",", " ").split()])
+    except ValueError:
+        direction = np.zeros(0)
+    if direction.shape != (3,) or not np.isfinite(direction).all() or not np.linalg.norm(direction) > 0:
+        raise ConfigError(f"--up {text}: give auto, one of {' '.join(AXES)}, or three numbers such as '0 -1 0.2'")
+    return direction / np.linalg.norm(direction)
+
+
+def export_map(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> ExportReport:
+    """Write a map to ``path``, and what belongs to it beside it.
+
+    Raises:
+        ConfigError: an option that the format cannot honour.
+        MapError: nothing to write, impossible numbers, or the file cannot be written.
+    """
+    for option in ("color", "up", "height", "resolution", "floor"):
+        if getattr(request, option) is not None and option not in _TAKES[request.format]:
+            able = ", ".join(name for name, takes in _TAKES.items() if option in takes)
+            raise ConfigError(f"--{option} means nothing for format {request.format}; it is for {able}")
+    if request.format in ("ply-mesh", "obj", "glb"):
+        return _export_mesh(voxel_map, path, request)
+    if request.format == "grid":
+        return _export_grid(voxel_map, path, request)
+    return _export_points(voxel_map, path, request)
+
+
+def _export_points(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> ExportReport:
+    labels = voxel_map.label_set
+    points = sure_points(voxel_map.points(request.min_weight), request.min_confidence)
+    if request.format == "ply":
+        write_ply(path, colored(points, labels, request.color or "rgb"), labels)
+    elif request.format == "npz":
+        write_npz(path, points, labels)
+    else:
+        with whole_path(path) as part:
+            RerunLog(recording_file(part), labels, voxel_map.config.voxel_size_m).finish(points)
+    return ExportReport((path,), f"{len(points.xyz):,} points")
+
+
+def _export_mesh(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> ExportReport:
+    labels = voxel_map.label_set
+    mesh = sure_faces(voxel_map.mesh(request.min_weight), request.min_confidence)
+    if not len(mesh.faces):
+        raise MapError("the map has no surface to mesh, or none that is measured so often and so sure")
+    color = request.color or "rgb"
+    mesh, files, found = colored(mesh, labels, color), (path,), ()
+    if request.format == "ply-mesh":
+        write_ply_mesh(path, mesh, labels)
+    elif request.format == "obj":
+        files = write_obj(path, mesh, labels, class_materials=color == "class")
+    else:
+        found = _write_glb(voxel_map, path, mesh, request)
+    return ExportReport(files, f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces", found)
+
+
+def _write_glb(voxel_map: VoxelMap, path: Path, mesh: MapMesh, request: ExportRequest) -> tuple[str, ...]:
+    up = request.up if request.up is not None else find_up(voxel_map.points(request.min_weight), voxel_map.label_set)
+    write_glb(path, mesh, voxel_map.label_set, up)
+    return _found_up(request, up)
+
+
+def _export_grid(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> ExportReport:
+    voxel = voxel_map.config.voxel_size_m
+    resolution = request.resolution if request.resolution is not None else max(RESOLUTION_M, voxel)
+    if resolution < voxel:
+        raise ConfigError(f"--resolution {resolution:g}: cells smaller than the map's voxels ({voxel:g} m) leave holes")
+    points = voxel_map.points(request.min_weight)
+    up = request.up if request.up is not None else find_up(points, voxel_map.label_set)
+    points = sure_points(points, request.min_confidence)
+    grid = occupancy_grid(points, up, resolution, request.height or HEIGHT_M, request.floor)
+    files = write_map_server(path, grid)
+    area = {name: (grid.cells == value).sum() * resolution**2 for name, value in _STATES.items()}
+    content = f"{grid.cells.shape[1]} x {grid.cells.shape[0]} cells of {resolution:g} m: " + ", ".join(
+        f"{square:.1f} m2 {name}" for name, square in area.items()
+    )
+    level = round(-float(grid.T_grid_world[2, 3]), 2) + 0.0  # never -0
+    floor = () if request.floor is not None else (f"floor at {level:.2f} m (--floor sets it)",)
+    return ExportReport(files, content, _found_up(request, up) + floor)
+
+
+_STATES = {"free": FREE, "occupied": OCCUPIED, "unknown": UNKNOWN}
+
+
+def _found_up(request: ExportRequest, up: Float64) -> tuple[str, ...]:
+    if request.up is not None:
+        return ()
+    name = next((name for name, axis in AXES.items() if (axis == up).all()), " ".join(f"{c:.3f}" for c in up))
+    return (f"up is {name} (--up sets it)",)

@@ -1,0 +1,217 @@
+"""What Rerun shows of a session: cameras, rendered semantics, depth, path, the map in four colourings, stage times.
+
+The same is written to a recording (.rrd) and sent to a viewer that watches, so both look alike.
+"""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rerun as rr
+
+from semantic_mapper.errors import LogError
+from semantic_mapper.evaluation.canvas import UNKNOWN
+from semantic_mapper.evaluation.upright import camera_up
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.replay.exporters.rerun_layout import (
+    AGE_SCALE,
+    AGED_S,
+    CONFIDENCE_SCALE,
+    Eye,
+    camera_path,
+    draw_map_legend,
+    eye_on,
+    layout,
+    scale_colors,
+)
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, MapUpdate, PosedFrame
+
+APPLICATION = "semantic_mapper"
+IMAGE_WIDTH = 320  # images are logged at this width: a recording of a long log stays small
+JPEG_QUALITY = 80
+FRUSTUM_M = 0.4  # how far before the camera its image stands in the world
+MAX_PATH = 4096  # positions kept of a camera's path; then every other one goes
+REGROWN = 1.5  # a map that is so much larger is looked at anew
+FLUSH_S = 10.0
+
+
+def recording_file(path: Path) -> rr.RecordingStream:
+    """A recording that is written to a file; open it with ``rerun FILE``.
+
+    Raises:
+        LogError: the file cannot be made.
+    """
+    stream = rr.RecordingStream(APPLICATION)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        stream.save(path)
+    except (OSError, RuntimeError) as error:
+        raise LogError(f"{path}: cannot be written: {error}") from error
+    return stream
+
+
+def recording_server(url: str) -> rr.RecordingStream:
+    """A recording that is sent to a server as it grows (``rerun+http://HOST:PORT/proxy``)."""
+    stream = rr.RecordingStream(APPLICATION)
+    stream.connect_grpc(url)
+    return stream
+
+
+class RerunLog:
+    """Writes to one recording. Frames and maps may come from two threads.
+
+    Args:
+        stream: From ``recording_file`` or ``recording_server``.
+        label_set: Of rendered images and map.
+        voxel_size_m: Of the map.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, label_set: LabelSet, voxel_size_m: float = 0.02) -> None:
+        self._stream = stream
+        self._label_set = label_set
+        self._radius = voxel_size_m / 2
+        self._lock = threading.Lock()
+        self._cameras: list[str] = []
+        self._paths: dict[str, list[Float64]] = {}  # poses, by camera
+        self._seen: dict[str, int] = {}
+        self._strides: dict[str, int] = {}
+        self._eye: Eye | None = None
+        self._aged = False
+        self._extent_m = -1.0  # of the map when the eye was set
+        infos = [
+            rr.AnnotationInfo(id=i, label=name, color=color)
+            for i, name, color in zip(label_set.ids, label_set.names, label_set.colors, strict=True)
+        ]
+        infos.append(rr.AnnotationInfo(id=label_set.ignore_id, label="unknown", color=UNKNOWN))
+        stream.log("/", rr.AnnotationContext(infos), static=True)
+
+    def log_step(self, frame: PosedFrame, update: MapUpdate) -> None:
+        """One frame and what was rendered for it."""
+        self.log_frame(frame)
+        self.log_update(update, frame.intrinsics)
+
+    def log_frame(self, frame: PosedFrame) -> None:
+        """A camera image with its pose."""
+        path, k, T = self._camera(frame.camera_id), frame.intrinsics, frame.T_world_camera
+        size, scale = _logged_size(k)
+        self._set_time(frame.stamp_ns, frame.seq)
+        self._stream.log(path, rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+        self._stream.log(
+            f"{path}/image",
+            rr.Pinhole(
+                focal_length=(k.fx * scale, k.fy * scale),
+                principal_point=((k.cx + 0.5) * scale, (k.cy + 0.5) * scale),
+                width=size[0],
+                height=size[1],
+                camera_xyz=rr.ViewCoordinates.RDF,
+                image_plane_distance=FRUSTUM_M,
+            ),
+        )
+        rgb = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
+        self._stream.log(f"{path}/image/rgb", rr.Image(np.asarray(rgb, np.uint8)).compress(jpeg_quality=JPEG_QUALITY))
+        self._note_pose(frame.camera_id, T)
+
+    def log_update(self, update: MapUpdate, intrinsics: CameraIntrinsics) -> None:
+        """What was rendered for a frame of a camera with these intrinsics, and how long it took."""
+        path, (size, _) = self._camera(update.camera_id), _logged_size(intrinsics)
+        self._set_time(update.stamp_ns, update.seq)
+        label = cv2.resize(update.label, size, interpolation=cv2.INTER_NEAREST_EXACT)
+        self._stream.log(f"{path}/image/semantics", rr.SegmentationImage(np.asarray(label, np.uint8)))
+        depth = cv2.resize(update.depth_m, size, interpolation=cv2.INTER_NEAREST_EXACT)
+        self._stream.log(f"{path}/image/depth", rr.DepthImage(np.asarray(depth, np.float32), meter=1.0))
+        for stage, value in update.stage_ms.items():
+            self._stream.log(f"stage_ms/{stage}", rr.Scalars(value))
+
+    def log_map(self, points: MapPoints, age_s: Float32 | None = None, stamp_ns: int | None = None) -> None:
+        """The map as it is now, coloured by class, camera colour, confidence and, where it is known, age.
+
+        Args:
+            points: Of its surface.
+            age_s: (N,) seconds since each point's surroundings last changed; None = not known.
+            stamp_ns: Of the newest frame in it; None = that which was logged last by this thread, if any was.
+        """
+        if stamp_ns is not None:
+            self._set_time(stamp_ns, None)
+        self._look_at(points, aged=age_s is not None)
+        for camera, poses in list(self._paths.items()):
+            positions = np.stack([T[:3, 3] for T in list(poses)])
+            self._stream.log(rr.new_entity_path(["world", "path", camera]), rr.LineStrips3D([positions]))
+        looks = {
+            "class": {"class_ids": points.label.astype(np.uint16)},
+            "colour": {"colors": points.rgb},
+            "confidence": {"colors": scale_colors(points.confidence, CONFIDENCE_SCALE)},
+        }
+        if age_s is not None:
+            looks["age"] = {"colors": scale_colors(1 - age_s / np.float32(AGED_S), AGE_SCALE)}
+        for name, look in looks.items():
+            self._stream.log(f"world/map/{name}", rr.Points3D(points.xyz, radii=self._radius, **look))
+        legend = draw_map_legend(points.label, self._label_set, aged=age_s is not None)
+        self._stream.log("legend", rr.Image(legend))
+
+    def finish(self, points: MapPoints) -> None:
+        """The finished map; ends the recording."""
+        self.log_map(points)
+        self.close()
+
+    def close(self) -> None:
+        """End the recording once all of it is written or sent. Harmless when repeated.
+
+        Raises:
+            LogError: not all of it could be.
+        """
+        try:
+            self._stream.flush(timeout_sec=FLUSH_S)
+        except RuntimeError as error:
+            raise LogError(f"not all of the recording could be written or sent: {error}") from error
+        finally:
+            self._stream.disconnect()
+
+    def _camera(self, camera: str) -> str:
+        """Entity of a camera; a new one gets its place in the layout."""
+        with self._lock:
+            new = camera not in self._cameras
+            if new:
+                self._cameras.append(camera)
+        if new:
+            self._lay_out()
+        return camera_path(camera)
+
+    def _look_at(self, points: MapPoints, *, aged: bool) -> None:
+        """Set the view anew where the map is the first one, or has grown much."""
+        if not len(points.xyz):
+            return
+        extent = float(np.linalg.norm(np.ptp(np.percentile(points.xyz, (1, 99), axis=0), axis=0)))
+        if self._aged == aged and extent <= REGROWN * self._extent_m:
+            return
+        poses = [T for poses in list(self._paths.values()) for T in list(poses)]
+        self._eye = eye_on(points.xyz, camera_up(np.stack(poses)) if poses else None)
+        self._aged, self._extent_m = aged, extent
+        self._lay_out()
+
+    def _lay_out(self) -> None:
+        self._stream.send_blueprint(layout(self._cameras, mapped=self._eye is not None, aged=self._aged, eye=self._eye))
+
+    def _set_time(self, stamp_ns: int, seq: int | None) -> None:
+        self._stream.set_time("capture", duration=np.timedelta64(stamp_ns, "ns"))
+        if seq is not None:
+            self._stream.set_time("frame", sequence=seq)
+
+    def _note_pose(self, camera: str, T_world_camera: Float64) -> None:
+        """A bounded, evenly spread sample of a camera's way, whatever its length."""
+        poses, stride = self._paths.setdefault(camera, []), self._strides.setdefault(camera, 1)
+        self._seen[camera] = self._seen.get(camera, -1) + 1
+        if self._seen[camera] % stride == 0:
+            poses.append(T_world_camera.copy())
+        if len(poses) > MAX_PATH:
+            self._paths[camera] = poses[::2]
+            self._strides[camera] *= 2
+
+
+def _logged_size(intrinsics: CameraIntrinsics) -> tuple[tuple[int, int], float]:
+    """Width and height of logged images, and their scale."""
+    scale = min(1.0, IMAGE_WIDTH / intrinsics.width)
+    return (round(intrinsics.width * scale), round(intrinsics.height * scale)), scale

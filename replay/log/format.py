@@ -1,0 +1,238 @@
+"""The log: an MCAP file whose messages are the very bytes that travel between processes.
+
+One message a chunk, not compressed (images already are), each chunk with its checksum and flushed at once: a killed
+writer loses at most the message it was writing, and a damaged byte spoils one message. A full disk costs the message
+that does not fit: the file ends with the one before. What the stream is (cameras, label set) stands twice: as an
+attachment, and as the first message.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import IO, cast
+
+import msgspec
+from mcap.data_stream import RecordBuilder
+from mcap.records import DataEnd, Footer
+from mcap.writer import CompressionType, Writer
+
+from semantic_mapper.errors import LogError
+from semantic_mapper.replay.log.atomic_file import WholeFile
+from semantic_mapper.replay.log.mcap_scan import MAGIC
+from semantic_mapper.replay.log.reader import INFO_ATTACHMENT, LogAttachment, LogReader
+from semantic_mapper.transport import headers
+from semantic_mapper.transport.codec import (
+    CodecOptions,
+    EncodedImage,
+    Parts,
+    encode_frame,
+    encode_info,
+    read_envelope,
+)
+from semantic_mapper.transport.framing import pack_parts
+from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.types import PosedFrame
+
+__all__ = ["LogAttachment", "LogReader", "LogWriter"]
+
+PROFILE = "semantic-mapper"
+_DEFAULTS = CodecOptions()
+_HEADERS = {
+    "frame": headers.FrameHeader,
+    "map": headers.MapUpdateHeader,
+    "refused": headers.FrameRefusedHeader,
+    "status": headers.StatusHeader,
+    "info": headers.StreamInfoHeader,
+    "end": headers.EndOfStreamHeader,
+}
+
+
+class LogWriter:
+    """Writes a log. A context manager; not for several threads at once.
+
+    Args:
+        path: Of the new file.
+        info: What the stream is.
+        options: How ``write_frame`` packs; lossless by default.
+        overwrite: Whether an existing file may be replaced.
+        attachments: What else to keep in it.
+
+    Attributes:
+        trouble: Why it takes nothing more; None where all is well.
+
+    Raises:
+        LogError: the file exists, or cannot be written; then there is none.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        info: StreamInfo,
+        *,
+        options: CodecOptions = _DEFAULTS,
+        overwrite: bool = False,
+        attachments: Sequence[LogAttachment] = (),
+    ) -> None:
+        self.path = path
+        self.frames = 0
+        self.messages = 0
+        self._options = options
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._last_stamp_ns = 0
+        parts = encode_info(info)  # before the file is made: what cannot be packed leaves none behind
+        self._failed = False
+        self.trouble: OSError | None = None
+        self._file = _create(path, overwrite)
+        # A chunk is closed once it is longer than chunk_size, that is after each message.
+        self._writer = Writer(cast(IO[bytes], self._file), chunk_size=1, compression=CompressionType.NONE)
+        try:
+            self._writer.start(profile=PROFILE)
+            self._writer.add_attachment(0, 0, INFO_ATTACHMENT, "application/msgpack", pack_parts(parts))
+            for attachment in attachments:
+                self.attach(attachment)
+            self._writer.add_metadata("semantic-mapper", _for_people(info))
+            self.write_parts(parts)
+        except LogError as error:
+            self._file.close()
+            if path.is_file():
+                path.unlink()
+            raise LogError(f"{path}: cannot be written: {self.trouble or error}") from self.trouble
+
+    @property
+    def bytes_written(self) -> int:
+        """Size of the file so far."""
+        return self._file.size
+
+    def attach(self, attachment: LogAttachment) -> None:
+        """Keep a file in the log, from the next message on; of several of one name readers give the last."""
+        self._writer.add_attachment(0, 0, attachment.name, attachment.media_type, attachment.data)
+
+    def write_frame(self, frame: PosedFrame, *, encoded_rgb: EncodedImage | None = None) -> None:
+        """Append one frame.
+
+        Args:
+            frame: With a finite pose.
+            encoded_rgb: A PNG or JPEG file that decodes to ``frame.rgb``, kept as it is.
+
+        Raises:
+            CodecError: the frame cannot be packed; the log is as it was.
+            LogError: the disk is full or gone.
+        """
+        self.write_parts(encode_frame(frame, self._options, encoded_rgb=encoded_rgb))
+
+    def write_parts(self, parts: Parts) -> None:
+        """Append one encoded message of any topic, as it came over the wire.
+
+        Raises:
+            CodecError: not a message of ours; the log is as it was.
+            LogError: the disk is full or gone; the log is as it was, and takes nothing more.
+        """
+        if self._failed:
+            raise LogError(f"{self.path}: is closed to further messages since one could not be written")
+        envelope = read_envelope(parts)
+        stamp = envelope.stamp_ns or self._last_stamp_ns
+        self._writer.add_message(
+            channel_id=self._channel(envelope.topic, envelope.source),
+            log_time=stamp,
+            publish_time=stamp,
+            sequence=envelope.seq & 0xFFFFFFFF,
+            data=pack_parts(parts),
+        )
+        try:
+            self._file.commit()
+        except OSError as error:
+            self._failed = True  # the index in memory tells of a message that is not there
+            raise self._cannot_write(error) from error
+        self._last_stamp_ns = stamp
+        self.messages += 1
+        self.frames += envelope.topic == "frame"
+
+    def close(self) -> None:
+        """Write the index and close the file. Harmless when repeated.
+
+        Where there is no room for the index, the log ends without one: it is whole, and slower to search.
+
+        Raises:
+            LogError: the disk is full to the last byte, or gone; what was written can be read.
+        """
+        if self._file.closed:
+            return
+        try:
+            if not (self._failed or self._end_with_index()):
+                self._failed = True
+            if self._failed:
+                self._file.write(_short_end())
+                self._file.commit()
+            self._file.sync()
+        except OSError as error:
+            raise self._cannot_write(error) from error
+        finally:
+            self._file.close()
+
+    def __enter__(self) -> LogWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _end_with_index(self) -> bool:
+        self._writer.finish()
+        try:
+            self._file.commit()
+        except OSError:
+            return False
+        return True
+
+    def _channel(self, topic: str, source: str) -> int:
+        name = f"{topic}/{source}"
+        if name not in self._channels:
+            if topic not in self._schemas:
+                kind = _HEADERS[topic]
+                self._schemas[topic] = self._writer.register_schema(
+                    f"semantic_mapper.{kind.__name__.removesuffix('Header')}", "jsonschema", _schema(kind)
+                )
+            self._channels[name] = self._writer.register_channel(name, "msgpack", self._schemas[topic])
+        return self._channels[name]
+
+    def _cannot_write(self, error: OSError) -> LogError:
+        self.trouble = error
+        return LogError(f"{self.path}: cannot be written ({error}); {self.frames} frames are in it and can be read")
+
+
+def _create(path: Path, overwrite: bool) -> WholeFile:
+    try:
+        return WholeFile(path, overwrite=overwrite)
+    except FileExistsError as error:
+        raise LogError(f"{path}: exists already; remove it or choose another name") from error
+    except OSError as error:
+        raise LogError(f"{path}: cannot be written: {error}") from error
+
+
+def _short_end() -> bytes:
+    """The end of an MCAP file without index: 50 bytes."""
+    builder = RecordBuilder()
+    DataEnd(0).write(builder)
+    Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
+    return builder.end() + MAGIC
+
+
+def _schema(kind: type[headers.Header]) -> bytes:
+    described = msgspec.json.schema(kind)
+    described["description"] = (
+        "The payload is a msgpack array of binaries: [topic, header, buffers...]. The header is msgpack in turn and "
+        "follows this schema; each of its 'encoding' fields says how the buffer is packed."
+    )
+    return json.dumps(described).encode()
+
+
+def _for_people(info: StreamInfo) -> dict[str, str]:
+    """What `mcap info` and the like show; nothing reads it back."""
+    cameras = ", ".join(f"{name} {i.width}x{i.height}" for name, i in info.cameras.items())
+    labels = "none" if info.label_set is None else f"{info.label_set.name} ({len(info.label_set)} classes)"
+    return {"source": info.source, "cameras": cameras, "labels": labels, **info.metadata}

@@ -1,0 +1,1 @@
+"""Maps that follow corrected poses."""

@@ -1,0 +1,54 @@
+"""Occupancy grids as ROS's ``map_server`` and nav2 read them: a grey picture (PGM) and its description (YAML)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from semantic_mapper.mapping.files.formats.files import whole_file
+from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, OccupancyGrid
+
+_FREE_GREY, _OCCUPIED_GREY, _UNKNOWN_GREY = 254, 0, 205
+_OCCUPIED_ABOVE, _FREE_BELOW = 0.65, 0.196  # of (255 - grey) / 255; nav2's own 0.25 would read unknown as free
+
+
+def write_map_server(path: Path, grid: OccupancyGrid) -> tuple[Path, Path]:
+    """Write the YAML and, beside it, the PGM of the same stem.
+
+    The picture's first row is the grid's last one: y runs upwards. ``origin`` is the outer corner of the lower left
+    pixel. ``T_grid_world`` (4 rows), which map servers pass over, takes points of the world to the frame of the plan.
+
+    Args:
+        path: One of the two files.
+        grid: The plan.
+
+    Returns:
+        The YAML and the PGM.
+
+    Raises:
+        MapError: a file cannot be written.
+    """
+    picture, description = path.with_suffix(".pgm"), path.with_suffix(".yaml")
+    rows, columns = grid.cells.shape
+    grey = np.full((rows, columns), _UNKNOWN_GREY, np.uint8)
+    grey[grid.cells == FREE] = _FREE_GREY
+    grey[grid.cells == OCCUPIED] = _OCCUPIED_GREY
+    with whole_file(picture) as file:
+        file.write(f"P5\n{columns} {rows}\n255\n".encode())
+        file.write(np.ascontiguousarray(grey[::-1]).tobytes())
+    x, y = grid.origin_m
+    lines = (
+        f"image: {json.dumps(picture.name)}",
+        "mode: trinary",
+        f"resolution: {grid.resolution_m!r}",
+        f"origin: [{x:.6f}, {y:.6f}, 0.0]",
+        "negate: 0",
+        f"occupied_thresh: {_OCCUPIED_ABOVE}",
+        f"free_thresh: {_FREE_BELOW}",
+        f"T_grid_world: {np.round(grid.T_grid_world, 9).tolist()}",
+    )
+    with whole_file(description) as file:
+        file.write(("\n".join(lines) + "\n").encode())
+    return description, picture

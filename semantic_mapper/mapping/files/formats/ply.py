@@ -1,0 +1,87 @@
+"""PLY, binary little-endian: points, or a mesh. World frame, metres; class ids with their names as comments.
+
+``comment label 3 chair`` says what the id 3 of the property ``label`` means. Names are ASCII, with Python's escapes for
+what is not, backslashes included: ``name.encode().decode("unicode_escape")`` gives the name back.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.files.formats.files import whole_file
+from semantic_mapper.mapping.map_types import MapMesh, MapPoints
+from semantic_mapper.types import Float32, UInt8
+
+_VERTEX = np.dtype(
+    [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("red", "u1"),
+        ("green", "u1"),
+        ("blue", "u1"),
+        ("label", "u1"),
+        ("confidence", "<f4"),
+    ]
+)
+MAX_NAME = 200  # characters of a class name in a comment
+_FACE = np.dtype([("count", "u1"), ("corners", "<i4", (3,))])
+_TYPES = {"<f4": "float", "|u1": "uchar"}
+
+
+def write_ply(path: Path, points: MapPoints, label_set: LabelSet) -> None:
+    """Write points as x y z red green blue label confidence; a comment names each class.
+
+    Raises:
+        MapError: the file cannot be written.
+    """
+    vertices = _vertices(points.xyz, points.rgb, points.label, points.confidence)
+    _write(path, vertices, np.empty(0, _FACE), label_set, mesh=False)
+
+
+def write_ply_mesh(path: Path, mesh: MapMesh, label_set: LabelSet) -> None:
+    """Write a triangle mesh: vertices as ``write_ply`` has them, faces as lists ``vertex_indices``.
+
+    Raises:
+        MapError: the file cannot be written.
+    """
+    faces = np.empty(len(mesh.faces), _FACE)
+    faces["count"], faces["corners"] = 3, mesh.faces
+    _write(path, _vertices(mesh.vertices, mesh.rgb, mesh.label, mesh.confidence), faces, label_set, mesh=True)
+
+
+def _vertices(xyz: Float32, rgb: UInt8, label: UInt8, confidence: Float32) -> NDArray[np.void]:
+    vertices = np.empty(len(xyz), _VERTEX)
+    for column, name in enumerate(("x", "y", "z")):
+        vertices[name] = xyz[:, column]
+    for column, name in enumerate(("red", "green", "blue")):
+        vertices[name] = rgb[:, column]
+    vertices["label"] = label
+    vertices["confidence"] = confidence
+    return vertices
+
+
+def _write(path: Path, vertices: NDArray[np.void], faces: NDArray[np.void], label_set: LabelSet, *, mesh: bool) -> None:
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [f"comment label {i} {_escaped(n)}" for i, n in zip(label_set.ids, label_set.names, strict=True)]
+    lines.append(f"comment label {label_set.ignore_id} unknown")
+    lines.append(f"element vertex {len(vertices)}")
+    lines += [f"property {_TYPES[_VERTEX[name].str]} {name}" for name in _VERTEX.names or ()]
+    if mesh:
+        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    lines.append("end_header")
+    with whole_file(path) as file:
+        file.write(("\n".join(lines) + "\n").encode("ascii"))
+        file.write(vertices.tobytes())
+        file.write(faces.tobytes())
+
+
+def _escaped(name: str) -> str:
+    """One line of printable ASCII; Open3D's reader writes past its buffer at lines above 1,000 characters."""
+    while len(escaped := name.encode("unicode_escape").decode("ascii")) > MAX_NAME:
+        name = name[:-1]  # a whole letter, however long its escape is
+    return escaped

@@ -1,0 +1,275 @@
+"""The map on disk: ``map.npz``, a zip of compressed .npy arrays in chunks of blocks, and ``manifest.json``.
+
+``numpy.load`` opens it: array ``tsdf`` of the first chunk is ``"000000/tsdf"``. Only voxels that hold something are
+stored: TSDF, weight and colour where there was a measurement, evidence and votes where there was a vote. Blocks stand
+in lexicographic order, and nothing in the file depends on when or where it was written: the same map gives the same
+bytes. The manifest (``map_manifest``) holds a SHA-256 of each chunk; its own is the comment of the zip.
+
+Writing and reading take memory for one chunk, whatever the size of the map.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.errors import MapError
+from semantic_mapper.mapping.files.atomic_file import replacing
+from semantic_mapper.mapping.files.map_manifest import (
+    MEND,
+    MapChunk,
+    MapManifest,
+    digest,
+    encode_manifest,
+    parse_manifest,
+)
+from semantic_mapper.mapping.storage.block_index import KEY_LIMIT, pack_keys
+from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS, BlockValues
+from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE
+
+BlockPart = tuple[NDArray[np.int32], BlockValues]  # keys (B, 3) and voxels
+
+_MANIFEST = "manifest.json"
+_MAX_MANIFEST_BYTES = 64 << 20  # 100 million blocks
+_COMMENT = b"sha256 of manifest.json: "
+_COMMENT_BYTES = len(_COMMENT) + 64
+_END_BYTES = 22 + _COMMENT_BYTES  # of a zip's last record
+_COMPRESSION_LEVEL = 1  # measured: higher levels take several times as long for a few percent
+_ARRAYS = {  # name -> dtype; in the order of the file
+    "keys": "<i4",  # (B, 3) block coordinates
+    "measured": "|u1",  # (B, 64) bit mask of the voxels with weight > 0: M of them
+    "voted": "|u1",  # (B, 64) bit mask of the voxels with votes > 0: V of them
+    "tsdf": "<f4",  # (M,)
+    "weight": "<f4",  # (M,)
+    "color": "<f4",  # (M, 3)
+    "evidence": "<f4",  # (V, L); of ``voxel_map.evidence`` "int16" "<i2"
+    "votes": "<f4",  # (V,)
+}
+_EVIDENCE = {"float32": "<f4", "int16": "<i2"}
+_UNREADABLE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError, OSError)
+
+
+def write_map(path: Path, manifest: MapManifest, parts: Iterable[BlockPart]) -> MapManifest:
+    """Write a map, replacing a file of that name in one step.
+
+    Args:
+        path: The file.
+        manifest: Its settings, classes and counters; what depends on the blocks is filled in here.
+        parts: Blocks in lexicographic order, ``CHUNK_BLOCKS`` at a time and at last the rest.
+
+    Returns:
+        The manifest as written.
+
+    Raises:
+        MapError: the file cannot be written; one that was there before is untouched.
+    """
+    chunks: list[MapChunk] = []
+    corners: list[NDArray[np.int32]] = []
+    dtypes = _dtypes(manifest)
+    with (
+        replacing(path) as file,
+        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=_COMPRESSION_LEVEL) as archive,
+    ):
+        for keys, values in parts:
+            chunks.append(_write_chunk(archive, len(chunks), keys, values, dtypes))
+            corners += [keys.min(axis=0), keys.max(axis=0) + 1]
+        blocks = sum(chunk.blocks for chunk in chunks)
+        bounds = _bounds_m(corners, manifest.config.voxel_size_m)
+        manifest = msgspec.structs.replace(manifest, blocks=blocks, bounds_m=bounds, chunks=tuple(chunks))
+        content = encode_manifest(manifest)
+        with archive.open(_MANIFEST, "w") as member:
+            member.write(content)
+        archive.comment = _COMMENT + digest(content).encode()
+    return manifest
+
+
+def describe_map(path: Path) -> MapManifest:
+    """What a saved map says of itself; its blocks are not read, and not checked.
+
+    Raises:
+        MapError: no such file, not a map, of another format version, or damaged where it says this.
+    """
+    with open_map(path) as reader:
+        return reader.manifest
+
+
+@contextmanager
+def open_map(path: Path) -> Iterator[MapReader]:
+    """Open a saved map to be read chunk by chunk.
+
+    Raises:
+        MapError: see ``describe_map``.
+    """
+    try:
+        file = path.open("rb")
+    except FileNotFoundError as error:
+        raise MapError(f"{path}: no such map file") from error
+    except OSError as error:
+        raise MapError(f"{path}: damaged or not a map: {error.strerror}") from error
+    with file:
+        with _told(f"{path}: damaged or not a map"):
+            archive = zipfile.ZipFile(file)
+        with archive:
+            yield MapReader(path, archive, _read_manifest(path, file, archive))
+
+
+class MapReader:
+    """A saved map that is open.
+
+    Args:
+        manifest: What it says of itself, checked.
+    """
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile, manifest: MapManifest) -> None:
+        self.manifest = manifest
+        self._path = path
+        self._archive = archive
+
+    def parts(self) -> Iterator[BlockPart]:
+        """All blocks in lexicographic order, a chunk at a time, each checked before it is given out.
+
+        Raises:
+            MapError: a chunk is damaged; says which.
+        """
+        last = -1
+        for n, chunk in enumerate(self.manifest.chunks):
+            where = f"{self._path}: chunk {n} of {len(self.manifest.chunks)}"
+            keys, values = _unpack(self._read_chunk(n, chunk, where), chunk, where)
+            packed = pack_keys(keys)
+            if np.abs(keys.astype(np.int64)).max() >= KEY_LIMIT or not (np.diff(packed, prepend=last) > 0).all():
+                raise MapError(f"{where}: block coordinates are out of range or not in order. {MEND}")
+            last = int(packed[-1])
+            yield keys, values
+
+    def _read_chunk(self, n: int, chunk: MapChunk, where: str) -> dict[str, NDArray[Any]]:
+        arrays: dict[str, NDArray[Any]] = {}
+        hashed, dtypes = hashlib.sha256(), _dtypes(self.manifest)
+        for name, shape in _shapes(chunk, len(self.manifest.label_set)).items():
+            head = _npy_head(dtypes[name], shape)
+            size = len(head) + int(np.prod(shape)) * np.dtype(dtypes[name]).itemsize
+            content = _read_member(self._archive, _member(n, name), size, f"{where}: {name}")
+            if not content.startswith(head):
+                raise MapError(f"{where}: {name} is not an array {dtypes[name]} of shape {shape}. {MEND}")
+            hashed.update(content)
+            arrays[name] = np.frombuffer(content, dtypes[name], offset=len(head)).reshape(shape)
+        if hashed.hexdigest() != chunk.sha256:
+            raise MapError(f"{where} is damaged: its SHA-256 is not the manifest's. {MEND}")
+        return arrays
+
+
+def _dtypes(manifest: MapManifest) -> dict[str, str]:
+    return {**_ARRAYS, "evidence": _EVIDENCE[manifest.config.evidence]}
+
+
+def _member(n: int, name: str) -> str:
+    return f"{n:06d}/{name}.npy"
+
+
+def _write_chunk(
+    archive: zipfile.ZipFile, n: int, keys: NDArray[np.int32], values: BlockValues, dtypes: dict[str, str]
+) -> MapChunk:
+    measured, voted = values.weight > 0, values.votes > 0
+    arrays = {
+        "keys": keys,
+        "measured": np.packbits(measured, axis=1),
+        "voted": np.packbits(voted, axis=1),
+        "tsdf": values.tsdf[measured],
+        "weight": values.weight[measured],
+        "color": values.color[measured],
+        "evidence": values.evidence[voted],
+        "votes": values.votes[voted],
+    }
+    hashed = hashlib.sha256()
+    for name, dtype in dtypes.items():
+        array = np.ascontiguousarray(arrays[name], dtype)
+        with archive.open(_member(n, name), "w") as member:
+            for content in (_npy_head(dtype, array.shape), array.reshape(-1).view(np.uint8).data):
+                hashed.update(content)
+                member.write(content)
+    return MapChunk(blocks=len(keys), measured=int(measured.sum()), voted=int(voted.sum()), sha256=hashed.hexdigest())
+
+
+def _unpack(arrays: dict[str, NDArray[Any]], chunk: MapChunk, where: str) -> BlockPart:
+    measured = np.unpackbits(arrays["measured"], axis=1).astype(np.bool_)
+    voted = np.unpackbits(arrays["voted"], axis=1).astype(np.bool_)
+    if (int(measured.sum()), int(voted.sum())) != (chunk.measured, chunk.voted):
+        raise MapError(f"{where}: its masks and its values do not fit each other. {MEND}")
+    full: dict[str, NDArray[Any]] = {}
+    for name in BlockValues._fields:
+        mask = voted if name in ("evidence", "votes") else measured
+        full[name] = np.zeros((*mask.shape, *arrays[name].shape[1:]), arrays[name].dtype)
+        full[name][mask] = arrays[name]
+    return arrays["keys"], BlockValues(**full)
+
+
+def _shapes(chunk: MapChunk, classes: int) -> dict[str, tuple[int, ...]]:
+    mask, measured, voted = (chunk.blocks, BLOCK_VOXELS // 8), (chunk.measured,), (chunk.voted,)
+    shapes = ((chunk.blocks, 3), mask, mask, measured, measured, (*measured, 3), (*voted, classes), voted)
+    return dict(zip(_ARRAYS, shapes, strict=True))
+
+
+def _npy_head(dtype: str, shape: tuple[int, ...]) -> bytes:
+    """What stands before the values in an .npy file of version 1.0; NumPy's own differs between its versions."""
+    text = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape!r}, }}"
+    padded = text.ljust(128 - 10 - 1) + "\n"  # starts on a multiple of 64 bytes
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(padded)) + padded.encode("ascii")
+
+
+def _bounds_m(corners: list[NDArray[np.int32]], voxel_size_m: float) -> Any:
+    if not corners:
+        return None
+    both = np.stack((np.min(corners, axis=0), np.max(corners, axis=0))) * (BLOCK_SIDE * voxel_size_m)
+    return tuple(tuple(float(x) for x in corner) for corner in both)
+
+
+def _read_manifest(path: Path, file: BinaryIO, archive: zipfile.ZipFile) -> MapManifest:
+    where = f"{path}: {_MANIFEST}"
+    names = archive.namelist()
+    if _MANIFEST not in names:
+        raise MapError(f"{path}: not a map file: there is no {_MANIFEST} in it")
+    size = archive.getinfo(_MANIFEST).file_size
+    if size > _MAX_MANIFEST_BYTES:
+        raise MapError(f"{where} is damaged: {size} bytes are too many. {MEND}")
+    content = _read_member(archive, _MANIFEST, size, where)
+    manifest = parse_manifest(content, where)
+    with _told(f"{path}: cannot be read"):
+        file.seek(-_END_BYTES, 2)
+        end = file.read()
+    if not (end.startswith(b"PK\5\6") and end[-_COMMENT_BYTES:].startswith(_COMMENT)):
+        raise MapError(f"{path}: damaged: it is cut off, or something stands behind its end. {MEND}")
+    if archive.comment != _COMMENT + digest(content).encode():
+        raise MapError(f"{where} is damaged: its SHA-256 is not the one at the end of the file. {MEND}")
+    if names != [*(_member(n, name) for n in range(len(manifest.chunks)) for name in _ARRAYS), _MANIFEST]:
+        raise MapError(f"{path}: damaged: arrays are missing, or others are there. {MEND}")
+    return manifest
+
+
+def _read_member(archive: zipfile.ZipFile, name: str, size: int, where: str) -> bytes:
+    """A member that must have ``size`` bytes."""
+    info = archive.getinfo(name)
+    if info.file_size != size or info.compress_type != zipfile.ZIP_DEFLATED or info.flag_bits & 1:
+        raise MapError(f"{where} is damaged: not {size} compressed bytes. {MEND}")
+    with _told(f"{where} is damaged"), archive.open(info) as member:
+        content = member.read()
+    if len(content) != size:
+        raise MapError(f"{where} is damaged: {len(content)} bytes instead of {size}. {MEND}")
+    return content
+
+
+@contextmanager
+def _told(what: str) -> Iterator[None]:
+    """What zip and decompression find wrong is an error of ours."""
+    try:
+        yield
+    except _UNREADABLE as error:
+        raise MapError(f"{what}: {error}. {MEND}") from error

@@ -1,0 +1,1 @@
+"""Fusion of frames and votes into voxel blocks."""

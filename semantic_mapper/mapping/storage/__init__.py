@@ -1,0 +1,1 @@
+"""Voxel blocks in memory and on disk."""

@@ -1,0 +1,418 @@
+"""Storage of the map: Open3D's sparse voxel blocks, with numpy views of their buffers and growth in bounded steps.
+
+With a limit on memory, the blocks that were used longest ago go to a ``BlockStore`` on disk and come back, equal to the
+bit, when they are asked for.
+
+A block holds 8 x 8 x 8 voxels in the order [z][y][x]; voxel (i, j, k) of block (x, y, z) is the point
+``(8 * (x, y, z) + (i, j, k)) * voxel_size_m`` in the world.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.errors import MapError
+from semantic_mapper.log_events import get_logger
+from semantic_mapper.mapping.fusion.evidence import EVIDENCE_DTYPES
+from semantic_mapper.mapping.open3d_loader import load_open3d
+from semantic_mapper.mapping.storage.block_index import (
+    BlockIndex,
+    find_blocks,
+    has_room,
+    insert_blocks,
+    make_block_index,
+    pack_keys,
+    unpack_keys,
+)
+from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS, BlockStore, BlockValues, PackedBlocks, pack_blocks
+from semantic_mapper.mapping.storage.grid_buffers import (
+    ATTRIBUTES,
+    GridBuffers,
+    advised_mb,
+    copy_blocks,
+    make_open3d_grid,
+    view_buffers,
+)
+
+LEAST_RESIDENT = 256  # blocks that memory has room for, whatever the limit
+EVICTED_AT_ONCE = 32  # at least, and
+EVICTED_SHARE = 32  # at least this part of what memory has room for: sorting out what to evict looks at all of it
+TILE_BLOCKS = 4096  # blocks brought together at a time to be read where some are on disk
+NEIGHBOURS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
+_READ_AT_ONCE = 256  # blocks between memory and disk: a copy of them takes room beside both
+
+_log = get_logger(__name__)
+
+
+class BlockGrid:
+    """A VoxelBlockGrid that grows by half when full and never past ``max_blocks``.
+
+    Args:
+        voxel_size_m: Edge of a voxel.
+        classes: L, channels of the class evidence.
+        initial_blocks: Capacity at start.
+        max_blocks: Blocks at most, in memory and on disk.
+        memory_bytes: For blocks in memory; 0 = no limit.
+        evidence: Key of ``EVIDENCE_DTYPES``.
+    """
+
+    def __init__(
+        self,
+        voxel_size_m: float,
+        classes: int,
+        initial_blocks: int,
+        max_blocks: int,
+        memory_bytes: int = 0,
+        evidence: str = "float32",
+    ) -> None:
+        self._o3d = load_open3d()
+        self._max_blocks = max_blocks
+        self._voxel_size_m = voxel_size_m
+        self._classes = classes
+        self.evidence = evidence
+        channels = (1, 1, 3, classes, 1)
+        value_bytes = 4 * (1 + 1 + 3 + 1) + np.dtype(EVIDENCE_DTYPES[evidence]).itemsize * classes
+        self.block_bytes = BLOCK_VOXELS * value_bytes + 12
+        self._max_resident = max_blocks
+        if memory_bytes > 0:
+            self._max_resident = min(max_blocks, max(LEAST_RESIDENT, memory_bytes // self.block_bytes))
+            initial_blocks = self._max_resident  # at once: growing needs room for the old memory beside the new
+        self._channels = channels
+        self._grid = self._make_grid(max(1, min(initial_blocks, max_blocks)))
+        self._map = self._grid.hashmap()
+        self._index = make_block_index(np.empty((0, 3), np.int32), np.empty(0, np.int32))
+        self._store: BlockStore | None = None
+        self._told_of_portions = False
+        self._clock = 0
+        self._used = np.zeros(self.capacity, np.int64)  # by buffer index: when last asked for
+        self._version = np.zeros(self.capacity, np.int64)  # by buffer index: see ``mark_changed``
+        # Called with the packed keys that ``activate`` was asked for, before anything is done with them.
+        self.watchers: list[Callable[[NDArray[np.int64]], None]] = []
+
+    @property
+    def grid(self) -> Any:
+        """The ``open3d.t.geometry.VoxelBlockGrid`` itself."""
+        return self._grid
+
+    @property
+    def index(self) -> BlockIndex:
+        """Block key -> buffer index; valid until the next ``activate``."""
+        return self._index
+
+    @property
+    def block_count(self) -> int:
+        """Blocks in the map, in memory and on disk."""
+        return self.resident_count + self.stored_count
+
+    @property
+    def resident_count(self) -> int:
+        """Blocks in memory."""
+        return int(self._map.size())
+
+    @property
+    def stored_count(self) -> int:
+        """Blocks on disk."""
+        return 0 if self._store is None else len(self._store)
+
+    @property
+    def stored_bytes(self) -> int:
+        """Bytes that the file of those on disk takes."""
+        return 0 if self._store is None else self._store.file_bytes
+
+    @property
+    def capacity(self) -> int:
+        """Blocks there is memory for."""
+        return int(self._map.capacity())
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes held for voxels and block tables, used or not."""
+        return self.capacity * self.block_bytes + self._index.slot_keys.nbytes + self._index.slot_values.nbytes
+
+    @property
+    def room(self) -> int:
+        """Blocks that memory may ever hold."""
+        return self._max_resident
+
+    def buffers(self) -> GridBuffers:
+        """Views of the present buffers. Take them anew after every ``activate``: growth moves the memory."""
+        return view_buffers(self._map)
+
+    def sorted_blocks(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Keys (B, 3) in lexicographic order and their buffer indices (B,)."""
+        indices = self._map.active_buf_indices().numpy().astype(np.int32)
+        keys = self._map.key_tensor().numpy()[indices]
+        order = np.argsort(pack_keys(keys))
+        return keys[order], indices[order]
+
+    def activate(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Make sure that the blocks of unique packed keys (B,), about to change, are in memory; return indices (B,).
+
+        New ones are zero; those on disk come back as they were.
+
+        Raises:
+            MapError: where the map would exceed ``max_blocks``, or these blocks alone the memory (``portions`` takes
+                any number of them), or the disk fails; no block has changed then.
+        """
+        for watcher in self.watchers:
+            watcher(packed)
+        return self._bring_together(packed)
+
+    def _bring_together(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
+        self._clock += 1
+        found = find_blocks(self._index, packed)
+        missing = packed[found < 0]
+        if len(missing):
+            self._check_room(missing)
+            if len(packed) > self._max_resident:
+                raise MapError(f"{len(packed)} blocks at once, memory has room for {self._max_resident} of them")
+            self._bring_in(packed, missing)
+            found = find_blocks(self._index, packed)
+        self._used[found] = self._clock
+        return found
+
+    def portions(self, packed: NDArray[np.int64]) -> Iterator[NDArray[np.int32]]:
+        """``activate`` unique packed keys (B,) so many at a time as memory has room for.
+
+        Yields:
+            Buffer indices of a part of them, valid until the next; one empty part where there are no keys.
+
+        Raises:
+            MapError: where the map would exceed ``max_blocks``, before the first part; or the disk fails.
+        """
+        if len(packed) > self._max_resident:
+            found = find_blocks(self._index, packed)
+            self._check_room(packed[found < 0])
+            self._tell_of_portions(len(packed))
+            packed = packed[np.argsort(found < 0, kind="stable")]  # first those in memory: they need not come back
+        for start in range(0, max(len(packed), 1), self._max_resident):
+            yield self.activate(packed[start : start + self._max_resident])
+
+    def reserve(self, blocks: int) -> None:
+        """Make room for so many blocks at once, as far as the limit on memory goes."""
+        if min(blocks, self._max_resident) > self.capacity:
+            self._grow(blocks)
+
+    def page_in(self, packed: NDArray[np.int64]) -> None:
+        """Make sure that the first of these existing blocks (B,) are in memory to be read: as many as have room."""
+        self._bring_together(packed[: self._max_resident])
+
+    def mark_changed(self, blocks: NDArray[np.int32], version: int) -> None:
+        """Note that blocks with these buffer indices were changed at ``version`` of the map."""
+        self._version[blocks] = version
+
+    def mark_all_changed(self, version: int, each: int) -> int:
+        """Note that all blocks were changed, ``each`` of them at a version, from ``version`` on; returns the last."""
+        _, indices = self.sorted_blocks()
+        count = self.block_count
+        versions = version + np.arange(count) // each
+        self._version[indices] = versions[: len(indices)]
+        if self._store is not None:
+            stored = self._store.versions
+            stored.put(stored.items()[0], versions[len(indices) :])
+        return version + max(count - 1, 0) // each
+
+    def changed_since(self, version: int) -> NDArray[np.int32]:
+        """Keys (B, 3) of all blocks that were changed after ``version``, in lexicographic order."""
+        return unpack_keys(self.versions_since(version)[0])
+
+    def versions_since(self, version: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Packed keys (B,) of all blocks that were changed after ``version``, sorted, and when each was: (B,)."""
+        keys, indices = self.sorted_blocks()
+        packed, versions = pack_keys(keys), self._version[indices]
+        if self._store is not None:
+            stored = self._store.versions.items()
+            packed, versions = np.concatenate((packed, stored[0])), np.concatenate((versions, stored[1]))
+        newer = np.flatnonzero(versions > version)
+        newer = newer[np.argsort(packed[newer])]
+        return packed[newer], versions[newer]
+
+    def stored_keys(self) -> NDArray[np.int32]:
+        """Keys (B, 3) of the blocks on disk."""
+        return unpack_keys(np.empty(0, np.int64) if self._store is None else self._store.versions.items()[0])
+
+    def all_keys(self) -> NDArray[np.int32]:
+        """Keys (B, 3) of all blocks in lexicographic order."""
+        keys = np.concatenate((self.sorted_blocks()[0], self.stored_keys()))
+        return keys[np.argsort(pack_keys(keys))]
+
+    def keys_between(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Those of ``all_keys`` from ``low`` (3,) to ``high`` (3,), both included, without sorting the others."""
+        resident = self._map.key_tensor().numpy()[self._map.active_buf_indices().numpy()]
+        parts = [keys[((keys >= low) & (keys <= high)).all(axis=1)] for keys in (resident, self.stored_keys())]
+        keys = np.concatenate(parts)
+        return keys[np.argsort(pack_keys(keys))]
+
+    def tiles(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], BlockGrid]]:
+        """All blocks, in lexicographic order, in parts that fit in memory.
+
+        Yields:
+            Keys (B, 3), their buffer indices (B,) in a grid, and that grid: this one where nothing is on disk, else a
+            temporary one, which also holds the next blocks along each axis.
+        """
+        if self._store is None or not len(self._store):
+            yield (*self.sorted_blocks(), self)
+            return
+        everything = pack_keys(self.all_keys())
+        for start in range(0, len(everything), TILE_BLOCKS):
+            part = everything[start : start + TILE_BLOCKS]
+            around = np.unique(pack_keys((unpack_keys(part)[:, None] + NEIGHBOURS).reshape(-1, 3)))
+            wanted = around[np.isin(around, everything)]
+            tile = self.holding(wanted)
+            yield unpack_keys(part), find_blocks(tile.index, part), tile
+
+    def holding(self, packed: NDArray[np.int64]) -> BlockGrid:
+        """A grid with these existing blocks (B,) in memory: this one where nothing is on disk, else a temporary one."""
+        if not self.stored_count:
+            return self
+        copy = BlockGrid(self._voxel_size_m, self._classes, len(packed), len(packed), evidence=self.evidence)
+        copy.fill(packed, self.read(packed))
+        return copy
+
+    def read(self, packed: NDArray[np.int64]) -> BlockValues:
+        """A copy of blocks (B,) that exist, from memory or disk."""
+        found = find_blocks(self._index, packed)
+        here = found >= 0
+        buffers = self.buffers()
+        values = BlockValues(*(getattr(buffers, name)[found] for name in ATTRIBUTES))
+        if not here.all():
+            assert self._store is not None
+            stored = self._store.get(packed[~here])
+            for mine, theirs in zip(values, stored, strict=True):
+                mine[~here] = theirs
+        return values
+
+    def pack(self, packed: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], PackedBlocks]]:
+        """A packed copy of blocks (B,) that exist, part by part: first those in memory, then those on disk.
+
+        Yields:
+            Positions in ``packed`` (P,), and the blocks there.
+        """
+        found = find_blocks(self._index, packed)
+        here, away = np.flatnonzero(found >= 0), np.flatnonzero(found < 0)
+        buffers = self.buffers()
+        yield here, pack_blocks(BlockValues(*(getattr(buffers, name) for name in ATTRIBUTES)), found[here])
+        for start in range(0, len(away), _READ_AT_ONCE):
+            part = away[start : start + _READ_AT_ONCE]
+            yield part, pack_blocks(self.read(packed[part]), np.arange(len(part), dtype=np.int32))
+
+    def fill(self, packed: NDArray[np.int64], values: BlockValues) -> NDArray[np.int32]:
+        """Make blocks (B,) be ``values``, new or not; returns their buffer indices."""
+        blocks = self.activate(packed)
+        buffers = self.buffers()
+        for name in ATTRIBUTES:
+            getattr(buffers, name)[blocks] = getattr(values, name)
+        return blocks
+
+    def _check_room(self, missing: NDArray[np.int64]) -> None:
+        new = len(missing) - (0 if self._store is None else int(self._store.holds(missing).sum()))
+        if self.block_count + new > self._max_blocks:
+            raise MapError(
+                f"the map is full: {self.block_count} blocks, {new} more asked for, limit {self._max_blocks} "
+                f"(voxel_map.max_blocks; {self.block_bytes / 1024:.0f} KiB a block). Raise the limit, use larger "
+                "voxels, or start a new map; what is in this one stays usable"
+            )
+
+    def _tell_of_portions(self, blocks: int) -> None:
+        if self._told_of_portions:
+            return
+        self._told_of_portions = True
+        reason = (
+            "a frame touches more blocks than memory has room for: it goes through the disk part by part, which is "
+            f"slow; raise voxel_map.memory_mb to {advised_mb(blocks, self.block_bytes)} or more, or use larger voxels"
+        )
+        _log.warning("memory_is_short", blocks=blocks, room=self._max_resident, reason=reason)
+
+    def _bring_in(self, packed: NDArray[np.int64], missing: NDArray[np.int64]) -> None:
+        """Make room for the missing blocks, add them, and read those that were on disk."""
+        needed = self.resident_count + len(missing)
+        if needed > self._max_resident:
+            self._evict(needed - self._max_resident, packed)
+        elif needed > self.capacity:
+            self._grow(needed)
+        stored = self._store
+        back = missing[:0] if stored is None else missing[stored.holds(missing)]
+        if stored is None or not len(back):
+            self._add(missing)
+            return
+        new = missing[~stored.holds(missing)]
+        for start in range(0, len(back), _READ_AT_ONCE):
+            part = back[start : start + _READ_AT_ONCE]
+            values, versions = stored.get(part), stored.versions.find(part)
+            stored.drop(part)  # may fail, and then the blocks are there still; what comes now does not
+            self._add(part)
+            indices, buffers = find_blocks(self._index, part), self.buffers()
+            for name in ATTRIBUTES:
+                getattr(buffers, name)[indices] = getattr(values, name)
+            self._version[indices] = versions
+        self._add(new)
+
+    def _evict(self, count: int, keep: NDArray[np.int64]) -> None:
+        """Put the ``count`` blocks that were used longest ago, and some more, on disk; those of ``keep`` stay."""
+        if self._store is None:
+            self._store = BlockStore(self._classes, self.evidence)
+            _log.info("map_pages", resident=self._max_resident, reason="voxel_map.memory_mb is used up")
+        keys, indices = self.sorted_blocks()
+        packed = pack_keys(keys)
+        free = ~np.isin(packed, keep)
+        oldest = np.flatnonzero(free)[np.argsort(self._used[indices[free]], kind="stable")]
+        count = max(count, EVICTED_AT_ONCE, self._max_resident // EVICTED_SHARE)
+        going = np.sort(oldest[:count])
+        buffers = self.buffers()
+        values = BlockValues(*(getattr(buffers, name) for name in ATTRIBUTES))
+        try:
+            for start in range(0, len(going), _READ_AT_ONCE):
+                part = going[start : start + _READ_AT_ONCE]
+                blobs = pack_blocks(values, indices[part]).blobs()
+                self._store.put_packed(packed[part], self._version[indices[part]], blobs)
+                self._map.erase(self._o3d.core.Tensor.from_numpy(np.ascontiguousarray(keys[part])))
+        finally:  # also where the disk is full: blocks that are there have left memory
+            self._index = make_block_index(*self.sorted_blocks())
+
+    def _make_grid(self, capacity: int) -> Any:
+        """An empty Open3D grid.
+
+        Raises:
+            MapError: the machine does not have so much memory, or none that is free.
+        """
+        needed, there = capacity * self.block_bytes, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        mend = "lower voxel_map.initial_blocks, max_blocks or memory_mb, or use larger voxels"
+        if needed > there:
+            raise MapError(
+                f"memory for {capacity} blocks is {needed / 1e9:.1f} GB, this machine has {there / 1e9:.1f} GB; {mend}"
+            )
+        try:
+            return make_open3d_grid(self._voxel_size_m, self._channels, capacity, self.evidence)
+        except RuntimeError as error:
+            raise MapError(f"no memory for {capacity} blocks ({needed / 1e9:.1f} GB): {error}; {mend}") from error
+
+    def _grow(self, needed: int) -> None:
+        capacity = min(max(needed, self.capacity + self.capacity // 2), self._max_resident)
+        _log.debug("map_grows", blocks=self.block_count, capacity=capacity)
+        keys, before = self.sorted_blocks()
+        larger = self._make_grid(capacity)
+        indices = copy_blocks(self.buffers(), keys, before, larger.hashmap())
+        used, version = self._used[before], self._version[before]
+        self._grid, self._map = larger, larger.hashmap()
+        self._index = make_block_index(keys, indices)
+        self._used, self._version = np.zeros(self.capacity, np.int64), np.zeros(self.capacity, np.int64)
+        self._used[indices], self._version[indices] = used, version
+
+    def _add(self, packed: NDArray[np.int64]) -> None:
+        keys = np.ascontiguousarray(unpack_keys(packed))
+        indices, inserted = self._map.activate(self._o3d.core.Tensor.from_numpy(keys))
+        if not bool(inserted.numpy().all()):  # the index says that they were not there: the two tables disagree
+            raise MapError(f"block table and Open3D's hash map disagree about {len(keys)} new blocks; this is a bug")
+        added = indices.numpy().astype(np.int32)
+        if not has_room(self._index, self.resident_count):
+            self._index = make_block_index(*self.sorted_blocks())
+        else:
+            insert_blocks(self._index, packed, added)
+        for view in self.buffers()[1:]:  # Open3D hands out memory as its last user left it
+            view[added] = 0
+        self._version[added] = 0

@@ -1,0 +1,1 @@
+"""The map and the field seen from a pose."""

@@ -1,0 +1,118 @@
+"""The map seen from a pose: a compiled ray caster over the sparse blocks.
+
+Open3D's own ``ray_cast`` is off by half a voxel and can crash when its range buffer overflows; this one walks from
+block to block, steps by the TSDF and finds the zero crossing on the interpolated field. Its C code is in
+``ray_casting.h``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.config import VoxelMapConfig
+from semantic_mapper.kernels import parallel_kernel
+from semantic_mapper.mapping.fusion.allocation import Camera, blocks_in_view, view_bounds
+from semantic_mapper.mapping.storage.block_grid import BlockGrid
+from semantic_mapper.mapping.storage.block_index import BlockIndex, unpack_keys
+from semantic_mapper.mapping.storage.grid_buffers import GridBuffers
+from semantic_mapper.types import CameraIntrinsics, Float32, Int64, UInt8
+
+
+class Window(NamedTuple):
+    """Part of an image: first row and column, rows and columns."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+    def halves(self) -> tuple[Window, Window]:
+        """Both halves of its longer side."""
+        if self.height > self.width:
+            half = self.height // 2
+            return self._replace(height=half), self._replace(top=self.top + half, height=self.height - half)
+        half = self.width // 2
+        return self._replace(width=half), self._replace(left=self.left + half, width=self.width - half)
+
+
+def cast_view(
+    grid: BlockGrid, camera: Camera, intrinsics: CameraIntrinsics, config: VoxelMapConfig
+) -> tuple[Float32, UInt8, NDArray[np.int64], Float32]:
+    """See the map through a camera, up to ``depth_max_m`` away.
+
+    What it may see and is on disk comes back into memory; where there is no room for all of it, for a part of the image
+    after the other. (Where even what one pixel may see does not fit, its ray meets the nearest of that.)
+
+    Returns:
+        depth (H, W) float32 metres (0 = miss), rgb (H, W, 3) uint8, channel (H, W) int64 (-1 = no votes),
+        confidence (H, W) float32.
+    """
+    size = (intrinsics.height, intrinsics.width)
+    depth, confidence = np.zeros(size, np.float32), np.zeros(size, np.float32)
+    rgb, channel = np.zeros((*size, 3), np.uint8), np.full(size, -1, np.int64)
+    for window, seen in _windows(grid, camera, intrinsics, config):
+        if len(seen):
+            grid.page_in(seen)
+        _cast_view_rows(
+            window.height,
+            camera,
+            window,
+            config.voxel_size_m,
+            config.truncation_voxels,
+            config.depth_max_m,
+            config.vote_discount,
+            grid.index,
+            grid.buffers(),
+            depth,
+            rgb,
+            channel,
+            confidence,
+        )
+    return depth, rgb, channel, confidence
+
+
+def _windows(
+    grid: BlockGrid, camera: Camera, intrinsics: CameraIntrinsics, config: VoxelMapConfig
+) -> Iterator[tuple[Window, NDArray[np.int64]]]:
+    """Parts of an image that together are all of it, each with packed keys (B,) of what it may see, nearest first.
+
+    One part, and no keys, where nothing is on disk.
+    """
+    whole = Window(0, 0, intrinsics.height, intrinsics.width)
+    if not grid.stored_count:
+        yield whole, np.empty(0, np.int64)
+        return
+    voxel, reach = config.voxel_size_m, config.depth_max_m + config.truncation_voxels * config.voxel_size_m
+    waiting = [(whole, grid.keys_between(*view_bounds(camera, intrinsics, voxel, reach)))]
+    while waiting:
+        window, keys = waiting.pop()
+        moved = camera._replace(cx=camera.cx - window.left, cy=camera.cy - window.top)
+        seen = blocks_in_view(moved, (window.height, window.width), keys, voxel, reach)
+        if len(seen) <= grid.room or window.height * window.width == 1:
+            yield window, seen
+        else:
+            waiting += [(half, unpack_keys(seen)) for half in reversed(window.halves())]
+
+
+@parallel_kernel()
+def _cast_view_rows(
+    rows: int,
+    camera: Camera,
+    window: Window,
+    voxel_size_m: float,
+    truncation_voxels: float,
+    depth_max_m: float,
+    vote_discount: float,
+    index: BlockIndex,
+    buffers: GridBuffers,
+    depth: Float32,
+    rgb: UInt8,
+    channel: Int64,
+    confidence: Float32,
+) -> None:
+    """Fill the rows of a window of what ``cast_view`` returns."""
+    ...

@@ -1,0 +1,396 @@
+"""The map after a correction is the map that the corrected poses make."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import structlog
+import torch
+from scipy.spatial import cKDTree
+
+from semantic_mapper.errors import MapError, PoseError
+from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.geometry import transform, unproject
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapping.correction.pose_correction import ALWAYS
+from semantic_mapper.mapping.pipeline import MappingPipeline
+from semantic_mapper.mapping.voxel_map import BLOCKS_A_VERSION, VoxelMap
+from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
+from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
+from tests.mapping.correction.test_history import damage
+from tests.small import tiny_config, tiny_field, tiny_frames
+
+COUNT = 32
+FINE = CameraIntrinsics(132.0, 132.0, 95.5, 71.5, 192, 144)
+
+
+def make_pipeline(max_frames: int = 100, **changes: object) -> MappingPipeline:
+    base = {
+        "render": {"encode_width": 96, "scale": 0.25},
+        "keyframes": {"source_views": 2, "translation_m": 0.1},
+        "history": {"max_frames": max_frames},
+    }
+    config = tiny_config(**{**base, **changes})
+    return MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS)
+
+
+def mapped(frames: list[PosedFrame] | tuple[PosedFrame, ...], **changes: object) -> MappingPipeline:
+    pipeline = make_pipeline(**changes)  # type: ignore[arg-type]
+    for frame in frames:
+        pipeline.step(frame)
+    return pipeline
+
+
+def finish(pipeline: MappingPipeline) -> None:
+    while pipeline.advance_correction(3):
+        pass
+
+
+def drift(share: float) -> Float64:
+    """(4, 4) in the world: up to 9 cm and 4.5 degrees away from the truth."""
+    turn = np.radians([1.0, -1.5 * np.cos(2 * share), 4.0]) * share
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(turn)[0]
+    T[:3, 3] = 0.06 * np.sin(2.5 * share), -0.05 * share, 0.04 * share**2
+    return T
+
+
+def drifted(frames: tuple[PosedFrame, ...]) -> list[PosedFrame]:
+    last = len(frames) - 1
+    return [replace(f, T_world_camera=drift(i / last) @ f.T_world_camera) for i, f in enumerate(frames)]
+
+
+def true_poses(frames: tuple[PosedFrame, ...], stride: int) -> dict[int, Float64]:
+    chosen = {*range(0, len(frames), stride), len(frames) - 1}
+    return {frames[i].stamp_ns: frames[i].T_world_camera for i in sorted(chosen)}
+
+
+def bits(voxel_map: VoxelMap) -> dict[str, bytes]:
+    return {name: values.tobytes() for name, values in voxel_map.block_state().items()}
+
+
+def same(a: VoxelMap, b: VoxelMap) -> bool:
+    x, y = a.block_state(), b.block_state()
+    return a.frames == b.frames and all(x[k].tobytes() == y[k].tobytes() for k in x)
+
+
+def true_planes() -> tuple[cKDTree, Float64, Float64]:
+    """Points of the room's true surface with their normals, as a perfect camera sees them."""
+    points, normals = [], []
+    for frame in room_frames(TRAIN_SEEDS[7], COUNT, FINE):
+        p = unproject(frame.depth_m, FINE)
+        n = np.cross(p[1:-1, 2:] - p[1:-1, :-2], p[2:, 1:-1] - p[:-2, 1:-1])
+        n /= np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-12)
+        points.append(transform(frame.T_world_camera, p[1:-1, 1:-1]).reshape(-1, 3))
+        normals.append((n @ frame.T_world_camera[:3, :3].T).reshape(-1, 3))
+    return cKDTree(np.concatenate(points)), np.concatenate(points), np.concatenate(normals)
+
+
+def median_error(voxel_map: VoxelMap, truth: tuple[cKDTree, Float64, Float64]) -> float:
+    """Median distance of the map's points to the plane of the nearest true point, metres."""
+    tree, points, normals = truth
+    xyz = voxel_map.points().xyz
+    _, nearest = tree.query(xyz)
+    return float(np.median(np.abs(((xyz - points[nearest]) * normals[nearest]).sum(axis=1))))
+
+
+def test_the_corrected_map_of_a_drifting_camera_is_as_good_as_that_of_true_poses():
+    frames = tiny_frames(COUNT)
+    truth = true_planes()
+    ideal = median_error(mapped(frames).voxel_map, truth)
+    pipeline = mapped(drifted(frames))
+    before = median_error(pipeline.voxel_map, truth)
+    pipeline.correct_poses(true_poses(frames, 4))
+    finish(pipeline)
+    after = median_error(pipeline.voxel_map, truth)
+    assert before > 10 * ideal
+    assert after < 1.2 * ideal
+
+
+def test_true_poses_of_all_frames_give_the_geometry_of_true_poses_to_the_bit():
+    frames = tiny_frames()
+    pipeline = mapped(drifted(frames))
+    pipeline.correct_poses(true_poses(frames, 1))
+    finish(pipeline)
+    ours, ideal = pipeline.voxel_map.block_state(), mapped(frames).voxel_map.block_state()
+    for name in ("keys", "tsdf", "weight", "color"):  # what the field rendered along the way differs a little
+        assert ours[name].tobytes() == ideal[name].tobytes(), name
+
+
+@pytest.mark.parametrize("max_frames", [100, 3])
+def test_unchanged_poses_give_the_same_map_to_the_bit_also_where_frames_have_left(max_frames: int):
+    frames = list(tiny_frames())
+    frames[3] = replace(frames[3], depth_m=None)
+    pipeline = mapped(frames, max_frames=max_frames)
+    without = mapped(frames, max_frames=0)
+    assert same(pipeline.voxel_map, without.voxel_map)
+    pipeline.correct_poses(
+        {frames[-1].stamp_ns: frames[-1].T_world_camera, frames[3].stamp_ns: frames[3].T_world_camera}
+    )
+    finish(pipeline)
+    assert pipeline.corrector.status.completed == 1
+    assert same(pipeline.voxel_map, without.voxel_map)
+
+
+def test_frames_that_come_during_the_rebuild_are_in_the_new_map():
+    frames = tiny_frames(8)
+    at_once, between = mapped(drifted(frames)[:5]), mapped(drifted(frames)[:5])
+    poses = true_poses(frames[:5], 2)
+    between.correct_poses(poses)
+    old = between.voxel_map.block_state()
+    assert between.advance_correction(2) and old["tsdf"].tobytes() == between.voxel_map.block_state()["tsdf"].tobytes()
+    for frame in drifted(frames)[5:]:
+        between.step(frame)
+        assert between.advance_correction(1)
+    finish(between)
+    for frame in drifted(frames)[5:]:
+        at_once.step(frame)
+    at_once.correct_poses(poses)
+    finish(at_once)
+    assert between.voxel_map.frames == 8 and same(between.voxel_map, at_once.voxel_map)
+
+
+def test_a_correction_during_another_one_is_as_if_it_came_after_it():
+    frames = tiny_frames()
+    late = drifted(frames)
+    first = {
+        late[0].stamp_ns: drift(0.3) @ late[0].T_world_camera,
+        late[4].stamp_ns: drift(0.1) @ late[4].T_world_camera,
+    }
+    second = {late[1].stamp_ns: frames[1].T_world_camera, late[5].stamp_ns: frames[5].T_world_camera}
+    joined, in_a_row = mapped(late), mapped(late)
+    joined.correct_poses(first, until_ns=ALWAYS)
+    joined.advance_correction(4)
+    assert joined.correct_poses(second).done == 0
+    finish(joined)
+    for poses, until_ns in ((first, ALWAYS), (second, None)):
+        in_a_row.correct_poses(poses, until_ns=until_ns)
+        finish(in_a_row)
+    assert same(joined.voxel_map, in_a_row.voxel_map)
+    assert joined.corrector.status == in_a_row.corrector.status
+    assert (
+        joined.corrector.place(late[0]).T_world_camera.tobytes()
+        == in_a_row.corrector.place(late[0]).T_world_camera.tobytes()
+    )
+
+
+def test_keyframes_move_with_their_frames_and_anchors_of_another_recording_stay():
+    frames = tiny_frames()
+    late = drifted(frames)
+    config = make_pipeline().config
+    foreign = replace(tiny_frames(2, 8)[1], stamp_ns=5)
+    anchors = (foreign, replace(late[2], T_world_camera=late[2].T_world_camera.copy()))
+    pipeline = MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS, anchors=anchors)
+    for frame in late:
+        pipeline.step(frame)
+    before = pipeline.keyframes.keyframes
+    assert [k.labelled for k in before[:3]] == [True, True, False]
+    pipeline.correct_poses(true_poses(frames, 1))
+    finish(pipeline)
+    after = pipeline.keyframes.keyframes
+    assert after[0] is before[0]
+    true = {f.stamp_ns: f.T_world_camera for f in frames}
+    for old, new in zip(before[1:], after[1:], strict=True):
+        assert new.T_world_camera.tobytes() == true[old.stamp_ns].tobytes()
+        assert new.encoded.feature is old.encoded.feature and new.depth_m is old.depth_m
+        expected = torch.from_numpy(np.linalg.inv(true[old.stamp_ns])).float()
+        torch.testing.assert_close(new.encoded.T_camera_world[0], expected, atol=1e-6, rtol=0)
+
+
+def test_later_frames_are_trusted_unless_their_odometry_goes_on_in_the_old_world():
+    frames = tiny_frames()
+    late = drifted(frames)
+    motion = drift(1.0)
+    trusting, moving = mapped(late[:4]), mapped(late[:4])
+    poses = {f.stamp_ns: motion @ f.T_world_camera for f in late[1:3]}
+    trusting.correct_poses(poses)
+    moving.correct_poses(poses, until_ns=ALWAYS)
+    for pipeline in (trusting, moving):
+        pipeline.step(late[4])  # comes during the rebuild
+        finish(pipeline)
+        pipeline.step(late[5])
+    for pipeline, expected in ((trusting, np.eye(4)), (moving, motion)):
+        at = pipeline.corrector.poses()
+        for frame in late[3:]:
+            np.testing.assert_allclose(at["rooms", frame.stamp_ns], expected @ frame.T_world_camera, atol=1e-12)
+        for frame in late[:3]:
+            np.testing.assert_allclose(at["rooms", frame.stamp_ns], motion @ frame.T_world_camera, atol=1e-12)
+
+
+def test_queries_and_steps_go_on_during_a_rebuild_in_another_thread():
+    frames = tiny_frames()
+    late = drifted(frames)
+    pipeline = mapped(late)
+    view = frames[2]
+    seen: set[tuple[bytes, bytes]] = set()
+
+    def look() -> tuple[bytes, bytes]:
+        cast = pipeline.voxel_map.ray_cast(view.T_world_camera, view.intrinsics)
+        return pipeline.voxel_map.points().xyz.tobytes(), cast.depth_m.tobytes()
+
+    old = look()
+    pipeline.correct_poses(true_poses(frames, 1))
+    rebuild = threading.Thread(target=finish, args=(pipeline,))
+    rebuild.start()
+    while rebuild.is_alive():
+        seen.add(look())
+    rebuild.join()
+    new = look()
+    points, casts = {old[0], new[0]}, {old[1], new[1]}
+    assert len(points) == 2 and {p for p, _ in seen} <= points and {c for _, c in seen} <= casts
+    pipeline.correct_poses({f.stamp_ns: f.T_world_camera for f in late})
+    rebuild = threading.Thread(target=finish, args=(pipeline,))
+    rebuild.start()
+    more = tiny_frames(9)[6:]
+    for frame in more:
+        pipeline.step(frame)
+    rebuild.join()
+    finish(pipeline)
+    assert pipeline.voxel_map.frames == 9 and pipeline.corrector.status.completed == 2
+
+
+def test_mirrors_see_every_block_as_changed_and_a_new_epoch_after_a_swap():
+    frames = tiny_frames()
+    pipeline = mapped(drifted(frames))
+    voxel_map = pipeline.voxel_map
+    version, epoch = voxel_map.version, voxel_map.epoch
+    assert version == voxel_map.frames == 6 and len(voxel_map.changed_since(version)) == 0
+    pipeline.correct_poses(true_poses(frames, 1))
+    finish(pipeline)
+    assert pipeline.voxel_map is voxel_map and (voxel_map.version, voxel_map.epoch) == (version + 1, epoch + 1)
+    assert voxel_map.changed_since(version).tobytes() == voxel_map.block_state()["keys"].tobytes()
+    assert len(voxel_map.changed_since(voxel_map.version)) == 0
+    update = pipeline.step(tiny_frames(7)[6])
+    assert len(voxel_map.changed_since(version + 1)) == update.blocks_touched and voxel_map.version == version + 2
+
+
+def test_a_pose_out_of_reach_of_any_voxel_is_given_up_and_mapping_goes_on():
+    frames = tiny_frames(8)
+    pipeline = mapped(frames[:6], max_frames=20, voxel_map={"voxel_size_m": 0.01, "initial_blocks": 200})
+    before = bits(pipeline.voxel_map)
+    far = frames[3].T_world_camera.copy()
+    far[0, 3] = 1e7
+    with pytest.raises(PoseError, match="nearer origin"):
+        pipeline.correct_poses({frames[3].stamp_ns: far})
+    far[0, 3] = 9e4  # keys of 1 cm voxels reach 84 km
+    assert pipeline.correct_poses({frames[3].stamp_ns: far}).running
+    with pytest.raises(MapError, match="given up, the map stays as it is"):
+        finish(pipeline)
+    status = pipeline.corrector.status
+    assert not status.running and "beyond" in status.failure and bits(pipeline.voxel_map) == before
+    assert pipeline.step(frames[6]).fused
+    pipeline.correct_poses({frames[3].stamp_ns: drift(0.5) @ frames[3].T_world_camera})
+    finish(pipeline)
+    assert pipeline.corrector.status.completed == 1 and pipeline.corrector.status.failure == ""
+
+
+def test_a_new_epoch_is_told_in_parts_too():
+    frames = tiny_frames()
+    pipeline = mapped(drifted(frames), voxel_map={"voxel_size_m": 0.01, "initial_blocks": 200})
+    pipeline.correct_poses(true_poses(frames, 1))
+    finish(pipeline)
+    voxel_map, since, told = pipeline.voxel_map, 6, 0
+    assert voxel_map.block_count > 1000
+    while since < voxel_map.version:
+        changes = voxel_map.changes(since, limit=300)
+        assert 0 < len(changes.keys) <= 300 and changes.epoch == 1 and changes.newest == voxel_map.version
+        since, told = changes.version, told + len(changes.keys)
+    assert told == voxel_map.block_count
+
+
+def test_blocks_on_disk_count_as_changed_too():
+    frames = tiny_frames()
+    settings = {"voxel_size_m": 0.01, "initial_blocks": 200, "depth_max_m": 2.0, "memory_mb": 110}
+    pipeline = mapped(drifted(frames), voxel_map=settings)
+    pipeline.correct_poses(true_poses(frames, 1))
+    finish(pipeline)
+    voxel_map = pipeline.voxel_map
+    assert voxel_map.stored_blocks > 0
+    assert len(voxel_map.changed_since(6)) == voxel_map.block_count > BLOCKS_A_VERSION
+    assert voxel_map.version == 6 + -(-voxel_map.block_count // BLOCKS_A_VERSION)
+    assert len(voxel_map.changed_since(7)) == voxel_map.block_count - BLOCKS_A_VERSION
+    assert len(voxel_map.changed_since(voxel_map.version)) == 0
+
+
+def test_a_damaged_frame_is_left_out_counted_and_logged():
+    frames = tiny_frames()
+    pipeline = mapped(drifted(frames))
+    damage(pipeline.corrector._history, 2)
+    pipeline.correct_poses(true_poses(frames, 1))
+    with structlog.testing.capture_logs() as logs:
+        finish(pipeline)
+    assert [e["seq"] for e in logs if e["event"] == "history_frame_lost"] == [2]
+    assert pipeline.corrector.status.lost == 1 and pipeline.voxel_map.frames == 5
+    by_hand = VoxelMap(pipeline.config.voxel_map, ROOMS)
+    for frame in (*frames[:2], *frames[3:]):
+        by_hand.integrate(frame, frame.depth_m, None, None)
+    assert pipeline.voxel_map.block_state()["tsdf"].tobytes() == by_hand.block_state()["tsdf"].tobytes()
+
+
+def test_a_disk_that_fails_ends_correcting_but_not_mapping():
+    frames = tiny_frames()
+    pipeline = mapped(frames[:3])
+    pipeline.correct_poses({frames[1].stamp_ns: frames[1].T_world_camera})
+    pipeline.corrector._history._database.execute("DROP TABLE frames")
+    with structlog.testing.capture_logs() as logs:
+        for frame in frames[3:]:
+            assert pipeline.step(frame).fused
+    assert [e["event"] for e in logs if e["log_level"] == "error"] == ["history_ends"]
+    with pytest.raises(MapError, match="history has ended: frame seq=3 cannot be put on disk"):
+        finish(pipeline)
+    with pytest.raises(MapError, match="history has ended"):
+        pipeline.correct_poses({frames[1].stamp_ns: frames[1].T_world_camera})
+    assert not pipeline.corrector.status.running and same(pipeline.voxel_map, mapped(frames, max_frames=0).voxel_map)
+
+
+def test_a_corrected_map_that_would_be_too_large_is_given_up_and_the_old_one_stays():
+    frames = tiny_frames()
+    blocks = mapped(frames[:1]).voxel_map.block_count
+    there = [
+        replace(f, T_world_camera=frames[0].T_world_camera, rgb=frames[0].rgb, depth_m=frames[0].depth_m)
+        for f in frames
+    ]
+    pipeline = mapped(there, voxel_map={"voxel_size_m": 0.05, "max_blocks": blocks + 5})
+    before = pipeline.voxel_map.block_state()
+    away = frames[0].T_world_camera.copy()
+    away[0, 3] += 20
+    pipeline.correct_poses({frames[2].stamp_ns: away})
+    with pytest.raises(MapError, match="the map is full"):
+        finish(pipeline)
+    assert not pipeline.corrector.status.running and pipeline.corrector.status.completed == 0
+    assert before["evidence"].tobytes() == pipeline.voxel_map.block_state()["evidence"].tobytes()
+    assert pipeline.step(replace(there[0], seq=9, stamp_ns=frames[-1].stamp_ns + 1)).fused
+
+
+def test_poses_that_cannot_be_used_are_refused_and_change_nothing():
+    frames = tiny_frames()
+    pipeline = mapped(frames)
+    pipeline.step(replace(frames[5], camera_id="rear"))
+    pose = frames[1].T_world_camera
+    bad = pose.copy()
+    bad[1, 3] = np.nan
+    refused = [
+        ({}, MapError, "none was given"),
+        ({frames[1].stamp_ns: bad}, PoseError, f"corrected pose of stamp {frames[1].stamp_ns}.*NaN"),
+        ({frames[1].stamp_ns + 2_000_000: pose}, MapError, rf"no frame.*nearest is {frames[1].stamp_ns}, 2 ms away"),
+        ({("side", frames[1].stamp_ns): pose}, MapError, "of camera 'side': no frame"),
+        ({frames[5].stamp_ns: pose}, MapError, r"cameras rear, rooms have this stamp; give \(camera_id, stamp_ns\)"),
+    ]
+    for poses, error, message in refused:
+        with pytest.raises(error, match=message):
+            pipeline.correct_poses(poses)
+        assert not pipeline.corrector.status.running
+    pipeline.correct_poses({("rear", frames[5].stamp_ns): frames[5].T_world_camera})
+    with pytest.raises(MapError, match=r"no frames are kept; set history\.max_frames"):
+        make_pipeline(max_frames=0).correct_poses({1: pose})
+    assert not make_pipeline().advance_correction()
+
+
+def test_recording_is_a_timed_stage_only_where_it_is_asked_for():
+    frame = tiny_frames()[0]
+    assert "history" in make_pipeline().step(frame).stage_ms
+    assert "history" not in make_pipeline(max_frames=0).step(frame).stage_ms

@@ -1,0 +1,100 @@
+"""What a snapshot reads is the grid of the moment it was taken, whatever happens to the grid meanwhile."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import MapError
+from semantic_mapper.mapping.files.map_file import describe_map
+from semantic_mapper.mapping.storage import block_store, grid_snapshot
+from semantic_mapper.mapping.storage.block_grid import LEAST_RESIDENT, BlockGrid
+from semantic_mapper.mapping.storage.block_index import pack_keys
+from semantic_mapper.mapping.storage.block_store import BlockValues
+from semantic_mapper.mapping.storage.grid_snapshot import GridSnapshot
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from tests.mapping.rendered_views import small_map
+from tests.mapping.storage.test_block_store import CLASSES, some_blocks
+from tests.mapping.storage.test_paging import MEMORY_MB, walk
+from tests.mapping.test_voxel_map import same
+
+BLOCKS = 700
+KEYS = pack_keys(np.stack(np.unravel_index(np.arange(BLOCKS), (10, 10, 7)), axis=1).astype(np.int32))
+
+
+def filled_grid(memory_bytes: int) -> BlockGrid:
+    grid = BlockGrid(0.02, CLASSES, 64, 10_000, memory_bytes)
+    for start in range(0, BLOCKS, 200):
+        part = KEYS[start : start + 200]
+        grid.fill(part, some_blocks(len(part), start))
+    return grid
+
+
+def read_all(snapshot: GridSnapshot, between: list[np.ndarray], grid: BlockGrid) -> BlockValues:
+    """Read it 100 blocks at a time; before each part, some blocks change."""
+    parts = []
+    for keys in between:
+        grid.fill(keys, some_blocks(len(keys), 9999))
+        parts.append(snapshot.read(100)[1])
+    return BlockValues(*(np.concatenate([getattr(part, name) for part in parts]) for name in BlockValues._fields))
+
+
+@pytest.mark.parametrize("most_aside", [grid_snapshot.MOST_ASIDE, 30], ids=["aside in memory", "aside on disk"])
+@pytest.mark.parametrize("memory_bytes", [0, 1], ids=["in memory", "most blocks on disk"])
+def test_a_snapshot_does_not_change_with_the_grid(
+    memory_bytes: int, most_aside: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(grid_snapshot, "MOST_ASIDE", most_aside)
+    grid = filled_grid(memory_bytes)
+    assert grid.stored_count >= BLOCKS - LEAST_RESIDENT if memory_bytes else grid.stored_count == 0
+    before = grid.read(KEYS)
+    new = pack_keys(np.array([[-5, 0, 0], [3, 3, 90], [50, 0, 0]], np.int32))
+    between = [np.sort(np.append(rng.choice(KEYS, 120, replace=False), new)) for _ in range(7)]
+    snapshot = GridSnapshot(grid, CLASSES)
+    then = read_all(snapshot, between, grid)
+    assert len(snapshot) == 0
+    snapshot.close()
+    now = grid.read(KEYS)
+    for name in BlockValues._fields:
+        assert getattr(then, name).tobytes() == getattr(before, name).tobytes(), name
+        assert getattr(now, name).tobytes() != getattr(before, name).tobytes(), name
+    assert not grid.watchers and grid.block_count == BLOCKS + 3
+
+
+def test_a_full_disk_fails_the_snapshot_and_not_the_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    grid = filled_grid(0)
+    snapshot = GridSnapshot(grid, CLASSES)
+
+    def tiny(*arguments: object, **options: object) -> sqlite3.Connection:
+        database = connect(*arguments, **options)  # type: ignore[call-overload]
+        database.execute("PRAGMA max_page_count = 4")
+        return database
+
+    connect = sqlite3.connect
+    monkeypatch.setattr(grid_snapshot, "MOST_ASIDE", 20)
+    monkeypatch.setattr(block_store.sqlite3, "connect", tiny)
+    changed = some_blocks(100, 5)
+    grid.fill(KEYS[300:400], changed)
+    assert grid.read(KEYS[300:400]).tsdf.tobytes() == changed.tsdf.tobytes()
+    with pytest.raises(MapError, match="full"):
+        snapshot.read(100)
+    snapshot.close()
+
+
+def test_a_map_that_is_saved_while_it_grows_is_that_of_one_frame(tmp_path: Path) -> None:
+    voxel_map = small_map(voxel_size_m=0.01, memory_mb=MEMORY_MB)
+    walk(voxel_map, 5)
+    path = tmp_path / "map.npz"
+    saver = threading.Thread(target=voxel_map.save, args=(path,))
+    saver.start()
+    walk(voxel_map, 4, first=3)  # back to what is there already, and on
+    saver.join()
+    saved = describe_map(path).frames
+    reference = small_map(voxel_size_m=0.01)
+    walk(reference, 5)
+    walk(reference, saved - 5, first=3)
+    assert same(VoxelMap.load(path, memory_mb=0).block_state(), reference.block_state())

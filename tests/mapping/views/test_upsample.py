@@ -1,0 +1,153 @@
+import math
+
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import ShapeError
+from semantic_mapper.mapping.views.upsample import COLOUR_RATE, DEPTH_SIGMA, LARGEST_STEP, LEAST_WEIGHT, lift
+
+
+def channels(probabilities: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Likeliest class (H, W) of what each pixel takes."""
+    return probabilities.reshape(-1, probabilities.shape[2])[rows].argmax(2)
+
+
+def test_lifted_classes_follow_the_image_edge_not_the_coarse_grid():
+    rgb = np.zeros((32, 32, 3), np.uint8)
+    rgb[:, 13:] = 200  # the edge lies within a coarse pixel of 4
+    depth = np.full((32, 32), 2.0, np.float32)
+    low_rgb = rgb[2::4, 2::4].copy()
+    probabilities = np.zeros((8, 8, 2), np.float32)
+    probabilities[..., 0] = low_rgb[..., 0] == 0
+    probabilities[..., 1] = low_rgb[..., 0] > 0
+    rows = lift(probabilities, np.ones((8, 8), bool), low_rgb, depth[2::4, 2::4].copy(), rgb, depth)
+    assert (rows >= 0).all()
+    assert (channels(probabilities, rows) == (rgb[..., 0] > 0)).all()
+
+
+def test_lifted_classes_follow_a_depth_edge_between_equal_colours():
+    rgb = np.full((32, 32, 3), 90, np.uint8)
+    depth = np.full((32, 32), 2.0, np.float32)
+    depth[:, 18:] = 3.0
+    low_depth = depth[2::4, 2::4].copy()
+    probabilities = np.stack((low_depth < 2.5, low_depth > 2.5), -1).astype(np.float32)
+    rows = lift(probabilities, np.ones((8, 8), bool), rgb[2::4, 2::4].copy(), low_depth, rgb, depth)
+    assert (channels(probabilities, rows) == (depth > 2.5)).all()
+
+
+def test_where_all_round_are_of_one_class_the_middle_one_speaks():
+    p = np.full((6, 8, 2), (0.9, 0.1), np.float32)
+    rgb = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
+    depth = np.ones((24, 32), np.float32)
+    rows = lift(p, np.ones((6, 8), bool), rgb[2::4, 2::4].copy(), depth[2::4, 2::4].copy(), rgb, depth)
+    np.testing.assert_array_equal(rows, np.arange(24)[:, None] // 4 * 8 + np.arange(32)[None] // 4)
+
+
+def spoken_by(v, u, p, known, rgb_low, depth_low, rgb, depth):
+    """The rule of ``lift`` in plain words, for one pixel where the classes differ."""
+    height, width = known.shape
+    y, x = (v + 0.5) * height / depth.shape[0] - 0.5, (u + 0.5) * width / depth.shape[1] - 0.5
+    j0, i0 = math.floor(y + 0.5), math.floor(x + 0.5)
+    round_it = [
+        (j, i) for j in range(j0 - 1, j0 + 2) for i in range(i0 - 1, i0 + 2) if 0 <= j < height and 0 <= i < width
+    ]
+    if all(known[at] and p[at].argmax() == p[j0, i0].argmax() for at in round_it):
+        return j0 * width + i0
+    weight = {}
+    for j, i in round_it:
+        if known[j, i]:
+            cost = (y - j) ** 2 + (x - i) ** 2
+            cost += COLOUR_RATE * ((rgb[v, u].astype(float) - rgb_low[j, i]) ** 2).sum()
+            if depth[v, u] > 0 and depth_low[j, i] > 0:
+                cost += min(((depth[v, u] - depth_low[j, i]) / (DEPTH_SIGMA * depth[v, u])) ** 2, LARGEST_STEP)
+            weight[j, i] = math.exp(-cost) + LEAST_WEIGHT
+    if not weight:
+        return -1
+    total = {int(p[at].argmax()): 0.0 for at in weight}
+    total = {c: sum(w * p[at][c] for at, w in weight.items()) for c in total}
+    top = max(total, key=total.__getitem__)
+    j, i = max((at for at in weight if p[at].argmax() == top), key=weight.__getitem__)
+    return j * width + i
+
+
+@pytest.mark.parametrize("holes", [False, True])
+def test_a_pixel_takes_the_most_alike_of_the_class_that_all_give_together(holes: bool):
+    rng = np.random.default_rng(3)
+    p = rng.random((6, 8, 5)).astype(np.float32)
+    p /= p.sum(2, keepdims=True)
+    rgb = rng.integers(80, 130, (24, 32, 3), dtype=np.uint8)
+    depth = (1 + 0.05 * rng.random((24, 32))).astype(np.float32)
+    known = rng.random((6, 8)) > (0.5 if holes else -1)
+    if holes:
+        depth[rng.random(depth.shape) < 0.3] = 0
+    low = rgb[2::4, 2::4].copy(), depth[2::4, 2::4].copy()
+    rows = lift(p, known, *low, rgb, depth)
+    expected = [[spoken_by(v, u, p, known, *low, rgb, depth) for u in range(32)] for v in range(24)]
+    assert (rows == np.array(expected)).mean() > 0.995  # float32 may decide a tie the other way
+
+
+def test_pixels_without_a_known_neighbour_stay_unknown():
+    known = np.zeros((8, 8), bool)
+    known[0, 0] = True
+    p = np.full((8, 8, 2), 0.5, np.float32)
+    rgb, depth = np.zeros((32, 32, 3), np.uint8), np.ones((32, 32), np.float32)
+    rows = lift(p, known, rgb[::4, ::4].copy(), depth[::4, ::4].copy(), rgb, depth)
+    assert rows[0, 0] == 0
+    assert (rows[20:, 20:] == -1).all()
+
+
+@pytest.mark.parametrize(("size", "full"), [((1, 1), (5, 3)), ((1, 7), (2, 20)), ((5, 3), (17, 14)), ((9, 8), (4, 5))])
+def test_images_of_any_size_follow_the_rule_up_to_their_borders(size: tuple[int, int], full: tuple[int, int]):
+    rng = np.random.default_rng(sum(size))
+    p = rng.random((*size, 4)).astype(np.float32)
+    known = rng.random(size) < 0.8
+    low = rng.integers(0, 60, (*size, 3), dtype=np.uint8), (1 + 0.05 * rng.random(size)).astype(np.float32)
+    rgb, depth = rng.integers(0, 60, (*full, 3), dtype=np.uint8), (1 + 0.05 * rng.random(full)).astype(np.float32)
+    rows = lift(p, known, *low, rgb, depth)
+    expected = [[spoken_by(v, u, p, known, *low, rgb, depth) for u in range(full[1])] for v in range(full[0])]
+    np.testing.assert_array_equal(rows, expected)
+
+
+def test_depths_that_are_no_numbers_leave_every_pixel_with_one_of_its_neighbours():
+    rng = np.random.default_rng(4)
+    p = rng.random((6, 8, 3)).astype(np.float32)
+    rgb, low = rng.integers(0, 255, (24, 32, 3), dtype=np.uint8), rng.integers(0, 255, (6, 8, 3), dtype=np.uint8)
+    odd = np.array([np.nan, np.inf, -np.inf, -1, 0, 1e-30, 1e30, 2], np.float32)
+    depth, depth_low = rng.choice(odd, (24, 32)), rng.choice(odd, (6, 8))
+    rows = lift(p, np.ones((6, 8), bool), low, depth_low, rgb, depth)
+    row, column = np.divmod(rows, 8)
+    v, u = np.mgrid[0:24, 0:32] // 4
+    near = (np.abs(row - v) <= 1) & (np.abs(column - u) <= 1)
+    assert ((rows == -1) | near).all() and near.mean() > 0.5
+
+
+def test_nothing_to_upsample_and_nothing_to_upsample_to():
+    none, some = np.zeros((0, 8, 2), np.float32), np.zeros((6, 8, 2), np.float32)
+    rgb, depth = np.zeros((24, 32, 3), np.uint8), np.ones((24, 32), np.float32)
+    rows = lift(none, np.zeros((0, 8), bool), np.zeros((0, 8, 3), np.uint8), np.zeros((0, 8), np.float32), rgb, depth)
+    assert (rows == -1).all() and rows.shape == (24, 32)
+    known, low = np.ones((6, 8), bool), (np.zeros((6, 8, 3), np.uint8), np.ones((6, 8), np.float32))
+    assert lift(some, known, *low, rgb[:0], depth[:0]).shape == (0, 32)
+
+
+def test_images_need_not_be_contiguous():
+    rng = np.random.default_rng(5)
+    p, known = rng.random((8, 6, 3), np.float32).transpose(1, 0, 2), rng.random((8, 6)).T > 0.1
+    rgb, depth = rng.integers(0, 99, (24, 64, 3), dtype=np.uint8)[:, ::2], rng.random((32, 24), np.float32).T + 1
+    low = rng.integers(0, 99, (6, 16, 3), dtype=np.uint8)[:, ::2], rng.random((8, 6), np.float32).T + 1
+    copies = (a.copy("C") for a in (p, known, *low, rgb, depth))
+    np.testing.assert_array_equal(lift(p, known, *low, rgb, depth), lift(*copies))
+
+
+def test_images_that_do_not_fit_together_are_refused():
+    p, known = np.zeros((6, 8, 2), np.float32), np.ones((6, 8), bool)
+    low, depth_low = np.zeros((6, 8, 3), np.uint8), np.ones((6, 8), np.float32)
+    rgb, depth = np.zeros((24, 32, 3), np.uint8), np.ones((24, 32), np.float32)
+    for name, images in {
+        "coarse known": (p, known[:5], low, depth_low, rgb, depth),
+        "coarse rgb": (p, known, low[:, :7], depth_low, rgb, depth),
+        "coarse depth": (p, known, low, depth_low[:, :7], rgb, depth),
+        "rgb": (p, known, low, depth_low, rgb[:23], depth),
+    }.items():
+        with pytest.raises(ShapeError, match=name):
+            lift(*images)

@@ -1,0 +1,192 @@
+"""``calibrate``: from folders, videos and logs to files that drivers read."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from semantic_mapper.drivers.base import CameraImage
+from semantic_mapper.drivers.calibrating.config import CalibrationConfig
+from semantic_mapper.drivers.calibrating.solve import solve
+from semantic_mapper.drivers.calibrating.views import BoardView, ViewGatherer
+from semantic_mapper.drivers.calibration import load_calibration, load_mount
+from semantic_mapper.errors import CameraError, ConfigError
+from semantic_mapper.nodes.calibration.report import CalibrationSettings, report, report_json, write_files
+from semantic_mapper.nodes.calibration.run import Gathering
+from semantic_mapper.nodes.calibration.sources import parse_sources
+from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.replay.log.format import LogWriter
+from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.types import PosedFrame
+from tests.drivers.calibrating.boards import BOARD, LENS, shown
+from tests.nodes.support import error_line, run, run_here
+from tests.replay.log.test_recording import files_at_most
+
+SETTINGS = CalibrationSettings(board=BOARD)
+BOARD_FILE = '[board]\nkind = "board"\ncolumns = 8\nrows = 6\nsquare_m = 0.04\nmarker_m = 0.03\n'
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("calibrate") / "front"
+    folder.mkdir()
+    for seq, (_, image) in enumerate(shown()):
+        cv2.imwrite(str(folder / f"{seq:02d}.png"), image.rgb)
+    return folder
+
+
+def gather(*sources: str, seconds: float = 60.0, config: CalibrationConfig | None = None) -> Gathering:
+    gathering = Gathering(BOARD, config or CalibrationConfig())
+    gathering.run(parse_sources(sources, ""), StopRequest(), seconds, rig=len(sources) > 1)
+    return gathering
+
+
+def test_a_folder_becomes_a_file_that_drivers_read_and_a_picture(pictures: Path, tmp_path: Path) -> None:
+    config = tmp_path / "board.toml"
+    config.write_text(BOARD_FILE)
+    out, sheet = tmp_path / "made", tmp_path / "sheet.png"
+    done = run("calibrate", pictures, "--config", config, "--out", out, "--board", sheet, "--json")
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    read = load_calibration(out / "camera.toml")
+    assert abs(read.fx / LENS.fx - 1) < 0.005 and (read.width, read.height) == (640, 480)
+    assert told["cameras"]["camera"]["fx"] == read.fx and told["cameras"]["camera"]["k1"] == read.distortion[0]
+    assert told["files"] == [str(out / "camera.toml"), str(out / "camera.png")] and told["rig"] is None
+    assert load_mount(out / "camera.toml") is None
+    assert cv2.imread(str(out / "camera.png")) is not None
+    drawn = cv2.imread(str(sheet), cv2.IMREAD_GRAYSCALE)
+    assert drawn is not None and drawn.shape[1] > drawn.shape[0] > 2000
+
+
+def test_a_rig_is_written_into_the_files_of_its_cameras(pictures: Path, tmp_path: Path) -> None:
+    gathered = gather(f"left={pictures}", f"right={pictures}")  # one camera twice: they sit at one place
+    found = solve(gathered.cameras, (), SETTINGS.calibration, rig=True)
+    files = write_files(tmp_path, found, SETTINGS)
+    assert [f.name for f in files] == ["left.toml", "left.png", "right.toml", "right.png"]
+    mount = load_mount(tmp_path / "right.toml")
+    assert mount is not None and np.allclose(mount, np.eye(4), atol=1e-6)
+    assert found.rig is not None
+    np.testing.assert_array_equal(mount, found.rig.T_rig_camera["right"])
+    assert load_calibration(tmp_path / "left.toml") == found.cameras["left"].intrinsics
+    told = report_json(found, gathered.cameras, files)
+    assert json.loads(json.dumps(told)) == told and told["rig"]["cameras"]["left"]["moments"] > 8
+    assert len(list(report(found, gathered.cameras, 3))) == 3
+
+
+def test_a_log_names_its_cameras_itself(tmp_path: Path) -> None:
+    path = tmp_path / "board.mcap"
+    intrinsics = shown()[0][1].intrinsics
+    with LogWriter(path, StreamInfo("test", {"front": intrinsics})) as log:
+        for seq in range(6):
+            rgb = shown()[seq // 2][1].rgb  # each board is held still for two frames
+            log.write_frame(PosedFrame(seq * 50_000_000 + 1, seq, "front", rgb, None, None, intrinsics, np.eye(4)))
+    gathered = gather(str(path))
+    front = gathered.cameras["front"]
+    assert list(gathered.cameras) == ["front"] and (front.images, front.seen, len(front.steady)) == (6, 6, 3)
+    assert front.intrinsics == intrinsics and not gathered.known
+
+
+def test_a_live_camera_is_looked_through_until_nothing_is_lacking(tmp_path: Path) -> None:
+    film = tmp_path / "film.avi"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 30, (640, 480))
+    for _, image in shown():
+        for _ in range(2):
+            writer.write(np.ascontiguousarray(image.rgb[..., ::-1]))
+    writer.release()
+    (source,) = parse_sources([str(film)], "")
+    source.live = True
+    gathering = Gathering(BOARD, CalibrationConfig())
+    gathering.run([source], StopRequest(), 120.0, rig=False)
+    assert gathering.lacks(rig=False) == [] and gathering.cameras["camera"].images <= 40
+    assert "several cameras saw the board held still" in gathering.lacks(rig=True)[0]
+    assert len(gathering.cameras["camera"].kept) >= SETTINGS.calibration.min_views
+
+
+def test_a_camera_may_come_while_it_is_told_what_the_others_have() -> None:
+    stopped = threading.Event()
+    gathering = Gathering(BOARD, CalibrationConfig())
+
+    class Waiting:
+        live = stream = True
+        known = False
+
+        def images(self) -> Iterator[tuple[str, CameraImage]]:
+            stopped.wait(60)
+            return iter(())
+
+        def stop(self) -> None:
+            stopped.set()
+
+    class Slow(list[BoardView]):
+        def __len__(self) -> int:  # meanwhile another thread has the first image of its camera
+            gathering.cameras.setdefault("late", ViewGatherer(BOARD, CalibrationConfig(), stream=True))
+            return 0
+
+    gathering.cameras["early"] = ViewGatherer(BOARD, CalibrationConfig(), stream=True)
+    gathering.cameras["early"].kept = Slow()
+    gathering.run([Waiting(), Waiting(), Waiting()], StopRequest(), 0.3, rig=True)
+    assert list(gathering.cameras) == ["early", "late"]
+
+
+def test_poor_coverage_is_refused_in_one_line(pictures: Path, tmp_path: Path) -> None:
+    left = tmp_path / "left"
+    left.mkdir()
+    for number, (T, _) in enumerate(shown()):
+        if T[0, 3] < -0.05:  # the board is at the left
+            name = f"{number:02d}.png"
+            (left / name).write_bytes((pictures / name).read_bytes())
+    config = tmp_path / "board.toml"
+    config.write_text(BOARD_FILE + "[calibration]\nmin_views = 4\n")
+    done = run("calibrate", left, "--config", config, "--out", tmp_path / "none" / "deep")
+    assert done.returncode == 1
+    line = error_line(done.stderr)
+    assert "camera 'camera' cannot be calibrated" in line and "right" in line and "hold it there, too" in line
+    assert not (tmp_path / "none").exists(), "what was made for the results goes with them"
+
+
+def test_a_board_that_does_not_fit_on_the_disk_is_named_and_leaves_nothing(tmp_path: Path) -> None:
+    with files_at_most(1000):
+        code, said = run_here("calibrate", "--board", tmp_path / "board.png")
+    assert code == 1 and f"error: {tmp_path / 'board.png'}: cannot be written (File too large)" in said
+    assert not list(tmp_path.iterdir())
+    assert run_here("calibrate", "--board", tmp_path / "board.png")[0] == 0
+    assert [file.name for file in tmp_path.iterdir()] == ["board.png"]
+
+
+@pytest.mark.parametrize(("room", "failed"), [(10, "camera.toml"), (2000, "camera.png")])
+def test_results_that_do_not_fit_on_the_disk_leave_those_that_were_there(
+    pictures: Path, tmp_path: Path, room: int, failed: str
+) -> None:
+    gathered = gather(str(pictures))
+    found = solve(gathered.cameras, set(), SETTINGS.calibration, rig=False)
+    (tmp_path / failed).write_text("old")
+    with files_at_most(room), pytest.raises(ConfigError, match=rf"{failed}: cannot be written \(File too large\)"):
+        write_files(tmp_path, found, SETTINGS)
+    assert (tmp_path / failed).read_text() == "old"
+    assert {file.name for file in tmp_path.iterdir()} <= {"camera.toml", "camera.png"}
+
+
+def test_what_is_no_source_is_told(pictures: Path, tmp_path: Path) -> None:
+    for text, says in (
+        ("nowhere.mp4", "neither a folder"),
+        ("v4l3:/dev/video0", "v4l2, opencv, oak"),
+        ("a b=x", "cannot be the name"),
+    ):
+        with pytest.raises(ConfigError, match=says):
+            parse_sources([text], "")
+    with pytest.raises(ConfigError, match="two cameras are called 'front'"):
+        parse_sources([str(pictures), str(pictures)], "")
+    with pytest.raises(ConfigError, match="WIDTHxHEIGHT"):
+        parse_sources(["v4l2:/dev/video0"], "large")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(CameraError, match="no pictures in it"):
+        gather(str(tmp_path / "empty"))
+    (tmp_path / "empty" / "a.png").write_bytes(b"x")
+    with pytest.raises(CameraError, match=r"a\.png: is no picture"):
+        gather(str(tmp_path / "empty"))

@@ -1,0 +1,435 @@
+"""The camera node over cameras: real drivers, sockets and video files; of V4L2 only the kernel is not real."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import cv2
+import numpy as np
+import pytest
+
+from semantic_mapper.config import convert_config
+from semantic_mapper.drivers.base import Camera
+from semantic_mapper.drivers.poses.sources import read_pose_config
+from semantic_mapper.drivers.registry import load_driver
+from semantic_mapper.errors import CameraError, ConfigError, TransportError
+from semantic_mapper.nodes.camera import live as live_camera
+from semantic_mapper.nodes.camera.node import run_camera
+from semantic_mapper.nodes.node import NodeContext
+from semantic_mapper.nodes.options import CameraOptions
+from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.supervisor.heartbeat import TURN, Heart
+from semantic_mapper.nodes.supervisor.launch_config import load_launch
+from semantic_mapper.transport.messages import EndOfStream, Message, Status, StreamInfo
+from semantic_mapper.transport.sockets import LosslessSubscriber
+from semantic_mapper.types import PosedFrame
+from tests.drivers.fake_v4l2 import Machine, Sensor, make_machine, write_calibration
+from tests.nodes.support import REPLAY_LAUNCH, eventually
+
+V4L2_LAUNCH = REPLAY_LAUNCH.with_name("v4l2.toml")
+PATIENCE_S = 20.0
+COUNT = 9
+
+
+class Walking:
+    """A camera that walks along x; of every third image nobody knows where it was."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._counts: Counter[str] = Counter({"no_pose": 0})
+
+    @property
+    def info(self) -> StreamInfo:
+        return self._camera.info
+
+    @property
+    def troubles(self) -> tuple[str, ...]:
+        return self._camera.troubles
+
+    @property
+    def can_wait(self) -> bool:
+        return self._camera.can_wait
+
+    @property
+    def turned_at(self) -> float:
+        return self._camera.turned_at
+
+    @property
+    def counters(self) -> dict[str, int]:
+        return dict(self._counts)
+
+    def __enter__(self) -> Self:
+        self._camera.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._camera.__exit__(kind, error, trace)
+
+    def __iter__(self) -> Iterator[PosedFrame]:
+        for image in self._camera:
+            if image.seq % 3 == 2:
+                self._counts["no_pose"] += 1
+                continue
+            pose = np.eye(4)
+            pose[0, 3] = image.seq
+            yield PosedFrame(
+                image.stamp_ns, image.seq, image.camera_id, image.rgb, None, None, image.intrinsics, pose, "walk", 0.1
+            )
+
+    def stop(self) -> None:
+        self._camera.stop()
+
+
+@dataclass
+class Running:
+    """A camera node in a thread of the test, and what it has published so far."""
+
+    stop: StopRequest
+    thread: threading.Thread
+    heard: list[Message] = field(default_factory=list)
+    error: Exception | None = None
+
+    def until(self, holds: Callable[[Message], bool]) -> Message:
+        """The first message that holds, waited for; those before it count, too."""
+        deadline = time.monotonic() + PATIENCE_S
+        while (found := next((m for m in list(self.heard) if holds(m)), None)) is None:
+            assert time.monotonic() < deadline, self.heard[-3:]
+            time.sleep(0.01)
+        return found
+
+    def frames(self) -> list[PosedFrame]:
+        return [m for m in list(self.heard) if isinstance(m, PosedFrame)]
+
+
+@contextmanager
+def running(
+    options: dict[str, Any], *, comes_back: bool = False, beats: int = -1, busy: threading.Event | None = None
+) -> Iterator[Running]:
+    with tempfile.TemporaryDirectory(prefix="sm-") as folder:  # pytest's own may be longer than a socket's path
+        endpoint = f"ipc://{folder}/eye"
+        stop = StopRequest()
+        context = NodeContext("eye", {"eye": endpoint}, 1, stop, Heart(beats, 1), comes_back=comes_back)
+        checked = convert_config(options, CameraOptions, "test")
+
+        def work() -> None:
+            try:
+                run_camera(context, checked)
+            except Exception as error:  # noqa: BLE001 - looked at by the test
+                node.error = error
+
+        node = Running(stop, threading.Thread(target=work))
+        ended = threading.Event()
+
+        def listen() -> None:
+            with LosslessSubscriber(endpoint, ("info", "frame", "end", "status"), hwm=2) as subscriber:
+                while not ended.is_set():
+                    if busy is not None and busy.is_set():  # reads nothing
+                        ended.wait(0.01)
+                        continue
+                    message = subscriber.receive(0.05)
+                    if message is not None:
+                        node.heard.append(message)
+                    if isinstance(message, EndOfStream):
+                        return
+
+        listener = threading.Thread(target=listen)
+        node.thread.start()
+        listener.start()
+        try:
+            yield node
+        finally:
+            stop.signum = 15
+            node.thread.join(PATIENCE_S)
+            ended.set()
+            listener.join(PATIENCE_S)
+            assert not node.thread.is_alive() and not listener.is_alive()
+
+
+@pytest.fixture(autouse=True)
+def _walking(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_camera, "with_poses", lambda camera, config, mount: Walking(camera))
+    monkeypatch.setattr(live_camera, "STATUS_PERIOD_S", 0.1)
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
+    return make_machine(tmp_path, monkeypatch)
+
+
+def v4l2(device: Path, tmp_path: Path, **settings: Any) -> dict[str, Any]:
+    config = {"device": str(device), "calibration": write_calibration(tmp_path / "webcam.toml"), "stall_s": 0.1}
+    return {"camera": {"kind": "v4l2", "id": "front", "config": config | settings, "poses": {"kind": "walk"}}}
+
+
+def test_a_video_file_is_published_to_its_end(tmp_path: Path) -> None:
+    film = tmp_path / "film.avi"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 20, (64, 48))
+    for index in range(COUNT):
+        writer.write(np.full((48, 64, 3), (0, 0, 20 * index), np.uint8))
+    writer.release()
+    config = tmp_path / "film.toml"
+    config.write_text(f'source = "{film}"\ncalibration = "{write_calibration(tmp_path / "lens.toml")}"\n')
+    with running({"camera": {"kind": "opencv", "config": str(config), "poses": {"kind": "walk"}}}) as node:
+        end = node.until(lambda m: isinstance(m, EndOfStream))
+        info = node.until(lambda m: isinstance(m, StreamInfo))
+        node.thread.join(PATIENCE_S)
+    assert isinstance(end, EndOfStream) and (end.reason, end.published, end.source) == ("end", 6, "eye")
+    assert isinstance(info, StreamInfo) and info.source == "video film.avi" and list(info.cameras) == ["camera"]
+    frames = node.frames()
+    assert [f.seq for f in frames] == [0, 1, 3, 4, 6, 7]
+    assert [f.T_world_camera[0, 3] for f in frames] == [0, 1, 3, 4, 6, 7]
+    assert all(f.pose_source == "walk" and f.pose_sigma == 0.1 for f in frames)
+    assert frames[4].rgb[..., 0].mean() == pytest.approx(120, abs=5)
+    assert node.error is None
+
+
+def long_film(tmp_path: Path) -> dict[str, Any]:
+    """60 images, as quickly as they are taken; a third of them is without a pose."""
+    writer = cv2.VideoWriter(str(tmp_path / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 20, (320, 240))
+    noise = np.random.default_rng(1).integers(0, 255, (240, 320, 3), np.uint8)
+    for _ in range(60):
+        writer.write(noise)
+    writer.release()
+    lens = tmp_path / "lens.toml"
+    lens.write_text("fx = 300.0\nfy = 300.0\ncx = 159.5\ncy = 119.5\nwidth = 320\nheight = 240\n")
+    config = {"source": str(tmp_path / "film.avi"), "calibration": str(lens), "pace": "fast"}
+    return {"camera": {"kind": "opencv", "config": config, "poses": {"kind": "walk"}}}
+
+
+def test_a_video_file_waits_for_a_reader_that_must_not_lose_a_frame(tmp_path: Path) -> None:
+    busy = threading.Event()
+    busy.set()
+    with running(long_film(tmp_path), busy=busy) as node:
+        time.sleep(2.0)  # a mapper that compiles
+        assert node.thread.is_alive()
+        busy.clear()
+        end = node.until(lambda m: isinstance(m, EndOfStream))
+    assert isinstance(end, EndOfStream) and (end.reason, end.published) == ("end", 40)
+    assert [f.seq for f in node.frames()] == [n for n in range(60) if n % 3 != 2]
+    assert node.error is None
+
+
+def test_a_video_file_that_waits_for_a_reader_can_be_stopped_and_has_a_limit(tmp_path: Path) -> None:
+    busy = threading.Event()
+    busy.set()
+    with running(long_film(tmp_path), busy=busy) as node:
+        time.sleep(0.5)
+    assert node.error is None, "stopped, not failed"
+    with running(long_film(tmp_path) | {"ack_timeout_s": 0.5}, busy=busy) as node:
+        assert eventually(lambda: isinstance(node.error, TransportError), PATIENCE_S)
+    assert "taken no frame for 0.5 s" in str(node.error)
+
+
+@pytest.mark.parametrize("kind", ["device", "rgbd"])
+def test_a_camera_that_tracks_itself_must_not_come_back_in_another_world(tmp_path: Path, kind: str) -> None:
+    camera = v4l2(tmp_path / "video0", tmp_path)["camera"] | {"poses": {"kind": kind}}
+    with running({"camera": camera}, comes_back=True) as node:
+        node.thread.join(PATIENCE_S)
+    assert isinstance(node.error, ConfigError) and 'set restart = "never"' in str(node.error)
+    assert not node.frames()
+
+
+def test_frames_get_the_poses_that_the_launch_file_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()  # of the walking camera
+    film = tmp_path / "film.avi"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 20, (64, 48))
+    for _ in range(COUNT):
+        writer.write(np.full((48, 64, 3), 90, np.uint8))
+    writer.release()
+    pose = np.eye(4)
+    pose[:3, 3] = 1.0, -2.0, 0.5
+    camera = {
+        "kind": "opencv",
+        "id": "wall",
+        "config": {"source": str(film), "calibration": write_calibration(tmp_path / "lens.toml")},
+        "poses": {"kind": "fixed", "T_world_camera": pose.tolist(), "sigma": 0.02},
+    }
+    with running({"camera": camera}) as node:
+        node.until(lambda m: isinstance(m, EndOfStream))
+    frames = node.frames()
+    assert node.error is None and [f.seq for f in frames] == list(range(COUNT))
+    assert all((f.camera_id, f.pose_source, f.pose_sigma) == ("wall", "fixed", 0.02) for f in frames)
+    assert all(np.array_equal(f.T_world_camera, pose) for f in frames)
+
+
+@pytest.mark.parametrize("comes_back", [False, True])
+def test_a_failure_ends_the_stream_only_where_the_camera_is_not_started_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, comes_back: bool
+) -> None:
+    monkeypatch.undo()  # of the walking camera
+    film = tmp_path / "film.avi"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 20, (64, 48))
+    for _ in range(COUNT):
+        writer.write(np.full((48, 64, 3), 90, np.uint8))
+    writer.release()
+    config = {"source": str(film), "calibration": write_calibration(tmp_path / "lens.toml")}
+    poses = {"kind": "device", "patience_s": 0.1}  # a video tells no pose of its own
+    monkeypatch.setattr(live_camera, "check_world", lambda *_: None)
+    with running({"camera": {"kind": "opencv", "config": config, "poses": poses}}, comes_back=comes_back) as node:
+        node.until(lambda m: isinstance(m, EndOfStream) or (isinstance(m, Status) and m.state == "ended"))
+        ends = [m for m in list(node.heard) if isinstance(m, EndOfStream)]
+    assert isinstance(node.error, CameraError)
+    assert [end.reason for end in ends] == ([] if comes_back else ["error"])
+
+
+def test_it_stays_when_the_camera_goes_says_so_and_goes_on_when_it_is_back(machine: Machine, tmp_path: Path) -> None:
+    sensor = Sensor()
+    with running(v4l2(machine.plug(sensor, 0), tmp_path)) as node:
+        before = node.until(lambda m: isinstance(m, PosedFrame))
+        assert isinstance(before, PosedFrame)
+        machine.unplug(sensor)
+        gone = node.until(lambda m: isinstance(m, Status) and m.state == "degraded")
+        assert isinstance(gone, Status)
+        last_before = node.frames()[-1].stamp_ns
+        machine.plug(sensor, 4)
+        back = node.until(lambda m: isinstance(m, PosedFrame) and m.stamp_ns > last_before)
+        well = node.until(lambda m: isinstance(m, Status) and m.state == "running" and m.stamp_ns > gone.stamp_ns)
+        node.stop.signum = 15
+        end = node.until(lambda m: isinstance(m, EndOfStream))
+        node.thread.join(PATIENCE_S)
+    assert any("no such camera" in t or "gone" in t for t in gone.degraded) and gone.counters["published"] >= 1
+    assert isinstance(back, PosedFrame) and back.seq > before.seq + 1 and back.camera_id == "front"
+    assert isinstance(well, Status) and well.degraded == () and well.ages_s["frame"] < PATIENCE_S
+    assert {"published", "missing", "no_pose"} == set(well.counters)
+    assert isinstance(end, EndOfStream) and end.reason == "stopped" and end.published >= len(node.frames())
+    assert node.error is None
+
+
+def test_a_driver_that_hangs_is_told_apart_from_a_camera_that_is_waited_for(machine: Machine, tmp_path: Path) -> None:
+    sensor, returns = Sensor(), threading.Event()
+    beats, theirs = os.pipe()
+    os.set_blocking(beats, False)
+
+    def turns() -> bool:
+        try:
+            return TURN in os.read(beats, 65536)
+        except BlockingIOError:
+            return False
+
+    def goes_on() -> bool:
+        turns()  # those of before do not count
+        return eventually(turns, 1.0)
+
+    with running(v4l2(machine.by_id / "usb-HD_Webcam-video-index0", tmp_path), beats=theirs) as node:
+        node.until(lambda m: isinstance(m, Status) and m.state == "starting" and bool(m.degraded))
+        assert goes_on(), "it waits for a camera that has never been there"
+        machine.plug(sensor, 0)
+        node.until(lambda m: isinstance(m, PosedFrame))
+        assert goes_on()
+        sensor.stalled = True
+        node.until(lambda m: isinstance(m, Status) and m.state == "degraded")
+        assert goes_on(), "nothing comes, but the driver says so"
+        machine.unplug(sensor)
+        node.until(lambda m: isinstance(m, Status) and any("no such camera" in t for t in m.degraded))
+        assert goes_on(), "it waits for a camera that is away"
+        sensor.stalled, sensor.hangs = False, returns
+        machine.plug(sensor, 4)
+        assert eventually(lambda: sensor.opens > 1 and not goes_on(), PATIENCE_S), "a read that never returns"
+        assert node.thread.is_alive()
+        returns.set()
+        assert goes_on()
+    assert node.error is None
+    os.close(beats)
+    os.close(theirs)
+
+
+def test_counters_add_up_to_what_was_captured(machine: Machine, tmp_path: Path) -> None:
+    with running(v4l2(machine.plug(Sensor(), 0), tmp_path) | {"max_frames": 12}) as node:
+        end = node.until(lambda m: isinstance(m, EndOfStream))
+        node.thread.join(PATIENCE_S)
+    assert isinstance(end, EndOfStream) and end.published == 12 and end.reason == "end"
+    frames = node.frames()
+    assert len(frames) == 12 and all(f.seq % 3 != 2 for f in frames)
+
+
+def test_a_camera_that_is_not_there_yet_is_waited_for(machine: Machine, tmp_path: Path) -> None:
+    with running(v4l2(machine.by_id / "usb-HD_Webcam-video-index0", tmp_path)) as node:
+        waiting = node.until(lambda m: isinstance(m, Status) and m.state == "starting" and bool(m.degraded))
+        assert isinstance(waiting, Status) and "is it plugged in" in waiting.degraded[0]
+        machine.plug(Sensor(), 0)
+        node.until(lambda m: isinstance(m, PosedFrame))
+    assert node.error is None
+
+
+def test_stopped_while_it_waits_for_the_camera_it_ends(machine: Machine, tmp_path: Path) -> None:
+    with running(v4l2(machine.dev / "video0", tmp_path)) as node:
+        node.until(lambda m: isinstance(m, Status))
+        node.stop.signum = 15
+        node.thread.join(PATIENCE_S)
+        assert not node.thread.is_alive()
+    assert node.error is None
+
+
+def test_patience_with_a_camera_can_be_limited(machine: Machine, tmp_path: Path) -> None:
+    options = v4l2(machine.dev / "video0", tmp_path)
+    options["camera"]["open_s"] = 0.3
+    with running(options) as node:
+        node.thread.join(PATIENCE_S)
+        assert not node.thread.is_alive()
+    assert isinstance(node.error, CameraError) and "is it plugged in" in str(node.error)
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [({"calibration": ""}, "semantic-mapper calibrate"), ({"devise": "x"}, "did you mean `device`")],
+)
+def test_mistakes_are_told_before_the_camera_is_waited_for(
+    machine: Machine, tmp_path: Path, settings: dict[str, Any], says: str
+) -> None:
+    with running(v4l2(machine.dev / "video0", tmp_path, **settings)) as node:
+        node.thread.join(PATIENCE_S)
+    assert isinstance(node.error, CameraError | ConfigError) and says in str(node.error)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({}, "either a log or a camera"),
+        ({"log": "a.mcap", "camera": {"kind": "v4l2", "poses": {}}}, "either a log or a camera"),
+        ({"camera": {"kind": "v4l2"}}, "poses"),
+        ({"camera": {"kind": "v4l2", "poses": {}, "id": "a/b"}}, "camera.id"),
+        ({"log": ""}, "log"),
+    ],
+)
+def test_options_name_a_log_or_a_camera_with_poses(options: dict[str, Any], says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        convert_config(options, CameraOptions, "test")
+
+
+def test_the_launch_file_for_a_webcam_is_filled_in() -> None:
+    launch = load_launch(V4L2_LAUNCH, ["device=/dev/video3", "calibration=lens.toml", "fps=15.0"], Path("somewhere"))
+    options = launch.options["camera"]
+    assert isinstance(options, CameraOptions) and options.log is None and options.inputs() == ()
+    assert options.camera is not None and options.camera.kind == "v4l2"
+    assert options.camera.config == {
+        "device": "/dev/video3",
+        "calibration": "lens.toml",
+        "fps": 15.0,
+        "exposure_ms": 0.0,
+    }
+    poses = options.camera.poses
+    assert isinstance(poses, dict) and (poses["kind"], poses["endpoint"]) == ("topic", "tcp://127.0.0.1:5560")
+    assert np.allclose(np.array(poses["T_base_camera"])[:3, 2], (1, 0, 0)), "it looks ahead"
+
+
+@pytest.mark.parametrize("name", ["oak.toml", "learning.toml"])
+def test_the_launch_file_for_an_oak_is_filled_in_and_fits_driver_and_poses(name: str) -> None:
+    launch = load_launch(V4L2_LAUNCH.with_name(name), ["device=169.254.1.222"], Path("somewhere"))
+    options = launch.options["camera"]
+    assert isinstance(options, CameraOptions) and options.camera is not None and options.camera.kind == "oak"
+    assert isinstance(options.camera.config, dict) and isinstance(options.camera.poses, dict)
+    config = convert_config(options.camera.config, load_driver("oak").Config, "test")
+    assert (config.device, config.fps, config.odometry) == ("169.254.1.222", 20.0, True)  # type: ignore[attr-defined]
+    assert read_pose_config(options.camera.poses).kind == "device"

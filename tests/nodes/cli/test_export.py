@@ -1,0 +1,103 @@
+"""``export`` and ``merge``, as commands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import ConfigError, PoseError
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.cli.saved_maps import map_path, parse_transform, refuse_overwriting
+from tests.mapping.files.test_formats import read_glb
+from tests.mapping.rendered_views import small_map
+from tests.mapping.test_voxel_map import fuse_sphere
+from tests.nodes.support import error_line, run
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder such as a replay leaves behind."""
+    folder = tmp_path_factory.mktemp("results")
+    voxel_map = small_map(voxel_size_m=0.04)
+    fuse_sphere(voxel_map, 3)
+    voxel_map.save(folder / "map.npz")
+    return folder
+
+
+@pytest.mark.slow
+def test_a_folder_of_results_becomes_a_glb(results: Path, tmp_path: Path) -> None:
+    out = tmp_path / "new" / "sphere.glb"
+    done = run("export", results, "--out", out, "--color", "class", "--up", "-y")
+    assert done.returncode == 0, done.stderr
+    mesh = VoxelMap.load(results / "map.npz").mesh()
+    assert f"{out}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces" in done.stdout
+    np.testing.assert_array_equal(read_glb(out)[1]["_LABEL"], mesh.label)
+
+
+@pytest.mark.slow
+def test_what_cannot_be_exported_is_refused_in_one_line(results: Path, tmp_path: Path) -> None:
+    done = run("export", results, "--out", results / "map.npz")
+    assert done.returncode == 1 and "is the map itself" in error_line(done.stderr)
+    VoxelMap.load(results / "map.npz")
+    done = run("export", tmp_path, "--out", tmp_path / "a.ply")
+    assert done.returncode == 1 and "no map.npz" in error_line(done.stderr)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_two_maps_become_one(results: Path, tmp_path: Path) -> None:
+    out = tmp_path / "both.npz"
+    done = run("merge", results, results / "map.npz", "--transform", "4 0 -0.4 90", "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert f"{out}: 6 frames" in done.stdout
+    one, both = VoxelMap.load(results / "map.npz").points().xyz, VoxelMap.load(out).points().xyz
+    assert len(both) == 2 * len(one)
+    moved = np.stack((4 - one[:, 1], one[:, 0], one[:, 2] - 0.4), axis=1)  # a quarter turn to the left, then the shift
+    second = both[both[:, 0] > 2]
+    np.testing.assert_allclose(np.sort(second, axis=0), np.sort(moved, axis=0), atol=1e-5)
+
+
+@pytest.mark.slow
+def test_merging_a_map_with_itself_says_where_its_blocks_have_gone(results: Path, tmp_path: Path) -> None:
+    voxel_map = VoxelMap.load(results / "map.npz")
+    measured = int((voxel_map.block_state()["weight"] > 0).any(axis=(1, 2, 3)).sum())
+    count, empty = voxel_map.block_count, voxel_map.block_count - measured
+    assert empty > 0
+    done = run("merge", results, results, "--out", tmp_path / "twice.npz")
+    assert done.returncode == 0, done.stderr
+    said = " ".join(done.stdout.split())
+    assert f"{count} and {count} made {measured} blocks; {2 * empty} empty blocks of the two" in said
+    assert VoxelMap.load(tmp_path / "twice.npz").block_count == measured
+
+
+def test_a_transform_is_four_numbers_or_a_file(tmp_path: Path) -> None:
+    T = parse_transform("1, 2 3 -90")
+    np.testing.assert_allclose(T @ (1, 0, 0, 1), (1, 1, 3, 1), atol=1e-12)
+    np.savetxt(tmp_path / "T.txt", T)
+    np.testing.assert_array_equal(parse_transform(str(tmp_path / "T.txt")), T)
+    np.savetxt(tmp_path / "mirror.txt", np.diag((1, 1, -1, 1)))
+    with pytest.raises(PoseError, match="mirror"):
+        parse_transform(str(tmp_path / "mirror.txt"))
+    np.savetxt(tmp_path / "short.txt", T[:3])
+    (tmp_path / "words.txt").write_text("east of here")
+    for text, message in (
+        ("1 2 3", "four numbers"),
+        ("1 2 3 nan", "four numbers"),
+        (str(tmp_path / "short.txt"), "4 rows of 4"),
+        (str(tmp_path / "words.txt"), "cannot be read"),
+        ("nowhere.txt", "nor a file"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            parse_transform(text)
+
+
+def test_maps_are_named_by_file_or_folder(results: Path, tmp_path: Path) -> None:
+    assert map_path(results) == results / "map.npz" == map_path(results / "map.npz")
+    with pytest.raises(ConfigError, match="no map"):
+        map_path(tmp_path)
+    with pytest.raises(ConfigError, match=r"day\.mcap: is a log; `semantic-mapper replay .*` makes a map of it"):
+        map_path(tmp_path / "day.mcap")
+    with pytest.raises(ConfigError, match="the map itself"):
+        refuse_overwriting(results / ".." / results.name / "map.npz", tmp_path / "other.npz", results / "map.npz")

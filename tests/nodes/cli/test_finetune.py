@@ -1,0 +1,132 @@
+"""``finetune`` and ``eval``."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+
+from semantic_mapper.fields.checkpoint import load_checkpoint
+from semantic_mapper.replay.log.format import LogWriter
+from semantic_mapper.transport.messages import StreamInfo
+from tests.nodes.support import Running, error_line, run, write_log
+from tests.small import INTRINSICS, tiny_frames
+
+
+@pytest.fixture(scope="module")
+def tuned(folder: Path, log: Path, weights: Path) -> Path:
+    out = folder / "made" / "tuned.safetensors"
+    arguments = ("--keyframes", "3", "--seconds", "0", "--steps", "2", "--weights", weights)
+    done = run("finetune", log, *arguments, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "finetuned on frames" in done.stdout
+    return out
+
+
+def test_finetuned_weights_remember_their_keyframes(tuned: Path) -> None:
+    checkpoint = load_checkpoint(tuned)
+    assert len(checkpoint.train_stamps_ns) == len(checkpoint.anchors) == 3
+    assert checkpoint.train_stamps_ns <= {f.stamp_ns for f in tiny_frames(6)}
+    assert checkpoint.recipe["source"] == "room.mcap"
+    assert checkpoint.recipe["steps"] == 2
+
+
+def test_more_keyframes_than_labelled_frames_are_refused(log: Path, weights: Path, tmp_path: Path) -> None:
+    done = run("finetune", log, "--keyframes", "7", "--weights", weights, "--out", tmp_path / "w.safetensors")
+    assert done.returncode == 1
+    assert "--keyframes 7" in error_line(done.stderr)
+
+
+@pytest.mark.slow
+def test_log_without_labels_is_refused(weights: Path, tmp_path: Path) -> None:
+    log = tmp_path / "plain.mcap"
+    with LogWriter(log, StreamInfo(source="test", cameras={"rooms": INTRINSICS})) as writer:
+        writer.write_frame(tiny_frames(1)[0])
+    for verb in (("finetune", log, "--keyframes", "2", "--out", tmp_path / "w.safetensors"), ("eval", log)):
+        done = run(*verb, "--weights", weights)
+        assert done.returncode == 1
+        assert "plain.mcap: has no label images" in error_line(done.stderr)
+
+
+def test_eval_shows_replays_side_by_side_and_writes_json(replayed: Path, tmp_path: Path) -> None:
+    file = tmp_path / "figures" / "eval.json"
+    done = run("eval", replayed, "--json", file)
+    assert done.returncode == 0, done.stderr
+    assert "mIoU" in done.stdout and "replayed" in done.stdout
+    written = json.loads(file.read_text())
+    assert written["replays"]["replayed"] == json.loads((replayed / "summary.json").read_text())
+
+
+@pytest.mark.slow
+def test_eval_of_a_log_compares_with_baselines_on_frames_that_nobody_was_fitted_to(
+    log: Path, tuned: Path, config: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "eval.json"
+    done = run("eval", log, "--weights", tuned, "--baselines", "--seconds", "1", "--config", config, "--json", file)
+    assert done.returncode == 0, done.stderr
+    scores = json.loads(file.read_text())["logs"][str(log)]
+    assert scores["scored"] == 3 and scores["excluded"] == 3
+    assert {"sray", "per-image U-Net", "labels carried by depth"} <= set(scores["methods"])
+    assert "per-image U-Net" in done.stdout
+
+
+def test_eval_of_a_folder_without_a_replay_says_so(tmp_path: Path) -> None:
+    done = run("eval", tmp_path)
+    assert done.returncode == 1
+    assert "no summary.json" in error_line(done.stderr)
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_the_best_weights_so_far(log: Path, weights: Path, tmp_path: Path) -> None:
+    out = tmp_path / "early.safetensors"
+    arguments = ("--keyframes", "3", "--seconds", "600", "--weights", weights, "--out", out)
+    with Running("finetune", log, *arguments) as running:
+        running.wait_for_line("step [1-9]")
+        running.process.send_signal(signal.SIGINT)
+        assert running.wait() == 130, running.text
+    checkpoint = load_checkpoint(out)
+    assert len(checkpoint.anchors) == 3 and checkpoint.recipe["seconds"] < 500
+    assert "the best weights so far" in running.text
+
+
+@pytest.mark.slow
+def test_eval_of_a_log_writes_beside_it(log: Path, weights: Path, config: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copy(log, tmp_path / "copy.mcap"))
+    done = run("eval", copy, "--weights", weights, "--config", config, "--max-frames", "2")
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "copy.eval.json").read_text())["logs"][str(copy)]["scored"] == 2
+
+
+@pytest.mark.slow
+def test_finetuning_on_top_remembers_the_keyframes_of_both(log: Path, tuned: Path, tmp_path: Path) -> None:
+    out = tmp_path / "again.safetensors"
+    arguments = ("--keyframes", "2", "--seed", "5", "--seconds", "0", "--steps", "1", "--weights", tuned)
+    assert run("finetune", log, *arguments, "--out", out).returncode == 0
+    assert load_checkpoint(tuned).train_stamps_ns <= load_checkpoint(out).train_stamps_ns
+    assert len(load_checkpoint(out).anchors) == 2
+
+
+def test_a_folder_in_place_of_the_weights_file_is_refused_before_training(
+    log: Path, weights: Path, tmp_path: Path
+) -> None:
+    done = run("finetune", log, "--keyframes", "2", "--weights", weights, "--out", tmp_path)
+    assert done.returncode == 1 and "is a folder" in error_line(done.stderr)
+    assert "step 1" not in done.stderr
+
+
+@pytest.mark.slow
+def test_labelled_frames_of_another_size_are_left_out(weights: Path, tmp_path: Path) -> None:
+    frames = list(tiny_frames(4))
+    k = frames[1].intrinsics
+    half = {n: getattr(frames[1], n)[:36, :48].copy() for n in ("rgb", "depth_m", "label")}
+    frames[1] = dataclasses.replace(frames[1], intrinsics=dataclasses.replace(k, width=48, height=36), **half)
+    mixed = write_log(tmp_path / "mixed.mcap", frames)
+    out = tmp_path / "w.safetensors"
+    arguments = ("--keyframes", "3", "--seconds", "0", "--steps", "1", "--weights", weights)
+    done = run("finetune", mixed, *arguments, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "48x36, but the first one is 96x72" in done.stderr and len(load_checkpoint(out).anchors) == 3

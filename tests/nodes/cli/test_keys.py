@@ -1,0 +1,68 @@
+"""Two machines that get to know each other, and a question from one to the other's mapper."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from semantic_mapper.client import MapClient
+from semantic_mapper.errors import TransportError
+from semantic_mapper.transport.security import ServerIdentity, load_keys
+from tests.nodes.mapper.test_query_service import answering
+from tests.nodes.support import run, run_here
+from tests.queries.scene import whole_map
+
+
+def keys(*arguments: object) -> str:
+    done = run("keys", *arguments)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_a_map_is_asked_from_another_machine(tmp_path: Path) -> None:
+    robot, desk = tmp_path / "robot", tmp_path / "desk"
+    public = {folder: keys("make", "--keys", folder).split()[0] for folder in (robot, desk)}
+    keys("allow", "desk", public[desk], "--keys", robot)
+    keys("allow", "robot", public[robot], "--keys", desk)
+    shown = json.loads(keys("show", "--json", "--keys", robot))
+    assert shown == {"folder": str(robot), "public": public[robot], "peers": {"desk": public[desk]}}
+    assert public[robot] in keys("show", "--keys", desk)
+
+    identity = ServerIdentity(load_keys(desk), "robot")
+    with answering("tcp://0.0.0.0:*", whole_map(), load_keys(robot)) as service:
+        endpoint = service.endpoint.replace("0.0.0.0", "127.0.0.1")
+        with MapClient(endpoint, timeout_s=60, identity=identity) as client:
+            assert client.info().blocks == whole_map().block_count
+        with MapClient(endpoint, timeout_s=0.2, attempts=1) as clear, pytest.raises(TransportError, match="no answer"):
+            clear.info()
+        asked = run("query", endpoint, "info", "--server", "robot", "--keys", desk)
+        assert asked.returncode == 0 and "table" in asked.stdout, asked.stderr
+        keys("forget", "desk", "--keys", robot)
+        refused = run("query", endpoint, "info", "--server", "robot", "--keys", desk)
+    assert refused.returncode == 1 and "Does it know this machine's key" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    "verb",
+    [
+        ("query", "tcp://192.0.2.1:5570", "info"),
+        ("top", "tcp://192.0.2.1:5570", "--once"),
+        ("weights", "tcp://192.0.2.1:5570"),
+        ("label", "room.mcap", "--keyframes", "2", "--to", "tcp://0.0.0.0:5570"),
+    ],
+    ids=lambda verb: verb[0],
+)
+def test_no_verb_speaks_to_another_machine_without_keys(verb: tuple[str, ...], log: Path) -> None:
+    code, said = run_here(*(log if word == "room.mcap" else word for word in verb))
+    assert code == 1 and "semantic-mapper keys make" in said and "ssh -L" in said
+
+
+def test_wrong_use_is_told(tmp_path: Path) -> None:
+    assert "make them with" in run("keys", "show", "--keys", tmp_path / "none").stderr
+    keys("make", "--keys", tmp_path / "own")
+    assert "there are keys already" in run("keys", "make", "--keys", tmp_path / "own").stderr
+    assert "no public key" in run("keys", "allow", "desk", "nonsense", "--keys", tmp_path / "own").stderr
+    assert "there are: none" in run("keys", "forget", "desk", "--keys", tmp_path / "own").stderr

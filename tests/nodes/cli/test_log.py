@@ -1,0 +1,157 @@
+"""``import``, ``info`` and ``recover`` of logs; ``info`` of maps."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.replay.log.format import LogWriter
+from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.types import PosedFrame
+from tests.mapping.rendered_views import small_map
+from tests.mapping.test_voxel_map import fuse_sphere
+from tests.nodes.support import error_line, run
+from tests.small import INTRINSICS, tiny_frames
+
+
+def _write_sequence(folder: Path, frames: tuple[PosedFrame, ...]) -> Path:
+    """A sequence folder, the way a recording comes."""
+    for name in ("color", "depth", "label"):
+        (folder / name).mkdir(parents=True)
+    rows = []
+    for i, frame in enumerate(frames):
+        assert frame.depth_m is not None and frame.label is not None
+        cv2.imwrite(str(folder / f"color/{i:06d}.png"), frame.rgb[..., ::-1])
+        cv2.imwrite(str(folder / f"depth/{i:06d}.png"), (frame.depth_m * 1000).round().astype(np.uint16))
+        cv2.imwrite(str(folder / f"label/{i:06d}.png"), frame.label)
+        rows.append(" ".join(map(str, frame.T_world_camera.ravel())))
+    (folder / "poses.txt").write_text("\n".join(rows))
+    k = INTRINSICS
+    intrinsics = {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}
+    (folder / "intrinsics.json").write_text(json.dumps({**intrinsics, "depth_scale": 1000}))
+    labels = sorted({int(i) for f in frames for i in np.unique(f.label) if i})
+    (folder / "labels.json").write_text(json.dumps({"classes": {str(i): f"class{i}" for i in labels}}))
+    return folder
+
+
+@pytest.mark.slow
+def test_recording_with_a_broken_pose_is_imported_but_for_that_frame(tmp_path: Path) -> None:
+    source = _write_sequence(tmp_path / "sequence", tiny_frames(4))
+    poses = (source / "poses.txt").read_text().splitlines()
+    poses[2] = " ".join(["nan"] * 16)
+    (source / "poses.txt").write_text("\n".join(poses))
+    log = tmp_path / "sequence.mcap"
+    done = run("import", source, log)
+    assert done.returncode == 0, done.stderr
+    assert "3 frames (3 of them labelled)" in done.stdout
+    assert "frame 2" in done.stdout and "poses.txt" in done.stdout
+    assert f"depth: 1000 units per metre, given in {source / 'intrinsics.json'}" in done.stdout
+    found = json.loads(run("info", log, "--json").stdout)
+    assert found["frames"] == found["frames_with_depth"] == found["frames_with_labels"] == 3
+    assert found["cameras"]["camera"]["width"] == 96
+    assert found["damage"] == []
+
+
+def test_what_is_no_recording_is_refused_by_name(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    done = run("import", tmp_path / "empty", tmp_path / "out.mcap")
+    assert done.returncode == 1
+    assert "empty" in error_line(done.stderr)
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_info_shows_topics_frames_and_classes(log: Path) -> None:
+    done = run("info", log)
+    assert done.returncode == 0, done.stderr
+    for text in ("6 (6 with depth, 6 with labels)", "96x72", "topic frame/rooms", "rooms: wall, floor", "none"):
+        assert text in done.stdout
+
+
+@pytest.mark.slow
+def test_info_lists_the_gaps_of_each_camera(tmp_path: Path) -> None:
+    """Frames that a recorder dropped, and a camera that stood still; another camera is whole."""
+    whole, frames = tiny_frames(6), []
+    for camera, seqs in (("left", (0, 1, 2, 6, 7, 9)), ("right", range(6))):
+        frames += [
+            replace(frame, camera_id=camera, seq=seq, stamp_ns=10**9 + seq * 10**8)
+            for frame, seq in zip(whole, seqs, strict=True)
+        ]
+    frames.sort(key=lambda frame: frame.stamp_ns)
+    log = tmp_path / "gaps.mcap"
+    with LogWriter(log, StreamInfo("test", {"left": INTRINSICS, "right": INTRINSICS}, ROOMS)) as writer:
+        for frame in frames:
+            writer.write_frame(frame)
+    gaps = json.loads(run("info", log, "--json").stdout)["gaps"]
+    left = gaps["left"]
+    assert (left["frames_missing"], left["sequence_gaps"], left["largest_sequence_gap"]) == (4, 2, 3)
+    assert (left["time_gaps"], left["longest_time_gap_s"], left["interval_s"]) == (1, 0.4, 0.1)
+    assert left["largest_sequence_gap_after_seq"] == left["longest_time_gap_after_seq"] == 2
+    assert gaps["right"]["frames_missing"] == gaps["right"]["time_gaps"] == 0
+    shown = " ".join(run("info", log).stdout.split())
+    assert "gaps left" in shown and "4 frames missing" in shown and "after seq 2" in shown
+
+
+@pytest.mark.slow
+def test_info_of_a_map_says_what_it_is(tmp_path: Path) -> None:
+    voxel_map = small_map(voxel_size_m=0.03)
+    fuse_sphere(voxel_map, 3)
+    path = tmp_path / "map.npz"
+    voxel_map.save(path)
+    done = run("info", path)
+    assert done.returncode == 0, done.stderr
+    state = voxel_map.block_state()
+    low, high = state["keys"].min(axis=0) * 0.24, (state["keys"].max(axis=0) + 1) * 0.24
+    extent = " x ".join(f"{x:.2f}" for x in high - low)
+    for text in ("version 2", "3, the last one at", "3 cm", extent, "72", "three: table, cup, wall"):
+        assert text in done.stdout
+    found = json.loads(run("info", path, "--json").stdout)
+    assert (found["frames"], found["last_stamp_ns"], found["blocks"]) == (3, 1002, voxel_map.block_count)
+    np.testing.assert_allclose(found["bounds_m"], [low, high])
+    assert found["measured_voxels"] == (state["weight"] > 0).sum()
+    assert found["voted_voxels"] == (state["votes"] > 0).sum()
+    assert found["label_set"] == {"name": "three", "ids": [5, 9, 2], "classes": ["table", "cup", "wall"]}
+    assert found["config"]["voxel_size_m"] == 0.03 and found["size_bytes"] == path.stat().st_size
+
+
+@pytest.mark.slow
+def test_info_of_a_damaged_map_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    small_map().save(path)
+    assert "blocks" in run("info", path).stdout
+    path.write_bytes(path.read_bytes()[:-1])
+    done = run("info", path)
+    assert done.returncode == 1
+    assert "map.npz: damaged: it is cut off" in error_line(done.stderr)
+
+
+@pytest.mark.slow
+def test_damaged_log_is_reported_and_recovered(log: Path, tmp_path: Path) -> None:
+    content = bytearray(log.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(content[: len(content) * 9 // 10])
+    told = run("info", damaged)
+    assert told.returncode == 1
+    assert "damaged:" in told.stdout and "semantic-mapper recover" in told.stdout
+    clean = tmp_path / "clean.mcap"
+    done = run("recover", damaged, clean)
+    assert done.returncode == 0, done.stderr
+    assert "lost:" in done.stdout
+    found = json.loads(run("info", clean, "--json").stdout)
+    assert 3 <= found["frames"] <= 5
+    assert found["damage"] == [] and found["finished"]
+
+
+def test_recover_never_writes_over_a_log(log: Path, tmp_path: Path) -> None:
+    taken = tmp_path / "taken.mcap"
+    taken.write_text("mine")
+    done = run("recover", log, taken)
+    assert done.returncode == 1
+    assert "taken.mcap: exists already" in error_line(done.stderr)
+    assert taken.read_text() == "mine"

@@ -1,0 +1,105 @@
+"""The command as such: help, usage errors, versions."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from semantic_mapper import __version__
+from tests.nodes.support import COMMAND, run, run_here
+
+VERBS = (
+    "demo",
+    "replay",
+    "up",
+    "record",
+    "import",
+    "info",
+    "recover",
+    "finetune",
+    "eval",
+    "doctor",
+    "query",
+    "train",
+    "bench",
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_explains_itself_with_an_example(verb: str) -> None:
+    done = run(verb, "--help")
+    assert done.returncode == 0, done.stderr
+    assert f"Example: semantic-mapper {verb}" in done.stdout
+    assert done.stderr == ""
+
+
+def test_help_lists_all_verbs() -> None:
+    done = run("--help")
+    assert done.returncode == 0
+    assert all(f"  {verb} " in done.stdout for verb in VERBS)
+
+
+def test_version_is_that_of_the_package() -> None:
+    assert run("--version").stdout == f"semantic-mapper {__version__}\n"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("replai",),
+        ("replay", "room.mcap"),
+        ("replay", "room.mcap", "--out", "x", "--voxel-size", "-1"),
+        ("import", "src", "dst", "--format", "rosbag"),
+        ("finetune", "room.mcap", "--keyframes", "1", "--out", "w"),
+        ("finetune", "room.mcap", "--keyframes", "4", "--out", "w", "--seconds", "0"),
+        ("eval",),
+        ("query", "map.npz", "where"),
+        ("query", "map.npz", "at", "1", "2"),
+        ("query", "map.npz", "at", "1", "2", "east"),
+        ("query", "map.npz", "nearest", "1", "2", "3"),
+        ("query", "map.npz", "info", "--jason", "x"),
+    ],
+)
+def test_wrong_usage_exits_with_2_and_says_so_on_stderr(arguments: tuple[str, ...]) -> None:
+    done = run(*arguments)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert "Usage: semantic-mapper" in done.stderr
+
+
+def test_no_heavy_package_is_loaded_for_help() -> None:
+    import subprocess
+    import sys
+
+    code = "import sys, semantic_mapper.nodes.cli.main\n"
+    code += "print([m for m in ('torch', 'numpy', 'open3d', 'cv2') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("number", ["inf", "nan", "1e308"])
+def test_numbers_that_nothing_can_be_computed_with_are_wrong_usage(number: str, tmp_path: Path) -> None:
+    code, said = run_here("label", tmp_path / "x.mcap", "--timeout", number)
+    assert code == 2 and "--timeout" in said
+
+
+def test_completion_of_bash_knows_verbs_and_options(tmp_path: Path) -> None:
+    def complete(line: str, **more: str) -> list[str]:
+        words = {"COMP_WORDS": line, "COMP_CWORD": str(len(line.split(" ")) - 1)}
+        environment = {**os.environ, "_SEMANTIC_MAPPER_COMPLETE": "complete_bash", **words, **more}
+        done = subprocess.run([str(COMMAND)], env=environment, capture_output=True, text=True, check=False)
+        return done.stdout.split()
+
+    assert complete("semantic-mapper re") == ["replay", "record", "recover"]
+    assert complete("semantic-mapper launch ") == ["list", "show", "copy"]
+    assert "--voxel-size" in complete("semantic-mapper replay --vo")
+    script = complete("", _SEMANTIC_MAPPER_COMPLETE="source_bash")
+    assert "complete" in script and "semantic-mapper" in script
+    home = {**os.environ, "HOME": str(tmp_path), "SHELL": "/bin/bash"}
+    subprocess.run([str(COMMAND), "--install-completion", "bash"], env=home, capture_output=True, check=True)
+    assert "semantic-mapper" in (tmp_path / ".bashrc").read_text()

@@ -1,0 +1,119 @@
+"""The command on a saved map of a known scene."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import TransportError
+from semantic_mapper.nodes.cli.query import Asked, Question, ask_file, ask_mapper
+from tests.nodes.mapper.test_query_service import a_folder, answering
+from tests.nodes.support import eventually, run, run_here
+from tests.queries.scene import BALL, BOX, HALF, RADIUS, whole_map
+
+
+@pytest.fixture(scope="module")
+def map_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("map") / "map.npz"
+    whole_map().save(path)
+    return path
+
+
+def ask(map_file: Path, *arguments: object) -> tuple[dict, str]:
+    answer = map_file.with_name("answer.json")
+    done = run("query", map_file, *map(str, arguments), "--json", answer)
+    assert done.returncode == 0, done.stderr
+    return json.loads(answer.read_text()), done.stdout
+
+
+@pytest.mark.slow
+def test_info(map_file: Path) -> None:
+    found, shown = ask(map_file, "info")
+    assert (found["frames"], found["blocks"], found["label_set"]) == (14, whole_map().block_count, "known")
+    assert found["classes"]["floor"] > found["classes"]["table"] > 500 and found["classes"]["lamp"] == 0
+    assert found["surface_voxels"] == found["without_class"] + sum(found["classes"].values())
+    assert "table" in shown and "lamp" not in shown
+
+
+def test_a_folder_with_a_map_is_that_map(map_file: Path) -> None:
+    info = Asked(Question.INFO)
+    assert ask_file(str(map_file.parent), info) == ask_file(str(map_file), info)
+    code, said = run_here("info", map_file.parent)
+    assert code == 0 and "blocks" in said
+    code, said = run_here("correct", map_file.parent, map_file)
+    assert code == 1 and "a saved map keeps no frames to correct" in said
+    code, said = run_here("eval", map_file)
+    assert code == 1 and "is a map alone; give the folder" in said
+
+
+@pytest.mark.slow
+def test_at_points_below_zero_too(map_file: Path) -> None:
+    x, y, z = BOX + np.array([0.0, 0.0, HALF[2]])
+    assert x < 0
+    found, shown = ask(map_file, "at", x, y, z)
+    assert found["class"] == "table" and found["confidence"] > 0.5 and found["surface_distance_m"] < 0.015
+    assert found["state"] == "occupied" and "table" in shown
+    found, _ = ask(map_file, "at", "-1e1", "-2", ".5")
+    assert (found["class"], found["state"], found["surface_distance_m"]) == (None, "unknown", None)
+
+
+@pytest.mark.slow
+def test_nearest(map_file: Path) -> None:
+    above = BALL + np.array([0.0, 0.0, 1.0])
+    found, shown = ask(map_file, "nearest", "cup", *above)
+    assert found["found"] and abs(found["distance_m"] - (1.0 - RADIUS)) < 0.006
+    np.testing.assert_allclose(found["xyz"], BALL + np.array([0.0, 0.0, RADIUS]), atol=0.03)
+    assert "cup" in shown
+    found, _ = ask(map_file, "nearest", "lamp", *above)
+    assert found["found"] is False
+    done = run("query", map_file, "nearest", "kettle", "0", "0", "0")
+    assert done.returncode == 1 and "floor, table, cup, lamp" in done.stderr.replace("\n", " ")
+
+
+@pytest.mark.slow
+def test_instances(map_file: Path) -> None:
+    found, shown = ask(map_file, "instances", "--up", "0", "0", "-1")
+    large = {thing["class"]: thing for thing in found["instances"] if thing["voxels"] > 200}
+    assert set(large) == {"table", "cup"}
+    np.testing.assert_allclose(large["table"]["box"]["center"], BOX, atol=0.03)
+    assert large["table"]["box"]["R_world_box"][2][2] == -1
+    assert "table" in shown and str(large["cup"]["voxels"]) in shown
+
+
+def answers(endpoint: str) -> bool:
+    try:
+        ask_mapper(endpoint, Asked(Question.INFO, "", ()))
+    except TransportError:
+        return False
+    return True
+
+
+@pytest.mark.slow
+def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
+    with a_folder() as folder, answering(f"ipc://{folder / 'query'}", whole_map()) as service:
+        assert eventually(lambda: answers(service.endpoint), 120), "no answer, not even once kernels are compiled"
+        for question, name, point in (
+            (Question.INFO, "", ()),
+            (Question.AT, "", (*BOX[:2], 0.4)),
+            (Question.NEAREST, "cup", (0.0, 0.0, 1.0)),
+            (Question.NEAREST, "lamp", (0.0, 0.0, 1.0)),
+            (Question.INSTANCES, "", ()),
+        ):
+            asked = Asked(question, name, point)
+            assert ask_mapper(service.endpoint, asked) == ask_file(str(map_file), asked)
+        done = run("query", service.endpoint, "nearest", "cup", "0", "0", "1", "--json", folder / "live.json")
+        assert done.returncode == 0 and "cup" in done.stdout, done.stderr
+        assert json.loads((folder / "live.json").read_text())["map"] == service.endpoint
+        wrong = run("query", service.endpoint, "nearest", "kettle", "0", "0", "0")
+        assert wrong.returncode == 1 and "floor, table, cup, lamp" in wrong.stderr.replace("\n", " ")
+
+
+@pytest.mark.slow
+def test_what_cannot_be_asked_is_said(map_file: Path, tmp_path: Path) -> None:
+    missing = run("query", tmp_path / "none.npz", "info")
+    assert missing.returncode == 1 and "no such map file" in missing.stderr
+    nan = run("query", map_file, "at", "nan", "0", "0")
+    assert nan.returncode == 1 and "row 0" in nan.stderr

@@ -1,0 +1,114 @@
+"""What ``doctor`` says of a launch file: its options, the keys that it names, the addresses where it would listen."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import pytest
+
+from semantic_mapper.drivers import registry
+from semantic_mapper.drivers.registry import FoundCamera
+from semantic_mapper.nodes.doctor import launch_file as doctor_launch
+from semantic_mapper.nodes.doctor.check import Check
+from semantic_mapper.nodes.doctor.robot import PORTS
+from semantic_mapper.nodes.supervisor.launch_config import load_launch
+from semantic_mapper.transport.security import allow, make_keys
+from tests.nodes.support import REPLAY_LAUNCH
+
+ROBOT = REPLAY_LAUNCH.with_name("headless-onboard.toml")
+REMOTE = REPLAY_LAUNCH.with_name("remote-viewer.toml")
+
+
+def of(path: Path, *settings: str) -> dict[str, list[Check]]:
+    found: dict[str, list[Check]] = {}
+    for check in doctor_launch.launch_file(path, settings):
+        found.setdefault(check.name, []).append(check)
+    return found
+
+
+def test_ports_of_the_viewer_and_of_all_launch_files_are_looked_at() -> None:
+    assert {9090, 9876} < set(PORTS)
+    remote = ["keys=k", "kind=v4l2", "camera=webcam.toml", "poses=poses.toml"]
+    for path, settings in ((ROBOT, []), (REMOTE, remote)):
+        for endpoint, _ in doctor_launch._listening(load_launch(path, settings)):
+            assert int(endpoint.rpartition(":")[2]) in PORTS
+
+
+def test_launch_file_that_up_would_refuse_is_bad(tmp_path: Path) -> None:
+    (refused,) = of(REPLAY_LAUNCH)["replay.toml"]
+    assert refused.state == "bad" and "needs 'log'" in refused.found and "--set log=" in refused.mend
+    assert of(tmp_path / "none.toml")["none.toml"][0].state == "bad"
+
+
+def test_addresses_are_told_with_who_has_them() -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        taken = f"tcp://127.0.0.1:{other.getsockname()[1]}"
+        found = of(ROBOT, f"query={taken}", "status=tcp://127.0.0.1:0", "publish=tcp://127.0.0.1:0")
+        everywhere = taken.replace("127.0.0.1", "0.0.0.0")
+        assert doctor_launch.port_is_taken(int(taken.rpartition(":")[2]), "0.0.0.0")
+    assert [(c.state, c.found) for c in found["address"]] == [
+        ("ok", "tcp://127.0.0.1:0"),
+        ("note", f"{taken} is in use (by this very launch, if it runs)"),
+        ("ok", "tcp://127.0.0.1:0"),
+    ]
+    assert f"sport = :{taken.rpartition(':')[2]}" in found["address"][1].mend
+    (refused,) = [c for c in of(ROBOT, f"query={everywhere}")["address"] if c.state == "bad"]
+    assert "which needs keys" in refused.found + refused.mend
+
+
+def test_keys_that_a_launch_file_names_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "keys"
+    settings = [f"keys={folder}", "query=tcp://0.0.0.0:0", "status=tcp://127.0.0.1:0", "publish=tcp://127.0.0.1:0"]
+    found = of(ROBOT, *settings)
+    (none,) = found["keys"]
+    assert "address" not in found, "told once"
+    assert (none.state, none.mend) == ("bad", f"make them with `semantic-mapper keys make --keys {folder}`")
+    own = make_keys(folder)
+    found = of(ROBOT, *settings)
+    assert found["keys"][0].state == "note" and "keys allow" in found["keys"][0].mend
+    assert [c.state for c in found["address"]] == ["ok", "bad", "ok"], "nobody could come in from elsewhere"
+    allow(folder, "desk", make_keys(tmp_path / "desk").public.decode())
+    found = of(ROBOT, *settings)
+    assert found["keys"] == [Check("keys", "ok", f"{folder}: this machine's, and those of desk")]
+    assert {c.state for c in found["address"]} == {"ok"}
+    secret = next(folder.glob("*.key_secret"))
+    secret.chmod(0o644)
+    open_to_all = of(ROBOT, *settings)["keys"][0]
+    assert open_to_all.state == "bad" and f"chmod 600 {secret}" in open_to_all.mend
+    assert own.secret.decode() not in str(of(ROBOT, *settings))
+
+    monkeypatch.setattr(doctor_launch, "default_folder", lambda: tmp_path / "nowhere")
+    assert [c.state for c in doctor_launch.own_keys()] == ["ok"]
+    monkeypatch.setattr(doctor_launch, "default_folder", lambda: folder)
+    assert [c.state for c in doctor_launch.own_keys()] == ["bad"]
+
+
+def test_what_a_node_would_refuse_as_it_starts_is_told_before(tmp_path: Path) -> None:
+    found = of(REPLAY_LAUNCH, f"log={tmp_path / 'none.mcap'}")
+    assert (found["camera"][0].state, found["mapper"][0].state) == ("bad", "ok")
+    assert "no such log" in found["camera"][0].found
+    assert "fps" in of(ROBOT, "fps=-1")["camera"][0].found
+    file = tmp_path / "learning.toml"
+    text = ROBOT.with_name("learning.toml").read_text(encoding="utf-8")
+    file.write_text(text.replace('restart = "never"', 'restart = "on-failure"'), encoding="utf-8")
+    (tmp_path / "mapper.toml").write_text("[voxel_map]\nvoxel_size = 0.1\n", encoding="utf-8")
+    (tmp_path / "broken.safetensors").write_bytes(b"no weights")
+    settings = (f"config={tmp_path / 'mapper.toml'}", f"weights={tmp_path / 'broken.safetensors'}")
+    found = of(file, *settings)
+    assert "begin in another world" in found["camera"][0].found
+    assert "voxel_size" in found["mapper"][0].found and "broken.safetensors" in found["finetuner"][0].found
+    assert {found[name][0].state for name in ("camera", "mapper", "finetuner")} == {"bad"}
+
+
+def test_a_camera_that_is_not_connected_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    connected: list[FoundCamera] = []
+    monkeypatch.setattr(registry, "find_cameras", lambda kinds: (connected, {}))
+    found = "camera 'oak': no oak camera is connected"
+    assert of(ROBOT)["camera"][0] == Check("camera", "bad", found, "plug it in (`up` waits for it)")
+    connected.append(FoundCamera("oak", "OAK-D", "1844"))
+    assert of(ROBOT)["camera"][0] == Check("camera", "ok", "oak 1844; its settings and poses")
+    assert "oak 17 is not connected, there are 1844" in of(ROBOT, "device=17")["camera"][0].found
+    assert of(ROBOT, "device=10.0.0.2")["camera"][0].state == "ok", "it may lie behind a router"

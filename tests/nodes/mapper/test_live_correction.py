@@ -1,0 +1,363 @@
+"""Corrected poses reach a mapper over real sockets while its stream goes on."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from structlog.testing import capture_logs
+
+from semantic_mapper.client import MapClient
+from semantic_mapper.config import MapperConfig, load_config
+from semantic_mapper.errors import CodecError, MapError, PoseError, ShapeError
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapping.correction.pose_correction import ALWAYS
+from semantic_mapper.mapping.pipeline import MappingPipeline
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
+from semantic_mapper.nodes.mapper.node import run_mapper
+from semantic_mapper.nodes.mapper.query_service import QueryService
+from semantic_mapper.nodes.node import NodeContext
+from semantic_mapper.nodes.options import MapperOptions
+from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.supervisor.heartbeat import Heart
+from semantic_mapper.replay.session import MapSession, load_pipeline
+from semantic_mapper.transport import query_messages as messages
+from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info
+from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
+from semantic_mapper.transport.query_codec import encode_request
+from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
+from semantic_mapper.types import Float64, PosedFrame
+from tests.mapping.correction.test_corrected_map import drifted, true_poses
+from tests.nodes.mapper.test_query_service import Stranger, a_folder
+from tests.nodes.support import CONFIG, eventually, run
+from tests.replay.test_corrected_poses import write as write_tum
+from tests.small import INTRINSICS, tiny_frames
+
+GEOMETRY = ("keys", "tsdf", "weight", "color")
+
+
+@dataclasses.dataclass
+class Robot:
+    """A mapper node in this process, and both ends of its sockets."""
+
+    camera: Publisher
+    query: str
+    out: Path
+    status: list[Status]
+    thread: threading.Thread
+    stop: StopRequest
+    endpoints: dict[str, str]
+    weights: Path
+
+    def send(self, frames: list[PosedFrame]) -> None:
+        for frame in frames:
+            self.camera.publish(encode_frame(frame))
+
+    def fused(self, count: int) -> bool:
+        return eventually(lambda: bool(self.status) and self.status[-1].counters.get("fused", 0) >= count)
+
+    def end(self, published: int) -> dict[str, object]:
+        """End the stream; the summary."""
+        self.camera.publish(encode_end(EndOfStream("test", "end", published)))
+        self.thread.join(100)
+        assert not self.thread.is_alive()
+        return json.loads((self.out / "summary.json").read_text())
+
+
+def config_file(folder: Path, history: int = 100) -> Path:
+    path = folder / f"history{history}.toml"
+    path.write_text(f"{CONFIG}[history]\nmax_frames = {history}\n", encoding="utf-8")
+    return path
+
+
+@contextmanager
+def running_robot(
+    weights: Path, out: Path, history: int = 100, restarts: int = 0, notes: Path | None = None, **more: Any
+) -> Iterator[Robot]:
+    with a_folder() as folder:
+        names = ("camera", "mapper", "query", "finetuner", "labels")
+        endpoints = {name: f"ipc://{folder / name}" for name in names}
+        options = MapperOptions(
+            out=str(out), weights=str(weights), config=str(config_file(folder, history)), delivery="all", **more
+        )
+        stop = StopRequest(patient=True)
+        context = NodeContext("mapper", endpoints, 1, stop, Heart(-1, 1), restarts, notes)
+        mapper = threading.Thread(target=run_mapper, args=(context, options), daemon=True)
+        status: list[Status] = []
+        ended = threading.Event()
+        with Publisher(endpoints["camera"], policy="block") as camera:
+            mapper.start()
+            for topic in ("info", "frame", "end"):
+                camera.wait_for_subscribers(topic, timeout_s=60)
+            with LosslessSubscriber(endpoints["mapper"], ("status",)) as listener:
+
+                def listen() -> None:
+                    while not ended.is_set():
+                        if isinstance(message := listener.receive(0.1), Status):
+                            status.append(message)
+
+                ear = threading.Thread(target=listen)
+                ear.start()
+                camera.publish(encode_info(StreamInfo("test", {"rooms": INTRINSICS}, label_set=ROOMS, frame_hz=10.0)))
+                try:
+                    yield Robot(camera, endpoints["query"], out, status, mapper, stop, endpoints, weights)
+                finally:
+                    stop.signum = 15
+                    mapper.join(60)
+                    ended.set()
+                    ear.join()
+
+
+@pytest.fixture(scope="module")
+def bundle_of(weights: Path, tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("bundles")
+
+    def make(history: int = 100):
+        return load_pipeline(weights, load_config(config_file(folder, history), MapperConfig))
+
+    return make
+
+
+def state_of(voxel_map: VoxelMap) -> dict[str, np.ndarray]:
+    return voxel_map.block_state()
+
+
+def ideal_map(bundle_of, frames: tuple[PosedFrame, ...]) -> VoxelMap:
+    pipeline = bundle_of(0).pipeline
+    for frame in frames:
+        pipeline.step(dataclasses.replace(frame, label=None))
+    return pipeline.voxel_map
+
+
+def surface_distance(a: VoxelMap, b: VoxelMap) -> float:
+    """95th percentile of the distance of points of ``a`` to those of ``b``, metres."""
+    from scipy.spatial import cKDTree
+
+    return float(np.percentile(cKDTree(b.points().xyz).query(a.points().xyz)[0], 95))
+
+
+def settle(client: MapClient) -> None:
+    assert eventually(lambda: not client.correction().running)
+
+
+def test_a_drifting_stream_that_is_corrected_midway_ends_as_the_map_of_true_poses(weights, bundle_of, tmp_path):
+    frames = tiny_frames(14)
+    late = drifted(frames)
+    with running_robot(weights, tmp_path / "out") as robot, MapClient(robot.query, timeout_s=60) as client:
+        robot.send(late[:8])
+        assert robot.fused(8)
+        before = client.info()
+        begun = client.correct_poses(true_poses(frames[:8], 1))
+        assert (begun.used, begun.left_out, begun.frozen) == (8, 0, 0)
+        robot.send(list(frames[8:]))  # from the loop closure on, poses are those of the corrected world
+        settle(client)
+        done = client.correction()
+        assert (done.completed, done.poses, done.epoch, done.failure) == (1, 8, 1, "")
+        assert robot.fused(14) and eventually(lambda: client.info().epoch == 1)
+        assert before.epoch == 0 and client.info().map_id == before.map_id
+        assert eventually(lambda: robot.status[-1].counters.get("corrections") == 1)
+        assert robot.status[-1].counters["correction_left"] == 0 and not robot.status[-1].degraded
+        summary = robot.end(14)
+    saved = VoxelMap.load(tmp_path / "out" / "map.npz")
+    assert saved.frames == 14 and summary["map"]["corrected_poses"] == 8
+    assert summary["map"]["unfinished_correction"] is None
+    ours, ideal = state_of(saved), state_of(ideal_map(bundle_of, frames))
+    for name in GEOMETRY:  # what the field rendered along the way differs a little
+        assert ours[name].tobytes() == ideal[name].tobytes(), name
+
+
+def test_where_odometry_goes_on_frames_to_come_move_too_and_the_end_waits_for_the_correction(
+    weights, bundle_of, tmp_path
+):
+    frames = tiny_frames(14)
+    late = drifted(frames)
+    drift: Float64 = late[7].T_world_camera @ np.linalg.inv(frames[7].T_world_camera)
+    odometry = [dataclasses.replace(f, T_world_camera=drift @ f.T_world_camera) for f in frames[8:]]
+    with running_robot(weights, tmp_path / "out") as robot, MapClient(robot.query, timeout_s=60) as client:
+        robot.send(late[:8])
+        assert robot.fused(8)
+        client.correct_poses(true_poses(frames[:8], 2), until_ns=ALWAYS)
+        robot.send(odometry)
+        summary = robot.end(14)
+    saved, ideal = VoxelMap.load(tmp_path / "out" / "map.npz"), ideal_map(bundle_of, frames)
+    uncorrected = ideal_map(bundle_of, (*late[:8], *odometry))
+    assert saved.frames == 14 and summary["map"]["corrected_poses"] == 5
+    assert surface_distance(saved, ideal) < 0.01 < 0.03 < surface_distance(uncorrected, ideal)
+    assert summary["metrics"]["map_miou"] is not None
+
+
+@pytest.mark.slow
+def test_a_file_is_sent_from_the_command_line(weights, tmp_path):
+    frames = tiny_frames(8)
+    with running_robot(weights, tmp_path / "out") as robot, MapClient(robot.query, timeout_s=60) as client:
+        robot.send(drifted(frames))
+        assert robot.fused(8)
+        far = dataclasses.replace(frames[-1], stamp_ns=frames[-1].stamp_ns + 10**9)
+        file = write_tum(tmp_path / "true.tum", [*frames[::2], far])
+        done = run("correct", robot.query, file, "--json")
+        assert done.returncode == 0, done.stderr
+        outcome = json.loads(done.stdout)
+        assert (outcome["used"], outcome["left_out"], outcome["completed"], outcome["running"]) == (4, 1, 1, False)
+        wrong = run("correct", robot.query, write_tum(tmp_path / "far.tum", [far]), "--until", "0.2", "--no-wait")
+        assert wrong.returncode == 1
+        assert "none of 1 poses was taken within 5 ms of a frame in the history (8 frames from 0.0" in wrong.stderr
+        assert client.correction().completed == 1 and robot.end(8)["map"]["corrected_poses"] == 4
+
+
+@contextmanager
+def answered(pipeline: MappingPipeline) -> Iterator[tuple[LiveCorrection, MapClient]]:
+    """A service whose mapper does nothing by itself."""
+    correction = LiveCorrection(pipeline)
+    with (
+        a_folder() as folder,
+        QueryService(f"ipc://{folder / 'query'}", pipeline.voxel_map, correction) as service,
+        MapClient(service.endpoint, timeout_s=60) as client,
+    ):
+        yield correction, client
+
+
+def session_of(bundle, frames: list[PosedFrame] | tuple[PosedFrame, ...]) -> MapSession:
+    session = MapSession(bundle, stream_labels=ROOMS)
+    for frame in frames:
+        session.process(frame)
+    return session
+
+
+def test_what_is_refused_says_why_and_changes_nothing(bundle_of):
+    frames = tiny_frames(4)
+    session = session_of(bundle_of(), [*frames, dataclasses.replace(frames[3], camera_id="rear")])
+    pose, stamp = frames[1].T_world_camera, frames[1].stamp_ns
+    skewed = pose * 2
+    with answered(session.pipeline) as (_, client):
+        for poses, options, error, says in (
+            ({}, {}, MapError, "none was given"),
+            ({stamp: skewed}, {}, PoseError, f"corrected pose of stamp {stamp}"),
+            ({stamp: np.full((4, 4), np.nan)}, {}, PoseError, "NaN"),
+            ({stamp: np.eye(3)}, {}, ShapeError, r"expected shape \(4, 4\)"),
+            (
+                {stamp + 2_000_000: pose},
+                {},
+                MapError,
+                "no frame with this stamp was mapped; of those in the history the nearest",
+            ),
+            ({("side", stamp): pose}, {}, MapError, "of camera 'side': no frame"),
+            ({frames[3].stamp_ns: pose}, {}, MapError, "cameras rear, rooms have this stamp"),
+            ({stamp: pose}, {"within_ns": 1000}, MapError, "cameras rear, rooms; name one"),
+            (
+                {("rooms", stamp + 2000): pose},
+                {"within_ns": 1000},
+                MapError,
+                "none of 1 poses was taken within 0.001 ms",
+            ),
+            ({stamp: pose}, {"within_ns": 10**10}, CodecError, "within_ns"),
+            ({stamp: pose}, {"until_ns": -1}, CodecError, "until_ns"),
+            ({("", stamp): pose, ("rooms", stamp): pose}, {}, CodecError, "must differ"),
+        ):
+            with pytest.raises(error, match=says):
+                client.correct_poses(poses, **options)
+            assert not session.pipeline.corrector.status.running
+        near = client.correct_poses({("rooms", stamp + 900): pose}, within_ns=1000)
+        assert (near.used, near.running, near.total) == (1, True, 5)
+    with answered(bundle_of(0).pipeline) as (_, client), pytest.raises(MapError, match=r"set history\.max_frames"):
+        client.correct_poses({stamp: pose})
+    with (
+        a_folder() as folder,
+        QueryService(f"ipc://{folder / 'query'}", session.pipeline.voxel_map) as service,
+        MapClient(service.endpoint, timeout_s=60) as client,
+        pytest.raises(MapError, match="only answers questions"),
+    ):
+        client.correction()
+
+
+def test_a_request_that_arrives_twice_counts_once(bundle_of):
+    frames = tiny_frames(3)
+    session = session_of(bundle_of(), drifted(frames))
+    with answered(session.pipeline) as (correction, client):
+        stranger = Stranger(client._socket.endpoint)
+        request = messages.CorrectPosesRequest(id="a", cameras=("",))
+        arrays = {
+            "stamps_ns": np.array([f.stamp_ns for f in frames]),
+            "camera": np.zeros(3),
+            "poses": np.array([f.T_world_camera for f in frames]),
+        }
+        parts = encode_request("correct_poses", request, arrays)
+        first = stranger.ask([b"", *parts])
+        correction.carry_on(session, mapped=False)
+        second = stranger.ask([b"", *parts])
+        assert first[0] == second[0] == b"correct_poses"
+        assert client.correction().done == 1  # goes on, and was not begun anew
+        doubled = {name: np.concatenate((a, a)) for name, a in arrays.items()}
+        again = messages.CorrectPosesRequest(id="b", cameras=("",))
+        assert b"given twice" in stranger.ask([b"", *encode_request("correct_poses", again, doubled)])[1]
+        uneven = {**arrays, "camera": np.zeros(2)}
+        assert (
+            b"3 stamps, 2 cameras and 3 poses"
+            in stranger.ask([b"", *encode_request("correct_poses", again, uneven)])[1]
+        )
+        stranger.socket.close()
+        while correction.running:
+            correction.carry_on(session, mapped=False)
+        assert client.correction().completed == 1 and session.corrected_poses == 3
+
+
+def test_it_ends_although_frames_never_stop_coming(bundle_of):
+    frames = tiny_frames(14)
+    session = session_of(bundle_of(), drifted(frames)[:6])
+    correction = LiveCorrection(session.pipeline)
+    session.pipeline.correct_poses(true_poses(frames[:6], 1))
+    steps = 0
+    while correction.running:
+        session.process(frames[6 + steps])
+        correction.carry_on(session, mapped=True)
+        steps += 1
+    assert 3 <= steps <= 7 and session.pipeline.voxel_map.frames == 6 + steps
+    assert session.corrected_poses == 6
+
+
+def test_time_to_spare_counts_so_that_steps_are_not_made_longer(bundle_of):
+    frames = tiny_frames(8)
+    session = session_of(bundle_of(), drifted(frames))
+    correction = LiveCorrection(session.pipeline)
+    session.pipeline.correct_poses(true_poses(frames, 1))
+    done = []
+    for mapped in (False, False, False, True, False, True, True):
+        correction.carry_on(session, mapped=mapped)
+        done.append(session.pipeline.corrector.status.done)
+    assert done == [1, 2, 3, 3, 4, 5, 7]
+
+
+def test_what_was_not_finished_is_told(bundle_of, monkeypatch):
+    frames = tiny_frames(4)
+    session = session_of(bundle_of(), drifted(frames))
+    correction = LiveCorrection(session.pipeline)
+    session.pipeline.correct_poses(true_poses(frames, 1))
+    monkeypatch.setattr("semantic_mapper.nodes.mapper.live_correction.STOPPED_S", 0.0)
+    waits: list[int] = []
+    with capture_logs() as logs:
+        correction.finish(session, lambda: True, lambda: waits.append(1))
+    assert len(waits) == 1 and "correction_unfinished" in [e["event"] for e in logs]
+    assert session.unfinished_correction.endswith("stopped after 1 of 4 frames")
+    request = messages.CorrectPosesRequest(id="late", cameras=("",))
+    with pytest.raises(MapError, match="the stream has ended"):
+        correction.begin(request, {})
+
+
+def test_a_correction_that_fails_leaves_the_mapper_running_and_is_told(bundle_of):
+    frames = tiny_frames(4)
+    session = session_of(bundle_of(), drifted(frames))
+    session.pipeline.correct_poses(true_poses(frames, 1))
+    session.pipeline.corrector._end_history("the disk is full")
+    correction = LiveCorrection(session.pipeline)
+    correction.carry_on(session, mapped=False)
+    assert not correction.running and "the disk is full" in correction.degraded[0]
+    assert session.process(dataclasses.replace(frames[3], stamp_ns=10**12, seq=9)) is not None
+    correction.finish(session, lambda: False, lambda: None)
+    assert "the disk is full" in session.unfinished_correction

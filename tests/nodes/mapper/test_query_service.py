@@ -1,0 +1,380 @@
+"""A map that is asked over real sockets answers as it does in process, whatever else arrives."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import pytest
+import zmq
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from semantic_mapper.client import MapClient
+from semantic_mapper.errors import CodecError, LabelError, MapError, TransportError
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.mapper import query_answers
+from semantic_mapper.nodes.mapper.query_service import QueryService
+from semantic_mapper.queries.boxes import points_in_box
+from semantic_mapper.queries.instances import InstanceTracker
+from semantic_mapper.queries.lookup import at
+from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.nearest import nearest
+from semantic_mapper.queries.occupancy import distance_field, occupancy
+from semantic_mapper.queries.rays import cast_rays
+from semantic_mapper.transport import query_messages as messages
+from semantic_mapper.transport.query_codec import encode_request
+from semantic_mapper.transport.query_sockets import MAX_REQUEST_BYTES
+from semantic_mapper.transport.security import Keys
+from tests.mapping.rendered_views import small_map
+from tests.queries.scene import BALL, LABELS, integrate, poses, whole, whole_map
+from tests.queries.test_mirror import assert_same
+
+PLACES = np.stack(np.meshgrid(np.linspace(-0.6, 1.2, 9), np.linspace(-0.5, 0.6, 9), [0.0, 0.2, 0.41]), -1).reshape(
+    -1, 3
+)
+
+
+@contextmanager
+def a_folder() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="sm-") as folder:  # pytest's own may be longer than a socket's path
+        yield Path(folder)
+
+
+@contextmanager
+def answering(endpoint: str, voxel_map: VoxelMap, keys: Keys | None = None) -> Iterator[QueryService]:
+    """A service, fed all the time as a mapper does."""
+    stop = threading.Event()
+    with QueryService(endpoint, voxel_map, keys=keys) as service:
+
+        def feed() -> None:
+            while not stop.wait(0.002):
+                service.follow()
+
+        mapper = threading.Thread(target=feed)
+        mapper.start()
+        try:
+            yield service
+        finally:
+            stop.set()
+            mapper.join()
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    with a_folder() as folder:
+        yield f"ipc://{folder / 'query'}"
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[MapClient]:
+    """Of a map that nobody changes."""
+    with (
+        a_folder() as folder,
+        answering(f"ipc://{folder / 'query'}", whole_map()) as service,
+        MapClient(service.endpoint, timeout_s=60) as client,
+    ):
+        yield client
+
+
+def assert_equal_fields(a: object, b: object) -> None:
+    assert type(a) is type(b)
+    for name in a.__slots__:  # type: ignore[attr-defined]
+        mine, other = getattr(a, name), getattr(b, name)
+        if hasattr(mine, "__slots__") and not isinstance(mine, np.ndarray):
+            assert_equal_fields(mine, other)
+            continue
+        np.testing.assert_array_equal(mine, other, err_msg=name)
+        assert np.asarray(mine).dtype == np.asarray(other).dtype, name
+
+
+def test_info(client: MapClient) -> None:
+    info = client.info()
+    assert (info.version, info.epoch, info.blocks) == (14, 0, whole_map().block_count)
+    assert (info.voxel_size_m, info.truncation_voxels) == (whole().voxel_size_m, whole().truncation_voxels)
+    assert info.label_set == LABELS
+
+
+def test_points_and_occupancy(client: MapClient) -> None:
+    assert_equal_fields(client.at(PLACES), at(whole(), PLACES))
+    assert_equal_fields(client.at(PLACES.tolist(), 0.2), at(whole(), PLACES, 0.2))
+    assert client.at(np.empty((0, 3))).label.shape == (0,)
+    np.testing.assert_array_equal(client.occupancy(PLACES), occupancy(whole(), PLACES))
+    assert len(set(client.occupancy(PLACES).tolist())) == 3
+    assert client.version == 14
+
+
+def test_nearest_and_rays(client: MapClient) -> None:
+    hit, local = client.nearest("cup", (1, 1, 1)), nearest(whole(), "cup", (1, 1, 1))
+    assert hit is not None
+    assert_equal_fields(hit, local)
+    assert client.nearest("lamp", (0, 0, 0)) is None
+    assert client.nearest("cup", (1, 1, 1), 1.0) is None
+    with pytest.raises(MapError, match="min_confidence"):
+        client.nearest("cup", (1, 1, 1), -0.5)
+    above = PLACES + np.array([0, 0, 1])
+    mine = client.cast_rays(above, BALL - above, 3)
+    assert_equal_fields(mine, cast_rays(whole(), above, BALL - above, 3))
+    assert (mine.distance_m > 0).any()
+    assert_equal_fields(client.cast_rays((0, 0, 2), (0, 0, -1)), cast_rays(whole(), (0, 0, 2), (0, 0, -1)))
+
+
+def test_boxes_and_fields(client: MapClient) -> None:
+    box = ((-0.5, -0.4, -0.1), (0.4, 0.5, 0.5))
+    mine = client.points_in_box(*box)
+    assert len(mine.xyz) > 500
+    assert_equal_fields(mine, points_in_box(whole(), *box))
+    assert_equal_fields(client.distance_field(*box), distance_field(whole(), *box))
+    mine = client.distance_field(*box, unknown_is_occupied=True)
+    assert_equal_fields(mine, distance_field(whole(), *box, unknown_is_occupied=True))
+
+
+def test_instances_keep_their_ids(client: MapClient) -> None:
+    local = InstanceTracker(up=(0, 0, -1)).update(whole())
+    for _ in range(2):
+        mine = client.instances((0, 0, -1))
+        assert len(mine) == len(local) >= 2
+        for a, b in zip(mine, local, strict=True):
+            assert_equal_fields(a, b)
+    for turn in range(6):  # more directions than trackers are kept
+        assert [t.id for t in client.instances((turn, 1, 1))] == [t.id for t in local]
+
+
+def test_a_bad_question_is_an_error_as_in_process(client: MapClient) -> None:
+    with pytest.raises(LabelError, match="has no class 'kettle'; it has floor, table, cup, lamp"):
+        client.nearest("kettle", (0, 0, 0))
+    with pytest.raises(MapError, match="row 1 is"):
+        client.at([(0, 0, 0), (np.nan, 0, 0)])
+    with pytest.raises(MapError, match="a direction must have"):
+        client.cast_rays((0, 0, 0), (0, 0, 0))
+    with pytest.raises(MapError, match="2 origins and 3 directions"):
+        client.cast_rays(PLACES[:2], PLACES[:3] + 1)
+    with pytest.raises(MapError, match="is empty"):
+        client.points_in_box((0, 0, 0), (0, 1, 1))
+    with pytest.raises(MapError, match="expected numbers"):
+        client.at("here")
+    for wrong in (lambda: client.at((1, 2, 3)), lambda: client.nearest("cup", (1, 2)), lambda: client.instances(1)):
+        with pytest.raises(CodecError, match="expected"):
+            wrong()
+    with pytest.raises(CodecError, match="at most 65536 at once"):
+        client.occupancy(np.zeros((65537, 3)))
+    with pytest.raises(CodecError, match="only finite"):
+        client.nearest("cup", (0, 0, np.nan))
+
+
+def test_what_would_keep_others_waiting_is_refused(client: MapClient) -> None:
+    many = np.zeros((60000, 3))
+    for wrong in (
+        lambda: client.at(many, 0.5),
+        lambda: client.at(many, 1e300),
+        lambda: client.cast_rays(many, many + 1, 100),
+        lambda: client.distance_field((-50, -50, -50), (50, 50, 50)),
+        lambda: client.distance_field((-1e308,) * 3, (1e308,) * 3),
+    ):
+        with pytest.raises(MapError, match="keep a mirror"):
+            wrong()
+
+
+def test_answers_that_are_too_large_are_errors(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("semantic_mapper.transport.query_codec.MAX_PART_BYTES", 1000)
+    with pytest.raises(CodecError, match=r"xyz of \d+ bytes, at most 1000"):
+        client.points_in_box((-1, -1, -1), (1, 1, 1))
+    monkeypatch.undo()
+    monkeypatch.setattr(query_answers, "points_in_box", _out_of_memory)
+    with pytest.raises(MapError, match="no memory left"):
+        client.points_in_box((-1, -1, -1), (1, 1, 1))
+
+
+def _out_of_memory(*arguments: object) -> None:
+    raise MemoryError
+
+
+def good_questions() -> list[list[bytes]]:
+    points = {"points": PLACES[:4]}
+    box = messages.BoxRequest(lower=(-1.0, -1.0, -1.0), upper=(1.0, 1.0, 1.0))
+    rays = {"origins": PLACES[:2], "directions": PLACES[:2] + 1}
+    return [
+        encode_request("info", messages.InfoRequest(), {}),
+        encode_request("at", messages.AtRequest(radius_m=0.1), points),
+        encode_request("nearest", messages.NearestRequest(class_name="cup", point=(0.0, 0.0, 1.0)), {}),
+        encode_request("cast_rays", messages.RaysRequest(max_m=4.0), rays),
+        encode_request("points_in_box", box, {}),
+        encode_request("occupancy", messages.OccupancyRequest(), points),
+        encode_request("changes", messages.ChangesRequest(since=3, limit=5), {}),
+    ]
+
+
+class Stranger:
+    """A raw socket that sends what it likes, and waits for an answer."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.socket = zmq.Context.instance().socket(zmq.DEALER)
+        self.socket.setsockopt(zmq.LINGER, 0)
+        self.socket.connect(endpoint)
+
+    def ask(self, parts: list[bytes]) -> list[bytes]:
+        self.socket.send_multipart(parts)
+        assert self.socket.poll(10_000), f"no answer to {parts}"
+        return self.socket.recv_multipart()[1:]
+
+
+@pytest.fixture(scope="module")
+def stranger(client: MapClient) -> Iterator[Stranger]:
+    stranger = Stranger(client._socket.endpoint)
+    yield stranger
+    stranger.socket.close()
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [b""],
+        [b"", b""],
+        [b"", b"at"],
+        [b"junk"],
+        [b"", b"at", b"\xff" * 300_000],
+        [b""] * 40,
+        [b""] * 20_000,
+        [b"", b"at", *[bytes(1 << 22)] * 6],
+        [b"", b"info", b"\x81" * 99],
+        [b"", b"info", msgpack.packb({"v": 1, "asker": "a", "waits_s": float("nan")})],
+        [b"", b"info", msgpack.packb({"v": 1, "asker": "a" * 129})],
+    ],
+    ids=range(11),
+)
+def test_junk_is_answered_with_an_error(client: MapClient, stranger: Stranger, parts: list[bytes]) -> None:
+    kind, header = stranger.ask(parts)
+    assert kind == b"error" and msgpack.unpackb(header)["error"] == "CodecError"
+    assert client.info().version == 14
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_every_mutated_question_is_answered(client: MapClient, stranger: Stranger, data: st.DataObject) -> None:
+    parts = [bytearray(p) for p in data.draw(st.sampled_from(good_questions()))]
+    for _ in range(data.draw(st.integers(1, 3))):
+        part = data.draw(st.sampled_from(parts))
+        where = data.draw(st.integers(0, len(part)))
+        part[where : where + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=4))
+    kind = stranger.ask([b"", *map(bytes, parts)])[0]
+    assert kind in {b"error", *(name.encode() for name in messages.QUESTIONS)}
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=12, max_size=12), st.floats(-1e308, 1e308))
+def test_every_number_is_answered(client: MapClient, stranger: Stranger, values: list[float], scalar: float) -> None:
+    points = {"points": np.array(values).reshape(-1, 3)}
+    rays = {"origins": np.array(values[:6]).reshape(-1, 3), "directions": np.array(values[6:]).reshape(-1, 3)}
+    three = tuple(v if np.isfinite(v) else 0.0 for v in values[:3])
+    for question in (
+        encode_request("at", messages.AtRequest(radius_m=scalar), points),
+        encode_request("occupancy", messages.OccupancyRequest(), points),
+        encode_request("cast_rays", messages.RaysRequest(max_m=scalar), rays),
+        encode_request("nearest", messages.NearestRequest(class_name="cup", point=three), {}),
+        encode_request("instances", messages.InstancesRequest(up=three), {}),
+        encode_request("distance_field", messages.DistanceRequest(lower=three, upper=(scalar, 1.0, 1.0)), {}),
+    ):
+        assert stranger.ask([b"", *question])[0] in {b"error", question[0]}
+
+
+def test_who_sends_too_much_is_cut_off_and_others_are_not(client: MapClient) -> None:
+    flooder = Stranger(client._socket.endpoint)
+    flooder.socket.send_multipart([b"", b"at", b"", bytes(MAX_REQUEST_BYTES + 1)])
+    assert client.info().version == 14
+    assert not flooder.socket.poll(100)
+    flooder.socket.close()
+
+
+def test_a_client_that_takes_no_answers_stops_nobody(client: MapClient) -> None:
+    lazy = Stranger(client._socket.endpoint)
+    question = encode_request("points_in_box", messages.BoxRequest(lower=(-1.0,) * 3, upper=(1.0,) * 3), {})
+    lazy.socket.setsockopt(zmq.RCVHWM, 1)
+    for _ in range(300):
+        lazy.socket.send_multipart([b"", *question])
+    assert client.info().version == 14
+    lazy.socket.close()
+
+
+def test_a_mirror_elsewhere_is_the_growing_map(endpoint: str) -> None:
+    voxel_map, corrected = small_map(LABELS), small_map(LABELS)
+    with answering(endpoint, voxel_map), MapClient(endpoint, timeout_s=60) as client:
+        assert client.mirror().snapshot().block_count == 0
+        for seq, pose in enumerate(poses(6)):
+            integrate(voxel_map, pose, seq)
+            mirror = client.mirror()
+            assert mirror.version <= voxel_map.version
+        caught_up(client, voxel_map)
+        assert client.mirror() is mirror
+        assert_same(mirror.snapshot(), MapMirror.of(voxel_map).snapshot())
+        for seq, pose in enumerate(poses(3)):
+            shifted = pose.copy()
+            shifted[:3, 3] += 0.5
+            integrate(corrected, shifted, seq)
+        voxel_map.take_over(corrected)
+        integrate(voxel_map, poses(1)[0], 9)
+        caught_up(client, voxel_map)
+        assert client.mirror() is mirror and mirror.snapshot().epoch == 1
+        assert_same(mirror.snapshot(), MapMirror.of(voxel_map).snapshot())
+        with MapClient(endpoint, timeout_s=60) as late:
+            assert_same(late.mirror().snapshot(), MapMirror.of(voxel_map).snapshot())
+
+
+def caught_up(client: MapClient, voxel_map: VoxelMap) -> None:
+    while client.mirror().version < voxel_map.version:
+        threading.Event().wait(0.01)
+
+
+def test_a_restarted_mapper_is_found_again_with_its_new_map(endpoint: str) -> None:
+    first, second = small_map(LABELS), small_map(LABELS)
+    for seq, pose in enumerate(poses(5)):
+        integrate(first if seq < 2 else second, pose, seq)
+    with MapClient(endpoint, timeout_s=0.5, attempts=100) as client:
+        with answering(endpoint, first):
+            before, info = client.mirror(), client.info()
+            assert_same(before.snapshot(), MapMirror.of(first).snapshot())
+            things = client.instances()
+        with answering(endpoint, second):
+            after = client.mirror()
+            assert client.info().map_id != info.map_id and things is not None
+            assert after is not before and before.version == 2
+            assert_same(after.snapshot(), MapMirror.of(second).snapshot())
+
+
+def test_nobody_at_home(endpoint: str) -> None:
+    with MapClient(endpoint, timeout_s=0.05, attempts=2) as client:
+        with pytest.raises(TransportError, match=r"no answer within 2 x 0.05 s; is a mapper running"):
+            client.info()
+        with answering(endpoint, small_map(LABELS)):
+            while True:  # it may compile first
+                try:
+                    assert client.info().blocks == 0
+                    break
+                except TransportError:
+                    continue
+            with pytest.raises(TransportError, match="another process listens there"):
+                QueryService(endpoint, small_map(LABELS))
+    with pytest.raises(TransportError, match="the client is closed"):
+        client.info()
+    with pytest.raises(TransportError, match="other machines could connect, which needs keys"):
+        QueryService("tcp://0.0.0.0:5555", small_map(LABELS))
+    with pytest.raises(TransportError, match="nowhere: no endpoint; endpoints read ipc://PATH"):
+        MapClient("nowhere")
+
+
+def test_a_mapper_that_nobody_asks_is_not_looked_at(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    voxel_map, asked = small_map(LABELS), []
+    integrate(voxel_map, poses(1)[0], 0)
+    changes = VoxelMap.copy_changes
+    monkeypatch.setattr(VoxelMap, "copy_changes", lambda self, *a: asked.append(a) or changes(self, *a))
+    with QueryService(endpoint, voxel_map) as service:
+        for _ in range(50):
+            service.follow()
+        assert not asked
+    with answering(endpoint, voxel_map), MapClient(endpoint, timeout_s=60) as client:
+        assert client.info().blocks == voxel_map.block_count  # the very first answer is about the present map
+    assert len(asked) == 1

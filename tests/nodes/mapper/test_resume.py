@@ -1,0 +1,188 @@
+"""A restarted mapper: which saved map it goes on from, which it does not, and that it writes over none."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semantic_mapper.config import VoxelMapConfig
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.camera.resume_playback import Beginning
+from semantic_mapper.nodes.mapper.node import run_mapper
+from semantic_mapper.nodes.mapper.resume import forbid, keep_earlier, take_up
+from semantic_mapper.nodes.node import NodeContext
+from semantic_mapper.nodes.options import MapperOptions
+from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.supervisor.heartbeat import Heart
+from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info
+from semantic_mapper.transport.messages import EndOfStream, StreamInfo
+from semantic_mapper.transport.sockets import Publisher
+from tests.small import INTRINSICS, tiny_frames
+
+CONFIG = VoxelMapConfig(voxel_size_m=0.05, initial_blocks=200)
+
+
+def context(folder: Path, restarts: int) -> NodeContext:
+    folder.mkdir(exist_ok=True)
+    return NodeContext("mapper", {}, 1, StopRequest(), Heart(-1, 1), restarts, folder)
+
+
+def some_map(frames: int) -> VoxelMap:
+    made = VoxelMap(CONFIG, ROOMS)
+    for frame in tiny_frames(6)[:frames]:
+        assert frame.depth_m is not None
+        made.integrate(frame, frame.depth_m, None)
+    return made
+
+
+def assert_same(left: VoxelMap, right: VoxelMap) -> None:
+    ours, theirs = left.block_state(), right.block_state()
+    for name, values in theirs.items():
+        np.testing.assert_array_equal(ours[name], values, err_msg=name)
+
+
+def test_map_saved_in_this_launch_is_gone_on_with_as_if_nothing_had_happened(tmp_path: Path) -> None:
+    path, folder = tmp_path / "map.npz", tmp_path / "notes"
+    assert take_up(context(folder, 0), path, VoxelMap(CONFIG, ROOMS)) == ""
+    some_map(3).save(path)
+    resumed = VoxelMap(CONFIG, ROOMS)
+    said = take_up(context(folder, 1), path, resumed)
+    assert said == "the mapper was restarted and went on from the map saved after 3 frames"
+    for frame in tiny_frames(6)[3:]:
+        assert frame.depth_m is not None
+        resumed.integrate(frame, frame.depth_m, None)
+    assert resumed.frames == 6
+    assert_same(resumed, some_map(6))
+
+
+def test_map_of_an_earlier_run_is_no_map_of_this_one(tmp_path: Path) -> None:
+    path, folder = tmp_path / "map.npz", tmp_path / "notes"
+    some_map(2).save(path)
+    before = path.read_bytes()
+    take_up(context(folder, 0), path, VoxelMap(CONFIG, ROOMS))
+    fresh = VoxelMap(CONFIG, ROOMS)
+    assert "began an empty map: none had been saved" in take_up(context(folder, 1), path, fresh)
+    assert fresh.frames == 0 and path.read_bytes() == before
+    some_map(4).save(path)  # by the first restarted one
+    assert "after 4 frames" in take_up(context(folder, 2), path, fresh)
+
+
+@pytest.mark.parametrize("case", ["corrected", "damaged", "other settings"])
+def test_map_that_cannot_be_gone_on_with_is_put_aside(tmp_path: Path, case: str) -> None:
+    path, folder = tmp_path / "map.npz", tmp_path / "notes"
+    take_up(context(folder, 0), path, VoxelMap(CONFIG, ROOMS))
+    some_map(3).save(path)
+    config, why = CONFIG, ""
+    if case == "corrected":
+        why = "poses had been corrected"
+        forbid(context(folder, 0), why)
+    elif case == "damaged":
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 0xFF
+        path.write_bytes(data)
+    else:
+        config, why = VoxelMapConfig(voxel_size_m=0.1, initial_blocks=200), "same config"
+    saved = path.read_bytes()
+    fresh = VoxelMap(config, ROOMS)
+    said = take_up(context(folder, 1), path, fresh)
+    assert "began an empty map" in said and why in said and "map-before-restart-1.npz" in said
+    assert fresh.frames == 0 and not path.exists()
+    assert (tmp_path / "map-before-restart-1.npz").read_bytes() == saved
+    again = VoxelMap(config, ROOMS)
+    assert "none had been saved" in take_up(context(folder, 2), path, again)
+    assert (tmp_path / "map-before-restart-1.npz").read_bytes() == saved
+
+
+def begin(folder: Path, path: Path, restarts: int) -> str:
+    """What a mapper does until its stream begins."""
+    said = take_up(context(folder, restarts), path, VoxelMap(CONFIG, ROOMS))
+    keep_earlier(context(folder, restarts), path)
+    return said
+
+
+def test_results_of_earlier_launches_are_kept_each_in_a_folder(tmp_path: Path) -> None:
+    path, contents = tmp_path / "map.npz", {}
+    for launch in range(3):  # all saved in the same second, by their stamps
+        folder = tmp_path / f"notes-{launch}"
+        begin(folder, path, 0)
+        assert not path.exists() and not (tmp_path / "summary.json").exists()
+        some_map(launch + 1).save(path)
+        os.utime(path, (1.8e9 + launch / 10, 1.8e9 + launch / 10))
+        contents[launch] = path.read_bytes()
+        (tmp_path / "summary.json").write_text(str(launch))
+        (tmp_path / "map-before-restart-1.npz").write_text(str(launch))
+        (tmp_path / "recorded.mcap").write_text("the recorder's")
+        assert f"after {launch + 1} frames" in begin(folder, path, 1) and path.exists()  # this launch's own
+    for launch, name in enumerate(("earlier-20270115T080000Z", "earlier-20270115T080000Z-1")):
+        assert (tmp_path / name / "map.npz").read_bytes() == contents[launch]
+        assert {p.name for p in (tmp_path / name).iterdir()} == {"map.npz", "summary.json", "map-before-restart-1.npz"}
+        assert (tmp_path / name / "summary.json").read_text() == str(launch)
+    assert path.read_bytes() == contents[2]
+
+
+def test_earlier_map_is_kept_also_where_the_first_mapper_was_killed_at_once(tmp_path: Path) -> None:
+    path, folder = tmp_path / "map.npz", tmp_path / "notes"
+    some_map(2).save(path)
+    before = path.read_bytes()
+    take_up(context(folder, 0), path, VoxelMap(CONFIG, ROOMS))  # and no stream began
+    assert "none had been saved" in begin(folder, path, 1)
+    (kept,) = tmp_path.glob("earlier-*")
+    assert (kept / "map.npz").read_bytes() == before and not path.exists()
+    assert "none had been saved" in begin(folder, path, 2)
+
+
+def test_no_map_that_was_put_aside_is_replaced(tmp_path: Path) -> None:
+    path, folder = tmp_path / "map.npz", tmp_path / "notes"
+    (tmp_path / "map-before-restart-1.npz").write_text("of an earlier launch")
+    begin(folder, path, 0)
+    path.write_text("damaged")
+    assert "map-before-restart-1-1.npz" in begin(folder, path, 1)
+    assert (tmp_path / "map-before-restart-1.npz").read_text() == "of an earlier launch"
+
+
+def map_stream(options: MapperOptions) -> None:
+    """A mapper from the beginning of a stream to its end."""
+    with tempfile.TemporaryDirectory(prefix="sm-") as folder:
+        endpoints = {name: f"ipc://{folder}/{name}" for name in ("camera", "mapper")}
+        mapper = NodeContext("mapper", endpoints, 0, StopRequest(), Heart(-1, 1), folder=Path(folder))
+        with Publisher(endpoints["camera"], policy="block") as camera:
+            thread = threading.Thread(target=run_mapper, args=(mapper, options))
+            thread.start()
+            camera.wait_for_subscribers("frame", timeout_s=200)
+            camera.publish(encode_info(StreamInfo("a wall", {"rooms": INTRINSICS}, ROOMS), "camera"))
+            camera.publish(encode_frame(tiny_frames(1)[0]), 120)
+            camera.publish(encode_end(EndOfStream("camera", "end", 1)), 120)
+            thread.join(200)
+            assert not thread.is_alive()
+
+
+def test_live_launch_into_the_same_folder_keeps_the_map_and_a_replay_replaces_it(
+    tmp_path: Path, weights: Path, config: Path
+) -> None:
+    live = MapperOptions(out=str(tmp_path), weights=str(weights), config=str(config), query="")
+    map_stream(live)
+    first = (tmp_path / "map.npz").read_bytes()
+    map_stream(live)
+    (kept,) = tmp_path.glob("earlier-*")
+    assert (kept / "map.npz").read_bytes() == first
+    results = {"map.npz", "map.ply", "overview.png", "report.html", "summary.json"}
+    assert {p.name for p in kept.iterdir()} == results == {p.name for p in tmp_path.iterdir() if p.is_file()}
+    map_stream(MapperOptions(out=str(tmp_path), weights=str(weights), config=str(config), query="", delivery="all"))
+    assert list(tmp_path.glob("earlier-*")) == [kept]
+
+
+def test_where_no_note_can_be_written_nodes_go_on(tmp_path: Path) -> None:
+    gone = context(tmp_path / "notes", 0)
+    (tmp_path / "notes").rmdir()
+    assert not forbid(gone, "poses had been corrected")
+    began = Beginning(gone, 1.0)
+    began.note(5)
+    began.note(6)
+    assert 5 <= began.due_stamp_ns() < 5 + 60e9
+    assert forbid(context(tmp_path / "notes", 0), "poses had been corrected")

@@ -1,0 +1,268 @@
+"""The recorder node against real sockets: splits, full disk, packing, attachments; and ``record`` from outside."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+import semantic_mapper.nodes.recorder.node
+from semantic_mapper.config import convert_config
+from semantic_mapper.errors import ConfigError, LogError, TransportError
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.cli.log_info import describe_log
+from semantic_mapper.nodes.cli.record import _join
+from semantic_mapper.nodes.cli.run_replay import ReplayRequest, mapper_config, replay_log
+from semantic_mapper.nodes.cli.saved_maps import is_log
+from semantic_mapper.nodes.cli.scoring import ScoreRequest, score_log
+from semantic_mapper.nodes.node import NodeContext
+from semantic_mapper.nodes.options import RecorderOptions
+from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.recorder.node import Recorder, run_recorder
+from semantic_mapper.nodes.supervisor.heartbeat import Heart
+from semantic_mapper.nodes.supervisor.launch_note import NOTE, LaunchNote, NodeNote, read_launch_note
+from semantic_mapper.nodes.supervisor.running_launches import launch_folder
+from semantic_mapper.replay.log.format import LogReader
+from semantic_mapper.replay.log.recording import Recording, RecordingRules
+from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
+from semantic_mapper.transport.codec import CodecOptions, encode_end, encode_frame, encode_info, repack_rgb
+from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
+from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
+from tests.nodes.support import Running, eventually, repeated_frames, run, write_log
+from tests.nodes.test_faults import alone
+from tests.small import INTRINSICS, tiny_frames
+from tests.transport import samples
+
+
+@dataclass
+class Stream:
+    """A camera that publishes what a test says, and a recorder node that listens."""
+
+    publisher: Publisher
+    recorder: threading.Thread
+    status: NewestSubscriber
+    failures: list[BaseException]
+    stop: StopRequest
+
+    def publish(self, *frames: int) -> None:
+        for seq in frames:
+            self.publisher.publish(encode_frame(samples.make_frame(seq)))
+
+    def end(self) -> None:
+        self.publisher.publish(encode_end(EndOfStream("camera", "end", 0)))
+        self.recorder.join(60)
+        assert not self.recorder.is_alive() and not self.failures
+
+    def last_status(self) -> Status:
+        """What the recorder said when it had closed its log."""
+        for _ in range(100):
+            status = self.status.receive(1.0)
+            if isinstance(status, Status) and status.state == "ended":
+                return status
+        raise AssertionError("the recorder never said that it has ended")
+
+    def wait_for_status(self, wanted: str) -> Status:
+        for _ in range(100):
+            status = self.status.receive(1.0)
+            if isinstance(status, Status) and any(wanted in text for text in status.degraded):
+                return status
+        raise AssertionError(f"the recorder never said '{wanted}'")
+
+
+@contextmanager
+def streaming(tmp_path: Path, sockets: Path, **options: Any) -> Iterator[Stream]:
+    endpoints = {name: f"ipc://{sockets}/{name}" for name in ("camera", "recorder")}
+    settings = convert_config({"out": str(tmp_path / "a.mcap"), "sources": ["camera"], **options}, RecorderOptions, "t")
+    stop = StopRequest()
+    context = NodeContext("recorder", endpoints, 0, stop, Heart(-1, 0), folder=sockets)
+    failures: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            run_recorder(context, settings)
+        except (LogError, TransportError) as error:
+            failures.append(error)
+
+    with Publisher(endpoints["camera"], policy="block") as publisher:
+        recorder = threading.Thread(target=work, daemon=True)
+        recorder.start()
+        with NewestSubscriber(endpoints["recorder"], ("status",)) as status:
+            publisher.wait_for_subscribers("frame", 1, 30)
+            publisher.publish(encode_info(samples.make_info(), "camera"))
+            yield Stream(publisher, recorder, status, failures, stop)
+
+
+@pytest.fixture
+def sockets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    folder = Path(f"/tmp/sm-{os.getpid()}-{tmp_path_factory.mktemp('s').name}")
+    folder.mkdir()
+    yield folder
+    for file in folder.iterdir():
+        file.unlink()
+    folder.rmdir()
+
+
+def test_a_recorder_whose_log_was_removed_fails(tmp_path: Path, sockets: Path) -> None:
+    with streaming(tmp_path, sockets, reserve_mb=0) as stream:
+        stream.publish(*range(4))
+        assert eventually((tmp_path / "a.mcap").exists, 30)
+        (tmp_path / "a.mcap").unlink()
+        stream.publisher.publish(encode_end(EndOfStream("camera", "end", 0)))
+        stream.recorder.join(60)
+        assert len(stream.failures) == 1 and "a.mcap: was removed while it was written" in str(stream.failures[0])
+
+
+def test_recorder_splits_packs_and_keeps_what_belongs_to_the_log(tmp_path: Path, sockets: Path) -> None:
+    note = LaunchNote("kitchen.toml", (NodeNote("camera", "camera", {"log": "x"}),))
+    (sockets / NOTE).write_bytes(msgspec.json.encode(note))
+    with streaming(tmp_path, sockets, split_mb=0.02, rgb="jpeg", jpeg_quality=90, reserve_mb=0) as stream:
+        stream.publish(*range(10), *range(12, 30))
+        topic = encode_frame(samples.make_frame(30))[0]
+        stream.publisher.publish([topic, b"no header"])
+        stream.end()
+        told = stream.last_status().counters
+    parts = list(parts_on_disk(tmp_path / "a.mcap").values())
+    assert len(parts) > 1
+    assert (told["recorded"], told["missed"], told["rejected"], told["lost"]) == (28, 2, 1, 0)
+    assert told["log_kb"] == sum(part.stat().st_size for part in parts) // 1024 > 20
+    with open_log(parts) as log:
+        frames = list(log)
+        assert [f.seq for f in frames] == [*range(10), *range(12, 30)] and not log.errors
+        for frame in frames:
+            sent = samples.make_frame(frame.seq)
+            assert frame.depth_m is not None and sent.depth_m is not None and frame.label is not None
+            assert frame.depth_m.tobytes() == sent.depth_m.tobytes() and np.array_equal(frame.label, sent.label)
+            assert not np.array_equal(frame.rgb, sent.rgb)  # noise, the worst there is for JPEG
+        _, wire = next(log.frame_parts())
+        assert wire[2][:3] == b"\xff\xd8\xff"
+        kept = log.attachments()
+        assert json.loads(kept[NOTE].data)["launch"] == "kitchen.toml"
+        assert json.loads(kept["calibration.json"].data)["cameras"]["front"]["fx"] == 20.5
+    found = describe_log(parts[::-1], lambda: None)
+    assert found["frames"] == 28 and found["finished"] and found["part"] is None and len(found["parts"]) == len(parts)
+    assert found["attachments"].keys() >= {NOTE, "calibration.json"} and not found["damage"]
+    alone = describe_log(parts[1:2], lambda: None)
+    assert alone["part"] == 1 and 0 < alone["frames"] < 28
+
+
+def test_full_disk_is_told_and_the_stream_goes_on(tmp_path: Path, sockets: Path) -> None:
+    with streaming(tmp_path, sockets, reserve_mb=1e12) as stream:
+        stream.publish(*range(100))  # would block if nobody read on
+        status = stream.wait_for_status("the disk is full")
+        assert "recording has stopped" in status.degraded[0] and status.counters["recorded"] == 0
+        stream.end()
+    with LogReader(tmp_path / "a.mcap", allow_empty=True) as log:
+        assert log.finished and len(log) == 0
+
+
+@pytest.mark.parametrize("time_left", [True, False])
+def test_what_waits_when_the_recorder_is_stopped_is_written_or_counted(
+    tmp_path: Path, sockets: Path, monkeypatch: pytest.MonkeyPatch, time_left: bool
+) -> None:
+    taking, go_on, take = threading.Event(), threading.Event(), Recorder.take
+
+    def slowly(recorder: Recorder, parts: list[bytes]) -> bool:
+        if recorder.recording is not None:
+            taking.set()
+            assert go_on.wait(30)
+        return take(recorder, parts)
+
+    monkeypatch.setattr(Recorder, "take", slowly)
+    if not time_left:
+        monkeypatch.setattr(semantic_mapper.nodes.recorder.node, "DRAIN_S", 0.0)
+    with streaming(tmp_path, sockets, reserve_mb=0) as stream:
+        assert eventually(lambda: isinstance(stream.status.receive(0.1), Status), 30)
+        stream.publish(0)
+        assert taking.wait(30)
+        stream.publish(*range(1, 40))
+        stream.stop.signum = signal.SIGTERM
+        time.sleep(0.3)  # until all have come
+        go_on.set()
+        stream.recorder.join(60)
+        assert not stream.recorder.is_alive() and not stream.failures
+        told = stream.last_status().counters
+    with LogReader(tmp_path / "a.mcap") as log:
+        assert [envelope.seq for envelope, _ in log.frame_parts()] == list(range(40 if time_left else 1))
+    assert (told["recorded"], told["lost"]) == ((40, 0) if time_left else (1, 39))
+
+
+def test_frames_are_packed_anew_without_touching_anything_else() -> None:
+    frame = samples.make_frame()
+    for options in (CodecOptions(rgb="raw"), CodecOptions(rgb="raw", depth="raw")):
+        raw = encode_frame(frame, options)
+        png = repack_rgb(raw, CodecOptions(rgb="png"))
+        assert png[2].startswith(b"\x89PNG") and png[3:] == raw[3:]
+        assert repack_rgb(png, CodecOptions(rgb="raw")) == raw  # there and back, header included
+        assert repack_rgb(png, CodecOptions(rgb="png", jpeg_quality=3)) == png
+
+
+def test_options_that_contradict_each_other_are_refused() -> None:
+    for options, message in (
+        ({"disk_full": "delete-oldest"}, "give split_mb or split_s"),
+        ({"jpeg_quality": 0}, ">= 1"),
+        ({"rgb": "webp"}, "webp"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            convert_config({"out": "a.mcap", **options}, RecorderOptions, "node 'recorder'")
+
+
+def test_what_is_no_node_of_a_launch_cannot_be_recorded(tmp_path: Path) -> None:
+    note = LaunchNote("kitchen.toml", (NodeNote("eye", "camera", {}), NodeNote("mapper", "mapper", {})))
+    (tmp_path / NOTE).write_bytes(msgspec.json.encode(note))
+    wanted = {"out": "a.mcap"}
+    with pytest.raises(ConfigError, match=r"--source ear: no node of kitchen\.toml; there are eye, mapper"):
+        _join(tmp_path, ("ear",), wanted, StopRequest())
+    context, options = _join(tmp_path, (), wanted, StopRequest())
+    assert options.sources == ("eye", "mapper") and context.endpoint("eye") == f"ipc://{tmp_path}/eye"
+    (tmp_path / NOTE).write_bytes(b"{}")
+    with pytest.raises(TransportError, match="another version"):
+        _join(tmp_path, (), wanted, StopRequest())
+    with pytest.raises(TransportError, match="no socket folder"):
+        launch_folder(str(tmp_path))
+
+
+def test_running_launch_is_recorded_from_outside(tmp_path: Path) -> None:
+    long_log = write_log(tmp_path / "long.mcap", repeated_frames(600))
+    with Running("up", alone(tmp_path, long_log)) as running:
+        running.wait_for_line("all_ready")
+        sockets = re.findall(r"sockets=(\S+)", running.text)[0]
+        assert read_launch_note(Path(sockets)).names("camera") == ("eye",)
+        out = tmp_path / "out" / "a.mcap"
+        done = run("record", out, "--launch", sockets, "--duration", "1.5", "--split-s", "0.5", "--jpeg", "80")
+        assert done.returncode == 0, done.stderr
+        running.process.send_signal(signal.SIGINT)
+        assert running.wait() == 0
+    with open_log(out.parent) as found:
+        seqs = [envelope.seq for envelope, _ in found.frame_parts()]
+        assert len(seqs) > 5 and seqs == list(range(seqs[0], seqs[0] + len(seqs)))
+        assert f"{out}: {len(seqs)} frames" in done.stdout and "parts" in done.stdout
+        assert json.loads(found.attachments()[NOTE].data)["nodes"][0]["name"] == "eye"
+
+
+def test_parts_are_replayed_as_one_log(weights: Path, config: Path, tmp_path: Path) -> None:
+    info = StreamInfo("test room", {"rooms": INTRINSICS}, ROOMS)
+    with_parts = Recording(tmp_path / "a.mcap", info, RecordingRules(split_bytes=60_000), recording="x")
+    for frame in tiny_frames(6):
+        with_parts.write(encode_frame(frame))
+    with_parts.close()
+    first, second, *more = parts_on_disk(tmp_path / "a.mcap").values()
+    settings = mapper_config(config, None)
+    request = ReplayRequest(second, tmp_path / "out", weights, settings, further_parts=(*more, first))
+    summary = replay_log(request, StopRequest(), lambda count: None, lambda done: None)
+    assert summary["frames"]["fused"] == 6 == VoxelMap.load(tmp_path / "out" / "map.npz").frames
+    assert is_log(tmp_path) and not is_log(tmp_path / "out")
+    scored = score_log(ScoreRequest(tmp_path, weights, baselines=False, seconds=0, max_frames=5, config=config, seed=0))
+    assert scored["scored"] + scored["excluded"] + scored["refused"] == 5  # more than one part holds

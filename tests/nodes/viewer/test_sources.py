@@ -1,0 +1,312 @@
+"""What the viewer is shown, and who can see it and be spoken to by it."""
+
+from __future__ import annotations
+
+import dataclasses
+import http.client
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+import msgspec
+import numpy as np
+import pytest
+import rerun.chunk
+
+from semantic_mapper.errors import MapError, TransportError
+from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.nodes.cli.console import Output
+from semantic_mapper.nodes.cli.view import _find_live, _Page
+from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.supervisor.launch_config import STATUS_SOCKET
+from semantic_mapper.nodes.supervisor.launch_note import NOTE, LaunchNote, NodeNote
+from semantic_mapper.nodes.viewer import sources as watching
+from semantic_mapper.nodes.viewer.server import WebViewer
+from semantic_mapper.nodes.viewer.sources import Live, show_live, show_log, show_saved, thinned
+from semantic_mapper.queries.ages import BlockAges
+from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.replay.exporters.rerun_log import MAX_PATH, RerunLog, recording_file, recording_server
+from semantic_mapper.transport.codec import encode_end, encode_frame, encode_map_update, encode_status
+from semantic_mapper.transport.messages import EndOfStream, NodeState, Status
+from semantic_mapper.transport.security import ServerIdentity, allow, make_keys
+from semantic_mapper.transport.sockets import Publisher
+from semantic_mapper.types import MapUpdate
+from tests.nodes.mapper.test_query_service import answering
+from tests.nodes.support import error_line, eventually, is_alive, run
+from tests.queries.scene import LABELS, painted, whole_map
+from tests.small import tiny_config, tiny_frames
+
+WARM_S = 240.0  # a service may compile kernels before it answers
+
+
+def logged(path: Path) -> Counter[str]:
+    """Rows of each entity of a recording."""
+    rows: Counter[str] = Counter()
+    for chunk in rerun.chunk.RrdReader(path).stream():
+        rows[chunk.entity_path] += chunk.num_rows
+    return rows
+
+
+def update_for(frame, label) -> MapUpdate:
+    size = frame.rgb.shape[:2]
+    return MapUpdate(
+        stamp_ns=frame.stamp_ns,
+        seq=frame.seq,
+        camera_id=frame.camera_id,
+        fused=True,
+        is_keyframe=False,
+        source_seqs=(),
+        label=np.full(size, label, np.uint8),
+        confidence=np.ones(size, np.float32),
+        depth_m=np.ones(size, np.float32),
+        blocks=1,
+        blocks_touched=1,
+        stage_ms={"render": 3.0, "fuse": 1.0},
+    )
+
+
+def listening(port: int) -> set[str]:
+    """Addresses on which somebody listens to a port, as the kernel writes them."""
+    lines = Path("/proc/net/tcp").read_text().splitlines()[1:] + Path("/proc/net/tcp6").read_text().splitlines()[1:]
+    sockets = (line.split() for line in lines)
+    return {s[1].split(":")[0] for s in sockets if s[3] == "0A" and int(s[1].split(":")[1], 16) == port}
+
+
+def test_the_page_is_served_here_alone_and_may_speak_to_nobody_else() -> None:
+    with WebViewer(0, 0) as viewer:
+        page, data = urlsplit(viewer.page_url), urlsplit(viewer.data_url)
+        assert parse_qs(page.query)["url"] == [viewer.data_url]
+        assert page.port and data.port and listening(page.port) == listening(data.port) == {"0100007F"}
+        connection = http.client.HTTPConnection(page.hostname or "", page.port, timeout=10)
+        connection.request("GET", f"/?{page.query}")
+        answer = connection.getresponse()
+        assert answer.status == 200 and b"re_viewer.js" in answer.read()
+        rules = dict(rule.strip().split(" ", 1) for rule in answer.headers["Content-Security-Policy"].split(";"))
+        assert rules["connect-src"].split() == ["'self'", "data:", "blob:", f"http://127.0.0.1:{data.port}"]
+        assert "http" not in rules["default-src"]
+        connection.request("GET", "/re_viewer_bg.wasm")
+        answer = connection.getresponse()
+        assert answer.headers["Content-Type"] == "application/wasm" and answer.read(4) == b"\0asm"
+        connection.close()
+        [settings] = Path(tempfile.gettempdir()).glob(f"semantic-mapper-{os.getpid()}-view-*/config/rerun/*.json")
+        assert json.loads(settings.read_text())["analytics_enabled"] is False
+        log = RerunLog(recording_server(viewer.data_url), LABELS)
+        log.log_map(whole_map().points())
+        log.close()  # all of it has been taken
+        with pytest.raises(TransportError, match=f"port {page.port} cannot be had"):
+            WebViewer(page.port, 0).__enter__()
+        pid = viewer.pid
+    assert not is_alive(pid) and not listening(page.port) and not listening(data.port)
+    assert not settings.exists()
+
+
+@pytest.mark.slow
+def test_what_cannot_be_shown_is_refused_before_a_page_is_promised(tmp_path: Path) -> None:
+    for name in ("map.npz", "log.mcap", "text"):
+        (tmp_path / name).write_bytes(b"neither of these" * 100)
+    words = {
+        tmp_path / "map.npz": "damaged or not a map",
+        tmp_path / "log.mcap": "not an MCAP log",
+        tmp_path / "text": "no socket folder of a launch",
+        tmp_path / "nope": "no such file, and no socket folder of a launch",
+        "tcp://10.1.2.3:5570": "without keys",
+    }
+    for source, reason in words.items():
+        done = run("view", source, "--port", "0", "--data-port", "0")
+        assert done.returncode == 1 and reason in error_line(done.stderr)
+        assert not done.stdout and len(done.stderr.splitlines()) == 1, "no address, and nothing of Rerun's"
+
+
+def test_an_error_while_something_is_shown_is_the_only_one(capfd: pytest.CaptureFixture[str]) -> None:
+    def show_and_fail() -> None:
+        with _Page(0, 0, 64, Output.guarded()) as page:
+            log = RerunLog(page.begin(), LABELS)
+            assert page.alive
+            for _ in range(20):
+                log.log_map(whole_map().points())
+            raise MapError("ours")
+
+    with pytest.raises(MapError, match="ours"):
+        show_and_fail()
+    said = capfd.readouterr()
+    assert said.out.startswith("watch at http://127.0.0.1:") and not said.err
+
+
+def test_a_viewer_that_is_killed_leaves_no_server() -> None:
+    program = (
+        "import time\nfrom semantic_mapper.nodes.viewer.server import WebViewer\n"
+        "with WebViewer(0, 0) as viewer:\n    print(viewer.pid, flush=True)\n    time.sleep(600)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        server = int(process.stdout.readline())
+        assert is_alive(server)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert eventually(lambda: not is_alive(server), 10)
+
+
+def test_a_log_is_mapped_and_shown_with_all_colourings(log: Path, weights: Path, tmp_path: Path) -> None:
+    done: list[int] = []
+    show_log(
+        log,
+        weights,
+        tiny_config(),
+        5,
+        lambda: recording_file(tmp_path / "log.rrd"),
+        0.0,
+        going=lambda: len(done) < 4,
+        on_start=done.append,
+        on_frame=done.append,
+    )
+    assert done == [5, 1, 2, 3], "asked to end after the third frame"
+    rows = logged(tmp_path / "log.rrd")
+    camera = f"/world/cameras/{tiny_frames()[0].camera_id}/image"
+    assert rows[f"{camera}/rgb"] == rows[f"{camera}/semantics"] == rows[f"{camera}/depth"] == 3
+    assert rows["/stage_ms/fuse"] == 3 and rows["/legend"] >= 2
+    for colouring in ("class", "colour", "confidence", "age"):
+        assert rows[f"/world/map/{colouring}"] == rows["/legend"]
+
+
+@contextmanager
+def watching_live(live: Live, path: Path, told: list[str]) -> Iterator[StopRequest]:
+    """Somebody who watches, until it is over or asked to stop at the end."""
+    stop = StopRequest()
+    watcher = threading.Thread(target=show_live, args=(live, lambda: recording_file(path), 0.2, stop, told.append))
+    watcher.start()
+    try:
+        yield stop
+        watcher.join(60 if not stop else 10)
+    finally:
+        stop.signum = stop.signum or signal.SIGTERM
+        watcher.join(30)
+        assert not watcher.is_alive()
+
+
+def test_a_running_system_is_shown_until_its_stream_ends(tmp_path: Path) -> None:
+    frames = tiny_frames()[:3]
+    told: list[str] = []
+    with tempfile.TemporaryDirectory(prefix="sm-") as folder:
+        live = Live(f"ipc://{folder}/query", (f"ipc://{folder}/camera",))
+        with Publisher(live.nodes[0]) as publisher, watching_live(live, tmp_path / "live.rrd", told):
+            assert not publisher.subscribers("frame"), "before its mapper is there it is no listener"
+            with answering(live.query, whole_map()):
+                assert eventually(lambda: publisher.subscribers("frame") > 0, WARM_S)
+                for frame in frames:
+                    publisher.publish(encode_frame(frame))
+                    publisher.publish(encode_map_update(update_for(frame, LABELS.ids[0])))
+                publisher.publish(encode_end(EndOfStream("camera", "end", len(frames))))
+                assert eventually(lambda: "the stream has ended" in told, 60)
+                assert eventually(lambda: not publisher.subscribers("frame"), 10), "the camera may go"
+    rows = logged(tmp_path / "live.rrd")
+    camera = f"/world/cameras/{frames[0].camera_id}/image"
+    assert 1 <= rows[f"{camera}/rgb"] <= 3 and 1 <= rows[f"{camera}/semantics"] <= 3, "the newest of what came"
+    assert rows["/world/map/class"] == rows["/world/map/age"] == 1, "a map that has not changed is not sent again"
+
+
+def test_several_cameras_are_shown_until_the_last_one_ends(tmp_path: Path) -> None:
+    frame, cameras = tiny_frames()[0], ("left", "right")
+    told: list[str] = []
+    with tempfile.TemporaryDirectory(prefix="sm-") as folder, ExitStack() as stack:
+        live = Live(f"ipc://{folder}/query", tuple(f"ipc://{folder}/{name}" for name in cameras), streams=2)
+        left, right = (stack.enter_context(Publisher(endpoint)) for endpoint in live.nodes)
+        stack.enter_context(answering(live.query, whole_map()))
+        stack.enter_context(watching_live(live, tmp_path / "live.rrd", told))
+        assert eventually(lambda: bool(left.subscribers("frame") and right.subscribers("frame")), WARM_S)
+        left.publish(encode_frame(dataclasses.replace(frame, camera_id="left")))
+        left.publish(encode_end(EndOfStream("left", "end", 1)))
+        left.remind("end")  # said again, it is still one camera's
+        assert not eventually(lambda: not right.subscribers("frame"), 0.7) and not told, "it goes on"
+        right.publish(encode_frame(dataclasses.replace(frame, camera_id="right")))
+        right.publish(encode_end(EndOfStream("right", "end", 1)))
+        assert eventually(lambda: "the stream has ended" in told, 60)
+    rows = logged(tmp_path / "live.rrd")
+    assert rows["/world/cameras/left/image/rgb"] == rows["/world/cameras/right/image/rgb"] == 1
+
+
+def test_of_a_launch_the_cameras_that_have_not_ended_are_waited_for() -> None:
+    states: dict[str, NodeState] = {"left": "running", "right": "stopping", "gone": "ended", "mapper": "running"}
+    kinds = {name: "mapper" if name == "mapper" else "camera" for name in states}
+    with tempfile.TemporaryDirectory(prefix="sm-") as folder:
+        note = LaunchNote("test.toml", tuple(NodeNote(name, kind, {}) for name, kind in kinds.items()))
+        (Path(folder) / NOTE).write_bytes(msgspec.json.encode(note))
+        ended = threading.Event()
+
+        def launcher() -> None:
+            with Publisher(f"ipc://{folder}/{STATUS_SOCKET}") as publisher:
+                while not ended.wait(0.1):
+                    for name, state in (*states.items(), (STATUS_SOCKET, "running")):
+                        counters = {"nodes": len(states)}
+                        publisher.publish(encode_status(Status(name, state, time.monotonic_ns(), counters)))
+
+        thread = threading.Thread(target=launcher)
+        thread.start()
+        try:
+            assert eventually((Path(folder) / STATUS_SOCKET).exists, 20)
+            live = _find_live(folder, "query", "", None)
+        finally:
+            ended.set()
+            thread.join()
+        assert live.streams == 2 and live.query == f"ipc://{folder}/query"
+        assert set(live.nodes) == {f"ipc://{folder}/{name}" for name in ("left", "right", "mapper")}
+
+
+def test_a_map_on_another_machine_is_shown_to_who_has_a_key(tmp_path: Path) -> None:
+    robot, desk = make_keys(tmp_path / "robot"), make_keys(tmp_path / "desk")
+    allow(robot.folder, "desk", desk.public.decode())
+    allow(desk.folder, "robot", robot.public.decode())
+    with answering("tcp://127.0.0.1:*", whole_map(), robot) as service:
+        live = Live(service.endpoint, (), ServerIdentity(desk, "robot"))
+        with watching_live(live, tmp_path / "live.rrd", []) as stop:
+            assert eventually(lambda: service.answered >= 4, WARM_S)
+            stop.signum = signal.SIGTERM
+    assert logged(tmp_path / "live.rrd")["/world/map/age"] == 1
+
+
+def test_a_saved_map_has_no_ages(tmp_path: Path) -> None:
+    whole_map().save(tmp_path / "map.npz")
+    show_saved(tmp_path / "map.npz", lambda: recording_file(tmp_path / "map.rrd"))
+    rows = logged(tmp_path / "map.rrd")
+    assert rows["/world/map/class"] == rows["/legend"] == 1 and "/world/map/age" not in rows
+
+
+def test_blocks_age_until_they_change() -> None:
+    plan = np.full((24, 8), LABELS.ids[0], np.uint8)
+    mirror, ages = MapMirror(0.05, 4.0, LABELS), BlockAges()
+    everything = painted(plan, 0, 1)
+    assert not ages.follow(mirror.apply(everything), 100.0).any()
+    middle = {name: getattr(everything, name)[1:2] for name in ("keys", "tsdf", "label", "confidence", "rgb")}
+    snapshot = mirror.apply(dataclasses.replace(everything, since=1, version=2, newest=2, **middle))
+    assert ages.follow(snapshot, 130.0).tolist() == [30.0, 0.0, 30.0]
+    assert ages.follow(snapshot, 131.0).tolist() == [31.0, 1.0, 31.0]
+    other = MapMirror(0.05, 4.0, LABELS)
+    assert ages.follow(other.apply(everything), 140.0).tolist() == [0.0, 0.0, 0.0], "a mapper that was restarted"
+
+
+def test_a_large_map_is_thinned_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(watching, "MAX_POINTS", 4)
+    xyz = np.arange(27, dtype=np.float32).reshape(9, 3)
+    points = MapPoints(xyz, xyz.astype(np.uint8), np.arange(9, dtype=np.uint8), np.ones(9, np.float32))
+    few, ages = thinned(points, np.arange(9, dtype=np.float32))
+    assert few.label.tolist() == ages.tolist() == [0, 3, 6] and few.xyz[1].tolist() == [9, 10, 11]
+
+
+def test_the_path_of_a_camera_stays_bounded_and_even(tmp_path: Path) -> None:
+    log = RerunLog(recording_file(tmp_path / "path.rrd"), LABELS)
+    for number in range(3 * MAX_PATH):
+        T = np.eye(4)
+        T[0, 3] = number
+        log._note_pose("camera", T)
+    kept = [T[0, 3] for T in log._paths["camera"]]
+    assert len(kept) <= MAX_PATH and set(np.diff(kept)) == {4.0} and kept[0] == 0
+    log.close()

@@ -1,0 +1,136 @@
+"""A real map, exported and read back: options reach the file, and those that mean nothing are refused."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun.chunk
+
+from semantic_mapper.errors import ConfigError, MapError
+from semantic_mapper.geometry import look_at
+from semantic_mapper.labels import make_label_set
+from semantic_mapper.mapping.open3d_loader import load_open3d
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.replay.exporters.map_files import AXES, ExportRequest, export_map, format_of, parse_up
+from tests.mapping.files.test_formats import read_glb
+from tests.mapping.rendered_views import frame, plane_depth, small_map, sure
+
+LABELS = make_label_set("corner", ("table", "floor", "wall"), ids=(5, 9, 2))
+
+
+@pytest.fixture(scope="module")
+def corner() -> VoxelMap:
+    """A floor (z = 0) seen twice, and a wall (y = 2), seen once."""
+    voxel_map = small_map(LABELS)
+    up = np.array((0.0, 0.0, 1.0))
+    for seq, (target, normal, offset, channel, p) in enumerate(
+        (
+            ((0.2, 1.3, 0.0), (0, 0, 1), 0.0, 1, 0.9),
+            ((0.3, 1.2, 0.0), (0, 0, 1), 0.0, 1, 0.9),
+            ((0.4, 2.0, 0.6), (0, 1, 0), 2.0, 2, 0.6),
+        )
+    ):
+        pose = look_at(np.array((0.1, 0.4, 1.2)), np.array(target), up)
+        voxel_map.integrate(frame(pose, seq=seq), plane_depth(pose, normal, offset), sure(channel, p), None)
+    return voxel_map
+
+
+def test_the_name_of_a_file_tells_its_format_or_it_is_given() -> None:
+    assert format_of(Path("a.GLB"), None) == "glb" and format_of(Path("a.yaml"), None) == "grid"
+    assert format_of(Path("a.ply"), None) == "ply" and format_of(Path("a.ply"), "ply-mesh") == "ply-mesh"
+    for path, given in ((Path("a.stl"), None), (Path("map"), None), (Path("a.ply"), "stl")):
+        with pytest.raises(ConfigError, match="which format"):
+            format_of(path, given)
+
+
+def test_up_is_an_axis_or_three_numbers() -> None:
+    assert parse_up("auto") is None
+    np.testing.assert_array_equal(parse_up("-y"), (0, -1, 0))
+    np.testing.assert_allclose(parse_up("0, 3 -4"), (0, 0.6, -0.8))
+    assert len(AXES) == 6
+    for text in ("up", "1 2", "0 0 0", "nan 0 1"):
+        with pytest.raises(ConfigError, match="--up"):
+            parse_up(text)
+
+
+def test_options_that_a_format_cannot_honour_are_refused(corner: VoxelMap, tmp_path: Path) -> None:
+    for request, message in (
+        (
+            ExportRequest("npz", color="class"),
+            "--color means nothing for format npz; it is for ply, ply-mesh, obj, glb",
+        ),
+        (ExportRequest("obj", up=AXES["z"]), "--up means nothing for format obj"),
+        (ExportRequest("glb", height=(0.1, 1)), "--height"),
+        (ExportRequest("grid", resolution=0.01), "smaller than the map's voxels"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            export_map(corner, tmp_path / "out", request)
+    with pytest.raises(MapError, match="no surface"):
+        export_map(corner, tmp_path / "out.glb", ExportRequest("glb", min_weight=4))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_mesh_keeps_its_place_and_faces_through_glb(corner: VoxelMap, tmp_path: Path) -> None:
+    report = export_map(corner, tmp_path / "map.glb", ExportRequest("glb", color="class"))
+    mesh = corner.mesh()
+    assert report.files == (tmp_path / "map.glb",) and f"{len(mesh.faces):,} faces" in report.content
+    assert report.found == ("up is z (--up sets it)",)
+    _, read = read_glb(tmp_path / "map.glb")
+    np.testing.assert_array_equal(read["POSITION"], mesh.vertices)
+    np.testing.assert_array_equal(read["indices"].reshape(-1, 3), mesh.faces)
+    np.testing.assert_array_equal(read["_LABEL"], mesh.label)
+    assert set(np.unique(mesh.label)) >= {9, 2}
+    wall, floor = read["POSITION"][read["_LABEL"] == 2], read["POSITION"][read["_LABEL"] == 9]
+    assert abs(np.median(wall[:, 1]) - 2) < 0.01 and abs(np.median(floor[:, 2])) < 0.01
+    model = load_open3d().io.read_triangle_model(str(tmp_path / "map.glb")).meshes[0].mesh
+    corners = np.asarray(model.vertices)[np.asarray(model.triangles)].reshape(-1, 3)  # y up: the wall stands at z = -2
+    np.testing.assert_allclose(corners, mesh.vertices[mesh.faces].reshape(-1, 3)[:, (0, 2, 1)] * (1, 1, -1), atol=1e-5)
+
+
+def test_weight_and_confidence_leave_out_what_is_less_sure(corner: VoxelMap, tmp_path: Path) -> None:
+    def labels(**changes: float) -> np.ndarray:
+        export_map(corner, tmp_path / "points.npz", dataclasses.replace(ExportRequest("npz"), **changes))
+        with np.load(tmp_path / "points.npz") as read:
+            return np.unique(read["label"], return_counts=True)
+
+    everything = corner.points()
+    ids, counts = labels()
+    assert counts.sum() == len(everything.xyz)
+    ids, counts = labels(min_confidence=0.7)
+    assert ids.tolist() == [9] and counts.sum() == (everything.confidence >= 0.7).sum() > 100
+    ids, counts = labels(min_weight=2)
+    assert (counts[ids == 2].sum() < 50) and counts[ids == 9] > 1000
+
+
+def test_a_plan_says_what_was_found_out_for_it(corner: VoxelMap, tmp_path: Path) -> None:
+    report = export_map(corner, tmp_path / "plan.yaml", ExportRequest("grid", height=(0.2, 1.0)))
+    assert report.files == (tmp_path / "plan.yaml", tmp_path / "plan.pgm")
+    assert report.found[0] == "up is z (--up sets it)" and "floor at 0.00 m" in report.found[1]
+    assert "cells of 0.05 m" in report.content and "m2 free" in report.content
+    told = export_map(corner, tmp_path / "plan.yaml", ExportRequest("grid", up=AXES["z"], floor=0.0))
+    assert told.found == ()
+
+
+def test_rerun_gets_a_cloud_for_each_colouring(corner: VoxelMap, tmp_path: Path) -> None:
+    export_map(corner, tmp_path / "map.rrd", ExportRequest("rrd"))
+    assert list(tmp_path.iterdir()) == [tmp_path / "map.rrd"]
+    clouds: dict[str, dict[str, np.ndarray]] = {}
+    for chunk in rerun.chunk.RrdReader(tmp_path / "map.rrd").stream():
+        if chunk.entity_path.startswith("/world/map"):
+            batch = chunk.to_record_batch()
+            names = {"positions": np.float32, "colors": np.uint32, "class_ids": np.uint16}
+            clouds[chunk.entity_path.removeprefix("/world/map/")] = {
+                name: np.array(batch.column(f"Points3D:{name}").to_pylist()[0], dtype)
+                for name, dtype in names.items()
+                if f"Points3D:{name}" in batch.schema.names
+            }
+    points = corner.points()
+    assert clouds.keys() == {"class", "colour", "confidence"}, "a saved map does not know its ages"
+    for cloud in clouds.values():
+        np.testing.assert_array_equal(cloud["positions"], points.xyz)
+    np.testing.assert_array_equal(clouds["class"]["class_ids"], points.label)
+    rgb = np.stack([(clouds["colour"]["colors"] >> shift) & 255 for shift in (24, 16, 8)], axis=1)
+    np.testing.assert_array_equal(rgb, points.rgb)

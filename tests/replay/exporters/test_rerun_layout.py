@@ -1,0 +1,48 @@
+"""From where a map is looked at first."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from semantic_mapper.evaluation.splat import seen_from
+from semantic_mapper.replay.exporters.rerun_layout import eye_on
+
+SIZE = np.array((5.0, 4.0, 2.6))
+
+
+def room(*, ceiling: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Floor and table, and walls with or without a ceiling, of a room that stands on z = 0."""
+    rng = np.random.default_rng(0)
+
+    def plane(axis: int, value: float) -> np.ndarray:
+        points = rng.random((15_000, 3)) * SIZE
+        points[:, axis] = value
+        return points
+
+    table = rng.random((4000, 3)) * (1.2, 0.8, 0.7) + (2.0, 1.5, 0.0)
+    walls = [plane(axis, value) for axis in (0, 1) for value in (0.0, SIZE[axis])]
+    return np.concatenate((plane(2, 0.0), table)), np.concatenate(walls + ([plane(2, SIZE[2])] if ceiling else []))
+
+
+@pytest.mark.parametrize("ceiling", [False, True])
+def test_the_first_look_is_into_the_room_not_onto_a_wall(ceiling: bool) -> None:
+    inside, around = room(ceiling=ceiling)
+    xyz = np.concatenate((inside, around))
+    eye = eye_on(xyz.astype(np.float32), np.array((0.0, 0.0, 1.0)))
+    assert np.allclose(eye.up, (0, 0, 1), atol=0.05)
+    within = bool(((eye.position > 0) & (eye.position < SIZE)).all())
+    assert within == ceiling, "a closed room is looked at from inside"
+    seen = seen_from(xyz, eye.position, eye.target, eye.up)[: len(inside)]
+    assert seen.mean() > (0.25 if ceiling else 0.5)
+
+
+def test_what_stands_behind_a_wall_is_not_seen() -> None:
+    v, u = np.mgrid[-1:1:80j, -1:1:80j]
+    wall = np.stack((u.ravel(), np.full(u.size, 1.0), v.ravel()), axis=-1)
+    behind = wall * 0.8 + (0.0, 2.0, 0.0)
+    position, target, up = np.zeros(3), np.array((0.0, 1.0, 0.0)), np.array((0.0, 0.0, 1.0))
+    seen = seen_from(np.concatenate((wall, behind)), position, target, up)
+    assert seen[: len(wall)].sum() > 1000 and not seen[len(wall) :].any()
+    assert seen_from(behind, position, target, up).mean() > 0.9
+    assert not seen_from(behind, position, -target, up).any()

@@ -1,0 +1,185 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from semantic_mapper.errors import NodeError, TransportError
+from semantic_mapper.replay.log.format import LogReader, LogWriter
+from semantic_mapper.replay.log.player import ACK_TOPICS, PlayOptions, PlayReport, play
+from semantic_mapper.transport.codec import encode_frame, encode_map_update, encode_refused
+from semantic_mapper.transport.messages import EndOfStream, FrameRefused, Message, StreamInfo
+from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
+from semantic_mapper.types import PosedFrame
+from tests.replay.conftest import FRAMES
+from tests.transport import samples
+
+WAIT_S = 30.0
+
+
+class Mapper:
+    """Stands at the other end in a thread of its own: answers each frame, and remembers what it got."""
+
+    def __init__(self, endpoint: str, answer: Callable[[PosedFrame], list[bytes] | None]) -> None:
+        self.received: list[Message] = []
+        self.publisher = Publisher(endpoint + "-map")
+        self.subscriber = NewestSubscriber(endpoint, ["info", "frame", "end"])
+        self._answer = answer
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while (message := self.subscriber.receive(WAIT_S)) is not None:
+            self.received.append(message)
+            if isinstance(message, EndOfStream):
+                return
+            if isinstance(message, PosedFrame) and (parts := self._answer(message)) is not None:
+                self.publisher.publish(parts)
+
+    @property
+    def seqs(self) -> list[int]:
+        return [m.seq for m in self.received if isinstance(m, PosedFrame)]
+
+    def __enter__(self) -> Mapper:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._thread.join()
+        self.subscriber.close()
+        self.publisher.close()
+
+
+def fuse(frame: PosedFrame) -> list[bytes]:
+    return encode_map_update(samples.make_update(frame.seq, frame.camera_id))
+
+
+def play_to(
+    log: Path, endpoint: str, answer: Callable[[PosedFrame], list[bytes] | None], **options: object
+) -> tuple[PlayReport, Mapper]:
+    with (
+        LogReader(log) as reader,
+        Publisher(endpoint, policy="block") as publisher,
+        Mapper(endpoint, answer) as mapper,
+        LosslessSubscriber(endpoint + "-map", ACK_TOPICS) as acks,
+    ):
+        report = play(reader, publisher, acks, PlayOptions(**options))  # type: ignore[arg-type]
+    return report, mapper
+
+
+def test_lockstep_drops_nothing_however_slow_the_mapper_is(small_log: Path, endpoint: str) -> None:
+    pause = threading.Event()
+
+    def slowly(frame: PosedFrame) -> list[bytes]:
+        pause.wait(0.02)
+        return fuse(frame)
+
+    report, mapper = play_to(small_log, endpoint, slowly)
+    assert (report.published, report.fused, report.refused, report.errors) == (FRAMES, FRAMES, (), ())
+    assert mapper.seqs == list(range(FRAMES)) and mapper.subscriber.overwritten == 0
+    info, end = mapper.received[0], mapper.received[-1]
+    assert isinstance(info, StreamInfo) and info.frame_count == FRAMES
+    assert end == EndOfStream("player", "end", FRAMES)
+
+
+def test_a_refusal_is_an_answer_too(small_log: Path, endpoint: str) -> None:
+    def answer(frame: PosedFrame) -> list[bytes]:
+        if frame.seq == 3:
+            return encode_refused(FrameRefused(frame.stamp_ns, 3, frame.camera_id, "pose holds NaN"))
+        return fuse(frame)
+
+    report, _ = play_to(small_log, endpoint, answer)
+    assert (report.published, report.fused) == (FRAMES, FRAMES - 1)
+    assert [refused.reason for refused in report.refused] == ["pose holds NaN"]
+
+
+def test_a_mapper_that_does_not_answer_ends_the_playing_with_a_clear_error(small_log: Path, endpoint: str) -> None:
+    with pytest.raises(NodeError, match=r"has not answered frame seq=2 of camera .front. within 0\.3 s"):
+        play_to(small_log, endpoint, lambda f: fuse(f) if f.seq < 2 else None, ack_timeout_s=0.3)
+
+
+DYING_MAPPER = """
+import os, sys
+from semantic_mapper.transport.codec import encode_map_update
+from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
+from semantic_mapper.types import PosedFrame
+from tests.transport import samples
+endpoint = sys.argv[1]
+publisher, frames = Publisher(endpoint + "-map"), NewestSubscriber(endpoint, ["frame"])
+while True:
+    frame = frames.receive()
+    if frame.seq == 3:
+        os.kill(os.getpid(), 9)
+    publisher.publish(encode_map_update(samples.make_update(frame.seq, frame.camera_id)))
+"""
+
+
+def test_a_mapper_that_is_killed_is_noticed_long_before_the_timeout(small_log: Path, endpoint: str) -> None:
+    root = Path(__file__).parents[3]
+    child = subprocess.Popen([sys.executable, "-c", DYING_MAPPER, endpoint], cwd=root)
+    with (
+        LogReader(small_log) as reader,
+        Publisher(endpoint, policy="block", linger_ms=0) as publisher,
+        NewestSubscriber(endpoint, ["frame"]),  # a viewer: the mapper is not the only one to listen
+        LosslessSubscriber(endpoint + "-map", ACK_TOPICS) as acks,
+        pytest.raises(NodeError, match="the mapper has gone while it worked on frame seq=3"),
+    ):
+        play(reader, publisher, acks, PlayOptions(subscribers=2, ack_timeout_s=1000.0))
+    assert child.wait() == -9
+
+
+def test_damaged_frames_are_passed_over_and_reported(tmp_path: Path, endpoint: str) -> None:
+    path = tmp_path / "log.mcap"
+    with LogWriter(path, StreamInfo("test")) as writer:
+        for seq in range(5):
+            parts = encode_frame(samples.make_frame(seq))
+            if seq == 1:
+                parts[2] = bytes(len(parts[2]))
+            writer.write_parts(parts)
+    report, mapper = play_to(path, endpoint, fuse)
+    assert mapper.seqs == [0, 2, 3, 4] and report.published == 4
+    assert len(report.errors) == 1 and "seq=1" in str(report.errors[0])
+
+
+def test_playing_fast_to_a_lossless_subscriber_loses_nothing(small_log: Path, endpoint: str) -> None:
+    seqs: list[int] = []
+    with (
+        LogReader(small_log) as reader,
+        Publisher(endpoint, policy="block", hwm=1) as publisher,
+        LosslessSubscriber(endpoint, ["frame", "end"], hwm=1) as subscriber,
+    ):
+        thread = threading.Thread(target=lambda: play(reader, publisher, None, PlayOptions(mode="fast", max_frames=7)))
+        thread.start()
+        while isinstance(message := subscriber.receive(WAIT_S), PosedFrame):
+            seqs.append(message.seq)
+        thread.join()
+    assert seqs == list(range(7)) and isinstance(message, EndOfStream)
+
+
+def test_real_time_keeps_the_order_and_sends_all(small_log: Path, endpoint: str) -> None:
+    report, mapper = play_to(small_log, endpoint, lambda _: None, mode="realtime", rate=1000.0)
+    assert report.published == FRAMES and mapper.seqs == sorted(mapper.seqs) and mapper.seqs[-1] == FRAMES - 1
+
+
+def test_playing_can_be_stopped(small_log: Path, endpoint: str) -> None:
+    stop = threading.Event()
+    with (
+        LogReader(small_log) as reader,
+        Publisher(endpoint, policy="block") as publisher,
+        Mapper(endpoint, fuse) as mapper,
+        LosslessSubscriber(endpoint + "-map", ACK_TOPICS) as acks,
+    ):
+        report = play(reader, publisher, acks, stop=stop, on_frame=lambda e, _: stop.set() if e.seq == 4 else None)
+    assert report.stopped and report.published == 5
+    assert mapper.received[-1] == EndOfStream("player", "stopped", 5)
+
+
+def test_playing_to_nobody_fails_clearly(small_log: Path, endpoint: str) -> None:
+    with LogReader(small_log) as reader, Publisher(endpoint) as publisher:
+        with pytest.raises(TransportError, match="0 of 1 subscribers of 'frame'"):
+            play(reader, publisher, None, PlayOptions(mode="fast", subscriber_timeout_s=0.1))
+        with pytest.raises(NodeError, match="lockstep needs"):
+            play(reader, publisher)

@@ -1,0 +1,392 @@
+"""Recordings in parts; disks that are full, by the kernel's word and by our own reserve."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from resource import RLIMIT_FSIZE, getrlimit, setrlimit
+
+import pytest
+
+from semantic_mapper.errors import LogError
+from semantic_mapper.labels import NYU40
+from semantic_mapper.replay.log.format import LogAttachment, LogReader, LogWriter
+from semantic_mapper.replay.log.recording import Recording, RecordingRules
+from semantic_mapper.replay.log.recover import recover
+from semantic_mapper.replay.log.sequence import LogSequence, open_log, parts_on_disk
+from semantic_mapper.transport.codec import encode_frame, encode_info
+from semantic_mapper.transport.messages import StreamInfo
+from tests.transport import samples
+
+INFO = StreamInfo("test", {samples.CAMERA: samples.INTRINSICS}, NYU40)
+FRAME = [encode_frame(samples.make_frame(seq)) for seq in range(60)]
+FRAME_BYTES = sum(map(len, FRAME[0]))
+
+
+def recording(path: Path, rules: RecordingRules, **more) -> Recording:
+    return Recording(path, INFO, rules, recording=more.pop("name", "one"), **more)
+
+
+def write(to: Recording, numbers: range) -> None:
+    for seq in numbers:
+        to.write(FRAME[seq])
+
+
+def frames_in(*paths: Path) -> list[int]:
+    """Numbers of the frames, all of which have to be whole."""
+    with open_log(paths, allow_empty=True) as log:
+        found = [frame.seq for frame in log]
+        assert not log.errors, log.errors
+        return found
+
+
+class Disk:
+    """A disk of ``size`` bytes under the files that are written: takes what fits, then says ENOSPC."""
+
+    def __init__(self, folder: Path, size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder, self.size = folder, size
+        self._write = os.write
+        monkeypatch.setattr("semantic_mapper.replay.log.atomic_file.os.write", self.write)
+
+    def free(self, folder: Path) -> int:
+        return self.size - sum(file.stat().st_size for file in self.folder.iterdir())
+
+    def write(self, fd: int, data) -> int:
+        if not os.readlink(f"/proc/self/fd/{fd}").startswith(str(self.folder)):
+            return self._write(fd, data)
+        room = self.free(self.folder)
+        if room <= 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return self._write(fd, bytes(data)[:room])
+
+
+def plenty(folder: Path) -> int:
+    return 1 << 40
+
+
+@contextmanager
+def files_at_most(size: int) -> Iterator[None]:
+    """Writing beyond so many bytes of any file fails meanwhile."""
+    before = getrlimit(RLIMIT_FSIZE)
+    setrlimit(RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        setrlimit(RLIMIT_FSIZE, before)
+
+
+def test_parts_by_size_are_logs_by_themselves_and_one_together(tmp_path: Path) -> None:
+    with_parts = recording(tmp_path / "a.mcap", RecordingRules(split_bytes=20_000))
+    write(with_parts, range(40))
+    with_parts.close()
+    files = parts_on_disk(tmp_path / "a.mcap")
+    assert list(files) == list(range(with_parts.parts)) and len(files) > 5
+    alone = [frames_in(file) for file in files.values()]
+    assert [seq for found in alone for seq in found] == list(range(40)) and all(alone)
+    shuffled = sorted(files.values(), key=lambda file: file.name[::-1])
+    assert frames_in(*shuffled) == frames_in(tmp_path) == list(range(40))
+    with open_log(shuffled) as log:
+        assert isinstance(log, LogSequence) and log.finished and not log.notices and len(log) == 40
+        assert [log.frame(n).seq for n in (39, 0, 17, 8)] == [39, 0, 17, 8]
+        assert [e.seq for e, _ in log.frame_parts()] == list(range(40))
+        assert [item.seq for item in log.frames_or_errors(11)] == list(range(11))  # type: ignore[union-attr]
+        assert log.info == INFO and log.path == files[0]
+        with pytest.raises(LogError, match="no frame 40"):
+            log.frame(40)
+    for file in files.values():
+        assert file.stat().st_size < 20_000 + 8_000  # the index comes on top
+
+
+def test_each_part_says_what_all_streams_are(tmp_path: Path) -> None:
+    second = StreamInfo("test", {"right": samples.INTRINSICS}, NYU40)
+    lenses = [LogAttachment("lenses.json", "application/json", data) for data in (b"left", b"left, right")]
+    two = Recording(
+        tmp_path / "a.mcap", INFO, RecordingRules(split_bytes=20_000), recording="two", attachments=lenses[:1]
+    )
+    two.announce(encode_info(second, "right"), lenses[1])
+    for seq in range(20):
+        write(two, range(seq, seq + 1))
+        two.write(encode_frame(replace(samples.make_frame(seq), camera_id="right")))
+    two.close()
+    files = parts_on_disk(tmp_path / "a.mcap")
+    assert len(files) > 3
+    for file in files.values():
+        with LogReader(file) as log:
+            assert set(log.info.cameras) == {samples.CAMERA, "right"}
+            assert log.attachments()["lenses.json"] == lenses[1]
+            assert not log.errors
+
+
+def test_parts_by_time(tmp_path: Path) -> None:
+    now = 100.0
+    timed = recording(tmp_path / "a.mcap", RecordingRules(split_s=2), clock=lambda: now)
+    for seq in range(10):
+        write(timed, range(seq, seq + 1))
+        now += 0.75
+    timed.close()
+    assert [frames_in(f) for f in parts_on_disk(tmp_path / "a.mcap").values()] == [[0, 1, 2], [3, 4, 5], [6, 7, 8], [9]]
+
+
+def test_parts_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        r = recording(tmp_path / f"{name}.mcap", RecordingRules(split_bytes=20_000), name=name)
+        write(r, range(20))
+        r.close()
+    one, two = parts_on_disk(tmp_path / "one.mcap"), parts_on_disk(tmp_path / "two.mcap")
+    with LogWriter(tmp_path / "alone.mcap", INFO) as log:
+        log.write_parts(FRAME[0])
+    for paths, message in (
+        ([one[0], two[1]], "different recordings"),
+        ([one[0], tmp_path / "alone.mcap"], r"alone.mcap: was not recorded in parts"),
+        ([one[1], one[1]], "same part 1"),
+        ([tmp_path], r"taken for the parts of one recording.*in parts.*name its file: alone\.mcap, one-1\.mcap"),
+    ):
+        with pytest.raises(LogError, match=message):
+            open_log(paths)
+    (tmp_path / "none").mkdir()
+    with pytest.raises(LogError, match="holds no log"):
+        open_log(tmp_path / "none")
+    with open_log([one[3], one[1]]) as log:
+        assert "is part 1: what was recorded before" in log.notices[0] and "1 parts of the recording" in log.notices[1]
+
+
+def test_full_disk_stops_the_recording_with_all_that_was_written(tmp_path: Path) -> None:
+    free = 10 * FRAME_BYTES
+    stopped = recording(tmp_path / "a.mcap", RecordingRules(reserve_bytes=5_000), free=lambda folder: free)
+    for seq in range(20):
+        write(stopped, range(seq, seq + 1))
+        free -= FRAME_BYTES
+    assert stopped.ended and stopped.frames + stopped.lost == 20 and stopped.frames >= 5
+    assert "recording has stopped" in stopped.trouble and "the disk is full" in stopped.trouble
+    free = 1 << 40
+    write(stopped, range(20, 22))  # stopped is stopped
+    assert stopped.lost == 22 - stopped.frames
+    with LogReader(tmp_path / "a.mcap") as log:
+        assert log.finished and [f.seq for f in log] == list(range(stopped.frames))
+    stopped.close()
+
+
+def test_ring_keeps_the_newest_and_the_reserve(tmp_path: Path) -> None:
+    size, reserve = 200_000, 30_000
+    left: list[int] = []
+
+    def free(folder: Path) -> int:
+        left.append(size - sum(file.stat().st_size for file in folder.iterdir()))
+        return left[-1]
+
+    rules = RecordingRules(split_bytes=30_000, disk_full="delete-oldest", reserve_bytes=reserve)
+    ring = recording(tmp_path / "a.mcap", rules, free=free)
+    write(ring, range(60))
+    ring.close()
+    found = frames_in(tmp_path)
+    assert found == list(range(60))[-len(found) :] and 8 < len(found) < 60
+    assert ring.lost == 0 and ring.deleted > 0 and not ring.trouble and min(left) > reserve - 20_000
+    assert 0 not in parts_on_disk(tmp_path / "a.mcap")
+    with open_log(tmp_path) as log:
+        assert "what was recorded before is not here" in log.notices[0]
+
+
+def test_recording_pauses_where_nothing_is_left_to_delete_and_goes_on(tmp_path: Path) -> None:
+    free, now = 1 << 30, 0.0
+    rules = RecordingRules(split_bytes=1 << 20, disk_full="delete-oldest", reserve_bytes=1000)
+    pausing = recording(tmp_path / "a.mcap", rules, free=lambda folder: free, clock=lambda: now)
+    write(pausing, range(3))
+    free = 1500
+    write(pausing, range(3, 6))
+    assert pausing.lost == 3 and not pausing.ended and "goes on once there is room" in pausing.trouble
+    free, now = 1 << 30, 5.0
+    write(pausing, range(6, 8))
+    assert not pausing.trouble
+    pausing.close()
+    assert frames_in(tmp_path) == [0, 1, 2, 6, 7]
+
+
+def test_disk_that_goes_away_is_told(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    gone = recording(tmp_path / "disk" / "a.mcap", RecordingRules())
+    write(gone, range(3))
+    shutil.rmtree(tmp_path / "disk")
+    write(gone, range(3, 6))
+    assert gone.ended and (gone.frames, gone.lost) == (3, 3) and "cannot be asked" in gone.trouble
+
+
+@pytest.mark.parametrize("size", range(30_000, 32_600, 133))
+def test_disk_that_takes_half_a_message_damages_nothing(
+    tmp_path: Path, size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Disk(tmp_path, size, monkeypatch)
+    stopped = recording(tmp_path / "a.mcap", RecordingRules(), free=plenty)  # which is not true
+    write(stopped, range(30))
+    assert stopped.ended and "No space left" in stopped.trouble and stopped.frames + stopped.lost == 30
+    stopped.close()
+    with LogReader(tmp_path / "a.mcap") as log:
+        assert [f.seq for f in log] == list(range(stopped.frames)) and not log.errors
+        # Fifty bytes end it properly; where not even these fit, it is as if the writer had been killed.
+        assert log.finished or size - (tmp_path / "a.mcap").stat().st_size < 50
+
+
+def test_ring_on_a_disk_that_is_full_before_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Disk(tmp_path, 150_000, monkeypatch)
+    rules = RecordingRules(split_bytes=30_000, disk_full="delete-oldest")
+    ring = recording(tmp_path / "a.mcap", rules, free=plenty)
+    write(ring, range(60))
+    assert ring.lost == 0 and ring.deleted > 0
+    monkeypatch.undo()
+    ring.close()
+    found = frames_in(tmp_path)
+    assert found == list(range(60))[-len(found) :] and len(found) > 8
+
+
+def test_disk_smaller_than_one_message_leaves_no_empty_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    Disk(tmp_path, 16_000, monkeypatch)
+    rules = RecordingRules(split_bytes=50_000, disk_full="delete-oldest")
+    ring = recording(tmp_path / "a.mcap", rules, free=plenty, clock=lambda: now)
+    for seq in range(30):
+        write(ring, range(seq, seq + 1))
+        now += 2
+    assert ring.lost + ring.frames == 30 and ring.lost > 20
+    assert list(parts_on_disk(tmp_path / "a.mcap")) == [0]
+    ring.close()
+    assert frames_in(tmp_path / "a.mcap") == list(range(ring.frames)) and ring.deleted == 0
+
+
+def test_limit_of_the_kernel_on_one_file(tmp_path: Path) -> None:
+    with files_at_most(30_000):
+        stopped = recording(tmp_path / "stop.mcap", RecordingRules())
+        write(stopped, range(40))
+        stopped.close()
+        rules = RecordingRules(split_s=1e9, disk_full="delete-oldest")
+        split = recording(tmp_path / "split.mcap", rules)
+        write(split, range(40))
+        split.close()
+    assert "File too large" in stopped.trouble and stopped.lost == 40 - stopped.frames
+    assert frames_in(tmp_path / "stop.mcap") == list(range(stopped.frames))
+    assert split.lost == 0 and split.deleted == 0
+    assert frames_in(*parts_on_disk(tmp_path / "split.mcap").values()) == list(range(40))
+
+
+REAL_DISK = """
+import sys
+from pathlib import Path
+from tests.replay.log.test_recording import FRAME, recording
+from semantic_mapper.replay.log.recording import RecordingRules
+folder, copy = Path(sys.argv[1]), Path(sys.argv[2])
+for policy, reserve in (("stop", 0), ("stop", 300_000), ("delete-oldest", 0), ("delete-oldest", 300_000)):
+    rules = RecordingRules(split_bytes=100_000, disk_full=policy, reserve_bytes=reserve)
+    r = recording(folder / "a.mcap", rules)
+    for n in range(500):
+        r.write(FRAME[n % 60])
+    r.close()
+    to = copy / f"{policy}-{reserve}"
+    to.mkdir()
+    print(policy, reserve, r.frames, r.lost, r.deleted)
+    for file in folder.iterdir():
+        (to / file.name).write_bytes(file.read_bytes())
+        file.unlink()
+"""
+
+
+def test_real_small_disk(tmp_path: Path) -> None:
+    """A file system of 1 MB in a name space of its own; what it held is copied out of it."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = f'mount -t tmpfs -o size=1m tmpfs {disk} && exec {sys.executable} -c "$0" {disk} {tmp_path}'
+    words = ["unshare", "-rm", "sh", "-c", mount, REAL_DISK]
+    root = Path(__file__).parents[3]
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, cwd=root, check=False, timeout=120)
+    except FileNotFoundError:
+        pytest.skip("this system has no unshare")
+    if "unshare:" in done.stderr or "mount:" in done.stderr:
+        pytest.skip(f"no file system can be mounted here: {done.stderr.strip()}")
+    assert done.returncode == 0, done.stderr
+    results = [line for line in done.stdout.splitlines() if line.startswith(("stop", "delete"))]
+    for line in results:
+        policy, reserve, frames, lost, deleted = line.split()
+        found = frames_in(tmp_path / f"{policy}-{reserve}")
+        order = [n % 60 for n in range(500)]
+        if policy == "stop":
+            assert found == order[: int(frames)] and int(lost) == 500 - int(frames) > 100 and deleted == "0"
+        else:
+            assert found == order[-len(found) :] and len(found) > 150 and lost == "0" and int(deleted) > 1
+    assert len(results) == 4
+
+
+def test_recorder_that_was_killed_goes_on_in_the_next_part(tmp_path: Path) -> None:
+    rules = RecordingRules(split_bytes=20_000, disk_full="delete-oldest")
+    first = recording(tmp_path / "a.mcap", rules)
+    write(first, range(12))  # and never closed
+    second = recording(tmp_path / "a.mcap", rules, goes_on=True)
+    write(second, range(12, 30))
+    second.close()
+    assert frames_in(tmp_path) == list(range(30))
+    assert second.parts == len(parts_on_disk(tmp_path / "a.mcap"))  # the ring knows of those from before
+
+
+def test_recording_that_is_there_is_kept_unless_told_otherwise(tmp_path: Path) -> None:
+    rules = RecordingRules(split_bytes=20_000)
+    for _ in range(2):
+        old = recording(tmp_path / "a.mcap", rules, overwrite=True)
+        write(old, range(20))
+        old.close()
+    (tmp_path / "a.mcap").unlink()
+    with pytest.raises(LogError, match=r"a-1\.mcap: exists already.* --overwrite, in a launch file overwrite = true"):
+        recording(tmp_path / "a.mcap", rules)
+    new = recording(tmp_path / "a.mcap", rules, overwrite=True)
+    write(new, range(2))
+    new.close()
+    assert list(parts_on_disk(tmp_path / "a.mcap")) == [0]
+    with pytest.raises(LogError, match="is no file"):
+        recording(Path("/dev/null"), rules, overwrite=True)
+
+
+def test_attachments_stay_with_a_log(tmp_path: Path) -> None:
+    kept = LogAttachment("calibration.json", "application/json", b"{}")
+    with LogWriter(tmp_path / "a.mcap", INFO, attachments=[kept]) as log:
+        log.write_parts(FRAME[0])
+    recover(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    data = bytearray((tmp_path / "b.mcap").read_bytes())
+    with LogReader(tmp_path / "b.mcap") as reader:
+        assert reader.attachments() == {"calibration.json": kept}
+    data[data.index(b"calibration.json") + 45] ^= 1
+    (tmp_path / "c.mcap").write_bytes(data)
+    with LogReader(tmp_path / "c.mcap") as reader:
+        assert reader.attachments() == {} and "is damaged" in str(reader.errors[0])
+
+
+@pytest.mark.parametrize("room", [lambda size: size - 60, lambda size: size - 3])
+def test_log_without_room_for_its_index_is_closed_without_one(
+    tmp_path: Path, room: Callable[[int], int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with LogWriter(tmp_path / "a.mcap", INFO) as log:
+        for parts in FRAME[:3]:
+            log.write_parts(parts)
+    whole = (tmp_path / "a.mcap").stat().st_size
+    (tmp_path / "a.mcap").unlink()
+    Disk(tmp_path, room(whole), monkeypatch)
+    with LogWriter(tmp_path / "a.mcap", INFO) as log:
+        for parts in FRAME[:3]:
+            log.write_parts(parts)
+    with LogReader(tmp_path / "a.mcap") as reader:
+        assert reader.finished and len(reader) == 3 and not reader.errors
+
+
+def test_a_log_that_was_removed_is_not_called_whole(tmp_path: Path) -> None:
+    for name, remove in (("folder", shutil.rmtree), ("file", lambda folder: (folder / "a.mcap").unlink())):
+        folder = tmp_path / name
+        folder.mkdir()
+        gone = recording(folder / "a.mcap", RecordingRules())
+        write(gone, range(3))
+        assert not gone.gone
+        remove(folder)
+        write(gone, range(3, 6))
+        gone.close()
+        assert gone.gone and "whole" not in gone.trouble
