@@ -11,76 +11,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from semantic_mapper.config import MapperConfig, convert_config, to_plain, with_quality
 from semantic_mapper.errors import FrameError, LabelError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, ImageMeans, confusion_of
-from semantic_mapper.fields.base import SemanticField
-from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint
-from semantic_mapper.fields.device import choose_device
-from semantic_mapper.fields.device_field import DeviceField
-from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.sray_streaming import StreamingSRay, compiled_covers
+from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.pipeline import MappingPipeline
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.replay.artifacts import MAX_LISTED, write_artifacts
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.replay.stats import FirstAndLast, StepTimes
 from semantic_mapper.types import MapUpdate, PosedFrame
 
 if TYPE_CHECKING:
+    from semantic_mapper.mapping.pipeline import MappingPipeline
     from semantic_mapper.replay.exporters.rerun_log import RerunLog
 
 _log = get_logger(__name__)
 
 SNAPSHOTS = 8  # frames kept for the overview picture
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PipelineBundle:
-    """A pipeline with the weights it runs on."""
-
-    pipeline: MappingPipeline
-    checkpoint: Checkpoint
-    weights_path: Path
-
-
-def load_pipeline(weights: Path | None, config: MapperConfig) -> PipelineBundle:
-    """Load weights (None = those that ship with the package) and build the pipeline round them.
-
-    The map's classes are those of the weights. With ``sampling.mode = "streaming"`` and a model that the compiled
-    renderer covers, that renderer is used; the eager reference otherwise, and on a GPU.
-
-    Raises:
-        ConfigError: a GPU is asked for that is not there.
-        WeightsError: missing, damaged or foreign weights.
-    """
-    config = with_quality(config)
-    path = weights or default_checkpoint_path()
-    checkpoint = load_checkpoint(path)
-    if config.render.encode_width == 0:
-        plain = to_plain(config)
-        plain["render"]["encode_width"] = checkpoint.width
-        config = convert_config(plain, MapperConfig, "mapper config")
-    pipeline = MappingPipeline(
-        config, make_field(checkpoint.model, config), checkpoint.label_set, anchors=checkpoint.anchors
-    )
-    return PipelineBundle(pipeline, checkpoint, path)
-
-
-def make_field(model: LearnedField, config: MapperConfig) -> SemanticField:
-    """The renderer that a config asks for, over given weights.
-
-    Raises:
-        ConfigError: ``render.device = "cuda"`` where torch sees no GPU.
-    """
-    if config.render.device == "cuda":
-        return DeviceField(model, choose_device("cuda", 0), config.sampling, bfloat16=config.render.bfloat16)
-    if isinstance(model, SRay) and config.sampling.mode == "streaming" and compiled_covers(model):
-        return StreamingSRay(model, config.sampling)
-    model.sampling = config.sampling
-    return model
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +44,7 @@ class MapSession:
     """Feeds frames to the pipeline, keeps count, and scores against labels where the stream has them.
 
     Args:
-        bundle: From ``load_pipeline``.
+        bundle: From ``Mapper.load``.
         stream_labels: Label set of the frames' label images; None where they have none.
         exclude_stamps: Frames to leave out of the scores, beside those that the weights were finetuned on.
         source: Name of the log or stream, for the summary.
@@ -105,7 +53,7 @@ class MapSession:
 
     def __init__(
         self,
-        bundle: PipelineBundle,
+        bundle: Mapper,
         *,
         stream_labels: LabelSet | None,
         exclude_stamps: frozenset[int] = frozenset(),

@@ -228,7 +228,7 @@ class LogReplays:
 
         Raises:
             LogError: the log cannot be read, or none of its frames can be mapped.
-            WeightsError, ConfigError, MapError: as of ``load_pipeline`` and ``MappingPipeline.step``.
+            WeightsError, ConfigError, MapError: as of ``Mapper.load`` and ``MappingPipeline.step``.
         """
         log = self._root / log
         weights = None if weights is None else self._root / weights
@@ -249,12 +249,13 @@ class LogReplays:
         return mapper
 
     def _replay(self, path: Path, weights: Path | None, config: MapperConfig, max_frames: int) -> ReplayedMap:
+        from semantic_mapper.mapper import Mapper
         from semantic_mapper.replay.log.sequence import open_log
-        from semantic_mapper.replay.session import MapSession, load_pipeline
+        from semantic_mapper.replay.session import MapSession
         from semantic_mapper.types import PosedFrame
 
         with open_log(path) as log:
-            bundle = load_pipeline(weights, config)
+            bundle = Mapper.load(weights, config)
             session = MapSession(bundle, stream_labels=log.info.label_set, source=log.info.source)
             for error in log.errors:
                 session.note_damage(str(error))

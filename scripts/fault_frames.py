@@ -22,8 +22,9 @@ from semantic_mapper.drivers.poses.posed_camera import PosedCamera
 from semantic_mapper.drivers.poses.sources import make_poses
 from semantic_mapper.drivers.registry import open_camera
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.nodes.cli.run_replay import mapper_config
-from semantic_mapper.replay.session import MapSession, load_pipeline
+from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 from tests.drivers.fake_v4l2 import Sensor, make_machine, write_calibration
@@ -141,7 +142,7 @@ def _image(frame: PosedFrame) -> CameraImage:
 
 def _map_of(weights: str, config: str, images: Iterable[CameraImage]) -> tuple[list[bytes], dict[str, int]]:
     """The map's surface points as bytes, and what the posed camera has counted."""
-    bundle = load_pipeline(Path(weights) if weights else None, mapper_config(Path(config) if config else None, None))
+    bundle = Mapper.load(Path(weights) if weights else None, mapper_config(Path(config) if config else None, None))
     session = MapSession(bundle, stream_labels=None)
     camera = PosedCamera(_ListCamera(images), make_poses(DevicePoses()))
     with camera:

@@ -26,9 +26,10 @@ from semantic_mapper.errors import CodecError, MapError
 from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import NYU40, ROOMS
+from semantic_mapper.mapper import Mapper, make_field
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.memory import give_back_freed_memory
-from semantic_mapper.replay.session import MapSession, PipelineBundle, make_field
+from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport import codec
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
@@ -303,7 +304,7 @@ def run(frames: int, seed: int = 0, on_progress: Callable[[Report], None] | None
     return report
 
 
-def _bundle() -> PipelineBundle:
+def _bundle() -> Mapper:
     """With a small network of random weights: the values, not the quality of the map, are looked at."""
     torch.manual_seed(0)
     encoder = EncoderConfig(channels=(8, 16), blocks=(1, 1), depth=True)
@@ -311,10 +312,10 @@ def _bundle() -> PipelineBundle:
     config = convert_config(CONFIG, MapperConfig, "fuzz")
     recipe = {"kind": "random", "width": 32, "train_stamps_ns": []}
     pipeline = MappingPipeline(config, make_field(model, config), ROOMS)
-    return PipelineBundle(pipeline, Checkpoint(model, (), recipe), Path("random.safetensors"))
+    return Mapper(pipeline, Checkpoint(model, (), recipe), Path("random.safetensors"))
 
 
-def _session(bundle: PipelineBundle) -> MapSession:
+def _session(bundle: Mapper) -> MapSession:
     """With an empty map."""
     pipeline = bundle.pipeline
     fresh = MappingPipeline(pipeline.config, pipeline.field, pipeline.label_set)

@@ -50,7 +50,8 @@ def test_every_module_can_be_imported_and_none_loads_a_vendor_library() -> None:
 
 
 def test_the_command_line_starts_without_heavy_packages() -> None:
-    program = "import sys, semantic_mapper.nodes.cli.main\nprint(sorted({'torch', 'open3d', 'rerun', 'scipy', 'cv2', 'zmq'} & set(sys.modules)))\n"
+    heavy = {"torch", "open3d", "rerun", "scipy", "cv2", "zmq"}
+    program = f"import sys, semantic_mapper.nodes.cli.main; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-I", "-c", program], capture_output=True, text=True, check=False)
     assert (done.stdout.strip(), done.returncode) == ("[]", 0), done.stderr
 

@@ -19,6 +19,7 @@ import torch
 
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import TransportError
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.bench_client import ASK, ASKING, KINDS, READY, REST, Asked, ask_when_told
@@ -26,7 +27,6 @@ from semantic_mapper.nodes.mapper.query_answers import Question
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.replay.bench.fusion import STEP_M, WARM_UP
 from semantic_mapper.replay.bench.walk import wide_camera
-from semantic_mapper.replay.session import load_pipeline
 from semantic_mapper.scenes import TEST_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.types import PosedFrame
 
@@ -68,7 +68,7 @@ def bench_queries(
     """
     count, path = WARM_UP + 2 * frames + HELD, CameraPathConfig(step_m=STEP_M)
     posed = list(room_frames(TEST_SEEDS[0], count, wide_camera(width), path=path))
-    pipeline = load_pipeline(weights, config).pipeline
+    pipeline = Mapper.load(weights, config).pipeline
     for frame in posed[:WARM_UP]:
         pipeline.step(frame)
     eyes = np.stack([frame.T_world_camera[:3, 3] for frame in posed])

@@ -13,12 +13,13 @@ import structlog
 from semantic_mapper.config import MapperConfig, Quality, check_quality, convert_config, read_toml
 from semantic_mapper.errors import LogError, SemanticMapperError
 from semantic_mapper.fields.checkpoint import load_checkpoint
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.nodes.cli.outputs import hold_folder
 from semantic_mapper.nodes.mapper.finish import finish_session
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.corrected_poses import correct_session, keeping_frames, read_corrections
 from semantic_mapper.replay.log.sequence import Log, open_log
-from semantic_mapper.replay.session import MapSession, load_pipeline, open_recording
+from semantic_mapper.replay.session import MapSession, open_recording
 from semantic_mapper.types import PosedFrame
 
 _log = structlog.get_logger(__name__)
@@ -77,7 +78,7 @@ def replay_log(
         for notice in log.notices:
             _log.warning("log_notice", notice=notice)
         config = request.config if trajectory is None else keeping_frames(request.config, len(log))
-        bundle = load_pipeline(request.weights, config)
+        bundle = Mapper.load(request.weights, config)
         clear_summary(request.out)
         session = MapSession(
             bundle,

@@ -10,12 +10,12 @@ from typing import Any
 from rich.table import Table
 
 from semantic_mapper.errors import LabelError, WeightsError
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.nodes.cli.console import frame_progress
 from semantic_mapper.nodes.cli.run_replay import mapper_config
 from semantic_mapper.nodes.cli.summary_table import percent
 from semantic_mapper.replay.evaluate.methods import baseline_predictors, evaluate_frames, field_predictors
 from semantic_mapper.replay.log.sequence import Log, open_log
-from semantic_mapper.replay.session import load_pipeline
 from semantic_mapper.types import PosedFrame
 
 
@@ -45,7 +45,7 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
         stream_labels = log.info.label_set
         if stream_labels is None:
             raise LabelError(f"{request.log}: has no label images to score against")
-        bundle = load_pipeline(request.weights, mapper_config(request.config, None, request.seed))
+        bundle = Mapper.load(request.weights, mapper_config(request.config, None, request.seed))
         predictors = field_predictors(bundle)
         stamps = bundle.checkpoint.train_stamps_ns
         if request.baselines:

@@ -16,6 +16,7 @@ from msgspec import to_builtins
 
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.mapper import Mapper, make_field
 from semantic_mapper.mapping.views.weights_check import FieldTrial
 from semantic_mapper.nodes.mapper.offered_weights import (
     FOLDER,
@@ -26,7 +27,7 @@ from semantic_mapper.nodes.mapper.offered_weights import (
 )
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
-from semantic_mapper.replay.session import MapSession, PipelineBundle, make_field
+from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport.codec import encode_in_use
 from semantic_mapper.transport.learning_messages import digest_of
 from semantic_mapper.transport.messages import WeightsInUse, WeightsUpdate
@@ -55,7 +56,7 @@ class _Task:
 
 @contextmanager
 def taking_weights(
-    context: NodeContext, options: MapperOptions, bundle: PipelineBundle, publisher: Publisher
+    context: NodeContext, options: MapperOptions, bundle: Mapper, publisher: Publisher
 ) -> Iterator[LiveWeights | None]:
     """What takes the weights of the learner that ``options`` name; None where they name none.
 
@@ -90,7 +91,7 @@ class LiveWeights:
     def __init__(
         self,
         context: NodeContext,
-        bundle: PipelineBundle,
+        bundle: Mapper,
         folder: Path,
         least_agreement: float,
         publisher: Publisher,

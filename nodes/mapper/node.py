@@ -17,11 +17,12 @@ from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.streams import Streams
 
 if TYPE_CHECKING:
+    from semantic_mapper.mapper import Mapper
     from semantic_mapper.nodes.mapper.autosave import Autosave
     from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
     from semantic_mapper.nodes.mapper.live_weights import LiveWeights
     from semantic_mapper.nodes.mapper.query_service import QueryService
-    from semantic_mapper.replay.session import MapSession, PipelineBundle
+    from semantic_mapper.replay.session import MapSession
     from semantic_mapper.transport.messages import EndOfStream, NodeState, StreamInfo
     from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
     from semantic_mapper.types import PosedFrame
@@ -56,6 +57,7 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
         TransportError: an endpoint is taken.
     """
     from semantic_mapper.fields.checkpoint import load_checkpoint
+    from semantic_mapper.mapper import Mapper
     from semantic_mapper.nodes.cli.outputs import prepare_folder
     from semantic_mapper.nodes.cli.run_replay import mapper_config
     from semantic_mapper.nodes.cli.saved_maps import MAP_NAME
@@ -64,12 +66,11 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
     from semantic_mapper.nodes.mapper.resume import take_up
     from semantic_mapper.nodes.mapper.standby import warm_up_mapper
     from semantic_mapper.nodes.public_publisher import PublicPublisher
-    from semantic_mapper.replay.session import load_pipeline
     from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber
 
     prepare_folder(Path(options.out))
     config = mapper_config(Path(options.config) if options.config else None, options.voxel_size_m or None)
-    bundle = load_pipeline(Path(options.weights) if options.weights else None, config)
+    bundle = Mapper.load(Path(options.weights) if options.weights else None, config)
     if context.waits or context.comes_back:
         # Live: kernels compile at the start; at a first frame a process in waiting would compile them beside it.
         warm_up_mapper(bundle)
@@ -105,7 +106,7 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
 def _answering(
     context: NodeContext,
     options: MapperOptions,
-    bundle: PipelineBundle,
+    bundle: Mapper,
     correction: LiveCorrection,
     weights: LiveWeights | None,
 ) -> QueryService | nullcontext[None]:
@@ -120,7 +121,7 @@ def _answering(
     return QueryService(endpoint, bundle.pipeline.voxel_map, correction, keys, weights)
 
 
-def _saving(options: MapperOptions, bundle: PipelineBundle) -> Autosave | None:
+def _saving(options: MapperOptions, bundle: Mapper) -> Autosave | None:
     from semantic_mapper.nodes.cli.saved_maps import MAP_NAME
     from semantic_mapper.nodes.mapper.autosave import Autosave
 
@@ -136,7 +137,7 @@ class _Mapper:
         self,
         context: NodeContext,
         options: MapperOptions,
-        bundle: PipelineBundle,
+        bundle: Mapper,
         exclude: frozenset[int],
         publisher: Publisher,
         frames: LosslessSubscriber | NewestSubscriber,

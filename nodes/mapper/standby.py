@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from semantic_mapper.geometry import pose_matrix
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.replay.session import PipelineBundle
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
 _WIDTH, _HEIGHT = 160, 120
 _FRAMES = 3  # the second is rendered from the first; the third meets what the second left
 
 
-def warm_up_mapper(bundle: PipelineBundle) -> None:
+def warm_up_mapper(bundle: Mapper) -> None:
     """Map a wall in a pipeline that is thrown away, and copy a map once.
 
     What computes loads its code and allocates what it keeps. The pipeline of ``bundle`` is as it was.

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from semantic_mapper.client import MapClient
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import SemanticMapperError, TransportError
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.process import StopRequest
@@ -26,7 +27,7 @@ from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.replay.exporters.rerun_log import RerunLog
 from semantic_mapper.replay.log.sequence import open_log
-from semantic_mapper.replay.session import MapSession, load_pipeline
+from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport.messages import EndOfStream
 from semantic_mapper.transport.security import ServerIdentity
 from semantic_mapper.transport.sockets import NewestSubscriber
@@ -111,7 +112,7 @@ def show_log(
 
     Args:
         path: The log.
-        weights, config: See ``load_pipeline``.
+        weights, config: See ``Mapper.load``.
         frames: At most so many; 0 = all.
         begin: Says where to write it, once log and weights are open.
         refresh_s: Time between two maps.
@@ -122,7 +123,7 @@ def show_log(
     Raises:
         LogError, WeightsError, ConfigError, MapError: it cannot be mapped.
     """
-    bundle = load_pipeline(weights, config)
+    bundle = Mapper.load(weights, config)
     pipeline = bundle.pipeline
     voxel_map = pipeline.voxel_map
     with open_log(path) as reader:

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from semantic_mapper.benchmark.config import MAP_WIDTH, SequenceConfig, camera_of_width
 from semantic_mapper.config import MapperConfig, with_quality
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.replay.evaluate.room_map import NEAR_M, true_surface
-from semantic_mapper.replay.session import load_pipeline
 from semantic_mapper.scenes import VALIDATION_SEEDS, CameraPathConfig, NoiseConfig, make_room, room_frames
 
 
@@ -29,7 +29,7 @@ def bench_depthless(weights: Path | None, config: MapperConfig, frames: int = 24
     surface = true_surface(make_room(seed), [f.T_world_camera for f in posed]).xyz
     rows: list[dict[str, Any]] = []
     for measured in (frames, frames // 4, 0):
-        pipeline = load_pipeline(weights, with_quality(config)).pipeline
+        pipeline = Mapper.load(weights, with_quality(config)).pipeline
         for number, frame in enumerate(posed):
             pipeline.step(replace(frame, label=None, depth_m=frame.depth_m if number < measured else None))
         xyz = pipeline.voxel_map.points().xyz

@@ -19,10 +19,10 @@ from semantic_mapper.config import MapperConfig, Quality, VoxelMapConfig, with_q
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import ROOMS, make_label_set
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.storage.grid_buffers import make_open3d_grid
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.replay.session import load_pipeline
 from semantic_mapper.scenes import TEST_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame
 
@@ -84,7 +84,7 @@ def bench_pipeline(weights: Path | None, config: MapperConfig, frames: int = 40)
         Plain data: ``hz`` (1 / mean of a step), ``p50_ms`` and ``p95_ms`` of ``step``, medians of its stages, and the
         mIoU of the rendered labels.
     """
-    pipeline = load_pipeline(weights, config).pipeline
+    pipeline = Mapper.load(weights, config).pipeline
     posed = list(room_frames(TEST_SEEDS[0], frames + WARM_UP, VGA, path=CameraPathConfig(step_m=STEP_M)))
     steps: list[float] = []
     confusion = ConfusionMatrix(pipeline.label_set)

@@ -13,9 +13,9 @@ import torch
 from semantic_mapper.config import MapperConfig, convert_config, to_plain, with_quality
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import make_label_set
+from semantic_mapper.mapper import Mapper, make_field
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.replay.bench.walk import WARM_UP, timed_step, wide_camera
-from semantic_mapper.replay.session import load_pipeline, make_field
 from semantic_mapper.scenes import TEST_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.types import Float32, PosedFrame
 
@@ -91,7 +91,7 @@ def _pipeline(weights: Path | None, config: MapperConfig, axis: str, value: floa
         plain["render"]["share"] = value
     elif axis == "blocks":
         plain["voxel_map"]["memory_mb"] = plain["voxel_map"]["memory_mb"] or PAGED_MB
-    bundle = load_pipeline(weights, convert_config(plain, MapperConfig, f"bench growth, {axis} {value:g}"))
+    bundle = Mapper.load(weights, convert_config(plain, MapperConfig, f"bench growth, {axis} {value:g}"))
     model = bundle.checkpoint.model
     if axis != "classes" or not isinstance(model, SRay):
         return bundle.pipeline

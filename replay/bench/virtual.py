@@ -16,10 +16,10 @@ from semantic_mapper.benchmark.config import MAP_WIDTH, SequenceConfig, camera_o
 from semantic_mapper.config import MapperConfig, with_quality
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration, confusion_of, nearest_labels
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.evaluate.room_map import NEAR_M, in_rooms, true_surface
-from semantic_mapper.replay.session import load_pipeline
 from semantic_mapper.scenes import VALIDATION_SEEDS, CameraPathConfig, NoiseConfig, make_room, room_frames
 from semantic_mapper.types import Float32, PosedFrame, UInt8
 
@@ -132,7 +132,7 @@ def map_frames(
     weights: Path | None, config: MapperConfig, frames: Sequence[PosedFrame], rendered: int
 ) -> tuple[MappingPipeline, float]:
     """Map frames, of which every ``rendered``-th is rendered; the seconds of CPU time that those took."""
-    pipeline = load_pipeline(weights, config).pipeline
+    pipeline = Mapper.load(weights, config).pipeline
     seconds = 0.0
     for number, frame in enumerate(frames):
         assert frame.depth_m is not None

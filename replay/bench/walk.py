@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.storage.grid_buffers import advised_mb
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.memory import give_back_freed_memory
-from semantic_mapper.replay.session import load_pipeline
 from semantic_mapper.scenes import CameraPathConfig, Visit, building_walk
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
@@ -103,7 +103,7 @@ def bench_walk(
         on: for drift, not for rank.
     """
     began = time.perf_counter()
-    pipeline = load_pipeline(weights, config).pipeline
+    pipeline = Mapper.load(weights, config).pipeline
     log, left = _StepLog(pipeline, plan.frames_a_visit), {}
     unchanged = 0
     for visit in plan.visits():

@@ -11,9 +11,9 @@ from semantic_mapper.errors import FrameError, LabelError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
+from semantic_mapper.mapper import Mapper, make_field
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.replay.evaluate.truth import TruthMapper
-from semantic_mapper.replay.session import PipelineBundle, make_field
 from semantic_mapper.training.baselines import UNetBaseline, UNetConfig, WarpBaseline
 from semantic_mapper.types import PosedFrame, UInt8
 
@@ -32,7 +32,7 @@ class Evaluation:
     refused: int
 
 
-def field_predictors(bundle: PipelineBundle) -> dict[str, Predictor]:
+def field_predictors(bundle: Mapper) -> dict[str, Predictor]:
     """The field as it maps (the frame itself is a source view) and for a novel view (the frame is none), by kind."""
     novel = _with_current_view(bundle.pipeline.config, False)
     pipeline = MappingPipeline(

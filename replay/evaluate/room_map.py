@@ -21,9 +21,9 @@ from semantic_mapper.evaluation.metrics import (
 )
 from semantic_mapper.geometry import invert_pose, project, transform, unproject
 from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.replay.session import load_pipeline
 from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, Scene, make_room, render_view, room_frames
 from semantic_mapper.types import Float32, Float64, UInt8
 
@@ -60,10 +60,10 @@ def map_room(seed: int, weights: Path, digest: str, suite: SuiteConfig) -> MapRe
         suite: Gives the number of frames, their spacing, whether they have depth, and the settings of the mapper.
 
     Raises:
-        WeightsError: see ``load_pipeline``.
+        WeightsError: see ``Mapper.load``.
         MapError: the map came out empty.
     """
-    pipeline = load_pipeline(weights, suite.mapper).pipeline
+    pipeline = Mapper.load(weights, suite.mapper).pipeline
     camera = camera_of_width(MAP_WIDTH)
     path = CameraPathConfig(step_m=suite.sequence.step_m)
     scene = make_room(seed)

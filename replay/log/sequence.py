@@ -154,7 +154,7 @@ Log = LogReader | LogSequence
 
 
 def open_log(
-    paths: Path | Sequence[Path], *, on_error: Callable[[LogError], None] | None = None, allow_empty: bool = False
+    paths: Path | str | Sequence[Path], *, on_error: Callable[[LogError], None] | None = None, allow_empty: bool = False
 ) -> Log:
     """Open a log, or the parts of a recording as one.
 
@@ -166,7 +166,7 @@ def open_log(
     Raises:
         LogError: see ``LogReader`` and ``LogSequence``.
     """
-    named = [paths] if isinstance(paths, Path) else list(paths)
+    named = [Path(paths)] if isinstance(paths, str | Path) else list(paths)
     files = [file for path in named for file in (logs_in(path) if path.is_dir() else [path])]
     if len(files) == 1:
         return LogReader(files[0], on_error=on_error, allow_empty=allow_empty)

@@ -8,8 +8,8 @@ from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_chec
 from semantic_mapper.fields.device_field import DeviceField
 from semantic_mapper.fields.render import chunk_size, render_view
 from semantic_mapper.fields.sparse_render import render_sparse_view
+from semantic_mapper.mapper import make_field
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.replay.session import make_field
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from tests.small import tiny_config, tiny_field, tiny_frames
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.run_folder import Run
-from semantic_mapper.replay.session import MapSession, load_pipeline
+from semantic_mapper.replay.session import MapSession
 from semantic_mapper.types import PosedFrame
 from tests.mapping import rendered_views as views
 from tests.small import tiny_config
@@ -51,7 +52,7 @@ def replayed(
     weights: Path, frames: Sequence[PosedFrame], out: Path, config: MapperConfig | None = None
 ) -> tuple[Run, dict[str, Any]]:
     """A session over frames, and its summary; its folder is whole."""
-    session = MapSession(load_pipeline(weights, config or tiny_config()), stream_labels=ROOMS, source="test")
+    session = MapSession(Mapper.load(weights, config or tiny_config()), stream_labels=ROOMS, source="test")
     for frame in frames:
         session.process(frame)
     summary = session.finish(out)

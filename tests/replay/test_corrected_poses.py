@@ -14,8 +14,9 @@ from semantic_mapper.config import MapperConfig, convert_config
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.replay.corrected_poses import correct_session, keeping_frames, read_corrections
-from semantic_mapper.replay.session import MapSession, load_pipeline
+from semantic_mapper.replay.session import MapSession
 from semantic_mapper.types import Float64, PosedFrame
 from tests.small import tiny_config, tiny_field, tiny_frames
 
@@ -42,7 +43,7 @@ def write(path: Path, frames: tuple[PosedFrame, ...] | list[PosedFrame], *more: 
 def session_of(folder: Path, frames: list[PosedFrame], **changes: object) -> MapSession:
     save_checkpoint(Checkpoint(tiny_field(), (), {"kind": "test", "width": 96}), folder / "w.safetensors")
     config = keeping_frames(tiny_config(render={"encode_width": 96, "scale": 0.25}, **changes), len(frames))
-    session = MapSession(load_pipeline(folder / "w.safetensors", config), stream_labels=ROOMS)
+    session = MapSession(Mapper.load(folder / "w.safetensors", config), stream_labels=ROOMS)
     for frame in frames:
         session.process(frame)
     return session

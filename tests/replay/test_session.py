@@ -16,12 +16,13 @@ from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import NYU40, ROOMS, make_label_set
+from semantic_mapper.mapper import Mapper, make_field
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.summary_table import notes, summary_table
 from semantic_mapper.replay import artifacts
 from semantic_mapper.replay.evaluate.methods import baseline_predictors, evaluate_frames, field_predictors
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
-from semantic_mapper.replay.session import SNAPSHOTS, MapSession, load_pipeline, make_field, open_recording
+from semantic_mapper.replay.session import SNAPSHOTS, MapSession, open_recording
 from semantic_mapper.replay.stats import StepTimes
 from tests.small import SMALL_ENCODER, tiny_config, tiny_field, tiny_frames
 
@@ -36,7 +37,7 @@ def weights(tmp_path):
 
 
 def run(weights, frames, rerun=None, **options):
-    bundle = load_pipeline(weights, tiny_config())
+    bundle = Mapper.load(weights, tiny_config())
     recording = open_recording(rerun, bundle.pipeline)
     session = MapSession(bundle, stream_labels=ROOMS, source="test", rerun=recording, **options)
     for frame in frames:
@@ -69,7 +70,7 @@ def test_a_session_leaves_summary_map_points_and_picture(tmp_path, weights):
 
 def test_the_summary_has_the_settings_that_were_in_force(tmp_path, weights):
     config = tiny_config(quality="fast", render={"scale": 0.5})
-    session = MapSession(load_pipeline(weights, config), stream_labels=None)
+    session = MapSession(Mapper.load(weights, config), stream_labels=None)
     summary = session.finish(tmp_path / "out")
     assert summary["quality"] == "fast"
     assert (summary["config"]["sampling"]["guided"], summary["config"]["render"]["share"]) == (2, 0.12)
@@ -150,7 +151,7 @@ def test_frames_that_the_weights_have_seen_are_not_scored(weights):
 
 def test_scores_are_those_of_the_rendered_labels(weights):
     frames = tiny_frames()
-    session = MapSession(load_pipeline(weights, tiny_config()), stream_labels=ROOMS)
+    session = MapSession(Mapper.load(weights, tiny_config()), stream_labels=ROOMS)
     right = counted = 0
     for frame in frames:
         update = session.process(frame)
@@ -217,21 +218,21 @@ def test_an_unknown_label_id_costs_the_score_but_neither_map_nor_results(tmp_pat
 
 
 def test_without_labels_metrics_are_null(tmp_path, weights):
-    session = MapSession(load_pipeline(weights, tiny_config()), stream_labels=None)
+    session = MapSession(Mapper.load(weights, tiny_config()), stream_labels=None)
     session.process(replace(tiny_frames()[0], label=None))
     summary = session.finish(tmp_path)
     assert all(v is None for v in summary["metrics"].values()) and summary["metrics_per_image"] is None
 
 
 def test_an_empty_session_still_writes_everything(tmp_path, weights):
-    session = MapSession(load_pipeline(weights, tiny_config()), stream_labels=ROOMS)
+    session = MapSession(Mapper.load(weights, tiny_config()), stream_labels=ROOMS)
     summary = session.finish(tmp_path)
     assert summary["frames"]["fused"] == 0 and summary["latency_ms"]["p50"] is None
     assert (tmp_path / "overview.png").exists() and (tmp_path / "map.npz").exists()
 
 
 def test_snapshots_stay_few_and_spread(weights):
-    session = MapSession(load_pipeline(weights, tiny_config()), stream_labels=ROOMS)
+    session = MapSession(Mapper.load(weights, tiny_config()), stream_labels=ROOMS)
     for _ in range(3):
         for frame in tiny_frames():
             session.process(frame)
@@ -240,13 +241,13 @@ def test_snapshots_stay_few_and_spread(weights):
 
 def test_missing_weights_are_an_error_before_any_frame(tmp_path):
     with pytest.raises(WeightsError, match="no such weights file"):
-        load_pipeline(tmp_path / "none.safetensors", tiny_config())
+        Mapper.load(tmp_path / "none.safetensors", tiny_config())
 
 
 def test_working_width_comes_from_the_weights_unless_set(weights):
     unset = tiny_config(render={"scale": 0.5})
-    assert load_pipeline(weights, unset).pipeline.config.render.encode_width == 96
-    assert load_pipeline(weights, tiny_config(render={"encode_width": 48})).pipeline.config.render.encode_width == 48
+    assert Mapper.load(weights, unset).pipeline.config.render.encode_width == 96
+    assert Mapper.load(weights, tiny_config(render={"encode_width": 48})).pipeline.config.render.encode_width == 48
 
 
 def test_the_compiled_renderer_is_used_where_it_covers_the_model():
@@ -278,7 +279,7 @@ def test_surface_truth_is_the_majority_of_the_frames_that_see_the_point():
 
 def test_methods_are_scored_on_the_same_frames_and_keyframes_never_count(weights):
     frames = list(tiny_frames())
-    bundle = load_pipeline(weights, tiny_config())
+    bundle = Mapper.load(weights, tiny_config())
     keyframes = [frames[1], frames[4]]
     predictors = field_predictors(bundle) | baseline_predictors(keyframes, ROOMS, seconds=1.0, seed=0)
     excluded = frozenset(f.stamp_ns for f in keyframes)
@@ -311,6 +312,6 @@ def test_other_label_sets_are_scored_on_shared_classes_only(weights):
     stream = make_label_set("mine", ["wall", "spaceship"], ids=[1, 9])
     frame = tiny_frames()[0]
     label = np.where(frame.label == ROOMS.ids[0], 1, 9).astype(np.uint8)
-    session = MapSession(load_pipeline(weights, tiny_config()), stream_labels=stream)
+    session = MapSession(Mapper.load(weights, tiny_config()), stream_labels=stream)
     session.process(replace(frame, label=label))
     assert set(session.confusion.metrics().per_class) == {"wall"}

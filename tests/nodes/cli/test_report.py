@@ -14,11 +14,12 @@ from rich.table import Table
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.nodes.cli.html_page import HtmlPage
 from semantic_mapper.nodes.cli.report import write_eval_report, write_suite_report
 from semantic_mapper.nodes.cli.scoring import score_table
 from semantic_mapper.nodes.mapper.finish import finish_session
-from semantic_mapper.replay.session import MapSession, load_pipeline
+from semantic_mapper.replay.session import MapSession
 from tests.nodes.support import write_weights
 from tests.small import tiny_config, tiny_frames
 
@@ -57,7 +58,7 @@ def cells(page: ElementTree.Element) -> dict[str, list[str]]:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What a session of three frames and a refused one leaves."""
     out = tmp_path_factory.mktemp("run")
-    bundle = load_pipeline(write_weights(out / "w.safetensors"), tiny_config())
+    bundle = Mapper.load(write_weights(out / "w.safetensors"), tiny_config())
     session = MapSession(bundle, stream_labels=ROOMS, source="<room> & hall")
     for frame in tiny_frames()[:3]:
         session.process(frame)

@@ -18,6 +18,7 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.config import MapperConfig, load_config
 from semantic_mapper.errors import CodecError, MapError, PoseError, ShapeError
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.correction.pose_correction import ALWAYS
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -28,7 +29,7 @@ from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.supervisor.heartbeat import Heart
-from semantic_mapper.replay.session import MapSession, load_pipeline
+from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport import query_messages as messages
 from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
@@ -121,7 +122,7 @@ def bundle_of(weights: Path, tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("bundles")
 
     def make(history: int = 100):
-        return load_pipeline(weights, load_config(config_file(folder, history), MapperConfig))
+        return Mapper.load(weights, load_config(config_file(folder, history), MapperConfig))
 
     return make
 

@@ -1,0 +1,94 @@
+"""The map of a stream of frames, in this process: weights, renderer and pipeline in one object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from semantic_mapper.config import MapperConfig, convert_config, load_config, to_plain, with_quality
+from semantic_mapper.fields.base import SemanticField
+from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint
+from semantic_mapper.fields.device import choose_device
+from semantic_mapper.fields.device_field import DeviceField
+from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.sray import SRay
+from semantic_mapper.fields.sray_streaming import StreamingSRay, compiled_covers
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.pipeline import MappingPipeline
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.types import MapUpdate, PosedFrame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mapper:
+    """A mapping pipeline and the weights that it renders with; ``Mapper.load`` makes one.
+
+    Args:
+        pipeline: What every frame goes through, live or replayed.
+        checkpoint: The weights, their classes and their training.
+        weights_path: File that they came from.
+    """
+
+    pipeline: MappingPipeline
+    checkpoint: Checkpoint
+    weights_path: Path
+
+    @classmethod
+    def load(cls, weights: Path | str | None = None, config: MapperConfig | Path | str | None = None) -> Mapper:
+        """Load weights and build the pipeline round them; the map's classes are those of the weights.
+
+        Args:
+            weights: A .safetensors file; None = the weights that ship with the package.
+            config: Settings, or a TOML file of them; None = the defaults.
+
+        Raises:
+            ConfigError: a setting cannot be used, or a GPU is asked for that is not there.
+            WeightsError: missing, damaged or foreign weights.
+        """
+        if not isinstance(config, MapperConfig):
+            config = MapperConfig() if config is None else load_config(Path(config), MapperConfig)
+        config = with_quality(config)
+        path = default_checkpoint_path() if weights is None else Path(weights)
+        checkpoint = load_checkpoint(path)
+        if config.render.encode_width == 0:
+            plain = to_plain(config)
+            plain["render"]["encode_width"] = checkpoint.width
+            config = convert_config(plain, MapperConfig, "mapper config")
+        field = make_field(checkpoint.model, config)
+        pipeline = MappingPipeline(config, field, checkpoint.label_set, anchors=checkpoint.anchors)
+        return cls(pipeline, checkpoint, path)
+
+    @property
+    def voxel_map(self) -> VoxelMap:
+        """The map so far."""
+        return self.pipeline.voxel_map
+
+    @property
+    def label_set(self) -> LabelSet:
+        """Classes of the map."""
+        return self.pipeline.label_set
+
+    def step(self, frame: PosedFrame) -> MapUpdate:
+        """Fuse one frame into the map; see ``MappingPipeline.step``.
+
+        Raises:
+            FrameError: the frame cannot be used; the map is as it was.
+        """
+        return self.pipeline.step(frame)
+
+
+def make_field(model: LearnedField, config: MapperConfig) -> SemanticField:
+    """The renderer that a config asks for, over given weights.
+
+    With ``sampling.mode = "streaming"`` and a model that the compiled renderer covers it is that renderer; otherwise,
+    and on a GPU, it is the eager one.
+
+    Raises:
+        ConfigError: ``render.device = "cuda"`` where torch sees no GPU.
+    """
+    if config.render.device == "cuda":
+        return DeviceField(model, choose_device("cuda", 0), config.sampling, bfloat16=config.render.bfloat16)
+    if isinstance(model, SRay) and config.sampling.mode == "streaming" and compiled_covers(model):
+        return StreamingSRay(model, config.sampling)
+    model.sampling = config.sampling
+    return model

@@ -1,0 +1,51 @@
+"""The names that ``semantic_mapper`` offers, and that nothing of ours fights a user's own modules."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import semantic_mapper
+
+
+@pytest.mark.parametrize("name", semantic_mapper.__all__)
+def test_public_name_resolves_to_a_documented_object(name: str) -> None:
+    assert getattr(semantic_mapper, name).__doc__
+    assert name in dir(semantic_mapper)
+
+
+def test_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'Maper'"):
+        _ = semantic_mapper.Maper  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    program = "import semantic_mapper, sys; print(sorted({'torch', 'numpy', 'zmq', 'open3d'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-I", "-c", program], capture_output=True, text=True, check=False)
+    assert (done.stdout.strip(), done.returncode) == ("[]", 0), done.stderr
+
+
+def test_script_beside_modules_of_the_same_names_gets_both(tmp_path: Path) -> None:
+    for name in ("replay", "nodes", "drivers", "launch"):
+        (tmp_path / f"{name}.py").write_text(f"MINE = {name!r}\n")
+    script = tmp_path / "robot.py"
+    script.write_text(
+        "import drivers, launch, nodes, replay\n"
+        "from semantic_mapper import Mapper, open_log\n"
+        "from semantic_mapper.drivers.registry import KINDS\n"
+        "from semantic_mapper.nodes.cli.main import app\n"
+        "print(drivers.MINE, launch.MINE, nodes.MINE, replay.MINE, Mapper.__module__, open_log.__module__)\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == [
+        "drivers",
+        "launch",
+        "nodes",
+        "replay",
+        "semantic_mapper.mapper",
+        "semantic_mapper.replay.log.sequence",
+    ]
