@@ -23,6 +23,23 @@ _PART = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{12}\.part", re.DOTALL)
 _NAME_BYTES = 200  # of the final name that are part of the other one: names end at 255
 
 
+def open_regular(path: Path) -> BinaryIO:
+    """Open a regular file to be read.
+
+    Args:
+        path: Of the file. Pipes, devices and sockets are refused: they may never end, or never begin.
+
+    Raises:
+        ConfigError: no regular file.
+        OSError: it is missing or cannot be read; ``filename`` is set.
+    """
+    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe without a writer must not block
+    if not stat.S_ISREG(os.fstat(fd).st_mode):
+        os.close(fd)
+        raise ConfigError(f"{path}: is no regular file; copy its content to one")
+    return os.fdopen(fd, "rb")
+
+
 def read_regular(path: Path, limit: int) -> bytes:
     """All bytes of a regular file.
 
@@ -34,13 +51,8 @@ def read_regular(path: Path, limit: int) -> bytes:
         ConfigError: no regular file, or a larger one.
         OSError: it is missing or cannot be read; ``filename`` is set.
     """
-    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe without a writer must not block
-    status = os.fstat(fd)
-    if not stat.S_ISREG(status.st_mode):
-        os.close(fd)
-        raise ConfigError(f"{path}: is no regular file; copy its content to one")
-    with os.fdopen(fd, "rb") as file:
-        data = file.read(min(status.st_size, limit) + 1)
+    with open_regular(path) as file:
+        data = file.read(min(os.fstat(file.fileno()).st_size, limit) + 1)
         while len(data) <= limit and (more := file.read(1 << 16)):  # it grows, or is the kernel's and has no size
             data += more
     if len(data) > limit:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
+
+import semantic_mapper
 
 LOAD = """
 import logging, structlog
@@ -62,3 +65,11 @@ def test_library_code_says_nothing_on_stdout() -> None:
         "log.warning('gap')\n"
     )
     assert done.stdout == "" and "last_record_incomplete" in done.stderr and "gap" in done.stderr
+
+
+def test_no_library_module_logs_past_log_events() -> None:
+    """structlog's own loggers print to stdout where the program has not configured it."""
+    root = Path(semantic_mapper.__file__).parent
+    files = [p for folder in (root, root / "drivers", root / "replay") for p in folder.rglob("*.py")]
+    users = {p.relative_to(root).as_posix() for p in files if "structlog.get_logger(" in p.read_text(encoding="utf-8")}
+    assert len(files) > 300 and {u for u in users if not u.startswith("nodes/")} == {"log_events.py"}

@@ -18,7 +18,7 @@ from semantic_mapper.transport.sockets import NewestSubscriber
 from semantic_mapper.types import MapUpdate
 
 STAND_OFF_M = 0.4  # where the robot stops before what it looks for
-SILENCE_S = 120.0  # the first frame compiles kernels
+SILENCE_S = 120.0
 
 
 @dataclass(frozen=True)

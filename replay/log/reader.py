@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -10,7 +9,8 @@ from itertools import islice
 from pathlib import Path
 from types import TracebackType
 
-from semantic_mapper.errors import CodecError, LogError
+from semantic_mapper.errors import CodecError, ConfigError, LogError
+from semantic_mapper.files import open_regular
 from semantic_mapper.replay.log.mcap_scan import (
     Damage,
     ReadLimits,
@@ -88,8 +88,9 @@ class LogReader:
         self._reported: set[str] = set()
         self._last_chunk: tuple[int, list[bytes] | str] = -1, ""
         try:
-            self._file = path.open("rb")
-            os.pread(self._file.fileno(), 1, 0)  # a folder opens, but cannot be read
+            self._file = open_regular(path)
+        except ConfigError as error:
+            raise LogError(f"{path}: cannot be read: it is no regular file; copy its content to one") from error
         except OSError as error:
             raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
         try:

@@ -120,7 +120,9 @@ def load_checkpoint(path: Path) -> Checkpoint:
     Raises:
         WeightsError: missing, damaged, of another format or version, or weights that do not fit their own config.
     """
-    if not path.is_file():
+    if path.exists() and not path.is_file():
+        raise WeightsError(f"{path}: is no regular file; copy its content to one")
+    if not path.exists():
         raise WeightsError(f"{path}: no such weights file; make one with `semantic-mapper finetune` or check the path")
     try:
         with safe_open(path, framework="pt") as stored:

@@ -16,13 +16,13 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-import structlog
 
 from semantic_mapper.geometry import invert_pose, nearest_pixels, transform
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.keyframes import Keyframe
 from semantic_mapper.types import Float64
 
-_log = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 MAX_DISAGREEMENT = 0.02  # fraction of the depth, median over the newest keyframes
 QUARTILE = 25  # percent

@@ -240,6 +240,19 @@ def load_launch_values(path: Path) -> dict[str, Any]:
     return dict(load_config(path, LaunchFile).set)
 
 
+# Names of then that are called otherwise now: `replay`, `nodes` and `drivers` are no longer top-level modules, because
+# they would hide, or be hidden by, a user's own.
+_MOVED = {
+    ("replay.log", "LogReader"): ("semantic_mapper.replay.log.format", "LogReader"),
+    ("replay.log", "LogWriter"): ("semantic_mapper.replay.log.format", "LogWriter"),
+    ("replay.session", "load_pipeline"): ("semantic_mapper", "Mapper.load"),
+}
+
+
 def importable(module: str, name: str) -> Any:
-    """What ``from module import name`` gives."""
-    return getattr(importlib.import_module(module), name)
+    """What ``from module import name`` gives, or what it gave is called now."""
+    module, name = _MOVED.get((module, name), (module, name))
+    value: Any = importlib.import_module(module)
+    for part in name.split("."):
+        value = getattr(value, part)
+    return value

@@ -94,9 +94,7 @@ def test_the_readme_maps_a_log(tmp_path: Path) -> None:
     """The first code block of the README, on the golden log."""
     from tests.contract.golden import LOG, REFUSED_SEQ, WEIGHTS
 
-    text = next(
-        block for block in _BLOCK.findall((api.REPOSITORY / "README.md").read_text()) if "load_pipeline" in block
-    )
+    text = next(block for block in _BLOCK.findall((api.REPOSITORY / "README.md").read_text()) if "Mapper.load" in block)
     text = text.replace('"kitchen.safetensors"', repr(str(WEIGHTS))).replace('"kitchen.mcap"', repr(str(LOG)))
     text = text.replace("for frame in log:", f"for frame in (f for f in log if f.seq < {REFUSED_SEQ - 3}):")
     known: dict[str, Any] = {}

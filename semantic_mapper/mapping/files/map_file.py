@@ -23,7 +23,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.errors import MapError
+from semantic_mapper.errors import ConfigError, MapError
+from semantic_mapper.files import open_regular
 from semantic_mapper.mapping.files.atomic_file import replacing
 from semantic_mapper.mapping.files.map_manifest import (
     MEND,
@@ -111,7 +112,9 @@ def open_map(path: Path) -> Iterator[MapReader]:
         MapError: see ``describe_map``.
     """
     try:
-        file = path.open("rb")
+        file = open_regular(path)
+    except ConfigError as error:
+        raise MapError(f"{path}: damaged or not a map: it is no regular file; copy its content to one") from error
     except FileNotFoundError as error:
         raise MapError(f"{path}: no such map file") from error
     except OSError as error:
