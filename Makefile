@@ -11,7 +11,7 @@ KERNELS := $(wildcard semantic_mapper/kernels/src/*)
 # One thread of computation for each of two test processes. A worker that crashes ends the run with an error.
 PYTEST := OMP_NUM_THREADS=1 .venv/bin/python -m pytest tests -n 2 --dist worksteal --max-worker-restart 0
 
-.PHONY: help setup demo test test-slow test-all test-v4l2 test-web check bench format lock clean
+.PHONY: help setup demo test test-slow test-all test-v4l2 test-web check bench wheels format lock clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -48,6 +48,9 @@ check: $(READY)  ## formatting, lint, types, import contracts
 
 bench: $(READY)  ## measure speed
 	.venv/bin/semantic-mapper bench
+
+wheels: $(READY)  ## build wheels for x86_64 and aarch64 into dist/, and check them
+	.venv/bin/python scripts/wheels.py
 
 format: $(READY)  ## format and mend what can be mended automatically
 	.venv/bin/ruff format .

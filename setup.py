@@ -8,12 +8,13 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import shutil
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-from setuptools import setup
+from setuptools import Distribution, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_py import build_py
 
@@ -67,21 +68,27 @@ class BuildWithKernels(build_py):
     """Adds the libraries to what is built, or puts them into the checkout for an editable install."""
 
     def run(self) -> None:
+        if not self.editable_mode:  # what an earlier build left: modules that are gone, libraries of another machine
+            shutil.rmtree(self.build_lib, ignore_errors=True)
         super().run()
         root = ROOT if self.editable_mode else Path(self.build_lib)
         build_kernels(root / "semantic_mapper" / "kernels" / "lib", target_machine())
 
 
+class PlatformDistribution(Distribution):
+    """A distribution with compiled code, which setuptools cannot see: a wheel holds it where it belongs."""
+
+    def has_ext_modules(self) -> bool:
+        return True
+
+
 class PlatformWheel(bdist_wheel):
     """A wheel for one machine and any Python 3."""
-
-    def finalize_options(self) -> None:
-        super().finalize_options()
-        self.root_is_pure = False
 
     def get_tag(self) -> tuple[str, str, str]:
         return "py3", "none", f"manylinux_{GLIBC.replace('.', '_')}_{target_machine()}"
 
 
 if __name__ == "__main__":
-    setup(cmdclass={"build_py": BuildWithKernels, "bdist_wheel": PlatformWheel})
+    commands = {"build_py": BuildWithKernels, "bdist_wheel": PlatformWheel}
+    setup(distclass=PlatformDistribution, cmdclass=commands)

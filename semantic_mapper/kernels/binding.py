@@ -21,6 +21,7 @@ R = TypeVar("R")
 
 LIBRARY_FOLDER = Path(__file__).resolve().parent / "lib"
 MAX_DIMENSIONS = 4
+_OTHER_VERSION = "the library is of another version: run `make setup`, or install the package again"
 _NO_SHAPE = (1,) * MAX_DIMENSIONS
 _Words = list[Any]
 _Pack = Callable[[Any, _Words], None]
@@ -44,13 +45,16 @@ class Kernel(Generic[P, R]):
     def function(self) -> Callable[[int, int, bytes], int]:
         """The C function: start and stop of its loop, and the packed arguments."""
         library = load_library()
-        function = getattr(library, self.name)
+        try:
+            function = getattr(library, self.name)
+        except AttributeError:
+            raise DependencyError(f"the compiled kernels have no kernel {self.name}; {_OTHER_VERSION}") from None
         function.argtypes, function.restype = (ctypes.c_int64, ctypes.c_int64, ctypes.c_char_p), ctypes.c_int64
         size = ctypes.c_int64.in_dll(library, f"{self.name}_size").value
         if size != self._struct.size:
             raise DependencyError(
                 f"kernel {self.name} takes {size} bytes of arguments, its declaration says {self._struct.size}; "
-                "the library is of another version: run `make setup`, or install the package again"
+                f"{_OTHER_VERSION}"
             )
         return function
 
@@ -138,8 +142,10 @@ def _packer(hint: Any) -> tuple[str, _Pack]:
     """Format of one argument and how to add its words."""
     if hint is float:
         return "d", _add_number
-    if hint in (int, bool):
+    if hint is int:
         return "q", _add_number
+    if hint is bool:
+        return "q", _add_flag
     if typing.get_origin(hint) is np.ndarray:
         (dtype,) = typing.get_args(typing.get_args(hint)[1])
         return "Pq" + MAX_DIMENSIONS * "q", functools.partial(_add_array, None if dtype is Any else np.dtype(dtype))
@@ -157,6 +163,10 @@ def _packer(hint: Any) -> tuple[str, _Pack]:
 
 def _add_number(value: Any, words: _Words) -> None:
     words.append(value)
+
+
+def _add_flag(value: Any, words: _Words) -> None:
+    words.append(1 if value else 0)  # numpy's bool is no integer
 
 
 def _add_array(dtype: np.dtype[Any] | None, value: Any, words: _Words) -> None:

@@ -1,0 +1,188 @@
+"""Kernels on several threads: each iteration runs once, whoever calls, and torch's threads leave them the cores."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from semantic_mapper.errors import ShapeError
+from semantic_mapper.kernels import parallel_kernel
+from semantic_mapper.types import Int64
+
+
+@pytest.fixture(params=[1, 2, 5])
+def threads(request: pytest.FixtureRequest) -> Iterator[int]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield request.param
+    torch.set_num_threads(before)
+
+
+@parallel_kernel()
+def count_visits(count: int, visits: Int64) -> None: ...
+
+
+@parallel_kernel(chunks_per_thread=4)
+def _count_visits(count: int, visits: Int64) -> None: ...
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 7, 1000])
+def test_every_iteration_runs_once(threads: int, count: int) -> None:
+    for run in (count_visits, _count_visits):
+        visits = np.zeros(count + 1, np.int64)
+        run(count, visits)
+        assert (visits[:count] == 1).all() and visits[count] == 0
+
+
+def test_arguments_may_be_named(threads: int) -> None:
+    visits = np.zeros(9, np.int64)
+    count_visits(9, visits=visits)
+    assert (visits == 1).all()
+
+
+def test_a_wrong_argument_reaches_the_caller_and_the_kernel_runs_again(threads: int) -> None:
+    visits = np.zeros(1000, np.int64)
+    with pytest.raises(ShapeError, match="kernel count_visits, argument visits"):
+        count_visits(1000, visits.astype(np.float32))  # type: ignore[arg-type]
+    count_visits(1000, visits)
+    assert (visits == 1).all()
+
+
+def test_kernels_run_from_many_threads_at_once(threads: int) -> None:
+    barrier = threading.Barrier(8)
+
+    def run(n: int) -> np.ndarray:
+        visits = np.full(500, n)
+        barrier.wait()
+        for _ in range(50):
+            count_visits(500, visits)
+            _count_visits(500, visits)
+        return visits
+
+    with ThreadPoolExecutor(8) as pool:
+        for n, visits in enumerate(pool.map(run, range(8))):
+            assert (visits == n + 100).all()
+
+
+def test_kernels_run_in_a_forked_child(threads: int) -> None:
+    count_visits(100, np.zeros(100, np.int64))  # the parent's threads are there
+    child = os.fork()
+    if child == 0:
+        visits = np.zeros(100, np.int64)
+        count_visits(100, visits)
+        os._exit(0 if (visits == 1).all() else 1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+KERNELS = """
+import numpy as np
+from semantic_mapper.kernels import parallel_kernel
+from semantic_mapper.types import Int64
+
+@parallel_kernel()
+def count_visits(count: int, visits: Int64) -> None: ...
+
+def run():
+    visits = np.zeros(10, np.int64)
+    count_visits(10, visits)
+    return visits.sum()
+"""
+AT_EXIT = """
+import threading
+import torch
+from kernels import run
+
+def go_on():
+    threading.main_thread().join()
+    print(run())
+
+torch.set_num_threads(2)
+run()
+threading.Thread(target=go_on).start()
+"""
+
+
+@pytest.fixture
+def script(tmp_path: Path) -> Path:
+    """A script beside a module that holds ``run``."""
+    (tmp_path / "kernels.py").write_text(KERNELS, encoding="utf-8")
+    return tmp_path / "script.py"
+
+
+def start(script: Path, code: str, **environment: str) -> subprocess.Popen[str]:
+    script.write_text(code, encoding="utf-8")
+    inherited = {k: v for k, v in os.environ.items() if not k.startswith("OMP_")}
+    return subprocess.Popen(
+        [sys.executable, str(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=inherited | environment,
+    )
+
+
+def output(process: subprocess.Popen[str]) -> list[str]:
+    out, errors = process.communicate(timeout=200)
+    assert process.returncode == 0 and "Error" not in errors, errors
+    return out.split()
+
+
+def test_a_thread_that_outlives_the_main_thread_still_runs_kernels(script: Path) -> None:
+    assert output(start(script, AT_EXIT))[-1:] == ["10"]
+
+
+def test_several_processes_run_kernels_at_once(script: Path) -> None:
+    code = "import torch, kernels; torch.set_num_threads(2); print(sum(kernels.run() for _ in range(300)))"
+    processes = [start(script, code) for _ in range(3)]
+    assert [output(process) for process in processes] == [["3000"]] * 3
+
+
+@pytest.mark.parametrize("wanted", [1, 2])
+def test_kernels_leave_torchs_thread_count_as_it_is(script: Path, wanted: int) -> None:
+    """OneDNN plans for one count and would run, and sometimes crash, with another."""
+    code = "import torch, kernels; kernels.run(); print(torch.get_num_threads())"
+    assert output(start(script, code, OMP_NUM_THREADS=str(wanted))) == [str(wanted)]
+
+
+@pytest.mark.parametrize(("given", "policy"), [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")])
+def test_importing_the_package_keeps_torchs_threads_from_spinning(
+    script: Path, given: dict[str, str], policy: str
+) -> None:
+    code = "import os, semantic_mapper; print(os.environ['OMP_WAIT_POLICY'])"
+    assert output(start(script, code, **given)) == [policy]
+
+
+SPIN = """
+import statistics, time
+import torch
+
+def idle_cpu_s():
+    x, costs = torch.ones(1 << 20), []
+    for _ in range(21):
+        x.add_(1)
+        began = time.process_time()
+        time.sleep(0.02)
+        costs.append(time.process_time() - began)
+    return statistics.median(costs)
+
+before = idle_cpu_s()
+import kernels
+kernels.run()
+print(before, idle_cpu_s())
+"""
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="on one core OpenMP's threads do not spin")
+def test_torchs_threads_stop_spinning_where_torch_was_imported_first(script: Path) -> None:
+    cores = len(os.sched_getaffinity(0))
+    before, after = map(float, output(start(script, SPIN, OMP_NUM_THREADS=str(cores))))
+    assert after < before / 2, f"CPU time while idle after an operation: {before} s before, {after} s after"
