@@ -12,6 +12,8 @@ import os
 import socket
 import subprocess
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -110,8 +112,16 @@ class WebViewer:
         told = subprocess.run([program, "analytics", "disable"], env=environment, capture_output=True, check=False)
         if told.returncode != 0:  # then it would call home
             raise DependencyError(f"{program}: analytics cannot be switched off: {told.stderr.decode().strip()}")
-        self._ports = _choose_port(self._ports[0], "--port"), _choose_port(self._ports[1], "--data-port")
-        web, data = _choose_port(0, ""), self._ports[1]
+        # All three are held until all are chosen: a port that was let go may be given out again.
+        with (
+            _hold_port(self._ports[0], "--port") as page,
+            _hold_port(self._ports[1], "--data-port") as data,
+            _hold_port(0, "") as web,
+        ):
+            pass
+        # It answers before there is anything to show, and so keeps its port.
+        self._page = QuietPage((HOST, page), (HOST, web), (f"http://{HOST}:{data}",))
+        self._ports = page, data
         command = [program, "--serve-web", "--bind", HOST, "--port", str(data), "--web-viewer-port", str(web)]
         command += ["--server-memory-limit", f"{self._memory_mb}MB"]
         log = self._folder.path / "log"
@@ -131,7 +141,6 @@ class WebViewer:
                 words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-3:]
                 raise TransportError(f"the web viewer has not started; its last words: {' | '.join(words) or 'none'}")
             time.sleep(_POLL_S)
-        self._page = QuietPage((HOST, self._ports[0]), (HOST, web), (f"http://{HOST}:{data}",))
 
 
 def _find_program() -> str:
@@ -142,8 +151,9 @@ def _find_program() -> str:
     return str(program)
 
 
-def _choose_port(port: int, option: str) -> int:
-    """The port itself where it is free, a free one for 0.
+@contextmanager
+def _hold_port(port: int, option: str) -> Iterator[int]:
+    """The port itself where it is free, a free one for 0; nobody else gets it meanwhile.
 
     Raises:
         TransportError: it is taken.
@@ -156,7 +166,7 @@ def _choose_port(port: int, option: str) -> int:
             raise TransportError(
                 f"port {port} cannot be had ({error.strerror}); give another one with {option}, or 0 for any"
             ) from error
-        return probe.getsockname()[1]
+        yield probe.getsockname()[1]
 
 
 def _answers(port: int) -> bool:
