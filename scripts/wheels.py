@@ -26,7 +26,7 @@ LIBRARIES = "semantic_mapper/kernels/lib/"
 SMOKE = """
 import numpy as np
 import semantic_mapper
-from semantic_mapper.mapping.key_table import KeyTable
+from semantic_mapper.mapping.storage.key_table import KeyTable
 table = KeyTable()
 table.put(np.array([3, 5]), np.array([30, 50]))
 assert table.find(np.array([5, 4, 3])).tolist() == [50, -1, 30]
