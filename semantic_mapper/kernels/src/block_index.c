@@ -1,4 +1,4 @@
-/* The table of mapping/block_index.py. */
+/* The table of mapping/storage/block_index.py. */
 #include "block_index.h"
 
 typedef struct {

@@ -1,4 +1,4 @@
-/* Votes for one voxel; see mapping/evidence.py. */
+/* Votes for one voxel; see mapping/fusion/evidence.py. */
 #include "evidence.h"
 
 typedef struct {

@@ -1,4 +1,4 @@
-/* How class evidence is stored, and how a vote is added to it; see mapping/evidence.py.
+/* How class evidence is stored, and how a vote is added to it; see mapping/fusion/evidence.py.
  *
  * An evidence array is float32 (itemsize 4), the sum of weighted log probabilities, or int16 (itemsize 2), their mean
  * in steps of 1 / STEPS_PER_NAT. Evidence that was interpolated is float64 (itemsize 8), a sum.
@@ -44,7 +44,7 @@ static inline int64_t first_dither(uint64_t seed, int64_t voxel) {
 
 /* Adds `weight * log_p` to the evidence of voxel `at` (block * 512 + voxel) and `weight` to its votes. Past the cap
  * the old sum shrinks, so that the map stays able to change its mind. `log_p` has L values; `dither` (4096 + 256,) is
- * the table of mapping/evidence.py, `first` of first_dither. */
+ * the table of mapping/fusion/evidence.py, `first` of first_dither. */
 static inline void add_vote(const GridBuffers *buffers, int64_t at, const float *restrict log_p, float weight,
                             float cap, const float *restrict dither, int64_t first) {
     int64_t classes = buffers->evidence.shape[2];

@@ -1,10 +1,10 @@
-/* Fusion of one frame: TSDF, color and class evidence in one pass; see mapping/fusion.py. */
+/* Fusion of one frame: TSDF, color and class evidence in one pass; see mapping/fusion/fuse.py. */
 #include <string.h>
 
 #include "voxel_lookup.h"
 
-#define PROBABILITY_FLOOR 1e-4f /* of mapping/evidence.py */
-#define FULL_TRUST_RANGE_M 2.0f /* of mapping/fusion.py, as the next */
+#define PROBABILITY_FLOOR 1e-4f /* of mapping/fusion/evidence.py */
+#define FULL_TRUST_RANGE_M 2.0f /* of mapping/fusion/fuse.py, as the next */
 #define LEAST_COSINE 0.2f
 
 typedef struct {

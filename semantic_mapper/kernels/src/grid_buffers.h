@@ -1,4 +1,4 @@
-/* The memory of the voxel grid; see mapping/grid_buffers.py. */
+/* The memory of the voxel grid; see mapping/storage/grid_buffers.py. */
 #pragma once
 
 #include "block_index.h"

@@ -1,4 +1,4 @@
-/* Packed key -> version: the open-addressing table of mapping/key_table.py. */
+/* Packed key -> version: the open-addressing table of mapping/storage/key_table.py. */
 #include "block_index.h"
 
 #define ABSENT ((int64_t)-1)

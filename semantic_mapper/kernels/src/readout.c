@@ -1,4 +1,4 @@
-/* Color, class and confidence of points; see mapping/readout.py. */
+/* Color, class and confidence of points; see mapping/views/readout.py. */
 #include "readout.h"
 
 typedef struct {

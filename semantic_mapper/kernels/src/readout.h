@@ -1,4 +1,4 @@
-/* Reading the map at any point: interpolation over the eight voxels around it; see mapping/readout.py. */
+/* Reading the map at any point: interpolation over the eight voxels around it; see mapping/views/readout.py. */
 #pragma once
 
 #include "evidence.h"

@@ -1,4 +1,4 @@
-/* The surface of a map in patches of one block; see mapping/surface_patches.py. */
+/* The surface of a map in patches of one block; see mapping/views/surface_patches.py. */
 #include "readout.h"
 
 typedef struct {

@@ -1,4 +1,4 @@
-/* Class votes without a measurement; see mapping/vote_fusion.py. */
+/* Class votes without a measurement; see mapping/fusion/vote_fusion.py. */
 #include "voxel_lookup.h"
 
 typedef struct {
