@@ -56,7 +56,7 @@ def _draw_overview(session: MapSession, points: MapPoints, path: Path) -> None:
         points,
         label_set,
         title=f"{session.source or 'session'}: {session.fused} frames, {len(points.xyz):,} surface points, {size}",
-        subtitle=_scores_line(session) + _depth_line(session),
+        subtitle=_pose_line(session) + _scores_line(session) + _depth_line(session),
         up=camera_up(np.stack(poses)) if poses else None,
     )
 
@@ -79,6 +79,10 @@ def _scores_line(session: MapSession) -> str:
     if miou is None:
         return "no labels to score against"
     return f"mIoU {100 * miou:.1f} % over {session.scored} labelled frames that the weights have not seen"
+
+
+def _pose_line(session: MapSession) -> str:
+    return "POSES AND DEPTH CONTRADICT EACH OTHER (see summary.json); " if session.pipeline.pose_check.warning else ""
 
 
 def _depth_line(session: MapSession) -> str:
@@ -128,6 +132,8 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "keyframes_compared": pipeline.pose_check.compared,
             "depth_disagreement": _rounded(pipeline.pose_check.recent, 4),
             "worst_depth_disagreement": _rounded(pipeline.pose_check.worst, 4),
+            "contradicting_pairs": _rounded(pipeline.pose_check.contradicting, 4),
+            "worst_contradicting_pairs": _rounded(pipeline.pose_check.worst_contradicting, 4),
             "warning": pipeline.pose_check.warning or None,
         },
         "map": {

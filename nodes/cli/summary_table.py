@@ -82,6 +82,12 @@ def _ms(value: float) -> str:
     return f"{value:.0f} ms"
 
 
+def _pose_figure(check: Mapping[str, Any], key: str) -> str:
+    """A figure of the pose check, or that too few keyframes overlap for it."""
+    value = check.get(key)
+    return "not checked" if value is None else percent(value)
+
+
 _DEPTH_SOURCES = {
     "sensor": "sensor",
     "rendered": "rendered by the field (no depth sensor)",
@@ -96,7 +102,8 @@ _ROWS: Sequence[tuple[str, str, Any]] = (
     ("frames refused", "frames.refused", str),
     ("frames scored", "frames.scored", str),
     ("depth", "depth", lambda d: _DEPTH_SOURCES[d["source"]].format(percent(d["rendered_fraction"]))),
-    ("depth disagreement", "pose_check.depth_disagreement", percent),
+    ("depth disagreement", "pose_check", lambda c: _pose_figure(c, "depth_disagreement")),
+    ("contradicting pairs", "pose_check", lambda c: _pose_figure(c, "contradicting_pairs")),
     ("latency p50", "latency_ms.p50", _ms),
     ("latency p95", "latency_ms.p95", _ms),
     ("voxel size", "map.voxel_size_m", lambda v: f"{v * 100:g} cm"),

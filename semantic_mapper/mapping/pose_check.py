@@ -1,11 +1,19 @@
 """Whether poses, depth and intrinsics fit each other: overlapping keyframes have to measure the same surface.
 
-Each new keyframe's depth is carried into a few earlier ones and theirs into it, and the two depths at a pixel are
-compared. The figure is the lower quartile of their relative differences, so that it stays small where a quarter of the
-pixels agree, whatever moves before the camera or is hidden in one of two views: 0.2 to 0.5 % in good recordings, 1 %
-with depth as noisy as a stereo camera's, 4 to 15 % with inverted poses or camera axes of another convention, 2 to 10 %
-with depth that is off by a factor of two to five. Smaller errors stay unnoticed: depth that is 20 % too large, a focal
-length that is 30 % too long.
+Each new keyframe's depth is carried into some earlier ones and theirs into it, and the two depths at a pixel are
+compared. Two figures come of it.
+
+The disagreement is the lower quartile of the relative differences, so that it stays small where a quarter of the pixels
+agree, whatever moves before the camera or is hidden in one of two views: 0.2 to 0.5 % in good recordings, 1 % with
+depth as noisy as a stereo camera's, 4 to 15 % with inverted poses or camera axes of another convention.
+
+A pair of keyframes contradicts itself where one sees through what the other measures: its points lie before the depth
+that the other has there, which nothing that is hidden can explain. In good recordings no pair does so in more than 8 %
+of the pixels. Where the poses jump or drift, only the pairs across the jump do: a new keyframe is compared with the
+oldest of its neighbourhood, too, and a tenth of the pairs is enough for a warning. What moves before the camera is seen
+through as well, but between neighbours in time just as much: what each keyframe has of it against the one before it is
+taken off. Smaller errors stay unnoticed: depth that is 20 % too large, a focal length that is 10 % too long, a drift of
+less than about 20 cm.
 """
 
 from __future__ import annotations
@@ -19,17 +27,25 @@ import numpy as np
 
 from semantic_mapper.geometry import invert_pose, nearest_pixels, transform
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.keyframes import Keyframe
+from semantic_mapper.mapping.keyframes import Keyframe, pose_distances
 from semantic_mapper.types import Float64
 
 _log = get_logger(__name__)
 
 MAX_DISAGREEMENT = 0.02  # fraction of the depth, median over the newest keyframes
 QUARTILE = 25  # percent
+MAX_CONTRADICTING = 0.1  # fraction of the newest pairs
+SEEN_THROUGH = 0.12  # fraction of a pair's pixels, beyond what moves, from which on it contradicts itself
+BEFORE = 0.1  # fraction of the depth that a point lies before it
+MIN_OVERLAP = 0.3  # fraction of a pair's pixels that can be compared, where it is to be judged by itself
 WINDOW = 32  # newest keyframes that count
+PAIR_WINDOW = 128  # newest pairs that count: those of about 20 keyframes
 MIN_KEYFRAMES = 6  # that were compared, before anything is said
 MIN_PIXELS = 100
+MIN_PAIRS = 32  # before contradicting ones are counted
 PARTNERS = 3  # earlier keyframes that a new one is compared with, beside the newest
+OLDEST = 4  # of its neighbourhood, as many again
+NEIGHBOURS_M, NEIGHBOURS_DEG = 2.0, 40.0  # what counts as its neighbourhood
 FAR = 2  # times the range of the map; depth beyond may be noise
 STEP = 3  # every so many rows and columns of a keyframe's small depth image
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -53,6 +69,7 @@ class PoseCheck:
     Attributes:
         compared: Keyframes that overlap with earlier ones and were compared.
         worst: Largest ``recent`` so far; None before ``MIN_KEYFRAMES``.
+        worst_contradicting: Largest ``contradicting`` so far; None before ``MIN_KEYFRAMES``.
         warning: What is wrong and how to mend it, for people; empty where all is well. Stays once it is there, as the
             map keeps what was fused.
     """
@@ -60,14 +77,27 @@ class PoseCheck:
     def __init__(self, depth_max_m: float) -> None:
         self._limit_m = FAR * depth_max_m
         self._newest: deque[float] = deque(maxlen=WINDOW)
+        self._pairs: deque[float] = deque(maxlen=PAIR_WINDOW)
+        self._moving: dict[tuple[str, int], float] = {}  # keyframe -> fraction seen through against the one before it
         self.compared = 0
         self.worst: float | None = None
+        self.worst_contradicting: float | None = None
         self.warning = ""
 
     @property
     def recent(self) -> float | None:
         """Median disagreement of the newest keyframes, fraction of the depth; None before ``MIN_KEYFRAMES``."""
         return float(np.median(self._newest)) if self.compared >= MIN_KEYFRAMES else None
+
+    @property
+    def contradicting(self) -> float | None:
+        """Fraction of the newest pairs of keyframes of which one sees through what the other measures.
+
+        None before ``MIN_KEYFRAMES`` were compared in pairs that overlap by ``MIN_OVERLAP``.
+        """
+        if self.compared < MIN_KEYFRAMES or len(self._pairs) < MIN_PAIRS:
+            return None
+        return float(np.mean(np.array(self._pairs) > SEEN_THROUGH))
 
     def add(self, new: Keyframe, sources: Sequence[Keyframe], keyframes: Sequence[Keyframe]) -> None:
         """Compare a new keyframe with earlier ones.
@@ -77,28 +107,54 @@ class PoseCheck:
             sources: Of them, those that see most of what it sees, the best first.
             keyframes: All, oldest first.
         """
-        chosen = [k for k in sources if not k.labelled][:PARTNERS]
-        if keyframes and not keyframes[-1].labelled and not any(keyframes[-1] is k for k in chosen):
-            chosen.append(keyframes[-1])
-        found = disagreement([(new, k) for k in chosen], self._limit_m)
+        near = [k for k in sources if not k.labelled][:PARTNERS]
+        if keyframes and not keyframes[-1].labelled and not any(keyframes[-1] is k for k in near):
+            near.append(keyframes[-1])
+        found = disagreement([(new, k) for k in near], self._limit_m)
         if found is None:
             return
         self.compared += 1
         self._newest.append(found)
-        recent = self.recent
-        if recent is None:
+        self._compare_pairs(new, [*near, *_oldest_neighbours(new, keyframes, near)], keyframes)
+        recent, contradicting = self.recent, self.contradicting
+        self.worst = _largest(self.worst, recent)
+        self.worst_contradicting = _largest(self.worst_contradicting, contradicting)
+        if self.warning or recent is None:
             return
-        self.worst = recent if self.worst is None else max(self.worst, recent)
-        if recent > MAX_DISAGREEMENT and not self.warning:
-            self.warning = self._explain(recent, [*keyframes, new])
+        if recent > MAX_DISAGREEMENT or (contradicting or 0.0) > MAX_CONTRADICTING:
+            self.warning = self._explain(recent, contradicting, [*keyframes, new])
             _log.warning("keyframes_contradict_each_other", seq=new.seq, camera=new.camera_id, reason=self.warning)
 
-    def _explain(self, recent: float, keyframes: Sequence[Keyframe]) -> str:
+    def _compare_pairs(self, new: Keyframe, partners: Sequence[Keyframe], keyframes: Sequence[Keyframe]) -> None:
+        kept = {_key(k) for k in keyframes}
+        self._moving = {key: moving for key, moving in self._moving.items() if key in kept}
+        before = next((k for k in reversed(keyframes) if k.camera_id == new.camera_id and not k.labelled), None)
+        moving = fraction_seen_through(new, before, self._limit_m) if before is not None else None
+        if before is not None and moving is not None:
+            self._moving[_key(new)] = moving
+            self._moving.setdefault(_key(before), moving)  # the first of its camera has none before it
+        for k in partners:
+            seen_through = fraction_seen_through(new, k, self._limit_m)
+            if seen_through is not None:
+                moves = max(self._moving.get(_key(new), 0.0), self._moving.get(_key(k), 0.0))
+                self._pairs.append(seen_through - moves)
+
+    def _explain(self, recent: float, contradicting: float | None, keyframes: Sequence[Keyframe]) -> str:
         own = [k for k in keyframes if not k.labelled][-WINDOW:]
+        if recent > MAX_DISAGREEMENT:
+            what = (
+                f"the depth of overlapping keyframes disagrees by {100 * recent:.1f} % (lower quartile; below 1 % where "
+                "poses and depth fit)"
+            )
+        else:
+            what = (
+                f"in {100 * (contradicting or 0.0):.0f} % of the pairs of overlapping keyframes, one sees through what "
+                "the other measures (none do where poses and depth fit): the poses jump or drift, or depth and "
+                "intrinsics do not fit"
+            )
         text = (
-            f"the depth of overlapping keyframes disagrees by {100 * recent:.1f} % (lower quartile; below 1 % where "
-            f"poses and depth fit), found at frame seq={own[-1].seq}: the map cannot be trusted. Check the poses "
-            "(T_world_camera, OpenCV axes, metres, stamps), the depth scale and the intrinsics"
+            f"{what}, found at frame seq={own[-1].seq}: the map cannot be trusted. Check the poses (T_world_camera, "
+            "OpenCV axes, metres, stamps), the depth scale and the intrinsics"
         )
         for cause, change, depth_factor in _CAUSES:
             changed = [
@@ -107,7 +163,10 @@ class PoseCheck:
             ]
             pairs = [disagreement([pair], self._limit_m) for pair in pairwise(changed)]
             singles = [d for d in pairs if d is not None]
-            if len(singles) >= MIN_KEYFRAMES - 1 and (then := float(np.median(singles))) < MAX_DISAGREEMENT / 2:
+            if len(singles) < MIN_KEYFRAMES - 1:
+                continue
+            then = float(np.median(singles))
+            if then < min(MAX_DISAGREEMENT, recent) / 2:
                 return f"{text}. With {cause} they disagree by {100 * then:.1f} %"
         return text
 
@@ -122,14 +181,45 @@ def disagreement(pairs: Sequence[tuple[Keyframe, Keyframe]], limit_m: float) -> 
     Returns:
         Fraction of the depth; None where fewer than ``MIN_PIXELS`` can be compared.
     """
-    parts = [part for a, b in pairs for part in (_differences(a, b, limit_m), _differences(b, a, limit_m))]
+    parts = [part for a, b in pairs for part in (_differences(a, b, limit_m)[0], _differences(b, a, limit_m)[0])]
     if sum(map(len, parts)) < MIN_PIXELS:
         return None
-    return float(np.percentile(np.concatenate(parts), QUARTILE))
+    return float(np.percentile(np.abs(np.concatenate(parts)), QUARTILE))
 
 
-def _differences(a: Keyframe, b: Keyframe, limit_m: float) -> Float64:
-    """(N,) relative differences between depth of ``a``, carried into ``b``, and the depth that ``b`` has there."""
+def fraction_seen_through(a: Keyframe, b: Keyframe, limit_m: float) -> float | None:
+    """Fraction of the pixels where points of one keyframe lie before the depth of the other by more than ``BEFORE``.
+
+    Args:
+        a, b: Compared in both directions.
+        limit_m: Depth beyond is not compared.
+
+    Returns:
+        None where the two overlap in less than ``MIN_OVERLAP`` of their pixels with depth.
+    """
+    (there, of_a), (back, of_b) = _differences(a, b, limit_m), _differences(b, a, limit_m)
+    compared = len(there) + len(back)
+    if compared < max(MIN_PIXELS, MIN_OVERLAP * (of_a + of_b)):
+        return None
+    return float((np.count_nonzero(there < -BEFORE) + np.count_nonzero(back < -BEFORE)) / compared)
+
+
+def _oldest_neighbours(new: Keyframe, keyframes: Sequence[Keyframe], but: Sequence[Keyframe]) -> list[Keyframe]:
+    """Up to ``OLDEST`` keyframes that look from about the same place in about the same direction."""
+    others = [k for k in keyframes if not k.labelled and not any(k is other for other in but)]
+    if not others:
+        return []
+    moved, turned = pose_distances(np.array([k.T_world_camera for k in others]), new.T_world_camera)
+    near = (moved < NEIGHBOURS_M) & (turned < NEIGHBOURS_DEG)
+    return [others[i] for i in np.flatnonzero(near)[:OLDEST]]
+
+
+def _differences(a: Keyframe, b: Keyframe, limit_m: float) -> tuple[Float64, int]:
+    """Depth of ``a``, carried into ``b``, less the depth that ``b`` has there, and how many pixels of ``a`` have depth.
+
+    Returns:
+        (N,) differences as fractions of the depth of ``b``, and the number of pixels that were carried.
+    """
     depth = a.depth_m[::STEP, ::STEP].astype(np.float64)
     row, column = np.nonzero((depth > 0) & (depth < limit_m))
     z, k = depth[row, column], a.intrinsics
@@ -138,7 +228,16 @@ def _differences(a: Keyframe, b: Keyframe, limit_m: float) -> Float64:
     inside, row, column = nearest_pixels(carried, b.intrinsics)
     there = b.depth_m[row[inside], column[inside]].astype(np.float64)
     measured = (there > 0) & (there < limit_m)
-    return np.abs(carried[inside, 2][measured] - there[measured]) / there[measured]
+    return (carried[inside, 2][measured] - there[measured]) / there[measured], len(z)
+
+
+def _key(keyframe: Keyframe) -> tuple[str, int]:
+    return keyframe.camera_id, keyframe.seq
+
+
+def _largest(a: float | None, b: float | None) -> float | None:
+    known = [value for value in (a, b) if value is not None]
+    return max(known) if known else None
 
 
 def _scaled(T: Float64, factor: float) -> Float64:

@@ -17,7 +17,7 @@ from semantic_mapper.geometry import invert_pose
 from semantic_mapper.imaging import resize_depth, working_intrinsics
 from semantic_mapper.mapping.keyframes import KeyframeStore
 from semantic_mapper.mapping.pipeline import COVERAGE_WIDTH
-from semantic_mapper.mapping.pose_check import MAX_DISAGREEMENT, MIN_KEYFRAMES, PoseCheck
+from semantic_mapper.mapping.pose_check import MAX_CONTRADICTING, MAX_DISAGREEMENT, MIN_KEYFRAMES, PoseCheck
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 from tests.mapping.test_keyframes import keyframe
 from tests.mapping.test_pipeline import make_pipeline, same_map
@@ -85,6 +85,40 @@ def test_a_good_recording_is_far_from_a_warning() -> None:
     poses = check(room())
     assert not poses.warning and poses.compared > MIN_KEYFRAMES
     assert poses.worst is not None and poses.worst < MAX_DISAGREEMENT / 2
+    assert poses.worst_contradicting == 0
+
+
+def moved(x: float = 0.0, z: float = 0.0, turned_deg: float = 0.0) -> np.ndarray:
+    """How the world is shifted (metres) and turned about its y axis, (4, 4)."""
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(np.array([0.0, np.radians(turned_deg), 0.0]))[0]
+    T[:3, 3] = x, 0, z
+    return T
+
+
+def from_on(fraction: float, T: np.ndarray) -> Change:
+    return lambda frame: posed(lambda pose: T @ pose)(frame) if frame.seq >= fraction * 60 else frame
+
+
+BEGINS_LATE: dict[str, Change] = {
+    "second half 20 cm aside": from_on(0.5, moved(x=0.2)),
+    "second half 20 cm ahead": from_on(0.5, moved(z=0.2)),
+    "second half 50 cm aside": from_on(0.5, moved(x=0.5)),
+    "second half turned by 15 degrees": from_on(0.5, moved(turned_deg=15)),
+    "second half turned by 5 degrees": from_on(0.5, moved(turned_deg=5)),
+    "last fifth 30 cm aside": from_on(0.8, moved(x=0.3)),
+    "every other ten frames 20 cm aside": lambda f: posed(lambda T: moved(x=0.2 * (f.seq // 10 % 2)) @ T)(f),
+    "drift of 50 cm": lambda f: posed(lambda T: moved(x=0.5 * f.seq / 60) @ T)(f),
+    "depth 1.5 times too large": deeper(1.5),
+    "depth a third too small": deeper(0.67),
+}
+
+
+@pytest.mark.parametrize("wrong", BEGINS_LATE)
+def test_what_begins_in_mid_recording_is_reported(wrong: str) -> None:
+    poses = check(tiny_frames(60), BEGINS_LATE[wrong])
+    assert poses.worst_contradicting is not None and poses.worst_contradicting > MAX_CONTRADICTING
+    assert "sees through" in poses.warning or "disagrees" in poses.warning
 
 
 def test_what_moves_in_a_third_of_the_picture_raises_no_warning() -> None:
@@ -146,4 +180,9 @@ def test_real_poses_that_are_pixels_off_raise_no_warning(redkitchen: Path) -> No
     good = check(frames)
     assert good.compared > 20 and not good.warning
     assert good.worst is not None and good.worst < MAX_DISAGREEMENT / 2
+    assert good.worst_contradicting is not None and good.worst_contradicting < MAX_CONTRADICTING / 2
+    half = frames[len(frames) // 2].seq
+    late = check(frames, lambda f: posed(lambda T: moved(x=0.5) @ T)(f) if f.seq >= half else f)
+    assert late.worst is not None and late.worst < MAX_DISAGREEMENT  # the figure over all keyframes does not see it
+    assert "sees through" in late.warning
     assert "With poses inverted" in check(frames, posed(invert_pose)).warning

@@ -120,16 +120,22 @@ def test_summary_table_notes_and_picture_say_where_depth_comes_from(
     assert [strip.depth_rendered for strip in strips] == [frames[0].depth_m is None or measured == 0, measured < 6]
 
 
-def test_poses_that_contradict_the_depth_are_in_summary_table_and_notes(tmp_path, weights):
+def test_poses_that_contradict_the_depth_are_in_summary_table_picture_and_notes(tmp_path, weights, monkeypatch):
+    subtitles = []
+    monkeypatch.setattr(artifacts, "write_overview", lambda *_, subtitle, **__: subtitles.append(subtitle))
     right = run(weights, tiny_frames(30)).finish(tmp_path / "right")
     assert right["pose_check"]["warning"] is None and right["pose_check"]["depth_disagreement"] < 0.01
     wrong_poses = [replace(f, T_world_camera=invert_pose(f.T_world_camera)) for f in tiny_frames(30)]
     wrong = run(weights, wrong_poses).finish(tmp_path / "wrong")
     assert "poses inverted" in wrong["pose_check"]["warning"]
+    assert right["pose_check"]["worst_contradicting_pairs"] == 0
     assert wrong["pose_check"]["worst_depth_disagreement"] >= wrong["pose_check"]["depth_disagreement"] > 0.02
-    table = summary_table({"right": right, "wrong": wrong})
+    assert ["CONTRADICT" in subtitle for subtitle in subtitles] == [False, True]
+    few = run(weights, tiny_frames(30)[:2]).finish(tmp_path / "few")
+    table = summary_table({"right": right, "wrong": wrong, "few": few})
     names, *values = (list(column.cells) for column in table.columns)
-    first, second = (column[names.index("depth disagreement")] for column in values)
+    first, second, third = (column[names.index("depth disagreement")] for column in values)
+    assert third == values[2][names.index("contradicting pairs")] == "not checked"
     assert float(first.removesuffix(" %")) < 1 and float(second.removesuffix(" %")) > 2
     assert not any("inverted" in note for note in notes(right)) and "poses inverted" in notes(wrong)[0]
 
