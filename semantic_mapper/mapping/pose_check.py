@@ -143,8 +143,8 @@ class PoseCheck:
         own = [k for k in keyframes if not k.labelled][-WINDOW:]
         if recent > MAX_DISAGREEMENT:
             what = (
-                f"the depth of overlapping keyframes disagrees by {100 * recent:.1f} % (lower quartile; below 1 % where "
-                "poses and depth fit)"
+                f"the depth of overlapping keyframes disagrees by {100 * recent:.1f} % (lower quartile; below 1 % "
+                "where poses and depth fit)"
             )
         else:
             what = (
