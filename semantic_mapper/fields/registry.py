@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 import msgspec
@@ -18,27 +19,23 @@ from semantic_mapper.config import (
 )
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.mvsnerf import MVSNeRF
-from semantic_mapper.fields.neuray import NeuRay
-from semantic_mapper.fields.semantic_nerf import SemanticNeRF
-from semantic_mapper.fields.sray import SRay
-from semantic_mapper.fields.unet_field import UNetField
 from semantic_mapper.labels import LabelSet
 
-KINDS: dict[str, tuple[type[Config], type[LearnedField]]] = {
-    SRay.kind: (SRayConfig, SRay),
-    UNetField.kind: (UNetFieldConfig, UNetField),
-    NeuRay.kind: (NeuRayConfig, NeuRay),
-    MVSNeRF.kind: (MVSNeRFConfig, MVSNeRF),
-    SemanticNeRF.kind: (SemanticNeRFConfig, SemanticNeRF),
+# kind -> its config, and the module and class of the field. A peer's module is imported when the kind is built.
+KINDS: dict[str, tuple[type[Config], str, str]] = {
+    "sray": (SRayConfig, "semantic_mapper.fields.sray", "SRay"),
+    "unet": (UNetFieldConfig, "semantic_mapper.fields.peers.unet_field", "UNetField"),
+    "neuray": (NeuRayConfig, "semantic_mapper.fields.peers.neuray", "NeuRay"),
+    "mvsnerf": (MVSNeRFConfig, "semantic_mapper.fields.peers.mvsnerf", "MVSNeRF"),
+    "semantic_nerf": (SemanticNeRFConfig, "semantic_mapper.fields.peers.semantic_nerf", "SemanticNeRF"),
 }
 
 # A name for some switches of a kind. The field built is of that kind, and so is its checkpoint: the switches are part
 # of the config that is saved, so nothing but a choice of names depends on this table.
 PRESETS: dict[str, tuple[str, dict[str, bool]]] = {
-    "sray-none": (SRay.kind, {"intra_view_attention": False, "cross_view_attention": False}),
-    "sray-intra": (SRay.kind, {"intra_view_attention": True, "cross_view_attention": False}),
-    "sray-cross": (SRay.kind, {"intra_view_attention": False, "cross_view_attention": True}),
+    "sray-none": ("sray", {"intra_view_attention": False, "cross_view_attention": False}),
+    "sray-intra": ("sray", {"intra_view_attention": True, "cross_view_attention": False}),
+    "sray-cross": ("sray", {"intra_view_attention": False, "cross_view_attention": True}),
 }
 
 
@@ -60,7 +57,7 @@ def field_config(name: str, config: dict[str, Any] | Config) -> Config:
     kind, switches = PRESETS.get(name, (name, {}))
     if kind not in KINDS:
         raise ConfigError(f"no field of kind '{name}'; there are {', '.join(sorted(field_names()))}")
-    config_type, _ = KINDS[kind]
+    config_type, _, _ = KINDS[kind]
     if isinstance(config, dict):
         config = convert_config(config, config_type, f"config of field '{name}'")
     if not isinstance(config, config_type):
@@ -81,5 +78,6 @@ def build_field(
         ConfigError: no such name, or a config that does not fit it.
     """
     full = field_config(name, config)
-    _, field_type = KINDS[PRESETS[name][0] if name in PRESETS else name]
+    _, module, class_name = KINDS[PRESETS[name][0] if name in PRESETS else name]
+    field_type: type[LearnedField] = getattr(import_module(module), class_name)
     return field_type(full, label_set, sampling)

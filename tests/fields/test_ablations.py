@@ -5,8 +5,8 @@ from semantic_mapper.config import SRayConfig
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.registry import PRESETS, build_field
 from semantic_mapper.fields.sray import SRay
-from tests.fields.peers import LABELS, POSES, TINY, assert_gradients_are_right, tiny
 from tests.fields.scene import pose_at, wall_rays, wall_sources
+from tests.fields.tiny_fields import LABELS, POSES, TINY, assert_gradients_are_right, tiny
 
 SWITCHES = {"sray-none": (False, False), "sray-intra": (True, False), "sray-cross": (False, True), "sray": (True, True)}
 

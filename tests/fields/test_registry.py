@@ -9,8 +9,8 @@ from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.training.losses import LossConfig
 from semantic_mapper.training.step import StepConfig, training_loss
 from semantic_mapper.training.views import view_from_frame
-from tests.fields.peers import LABELS, POSES, TINY, tiny
 from tests.fields.scene import wall_rays, wall_sources
+from tests.fields.tiny_fields import LABELS, POSES, TINY, tiny
 from tests.small import tiny_frames
 
 STEP = StepConfig(rays=32, views_min=2, views_max=2, blind_samples=4)

@@ -14,8 +14,8 @@ from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.types import RayBatch, SourceViews
-from tests.fields.peers import assert_gradients_are_right, tiny
 from tests.fields.scene import WALL_M, pose_at, wall_rays, wall_sources
+from tests.fields.tiny_fields import assert_gradients_are_right, tiny
 from tests.small import SMALL_ENCODER
 
 LABELS = make_label_set("test", ["a", "b", "c"])

@@ -14,9 +14,9 @@ from semantic_mapper.scenes.fast_cast import cast_pixels
 from semantic_mapper.scenes.fast_shade import shade_pixels
 from semantic_mapper.scenes.materials import MaterialTable, Pattern
 from semantic_mapper.scenes.primitives import Primitives
-from semantic_mapper.scenes.reference import render_view_torch
 from semantic_mapper.scenes.scene import Lights, extremes, kernel_arrays, shadow_cubes
 from semantic_mapper.types import CameraIntrinsics, Float64
+from tests.scenes.torch_renderer import render_view_torch
 
 CAMERA = CameraIntrinsics(fx=40.0, fy=42.0, cx=30.0, cy=22.0, width=64, height=48)
 

@@ -15,11 +15,11 @@ from semantic_mapper.scenes.camera import pose_of
 from semantic_mapper.scenes.fast_cast import cast_pixels
 from semantic_mapper.scenes.materials import MaterialTable, Pattern
 from semantic_mapper.scenes.primitives import Primitives, Shape
-from semantic_mapper.scenes.reference import render_view_torch, render_views_torch
 from semantic_mapper.scenes.render import Sensor
 from semantic_mapper.scenes.scene import Lights, extremes, shadow_cubes
 from semantic_mapper.scenes.sensor_depth import depth_edges
 from semantic_mapper.types import CameraIntrinsics
+from tests.scenes.torch_renderer import render_view_torch, render_views_torch
 
 CAMERA = CameraIntrinsics(fx=66.0, fy=66.0, cx=47.5, cy=35.5, width=96, height=72)
 FAST = RoomConfig(shadow_resolution=8)

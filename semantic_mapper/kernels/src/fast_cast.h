@@ -1,4 +1,4 @@
-/* Where a ray first meets a primitive of a room; see scenes/fast_cast.py and, for the same in torch, reference.py. */
+/* Where a ray first meets a primitive of a room; see scenes/fast_cast.py and, for the same in torch, tests/scenes/torch_renderer.py. */
 #pragma once
 
 #include "kernels.h"

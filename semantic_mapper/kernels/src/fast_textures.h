@@ -1,4 +1,4 @@
-/* The procedural patterns; scenes/textures.py holds their twins in torch. */
+/* The procedural patterns; tests/scenes/torch_textures.py holds their twins in torch. */
 #pragma once
 
 #include "kernels.h"

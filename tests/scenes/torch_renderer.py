@@ -26,8 +26,8 @@ from semantic_mapper.scenes.primitives import Shape
 from semantic_mapper.scenes.render import RenderedView, Sensor, finish_view
 from semantic_mapper.scenes.scene import Scene, kernel_arrays
 from semantic_mapper.scenes.shots import Shot
-from semantic_mapper.scenes.textures import albedo
 from semantic_mapper.types import CameraIntrinsics, Float64
+from tests.scenes.torch_textures import albedo
 
 _RAYS_A_CHUNK = 8192
 _RAYS_A_CHUNK_GPU = 1 << 18  # about 2 GiB of temporaries with 150 primitives in float32

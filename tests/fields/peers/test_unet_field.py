@@ -2,10 +2,10 @@ import pytest
 import torch
 
 from semantic_mapper.errors import ShapeError
-from semantic_mapper.fields.unet_field import UNetField, own_view
+from semantic_mapper.fields.peers.unet_field import UNetField, own_view
 from semantic_mapper.types import SourceViews
-from tests.fields.peers import AWAY, POSES, assert_gradients_are_right, assert_unknown, tiny
 from tests.fields.scene import pose_at, wall_rays, wall_sources
+from tests.fields.tiny_fields import AWAY, POSES, assert_gradients_are_right, assert_unknown, tiny
 
 
 def unet() -> UNetField:

@@ -5,13 +5,13 @@ from semantic_mapper.config import SemanticNeRFConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.nerf_math import encode_frequencies, encoded_size
+from semantic_mapper.fields.peers.semantic_nerf import SemanticNeRF, config_for_scene
 from semantic_mapper.fields.sampling import sample_guided
-from semantic_mapper.fields.semantic_nerf import SemanticNeRF, config_for_scene
 from semantic_mapper.training.losses import LossConfig, ray_loss
 from semantic_mapper.training.views import RayTargets
 from semantic_mapper.types import RayBatch
-from tests.fields.peers import AWAY, LABELS, POSES, assert_gradients_are_right, assert_unknown, tiny
 from tests.fields.scene import WALL_M, pose_at, wall_rays, wall_sources
+from tests.fields.tiny_fields import AWAY, LABELS, POSES, assert_gradients_are_right, assert_unknown, tiny
 
 
 def semantic_nerf() -> SemanticNeRF:

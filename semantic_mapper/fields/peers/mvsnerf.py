@@ -22,7 +22,10 @@ from torch.nn import functional
 from semantic_mapper.config import MVSNeRFConfig, SamplingConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import MAX_SOURCE_VIEWS, EncodedViews
-from semantic_mapper.fields.cost_volume import (
+from semantic_mapper.fields.encoder import ImageEncoder
+from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.nerf_math import density_from, encode_frequencies, encoded_size, relu_layers
+from semantic_mapper.fields.peers.cost_volume import (
     COLOUR_CHANNELS,
     EncodingVolumeNet,
     Sweep,
@@ -30,9 +33,6 @@ from semantic_mapper.fields.cost_volume import (
     cost_volume,
     nearest_views,
 )
-from semantic_mapper.fields.encoder import ImageEncoder
-from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.nerf_math import density_from, encode_frequencies, encoded_size, relu_layers
 from semantic_mapper.fields.projection import Reprojection, gather, reproject
 from semantic_mapper.fields.ray_render import composite_render
 from semantic_mapper.fields.source_maps import check_views, encoded_views

@@ -5,11 +5,11 @@ import torch
 
 from semantic_mapper.errors import ShapeError
 from semantic_mapper.fields.contextual import contextual_space, visibility_share
-from semantic_mapper.fields.neuray import NeuRay
+from semantic_mapper.fields.peers.neuray import NeuRay
 from semantic_mapper.fields.ray_render import weighted_moments
 from semantic_mapper.types import SourceViews
-from tests.fields.peers import AWAY, POSES, assert_gradients_are_right, assert_unknown, tiny
 from tests.fields.scene import WALL_M, pose_at, wall_rays, wall_sources
+from tests.fields.tiny_fields import AWAY, POSES, assert_gradients_are_right, assert_unknown, tiny
 
 
 def neuray() -> NeuRay:

@@ -10,9 +10,9 @@ import torch
 from torch.nn import functional
 
 from semantic_mapper.config import EncoderConfig, MVSNeRFConfig
-from semantic_mapper.fields import mvsnerf
 from semantic_mapper.fields.encoder import calibrate
-from semantic_mapper.fields.mvsnerf import MVSNeRF
+from semantic_mapper.fields.peers import mvsnerf
+from semantic_mapper.fields.peers.mvsnerf import MVSNeRF
 from semantic_mapper.fields.sampling import sample_inverse_depth
 from semantic_mapper.geometry import camera_matrix, pixel_grid, pixel_rays
 from semantic_mapper.labels import make_label_set

@@ -6,12 +6,12 @@ import torch
 
 from semantic_mapper.config import EncoderConfig, MVSNeRFConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.cost_volume import Sweep, cost_volume, nearest_views, query_camera
-from semantic_mapper.fields.mvsnerf import MVSNeRF
 from semantic_mapper.fields.nerf_math import encoded_size
+from semantic_mapper.fields.peers.cost_volume import Sweep, cost_volume, nearest_views, query_camera
+from semantic_mapper.fields.peers.mvsnerf import MVSNeRF
 from semantic_mapper.fields.render import render_image
-from tests.fields.peers import AWAY, LABELS, POSES, assert_gradients_are_right, assert_unknown, tiny
 from tests.fields.scene import INTRINSICS, WALL_M, pose_at, wall_rays, wall_sources
+from tests.fields.tiny_fields import AWAY, LABELS, POSES, assert_gradients_are_right, assert_unknown, tiny
 
 
 def mvsnerf() -> MVSNeRF:
