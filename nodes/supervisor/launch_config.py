@@ -228,15 +228,17 @@ def _check_camera_kinds(camera: Any, where: str) -> None:
     kind, poses = camera.get("kind"), camera.get("poses")
     if isinstance(kind, str) and kind not in CAMERA_KINDS:
         raise ConfigError(f"{where}: `camera.kind`: no kind of camera is called '{kind}'{_nearest(kind, CAMERA_KINDS)}")
-    if poses is None:
+    if poses is None or poses in ({}, ""):
         raise ConfigError(
-            f"{where}: `camera.poses` is missing: a camera alone does not know where it is. Write "
-            '[node.options.camera.poses] with kind = "topic" (odometry from a socket), "board" (a printed board), '
-            '"rgbd" (odometry from depth), "device" (it tracks itself, OAK) or "fixed" (it never moves); for example '
-            'poses = { kind = "topic", endpoint = "tcp://127.0.0.1:5560" }'
+            f"{where}: `camera.poses` is {'missing' if poses is None else 'empty'}: a camera alone does not know "
+            'where it is. Write [node.options.camera.poses] with kind = "topic" (odometry from a socket), "board" (a '
+            'printed board), "rgbd" (odometry from depth), "device" (it tracks itself, OAK) or "fixed" (it never '
+            'moves); for example poses = { kind = "topic", endpoint = "tcp://127.0.0.1:5560" }'
         )
     if isinstance(poses, dict) and poses.get("kind") not in POSE_KINDS:
-        named = str(poses.get("kind", ""))
+        if "kind" not in poses:
+            raise ConfigError(f"{where}: `camera.poses` has no kind; there are {', '.join(POSE_KINDS)}")
+        named = str(poses["kind"])
         raise ConfigError(f"{where}: `camera.poses.kind`: '{named}' is no source of poses{_nearest(named, POSE_KINDS)}")
 
 
