@@ -58,8 +58,6 @@ class LiveCamera(Config, frozen=True):
                 f'poses = "{self.poses}" names a file of settings, and there is none; for poses of that kind write '
                 f'poses = {{ kind = "{self.poses}" }}'
             )
-        if isinstance(self.poses, dict):
-            check_tracking(self.kind, self.poses.get("kind"))
 
 
 class CameraOptions(Config, frozen=True):

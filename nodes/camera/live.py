@@ -18,7 +18,7 @@ import structlog
 from semantic_mapper.errors import CameraError, ConfigError, TransportError
 from semantic_mapper.nodes.camera.listeners import drain, wait_for_listeners
 from semantic_mapper.nodes.node import NodeContext
-from semantic_mapper.nodes.options import CameraOptions, LiveCamera, check_tracking
+from semantic_mapper.nodes.options import CameraOptions, LiveCamera
 
 if TYPE_CHECKING:
     from semantic_mapper.drivers.base import Camera, FrameSource
@@ -123,14 +123,9 @@ def make_source(live: LiveCamera) -> LiveSource:
     from semantic_mapper.drivers.registry import open_camera
 
     config, where = table_of(live.config, "camera.config")
-    poses, poses_where = table_of(live.poses, "camera.poses")
-    try:
-        check_tracking(live.kind, poses.get("kind"))
-    except ValueError as error:
-        raise ConfigError(f"{poses_where}: {error}") from error
     camera = open_camera(live.kind, config, live.id, where)
     mount = mount_of(live.T_rig_camera, live.kind, config, f"camera '{live.id}'")
-    return with_poses(camera, poses, mount)
+    return with_poses(camera, table_of(live.poses, "camera.poses")[0], mount)
 
 
 def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> LiveSource:

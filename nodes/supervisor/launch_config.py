@@ -27,6 +27,7 @@ from semantic_mapper.nodes.options import (
     NodeOptions,
     Positive,
     RecorderOptions,
+    check_tracking,
 )
 
 Value = str | int | float | bool
@@ -240,6 +241,11 @@ def _check_camera_kinds(camera: Any, where: str) -> None:
             raise ConfigError(f"{where}: `camera.poses` has no kind; there are {', '.join(POSE_KINDS)}")
         named = str(poses["kind"])
         raise ConfigError(f"{where}: `camera.poses.kind`: '{named}' is no source of poses{_nearest(named, POSE_KINDS)}")
+    if isinstance(poses, dict):
+        try:
+            check_tracking(str(kind), poses["kind"])
+        except ValueError as error:
+            raise ConfigError(f"{where}: {error}") from error
 
 
 def _fill_in(value: Any, values: Mapping[str, Value], where: str) -> Any:
