@@ -10,9 +10,9 @@ from pathlib import Path
 
 from browser import Browser
 from live_launch import COMMAND, LiveLaunch, Told
+from semantic_mapper.evaluation.legend import legend_rows
 from web_pictures import empty_images, map_pixels, take, what_is_missing
 
-from semantic_mapper.evaluation.legend import legend_rows
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.log.format import LogReader, LogWriter

@@ -15,12 +15,12 @@ from urllib.parse import urlsplit
 
 import numpy as np
 from browser import ROOT, Browser, provide_browser
+from semantic_mapper.evaluation.legend import legend_rows
+from semantic_mapper.evaluation.plot import Bar, draw_bars
 from web_live import look_at_live
 from web_pictures import LARGEST, take, what_is_missing
 
 from semantic_mapper.config import VoxelMapConfig
-from semantic_mapper.evaluation.legend import legend_rows
-from semantic_mapper.evaluation.plot import Bar, draw_bars
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.html_page import HtmlPage

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
-
 from semantic_mapper.evaluation.plot import Bar, draw_bars
 from semantic_mapper.evaluation.report import draw_strip
+
 from semantic_mapper.nodes.cli.html_page import HtmlPage
 from semantic_mapper.nodes.cli.summary_table import notes, summary_table
 from semantic_mapper.replay.artifacts import MAX_LISTED, view_strips

@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-
 from semantic_mapper.benchmark.fit_plot import draw_fit_curves
 
 BLUE, ORANGE = (94, 180, 255), (255, 164, 92)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import numpy as np
-
 from semantic_mapper.evaluation.path_plot import draw_top_view
 
 GREEN, ORANGE = (130, 214, 130), (255, 164, 92)

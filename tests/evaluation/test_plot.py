@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-
 from semantic_mapper.evaluation.canvas import PANEL
 from semantic_mapper.evaluation.plot import Bar, Curve, Panel, draw_bars, draw_panel, draw_panels, ticks
 

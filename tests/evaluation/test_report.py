@@ -6,11 +6,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from semantic_mapper.evaluation.canvas import UNKNOWN, draw_text, new_canvas, shorten, text_width
+from semantic_mapper.evaluation.report import ViewStrip, class_colors, draw_overview, write_overview
 
 from semantic_mapper.errors import SemanticMapperError, ShapeError
 from semantic_mapper.evaluation import canvas
-from semantic_mapper.evaluation.canvas import UNKNOWN, draw_text, new_canvas, shorten, text_width
-from semantic_mapper.evaluation.report import ViewStrip, class_colors, draw_overview, write_overview
 from semantic_mapper.labels import ROOMS
 from tests.evaluation.room_points import Points, class_id, room_points
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from semantic_mapper.evaluation.canvas import UNKNOWN
 
 from semantic_mapper.errors import SemanticMapperError
-from semantic_mapper.evaluation.canvas import UNKNOWN
 from semantic_mapper.evaluation.sheet import SheetRow, draw_sheet, write_picture
 from semantic_mapper.labels import ROOMS
 

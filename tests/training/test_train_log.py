@@ -4,9 +4,9 @@ from pathlib import Path
 
 import cv2
 import pytest
+from semantic_mapper.training.curves import write_curves
 from structlog.testing import capture_logs
 
-from semantic_mapper.training.curves import write_curves
 from semantic_mapper.training.train_log import TrainLog
 
 LINES = [

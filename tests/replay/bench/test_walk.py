@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from semantic_mapper.replay.bench.growth_plot import AXIS_TITLES, write_growth_plot
+from semantic_mapper.replay.bench.walk_plot import write_walk_plot
 
 import semantic_mapper.replay.bench.growth as bench_growth_module
 import semantic_mapper.replay.bench.walk as bench_walk_module
@@ -16,9 +18,7 @@ from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.storage.block_grid import LEAST_RESIDENT
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.bench.growth import bench_growth
-from semantic_mapper.replay.bench.growth_plot import AXIS_TITLES, write_growth_plot
 from semantic_mapper.replay.bench.walk import WalkPlan, bench_walk, first_and_last, slope_percent
-from semantic_mapper.replay.bench.walk_plot import write_walk_plot
 from semantic_mapper.types import MapUpdate, PosedFrame
 from tests.nodes.support import write_weights
 from tests.small import tiny_config, tiny_field

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from semantic_mapper.evaluation.canvas import GAP, MARGIN, PANEL, text_width
 
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, MapError
-from semantic_mapper.evaluation.canvas import GAP, MARGIN, PANEL, text_width
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.compare.picture import (
