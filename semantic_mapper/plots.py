@@ -11,6 +11,7 @@ import functools
 import importlib.util
 import threading
 import warnings
+from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +43,7 @@ CYCLE = ("#56b4e9", "#e69f00", "#2fbf94", "#e28fc0", "#f0e442", "#e8743b", "#4f8
 TITLE_PT, TEXT_PT, SMALL_PT = 14, 11, 9.5
 _DPI = 100
 _PIXELS_PER_POINT = _DPI / 72
-_LETTER_EM = 0.6  # mean width of a letter, of the size of its font
+_LONGEST = 500  # letters of a line
 _LOCK = threading.RLock()  # Matplotlib's settings belong to the process
 
 
@@ -50,7 +51,7 @@ def _hex(color: Color) -> str:
     return "#{:02x}{:02x}{:02x}".format(*color)
 
 
-_STYLE: dict[str, Any] = {
+_STYLE: dict[Any, Any] = {
     "figure.dpi": _DPI,
     "figure.facecolor": _hex(BACKGROUND),
     "figure.titlesize": TITLE_PT,
@@ -180,7 +181,7 @@ def draw_panels(title: str, panels: Sequence[Panel], columns: int = 3, size: tup
     rows = -(-len(panels) // columns)
     figure = new_figure(columns * size[0], rows * size[1] + 50 * bool(title), layout="constrained")
     if title:
-        figure.suptitle(cut(title, 0.6 * columns * size[0], TEXT_PT), x=0.012, ha="left")
+        figure.suptitle(cut(title, 0.85 * columns * size[0], TITLE_PT), x=0.012, ha="left")
     names = {tuple(curve.name for curve in panel.curves) for panel in panels if panel.curves}
     shared = len(names) == 1 and len(panels) > 1
     for number, panel in enumerate(panels, 1):
@@ -202,7 +203,7 @@ def _draw_curves(axes: Axes, panel: Panel) -> None:
     for curve in panel.curves:
         x, y = np.array(curve.points, np.float64).T
         single = len(x) == 1
-        axes.plot(x, y, marker="o" if curve.marked or single else "", label=visible(curve.name)[:40])
+        axes.plot(x, y, marker="o" if curve.marked or single else "", label=cut(curve.name, 260, SMALL_PT))
     x, y = np.array([point for curve in panel.curves for point in curve.points], np.float64).T
     axes.set_xlim(min(0.0, float(x.min())), max(float(x.max()), 1e-9) * 1.02)
     low, high = min(0.0, float(np.nanmin(y))), float(np.nanmax(y))
@@ -223,21 +224,22 @@ def draw_bars(title: str, bars: Sequence[Bar], x_label: str) -> Figure:
     legend_rows = -(-len(names) // 6) if len(names) > 1 else 0
     figure = new_figure(1000, height + 24 * legend_rows + (130 if title else 84), 1.5, layout="constrained")
     if title:
-        figure.suptitle(title, x=0.012, ha="left")
+        figure.suptitle(cut(title, 850, TITLE_PT), x=0.012, ha="left")
     axes = figure.add_subplot()
     totals = np.zeros(len(bars))
     longest = max(sum(bar.parts.values()) for bar in bars) or 1.0
+    stacked = any(len(bar.parts) > 1 for bar in bars)
     for name in names:
         values = np.array([bar.parts.get(name, 0.0) for bar in bars])
-        drawn = axes.barh(range(len(bars)), values, 0.66, totals, label=visible(name)[:30])
-        texts = [_value(v) if v / longest * 780 > 9 * len(_value(v)) else "" for v in values]
+        drawn = axes.barh(range(len(bars)), values, 0.66, totals, label=cut(name, 140, SMALL_PT))
+        texts = [_value(v) if stacked and v / longest * 780 > 9 * len(_value(v)) else "" for v in values]
         axes.bar_label(drawn, texts, label_type="center", color=_hex(BACKGROUND), fontsize=SMALL_PT)
         totals += values
     if len(names) > 1:
         figure.legend(loc="outside upper left" if not title else "outside lower left", ncols=6, frameon=False)
-        for row, total in enumerate(totals):
-            axes.text(total, row, f" {_value(total)}", va="center", fontsize=SMALL_PT)
-    axes.set_yticks(range(len(bars)), [visible(bar.name)[:40] for bar in bars], fontsize=TEXT_PT, color=_hex(TEXT))
+    for row, total in enumerate(totals):
+        axes.text(total, row, f" {_value(total)}", va="center", fontsize=SMALL_PT)
+    axes.set_yticks(range(len(bars)), [cut(bar.name, 260, TEXT_PT) for bar in bars], fontsize=TEXT_PT, color=_hex(TEXT))
     axes.set(xlabel=x_label, xlim=(0, longest * 1.07), ylim=(len(bars) - 0.4, -0.6))
     axes.grid(visible=False, axis="y")
     axes.tick_params(axis="y", length=0)
@@ -245,7 +247,7 @@ def draw_bars(title: str, bars: Sequence[Bar], x_label: str) -> Figure:
 
 
 def _value(value: float) -> str:
-    return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
+    return f"{value:.1f}" if value < 100 else f"{value:.0f}"
 
 
 @rendered
@@ -258,12 +260,12 @@ def draw_paths(title: str, paths: Mapping[str, Float64], up: Float64) -> Figure:
         up: (3,) in that world.
     """
     figure = new_figure(900, 760, layout="constrained")
-    figure.suptitle(cut(title, 860, TITLE_PT), x=0.012, ha="left")
-    axes = figure.add_subplot(aspect="equal", adjustable="datalim", xlabel="m", ylabel="m")
+    figure.suptitle(cut(title, 780, TITLE_PT), x=0.012, ha="left")
+    axes = figure.add_subplot(aspect="equal", adjustable="datalim", xlabel="metres", ylabel="metres")
     ground = _ground_axes(np.concatenate(list(paths.values())), up)
     for name, xyz in paths.items():
         x, y = ground @ xyz.T
-        (line,) = axes.plot(x, y, label=visible(name)[:40])
+        (line,) = axes.plot(x, y, label=cut(name, 260, SMALL_PT))
         known = np.flatnonzero(np.isfinite(x))[:1]
         axes.plot(x[known], y[known], "o", color=line.get_color(), markersize=9)
     axes.legend(loc="best")
@@ -278,7 +280,7 @@ def _ground_axes(xyz: Float64, up: Float64) -> Float64:
     right = np.linalg.svd(level - np.outer(level @ up, up), full_matrices=False)[2][0]
     right = right - (right @ up) * up
     right = right / np.linalg.norm(right)
-    return np.stack((right, np.cross(up, right)))
+    return np.stack((right, np.cross(up, right))).astype(np.float64)
 
 
 # Pictures with captions, and class legends
@@ -313,14 +315,25 @@ def put_title(figure: Figure, title: str, subtitle: str = "") -> None:
     """The head of a figure whose parts have their places."""
     width = figure.get_figwidth() * _DPI - 48
     axes = place(figure, (24, 12, width, 50))
-    put_text(axes, (0, 16), cut(title, width, TITLE_PT + 2), fontsize=TITLE_PT + 2, weight="bold")
+    put_text(axes, (0, 16), cut(title, 0.88 * width, TITLE_PT + 2), fontsize=TITLE_PT + 2, weight="bold")
     put_text(axes, (0, 42), cut(subtitle, width, TEXT_PT), color=DIM_TEXT)
 
 
 def cut(text: str, width: float, size_pt: float) -> str:
-    """``text``, ended by an ellipsis where it is wider than ``width`` pixels by the mean width of letters."""
-    letters = max(1, int(width / (_LETTER_EM * size_pt * _PIXELS_PER_POINT)))
-    return text if len(text) <= letters else text[: letters - 1] + "…"
+    """``text`` with control characters as escapes, ended by an ellipsis where it is wider than ``width`` pixels."""
+    text = visible(text[:_LONGEST])
+    if text_width(text, size_pt) <= width:
+        return text
+    return text[: bisect_right(range(len(text)), width, 1, key=lambda n: text_width(f"{text[:n]}…", size_pt)) - 1] + "…"
+
+
+def text_width(text: str, size_pt: float) -> float:
+    """Width of a line of text, pixels."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import text_to_path
+
+    width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(size=size_pt), ismath=False)
+    return width * _PIXELS_PER_POINT
 
 
 def class_colors(label: UInt8, label_set: LabelSet) -> UInt8:

@@ -9,8 +9,7 @@ import numpy as np
 from semantic_mapper.drivers.calibrating.config import CalibrationConfig
 from semantic_mapper.drivers.calibrating.coverage import CELLS
 from semantic_mapper.drivers.calibrating.intrinsics import CameraCalibration
-from semantic_mapper.plain_text import visible
-from semantic_mapper.plots import BAD, DIM_TEXT, GOOD, SMALL_PT, WARN, new_figure, rendered
+from semantic_mapper.plots import BAD, DIM_TEXT, GOOD, PANEL, SMALL_PT, TITLE_PT, WARN, cut, new_figure, rendered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,16 +17,16 @@ if TYPE_CHECKING:
 
 _LONGEST = 0.03  # of the image's width, for the 95th percentile of the residuals
 _MAX_TILT_DEG = 60
-_GOOD, _BAD, _WARN, _DIM = (tuple(v / 255 for v in color) for color in (GOOD, BAD, WARN, DIM_TEXT))
+_GOOD, _BAD, _WARN, _DIM, _PANEL = (tuple(v / 255 for v in c) for c in (GOOD, BAD, WARN, DIM_TEXT, PANEL))
 
 
 @rendered
 def draw_calibration(camera_id: str, found: CameraCalibration, config: CalibrationConfig) -> Figure:
     """Residuals of all corners, the error of each view, and the tilts of the board."""
-    figure = new_figure(1400, 780, layout="constrained")
-    title = f"{visible(camera_id)}: {len(found.views)} views, {found.rms_px:.3f} px RMS"
+    figure = new_figure(1400, 760, layout="constrained")
+    title = f"{cut(camera_id, 700, TITLE_PT)}: {len(found.views)} views, {found.rms_px:.3f} px RMS"
     figure.suptitle(title, x=0.012, ha="left")
-    grid = figure.add_gridspec(2, 2, width_ratios=(2, 1))
+    grid = figure.add_gridspec(2, 2, width_ratios=(2.3, 1))
     _draw_residuals(figure.add_subplot(grid[:, 0]), found)
     _draw_errors(figure.add_subplot(grid[0, 1]), found)
     _draw_tilts(figure.add_subplot(grid[1, 1]), found, config)
@@ -44,9 +43,10 @@ def _draw_residuals(axes: Axes, found: CameraCalibration) -> None:
     edges = np.linspace(-0.5, right, CELLS + 1), np.linspace(-0.5, bottom, CELLS + 1)
     seen = np.where(found.counts > 0, 0.12, 0.0)
     axes.imshow(np.dstack([np.ones((CELLS, CELLS, 3)), seen]), extent=(-0.5, right, bottom, -0.5), aspect="equal")
+    label = {"color": _DIM, "zorder": 5, "bbox": {"facecolor": _PANEL, "linewidth": 0, "pad": 1}}
     for (row, column), count in np.ndenumerate(found.counts):
         place = edges[0][column], edges[1][row]
-        axes.annotate(str(count), place, (4, -4), textcoords="offset points", va="top", color=_DIM, fontsize=SMALL_PT)
+        axes.annotate(str(count), place, (4, -4), textcoords="offset points", va="top", fontsize=SMALL_PT, **label)
     pixels = np.concatenate([view.pixels for view in found.views])
     residuals = np.concatenate(found.residuals)
     lengths = np.linalg.norm(residuals, axis=1)
@@ -58,16 +58,20 @@ def _draw_residuals(axes: Axes, found: CameraCalibration) -> None:
     axes.plot(*pixels.T, ".", color="white", markersize=2.5)
     axes.set(xticks=edges[0], yticks=edges[1], xlim=(-0.5, right), ylim=(bottom, -0.5))
     axes.tick_params(length=0, labelbottom=False, labelleft=False)
+    axes.set_axisbelow(False)
+    axes.grid(color=_PANEL, linewidth=1.5)
     note = f"lines: seen minus predicted, {enlarged:.0f} times enlarged, orange: the longest 5 %\n"
     axes.set_xlabel(f"{note}numbers: corners in a cell; dark cells: none", loc="left")
 
 
 def _draw_errors(axes: Axes, found: CameraCalibration) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     left_out = f", {len(found.left_out)} left out" if found.left_out else ""
     axes.set(title=f"error of each view{left_out}", xlabel="view", ylabel="px RMS")
     axes.bar(range(1, len(found.errors_px) + 1), found.errors_px, color=_GOOD)
     axes.axhline(found.rms_px, color=_WARN, label=f"all corners: {found.rms_px:.2f}")
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_ylim(0, max(1.25 * max(found.errors_px), 1e-6))
     axes.legend(loc="upper right")
 
@@ -81,4 +85,4 @@ def _draw_tilts(axes: Axes, found: CameraCalibration, config: CalibrationConfig)
     axes.plot(side, up, "o", color=_GOOD)
     axes.set(title="how the board leaned", xlabel="to a side, degrees", ylabel="up or down, degrees")
     axes.set(xlim=(-65, 65), ylim=(65, -65), xticks=ticks, yticks=ticks, aspect="equal")
-    axes.legend(loc="upper left", bbox_to_anchor=(1.02, 1), frameon=False, handlelength=1)
+    axes.legend(loc="upper center", handlelength=1)

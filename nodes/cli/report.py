@@ -151,7 +151,7 @@ def point_view(points: LabelledPoints, label_set: LabelSet, up: Float64 | None) 
     table = np.full((256, 4), (*UNKNOWN, 255), np.uint8)
     table[list(label_set.ids), :3] = label_set.colors
     rows = class_rows(points.label, label_set)
-    ids = {**dict(zip(label_set.names, label_set.ids, strict=True))}
+    ids = dict(zip(label_set.names, label_set.ids, strict=True))
     classes = [
         {"id": ids.get(name, label_set.ignore_id), "name": name, "color": "rgb({},{},{})".format(*color)}
         | {"share": f"{100 * (fraction or 0):.1f} %"}
@@ -164,16 +164,16 @@ def point_view(points: LabelledPoints, label_set: LabelSet, up: Float64 | None) 
         "spacing": point_spacing(xyz),
         "ceiling": ceiling_height(xyz),
         "azimuth": open_side(xyz, ELEVATION),
-        "classes": _base64(table),
-        "xyz": _base64(np.round((xyz - low) / extent * 65535).astype("<u2")),
-        "rgb": _base64(points.rgb[chosen]),
-        "label": _base64(points.label[chosen]),
+        "classes": _base64(table.tobytes()),
+        "xyz": _base64(np.round((xyz - low) / extent * 65535).astype("<u2").tobytes()),
+        "rgb": _base64(points.rgb[chosen].tobytes()),
+        "label": _base64(points.label[chosen].tobytes()),
     }
     return {"classes": classes, "data": data}
 
 
-def _base64(data: bytes | np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(data) if isinstance(data, np.ndarray) else data).decode("ascii")
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")
 
 
 def table_of(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
@@ -193,15 +193,10 @@ def write_replay_report(session: MapSession, summary: Mapping[str, Any], out: Pa
     label_set, points = session.pipeline.label_set, session.pipeline.voxel_map.points()
     overview = out / "overview.png", "Frames, what was rendered for them, and the map from above and aside"
     strips = [
-        picture(
-            draw_strip(s, label_set),
-            f"{s.name}: camera, rendered semantics, truth where there is one, depth",
-            photo=True,
-        )
+        picture(draw_strip(s, label_set), f"{s.name}: camera, and what was rendered for it", photo=True)
         for s in view_strips(session, STRIPS)
     ]
     counts = [(name.replace("_", " "), str(count)) for name, count in summary["frames"].items()]
-    refused = [(str(r["seq"]), str(r["stamp_ns"]), r["reason"]) for r in summary["refusals"]]
     sections = [
         Section(notes=notes(summary)),
         *([Section("The map", view=point_view(points, label_set, map_up(session)))] if len(points.xyz) else []),
@@ -215,16 +210,7 @@ def write_replay_report(session: MapSession, summary: Mapping[str, Any], out: Pa
             notes=[f"Damaged: {stretch}" for stretch in summary["damaged_stretches"]],
             tables=[table_of(("frames", ""), counts)],
         ),
-        *(
-            [
-                Section(
-                    f"Refused frames, the first {MAX_LISTED}",
-                    tables=[table_of(("seq", "stamp, ns", "reason"), refused)],
-                )
-            ]
-            if refused
-            else []
-        ),
+        *_refused(summary["refusals"]),
         Section(
             "Configuration",
             tables=[table_of(("package", "version"), list(summary["versions"].items()))],
@@ -286,6 +272,12 @@ def write_suite_report(path: Path, table: Table, lines: Sequence[str], pictures:
     figures = Section(tables=[table], lines=lines)
     drawn = Section(pictures=list(picture_files(*((path, path.name) for path in pictures))))
     write_page(path, found["title"], [figures, drawn, Section(folded={"All figures": json.dumps(found, indent=1)})])
+
+
+def _refused(refusals: Sequence[Mapping[str, Any]]) -> Iterator[Section]:
+    rows = [(str(r["seq"]), str(r["stamp_ns"]), r["reason"]) for r in refusals]
+    if rows:
+        yield Section(f"Refused, the first {MAX_LISTED}", tables=[table_of(("seq", "stamp, ns", "reason"), rows)])
 
 
 def _stages(summaries: Mapping[str, Mapping[str, Any]]) -> Iterator[Section]:

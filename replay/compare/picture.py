@@ -26,6 +26,7 @@ from semantic_mapper.plots import (
     put_picture,
     put_text,
     rendered,
+    text_width,
 )
 from semantic_mapper.replay.compare.runs import Comparison
 from semantic_mapper.replay.compare.surface_match import SurfaceMatch
@@ -60,18 +61,17 @@ def draw_comparison(comparison: Comparison) -> Figure:
         text = cut(f"{name}: {run.name}", WIDTH - 2 * MARGIN, TITLE_PT)
         put_text(head, (0, y), text, color=color, fontsize=TITLE_PT, weight="bold")
     mine, theirs = comparison.surfaces
+    blocks = "blocks: red A alone, blue B alone" if comparison.blocks else "blocks: of other sizes"
     panels = [
         ("classes of A", _classes(mine, plan)),
         ("classes of B", _classes(theirs, plan)),
         ("common surface with another class: pink", _labels_plan(comparison, plan)),
         ("surface: red A alone, blue B alone, yellow moved", _surface_plan(comparison, plan)),
-        ("blocks: red A alone, blue B alone", _blocks_plan(comparison, plan)),
+        (blocks, _blocks_plan(comparison, plan)),
     ]
     for number, (caption, picture) in enumerate(panels):
-        x = MARGIN + number % 3 * (COLUMN + GAP)
-        axes = put_picture(figure, (x, (HEADER + CAPTION, top)[number // 3], COLUMN, PANEL_HEIGHT), picture, caption)
-    if comparison.blocks is None:
-        put_text(axes, (16, 24), "voxels of other sizes")
+        x, y = MARGIN + number % 3 * (COLUMN + GAP), (HEADER + CAPTION, top)[number // 3]
+        put_picture(figure, (x, y, COLUMN, PANEL_HEIGHT), picture, caption)
     _put_table(figure, comparison, (MARGIN + 2 * (COLUMN + GAP), top - CAPTION, COLUMN, table_height))
     return figure
 
@@ -192,7 +192,7 @@ def _put_table(figure: Figure, comparison: Comparison, box: tuple[int, int, int,
     axes = place(figure, box)
     rows = [(("", "A", "B", "difference", "allowed"), DIM_TEXT)]
     rows += [((f.title, *f.texts()), TEXT if f.within else ONLY_A) for f in comparison.fields]
-    widths = [max(len(row[i]) for row, _ in rows) * 8.6 + 12 for i in range(1, 5)]  # pixels
+    widths = [max(text_width(row[i], SMALL_PT) for row, _ in rows) + 14 for i in range(1, 5)]
     ends = [COLUMN - sum(widths[i:]) for i in range(1, 5)]
     verdict, color = ("equal", WITHIN) if comparison.equal else ("differs", ONLY_A)
     put_text(axes, (0, 15), verdict, color=color, weight="bold")

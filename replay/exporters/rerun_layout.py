@@ -93,7 +93,7 @@ def draw_map_legend(labels: UInt8, label_set: LabelSet, *, aged: bool) -> Figure
     """Picture of the classes of a map's points (N,) and of the scales of confidence and (``aged``) age."""
     rows = class_rows(labels, label_set)
     scales = [("confidence: 0 to 1", CONFIDENCE_SCALE)]
-    scales += [(f"age: {AGED_S:g} s and more, to 0 s", AGE_SCALE)] if aged else []
+    scales += [(f"age: {AGED_S:g} s or more, to 0 s", AGE_SCALE)] if aged else []
     width, height = LEGEND_WIDTH - 2 * _MARGIN, len(rows) * _PITCH
     top = _MARGIN + _CAPTION
     figure = new_figure(LEGEND_WIDTH, top + height + _MARGIN + len(scales) * (_CAPTION + _BAR + _MARGIN))

@@ -92,7 +92,7 @@ def draw_history(history: Sequence[dict[str, Any]]) -> UInt8:
     panels = (
         ("loss", "loss", losses),
         ("validation", "mIoU, %", scores),
-        ("", "learning rate", [_curve(history, "rate", "")]),
+        ("learning rate", "learning rate", [_curve(history, "rate", "")]),
     )
     return draw_panels(
         "", [Panel(title, unit, "step", [c for c in curves if c.points]) for title, unit, curves in panels]

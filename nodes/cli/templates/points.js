@@ -46,9 +46,9 @@
       float here = log2(metres(at)), hidden = 0.0;
       for (int i = 0; i < 8; i++) {
         float a = 0.785398 * float(i);
-        hidden += max(0.0, here - log2(metres(at + ivec2(round(radius * vec2(cos(a), sin(a)))))));
+        hidden += clamp(here - log2(metres(at + ivec2(round(radius * vec2(cos(a), sin(a)))))), 0.0, 0.06);
       }
-      pixel = vec4(texelFetch(colors, at, 0).rgb * (here >= log2(far) - 1e-4 ? 1.0 : exp(-1.6 * hidden)), 1.0);
+      pixel = vec4(texelFetch(colors, at, 0).rgb * (here >= log2(far) - 1e-4 ? 1.0 : exp(-2.2 * hidden)), 1.0);
     }`];
   function program([vertex, fragment]) {
     const made = gl.createProgram();
@@ -93,7 +93,7 @@
   const middle = data.low.map((v, i) => v + data.extent[i] / 2);
   const size = Math.max(Math.hypot(...data.extent), 0.1), FIELD_OF_VIEW = 0.8;
   let centre, azimuth, elevation, distance;
-  const goBack = () => { [centre, azimuth, elevation, distance] = [[...middle], data.azimuth, 0.85, 1.0 * size]; };
+  const goBack = () => { [centre, azimuth, elevation, distance] = [[...middle], data.azimuth, 0.85, (canvas.clientWidth < canvas.clientHeight ? 1.05 : 0.9) * size]; };
   goBack();
   const axes = () => {
     const [ca, sa, ce, se] = [Math.cos(azimuth), Math.sin(azimuth), Math.cos(elevation), Math.sin(elevation)];
