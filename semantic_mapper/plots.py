@@ -181,7 +181,7 @@ def draw_panels(title: str, panels: Sequence[Panel], columns: int = 3, size: tup
     rows = -(-len(panels) // columns)
     figure = new_figure(columns * size[0], rows * size[1] + 50 * bool(title), layout="constrained")
     if title:
-        figure.suptitle(cut(title, 0.85 * columns * size[0], TITLE_PT), x=0.012, ha="left")
+        figure.suptitle(cut(title, columns * size[0] - 30, TITLE_PT, "bold"), x=0.012, ha="left")
     names = {tuple(curve.name for curve in panel.curves) for panel in panels if panel.curves}
     shared = len(names) == 1 and len(panels) > 1
     for number, panel in enumerate(panels, 1):
@@ -203,13 +203,19 @@ def _draw_curves(axes: Axes, panel: Panel) -> None:
     for curve in panel.curves:
         x, y = np.array(curve.points, np.float64).T
         single = len(x) == 1
-        axes.plot(x, y, marker="o" if curve.marked or single else "", label=cut(curve.name, 260, SMALL_PT))
+        axes.plot(x, y, marker="o" if curve.marked or single else "", label=_label(curve.name, 260))
     x, y = np.array([point for curve in panel.curves for point in curve.points], np.float64).T
     axes.set_xlim(min(0.0, float(x.min())), max(float(x.max()), 1e-9) * 1.02)
     low, high = min(0.0, float(np.nanmin(y))), float(np.nanmax(y))
     axes.set_ylim(low, high + 0.08 * ((high - low) or 1.0))
     axes.xaxis.set_major_formatter(_short_number)
     axes.yaxis.set_major_formatter(_short_number)
+
+
+def _label(name: str, width: float) -> str:
+    """A name for a legend, which leaves out names that begin with "_"."""
+    name = cut(name, width, SMALL_PT)
+    return f" {name}" if name.startswith("_") else name
 
 
 def _short_number(value: float, _: object = None) -> str:
@@ -224,14 +230,14 @@ def draw_bars(title: str, bars: Sequence[Bar], x_label: str) -> Figure:
     legend_rows = -(-len(names) // 6) if len(names) > 1 else 0
     figure = new_figure(1000, height + 24 * legend_rows + (130 if title else 84), 1.5, layout="constrained")
     if title:
-        figure.suptitle(cut(title, 850, TITLE_PT), x=0.012, ha="left")
+        figure.suptitle(cut(title, 970, TITLE_PT, "bold"), x=0.012, ha="left")
     axes = figure.add_subplot()
     totals = np.zeros(len(bars))
     longest = max(sum(bar.parts.values()) for bar in bars) or 1.0
     stacked = any(len(bar.parts) > 1 for bar in bars)
     for name in names:
         values = np.array([bar.parts.get(name, 0.0) for bar in bars])
-        drawn = axes.barh(range(len(bars)), values, 0.66, totals, label=cut(name, 140, SMALL_PT))
+        drawn = axes.barh(range(len(bars)), values, 0.66, totals, label=_label(name, 140))
         texts = [_value(v) if stacked and v / longest * 780 > 9 * len(_value(v)) else "" for v in values]
         axes.bar_label(drawn, texts, label_type="center", color=_hex(BACKGROUND), fontsize=SMALL_PT)
         totals += values
@@ -260,15 +266,16 @@ def draw_paths(title: str, paths: Mapping[str, Float64], up: Float64) -> Figure:
         up: (3,) in that world.
     """
     figure = new_figure(900, 760, layout="constrained")
-    figure.suptitle(cut(title, 780, TITLE_PT), x=0.012, ha="left")
+    figure.suptitle(cut(title, 870, TITLE_PT, "bold"), x=0.012, ha="left")
     axes = figure.add_subplot(aspect="equal", adjustable="datalim", xlabel="metres", ylabel="metres")
     ground = _ground_axes(np.concatenate(list(paths.values())), up)
     for name, xyz in paths.items():
         x, y = ground @ xyz.T
-        (line,) = axes.plot(x, y, label=cut(name, 260, SMALL_PT))
+        (line,) = axes.plot(x, y, label=_label(name, 260))
         known = np.flatnonzero(np.isfinite(x))[:1]
         axes.plot(x[known], y[known], "o", color=line.get_color(), markersize=9)
-    axes.legend(loc="best")
+    if any(paths):
+        axes.legend(loc="best")
     return figure
 
 
@@ -315,24 +322,27 @@ def put_title(figure: Figure, title: str, subtitle: str = "") -> None:
     """The head of a figure whose parts have their places."""
     width = figure.get_figwidth() * _DPI - 48
     axes = place(figure, (24, 12, width, 50))
-    put_text(axes, (0, 16), cut(title, 0.88 * width, TITLE_PT + 2), fontsize=TITLE_PT + 2, weight="bold")
+    put_text(axes, (0, 16), cut(title, width, TITLE_PT + 2, "bold"), fontsize=TITLE_PT + 2, weight="bold")
     put_text(axes, (0, 42), cut(subtitle, width, TEXT_PT), color=DIM_TEXT)
 
 
-def cut(text: str, width: float, size_pt: float) -> str:
+def cut(text: str, width: float, size_pt: float, weight: str = "normal") -> str:
     """``text`` with control characters as escapes, ended by an ellipsis where it is wider than ``width`` pixels."""
     text = visible(text[:_LONGEST])
-    if text_width(text, size_pt) <= width:
+    if text_width(text, size_pt, weight) <= width:
         return text
-    return text[: bisect_right(range(len(text)), width, 1, key=lambda n: text_width(f"{text[:n]}…", size_pt)) - 1] + "…"
+    letters = range(len(text))
+    return text[: bisect_right(letters, width, 1, key=lambda n: text_width(f"{text[:n]}…", size_pt, weight)) - 1] + "…"
 
 
-def text_width(text: str, size_pt: float) -> float:
+def text_width(text: str, size_pt: float, weight: str = "normal") -> float:
     """Width of a line of text, pixels."""
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import text_to_path
 
-    width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(size=size_pt), ismath=False)
+    width, _, _ = text_to_path.get_text_width_height_descent(
+        text, FontProperties(size=size_pt, weight=weight), ismath=False
+    )
     return width * _PIXELS_PER_POINT
 
 

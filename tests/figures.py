@@ -25,7 +25,12 @@ def figure_of(draw: Callable[..., Any], *args: Any, **kwargs: Any) -> Figure:
 
 def misplaced_texts(figure: Figure) -> list[str]:
     """Texts that overlap others, or that leave the figure."""
-    shown = [text for text in figure.findobj(Text) if text.get_visible() and text.get_text().strip()]
+    beyond: set[Text] = set()  # labels of ticks out of view, which are not drawn
+    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+        low, high = sorted(axis.get_view_interval())
+        beyond |= {tick.label1 for tick in axis.get_major_ticks() if not low <= tick.get_loc() <= high}
+    texts = [text for text in figure.findobj(Text) if text not in beyond]
+    shown = [text for text in texts if text.get_visible() and text.get_text().strip()]
     boxes = [(text.get_text(), text.get_window_extent().padded(-1.0)) for text in shown]
     bounds = figure.bbox.padded(1.0)
     found = [f"{name!r} leaves the figure" for name, box in boxes if not np.allclose(_inside(box, bounds), box.extents)]

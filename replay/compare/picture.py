@@ -58,7 +58,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
     figure = new_figure(WIDTH, top + max(PANEL_HEIGHT, table_height) + MARGIN)
     head = place(figure, (MARGIN, 0, WIDTH - 2 * MARGIN, HEADER))
     for y, name, run, color in ((24, "A", comparison.a, ONLY_A), (52, "B", comparison.b, ONLY_B)):
-        text = cut(f"{name}: {run.name}", WIDTH - 2 * MARGIN, TITLE_PT)
+        text = cut(f"{name}: {run.name}", WIDTH - 2 * MARGIN, TITLE_PT, "bold")
         put_text(head, (0, y), text, color=color, fontsize=TITLE_PT, weight="bold")
     mine, theirs = comparison.surfaces
     blocks = "blocks: red A alone, blue B alone" if comparison.blocks else "blocks: of other sizes"

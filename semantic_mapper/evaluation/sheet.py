@@ -76,7 +76,7 @@ def draw_sheet(rows: Sequence[SheetRow], methods: Sequence[str], label_set: Labe
     empty = np.full((1, 1, 3), PANEL, np.uint8)
     for column, name in enumerate(columns):
         x = column * (TILE_WIDTH + GAP)
-        put_text(heads, (x, 6), cut(name, 0.88 * TILE_WIDTH, TEXT_PT), weight="bold")
+        put_text(heads, (x, 6), cut(name, TILE_WIDTH, TEXT_PT, "bold"), weight="bold")
         for number, row in enumerate(rows):
             if column < 2:
                 picture = row.rgb if column == 0 else class_colors(row.truth, label_set)

@@ -2,7 +2,6 @@ import importlib.util
 import json
 from pathlib import Path
 
-import cv2
 import pytest
 from structlog.testing import capture_logs
 

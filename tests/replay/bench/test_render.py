@@ -1,6 +1,5 @@
 import pytest
 import torch
-from semantic_mapper.replay.bench.plots import draw_pipeline, step_parts
 
 import semantic_mapper.replay.bench.fusion as bench_map
 import semantic_mapper.replay.bench.render as bench
@@ -9,6 +8,7 @@ from semantic_mapper.errors import LogError
 from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.replay.bench.fusion import bench_fusion, bench_pipeline, bench_qualities
+from semantic_mapper.replay.bench.plots import draw_pipeline, step_parts
 from semantic_mapper.replay.bench.render import bench_render, log_scenes, room_scenes
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from semantic_mapper.replay.bench.plots import GROWTH_LABELS, draw_growth, draw_walk
 
 import semantic_mapper.replay.bench.growth as bench_growth_module
 import semantic_mapper.replay.bench.plots as plots_module
@@ -18,6 +17,7 @@ from semantic_mapper.mapping.storage.block_grid import LEAST_RESIDENT
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.plots import Panel
 from semantic_mapper.replay.bench.growth import bench_growth
+from semantic_mapper.replay.bench.plots import GROWTH_LABELS, draw_growth, draw_walk
 from semantic_mapper.replay.bench.walk import WalkPlan, bench_walk, first_and_last, slope_percent
 from semantic_mapper.types import MapUpdate, PosedFrame
 from tests.nodes.support import write_weights
