@@ -101,7 +101,7 @@ def look_at_report() -> list[str]:
         Section("Figures", pictures=pictures, tables=[table_of(("class", "fraction"), rows)]),
     ]
     write_page(OUT / "report.html", "Report of a test", sections)
-    largest = class_rows(points.label, ROOMS)[:LARGEST]
+    largest = [row for row in class_rows(points.label, ROOMS) if row[0] != "ceiling"][:LARGEST]  # which is cut away
     with Browser(WIDTH, HEIGHT) as browser:
         browser.open((OUT / "report.html").as_uri())
         browser.wait(LOOK_S)

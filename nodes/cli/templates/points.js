@@ -93,7 +93,7 @@
   const middle = data.low.map((v, i) => v + data.extent[i] / 2);
   const size = Math.max(Math.hypot(...data.extent), 0.1), FIELD_OF_VIEW = 0.8;
   let centre, azimuth, elevation, distance;
-  const goBack = () => { [centre, azimuth, elevation, distance] = [[...middle], data.azimuth, 0.85, (canvas.clientWidth < canvas.clientHeight ? 1.05 : 0.9) * size]; };
+  const goBack = () => { [centre, azimuth, elevation, distance] = [[...middle], data.azimuth, 0.85, (canvas.clientWidth < canvas.clientHeight ? 1.15 : 1.0) * size]; };
   goBack();
   const axes = () => {
     const [ca, sa, ce, se] = [Math.cos(azimuth), Math.sin(azimuth), Math.cos(elevation), Math.sin(elevation)];
@@ -137,7 +137,7 @@
     gl.uniform3fv(uniform(points, "low"), data.low);
     gl.uniform3fv(uniform(points, "extent"), data.extent);
     gl.uniformMatrix4fv(uniform(points, "view"), false, view);
-    gl.uniform1f(uniform(points, "pixels"), 0.5 * height * fy * 1.25 * data.spacing);
+    gl.uniform1f(uniform(points, "pixels"), 0.5 * height * fy * 1.4 * data.spacing);
     gl.uniform1f(uniform(points, "cut"), cutHeight());
     gl.uniform1i(uniform(points, "byClass"), document.querySelector("[name=look]:checked").value === "class" ? 1 : 0);
     gl.bindVertexArray(cloud);
