@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+import logging
 import threading
 import warnings
 from bisect import bisect_right
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec
@@ -91,16 +93,31 @@ def cannot_draw() -> str:
     return "" if importlib.util.find_spec("matplotlib") else "Matplotlib is not installed"
 
 
+@contextmanager
+def _common_style() -> Iterator[None]:
+    """Matplotlib's settings while something is drawn; what it says of fonts and of its cache is kept back."""
+    logger = logging.getLogger("matplotlib")
+    with _LOCK, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph", UserWarning)  # a name in letters that the font lacks
+        level = logger.level
+        logger.setLevel(logging.ERROR)
+        try:
+            import matplotlib
+
+            with matplotlib.rc_context(_STYLE):
+                yield
+        finally:
+            logger.setLevel(level)
+
+
 def rendered(draw: Callable[P, Figure]) -> Callable[P, UInt8]:
     """Make a function that returns a figure one that returns its picture, (H, W, 3) uint8 RGB, in the common style."""
 
     @functools.wraps(draw)
     def picture(*args: P.args, **kwargs: P.kwargs) -> UInt8:
-        import matplotlib
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        with _common_style():
+            from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-        with _LOCK, matplotlib.rc_context(_STYLE), warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Glyph", UserWarning)  # a name in letters that the font lacks
             canvas = FigureCanvasAgg(draw(*args, **kwargs))
             canvas.draw()
             return np.asarray(canvas.buffer_rgba(), np.uint8)[..., :3].copy()

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from itertools import combinations
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -17,7 +16,7 @@ from semantic_mapper import plots
 
 def figure_of(draw: Callable[..., Any], *args: Any, **kwargs: Any) -> Figure:
     """What a function decorated with ``rendered`` makes, drawn."""
-    with matplotlib.rc_context(plots._STYLE):
+    with plots._common_style():
         figure = draw.__wrapped__(*args, **kwargs)  # type: ignore[attr-defined]
         FigureCanvasAgg(figure).draw()
     return figure

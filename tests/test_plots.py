@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import warnings
@@ -130,6 +131,15 @@ def test_matplotlib_is_imported_when_something_is_drawn() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["set()", "False"]
+
+
+def test_a_home_that_cannot_be_written_to_is_no_news() -> None:
+    code = "from semantic_mapper.plots import Panel, draw_panels; draw_panels('', [Panel('', '', '', [])])"
+    homeless = {name: value for name, value in os.environ.items() if not name.startswith(("XDG_", "MPL"))}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env={**homeless, "HOME": "/proc/none"}, check=True
+    )
+    assert done.stdout == done.stderr == ""
 
 
 def test_pictures_are_written_or_say_why_not(tmp_path: Path) -> None:
