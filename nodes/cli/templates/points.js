@@ -90,10 +90,9 @@
 
   // The camera: turned about `centre`, with z up; metres and radians.
   const high = data.low.map((v, i) => v + data.extent[i]);
-  const middle = data.low.map((v, i) => v + data.extent[i] / 2);
-  const size = Math.max(Math.hypot(...data.extent), 0.1), FIELD_OF_VIEW = 0.8;
+  const size = data.size, reach = Math.hypot(...data.extent), FIELD_OF_VIEW = 0.8;
   let centre, azimuth, elevation, distance;
-  const goBack = () => { [centre, azimuth, elevation, distance] = [[...middle], data.azimuth, 0.85, (canvas.clientWidth < canvas.clientHeight ? 1.15 : 1.0) * size]; };
+  const goBack = () => { [centre, azimuth, elevation, distance] = [[...data.centre], data.azimuth, 0.85, (canvas.clientWidth < canvas.clientHeight ? 1.15 : 1.0) * size]; };
   goBack();
   const axes = () => {
     const [ca, sa, ce, se] = [Math.cos(azimuth), Math.sin(azimuth), Math.cos(elevation), Math.sin(elevation)];
@@ -116,7 +115,7 @@
       gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, colors, 0);
       gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.TEXTURE_2D, depths, 0);
     }
-    const near = Math.max(0.02, distance - size), far = distance + 2 * size;
+    const near = Math.max(0.02, distance - reach), far = distance + 2 * reach;
     const focal = 1 / Math.tan(FIELD_OF_VIEW / 2), narrow = Math.min(1, width / height), [right, up, back] = axes();
     const eye = centre.map((v, i) => v + distance * back[i]);
     const [fx, fy, a] = [focal * narrow * height / width, focal * narrow, (far + near) / (near - far)];
