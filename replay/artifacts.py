@@ -15,12 +15,14 @@ import numpy as np
 from semantic_mapper import __version__
 from semantic_mapper.config import to_plain
 from semantic_mapper.evaluation.metrics import confusion_of
-from semantic_mapper.evaluation.report import ViewStrip, write_overview
+from semantic_mapper.evaluation.overview import ViewStrip, draw_overview
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.formats.ply import write_ply
 from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.plots import write_picture
+from semantic_mapper.types import Float64
 
 if TYPE_CHECKING:  # session imports this module
     from semantic_mapper.replay.exporters.rerun_log import RerunLog
@@ -56,17 +58,22 @@ def write_artifacts(session: MapSession, out: Path, rerun: RerunLog | None) -> d
 
 def _draw_overview(session: MapSession, points: MapPoints, path: Path) -> None:
     label_set = session.pipeline.label_set
-    poses = [f.T_world_camera for f, _ in session.snapshots]
     size = f"{session.pipeline.voxel_map.config.voxel_size_m * 100:g} cm voxels"
-    write_overview(
-        path,
+    picture = draw_overview(
         view_strips(session, OVERVIEW_FRAMES),
         points,
         label_set,
         title=f"{session.source or 'session'}: {session.fused} frames, {len(points.xyz):,} surface points, {size}",
         subtitle=_pose_line(session) + _empty_line(session, points) + _scores_line(session) + _depth_line(session),
-        up=camera_up(np.stack(poses)) if poses else None,
+        up=map_up(session),
     )
+    write_picture(path, picture)
+
+
+def map_up(session: MapSession) -> Float64 | None:
+    """Rough up (3,) of a session's world by the poses of its frames; None without a frame."""
+    poses = [f.T_world_camera for f, _ in session.snapshots]
+    return camera_up(np.stack(poses)) if poses else None
 
 
 def view_strips(session: MapSession, count: int) -> list[ViewStrip]:

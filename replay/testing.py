@@ -168,7 +168,7 @@ class ReplayedMap:
         Raises:
             AssertionError: it differs, or no run is stored there.
         """
-        from semantic_mapper.evaluation.sheet import write_picture
+        from semantic_mapper.plots import write_picture
         from semantic_mapper.replay.compare.picture import draw_comparison
 
         target = self.root / stored

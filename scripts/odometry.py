@@ -19,9 +19,8 @@ from semantic_mapper.config import convert_config, read_toml, to_plain
 from semantic_mapper.drivers.base import CameraImage
 from semantic_mapper.drivers.poses.config import OdometryPoses
 from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
-from semantic_mapper.evaluation.path_plot import draw_top_view
-from semantic_mapper.evaluation.sheet import write_picture
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, align_rigid, relative_pose_error
+from semantic_mapper.plots import draw_paths, write_picture
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.types import Float64, PosedFrame
 
@@ -91,7 +90,7 @@ def picture(run: Run, title: str, path: Path) -> None:
     T = align_rigid(estimated[known, :3, 3], given[known, :3, 3])
     moved = estimated[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
     up = -given[:, :3, 1].mean(axis=0)  # a camera is held upright, more or less
-    write_picture(path, draw_top_view(title, {"given poses": given[:, :3, 3], "odometry, aligned": moved}, up))
+    write_picture(path, draw_paths(title, {"given poses": given[:, :3, 3], "odometry, aligned": moved}, up))
 
 
 def main() -> None:

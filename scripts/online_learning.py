@@ -29,13 +29,12 @@ import torch
 from scripts.paired_steps import LAP, Turn, slowdown
 from semantic_mapper.client import MapClient
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, confusion_of
-from semantic_mapper.evaluation.plot import Curve, Panel, draw_panels
-from semantic_mapper.evaluation.sheet import write_picture
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.finetuner.finetune_round import file_of
 from semantic_mapper.nodes.options import NodeJob
 from semantic_mapper.nodes.supervisor.node_process import Child
+from semantic_mapper.plots import Curve, Panel, draw_panels, write_picture
 from semantic_mapper.replay.artifacts import write_json
 from semantic_mapper.replay.evaluate.truth import TruthMapper
 from semantic_mapper.replay.log.format import LogReader
@@ -347,8 +346,8 @@ def draw(found: dict[str, Any], path: Path) -> None:
     """mIoU against time, with what happened."""
     events = {e["what"]: e["at_s"] for e in reversed(found["events"])}
     marks = [Curve(name, ((events[e], 0.0), (events[e], 100.0))) for e, name in MARKS.items() if e in events]
-    curve = Curve("mIoU, %", tuple((x, y) for x, y in found["curve"]), marked=True)
-    panel = Panel(f"mIoU of {WINDOW} frames", (curve, *marks), "seconds of mapping")
+    curve = Curve("mIoU", tuple((x, y) for x, y in found["curve"]), marked=True)
+    panel = Panel(f"mIoU of {WINDOW} frames", "mIoU, %", "seconds of mapping", [curve, *marks])
     write_picture(path, draw_panels("", [panel], 1, (1080, 420)))
 
 

@@ -25,8 +25,7 @@ import numpy as np
 
 from scripts.live_launch import NODES, PATIENCE_S, LiveLaunch
 from scripts.long_log import write_long_log
-from semantic_mapper.evaluation.plot import Curve, Panel, draw_panels
-from semantic_mapper.evaluation.sheet import write_picture
+from semantic_mapper.plots import Curve, Panel, draw_panels, write_picture
 from semantic_mapper.transport.messages import Status
 from semantic_mapper.transport.sockets import NewestSubscriber
 from semantic_mapper.types import Float64
@@ -151,9 +150,9 @@ def draw(seen: dict[str, Samples], ages: Sequence[tuple[float, float]], path: Pa
     files = [Curve(name, _curve(at, seen[name].files)) for name, at in minutes.items()]
     age = Curve("p99 of each minute", tuple(ages))
     panels = [
-        Panel("resident memory, MB", tuple(memory), "minutes"),
-        Panel("open files", tuple(files), "minutes"),
-        Panel("age of the frame being mapped, ms", (age,), "minutes"),
+        Panel("resident memory", "MB", "minutes", memory),
+        Panel("open files", "files", "minutes", files),
+        Panel("age of the frame being mapped", "ms", "minutes", [age]),
     ]
     write_picture(path, draw_panels("Soak", panels))
 

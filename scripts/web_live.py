@@ -12,9 +12,9 @@ from browser import Browser
 from live_launch import COMMAND, LiveLaunch, Told
 from web_pictures import empty_images, map_pixels, take, what_is_missing
 
-from semantic_mapper.evaluation.legend import legend_rows
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.plots import class_rows
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.scenes import TEST_SEEDS, room_frames
 from semantic_mapper.transport.messages import StreamInfo
@@ -85,7 +85,7 @@ def _watch(launch: LiveLaunch, told: Told, browser: Browser, out: Path) -> list[
     browser.wait(3 * LOOK_S)
     picture = take(browser, out / "live.png")
     voxel_map = VoxelMap.load(launch.out / "map.npz")
-    rows = legend_rows(voxel_map.points().label, voxel_map.label_set)
+    rows = class_rows(voxel_map.points().label, voxel_map.label_set)
     failures = what_is_missing(picture, rows) + empty_images(picture)
     if not complete:
         failures.append("no picture that was taken while it ran has all images of the camera")

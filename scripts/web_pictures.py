@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from browser import Browser
 
-from semantic_mapper.evaluation.legend import LegendRow
+from semantic_mapper.plots import LegendRow
 from semantic_mapper.types import UInt8
 
 LEGEND_FROM, TOP = 0.8, 50  # the legend begins at this share of the width; above this row are the names of the views

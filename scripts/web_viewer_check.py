@@ -16,16 +16,15 @@ from urllib.parse import urlsplit
 import numpy as np
 from browser import ROOT, Browser, provide_browser
 from web_live import look_at_live
-from web_pictures import LARGEST, take, what_is_missing
+from web_pictures import LARGEST, LEAST_MAP, pixels_of, take, what_is_missing
 
 from semantic_mapper.config import VoxelMapConfig
-from semantic_mapper.evaluation.legend import legend_rows
-from semantic_mapper.evaluation.plot import Bar, draw_bars
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.html_page import HtmlPage
+from semantic_mapper.nodes.cli.report import Section, picture, picture_files, point_view, table_of, write_page
 from semantic_mapper.nodes.viewer.server import WebViewer
 from semantic_mapper.nodes.viewer.sources import show_saved
+from semantic_mapper.plots import Bar, class_rows, draw_bars
 from semantic_mapper.replay.exporters.rerun_log import recording_server
 from semantic_mapper.scenes import TEST_SEEDS, room_frames
 from semantic_mapper.types import CameraIntrinsics
@@ -61,7 +60,7 @@ def look_at_viewer() -> list[str]:
     """Show the room, wait until it is all seen, and say what is not."""
     voxel_map = make_room()
     voxel_map.save(OUT / "map.npz")
-    rows = legend_rows(voxel_map.points().label, ROOMS)
+    rows = class_rows(voxel_map.points().label, ROOMS)
     picture, left = (
         np.zeros((HEIGHT, WIDTH, 3), np.uint8),
         what_is_missing(np.zeros((HEIGHT, WIDTH, 3), np.uint8), rows),
@@ -92,21 +91,34 @@ def make_room() -> VoxelMap:
 
 
 def look_at_report() -> list[str]:
-    """Open a page with pictures, and say which of them do not show."""
-    page = HtmlPage("Report of a test")
-    page.rows(("class", "share"), [("wall", "60 %"), ("<floor> & more", "40 %")])
-    page.picture(draw_bars("stages", [Bar("p50", {"render": 20.0, "fuse": 5.0})], "ms"), "stages", photo=False)
-    page.picture_file(OUT / "viewer.png", "the viewer")
-    page.write(OUT / "report.html")
+    """Open a page with the room, pictures and a table, and say what of it does not show, or does not answer."""
+    points = VoxelMap.load(OUT / "map.npz").points()
+    rows = [("wall", "60 %"), ("<floor> & more", "40 %")]
+    bars = picture(draw_bars("stages", [Bar("p50", {"render": 20.0, "fuse": 5.0})], "ms"), "stages")
+    pictures = [bars, *picture_files((OUT / "viewer.png", "the viewer"))]
+    sections = [
+        Section("The map", view=point_view(points, ROOMS, None)),
+        Section("Figures", pictures=pictures, tables=[table_of(("class", "fraction"), rows)]),
+    ]
+    write_page(OUT / "report.html", "Report of a test", sections)
+    largest = [row for row in class_rows(points.label, ROOMS) if row[0] != "ceiling"][:LARGEST]  # which is cut away
     with Browser(WIDTH, HEIGHT) as browser:
         browser.open((OUT / "report.html").as_uri())
         browser.wait(LOOK_S)
-        take(browser, OUT / "report.png")
+        seen = [pixels_of(take(browser, OUT / "report.png"), color) for _, color, _ in largest]
+        browser.evaluate("document.getElementById('none').click()")
+        browser.wait(LOOK_S)
+        left = [pixels_of(take(browser, OUT / "report-none.png"), color) for _, color, _ in largest]
         shown = browser.evaluate("[...document.images].filter(i => i.complete && i.naturalWidth > 0).length")
         cells = browser.evaluate("[...document.querySelectorAll('td')].map(c => c.textContent).join('|')")
         asked = {urlsplit(url).scheme for url in browser.requests.values()}
+        messages = browser.messages
     failures = [] if shown == 2 else [f"{shown} of 2 pictures of the report show"]
     failures += [] if cells == "wall|60 %|<floor> & more|40 %" else [f"the report's table reads {cells}"]
+    failures += [f"the page says: {message}" for message in messages]
+    for (name, _, _), before, after in zip(largest, seen, left, strict=True):
+        if before < LEAST_MAP or after > 0.5 * before:
+            failures.append(f"{name} has {before} pixels in the report's map, and {after} when hidden")
     return failures + ([] if asked <= {"file", "data"} else [f"the report asks for {sorted(asked)}"])
 
 

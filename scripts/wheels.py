@@ -24,9 +24,12 @@ ELF_MACHINES = {62: "x86_64", 183: "aarch64"}  # e_machine in the header
 LIBRARIES = "semantic_mapper/kernels/lib/"
 # Runs one kernel of the installed package, and says where the package lies.
 SMOKE = """
+from pathlib import Path
 import numpy as np
 import semantic_mapper
 from semantic_mapper.mapping.storage.key_table import KeyTable
+from semantic_mapper.nodes.cli.report import Section, write_page
+write_page(Path("page.html"), "a page, whose template is in the wheel", [Section()])
 table = KeyTable()
 table.put(np.array([3, 5]), np.array([30, 50]))
 assert table.find(np.array([5, 4, 3])).tolist() == [50, -1, 30]
@@ -125,7 +128,7 @@ def try_installed(wheel: Path) -> list[str]:
             check=False,
         )
         if done.returncode:
-            return [f"a kernel does not run where it is installed:\n{done.stderr}"]
+            return [f"a kernel or a page fails where it is installed:\n{done.stderr}"]
         if not Path(done.stdout.strip()).is_relative_to(venv):
             return [f"the installed package was not tried, but {done.stdout.strip()}"]
     return []

@@ -2,134 +2,87 @@
 
 from __future__ import annotations
 
-import cv2
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from semantic_mapper.drivers.calibrating.config import CalibrationConfig
 from semantic_mapper.drivers.calibrating.coverage import CELLS
 from semantic_mapper.drivers.calibrating.intrinsics import CameraCalibration
-from semantic_mapper.evaluation.canvas import (
-    DIM_TEXT,
-    GAP,
-    MARGIN,
-    PANEL,
-    TEXT,
-    draw_text,
-    new_canvas,
-    text_width,
-)
-from semantic_mapper.types import Float64, UInt8
+from semantic_mapper.plots import BAD, DIM_TEXT, GOOD, PANEL, SMALL_PT, TITLE_PT, WARN, cut, new_figure, rendered
 
-_IMAGE_WIDTH, _SIDE_WIDTH = 900, 420
-_HEAD, _FOOT = 70, 40
-_SUBPIXEL = 4  # bits
-_LONGEST = 26  # pixels of the picture for the 95th percentile of the residuals
-_GOOD, _BAD, _WARN = (130, 214, 130), (236, 112, 112), (255, 164, 92)
-_GRID, _SEEN = (56, 61, 71), (36, 52, 58)
-_MOST_TILT_DEG = 60.0
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_LONGEST = 0.03  # of the image's width, for the 95th percentile of the residuals
+_MAX_TILT_DEG = 60
+_GOOD, _BAD, _WARN, _DIM, _PANEL = (tuple(v / 255 for v in c) for c in (GOOD, BAD, WARN, DIM_TEXT, PANEL))
 
 
-def draw_calibration(camera_id: str, found: CameraCalibration, config: CalibrationConfig) -> UInt8:
-    """(H, W, 3) RGB."""
-    intrinsics = found.intrinsics
-    scale = _IMAGE_WIDTH / intrinsics.width
-    height = max(560, round(intrinsics.height * scale))
-    picture = new_canvas(2 * MARGIN + _IMAGE_WIDTH + GAP + _SIDE_WIDTH, _HEAD + height + _FOOT)
-    title = f"{camera_id}: {len(found.views)} views, {found.rms_px:.3f} px RMS"
-    draw_text(picture, title, (MARGIN, 14), 20, TEXT)
-    names = [f"{n} {v:.2f}" for n, v in zip(("fx", "fy", "cx", "cy"), _pinhole(found), strict=True)]
-    told = [f"{text} +- {found.sigmas[text[:2]]:.2f}" if found.sigmas else text for text in names]
-    draw_text(picture, ",  ".join(told), (MARGIN, 44), 13, DIM_TEXT)
-    _draw_residuals(picture[_HEAD : _HEAD + height, MARGIN : MARGIN + _IMAGE_WIDTH], found, scale)
-    longest = _longest(found)
-    note = f"lines: seen minus predicted, {_LONGEST / longest / scale:.0f} times enlarged; dark cells: no corner"
-    draw_text(picture, note, (MARGIN, _HEAD + height + 12), 13, DIM_TEXT)
-    x = MARGIN + _IMAGE_WIDTH + GAP
-    half = (height - GAP) // 2
-    _draw_errors(picture[_HEAD : _HEAD + half, x : x + _SIDE_WIDTH], found, config)
-    _draw_tilts(picture[_HEAD + half + GAP : _HEAD + height, x : x + _SIDE_WIDTH], found, config)
-    return picture
+@rendered
+def draw_calibration(camera_id: str, found: CameraCalibration, config: CalibrationConfig) -> Figure:
+    """Residuals of all corners, the error of each view, and the tilts of the board."""
+    figure = new_figure(1400, 760, layout="constrained")
+    title = f"{cut(camera_id, 700, TITLE_PT)}: {len(found.views)} views, {found.rms_px:.3f} px RMS"
+    figure.suptitle(title, x=0.012, ha="left")
+    grid = figure.add_gridspec(2, 2, width_ratios=(2.3, 1))
+    _draw_residuals(figure.add_subplot(grid[:, 0]), found)
+    _draw_errors(figure.add_subplot(grid[0, 1]), found)
+    _draw_tilts(figure.add_subplot(grid[1, 1]), found, config)
+    return figure
 
 
-def _pinhole(found: CameraCalibration) -> tuple[float, float, float, float]:
-    i = found.intrinsics
-    return i.fx, i.fy, i.cx, i.cy
-
-
-def _longest(found: CameraCalibration) -> float:
-    lengths = np.linalg.norm(np.concatenate(found.residuals), axis=1)
-    return max(float(np.percentile(lengths, 95)), 1e-6)
-
-
-def _draw_residuals(panel: UInt8, found: CameraCalibration, scale: float) -> None:
+def _draw_residuals(axes: Axes, found: CameraCalibration) -> None:
     """The image with its cells, the corners, and their residuals enlarged."""
-    panel[:] = PANEL
-    image = panel[: round(found.intrinsics.height * scale)]
-    height, width = image.shape[:2]
+    i = found.intrinsics
+    values = {"fx": i.fx, "fy": i.fy, "cx": i.cx, "cy": i.cy}
+    sigmas = {name: f" ± {found.sigmas[name]:.2f}" if name in found.sigmas else "" for name in values}
+    axes.set_title(",  ".join(f"{name} {value:.2f}{sigmas[name]}" for name, value in values.items()))
+    right, bottom = i.width - 0.5, i.height - 0.5
+    edges = np.linspace(-0.5, right, CELLS + 1), np.linspace(-0.5, bottom, CELLS + 1)
+    seen = np.where(found.counts > 0, 0.12, 0.0)
+    axes.imshow(np.dstack([np.ones((CELLS, CELLS, 3)), seen]), extent=(-0.5, right, bottom, -0.5), aspect="equal")
+    label = {"color": _DIM, "zorder": 5, "bbox": {"facecolor": _PANEL, "linewidth": 0, "pad": 1}}
     for (row, column), count in np.ndenumerate(found.counts):
-        top, left = row * height // CELLS, column * width // CELLS
-        cell = image[top : (row + 1) * height // CELLS, left : (column + 1) * width // CELLS]
-        cell[:] = _SEEN if count else PANEL
-        cv2.rectangle(cell, (0, 0), (cell.shape[1] - 1, cell.shape[0] - 1), _GRID, 1)
-        draw_text(cell, str(count), (6, 4), 12, DIM_TEXT)
-    enlarge = _LONGEST / _longest(found)
-    for view, residual in zip(found.views, found.residuals, strict=True):
-        starts = (view.pixels + 0.5) * scale - 0.5
-        for start, off in zip(starts, residual, strict=True):
-            end = start + off * enlarge
-            length = float(np.linalg.norm(off))
-            color = _GOOD if length <= _longest(found) else _BAD
-            cv2.line(image, _fixed(start), _fixed(end), color, 1, cv2.LINE_AA, _SUBPIXEL)
-            cv2.circle(image, _fixed(start), 1 << _SUBPIXEL, TEXT, -1, cv2.LINE_AA, _SUBPIXEL)
+        place = edges[0][column], edges[1][row]
+        axes.annotate(str(count), place, (4, -4), textcoords="offset points", va="top", fontsize=SMALL_PT, **label)
+    pixels = np.concatenate([view.pixels for view in found.views])
+    residuals = np.concatenate(found.residuals)
+    lengths = np.linalg.norm(residuals, axis=1)
+    longest = max(float(np.percentile(lengths, 95)), 1e-6)
+    enlarged = _LONGEST * i.width / longest
+    colors = np.where((lengths <= longest)[:, None], _GOOD, _BAD)
+    style = {"angles": "xy", "scale_units": "xy", "width": 0.0015, "headwidth": 1, "headlength": 0, "headaxislength": 0}
+    axes.quiver(*pixels.T, *residuals.T, color=colors, scale=1 / enlarged, **style)
+    axes.plot(*pixels.T, ".", color="white", markersize=2.5)
+    axes.set(xticks=edges[0], yticks=edges[1], xlim=(-0.5, right), ylim=(bottom, -0.5))
+    axes.tick_params(length=0, labelbottom=False, labelleft=False)
+    axes.set_axisbelow(False)
+    axes.grid(color=_PANEL, linewidth=1.5)
+    note = f"lines: seen minus predicted, {enlarged:.0f} times enlarged, orange: the longest 5 %\n"
+    axes.set_xlabel(f"{note}numbers: corners in a cell; dark cells: none", loc="left")
 
 
-def _draw_errors(panel: UInt8, found: CameraCalibration, config: CalibrationConfig) -> None:
-    """A bar for each view."""
-    panel[:] = PANEL
-    draw_text(panel, "error of each view, px RMS", (12, 10), 14, TEXT)
-    errors = found.errors_px
-    top, bottom = 40, panel.shape[0] - 28
-    most = max(max(errors), 1e-6) * 1.1
-    wide = (panel.shape[1] - 70) / len(errors)
-    for number, error in enumerate(errors):
-        left, right = 50 + round(number * wide), 50 + round((number + 1) * wide) - 1
-        up = bottom - round((bottom - top) * error / most)
-        cv2.rectangle(panel, (left, up), (max(left, right - 1), bottom), _GOOD, -1)
-    for value in (max(errors), found.rms_px):
-        y = bottom - round((bottom - top) * value / most)
-        cv2.line(panel, (46, y), (panel.shape[1] - 14, y), _WARN if value == found.rms_px else _GRID, 1)
-        text = f"{value:.2f}"
-        draw_text(panel, text, (42 - text_width(text, 12), y - 8), 12, DIM_TEXT)
+def _draw_errors(axes: Axes, found: CameraCalibration) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     left_out = f", {len(found.left_out)} left out" if found.left_out else ""
-    draw_text(panel, f"{len(errors)} views{left_out}; orange: of all corners", (50, bottom + 8), 12, DIM_TEXT)
+    axes.set(title=f"error of each view{left_out}", xlabel="view", ylabel="px RMS")
+    axes.bar(range(1, len(found.errors_px) + 1), found.errors_px, color=_GOOD)
+    axes.axhline(found.rms_px, color=_WARN, label=f"all corners: {found.rms_px:.2f}")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_ylim(0, max(1.25 * max(found.errors_px), 1e-6))
+    axes.legend(loc="upper right")
 
 
-def _draw_tilts(panel: UInt8, found: CameraCalibration, config: CalibrationConfig) -> None:
+def _draw_tilts(axes: Axes, found: CameraCalibration, config: CalibrationConfig) -> None:
     """How the board leaned in each view, and how far it has to have leaned at least once."""
-    panel[:] = PANEL
-    draw_text(panel, "how the board leaned, degrees", (12, 10), 14, TEXT)
-    middle = np.array((panel.shape[1] / 2, (panel.shape[0] + 20) / 2))
-    per_degree = (min(panel.shape[1], panel.shape[0] - 60) / 2 - 6) / _MOST_TILT_DEG
-    for degrees in (20, 40, 60):
-        cv2.circle(
-            panel, _fixed(middle), round(degrees * per_degree * (1 << _SUBPIXEL)), _GRID, 1, cv2.LINE_AA, _SUBPIXEL
-        )
-        draw_text(
-            panel, str(degrees), (round(middle[0] + degrees * per_degree) - 18, round(middle[1]) + 3), 11, DIM_TEXT
-        )
-    needed = config.min_tilt_deg * per_degree
-    corner = np.array((needed, needed))
-    cv2.rectangle(panel, _whole(middle - corner), _whole(middle + corner), _WARN, 1)
-    for up, side in np.clip(found.tilts, -_MOST_TILT_DEG, _MOST_TILT_DEG):
-        at = middle + np.array((side, up)) * per_degree
-        cv2.circle(panel, _fixed(at), 3 << _SUBPIXEL, _GOOD, -1, cv2.LINE_AA, _SUBPIXEL)
-
-
-def _fixed(at: Float64) -> tuple[int, int]:
-    x, y = (at * (1 << _SUBPIXEL)).tolist()
-    return round(x), round(y)
-
-
-def _whole(at: Float64) -> tuple[int, int]:
-    x, y = at.tolist()
-    return round(x), round(y)
+    up, side = np.clip(found.tilts, -_MAX_TILT_DEG, _MAX_TILT_DEG).T
+    least, ticks = config.min_tilt_deg, range(-_MAX_TILT_DEG, _MAX_TILT_DEG + 1, 20)
+    square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * least
+    axes.plot(*square.T, "-", color=_WARN, linewidth=1, label=f"needed: beyond {least:g}° each way")
+    axes.plot(side, up, "o", color=_GOOD)
+    axes.set(title="how the board leaned", xlabel="to a side, degrees", ylabel="up or down, degrees")
+    axes.set(xlim=(-65, 65), ylim=(65, -65), xticks=ticks, yticks=ticks, aspect="equal")
+    axes.legend(loc="upper center", handlelength=1)

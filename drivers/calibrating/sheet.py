@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
+import io
 from typing import Any
 
 import cv2
@@ -17,7 +16,6 @@ from semantic_mapper.types import UInt8
 PIXELS_A_METRE = 11811  # 300 dots an inch, about
 MARGIN_M = 0.005  # white, all round; the words stand in the lower one
 LARGEST_PX = 30_000  # a side
-_PNG_HEAD = 8 + 25  # signature and header chunk, which the size in metres has to follow
 
 
 def draw_sheet(config: BoardPoses) -> tuple[UInt8, int]:
@@ -65,10 +63,9 @@ def sheet_png(config: BoardPoses) -> bytes:
     Raises:
         ConfigError: see ``draw_sheet``.
     """
+    from PIL import Image
+
     sheet, a_metre = draw_sheet(config)
-    done, data = cv2.imencode(".png", sheet)
-    if not done:
-        raise ConfigError("OpenCV cannot write PNG pictures here")
-    plain = data.tobytes()
-    body = b"pHYs" + struct.pack(">IIB", a_metre, a_metre, 1)
-    return plain[:_PNG_HEAD] + struct.pack(">I", 9) + body + struct.pack(">I", zlib.crc32(body)) + plain[_PNG_HEAD:]
+    data, dpi = io.BytesIO(), 0.0254 * a_metre
+    Image.fromarray(sheet).save(data, "PNG", dpi=(dpi, dpi))
+    return data.getvalue()

@@ -83,9 +83,9 @@ def comparison_table(comparison: Comparison) -> Table:
 
 
 def _compare(a: Path, b: Path, tolerances: Tolerances, exact: bool, picture: Path | None) -> tuple[Comparison, Path]:
-    from semantic_mapper.evaluation.sheet import write_picture
     from semantic_mapper.nodes.cli.outputs import prepare_file
     from semantic_mapper.nodes.cli.saved_maps import is_log
+    from semantic_mapper.plots import write_picture
     from semantic_mapper.replay.compare.picture import draw_comparison
     from semantic_mapper.replay.compare.runs import compare_runs
     from semantic_mapper.replay.run_folder import read_run

@@ -1,26 +1,194 @@
-"""The report of a replay or an evaluation as one page of HTML."""
+"""The reports of replays, evaluations and benchmarks, each as one page of HTML.
+
+Pictures, figures and the map's points are inside the page; it fetches nothing, and its policy forbids it to. What comes
+from files and sockets is text in it: escaped, with control characters as escapes.
+"""
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
+import numpy as np
 from rich.table import Table
 
-from semantic_mapper.evaluation.plot import Bar, draw_bars
-from semantic_mapper.evaluation.report import draw_strip
-from semantic_mapper.nodes.cli.html_page import HtmlPage
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.evaluation.overview import ELEVATION, LabelledPoints, draw_strip
+from semantic_mapper.evaluation.splat import open_side, point_spacing
+from semantic_mapper.evaluation.upright import ceiling_height, upright_rotation
+from semantic_mapper.files import write_bytes
+from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.cli.summary_table import notes, summary_table
-from semantic_mapper.replay.artifacts import MAX_LISTED, view_strips
+from semantic_mapper.plain_text import visible
+from semantic_mapper.plots import UNKNOWN, Bar, class_rows, draw_bars, png_bytes
+from semantic_mapper.replay.artifacts import MAX_LISTED, map_up, view_strips
 from semantic_mapper.replay.summary import dig
+from semantic_mapper.types import Float64, UInt8
 
 if TYPE_CHECKING:
     from semantic_mapper.replay.session import MapSession
 
 REPORT_NAME = "report.html"
 STRIPS = 4  # frames that are shown
+JPEG_QUALITY = 88
+MAX_VIEW_POINTS = 300_000  # 10 bytes each
+_TEMPLATES = Path(__file__).parent / "templates"
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture with its source, a ``data:`` URL."""
+
+    source: str
+    caption: str
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of a page; what it has stands in this order.
+
+    Args:
+        heading: None of its own where empty.
+        notes: Paragraphs that the reader must not miss.
+        view: What ``point_view`` returns; at most once a page.
+        pictures, tables: The tables are those that the console shows.
+        lines: Paragraphs.
+        folded: Texts that a click unfolds, by their heads.
+    """
+
+    heading: str = ""
+    notes: Sequence[str] = ()
+    view: Mapping[str, Any] | None = None
+    pictures: Sequence[Picture] = ()
+    tables: Sequence[Table] = ()
+    lines: Sequence[str] = ()
+    folded: Mapping[str, str] = field(default_factory=dict)
+
+
+def write_page(path: Path, title: str, sections: Sequence[Section]) -> None:
+    """Write a page, whole or not at all.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup, escape
+
+    pages = Environment(
+        loader=FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=lambda value: value if isinstance(value, Markup) else visible(str(value)),
+    )
+    pages.filters["lines"] = lambda text: Markup(escape(visible(text, keep="\n")))
+    script = (_TEMPLATES / "points.js").read_text(encoding="utf-8")
+    parts = [_plain(section) for section in sections]
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+    page = pages.get_template("report.html.jinja").render(
+        title=title, sections=parts, script=Markup(script), script_digest=digest
+    )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, page.encode())
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _plain(section: Section) -> dict[str, Any]:
+    """A section as the template takes it."""
+    tables = [
+        {
+            "title": str(table.title or ""),
+            "heads": [str(column.header) for column in table.columns],
+            "right": [column.justify == "right" for column in table.columns],
+            "rows": list(zip(*(column.cells for column in table.columns), strict=True)),
+            "sections": [number for number, row in enumerate(table.rows, 1) if row.end_section],
+        }
+        for table in section.tables
+    ]
+    return {**{name: getattr(section, name) for name in Section.__slots__}, "tables": tables}
+
+
+def picture(pixels: UInt8, caption: str, *, photo: bool = False) -> Picture:
+    """(H, W, 3) RGB; ``photo``: as JPEG, which is smaller where there are no sharp lines."""
+    kind, data = "png", b""
+    if photo:
+        options = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
+        kind, data = "jpeg", cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), options)[1].tobytes()
+    return Picture(f"data:image/{kind};base64,{_base64(data or png_bytes(pixels))}", caption)
+
+
+def picture_files(*files: tuple[Path, str]) -> Iterator[Picture]:
+    """Pictures that were written before, with their captions; those that are not there are left out."""
+    for path, caption in files:
+        data = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
+        if data is not None:
+            yield picture(np.asarray(cv2.cvtColor(data, cv2.COLOR_BGR2RGB), np.uint8), caption, photo=True)
+
+
+def point_view(points: LabelledPoints, label_set: LabelSet, up: Float64 | None) -> dict[str, Any]:
+    """The map for the page's 3D view: ``classes`` as a legend, and ``data`` for ``templates/points.js``.
+
+    The points are turned upright. Positions are uint16 fractions of their bounds, below a millimetre in a map of 60 m.
+
+    Args:
+        points: The map; at most ``MAX_VIEW_POINTS`` of them are shown, drawn at random. N > 0.
+        label_set: Names and colours of all labels.
+        up: (3,) rough up direction of the world frame; None = unknown.
+    """
+    count = min(len(points.xyz), MAX_VIEW_POINTS)
+    chosen = np.random.default_rng(0).permutation(len(points.xyz))[:count]
+    xyz = points.xyz[chosen].astype(np.float64) @ upright_rotation(points.xyz, up).T
+    low, extent = xyz.min(axis=0), np.maximum(np.ptp(xyz, axis=0), 1e-3)
+    middle = np.percentile(xyz, (1, 99), axis=0)  # few stray points are no part of the first look
+    table = np.full((256, 4), (*UNKNOWN, 255), np.uint8)
+    table[list(label_set.ids), :3] = label_set.colors
+    rows = class_rows(points.label, label_set)
+    ids = dict(zip(label_set.names, label_set.ids, strict=True))
+    classes = [
+        {
+            "id": label_set.ignore_id if color is UNKNOWN else ids[name],
+            "name": name,
+            "color": "rgb({},{},{})".format(*color),
+        }
+        | {"share": f"{100 * (fraction or 0):.1f} %"}
+        for name, color, fraction in rows
+    ]
+    data = {
+        "count": count,
+        "low": low.tolist(),
+        "extent": extent.tolist(),
+        "centre": middle.mean(axis=0).tolist(),
+        "size": max(float(np.linalg.norm(np.ptp(middle, axis=0))), 0.1),
+        "spacing": point_spacing(xyz),
+        "ceiling": ceiling_height(xyz),
+        "azimuth": open_side(xyz, ELEVATION),
+        "classes": _base64(table.tobytes()),
+        "xyz": _base64(np.round((xyz - low) / extent * 65535).astype("<u2").tobytes()),
+        "rgb": _base64(points.rgb[chosen].tobytes()),
+        "label": _base64(points.label[chosen].tobytes()),
+    }
+    return {"classes": classes, "data": data}
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")
+
+
+def table_of(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """A plain table."""
+    table = Table(*heads)
+    for row in rows:
+        table.add_row(*row)
+    return table
 
 
 def write_replay_report(session: MapSession, summary: Mapping[str, Any], out: Path) -> None:
@@ -29,25 +197,34 @@ def write_replay_report(session: MapSession, summary: Mapping[str, Any], out: Pa
     Raises:
         ConfigError: it cannot be written.
     """
-    page = HtmlPage(f"Replay of {summary['source'] or 'a session'}")
-    for note in notes(summary):
-        page.text(note, note=True)
-    page.picture_file(out / "overview.png", "Frames, what was rendered for them, and the map from above and aside")
-    page.heading("Figures")
-    page.table(summary_table({out.resolve().name: summary}))
-    strips = view_strips(session, STRIPS)
-    if strips:
-        page.heading("Frames")
-    for strip in strips:
-        caption = f"{strip.name}: camera, rendered semantics, truth where there is one, depth"
-        page.picture(draw_strip(strip, session.pipeline.label_set), caption, photo=True)
-    _add_stages(page, {"this replay": summary})
-    _add_classes(page, {"this replay": dig(summary, "metrics.per_class") or {}})
-    _add_counts(page, summary)
-    page.heading("Configuration")
-    page.folded("Settings that were in force", json.dumps(summary["config"], indent=1))
-    page.rows(("package", "version"), list(summary["versions"].items()))
-    page.write(out / REPORT_NAME)
+    label_set, points = session.pipeline.label_set, session.pipeline.voxel_map.points()
+    overview = out / "overview.png", "Frames, what was rendered for them, and the map from above and aside"
+    strips = [
+        picture(draw_strip(s, label_set), f"{s.name}: camera, and what was rendered for it", photo=True)
+        for s in view_strips(session, STRIPS)
+    ]
+    counts = [(name.replace("_", " "), str(count)) for name, count in summary["frames"].items()]
+    sections = [
+        Section(notes=notes(summary)),
+        *([Section("The map", view=point_view(points, label_set, map_up(session)))] if len(points.xyz) else []),
+        Section("Overview", pictures=list(picture_files(overview))),
+        Section("Figures", tables=[summary_table({out.resolve().name: summary})]),
+        *([Section("Frames", pictures=strips)] if strips else []),
+        *_stages({"this replay": summary}),
+        *_classes({"this replay": dig(summary, "metrics.per_class") or {}}),
+        Section(
+            "Frames that came, and what became of them",
+            notes=[f"Damaged: {stretch}" for stretch in summary["damaged_stretches"]],
+            tables=[table_of(("frames", ""), counts)],
+        ),
+        *_refused(summary["refusals"]),
+        Section(
+            "Configuration",
+            tables=[table_of(("package", "version"), list(summary["versions"].items()))],
+            folded={"Settings that were in force": json.dumps(summary["config"], indent=1)},
+        ),
+    ]
+    write_page(out / REPORT_NAME, f"Replay of {summary['source'] or 'a session'}", sections)
 
 
 def write_eval_report(
@@ -68,31 +245,29 @@ def write_eval_report(
     Raises:
         ConfigError: it cannot be written.
     """
-    page = HtmlPage(f"Evaluation of {', '.join([*summaries, *(Path(log).name for log in logs)])}")
+    sections: list[Section] = []
     if summaries:
-        page.table(summary_table(summaries))
-        _add_stages(page, summaries)
-        _add_classes(page, {name: dig(s, "metrics.per_class") or {} for name, s in summaries.items()})
+        scores = {name: dig(s, "metrics.per_class") or {} for name, s in summaries.items()}
+        sections += [Section(tables=[summary_table(summaries)]), *_stages(summaries), *_classes(scores)]
     for (name, summary), folder in zip(summaries.items(), folders, strict=True):
-        page.heading(name)
-        for note in notes(summary):
-            page.text(note, note=True)
-        page.picture_file(folder / "overview.png", f"{name}: frames and map")
-        page.folded("Settings that were in force", json.dumps(summary.get("config"), indent=1))
+        pictures = list(picture_files((folder / "overview.png", f"{name}: frames and map")))
+        settings = {"Settings that were in force": json.dumps(summary.get("config"), indent=1)}
+        sections.append(Section(name, notes(summary), pictures=pictures, folded=settings))
     for log, table in logs.items():
-        page.heading(Path(log).name)
-        page.table(table)
         methods = found["logs"][log]["methods"]
-        _add_classes(page, {name: m["per_class"] for name, m in methods.items()})
+        sections += [
+            Section(Path(log).name, tables=[table]),
+            *_classes({n: m["per_class"] for n, m in methods.items()}),
+        ]
     if found.get("surface"):
-        page.heading("Surface")
         rows = [
             (name, f"{f['median_m'] * 1000:.1f} mm", f"{f['complete'] * 100:.1f} %")
             for name, f in found["surface"].items()
         ]
-        page.rows(("map", "median distance from the mesh", "of the mesh within 5 cm"), rows)
-    page.folded("All figures", json.dumps(found, indent=1))
-    page.write(path)
+        heads = ("map", "median distance from the mesh", "of the mesh within 5 cm")
+        sections.append(Section("Surface", tables=[table_of(heads, rows)]))
+    sections.append(Section(folded={"All figures": json.dumps(found, indent=1)}))
+    write_page(path, f"Evaluation of {', '.join([*summaries, *(Path(log).name for log in logs)])}", sections)
 
 
 def write_suite_report(path: Path, table: Table, lines: Sequence[str], pictures: Sequence[Path], found: Any) -> None:
@@ -101,44 +276,40 @@ def write_suite_report(path: Path, table: Table, lines: Sequence[str], pictures:
     Raises:
         ConfigError: it cannot be written.
     """
-    page = HtmlPage(found["title"])
-    page.table(table)
-    for line in lines:
-        page.text(line)
-    for picture in pictures:
-        page.picture_file(picture, picture.name)
-    page.folded("All figures", json.dumps(found, indent=1))
-    page.write(path)
+    figures = Section(tables=[table], lines=lines)
+    drawn = Section(pictures=list(picture_files(*((path, path.name) for path in pictures))))
+    write_page(path, found["title"], [figures, drawn, Section(folded={"All figures": json.dumps(found, indent=1)})])
 
 
-def _add_stages(page: HtmlPage, summaries: Mapping[str, Mapping[str, Any]]) -> None:
+def _refused(refusals: Sequence[Mapping[str, Any]]) -> Iterator[Section]:
+    rows = [(str(r["seq"]), str(r["stamp_ns"]), r["reason"]) for r in refusals]
+    if rows:
+        yield Section(f"Refused, the first {MAX_LISTED}", tables=[table_of(("seq", "stamp, ns", "reason"), rows)])
+
+
+def _stages(summaries: Mapping[str, Mapping[str, Any]]) -> Iterator[Section]:
     """Median and 95th percentile of each stage of a step, as bars and in figures."""
     stages = {name: s.get("stages_ms") or {} for name, s in summaries.items()}
+    several = len(stages) > 1
     bars = [
-        Bar(f"{name} {share}" if len(stages) > 1 else share, parts)
+        Bar(f"{name} {share}" if several else share, parts)
         for name, times in stages.items()
         for share in ("p50", "p95")
         if (parts := {stage: t[share] for stage, t in times.items() if t[share]})
     ]
     if not bars:
         return
-    page.heading("Times of the stages of a step")
-    page.picture(
-        draw_bars("", bars, "ms; each stage by itself"), "Stages of a step, median and 95th percentile", photo=False
-    )
     rows = [
-        (
-            *([name] if len(stages) > 1 else []),
-            stage,
-            *("-" if t[share] is None else f"{t[share]:.2f}" for share in ("p50", "p95")),
-        )
+        (*[name] * several, stage, *("-" if t[share] is None else f"{t[share]:.2f}" for share in ("p50", "p95")))
         for name, times in stages.items()
         for stage, t in times.items()
     ]
-    page.rows((*([""] if len(stages) > 1 else []), "stage", "p50, ms", "p95, ms"), rows)
+    drawn = picture(draw_bars("", bars, "ms, each stage by itself"), "Stages of a step, median and 95th percentile")
+    table = table_of((*[""] * several, "stage", "p50, ms", "p95, ms"), rows)
+    yield Section("Times of the stages of a step", pictures=[drawn], tables=[table])
 
 
-def _add_classes(page: HtmlPage, methods: Mapping[str, Mapping[str, float | None]]) -> None:
+def _classes(methods: Mapping[str, Mapping[str, float | None]]) -> Iterator[Section]:
     """IoU of each class, a bar for each method."""
     bars = [
         Bar(f"{name}: {method}" if len(methods) > 1 else name, {method: 100 * value})
@@ -147,18 +318,4 @@ def _add_classes(page: HtmlPage, methods: Mapping[str, Mapping[str, float | None
         if (value := scores.get(name)) is not None
     ]
     if bars:
-        page.heading("Classes")
-        page.picture(draw_bars("", bars, "IoU, %"), "IoU of each class", photo=False)
-
-
-def _add_counts(page: HtmlPage, summary: Mapping[str, Any]) -> None:
-    page.heading("Frames that came, and what became of them")
-    page.rows(("frames", ""), [(name.replace("_", " "), str(count)) for name, count in summary["frames"].items()])
-    if summary["refusals"]:
-        page.text(f"Refused, the first {MAX_LISTED} of them:")
-        page.rows(
-            ("seq", "stamp, ns", "reason"),
-            [(str(r["seq"]), str(r["stamp_ns"]), r["reason"]) for r in summary["refusals"]],
-        )
-    for stretch in summary["damaged_stretches"]:
-        page.text(f"Damaged: {stretch}", note=True)
+        yield Section("Classes", pictures=[picture(draw_bars("", bars, "IoU, %"), "IoU of each class")])

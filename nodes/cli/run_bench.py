@@ -14,16 +14,15 @@ from semantic_mapper.config import MapperConfig
 from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
 from semantic_mapper.nodes.cli.bench_queries import bench_queries
 from semantic_mapper.nodes.cli.console import Output, frame_progress
+from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.bench.depthless import bench_depthless
 from semantic_mapper.replay.bench.evidence import bench_evidence
 from semantic_mapper.replay.bench.fusion import bench_fusion, bench_pipeline, bench_qualities
 from semantic_mapper.replay.bench.growth import AXES, bench_growth
-from semantic_mapper.replay.bench.growth_plot import write_growth_plot
-from semantic_mapper.replay.bench.pipeline_plot import write_pipeline_plot
+from semantic_mapper.replay.bench.plots import draw_growth, draw_pipeline, draw_walk
 from semantic_mapper.replay.bench.render import bench_render, log_scenes, room_scenes
 from semantic_mapper.replay.bench.virtual import bench_virtual
 from semantic_mapper.replay.bench.walk import SLOPE_MINUTES, WalkPlan, bench_walk
-from semantic_mapper.replay.bench.walk_plot import write_walk_plot
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +104,7 @@ def run_pipeline(request: BenchRequest, output: Output) -> dict[str, Any]:
     )
     if request.plot is not None:
         qualities = bench_qualities(request.weights, request.config, request.frames, found)
-        write_pipeline_plot(qualities, request.plot)
+        write_picture(request.plot, draw_pipeline(qualities))
         found = {**found, "qualities": qualities}
     return found
 
@@ -120,7 +119,7 @@ def run_map(request: BenchRequest, output: Output) -> dict[str, Any]:
         bar.start(request.plan.frames)
         found = bench_walk(request.weights, config, request.plan, bar.set)
     if request.plot is not None:
-        write_walk_plot(found, request.plot)
+        write_picture(request.plot, draw_walk(found))
     output.print(
         f"{found['rooms']} rooms, {found['minutes']:g} minutes at {found['hz']:g} Hz: a step {found['step_p50_ms']} ms "
         f"(p50), {found['step_p95_ms']} ms (p95), {found['cpu_p50_ms']} ms of processor time; {_slopes(found)}"
@@ -156,7 +155,8 @@ def run_growth(request: BenchRequest, output: Output) -> list[dict[str, Any]]:
         found = bench_growth(request.weights, request.config, request.frames, request.plan.width, bar.set)
     if request.plot is not None:
         size = f"{request.plan.width}x{request.plan.width * 3 // 4}"
-        write_growth_plot(found, request.plot, f"a step at {size} as one setting grows, the others as they are")
+        title = f"a step at {size} as one setting grows, the others as they are"
+        write_picture(request.plot, draw_growth(found, title))
     table = Table(title=f"ms of a step as one setting grows, width {request.plan.width}")
     for column in found[0]:
         table.add_column(column.removesuffix("_ms"), justify="left" if column == "axis" else "right")

@@ -11,15 +11,14 @@ from typing import Any
 from semantic_mapper import __version__
 from semantic_mapper.benchmark.config import SuiteConfig, settings_digest, suite_seeds
 from semantic_mapper.benchmark.contestants import load_contestants
-from semantic_mapper.benchmark.figures import compare, map_figures, view_figures
-from semantic_mapper.benchmark.fit_plot import draw_fit_curves
+from semantic_mapper.benchmark.figures import compare, draw_fit_curves, map_figures, view_figures
 from semantic_mapper.benchmark.protocols import Contestant
 from semantic_mapper.benchmark.records import MapRecord
 from semantic_mapper.benchmark.run import Progress, room_records, run_suite, sheet_rows
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.evaluation.sheet import draw_sheet, write_picture
+from semantic_mapper.evaluation.sheet import draw_sheet
 from semantic_mapper.fields.checkpoint import default_checkpoint_path
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.memory import keep_freed_memory
@@ -28,6 +27,7 @@ from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.cli.report import write_suite_report
 from semantic_mapper.nodes.cli.suite_table import difference_lines, suite_table
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.plots import cannot_draw, write_picture
 from semantic_mapper.replay.artifacts import write_json
 
 PACKAGES = ("torch", "numpy")
@@ -78,7 +78,9 @@ def run_suite_verb(
         for line in lines:
             output.print(line)
         output.print(f"written to {out}")
-        pictures = list(_draw(suite, contestants, store, found, out))
+        if reason := cannot_draw():
+            output.print(f"no pictures: {reason}")
+        pictures = [] if reason else list(_draw(suite, contestants, store, found, out))
         for picture in pictures:
             output.print(f"picture: {picture}")
         write_suite_report(page := out.with_suffix(".html"), table, lines, pictures, found)

@@ -2,81 +2,78 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.evaluation.canvas import (
-    DIM_TEXT,
-    GAP,
-    MARGIN,
-    PANEL,
-    TEXT,
-    draw_text,
-    new_canvas,
-    paste,
-    shorten,
-    text_width,
-)
-from semantic_mapper.evaluation.report import class_colors
 from semantic_mapper.evaluation.splat import draw_points, from_above
 from semantic_mapper.evaluation.upright import ceiling_height, upright_rotation
 from semantic_mapper.mapping.files.up_axis import find_up
+from semantic_mapper.plots import (
+    DIM_TEXT,
+    PANEL,
+    SMALL_PT,
+    TEXT,
+    TITLE_PT,
+    class_colors,
+    cut,
+    new_figure,
+    place,
+    put_picture,
+    put_text,
+    rendered,
+    text_width,
+)
 from semantic_mapper.replay.compare.runs import Comparison
 from semantic_mapper.replay.compare.surface_match import SurfaceMatch
 from semantic_mapper.replay.run_folder import Run
 from semantic_mapper.types import Float32, Float64, UInt8
 
-WIDTH = 1600
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+WIDTH, MARGIN, GAP = 1600, 24, 14
 COLUMN = (WIDTH - 2 * MARGIN - 2 * GAP) // 3
 PANEL_HEIGHT = 420
-HEADER = 74
-CAPTION = 26
-LINE = 18  # of the table
-HEAD_TEXT, ROW_TEXT = 14, 13
-COLUMN_GAP = 12
-ONLY_A = (240, 96, 72)
-ONLY_B = (72, 150, 240)
-MOVED = (246, 204, 70)
-RELABELLED = (236, 84, 204)
+HEADER, CAPTION = 74, 26
+LINE = 20  # of the table
+ONLY_A, ONLY_B = (240, 96, 72), (72, 150, 240)
+MOVED, RELABELLED = (246, 204, 70), (236, 84, 204)
 WITHIN = (110, 200, 120)
 
 
-def draw_comparison(comparison: Comparison) -> UInt8:
+@rendered
+def draw_comparison(comparison: Comparison) -> Figure:
     """Draw two rows of three: classes of A, of B, where they differ; surface, blocks, and the table of fields.
 
     Plans look from above through the whole height of the maps up to the ceiling: what differs under a table is seen.
-
-    Returns:
-        (H, 1600, 3) uint8 RGB.
     """
     plan = _make_plan(comparison)
-    table_height = (len(comparison.fields) + 1) * LINE + len(comparison.label_changes) * LINE + 2 * LINE
-    lower = max(PANEL_HEIGHT, table_height)
-    canvas = new_canvas(WIDTH, HEADER + 2 * CAPTION + PANEL_HEIGHT + GAP + lower + MARGIN)
-    wide = WIDTH - 2 * MARGIN
-    draw_text(canvas, shorten(f"A: {comparison.a.name}", wide, 20), (MARGIN, 14), 20, ONLY_A)
-    draw_text(canvas, shorten(f"B: {comparison.b.name}", wide, 20), (MARGIN, 42), 20, ONLY_B)
+    table_height = (len(comparison.fields) + len(comparison.label_changes) + 4) * LINE
+    top = HEADER + CAPTION + PANEL_HEIGHT + GAP + CAPTION
+    figure = new_figure(WIDTH, top + max(PANEL_HEIGHT, table_height) + MARGIN)
+    head = place(figure, (MARGIN, 0, WIDTH - 2 * MARGIN, HEADER))
+    for y, name, run, color in ((24, "A", comparison.a, ONLY_A), (52, "B", comparison.b, ONLY_B)):
+        text = cut(f"{name}: {run.name}", WIDTH - 2 * MARGIN, TITLE_PT, "bold")
+        put_text(head, (0, y), text, color=color, fontsize=TITLE_PT, weight="bold")
     mine, theirs = comparison.surfaces
+    blocks = "blocks: red A alone, blue B alone" if comparison.blocks else "blocks: of other sizes"
     panels = [
         ("classes of A", _classes(mine, plan)),
         ("classes of B", _classes(theirs, plan)),
         ("common surface with another class: pink", _labels_plan(comparison, plan)),
         ("surface: red A alone, blue B alone, yellow moved", _surface_plan(comparison, plan)),
-        ("blocks: red A alone, blue B alone", _blocks_plan(comparison, plan)),
+        (blocks, _blocks_plan(comparison, plan)),
     ]
     for number, (caption, picture) in enumerate(panels):
-        x = MARGIN + number % 3 * (COLUMN + GAP)
-        y = HEADER + number // 3 * (CAPTION + PANEL_HEIGHT + GAP)
-        draw_text(canvas, shorten(caption, COLUMN, 15), (x, y + 4), 15, DIM_TEXT)
-        paste(canvas, picture, (x, y + CAPTION))
-    _draw_table(canvas, comparison, MARGIN + 2 * (COLUMN + GAP), HEADER + CAPTION + PANEL_HEIGHT + GAP)
-    return canvas
+        x, y = MARGIN + number % 3 * (COLUMN + GAP), (HEADER + CAPTION, top)[number // 3]
+        put_picture(figure, (x, y, COLUMN, PANEL_HEIGHT), picture, caption)
+    _put_table(figure, comparison, (MARGIN + 2 * (COLUMN + GAP), top - CAPTION, COLUMN, table_height))
+    return figure
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,14 +163,10 @@ def _surface_plan(comparison: Comparison, plan: _Plan) -> UInt8:
 
 def _blocks_plan(comparison: Comparison, plan: _Plan) -> UInt8:
     image = _ground(comparison, plan)
-    blocks = comparison.blocks
-    if blocks is None:
-        picture = image.astype(np.uint8)
-        draw_text(picture, "voxels of other sizes", (16, 16), 16, TEXT)
-        return picture
-    for keys, color in ((blocks.only_a, ONLY_A), (blocks.only_b, ONLY_B)):
-        xyz = (keys + 0.5) * blocks.side_m
-        image = _blend(image, plan.raster(xyz, np.ones(len(xyz), np.float32), blocks.side_m), color)
+    if (blocks := comparison.blocks) is not None:
+        for keys, color in ((blocks.only_a, ONLY_A), (blocks.only_b, ONLY_B)):
+            xyz = (keys + 0.5) * blocks.side_m
+            image = _blend(image, plan.raster(xyz, np.ones(len(xyz), np.float32), blocks.side_m), color)
     return image.astype(np.uint8)
 
 
@@ -194,30 +187,23 @@ def _blend(image: Float32, strength: Float32, color: tuple[int, int, int]) -> Fl
     return (image * (1 - share) + np.array(color, np.float32) * share).astype(np.float32)
 
 
-def _draw_table(canvas: UInt8, comparison: Comparison, x: int, y: int) -> None:
+def _put_table(figure: Figure, comparison: Comparison, box: tuple[int, int, int, int]) -> None:
+    """The fields, their values right-aligned, and below them which classes have become which."""
+    axes = place(figure, box)
+    rows = [(("", "A", "B", "difference", "allowed"), DIM_TEXT)]
+    rows += [((f.title, *f.texts()), TEXT if f.within else ONLY_A) for f in comparison.fields]
+    widths = [max(text_width(row[i], SMALL_PT) for row, _ in rows) + 14 for i in range(1, 5)]
+    ends = [COLUMN - sum(widths[i:]) for i in range(1, 5)]
     verdict, color = ("equal", WITHIN) if comparison.equal else ("differs", ONLY_A)
-    head = (verdict, "A", "B", "difference", "allowed")
-    rows = [(field.title, *field.texts()) for field in comparison.fields]
-    starts = table_columns([head, *rows])
-    for text, start in zip(head, starts, strict=True):
-        draw_text(canvas, text, (x + start, y + 4), HEAD_TEXT, color if text == verdict else DIM_TEXT)
-    y += CAPTION
-    for field, (title, *texts) in zip(comparison.fields, rows, strict=True):
-        shown = (shorten(title, starts[1] - COLUMN_GAP, ROW_TEXT), *texts)
-        for text, start in zip(shown, starts, strict=True):
-            draw_text(canvas, text, (x + start, y), ROW_TEXT, TEXT if field.within else ONLY_A)
-        y += LINE
-    if comparison.label_changes:
-        draw_text(canvas, "classes: A, B, points of A", (x, y + LINE // 2), 13, DIM_TEXT)
-        y += LINE + LINE // 2
-    for mine, theirs, count in comparison.label_changes:
-        for text, at in zip((mine, theirs, f"{count:,}"), (x, x + 150, x + 300), strict=True):
-            draw_text(canvas, shorten(text, 140, 13), (at, y), 13, TEXT)
-        y += LINE
-
-
-def table_columns(rows: Sequence[Sequence[str]]) -> list[int]:
-    """Where the columns of a table begin, pixels from its left: each as wide as its widest text, the first the rest."""
-    widths = [max(text_width(text, HEAD_TEXT) for text in column) for column in list(zip(*rows, strict=True))[1:]]
-    ends = accumulate(reversed(widths), lambda total, width: total + COLUMN_GAP + width)
-    return [0, *reversed([COLUMN - end for end in ends])]
+    put_text(axes, (0, 15), verdict, color=color, weight="bold")
+    for number, ((title, *texts), color) in enumerate(rows):
+        y = 15 + number * LINE
+        put_text(axes, (0, y), cut(title, ends[0] - widths[0], SMALL_PT), color=color, fontsize=SMALL_PT)
+        for end, text in zip(ends, texts, strict=True):
+            put_text(axes, (end, y), text, color=color, fontsize=SMALL_PT, ha="right")
+    changes = [("classes of A", "of B", "points")] if comparison.label_changes else []
+    changes += [(mine, theirs, f"{count:,}") for mine, theirs, count in comparison.label_changes]
+    for number, texts in enumerate(changes, len(rows) + 1):
+        color = TEXT if number > len(rows) + 1 else DIM_TEXT
+        for x, text in zip((0, 170, 340), texts, strict=True):
+            put_text(axes, (x, 15 + number * LINE), cut(text, 160, SMALL_PT), color=color, fontsize=SMALL_PT)

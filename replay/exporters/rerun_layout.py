@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from semantic_mapper.evaluation.canvas import DIM_TEXT, draw_text, new_canvas, paste
-from semantic_mapper.evaluation.legend import WIDEST, draw_legend, legend_rows
 from semantic_mapper.evaluation.splat import seen_from
 from semantic_mapper.evaluation.upright import upright_rotation
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.plots import DIM_TEXT, class_rows, new_figure, place, put_legend, put_picture, put_text, rendered
 from semantic_mapper.replay.exporters.rerun_sdk import rr, rrb
 from semantic_mapper.types import Float32, Float64, UInt8
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 COLOURINGS = ("class", "colour", "confidence", "age")
 AGED_S = 60.0  # what has not changed for so long has the last colour of the scale
@@ -25,7 +28,7 @@ DISTANCE = 0.8  # of the eye, times the map's diagonal
 AZIMUTHS_DEG = (35, 55, 125, 145, 215, 235, 305, 325)  # first looks are compared from these sides
 JUDGED_POINTS = 30_000  # of the map, for that
 LOW_PART = 0.6  # of its height: floor and furniture are in it
-_MARGIN, _CAPTION, _BAR = 12, 26, 16
+_MARGIN, _CAPTION, _BAR, _PITCH = 12, 26, 16, 27
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,23 +87,23 @@ def scale_colors(level: Float32, scale: int) -> UInt8:
     return table[:, 0, ::-1][steps]
 
 
-def draw_map_legend(labels: UInt8, label_set: LabelSet, *, aged: bool) -> UInt8:
+@rendered
+def draw_map_legend(labels: UInt8, label_set: LabelSet, *, aged: bool) -> Figure:
     """Picture of the classes of a map's points (N,) and of the scales of confidence and (``aged``) age."""
-    rows = legend_rows(labels, label_set)
+    rows = class_rows(labels, label_set)
     scales = [("confidence: 0 to 1", CONFIDENCE_SCALE)]
-    scales += [(f"age: {AGED_S:g} s and more, to 0 s", AGE_SCALE)] if aged else []
-    height = len(rows) * WIDEST
-    canvas = new_canvas(LEGEND_WIDTH, 2 * _MARGIN + _CAPTION + height + len(scales) * (_CAPTION + _BAR + _MARGIN))
-    wide = LEGEND_WIDTH - 2 * _MARGIN
-    draw_text(canvas, "class, share of the map", (_MARGIN, _MARGIN), 15, DIM_TEXT)
-    draw_legend(canvas, rows, (_MARGIN, _MARGIN + _CAPTION), (wide, height))
-    y = _MARGIN + _CAPTION + height + _MARGIN
+    scales += [(f"age: {AGED_S:g} s or more, to 0 s", AGE_SCALE)] if aged else []
+    width, height = LEGEND_WIDTH - 2 * _MARGIN, len(rows) * _PITCH
+    top = _MARGIN + _CAPTION
+    figure = new_figure(LEGEND_WIDTH, top + height + _MARGIN + len(scales) * (_CAPTION + _BAR + _MARGIN))
+    put_text(place(figure, (_MARGIN, _MARGIN, width, _CAPTION)), (0, 8), "class, fraction of the map", color=DIM_TEXT)
+    put_legend(figure, (_MARGIN, top, width, height), rows)
+    y = top + height + _MARGIN + _CAPTION
     for caption, scale in scales:
-        draw_text(canvas, caption, (_MARGIN, y), 15, DIM_TEXT)
-        bar = scale_colors(np.linspace(0, 1, wide, dtype=np.float32), scale)
-        paste(canvas, np.repeat(bar[None], _BAR, axis=0), (_MARGIN, y + _CAPTION))
+        bar = scale_colors(np.linspace(0, 1, width, dtype=np.float32), scale)
+        put_picture(figure, (_MARGIN, y, width, _BAR), bar[None], caption)
         y += _CAPTION + _BAR + _MARGIN
-    return canvas
+    return figure
 
 
 def camera_path(camera: str) -> str:

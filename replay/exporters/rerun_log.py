@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 
 from semantic_mapper.errors import LogError
-from semantic_mapper.evaluation.canvas import UNKNOWN
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.plots import UNKNOWN
 from semantic_mapper.replay.exporters.rerun_layout import (
     AGE_SCALE,
     AGED_S,

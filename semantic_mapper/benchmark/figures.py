@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -15,6 +15,8 @@ from semantic_mapper.evaluation.consistency import Agreement
 from semantic_mapper.evaluation.depth_error import DepthErrors
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration_of_bins
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.plots import Curve, Panel, draw_panels
+from semantic_mapper.types import UInt8
 
 
 def view_figures(records: Sequence[RoomRecord]) -> dict[str, Any]:
@@ -78,6 +80,27 @@ def compare(first: Sequence[RoomRecord], second: Sequence[RoomRecord], *, seed: 
         return None
     a, b = ([from_rows(r.confusion) for r in side] for side in zip(*both, strict=True))
     return asdict(paired_bootstrap(a, b, seed=seed))
+
+
+def draw_fit_curves(figures: Mapping[str, Mapping[str, Any]], title: str) -> UInt8 | None:
+    """mIoU against the seconds that fitting a room took, (H, W, 3) RGB; None where nothing was fitted.
+
+    Args:
+        figures: ``view_figures`` of each contestant, by name. Labels that depth alone carries over, the same for all of
+            them, are a line of their own.
+        title: Of the picture.
+    """
+    points = {
+        n: [(p["seconds"], 100 * p["miou"]) for p in f["curve"] if p["miou"] is not None] for n, f in figures.items()
+    }
+    curves = [Curve(name, found, marked=True) for name, found in points.items() if len(found) > 1]
+    if not curves:
+        return None
+    carried = next((f["carried_miou"] for f in figures.values() if f["carried_miou"] is not None), None)
+    if carried is not None:
+        last = max(curve.points[-1][0] for curve in curves)
+        curves.append(Curve("labels carried by depth", [(0.0, 100 * carried), (last, 100 * carried)]))
+    return draw_panels(title, [Panel("", "mIoU, %", "seconds of fitting a room", curves)], size=(1000, 520))
 
 
 def _summed(confusions: Sequence[ConfusionMatrix]) -> ConfusionMatrix:

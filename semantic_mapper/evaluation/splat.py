@@ -48,7 +48,7 @@ def draw_points(
         centre, scale = camera[0], camera[1] * SUPERSAMPLING
     pixel = np.floor((xyz_view[:, :2] - centre) * scale + (width / 2, height / 2)).astype(np.int64)
     nearest, depth = _z_buffer(pixel, xyz_view[:, 2], width, height)
-    side = int(np.clip(np.ceil(_spacing(xyz_view) * scale * 1.1), 1, MAX_SPLAT))
+    side = int(np.clip(np.ceil(point_spacing(xyz_view) * scale * 1.1), 1, MAX_SPLAT))
     nearest, depth = _grow(nearest, depth, side)
     hit = nearest >= 0
     shade = _edge_shading(depth, hit, scale)
@@ -173,7 +173,7 @@ def _edge_shading(depth: Float32, hit: NDArray[np.bool_], scale: float) -> Float
     return np.exp(-EDGE_STRENGTH * total).astype(np.float32)
 
 
-def _spacing(xyz: Float64) -> float:
+def point_spacing(xyz: Float64) -> float:
     """Typical distance of a point to its fourth neighbour, metres: the pitch of a surface sampled on a grid."""
     if len(xyz) < 5:
         return 0.05

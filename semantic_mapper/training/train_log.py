@@ -6,13 +6,15 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false
 import json
 import os
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Self
 
 from semantic_mapper.files import open_unlinked, write_bytes
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.training.curves import write_curves
+from semantic_mapper.plots import Curve, Panel, cannot_draw, draw_panels, write_picture
+from semantic_mapper.types import UInt8
 
 HISTORY_FILE = "history.jsonl"
 CURVES_FILE = "curves.png"
@@ -50,6 +52,8 @@ class TrainLog(AbstractContextManager["TrainLog"]):
         self._folder = folder
         self._history = history
         self._events = None if folder is None else _open_events(folder / EVENTS_FOLDER, history)
+        if folder is not None and (reason := cannot_draw()):
+            _log.info("no_curves_picture", reason=reason, mend=f"install it; {HISTORY_FILE} has all figures")
         if folder is not None:  # a run that goes on may have written further than its state reaches
             folder.mkdir(parents=True, exist_ok=True)
             lines = "".join(json.dumps(line, allow_nan=False) + "\n" for line in history)
@@ -69,8 +73,8 @@ class TrainLog(AbstractContextManager["TrainLog"]):
 
     def draw(self) -> None:
         """Draw the curves anew."""
-        if self._folder is not None:
-            write_curves(self._history, self._folder / CURVES_FILE)
+        if self._folder is not None and not cannot_draw():
+            write_picture(self._folder / CURVES_FILE, draw_history(self._history))
 
     def __enter__(self) -> Self:
         return self
@@ -79,6 +83,24 @@ class TrainLog(AbstractContextManager["TrainLog"]):
         self.draw()
         if self._events is not None:
             self._events.close()
+
+
+def draw_history(history: Sequence[dict[str, Any]]) -> UInt8:
+    """Losses, validation mIoU and learning rate against steps, (H, W, 3) RGB."""
+    losses = [_curve(history, f"loss_{name}", name) for name in ("total", "semantic", "colour", "depth")]
+    scores = [_curve(history, "miou", "with depth", 100), _curve(history, "blind_miou", "without", 100)]
+    panels = (
+        ("loss", "loss", losses),
+        ("validation", "mIoU, %", scores),
+        ("learning rate", "learning rate", [_curve(history, "rate", "")]),
+    )
+    return draw_panels(
+        "", [Panel(title, unit, "step", [c for c in curves if c.points]) for title, unit, curves in panels]
+    )
+
+
+def _curve(history: Sequence[dict[str, Any]], key: str, name: str, scale: float = 1.0) -> Curve:
+    return Curve(name, [(line["step"], scale * line[key]) for line in history if key in line])
 
 
 def _open_events(folder: Path, history: list[dict[str, Any]]) -> Any:

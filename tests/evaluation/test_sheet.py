@@ -1,15 +1,11 @@
 from __future__ import annotations
 
-from pathlib import Path
-
-import cv2
 import numpy as np
-import pytest
 
-from semantic_mapper.errors import SemanticMapperError
-from semantic_mapper.evaluation.canvas import UNKNOWN
-from semantic_mapper.evaluation.sheet import SheetRow, draw_sheet, write_picture
+from semantic_mapper.evaluation.sheet import SheetRow, draw_sheet
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.plots import UNKNOWN
+from tests.figures import figure_of, misplaced_texts
 
 WALL, BED = (ROOMS.ids[ROOMS.names.index(n)] for n in ("wall", "bed"))
 
@@ -40,11 +36,7 @@ def test_unknown_is_grey_and_in_the_legend() -> None:
     assert shows(sheet, UNKNOWN) * sheet[..., 0].size > 320 * 240
 
 
-def test_the_picture_is_written_or_says_why_not(tmp_path: Path) -> None:
-    sheet = draw_sheet([row()], [], ROOMS, title="sheet")
-    path = tmp_path / "new" / "sheet.png"
-    write_picture(path, sheet)
-    np.testing.assert_array_equal(cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB), sheet)
-    (tmp_path / "file").touch()
-    with pytest.raises(SemanticMapperError, match="cannot be written"):
-        write_picture(tmp_path / "file" / "sheet.png", sheet)
+def test_long_names_keep_to_their_columns() -> None:
+    name = "a name of weights that is much longer than its column is wide"
+    figure = figure_of(draw_sheet, [row(**{name: row().truth, "b": row().truth})], [name, "b"], ROOMS, title=name * 9)
+    assert not misplaced_texts(figure)

@@ -11,7 +11,7 @@ from rich.table import Table
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
-from semantic_mapper.nodes.cli.html_page import HtmlPage
+from semantic_mapper.nodes.cli.report import Section, table_of, write_page
 from semantic_mapper.nodes.options import NodeJob
 from semantic_mapper.nodes.supervisor.node_process import Child
 from semantic_mapper.plain_text import visible
@@ -107,11 +107,13 @@ def test_report_pages_hold_names_as_text(results: Path) -> None:
     page = (results / "report.html").read_text(encoding="utf-8")
     assert visible(page, keep="\n") == page
     assert r"log [/b]\x1b[2J" in page and "IoU [/b]" in page
-    made = HtmlPage("<b>\u202e")
-    made.rows(("<i>",), [("\x1b[2J",)])
-    made.write(results / "made.html")
+    hostile = "</script><b>\u202e"
+    view = {"classes": [{"id": 1, "name": hostile, "color": "red", "share": "1 %"}], "data": {"name": hostile}}
+    section = Section(hostile, [hostile], view, (), [table_of(("<i>",), [("\x1b[2J",)])], [hostile], {hostile: hostile})
+    write_page(results / "made.html", hostile, [section])
     text = (results / "made.html").read_text(encoding="utf-8")
-    assert "<b>" not in text and r"\x1b[2J" in text and r"\u202e" in text
+    assert visible(text, keep="\n") == text and text.count("</script>") == 2
+    assert "<b>" not in text and "<i>" not in text and r"\x1b[2J" in text and r"\u202e" in text
 
 
 def test_error_lines_show_names_as_they_are(tmp_path: Path) -> None:

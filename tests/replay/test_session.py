@@ -102,9 +102,12 @@ def test_summary_table_notes_and_picture_say_where_depth_comes_from(
     frames = tiny_frames()
     session = run(weights, [*frames[:measured], *(replace(f, depth_m=None) for f in frames[measured:])])
     drawn = []
-    monkeypatch.setattr(
-        artifacts, "write_overview", lambda _, strips, *__, subtitle, **___: drawn.append((strips, subtitle))
-    )
+
+    def draw(strips, *_, subtitle, **__):
+        drawn.append((strips, subtitle))
+        return np.zeros((8, 8, 3), np.uint8)
+
+    monkeypatch.setattr(artifacts, "draw_overview", draw)
     summary = session.finish(tmp_path / "out")
     assert summary["frames"]["without_depth"] == 6 - measured
     assert summary["depth"] == {

@@ -2,12 +2,11 @@ import importlib.util
 import json
 from pathlib import Path
 
-import cv2
 import pytest
 from structlog.testing import capture_logs
 
-from semantic_mapper.training.curves import write_curves
-from semantic_mapper.training.train_log import TrainLog
+from semantic_mapper.training import train_log
+from semantic_mapper.training.train_log import TrainLog, draw_history
 
 LINES = [
     {"step": 20, "seconds": 1.0, "loss_total": 2.0, "loss_semantic": 1.5, "rate": 1e-3, "rooms": 4, "waited_s": 0.1},
@@ -59,9 +58,16 @@ def test_with_tensorboard_its_event_files_hold_the_figures(tmp_path: Path):
     assert [round(e.value, 6) for e in events.Scalars("validation/mIoU without depth")] == [0.1]
 
 
-def test_a_picture_can_be_drawn_before_there_is_anything_to_draw(tmp_path: Path):
+def test_a_picture_can_be_drawn_before_there_is_anything_to_draw():
     for history in ([], LINES[:1], LINES):
-        write_curves(history, tmp_path / "curves.png")
-        picture = cv2.imread(str(tmp_path / "curves.png"))
-        assert picture is not None and picture.shape[1] > 1000 and picture.std() > 1
-    assert [p.name for p in tmp_path.iterdir()] == ["curves.png"]
+        picture = draw_history(history)
+        assert picture.shape[1] > 1000 and picture.std() > 1
+
+
+def test_without_matplotlib_one_line_of_the_log_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(train_log, "cannot_draw", lambda: "Matplotlib is not installed")
+    with capture_logs() as logs, TrainLog(tmp_path, []) as log:
+        log.add(LINES[0])
+        log.draw()
+    said = [line["event"] for line in logs if line["event"] != "no_tensorboard_files"]
+    assert said == ["no_curves_picture"] and not (tmp_path / "curves.png").exists()

@@ -16,6 +16,7 @@ from semantic_mapper.drivers.poses.board import BoardFinder
 from semantic_mapper.errors import CameraError
 from semantic_mapper.geometry import camera_matrix, project
 from semantic_mapper.types import CameraIntrinsics, Float64
+from tests.figures import figure_of, misplaced_texts
 
 from .boards import BOARD, LENS, corners_of, image, shown, views
 
@@ -68,6 +69,7 @@ def test_a_known_camera_is_found_from_pictures(gathered: ViewGatherer) -> None:
     picture = draw_calibration("cam", found, CONFIG)
     assert picture.dtype == np.uint8 and picture.shape[2] == 3
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50  # corners, lines and bars, not an empty panel
+    assert not misplaced_texts(figure_of(draw_calibration, "cam", found, CONFIG))
 
 
 def test_corners_are_found_where_the_lens_shows_them() -> None:

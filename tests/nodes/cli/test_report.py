@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 from pathlib import Path
 from xml.etree import ElementTree
@@ -15,8 +16,16 @@ from rich.table import Table
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.nodes.cli.html_page import HtmlPage
-from semantic_mapper.nodes.cli.report import write_eval_report, write_suite_report
+from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.cli.report import (
+    MAX_VIEW_POINTS,
+    Section,
+    point_view,
+    write_eval_report,
+    write_page,
+    write_suite_report,
+)
 from semantic_mapper.nodes.cli.scoring import score_table
 from semantic_mapper.nodes.mapper.finish import finish_session
 from semantic_mapper.replay.session import MapSession
@@ -28,8 +37,15 @@ def read_page(path: Path) -> ElementTree.Element:
     """The page, checked to be one that stands alone."""
     text = path.read_text(encoding="utf-8")
     doctype, _, rest = text.partition("\n")
-    assert doctype == "<!DOCTYPE html>" and "<script" not in text
+    assert doctype == "<!DOCTYPE html>"
     page = ElementTree.fromstring(rest)
+    (policy,) = [m.get("content") or "" for m in page.iter("meta") if m.get("http-equiv") == "Content-Security-Policy"]
+    assert policy.startswith("default-src 'none'; img-src data:; ")
+    scripts = [s.text or "" for s in page.iter("script") if s.get("type") is None]
+    for script in scripts:  # as a browser that reads HTML does, which knows no CDATA
+        whole = text.partition("<script>")[2].partition("</script>")[0]
+        digest = base64.b64encode(hashlib.sha256(whole.encode()).digest()).decode()
+        assert f"script-src 'sha256-{digest}'" in policy and script in whole.replace("<![CDATA[", "").replace("]]>", "")
     for element in page.iter():
         for name in ("src", "href", "srcset", "action", "data"):
             assert element.get(name, "data:").startswith("data:"), f"{element.tag} asks for {element.get(name)}"
@@ -87,6 +103,35 @@ def test_a_replay_leaves_a_report_with_its_figures_and_pictures(run: Path) -> No
     assert json.loads(page.findtext(".//details/pre") or "") == summary["config"]
 
 
+def test_the_map_is_on_the_page_in_3d_with_a_legend(run: Path) -> None:
+    page, summary = read_page(run / "report.html"), json.loads((run / "summary.json").read_text())
+    data = json.loads(page.findtext(".//script[@id='points']") or "")
+    points = VoxelMap.load(run / "map.npz").points()
+    assert data["count"] == len(points.xyz) == summary["map"]["surface_points"]
+    xyz, rgb = (np.frombuffer(base64.b64decode(data[name]), kind) for name, kind in (("xyz", "<u2"), ("rgb", "u1")))
+    placed = np.array(data["low"]) + np.array(data["extent"]) * xyz.reshape(-1, 3) / 65535
+    spread = [np.sort(np.linalg.norm(p - p.mean(axis=0), axis=1)) for p in (placed, points.xyz.astype(float))]
+    np.testing.assert_allclose(*spread, atol=2e-3), "turned upright, no more"
+    np.testing.assert_array_equal(np.sort(rgb), np.sort(points.rgb.ravel()))
+    boxes = [int(box.get("value") or 0) for box in page.iter("input") if box.get("type") == "checkbox"]
+    label = np.frombuffer(base64.b64decode(data["label"]), np.uint8)
+    assert sorted(boxes) == np.unique(label).tolist() == np.unique(points.label).tolist()
+    assert "viewport" in {meta.get("name") for meta in page.iter("meta")}
+
+
+def test_a_large_map_is_thinned_out_evenly() -> None:
+    side = np.linspace(0, 10, 800)
+    floor = np.stack(np.meshgrid(side, side, [0.0]), axis=-1).reshape(-1, 3).astype(np.float32)
+    points = MapPoints(
+        floor, np.zeros((len(floor), 3), np.uint8), np.full(len(floor), 1, np.uint8), np.ones(len(floor))
+    )
+    data = point_view(points, ROOMS, np.array((0.0, 0.0, 1.0)))["data"]
+    xyz = np.frombuffer(base64.b64decode(data["xyz"]), "<u2").reshape(-1, 3)
+    assert len(xyz) == data["count"] == MAX_VIEW_POINTS < len(floor)
+    counts = np.histogram2d(*xyz[:, :2].T, bins=4)[0]
+    assert counts.min() > 0.95 * counts.max() and 0.0125 < data["spacing"] < 0.05
+
+
 def test_replays_and_logs_are_compared_on_a_page(run: Path, tmp_path: Path) -> None:
     summary = json.loads((run / "summary.json").read_text())
     scores = {"methods": {}, "scored": 2, "excluded": 1}
@@ -121,4 +166,4 @@ def test_a_benchmark_run_has_a_page_with_its_pictures(tmp_path: Path) -> None:
 def test_a_page_that_cannot_be_written_says_so_and_leaves_the_old_one(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"page\.html: cannot be written"):
-        HtmlPage("x").write(tmp_path / "file" / "page.html")
+        write_page(tmp_path / "file" / "page.html", "x", [Section()])

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
 import semantic_mapper.replay.bench.growth as bench_growth_module
+import semantic_mapper.replay.bench.plots as plots_module
 import semantic_mapper.replay.bench.walk as bench_walk_module
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.storage.block_grid import LEAST_RESIDENT
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.plots import Panel
 from semantic_mapper.replay.bench.growth import bench_growth
-from semantic_mapper.replay.bench.growth_plot import AXIS_TITLES, write_growth_plot
+from semantic_mapper.replay.bench.plots import GROWTH_LABELS, draw_growth, draw_walk
 from semantic_mapper.replay.bench.walk import WalkPlan, bench_walk, first_and_last, slope_percent
-from semantic_mapper.replay.bench.walk_plot import write_walk_plot
 from semantic_mapper.types import MapUpdate, PosedFrame
 from tests.nodes.support import write_weights
 from tests.small import tiny_config, tiny_field
@@ -37,7 +37,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_weights(tmp_path_factory.mktemp("walk") / "tiny.safetensors")
 
 
-def test_rooms_come_back_unchanged_and_memory_keeps_its_limit(weights: Path, tmp_path: Path) -> None:
+def test_rooms_come_back_unchanged_and_memory_keeps_its_limit(weights: Path) -> None:
     done: list[int] = []
     found = bench_walk(weights, CONFIG, PLAN, done.append)
     assert PLAN.frames == 30 and done == list(range(1, 31))
@@ -56,8 +56,7 @@ def test_rooms_come_back_unchanged_and_memory_keeps_its_limit(weights: Path, tmp
     assert all(found[name] is None for name in short), "too short a walk to tell"
     assert found["rss_max_mb"] >= found["rss_last_minute_mb"] > 50
     assert {len(values) for name, values in found.items() if name.startswith("minute_")} == {1}
-    write_walk_plot({**found, "minute_step_p50_ms": [1.0, 2.0, 3.0]}, tmp_path / "walk.png")
-    assert cv2.imread(str(tmp_path / "walk.png")).shape[1] > 1000
+    assert draw_walk({**found, "minute_step_p50_ms": [1.0, 2.0, 3.0]}).shape[1] > 1000
 
 
 def test_a_walk_with_less_memory_than_one_frame_takes_comes_to_its_end(weights: Path) -> None:
@@ -137,24 +136,27 @@ def test_growth_changes_one_setting_at_a_time(weights: Path, monkeypatch: pytest
     assert found["views", 2]["views"] == 2 and found["views", 6]["views"] > 4, "as many as are allowed, or nearly"
 
 
-def test_growth_is_drawn_with_a_panel_for_each_setting(tmp_path: Path) -> None:
-    """A step that doubles from the first value to the last rises as high, whatever order the runs come in."""
-    assert set(AXIS_TITLES) == set(bench_growth_module.AXES)
+def drawn_panels(monkeypatch: pytest.MonkeyPatch) -> list[Panel]:
+    """Filled with the panels that are drawn."""
+    panels: list[Panel] = []
+    monkeypatch.setattr(plots_module, "draw_panels", lambda title, drawn: panels.extend(drawn))
+    return panels
+
+
+def test_growth_is_drawn_with_a_panel_for_each_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs may come in any order; a setting without runs has an empty panel."""
+    assert set(GROWTH_LABELS) == set(bench_growth_module.AXES)
     times = {"cpu_ms": 3.0, "render_ms": 2.0, "fuse_ms": 1.0}
     runs = [
-        {"axis": axis, "value": value, "step_ms": 10.0 * value, **times} for axis in AXIS_TITLES for value in (2, 1)
+        {"axis": axis, "value": value, "step_ms": 10.0 * value, **times} for axis in GROWTH_LABELS for value in (2, 1)
     ]
-    drawn = []
-    for some in (runs, runs[::-1], runs[:-2]):
-        write_growth_plot(some, tmp_path / "growth.png", "growth")
-        drawn.append(cv2.imread(str(tmp_path / "growth.png"))[..., ::-1].astype(int))
-    assert (drawn[0] == drawn[1]).all()
-    changed = np.argwhere((drawn[0] != drawn[2]).any(axis=-1))
-    assert (changed.min(axis=0) > (350, 900)).all(), "only the panel of the last setting, at the lower right"
-    panel = drawn[0][134:384, 24:484]  # the first one, below its legend
-    cpu, step = (np.argwhere(np.abs(panel - c).sum(axis=-1) < 60) for c in ((94, 180, 255), (255, 164, 92)))
-    assert len(cpu) and np.ptp(cpu[:, 0]) < 12, "the same for all values"
-    assert step[step[:, 1].argmin(), 0] > step[step[:, 1].argmax(), 0] + 60
+    assert draw_growth(runs, "growth").shape[1] > 1000
+    panels = drawn_panels(monkeypatch)
+    draw_growth(runs[:-2], "growth")
+    assert [panel.x_label for panel in panels] == list(GROWTH_LABELS.values()) and not panels[-1].curves
+    for panel in panels[:-1]:
+        curves = {curve.name: list(curve.points) for curve in panel.curves}
+        assert curves["step"] == [(1, 10), (2, 20)] and curves["rendering"] == [(1, 2), (2, 2)]
 
 
 def test_slopes_are_in_percent_of_the_mean() -> None:
@@ -170,7 +172,7 @@ def test_the_first_ten_minutes_that_count_stand_beside_the_last_ten() -> None:
     assert first_and_last(minutes[:2400], times[:2400]) == (None, None), "they would overlap"
 
 
-def test_memory_is_told_where_it_has_settled_and_where_it_was_most(tmp_path: Path) -> None:
+def test_memory_is_told_where_it_has_settled_and_where_it_was_most(monkeypatch: pytest.MonkeyPatch) -> None:
     rss = [300.0, 310, 320, 330, 340, 400, 410, 450, 430]
     found = bench_walk_module._memory(rss, 100)
     levels = ("rss_minute_5_mb", "rss_max_after_minute_5_mb", "rss_max_mb")
@@ -181,12 +183,11 @@ def test_memory_is_told_where_it_has_settled_and_where_it_was_most(tmp_path: Pat
     figures |= {name: [0.0] * 9 for name in ("blocks_on_disk", "blocks_in_memory")}
     walk = {"rooms": 1, "minutes": 9.0, "hz": 1.0, "size": "96x72", "minute_rss_mb": rss, **found}
     walk |= {f"minute_{name}": values for name, values in figures.items()}
-    drawn = []
-    for most in (450.0, 420.0):
-        write_walk_plot({**walk, "rss_max_after_minute_5_mb": most}, tmp_path / "walk.png")
-        drawn.append(cv2.imread(str(tmp_path / "walk.png")).astype(int))
-    columns = np.nonzero((drawn[0] != drawn[1]).any(axis=-1))[1]
-    assert columns.min() > 500 and columns.max() < 980, "the level in the second panel"
+    panels = drawn_panels(monkeypatch)
+    draw_walk(walk)
+    levels = {curve.name: list(curve.points) for curve in panels[1].curves}
+    assert levels["minute 5"] == [(5, 400), (8, 400)] and levels["most after it"] == [(5, 450), (8, 450)]
+    assert levels["each minute"] == list(enumerate(rss))
 
 
 def test_more_returns_than_rooms_are_refused(weights: Path) -> None:

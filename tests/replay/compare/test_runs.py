@@ -11,24 +11,25 @@ import pytest
 
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, MapError
-from semantic_mapper.evaluation.canvas import GAP, MARGIN, PANEL, text_width
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.plots import PANEL
 from semantic_mapper.replay.compare.picture import (
     CAPTION,
     COLUMN,
+    GAP,
     HEADER,
+    MARGIN,
     ONLY_A,
     PANEL_HEIGHT,
     RELABELLED,
-    ROW_TEXT,
     draw_comparison,
-    table_columns,
 )
 from semantic_mapper.replay.compare.runs import Comparison, compare_runs
 from semantic_mapper.replay.compare.surface_match import match_surfaces
 from semantic_mapper.replay.compare.tolerances import FIELDS, Tolerances
 from semantic_mapper.replay.run_folder import Run, read_run
+from tests.figures import figure_of, misplaced_texts
 from tests.mapping.rendered_views import LABELS, small_map
 from tests.nodes.support import write_weights
 from tests.replay.runs import VOXEL_M, alone, replayed, wall
@@ -290,15 +291,11 @@ def test_both_maps_are_drawn_from_one_camera_at_one_scale() -> None:
     assert (part & whole).sum() > 0.97 * part.sum(), "what both have stands at one place of both panels"
 
 
-def test_the_columns_of_the_picture_do_not_overlap() -> None:
-    rows = [
-        ("differs", "A", "B", "difference", "allowed"),
-        ("accuracy_mm (95 % of the surface)", "1464.46 mm", "1.02 mm", "1463.44 mm", "1.00 mm"),
-        ("labels", "120,000", "1,234,567", "12.345 %", "1.0 %"),
-    ]
-    starts = table_columns(rows)
-    ends = [*starts[1:], COLUMN]
-    for row in rows:
-        for text, start, end in zip(row[1:], starts[1:], ends[1:], strict=True):
-            assert start + text_width(text, ROW_TEXT) <= end
-    assert starts[0] == 0 and starts[1] > 100, "there is room for the name of the field"
+def test_the_texts_of_the_picture_do_not_overlap(run: Run) -> None:
+    long = replace(run, name="a folder with a very long name " * 20)
+    for comparison in (
+        compare_maps(wall(1.0, other=1), wall(1.4, cut=40)),
+        compare_runs(run, alone(wall()), Tolerances(), exact=True),
+        compare_runs(long, run, Tolerances()),
+    ):
+        assert not misplaced_texts(figure_of(draw_comparison, comparison))

@@ -4,40 +4,41 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.errors import SemanticMapperError, ShapeError
-from semantic_mapper.evaluation.canvas import (
-    DIM_TEXT,
-    GAP,
-    MARGIN,
-    PANEL,
-    TEXT,
-    UNKNOWN,
-    draw_text,
-    new_canvas,
-    paste,
-    shorten,
-)
-from semantic_mapper.evaluation.legend import draw_legend, legend_rows
+from semantic_mapper.errors import ShapeError
 from semantic_mapper.evaluation.splat import draw_points, from_above, from_angle, hides_the_room, open_side
 from semantic_mapper.evaluation.upright import ceiling_height, upright_rotation
-from semantic_mapper.files import write_bytes
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.plots import (
+    DIM_TEXT,
+    PANEL,
+    class_colors,
+    class_rows,
+    new_figure,
+    place,
+    put_legend,
+    put_picture,
+    put_text,
+    put_title,
+    rendered,
+)
 from semantic_mapper.types import Float32, Float64, UInt8
 
-WIDTH = 1600
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WIDTH, MARGIN, GAP = 1600, 24, 14
+HEADER, CAPTION = 74, 26
 MAP_HEIGHT = 620
 LEGEND_WIDTH = 250
-HEADER = 74
-CAPTION = 26
 MAX_POINTS = 2_000_000
-ELEVATION = np.deg2rad(42)
+ELEVATION = float(np.deg2rad(42))
 
 
 class LabelledPoints(Protocol):
@@ -85,32 +86,7 @@ class ViewStrip:
     depth_rendered: bool = False
 
 
-def write_overview(
-    path: Path,
-    strips: Sequence[ViewStrip],
-    points: LabelledPoints,
-    label_set: LabelSet,
-    *,
-    title: str,
-    subtitle: str = "",
-    up: Float64 | None = None,
-) -> None:
-    """Write the picture of ``draw_overview`` as PNG.
-
-    Raises:
-        SemanticMapperError: the file cannot be written.
-        ShapeError: see ``draw_overview``.
-    """
-    picture = draw_overview(strips, points, label_set, title=title, subtitle=subtitle, up=up)
-    encoded, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-    if not encoded:
-        raise SemanticMapperError(f"{path}: the picture could not be encoded as PNG")
-    try:
-        write_bytes(path, data.tobytes())
-    except OSError as error:
-        raise SemanticMapperError(f"{path}: cannot be written: {error.strerror or error}") from error
-
-
+@rendered
 def draw_overview(
     strips: Sequence[ViewStrip],
     points: LabelledPoints,
@@ -119,8 +95,8 @@ def draw_overview(
     title: str,
     subtitle: str = "",
     up: Float64 | None = None,
-) -> UInt8:
-    """Draw a row of tiles for each strip, under them the map and the legend.
+) -> Figure:
+    """Draw a row of tiles for each strip, under them the map and the legend, 1600 pixels wide.
 
     Args:
         strips: Frames to show, best one to three.
@@ -130,33 +106,57 @@ def draw_overview(
         up: (3,) rough up direction of the world frame (``upright.camera_up`` of the poses gives one); ``None``
             estimates it from the points alone.
 
-    Returns:
-        (H, 1600, 3) uint8 RGB.
-
     Raises:
         ShapeError: the arrays of ``points`` do not fit together.
     """
     _check(points)
-    rows = [draw_strip(strip, label_set) for strip in strips]
-    height = HEADER + sum(len(row) + GAP for row in rows) + CAPTION + MAP_HEIGHT + MARGIN
-    canvas = new_canvas(WIDTH, height)
-    draw_text(canvas, shorten(title, WIDTH - 2 * MARGIN, 24), (MARGIN, 16), 24, TEXT)
-    draw_text(canvas, shorten(subtitle, WIDTH - 2 * MARGIN, 15), (MARGIN, 46), 15, DIM_TEXT)
+    top = HEADER + sum(_strip_height(strip) + GAP for strip in strips)
+    figure = new_figure(WIDTH, top + CAPTION + MAP_HEIGHT + MARGIN)
+    put_title(figure, title, subtitle)
     y = HEADER
-    for row in rows:
-        paste(canvas, row, (0, y))
-        y += len(row) + GAP
-    _draw_map(canvas, y, points, label_set, up)
-    shown = [strip.rendered for strip in strips] + [strip.truth for strip in strips if strip.truth is not None]
-    _draw_legend(canvas, y, points.label, shown, label_set)
-    return canvas
+    for strip in strips:
+        _put_strip(figure, y, strip, label_set)
+        y += _strip_height(strip) + GAP
+    _put_map(figure, top + CAPTION, points, label_set, up)
+    shown = [image for strip in strips for image in (strip.rendered, strip.truth) if image is not None]
+    legend = place(figure, (WIDTH - MARGIN - LEGEND_WIDTH, top + CAPTION, LEGEND_WIDTH, MAP_HEIGHT))
+    put_text(legend, (0, -11), "class, fraction of the map", color=DIM_TEXT)
+    put_text(legend, (0, MAP_HEIGHT - 10), "paler in the map = less sure", color=DIM_TEXT)
+    box = (WIDTH - MARGIN - LEGEND_WIDTH, top + CAPTION, LEGEND_WIDTH, MAP_HEIGHT - 30)
+    put_legend(figure, box, class_rows(points.label, label_set, shown))
+    return figure
 
 
-def class_colors(label: UInt8, label_set: LabelSet) -> UInt8:
-    """Colours (..., 3) of class ids (...), grey for the ignore id."""
-    colors = label_set.colorize(label)
-    colors[label == label_set.ignore_id] = UNKNOWN
-    return colors
+@rendered
+def draw_strip(strip: ViewStrip, label_set: LabelSet) -> Figure:
+    """One frame as a row of tiles with captions, 1600 pixels wide."""
+    figure = new_figure(WIDTH, _strip_height(strip))
+    _put_strip(figure, 0, strip, label_set)
+    return figure
+
+
+def _tile_size(strip: ViewStrip) -> tuple[int, int]:
+    tiles = 2 + (strip.truth is not None) + (strip.depth_m is not None)
+    columns = max(tiles, 3)  # two tiles side by side would tower over the map
+    width = (WIDTH - 2 * MARGIN - (columns - 1) * GAP) // columns
+    return width, round(width * strip.rgb.shape[0] / strip.rgb.shape[1])
+
+
+def _strip_height(strip: ViewStrip) -> int:
+    return CAPTION + _tile_size(strip)[1]
+
+
+def _put_strip(figure: Figure, y: int, strip: ViewStrip, label_set: LabelSet) -> None:
+    tiles = [(f"{strip.name}: camera", strip.rgb), ("rendered semantics", class_colors(strip.rendered, label_set))]
+    if strip.truth is not None:
+        tiles.append(("truth", class_colors(strip.truth, label_set)))
+    if strip.depth_m is not None:
+        caption, picture = _color_depth(strip.depth_m)
+        tiles.append((f"rendered {caption}" if strip.depth_rendered else caption, picture))
+    width, height = _tile_size(strip)
+    for column, (caption, picture) in enumerate(tiles):
+        box = (MARGIN + column * (width + GAP), y + CAPTION, width, height)
+        put_picture(figure, box, picture, caption, smooth=column == 0)
 
 
 def _check(points: LabelledPoints) -> None:
@@ -164,27 +164,6 @@ def _check(points: LabelledPoints) -> None:
     shapes = (points.xyz.shape, points.rgb.shape, points.label.shape, points.confidence.shape)
     if shapes != ((count, 3), (count, 3), (count,), (count,)):
         raise ShapeError(f"map points: expected xyz (N, 3), rgb (N, 3), label (N,), confidence (N,), got {shapes}")
-
-
-def draw_strip(strip: ViewStrip, label_set: LabelSet) -> UInt8:
-    """One frame as a row of tiles with captions, (h, 1600, 3)."""
-    tiles = [(f"{strip.name}: camera", strip.rgb, cv2.INTER_AREA)]
-    tiles.append(("rendered semantics", class_colors(strip.rendered, label_set), cv2.INTER_NEAREST))
-    if strip.truth is not None:
-        tiles.append(("truth", class_colors(strip.truth, label_set), cv2.INTER_NEAREST))
-    if strip.depth_m is not None:
-        caption, picture = _color_depth(strip.depth_m)
-        tiles.append((f"rendered {caption}" if strip.depth_rendered else caption, picture, cv2.INTER_NEAREST))
-    columns = max(len(tiles), 3)  # two tiles side by side would tower over the map
-    tile_width = (WIDTH - 2 * MARGIN - (columns - 1) * GAP) // columns
-    tile_height = round(tile_width * strip.rgb.shape[0] / strip.rgb.shape[1])
-    row = new_canvas(WIDTH, CAPTION + tile_height)
-    for column, (caption, picture, interpolation) in enumerate(tiles):
-        x = MARGIN + column * (tile_width + GAP)
-        draw_text(row, shorten(caption, tile_width, 15), (x, 4), 15, DIM_TEXT)
-        scaled = cv2.resize(picture, (tile_width, tile_height), interpolation=interpolation)
-        paste(row, np.asarray(scaled, np.uint8), (x, CAPTION))
-    return row
 
 
 def _color_depth(depth_m: Float32) -> tuple[str, UInt8]:
@@ -199,7 +178,7 @@ def _color_depth(depth_m: Float32) -> tuple[str, UInt8]:
     return f"depth: {near:.1f} m (red) to {far:.1f} m (blue)", picture
 
 
-def _draw_map(canvas: UInt8, y: int, points: LabelledPoints, label_set: LabelSet, up: Float64 | None) -> None:
+def _put_map(figure: Figure, y: int, points: LabelledPoints, label_set: LabelSet, up: Float64 | None) -> None:
     width = (WIDTH - 2 * MARGIN - 2 * GAP - LEGEND_WIDTH) // 2
     size = (width, MAP_HEIGHT)
     step = max(1, -(-len(points.xyz) // MAX_POINTS))
@@ -209,16 +188,12 @@ def _draw_map(canvas: UInt8, y: int, points: LabelledPoints, label_set: LabelSet
     upright, colors = upright[inside], colors[inside]
 
     above, scale = draw_points(from_above(upright), colors, size, PANEL)
-    _draw_scale_bar(above, scale)
     azimuth = open_side(upright, ELEVATION)
     seen = ~hides_the_room(upright, azimuth)
     angled, _ = draw_points(from_angle(upright[seen], azimuth, ELEVATION), colors[seen], size, PANEL)
     cut = "" if inside.all() else ", ceiling cut away"
-    x = MARGIN
-    for caption, picture in ((f"map from above{cut}", above), (f"map from an angle{cut}", angled)):
-        draw_text(canvas, caption, (x, y + 4), 15, DIM_TEXT)
-        paste(canvas, picture, (x, y + CAPTION))
-        x += width + GAP
+    _put_scale_bar(put_picture(figure, (MARGIN, y, *size), above, f"map from above{cut}"), scale)
+    put_picture(figure, (MARGIN + width + GAP, y, *size), angled, f"map from an angle{cut}")
 
 
 def _point_colors(points: LabelledPoints, label_set: LabelSet) -> UInt8:
@@ -242,25 +217,14 @@ def _without_ceiling(upright: Float64, label: UInt8, label_set: LabelSet) -> NDA
     return inside if inside.any() else ~inside
 
 
-def _draw_scale_bar(picture: UInt8, scale: float) -> None:
-    """A bar of 1 m (or of the power of ten that fits) in the lower left corner."""
+def _put_scale_bar(axes: Axes, scale: float) -> None:
+    """A bar of 1 m (or of the power of ten that fits) in the lower left corner; ``scale`` is in pixels a metre."""
     metres = 1.0
-    while metres * scale > picture.shape[1] / 3:
+    while metres * scale > axes.get_xlim()[1] / 3:
         metres /= 10
     while metres * scale < 24:
         metres *= 10
-    length, y = round(metres * scale), picture.shape[0] - 18
-    corner = picture[y - 28 : y + 11, 8 : max(length, 40) + 26]  # points may lie here
-    corner[:] = (corner * 0.25 + np.array(PANEL) * 0.75).astype(np.uint8)
-    cv2.rectangle(picture, (16, y), (16 + length, y + 3), TEXT, -1)
-    draw_text(picture, f"{metres:g} m", (16, y - 20), 14, TEXT)
-
-
-def _draw_legend(canvas: UInt8, y: int, map_label: UInt8, shown: list[UInt8], label_set: LabelSet) -> None:
-    """Classes of the map and of the pictures, with the share of the map's points."""
-    x = WIDTH - MARGIN - LEGEND_WIDTH
-    rows = legend_rows(map_label, label_set, tuple(shown))
-    draw_text(canvas, "class, share of the map", (x, y + 4), 15, DIM_TEXT)
-    top = y + CAPTION
-    draw_legend(canvas, rows, (x, top), (LEGEND_WIDTH, MAP_HEIGHT - 30))
-    draw_text(canvas, "paler in the map = less sure", (x, top + MAP_HEIGHT - 20), 13, DIM_TEXT)
+    y = MAP_HEIGHT - 18
+    axes.plot((16, 16 + metres * scale), (y, y), color="white", linewidth=3, solid_capstyle="butt")
+    behind = {"facecolor": "black", "alpha": 0.5, "linewidth": 0, "pad": 2}  # points may lie here
+    put_text(axes, (16, y - 15), f"{metres:g} m", bbox=behind)

@@ -1,18 +1,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
-from semantic_mapper.errors import SemanticMapperError, ShapeError
-from semantic_mapper.evaluation import canvas
-from semantic_mapper.evaluation.canvas import UNKNOWN, draw_text, new_canvas, shorten, text_width
-from semantic_mapper.evaluation.report import ViewStrip, class_colors, draw_overview, write_overview
+from semantic_mapper.errors import ShapeError
+from semantic_mapper.evaluation.overview import ViewStrip, draw_overview
 from semantic_mapper.labels import ROOMS
 from tests.evaluation.room_points import Points, class_id, room_points
+from tests.figures import figure_of, misplaced_texts
 
 UP = np.array([0.0, 0, 1])
 
@@ -36,15 +34,15 @@ def share_of(picture: np.ndarray, name: str) -> float:
     return float((np.abs(picture.astype(int) - color).max(axis=-1) < 12).mean())
 
 
-def test_the_picture_is_written_and_shows_every_part(tmp_path: Path) -> None:
-    path = tmp_path / "overview.png"
-    write_overview(path, [strip()], room_points(), ROOMS, title="room", subtitle="1 frame", up=UP)
-    picture = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
-    assert picture.shape[1] == 1600
-    np.testing.assert_array_equal(
-        picture, draw_overview([strip()], room_points(), ROOMS, title="room", subtitle="1 frame", up=UP)
-    )
+def test_the_picture_shows_every_part() -> None:
+    picture = draw_overview([strip()], room_points(), ROOMS, title="room", subtitle="1 frame", up=UP)
+    assert picture.shape[1] == 1600 and picture.dtype == np.uint8
     assert share_of(picture, "floor") > 0.02 and share_of(picture, "wall") > 0.02
+    figure = figure_of(draw_overview, [strip()], room_points(), ROOMS, title="room", subtitle="1 frame", up=UP)
+    assert not misplaced_texts(figure)
+    assert {"room", "1 frame", "frame 5: camera", "truth", "wall", "1 m"} <= {
+        t.get_text() for t in figure.findobj(Text)
+    }
 
 
 def test_the_view_from_above_looks_under_the_ceiling() -> None:
@@ -73,36 +71,7 @@ def test_rendered_labels_of_a_smaller_size_fill_their_tile() -> None:
     assert share_of(draw_overview([small], no_points(), ROOMS, title="room"), "bed") > 0.05
 
 
-def test_unknown_is_grey_in_pictures() -> None:
-    colors = class_colors(np.array([ROOMS.ignore_id, class_id("wall")], np.uint8), ROOMS)
-    np.testing.assert_array_equal(colors, [UNKNOWN, ROOMS.colors[0]])
-
-
 def test_arrays_of_the_map_that_do_not_fit_together_are_refused() -> None:
     points = room_points(0.2)
     with pytest.raises(ShapeError, match="map points"):
         draw_overview([], replace(points, label=points.label[1:]), ROOMS, title="room")
-
-
-def test_a_picture_that_cannot_be_written_is_an_error_with_its_path(tmp_path: Path) -> None:
-    with pytest.raises(SemanticMapperError, match=r"absent.*overview\.png"):
-        write_overview(tmp_path / "absent" / "overview.png", [], no_points(), ROOMS, title="room")
-
-
-def test_long_text_is_cut_to_its_width_and_stays_on_the_canvas() -> None:
-    cut = shorten("a very long name of a class", 80, 15)
-    assert cut.endswith("...") and text_width(cut, 15) <= 80
-    assert shorten("wall", 80, 15) == "wall"
-    canvas = new_canvas(40, 20)
-    draw_text(canvas, "wider than the canvas Küche", (30, 10), 15, (255, 255, 255))
-    draw_text(canvas, "", (0, 0), 15, (255, 255, 255))
-    assert canvas.shape == (20, 40, 3)
-
-
-def test_a_name_without_an_end_is_cut_in_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    measured: list[int] = []
-    width = canvas.text_width
-    monkeypatch.setattr(canvas, "text_width", lambda text, height: measured.append(len(text)) or width(text, height))
-    text = canvas.shorten("word " * 100_000, 600, 20)
-    assert text.endswith("...") and width(text, 20) <= 600 < width("word " * len(text), 20)
-    assert len(measured) <= 12 and max(measured) <= 603
