@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
+import structlog
 
 from semantic_mapper.config import Config, convert_config, load_config
 from semantic_mapper.errors import ConfigError
@@ -34,20 +35,22 @@ STATUS_SOCKET = "launch"  # where the launcher publishes how all nodes are
 MAX_NODES = 64  # each is a process
 MAX_SHOWN = 60  # letters of an argument in a message
 MAX_TEXT = 4096  # letters of a text, once values of [set] are filled in
+_log = structlog.get_logger(__name__)
+
 _PLACE = re.compile(r"\{(\w+)\}")
 
 
 class NodeEntry(Config, frozen=True):
-    """One process."""
+    """One process; ``process_table.py`` says how its kind is started and stopped."""
 
     name: str  # unique; also the name of its endpoint
-    kind: Literal["camera", "mapper", "recorder", "finetuner"]  # runs `python -I -m nodes.KIND`
+    kind: Literal["camera", "mapper", "recorder", "finetuner"]  # a row of the process table
     options: dict[str, Any] = msgspec.field(
         default_factory=dict
     )  # see nodes/options.py; "{NAME}" stands for a value of [set]
-    # "on-failure": a node that is killed, sent away (SIGTERM of anybody but its launcher), hangs or fails comes back,
-    # and the others go on meanwhile; save where it fails by itself before it was ever ready, which the next start would
-    # not mend. "never": the launch ends then. A node that is done, such as a log played to its end, stays away.
+    # "on-failure": a node that is killed, terminated (SIGTERM of anybody but its launcher), hangs or fails restarts,
+    # and the others go on meanwhile; except where it fails by itself before it was ever ready, which the next start
+    # would not mend. "never": the launch ends then. A node that is done, such as a log played to its end, stays away.
     restart: Literal["never", "on-failure"] = "never"
     backoff_s: Positive = 0.1  # pause before the first restart; twice as long with each further one in the window
     backoff_max_s: Positive = 10.0  # but no longer than this
@@ -55,9 +58,7 @@ class NodeEntry(Config, frozen=True):
     # restarted for as long as the launch runs: back-off leaves no room for so many.
     max_restarts: Count = 20
     window_s: Positive = 60.0
-    # Keep a second process that has loaded all packages and waits, to take over at once: it costs its memory (a
-    # mapper's is half a gigabyte, part of it shared with the first one), and a core for some seconds after each start.
-    standby: bool = False
+    standby: bool = False  # does nothing any more, and is accepted with a warning: restarts are quick without it
 
 
 class LaunchFile(Config, frozen=True):
@@ -133,6 +134,8 @@ def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = Non
         values[name] = value
     values["now"] = values["now"] or _name_start(values)
     values = {k: v.replace("{now}", str(values["now"])) if isinstance(v, str) else v for k, v in values.items()}
+    if old := [n.name for n in file.node if n.standby]:
+        _log.warning("setting_ignored", setting="standby", nodes=", ".join(old), reason="restarts are quick without it")
     names = [n.name for n in file.node]
     for name in names:
         if names.count(name) > 1 or not re.fullmatch(r"[A-Za-z0-9_.-]{1,48}", name):

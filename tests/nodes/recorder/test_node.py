@@ -32,7 +32,7 @@ from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.recorder.node import Recorder, run_recorder
-from semantic_mapper.nodes.supervisor.heartbeat import Heart
+from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.nodes.supervisor.launch_note import NOTE, LaunchNote, NodeNote, read_launch_note
 from semantic_mapper.nodes.supervisor.running_launches import launch_folder
 from semantic_mapper.replay.log.format import LogReader
@@ -87,7 +87,7 @@ def streaming(tmp_path: Path, sockets: Path, **options: Any) -> Iterator[Stream]
     endpoints = {name: f"ipc://{sockets}/{name}" for name in ("camera", "recorder")}
     settings = convert_config({"out": str(tmp_path / "a.mcap"), "sources": ["camera"], **options}, RecorderOptions, "t")
     stop = StopRequest()
-    context = NodeContext("recorder", endpoints, 0, stop, Heart(-1, 0), folder=sockets)
+    context = NodeContext("recorder", endpoints, 0, stop, HeartbeatWriter(-1, 0), folder=sockets)
     failures: list[BaseException] = []
 
     def work() -> None:
