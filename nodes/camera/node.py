@@ -80,7 +80,7 @@ def _play(context: NodeContext, options: CameraOptions, path: Path) -> None:
                     _log.info("played", published=0, stopped=True)
                     return
                 with frame_progress("played", total) as bar:
-                    playback = _Playback(context, options.rate)
+                    playback = Playback(context, options.rate)
 
                     def on_frame(envelope: Envelope, ack: object) -> None:
                         bar.advance()
@@ -98,7 +98,7 @@ def _play(context: NodeContext, options: CameraOptions, path: Path) -> None:
             drain(context, publisher)
 
 
-class _Playback:
+class Playback:
     """Where a restarted player goes on: where the recording is by now, as a camera would.
 
     Args:

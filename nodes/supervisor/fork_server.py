@@ -183,6 +183,7 @@ def _fork_again(channel: socket.socket) -> None:
         os._exit(0)
     while os.getppid() == middle:
         time.sleep(0.0005)
+    os.setpgid(0, 0)  # Ctrl-C in the terminal reaches the launcher only
     channel.send(str(os.getpid()).encode())
     channel.close()
 
@@ -191,7 +192,6 @@ def _run(module: str, job: int, heartbeat: int, output: int) -> None:
     """Be the node; does not return."""
     from semantic_mapper.nodes.node import read_job
 
-    os.setpgid(0, 0)  # Ctrl-C in the terminal reaches the launcher only
     os.dup2(output, 1)
     os.dup2(output, 2)
     os.close(output)

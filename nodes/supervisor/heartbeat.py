@@ -110,7 +110,6 @@ class HeartbeatMonitor:
 
     Attributes:
         frames: Published, where the node counts them.
-        ready_after_s: Seconds from the start until the node was ready; None before.
     """
 
     def __init__(self, fd: int) -> None:
@@ -120,7 +119,6 @@ class HeartbeatMonitor:
         self._last_turn: float | None = None
         self._last_frame: float | None = None
         self.frames = 0
-        self.ready_after_s: float | None = None
         os.set_blocking(fd, False)
 
     @property
@@ -170,5 +168,3 @@ class HeartbeatMonitor:
         phases = beats.replace(TURN, b"").replace(FRAME, b"")
         if phases:
             self._phase = phases[-1:]
-        if self.ready and self.ready_after_s is None:
-            self.ready_after_s = self.age_s

@@ -61,13 +61,9 @@ class NodeEntry(Config, frozen=True):
     standby: bool = False  # does nothing any more, and is accepted with a warning: restarts are quick without it
 
 
-class LaunchFile(Config, frozen=True):
-    """A launch file as it stands on disk."""
+class Limits(Config, frozen=True):
+    """What a launch file says of the launch as a whole."""
 
-    node: Annotated[tuple[NodeEntry, ...], msgspec.Meta(max_length=MAX_NODES)]
-    # Values that `--set NAME=VALUE` replaces; an empty one has to be given. "{now}" in one of them stands for the time
-    # of the start, such as 20261123T024700Z, with a number where that is there already.
-    set: dict[str, Value] = msgspec.field(default_factory=dict)
     # A node that gives no sign of life for so long, and neither has had nor wants processor time meanwhile, is killed.
     # One that starts or ends, or is busy, or waits for a processor or a disk, may be silent for half a minute.
     heartbeat_s: Annotated[float, msgspec.Meta(ge=0.5)] = 30.0
@@ -81,7 +77,16 @@ class LaunchFile(Config, frozen=True):
     keys: str = ""  # folder of keys (`semantic-mapper keys`) for it; empty = none
 
 
-class Launch(Config, frozen=True):
+class LaunchFile(Limits, frozen=True, kw_only=True):
+    """A launch file as it stands on disk."""
+
+    node: Annotated[tuple[NodeEntry, ...], msgspec.Meta(max_length=MAX_NODES)]
+    # Values that `--set NAME=VALUE` replaces; an empty one has to be given. "{now}" in one of them stands for the time
+    # of the start, such as 20261123T024700Z, with a number where that is there already.
+    set: dict[str, Value] = msgspec.field(default_factory=dict)
+
+
+class Launch(Limits, frozen=True, kw_only=True):
     """A launch file with every option checked, ready to start.
 
     ``options`` are by node name, in the order of the file.
@@ -90,13 +95,6 @@ class Launch(Config, frozen=True):
     name: str  # of the file
     nodes: tuple[NodeEntry, ...]
     options: dict[str, NodeOptions]
-    heartbeat_s: float
-    stall_s: float
-    start_s: float
-    stop_s: float
-    finish_s: float
-    publish: str = ""
-    keys: str = ""
 
     def inputs(self, name: str) -> tuple[str, ...]:
         """Names of the nodes that a node subscribes to."""
@@ -151,18 +149,9 @@ def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = Non
         raise ConfigError(f"{path}: no node of kind 'camera': nothing would ever happen")
     _check_restarts(file, options, path)
     _check_cameras(options, path)
-    launch = Launch(
-        name=path.name,
-        nodes=file.node,
-        options=options,
-        heartbeat_s=file.heartbeat_s,
-        stall_s=file.stall_s,
-        start_s=file.start_s,
-        stop_s=file.stop_s,
-        finish_s=file.finish_s,
-        publish=str(_fill_in(file.publish, values, f"{path}: publish")),
-        keys=str(_fill_in(file.keys, values, f"{path}: keys")),
-    )
+    limits = {name: getattr(file, name) for name in Limits.__struct_fields__}
+    limits |= {name: str(_fill_in(limits[name], values, f"{path}: {name}")) for name in ("publish", "keys")}
+    launch = Launch(name=path.name, nodes=file.node, options=options, **limits)
     sockets = launch.sockets()
     twice = sorted({name for name in sockets if sockets.count(name) > 1})
     if twice:

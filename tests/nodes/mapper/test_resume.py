@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from semantic_mapper.nodes.camera.resume_playback import Beginning
 
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.camera.node import Playback
 from semantic_mapper.nodes.mapper.node import run_mapper
 from semantic_mapper.nodes.mapper.resume import forbid, keep_earlier, take_up
 from semantic_mapper.nodes.node import NodeContext
@@ -181,8 +181,8 @@ def test_where_no_note_can_be_written_nodes_go_on(tmp_path: Path) -> None:
     gone = context(tmp_path / "notes", 0)
     (tmp_path / "notes").rmdir()
     assert not forbid(gone, "poses had been corrected")
-    began = Beginning(gone, 1.0)
-    began.note(5)
-    began.note(6)
+    began = Playback(gone, 1.0)
+    began.note_frame(5)
+    began.note_frame(6)
     assert 5 <= began.due_stamp_ns() < 5 + 60e9
     assert forbid(context(tmp_path / "notes", 0), "poses had been corrected")
