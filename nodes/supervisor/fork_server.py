@@ -1,5 +1,7 @@
 """A process that has imported PyTorch, Open3D and ZeroMQ, and forks nodes that need not import them again.
 
+Where there is a CUDA driver, nodes import Open3D themselves.
+
 A forked node becomes a child of the launcher (a "child subreaper"), so that the launcher can wait for it and the node
 outlives the fork server. The server starts no threads; those of OpenBLAS end before each fork.
 """
@@ -169,11 +171,21 @@ def _preload() -> None:
     try:
         for name in _PRELOAD:
             importlib.import_module(name)
-        load_open3d()
+        if not _has_cuda_driver():
+            load_open3d()
     except (ImportError, OSError, MemoryError, SemanticMapperError):
         pass
     gc.collect()
     gc.freeze()  # what is never collected stays shared with the nodes
+
+
+def _has_cuda_driver() -> bool:
+    """Whether Open3D would initialise CUDA when imported, which a forked process could not use any more."""
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    return True
 
 
 def _fork_again(channel: socket.socket) -> None:
