@@ -133,6 +133,7 @@ class ForkServer:
                 env=self._environment,
                 process_group=0,
             )
+        _log.info("fork_server_started", pid=self._process.pid)
         ours.settimeout(START_S)
         if ours.recv(64) != _READY:
             raise OSError(errno.ECONNRESET, "the fork server has ended")

@@ -30,8 +30,8 @@ class LaunchStatus:
     """Publishes a ``Status`` of each node, and one of the launch itself. A context manager.
 
     Counters and ages of a node's own status are passed on (a player of logs has none: its launcher counts ``published``
-    frames); added are ``pid``, ``restarts``, ``rss_kb``, ``cpu_ms``, ``fds`` and ``threads``, and the ages ``start`` (of the process), ``beat`` (sign of life), ``turn`` (of its main
-    loop) and ``status`` (of what it has said itself).
+    frames). Added are ``pid``, ``restarts``, ``rss_kb``, ``cpu_ms``, ``fds`` and ``threads``, and the ages ``start``
+    (of the process), ``beat`` (last heartbeat), ``turn`` (of its main loop) and ``status`` (of its own status).
 
     Args:
         endpoints: Of the nodes and, under ``STATUS_SOCKET``, of this topic.

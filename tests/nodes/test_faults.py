@@ -98,7 +98,7 @@ def test_every_node_that_is_killed_or_frozen_comes_back_and_the_others_go_on(
         assert eventually(lambda: running.text.count("map_saved") > saves), running.text  # it maps on
         running.process.send_signal(signal.SIGINT)
         assert running.wait() == 0, running.text
-        assert not any(map(is_alive, running.node_pids()))
+        assert not any(map(is_alive, running.all_pids()))
     with capsys.disabled():
         print("\nback after:", ", ".join(f"{case} {seconds:.2f} s" for case, seconds in took.items()))  # noqa: T201
     summary = json.loads((out / "summary.json").read_text())
@@ -148,7 +148,7 @@ def test_a_mapper_that_is_given_up_leaves_the_results_of_the_map_it_saved(
             running.wait_for_line("node_restarts .*node=mapper")
             running.process.send_signal(signal.SIGINT)
         assert running.wait() == 1, running.text
-        assert not any(map(is_alive, running.node_pids()))
+        assert not any(map(is_alive, running.all_pids()))
     assert (out / "summary.json").exists(), running.text
     assert reason in error_line(running.text)
     saved = VoxelMap.load(out / "map.npz")
@@ -169,7 +169,7 @@ def test_node_that_a_stranger_sends_away_comes_back(long_log: Path, tmp_path: Pa
         for process in (running.process.pid, pid):  # as a service manager may, and terminals
             os.kill(process, signum)
         assert running.wait() == 0, running.text
-        assert not any(map(is_alive, running.node_pids()))
+        assert not any(map(is_alive, running.all_pids()))
 
 
 def test_node_that_is_not_to_come_back_and_is_sent_away_ends_the_launch_with_the_reason(
@@ -214,7 +214,7 @@ def test_killed_launcher_leaves_no_process_even_where_one_is_frozen(long_log: Pa
         running.wait_for_line("all_ready")
         os.kill(wait_for_start(running, "eye", 0), signal.SIGSTOP)
         running.process.kill()
-        assert eventually(lambda: not any(map(is_alive, running.node_pids())))
+        assert eventually(lambda: not any(map(is_alive, running.all_pids())))
 
 
 HUNG = """
