@@ -13,7 +13,6 @@ import errno
 import gc
 import importlib
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -21,6 +20,7 @@ import time
 from collections.abc import Mapping
 
 import msgspec
+import psutil
 import structlog
 
 from semantic_mapper.errors import SemanticMapperError
@@ -30,47 +30,8 @@ ANSWER_S = 5.0
 _PRELOAD = ("zmq", "torch", "cv2", "scipy.spatial")
 _PR_SET_CHILD_SUBREAPER = 36
 _READY = b"ready"
-_POLL_S = 0.005
 
 _log = structlog.get_logger(__name__)
-
-
-class ForkedProcess:
-    """A forked node: what ``subprocess.Popen`` is for a started one."""
-
-    def __init__(self, pid: int) -> None:
-        self.pid = pid
-        self.returncode: int | None = None
-
-    def poll(self) -> int | None:
-        """Exit code; negative: the signal that ended it; None while it runs."""
-        if self.returncode is None:
-            ended, status = os.waitpid(self.pid, os.WNOHANG)
-            if ended:
-                self.returncode = os.waitstatus_to_exitcode(status)
-        return self.returncode
-
-    def wait(self, timeout: float) -> int:
-        """Exit code.
-
-        Raises:
-            subprocess.TimeoutExpired: it still runs.
-        """
-        deadline = time.monotonic() + timeout
-        while (code := self.poll()) is None:
-            if time.monotonic() > deadline:
-                raise subprocess.TimeoutExpired(f"process {self.pid}", timeout)
-            time.sleep(_POLL_S)
-        return code
-
-    def send_signal(self, signum: int) -> None:
-        """Nothing happens where it has ended."""
-        if self.poll() is None:
-            os.kill(self.pid, signum)
-
-    def kill(self) -> None:
-        """SIGKILL."""
-        self.send_signal(signal.SIGKILL)
 
 
 class ForkServer:
@@ -81,7 +42,7 @@ class ForkServer:
         self._process: subprocess.Popen[bytes] | None = None
         self._socket: socket.socket | None = None
 
-    def fork(self, module: str, job: int, heartbeat: int, output: int) -> ForkedProcess:
+    def fork(self, module: str, job: int, heartbeat: int, output: int) -> psutil.Process:
         """Start a node.
 
         Args:
@@ -102,7 +63,7 @@ class ForkServer:
         except OSError:
             self.close()
             raise
-        return ForkedProcess(int(answer))
+        return psutil.Process(int(answer))
 
     def close(self) -> None:
         """End the server; nodes that it has forked go on. Harmless when repeated."""

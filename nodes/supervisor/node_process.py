@@ -12,6 +12,7 @@ from collections import deque
 from contextlib import ExitStack
 
 import msgspec
+import psutil
 import structlog
 
 from semantic_mapper.nodes.options import NodeJob
@@ -79,7 +80,11 @@ class NodeProcess:
 
     def exit_code(self) -> int | None:
         """None while it runs; negative: the signal that ended it."""
-        return self._process.poll()
+        try:
+            code = self._process.wait(0)
+        except (subprocess.TimeoutExpired, psutil.TimeoutExpired):
+            return None
+        return None if code is None else int(code)
 
     def has_failed(self) -> bool:
         """Ended otherwise than well; our request may hit a process that is too young to handle it."""
@@ -97,17 +102,17 @@ class NodeProcess:
         """``STOP_SIGNAL``, once; no matter if it has ended already."""
         if not self.asked_to_stop:
             self.asked_to_stop = True
-            self._process.send_signal(STOP_SIGNAL)
+            self._signal(STOP_SIGNAL)
 
     def kill(self) -> None:
         """SIGKILL; no matter if it has ended already."""
-        self._process.kill()
+        self._signal(signal.SIGKILL)
 
     def wait(self, timeout_s: float) -> bool:
         """Whether it ends within the time."""
         try:
             self._process.wait(timeout_s)
-        except subprocess.TimeoutExpired:
+        except (subprocess.TimeoutExpired, psutil.TimeoutExpired):
             return False
         return True
 
@@ -120,7 +125,7 @@ class NodeProcess:
 
     def describe_exit(self) -> str:
         """Exit code or signal."""
-        code = self._process.returncode
+        code = self.exit_code()
         if code in TERMINATED:
             return f"sent away by {TERMINATED[code].name} from outside the launch"
         return f"exit code {code}" if code is None or code >= 0 else f"killed by {signal.Signals(-code).name}"
@@ -134,9 +139,12 @@ class NodeProcess:
         end = f"node '{self.name}' ({self.kind}) ended: {self.describe_exit()}"
         return end + (f"; its last words: {words}" if words else "")
 
-    def _end(self) -> None:
+    def _signal(self, signum: signal.Signals) -> None:
         if self.exit_code() is None:
-            self._process.kill()
+            self._process.send_signal(signum)
+
+    def _end(self) -> None:
+        self.kill()
         if not self.wait(KILL_S):  # in the kernel, for a device or a disk that does not answer
             _log.error("node_does_not_die", node=self.name, pid=self.pid)
 

@@ -150,7 +150,7 @@ def parent(process: Path) -> int:
 def test_a_process_that_does_not_die_holds_nobody_up(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process_module, "KILL_S", 0.1)
     child = NodeProcess("camera", NodeJob(name="eye", options={"log": str(log)}))
-    monkeypatch.setattr(child._process, "kill", lambda: None)  # as where the kernel waits for a device
+    monkeypatch.setattr(child._process, "send_signal", lambda signum: None)  # as where the kernel waits for a device
     closing = threading.Thread(target=child.close, daemon=True)
     closing.start()
     closing.join(20)
