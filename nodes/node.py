@@ -1,13 +1,11 @@
-"""The frame round every node: its one argument, signs of life to the launcher, the stop request, exit codes."""
+"""The frame round every node: its one argument, heartbeats to the launcher, the stop request, exit codes."""
 
 from __future__ import annotations
 
-import importlib
-import select
 import signal
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
@@ -17,9 +15,9 @@ import structlog
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.memory import is_out_of_memory, memory_message
-from semantic_mapper.nodes.options import Call, CameraOptions, NodeJob, NodeOptions
+from semantic_mapper.nodes.options import CameraOptions, NodeJob, NodeOptions
 from semantic_mapper.nodes.process import STOP_SIGNAL, StopRequest, prepare_process
-from semantic_mapper.nodes.supervisor.heartbeat import Heart, end_with_launcher
+from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.nodes.supervisor.node_process import FAILURE_EVENT, JOB_PREFIX
 
 _log = structlog.get_logger(__name__)
@@ -36,45 +34,20 @@ class NodeContext:
         endpoints: By node name.
         subscribers: How many listen to its frames.
         stop: True once somebody has asked it to end.
-        heart: Tells the launcher how far the node is.
-        restarts: How often its launcher has started it anew.
+        heartbeat: Tells the launcher how far the node is.
+        restarts: How often its launcher has restarted it.
         folder: Of the launch's notes and sockets; None where it was started by hand.
-        comes_back: Whether it is started anew where it fails.
-        waits: Whether it is kept in waiting, in case that the node fails; see ``await_turn``.
+        restartable: Whether it restarts where it fails.
     """
 
     name: str
     endpoints: dict[str, str]
     subscribers: int
     stop: StopRequest
-    heart: Heart
+    heartbeat: HeartbeatWriter
     restarts: int = 0
     folder: Path | None = None
-    comes_back: bool = False
-    waits: bool = False
-
-    def await_turn(self) -> NodeContext:
-        """A process in waiting stays in here until it is needed, and ends where it never is; any other goes on at once.
-
-        To be called when all is prepared that needs neither sockets of its own nor what the node before it has left.
-
-        Returns:
-            The context to work with from now on.
-        """
-        if not self.waits:
-            return self
-        if not self.called():
-            _log.info("waiting")
-        line = sys.stdin.buffer.readline()
-        if not line:
-            sys.exit(0)
-        self.heart.outlive_launcher()
-        call = convert_config(msgspec.json.decode(line), Call, "call of a node that waits")
-        return replace(self, waits=False, restarts=call.restarts)
-
-    def called(self) -> bool:
-        """Whether a process in waiting is needed now, or never will be: ``await_turn`` returns at once."""
-        return not self.waits or bool(select.select([sys.stdin], [], [], 0)[0])
+    restartable: bool = False
 
     def endpoint(self, name: str) -> str:
         """Where a node publishes."""
@@ -120,48 +93,38 @@ class NodeContext:
 
 
 def run_node(
-    kind: type[OptionsT],
-    work: Callable[[NodeContext, OptionsT], None],
-    packages: Sequence[str] = (),
+    kind: type[OptionsT], work: Callable[[NodeContext, OptionsT], None], job: NodeJob | None = None
 ) -> NoReturn:
     """Run a node to its end and exit: 0 done (also when asked to stop), 1 failed with one line that says why.
 
     In a launch only the launcher's ``STOP_SIGNAL`` asks for an end that is one: after SIGTERM or SIGINT of anybody
-    else, a node that comes back does what it does at its end, and exits with 128 + the signal's number.
+    else, a restartable node does what it does at its end, and exits with 128 + the signal's number.
 
     Args:
         kind: Of its options.
-        work: Does it all; looks at ``stop`` often, and calls ``await_turn`` once.
-        packages: Modules that ``work`` imports; a process that is kept in waiting imports them before.
+        work: Does it all; looks at ``stop`` often.
+        job: What it is to do; None = what its one argument says.
     """
     prepare_process()
     code = 1
     try:
-        job = _read_job()
+        job = job or _job_of_arguments()
         structlog.contextvars.bind_contextvars(node=job.name)
-        heart = Heart(job.heartbeat_fd, job.orphan_s)
-        heart.start()
-        if job.waits:
-            end_with_launcher()
-            for name in packages:
-                importlib.import_module(name)
+        heartbeat = HeartbeatWriter(job.heartbeat_fd, job.orphan_timeout_s)
+        heartbeat.start()
         options = convert_config(job.options, kind, f"node '{job.name}'")
         with StopRequest(patient=True, signals=_requests(job, kind)) as stop:
-            folder = Path(job.folder) if job.folder else None
-            work(
-                NodeContext(
-                    job.name,
-                    job.endpoints,
-                    job.subscribers,
-                    stop,
-                    heart,
-                    job.restarts,
-                    folder,
-                    job.comes_back,
-                    job.waits,
-                ),
-                options,
+            context = NodeContext(
+                name=job.name,
+                endpoints=job.endpoints,
+                subscribers=job.subscribers,
+                stop=stop,
+                heartbeat=heartbeat,
+                restarts=job.restarts,
+                folder=Path(job.folder) if job.folder else None,
+                restartable=job.restartable,
             )
+            work(context, options)
         code = stop.exit_code if job.heartbeat_fd >= 0 else 0
     except SemanticMapperError as error:
         _log.error(FAILURE_EVENT, error=str(error))
@@ -177,7 +140,7 @@ def run_node(
 
 def _requests(job: NodeJob, kind: type[NodeOptions]) -> tuple[signal.Signals, ...]:
     """Signals that ask a node to end in order."""
-    if job.comes_back and kind is CameraOptions:
+    if job.restartable and kind is CameraOptions:
         # Its last words would be that the stream has ended, and its readers would end with it: it drops out instead.
         for signum in (signal.SIGINT, signal.SIGTERM):
             signal.signal(signum, signal.SIG_DFL)
@@ -185,15 +148,27 @@ def _requests(job: NodeJob, kind: type[NodeOptions]) -> tuple[signal.Signals, ..
     return (STOP_SIGNAL, signal.SIGINT, signal.SIGTERM)
 
 
-def _read_job() -> NodeJob:
+def _job_of_arguments() -> NodeJob:
     if len(sys.argv) != 2:
         raise ConfigError('a node takes one argument, JSON: {"name": "camera", "options": {"log": "kitchen.mcap"}}')
-    told: str | bytes = sys.argv[1]
+    return read_job(sys.argv[1])
+
+
+def read_job(argument: str) -> NodeJob:
+    """What a node is to do.
+
+    Args:
+        argument: JSON, or "fd:N" of an open file with it.
+
+    Raises:
+        ConfigError: it is neither.
+    """
+    text: str | bytes = argument
     try:
-        if told.startswith(JOB_PREFIX):
-            with open(int(told.removeprefix(JOB_PREFIX)), "rb") as file:
-                told = file.read()
-        plain = msgspec.json.decode(told)
+        if argument.startswith(JOB_PREFIX):
+            with open(int(argument.removeprefix(JOB_PREFIX)), "rb") as file:
+                text = file.read()
+        plain = msgspec.json.decode(text)
     except (ValueError, OSError) as error:
         raise ConfigError(f"the argument of a node must be JSON, or fd:N of an open file with it: {error}") from error
     return convert_config(plain, NodeJob, "argument of the node")

@@ -217,14 +217,7 @@ class NodeJob(Config, frozen=True):
     endpoints: dict[str, str] = msgspec.field(default_factory=dict)  # by node name
     subscribers: Count = 1  # a camera waits for so many before its first frame
     heartbeat_fd: int = -1  # where to tell that it lives; -1 = nowhere
-    restarts: Count = 0  # how often it was started anew
-    comes_back: bool = False  # it is started anew where it fails: its failure is no end of its stream
-    waits: bool = False  # prepare all, then wait for a ``Call`` as a line of stdin
-    folder: str = ""  # of the launch; a node leaves notes there for the process that may have to replace it
-    orphan_s: Count = 120  # without its launcher, it has so many seconds to write its results
-
-
-class Call(Config, frozen=True):
-    """What the launcher tells a process that has waited: begin, in the place of one that has failed."""
-
-    restarts: Count  # as of ``NodeJob``
+    restarts: Count = 0  # how often it was restarted
+    restartable: bool = False  # it restarts where it fails: its failure is no end of its stream
+    folder: str = ""  # of the launch; a node leaves notes there for the process that replaces it
+    orphan_timeout_s: Count = 120  # without its launcher, it has so many seconds to write its results

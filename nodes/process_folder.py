@@ -5,18 +5,20 @@ A lock in the folder says so, not the process number in its name: containers tha
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import structlog
+from filelock import FileLock, Timeout
 
 PREFIX = "semantic-mapper-"
 _LOCK = "in-use.lock"  # held by the process that has made the folder; the kernel frees it when that dies
+_ASK_S = 0.05  # another process may be asking, too
 
 _log = structlog.get_logger(__name__)
 
@@ -34,16 +36,15 @@ class OwnFolder:
     def __init__(self, kind: str = "") -> None:
         self.path = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{os.getpid()}-{kind}"))  # mode 0700
         draft = self.path / f"{_LOCK}.new"
-        self._lock = os.open(draft, os.O_RDWR | os.O_CREAT, 0o600)
-        fcntl.flock(self._lock, fcntl.LOCK_EX)
+        self._lock = FileLock(draft)
+        self._lock.acquire()
         draft.rename(self.path / _LOCK)  # now that it is held: nobody else can come first
 
     def close(self) -> None:
         """Remove it. Harmless when repeated."""
-        if self._lock >= 0:
-            shutil.rmtree(self.path, onerror=_tell_left_over)
-            os.close(self._lock)
-            self._lock = -1
+        if self._lock.is_locked:
+            shutil.rmtree(self.path, onerror=_report_left_over)
+            self._lock.release()
 
 
 def own_folders() -> Iterator[Path]:
@@ -57,38 +58,39 @@ def is_in_use(folder: Path) -> bool:
     Raises:
         OSError: it is another user's.
     """
-    lock = _take(folder, fcntl.LOCK_SH)  # shared: two that ask at once do not see each other
-    if lock is not None:
-        os.close(lock)
-    return lock is None and (folder / _LOCK).exists()
+    with _lock_of(folder) as lock:
+        return lock is None and (folder / _LOCK).exists()
 
 
 def sweep() -> None:
     """Remove the folders of this user's processes that were killed; what holds no lock file is none of ours."""
     for folder in own_folders():
-        lock = _take(folder, fcntl.LOCK_EX)
-        if lock is None:
-            continue
-        stat = os.fstat(lock)
-        if stat.st_uid == os.getuid() and stat.st_nlink:  # else somebody who sweeps, too, was quicker
-            shutil.rmtree(folder, onerror=_tell_left_over)
-        os.close(lock)
+        with suppress(OSError):  # it is another user's, or another process has just removed it
+            if folder.stat().st_uid != os.getuid():
+                continue
+            with _lock_of(folder) as lock:
+                if lock is not None:
+                    shutil.rmtree(folder, onerror=_report_left_over)
 
 
-def _take(folder: Path, how: int) -> int | None:
-    """Its lock, open; None where there is none, or somebody holds it."""
+@contextmanager
+def _lock_of(folder: Path) -> Iterator[FileLock | None]:
+    """Hold its lock; None where there is none, or another process holds it."""
+    lock = FileLock(folder / _LOCK)
     try:
-        lock = os.open(folder / _LOCK, os.O_RDWR)
-    except OSError:
-        return None
+        if not (folder / _LOCK).exists():
+            yield None
+            return
+        lock.acquire(timeout=_ASK_S, poll_interval=_ASK_S / 5)
+    except Timeout:
+        yield None
+        return
     try:
-        fcntl.flock(lock, how | fcntl.LOCK_NB)
-    except OSError:
-        os.close(lock)
-        return None
-    return lock
+        yield lock
+    finally:
+        lock.release()
 
 
-def _tell_left_over(function: object, path: str, error: object) -> None:
+def _report_left_over(function: object, path: str, error: object) -> None:
     sys.stderr.flush()
     _log.warning("left_over", path=path, error=str(error))

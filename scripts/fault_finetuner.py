@@ -20,7 +20,7 @@ from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 NODES = ("camera", "mapper", "finetuner")  # of replay-learning.toml
 KEYFRAMES = 8
 FAULTS = {"kill -9": signal.SIGKILL, "SIGSTOP": signal.SIGSTOP}
-SETTLE_S = 1.5  # between two faults, with all processes in waiting prepared
+SETTLE_S = 1.5  # between two faults
 PATIENCE_S = 120.0  # for a word of the finetuner
 
 
@@ -45,7 +45,6 @@ def _finetuner_faults(settings: Sequence[str], out: Path) -> Iterator[Outcome]:
             while _next_word(words).counters["kept"] < KEYFRAMES:
                 pass
             for fault in FAULTS:
-                launch.wait_until_covered("finetuner")
                 time.sleep(SETTLE_S)
                 yield _hit(launch, words, fault)
         assert camera.came and mapper.came, "frames were mapped meanwhile"

@@ -26,8 +26,8 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.options import NodeJob
-from semantic_mapper.nodes.supervisor.node_process import Child
-from semantic_mapper.nodes.supervisor.process_stats import process_figures
+from semantic_mapper.nodes.supervisor.hang_detector import process_stats
+from semantic_mapper.nodes.supervisor.node_process import NodeProcess
 from semantic_mapper.transport.codec import decode, encode_frame, encode_info
 from semantic_mapper.transport.framing import unpack_parts
 from semantic_mapper.transport.messages import StreamInfo
@@ -79,7 +79,7 @@ class FloodedMapper:
         self.endpoints = {name: f"ipc://{folder}/{name}" for name in ("camera", "mapper", "query")}
         options = {"out": str(folder / "out"), "delivery": "newest", "weights": weights, "config": config}
         self.publisher = Publisher(self.endpoints["camera"], policy="block")
-        self.child = Child("mapper", NodeJob(name="mapper", options=options, endpoints=self.endpoints))
+        self.child = NodeProcess("mapper", NodeJob(name="mapper", options=options, endpoints=self.endpoints))
         self.publisher.wait_for_subscribers("frame", 1, ANSWER_S * 3)
         self.answers = LosslessSubscriber(self.endpoints["mapper"], ("map", "refused", "status"))
         self.answers.wait_until_heard(ANSWER_S * 3)
@@ -129,7 +129,7 @@ def floods(weights: str, config: str, rounds: int, messages: int) -> Iterator[Ou
         map_id = client.info().map_id
         pid = mapper.child.pid
         pose_flood = _PoseFlood(f"ipc://{folder}/poses", stack)
-        before = process_figures(pid)
+        before = process_stats(pid)
         for count in range(rounds):
             for n in range(portion["frame"]):
                 mapper.publisher.publish(_two(bad["frame"][n % POOL]), ANSWER_S)
@@ -141,7 +141,7 @@ def floods(weights: str, config: str, rounds: int, messages: int) -> Iterator[Ou
             yield _outcome("questions", time.monotonic() - began_s, portion["question"], pid, mapper, wrong)
             yield pose_flood.round(bad["pose"], portion["pose"])
             print(f"floods: round {count + 1} of {rounds}", flush=True)
-        after = process_figures(pid)
+        after = process_stats(pid)
         print(f"mapper before and after all floods: {before} {after}", flush=True)
 
 

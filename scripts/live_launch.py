@@ -16,7 +16,7 @@ from typing import IO, Self
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.replay.log.format import LogReader
-from semantic_mapper.transport.codec import decode_map_update, read_envelope
+from semantic_mapper.transport.codec import decode_map_update, decode_status, read_envelope
 from semantic_mapper.transport.sockets import LosslessSubscriber
 from semantic_mapper.transport.topics import TOPICS
 
@@ -75,6 +75,7 @@ class Heard:
 
     def __init__(self, endpoint: str, topics: Iterable[str]) -> None:
         self.came: list[tuple[float, Key]] = []
+        self.counters: dict[str, int] = {}  # of the node's last status
         self.worked_s: dict[int, float] = {}  # by the number of a frame: what mapping it took
         self._subscriber = LosslessSubscriber(endpoint, tuple(topics))
         self._ended = threading.Event()
@@ -109,6 +110,8 @@ class Heard:
             if parts is not None:
                 now, e = time.monotonic(), read_envelope(parts)
                 self.came.append((now, (e.topic, e.source, e.stamp_ns, e.seq)))
+                if e.topic == "status":
+                    self.counters = dict(decode_status(parts).counters)
                 if e.topic == "map":
                     self.worked_s[e.seq] = sum(decode_map_update(parts).stage_ms.values()) / 1000
 
@@ -147,6 +150,7 @@ class LiveLaunch:
         self.told = Told(self.process.stderr)
         self.camera: Heard | None = None
         self.mapper: Heard | None = None
+        self.recorder: Heard | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -154,7 +158,7 @@ class LiveLaunch:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for heard in (self.camera, self.mapper):
+        for heard in (self.camera, self.mapper, self.recorder):
             if heard is not None:
                 heard.close()
         if self.process.poll() is None:
@@ -175,6 +179,8 @@ class LiveLaunch:
         folder = self.sockets()
         self.camera = Heard(f"ipc://{folder}/camera", ("frame",))
         self.mapper = Heard(f"ipc://{folder}/mapper", ("map", "refused", "status"))
+        if "recorder" in self.nodes:
+            self.recorder = Heard(f"ipc://{folder}/recorder", ("status",))
         return self.camera, self.mapper
 
     def pids(self) -> dict[str, int]:
@@ -183,14 +189,7 @@ class LiveLaunch:
 
     def all_pids(self) -> list[int]:
         """Of every process that ever was."""
-        return [int(pid) for pid in self.told.all(r"(?:node|standby)_started .*pid=(\d+)")]
-
-    def wait_until_covered(self, node: str) -> None:
-        """Until a process in waiting is prepared to take over from a node."""
-        started = self.told.last(rf"node_started .*node={node} ")
-        assert started is not None
-        standby, _ = self.told.wait(rf"standby_started .*node={node} ", started[0])
-        self.told.wait(rf"\[{node}\].* waiting", standby)
+        return [int(pid) for pid in self.told.all(r"(?:node|fork_server)_started .*pid=(\d+)")]
 
     def logged(self) -> set[Key]:
         """All messages that can be read in its logs."""

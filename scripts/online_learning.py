@@ -33,8 +33,8 @@ from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_pat
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.finetuner.finetune_round import file_of
 from semantic_mapper.nodes.options import NodeJob
-from semantic_mapper.nodes.supervisor.node_process import Child
 from semantic_mapper.plots import Curve, Panel, draw_panels, write_picture
+from semantic_mapper.nodes.supervisor.node_process import NodeProcess
 from semantic_mapper.replay.artifacts import write_json
 from semantic_mapper.replay.evaluate.truth import TruthMapper
 from semantic_mapper.replay.log.format import LogReader
@@ -143,8 +143,8 @@ class Robot:
         self._answers.wait_until_heard(300)
         self._labels.wait_for_subscribers("keyframe", timeout_s=300)
 
-    def _start(self, stack: ExitStack, kind: str, options: dict[str, Any]) -> Child:
-        child = Child(kind, NodeJob(name=kind, options=options, endpoints=self._endpoints))
+    def _start(self, stack: ExitStack, kind: str, options: dict[str, Any]) -> NodeProcess:
+        child = NodeProcess(kind, NodeJob(name=kind, options=options, endpoints=self._endpoints))
         stack.callback(child.close)
         return child
 

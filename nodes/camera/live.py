@@ -78,11 +78,10 @@ def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCame
     from semantic_mapper.transport.sockets import Publisher
 
     policy = "block" if make_source(live).can_wait else "drop"  # mistakes in the config are found here, before any wait
-    if context.comes_back:
+    if context.restartable:
         check_world(context.name, live)
-    context = context.await_turn()
     with Publisher(context.endpoint(context.name), policy=policy) as publisher, _Teller(context, publisher) as teller:
-        context.heart.ready()  # a camera may be plugged in much later
+        context.heartbeat.ready()  # a camera may be plugged in much later
         with ExitStack() as stack:
             source = _open(context, live, teller, stack)
             if source is None:
@@ -90,7 +89,7 @@ def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCame
             _listeners(context, options, publisher)
             with teller.watching_driver():
                 _publish(context, options, publisher, teller, source)
-        context.heart.ending()
+        context.heartbeat.ending()
         drain(context, publisher)
 
 
@@ -218,7 +217,7 @@ def _publish(
         detail = str(error)
         raise
     finally:
-        if reason != "error" or not context.comes_back:  # else the stream goes on with the process after this one
+        if reason != "error" or not context.restartable:  # else the stream goes on with the process after this one
             _send_end(publisher, encode_end(EndOfStream(context.name, reason, teller.published, detail)))
         _log.info("published", frames=teller.published, reason=reason)
 
@@ -240,7 +239,7 @@ def _send_frame(context: NodeContext, options: CameraOptions, publisher: Publish
                     f"camera node '{context.name}': a reader has taken no frame for {options.ack_timeout_s:g} s "
                     "(ack_timeout_s); it hangs, or needs longer than that for one frame"
                 ) from error
-        context.heart.turn()
+        context.heartbeat.turn()
     return False
 
 
@@ -307,7 +306,7 @@ class _Teller:
         while not self._ended.wait(POLL_S):
             source = self._source
             if self._comes_round(source):
-                self._context.heart.turn()
+                self._context.heartbeat.turn()
             if self._context.stop and source is not None:
                 source.stop()
             if time.monotonic() - told_at >= STATUS_PERIOD_S:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -11,19 +12,14 @@ import structlog
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.nodes.camera.listeners import drain, wait_for_listeners
-from semantic_mapper.nodes.camera.resume_playback import Beginning
 from semantic_mapper.nodes.cli.console import frame_progress
 from semantic_mapper.nodes.node import NodeContext, run_node
-from semantic_mapper.nodes.options import CameraOptions
+from semantic_mapper.nodes.options import CameraOptions, NodeJob
 
 if TYPE_CHECKING:
     from semantic_mapper.transport.codec import Envelope
 
-PACKAGES = (
-    "semantic_mapper.replay.log.player",
-    "semantic_mapper.replay.log.sequence",
-    "semantic_mapper.transport.sockets",
-)
+_BEGAN = "began"  # note: when the first frame was published, and its stamp
 
 _log = structlog.get_logger(__name__)
 
@@ -69,10 +65,9 @@ def _play(context: NodeContext, options: CameraOptions, path: Path) -> None:
     )
     stopped = threading.Event()
     with open_log(path, on_error=on_error) as log:
-        context = context.await_turn()
         policy = "drop" if options.mode == "realtime" else "block"
         with Publisher(context.endpoint(context.name), policy=policy) as publisher:
-            context.heart.ready()
+            context.heartbeat.ready()
             _log.info("playing", log=str(path), frames=len(log), mode=options.mode)
             watcher = threading.Thread(target=_pass_on_stop, args=(context, stopped), daemon=True)
             watcher.start()
@@ -85,13 +80,13 @@ def _play(context: NodeContext, options: CameraOptions, path: Path) -> None:
                     _log.info("played", published=0, stopped=True)
                     return
                 with frame_progress("played", total) as bar:
-                    began = Beginning(context, options.rate)
+                    playback = Playback(context, options.rate)
 
                     def on_frame(envelope: Envelope, ack: object) -> None:
                         bar.advance()
-                        began.note(envelope.stamp_ns)
+                        playback.note_frame(envelope.stamp_ns)
 
-                    play_options = dataclasses.replace(play_options, from_stamp_ns=began.due_stamp_ns())
+                    play_options = dataclasses.replace(play_options, from_stamp_ns=playback.due_stamp_ns())
                     report = play(log, publisher, acks, play_options, stop=stopped, on_frame=on_frame)
             finally:
                 if acks is not None:
@@ -99,8 +94,36 @@ def _play(context: NodeContext, options: CameraOptions, path: Path) -> None:
             for error in report.errors[len(log.errors) :]:
                 _log.error("frame_left_out", error=str(error))
             _log.info("played", published=report.published, damaged=len(report.errors), stopped=report.stopped)
-            context.heart.ending()
+            context.heartbeat.ending()
             drain(context, publisher)
+
+
+class Playback:
+    """Where a restarted player goes on: where the recording is by now, as a camera would.
+
+    Args:
+        context: Of the camera.
+        rate: How much faster than recorded the log is played.
+    """
+
+    def __init__(self, context: NodeContext, rate: float) -> None:
+        self._context = context
+        self._rate = rate
+        self._began = context.note(_BEGAN) if context.restarts else ""
+
+    def due_stamp_ns(self) -> int:
+        """Stamp of the recording that is due now; 0 where it has not begun."""
+        if not self._began:
+            return 0
+        began_ns, stamp_ns = map(int, self._began.split())
+        return stamp_ns + round((time.monotonic_ns() - began_ns) * self._rate)
+
+    def note_frame(self, stamp_ns: int) -> None:
+        """A frame of this stamp is published: the launcher counts it, and the first of all is noted."""
+        self._context.heartbeat.frame()
+        if not self._began:
+            self._began = f"{time.monotonic_ns()} {stamp_ns}"
+            self._context.try_to_leave_note(_BEGAN, self._began, "a restarted camera plays from the first frame")
 
 
 def _pass_on_stop(context: NodeContext, stopped: threading.Event) -> None:
@@ -109,6 +132,6 @@ def _pass_on_stop(context: NodeContext, stopped: threading.Event) -> None:
             stopped.set()
 
 
-def main() -> NoReturn:
+def main(job: NodeJob | None = None) -> NoReturn:
     """Run the node of this process to its end, then exit."""
-    run_node(CameraOptions, run_camera, PACKAGES)
+    run_node(CameraOptions, run_camera, job)

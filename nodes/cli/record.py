@@ -134,7 +134,7 @@ def _join(
     from semantic_mapper.errors import ConfigError
     from semantic_mapper.nodes.node import NodeContext
     from semantic_mapper.nodes.options import RecorderOptions
-    from semantic_mapper.nodes.supervisor.heartbeat import Heart
+    from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
     from semantic_mapper.nodes.supervisor.launch_note import read_launch_note
 
     note = read_launch_note(folder)
@@ -149,6 +149,6 @@ def _join(
     if not streams:
         raise ConfigError(f"--source: name a camera, too, whose end ends the recording: {', '.join(cameras)}")
     endpoints = {name: f"ipc://{folder}/{name}" for name in names}
-    heart = Heart(-1, 0)
-    context = NodeContext(f"record-{os.getpid()}", endpoints, 0, stop, heart, folder=folder)
+    heartbeat = HeartbeatWriter(-1, 0)
+    context = NodeContext(f"record-{os.getpid()}", endpoints, 0, stop, heartbeat, folder=folder)
     return context, convert_config({**wanted, "sources": sources, "streams": streams}, RecorderOptions, "record")

@@ -76,7 +76,10 @@ class LearningRound:
         return not self.running
 
     def _learn(self) -> None:
+        import torch
+
         lessons, parent, config = self._work
+        torch.set_num_threads(torch.get_num_threads())  # OpenMP has a limit for each thread
         if self._idle:
             run_when_idle()
         try:

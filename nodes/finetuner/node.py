@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -13,7 +12,7 @@ import structlog
 
 from semantic_mapper.errors import FrameError, LabelError, WeightsError
 from semantic_mapper.nodes.node import NodeContext, run_node
-from semantic_mapper.nodes.options import FinetunerOptions
+from semantic_mapper.nodes.options import FinetunerOptions, NodeJob
 
 if TYPE_CHECKING:
     from semantic_mapper.fields.checkpoint import Checkpoint
@@ -23,11 +22,6 @@ if TYPE_CHECKING:
     from semantic_mapper.transport.messages import LabelledKeyframe, NodeState, WeightsInUse
     from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
-PACKAGES = ("semantic_mapper.transport.sockets",)  # those that compute must not be loaded before ``_take_back_seat``
-_COMPUTING = (
-    "semantic_mapper.nodes.finetuner.finetune_round",
-    "semantic_mapper.nodes.finetuner.keyframe_store",
-)  # loaded after it, by a process in waiting, too
 POLL_S = 0.1
 STATUS_PERIOD_S = 1.0
 MAX_WAITING = 8  # keyframes, of about half a megabyte each, and of 64 MiB at the most
@@ -59,9 +53,6 @@ def run_finetuner(context: NodeContext, options: FinetunerOptions) -> None:
     config = load_config(Path(options.config), OnlineConfig) if options.config else OnlineConfig()
     path = Path(options.weights) if options.weights else default_checkpoint_path()
     start, digest = load_checkpoint(path), digest_of(path.read_bytes())
-    for name in _COMPUTING:
-        import_module(name)
-    context = context.await_turn()
     endpoint = options.labels if "://" in options.labels else context.endpoint(options.labels)
     with (
         Publisher(context.endpoint(context.name), hwm=2) as publisher,
@@ -70,16 +61,19 @@ def run_finetuner(context: NodeContext, options: FinetunerOptions) -> None:
     ):
         _log.info("ready", weights=path.name, labels=endpoint, share=options.share)
         node = _Finetuner(context, options, config, publisher, labels, mapper, start, digest)
-        context.heart.ready()
+        context.heartbeat.ready()
         node.run()
-        context.heart.ending()
+        context.heartbeat.ending()
         node.close()
 
 
 def _take_back_seat(options: FinetunerOptions) -> None:
-    """Before anything that computes is loaded: threads that it starts inherit this."""
+    """Before anything computes: threads that are started then inherit this."""
     os.environ["OMP_NUM_THREADS"] = str(options.threads)
     os.setpriority(os.PRIO_PROCESS, 0, max(options.niceness, os.getpriority(os.PRIO_PROCESS, 0)))
+    import torch
+
+    torch.set_num_threads(options.threads)  # a forked process has read the variable before
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +132,7 @@ class _Finetuner:
     def run(self) -> None:
         """Handle messages and rounds until a stop request."""
         while not self._context.stop:
-            self._context.heart.turn()
+            self._context.heartbeat.turn()
             keyframe = self._labels.receive(POLL_S)
             if keyframe is not None:
                 self._take(keyframe)  # pyright: ignore[reportArgumentType]
@@ -359,6 +353,6 @@ class _Finetuner:
         self._publisher.publish(encode_status(status))
 
 
-def main() -> NoReturn:
+def main(job: NodeJob | None = None) -> NoReturn:
     """Run the node of this process to its end, then exit."""
-    run_node(FinetunerOptions, run_finetuner, PACKAGES)
+    run_node(FinetunerOptions, run_finetuner, job)

@@ -13,7 +13,7 @@ from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.memory import give_back_freed_memory
 from semantic_mapper.nodes.frame_gaps import Gaps
 from semantic_mapper.nodes.node import NodeContext, run_node
-from semantic_mapper.nodes.options import MapperOptions
+from semantic_mapper.nodes.options import MapperOptions, NodeJob
 from semantic_mapper.nodes.streams import Streams
 
 if TYPE_CHECKING:
@@ -27,18 +27,6 @@ if TYPE_CHECKING:
     from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
     from semantic_mapper.types import PosedFrame
 
-PACKAGES = (
-    "semantic_mapper.nodes.mapper.autosave",
-    "semantic_mapper.nodes.mapper.live_correction",
-    "semantic_mapper.nodes.mapper.live_weights",
-    "semantic_mapper.nodes.public_publisher",
-    "semantic_mapper.nodes.mapper.query_service",
-    "semantic_mapper.nodes.mapper.resume",
-    "semantic_mapper.nodes.cli.run_replay",
-    "semantic_mapper.nodes.mapper.standby",
-    "semantic_mapper.replay.session",
-    "semantic_mapper.transport.sockets",
-)
 POLL_S = 0.1
 STATUS_PERIOD_S = 1.0
 HAND_OVER_S = 10.0  # for the whole map, before it is written: questions are answered meanwhile
@@ -64,17 +52,12 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
     from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
     from semantic_mapper.nodes.mapper.live_weights import taking_weights
     from semantic_mapper.nodes.mapper.resume import take_up
-    from semantic_mapper.nodes.mapper.standby import warm_up_mapper
     from semantic_mapper.nodes.public_publisher import PublicPublisher
     from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber
 
     prepare_folder(Path(options.out))
     config = mapper_config(Path(options.config) if options.config else None, options.voxel_size_m or None)
     bundle = Mapper.load(Path(options.weights) if options.weights else None, config)
-    if context.waits or context.comes_back:
-        # Live: kernels compile at the start; at a first frame a process in waiting would compile them beside it.
-        warm_up_mapper(bundle)
-    context = context.await_turn()
     taken_up = take_up(context, Path(options.out) / MAP_NAME, bundle.pipeline.voxel_map)
     correction = LiveCorrection(bundle.pipeline)
     exclude = load_checkpoint(Path(options.eval_exclude)).train_stamps_ns if options.eval_exclude else frozenset[int]()
@@ -91,14 +74,14 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
         )
         parts = (queries, correction, weights, autosave)
         mapper = _Mapper(context, options, bundle, exclude, publisher, frames, *parts, taken_up)
-        context.heart.ready()
+        context.heartbeat.ready()
         try:
             mapper.run()
         except BaseException as error:
             frames.close()
             mapper.finish_after(error)
             raise
-        context.heart.ending()
+        context.heartbeat.ending()
         frames.close()  # the camera waits until all have left
         mapper.finish()
 
@@ -176,7 +159,7 @@ class _Mapper:
         from semantic_mapper.types import PosedFrame
 
         while not self._context.stop:
-            self._context.heart.turn()
+            self._context.heartbeat.turn()
             message = self._frames.receive(0.0 if self._correction.running else POLL_S)
             match message:
                 case StreamInfo():
@@ -347,6 +330,6 @@ class _Mapper:
         self._publisher.publish(encode_status(status))
 
 
-def main() -> NoReturn:
+def main(job: NodeJob | None = None) -> NoReturn:
     """Run the node of this process to its end, then exit."""
-    run_node(MapperOptions, run_mapper, PACKAGES)
+    run_node(MapperOptions, run_mapper, job)

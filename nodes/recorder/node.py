@@ -15,7 +15,7 @@ import structlog
 from semantic_mapper.errors import CodecError, TransportError
 from semantic_mapper.nodes.frame_gaps import Gaps
 from semantic_mapper.nodes.node import NodeContext, run_node
-from semantic_mapper.nodes.options import RecorderOptions
+from semantic_mapper.nodes.options import NodeJob, RecorderOptions
 from semantic_mapper.nodes.streams import Streams
 
 if TYPE_CHECKING:
@@ -26,11 +26,6 @@ if TYPE_CHECKING:
     from semantic_mapper.transport.sockets import LosslessSubscriber
     from semantic_mapper.types import CameraIntrinsics
 
-PACKAGES = (
-    "semantic_mapper.nodes.recorder.backlog",
-    "semantic_mapper.replay.log.recording",
-    "semantic_mapper.transport.sockets",
-)
 POLL_S = 0.05
 WAIT_SLICE_S = 0.2
 QUIET_S = 0.5  # after the end of the stream, answers from other nodes may still be on their way
@@ -39,8 +34,9 @@ MAX_EARLY = 1000  # messages kept while no stream has begun
 STATUS_PERIOD_S = 1.0
 DRAIN_S = 5.0  # after a stop, for what has come before it; less than the `stop_s` of launches
 COUNT_S = 1.0  # then, for counting what is left
+END_BYTES = 1 << 24  # of a log, in which the last frame of each camera is looked for
 DRAINED_S = 0.005  # nothing for so long: all is written; what a camera that runs on sends comes later
-NOTE = "recording"  # the name of the recording, for the process that takes over
+NOTE = "recording"  # the name of the recording, for the process that replaces this one
 
 _log = structlog.get_logger(__name__)
 
@@ -56,8 +52,7 @@ def run_recorder(context: NodeContext, options: RecorderOptions) -> None:
     from semantic_mapper.transport.publisher import Publisher
 
     with ExitStack() as stack:
-        # Opened once it is at work: a process in waiting must leave the endpoint to the one before it.
-        teller = StatusTeller(context.name, lambda: stack.enter_context(Publisher(context.endpoint(context.name))))
+        teller = StatusTeller(context.name, stack.enter_context(Publisher(context.endpoint(context.name))))
         recorder = record(context, options, teller.follow)
         teller.tell(recorder, "ended")
 
@@ -75,14 +70,12 @@ def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Rec
         TransportError: a source cannot be subscribed to.
     """
     from semantic_mapper.errors import LogError
-    from semantic_mapper.nodes.recorder.backlog import listen_while_waiting
     from semantic_mapper.transport.sockets import LosslessSubscriber
 
     topics = tuple(dict.fromkeys(("info", *options.topics, "end")))
     cameras = [context.endpoint(name) for name in options.cameras]
     others = [context.endpoint(name) for name in options.sources[options.streams :]]
-    # At once, so that nothing begins where there is a log already.
-    recorder = None if context.waits else Recorder(context, options)
+    recorder = Recorder(context, options)  # at once, so that nothing begins where there is a log already
     with ExitStack() as stack:
         answers = None
         if others:
@@ -90,17 +83,12 @@ def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Rec
             _wait_until_heard(context, options, answers)
         # Cameras begin once they have all their subscribers, so this one comes last: by now nothing can be missed.
         frames = stack.enter_context(LosslessSubscriber(cameras, topics, hwm=MAX_WAITING))
-        backlog = listen_while_waiting(context, options.streams, frames, answers)
-        context = context.await_turn()
-        recorder = recorder or Recorder(context, options)
         stack.callback(recorder.close)
-        context.heart.ready()
-        for parts in backlog.missing_in_logs(Path(options.out)):
-            recorder.take(parts)
+        context.heartbeat.ready()
         sources = [frames, *([answers] if answers is not None else [])]
         ended_at = 0.0
-        while not (ended_at and time.monotonic() - ended_at > QUIET_S) and not context.stop and not backlog.ended:
-            context.heart.turn()
+        while not (ended_at and time.monotonic() - ended_at > QUIET_S) and not context.stop:
+            context.heartbeat.turn()
             recorder.rejected = sum(source.rejected for source in sources)
             if follow(recorder):
                 break
@@ -109,9 +97,9 @@ def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Rec
                 ended_at = ended_at or time.monotonic()
             while answers is not None and (parts := answers.receive_parts(0)) is not None:
                 recorder.take(parts)
-        if context.stop and not backlog.ended:
+        if context.stop:
             _drain(context, recorder, sources)
-        context.heart.ending()
+        context.heartbeat.ending()
     if recorder.recording is not None and recorder.recording.gone:
         raise LogError(f"{recorder.recording.path}: was removed while it was written, and what it held is lost")
     return recorder
@@ -124,7 +112,7 @@ def _drain(context: NodeContext, recorder: Recorder, sources: Sequence[LosslessS
     deadline = time.monotonic() + DRAIN_S
     for source in sources:
         while (parts := source.receive_parts(DRAINED_S)) is not None:
-            context.heart.turn()
+            context.heartbeat.turn()
             now = time.monotonic()
             if now < deadline:
                 recorder.take(parts)
@@ -192,6 +180,9 @@ class Recorder:
         self.gaps = Gaps()
         self._streams = Streams(options.streams)
         self._cameras: dict[str, CameraIntrinsics] = {}  # of all streams so far
+        if self._goes_on:  # what was lost in between is counted
+            for camera_id, seq in _last_frames(self._path).items():
+                self.gaps.note(camera_id, seq)
         self._told: set[bytes] = set()  # what the recording holds of streams
         self._early: deque[list[bytes]] = deque(maxlen=MAX_EARLY)
 
@@ -301,18 +292,41 @@ class Recorder:
             return parts
 
 
+def _last_frames(path: Path) -> dict[str, int]:
+    """Numbers of the last frames of each camera at the end of a recording.
+
+    Args:
+        path: Of its first part.
+    """
+    from semantic_mapper.errors import LogError
+    from semantic_mapper.replay.log.mcap_scan import read_payloads, scan_end
+    from semantic_mapper.replay.log.sequence import parts_on_disk
+    from semantic_mapper.transport.codec import read_envelope
+    from semantic_mapper.transport.framing import unpack_parts
+
+    found: dict[str, int] = {}
+    for part in reversed(parts_on_disk(path).values()):
+        with part.open("rb") as file:
+            for offset, length in scan_end(file.fileno(), END_BYTES).chunks:
+                with suppress(LogError, CodecError):  # cut off
+                    envelopes = map(read_envelope, map(unpack_parts, read_payloads(file.fileno(), offset, length)))
+                    found |= {e.source: e.seq for e in envelopes if e.topic == "frame"}
+        if found:
+            break
+    return found
+
+
 class StatusTeller:
     """Publishes how a recorder is, about once a second.
 
     Args:
         node: Name of the recorder.
-        open_publisher: Called before the first word.
+        publisher: Where.
     """
 
-    def __init__(self, node: str, open_publisher: Callable[[], Publisher]) -> None:
+    def __init__(self, node: str, publisher: Publisher) -> None:
         self._node = node
-        self._open_publisher = open_publisher
-        self._publisher: Publisher | None = None
+        self._publisher = publisher
         self._told_at = 0.0
 
     def follow(self, recorder: Recorder) -> bool:
@@ -334,11 +348,9 @@ class StatusTeller:
             counters |= {"parts": r.parts, "deleted": r.deleted, "log_kb": recorder.log_bytes // 1024}
             degraded = tuple(text for text in (r.trouble,) if text)
         status = Status(self._node, state, time.monotonic_ns(), counters, degraded=degraded)
-        if self._publisher is None:
-            self._publisher = self._open_publisher()
         self._publisher.publish(encode_status(status))
 
 
-def main() -> NoReturn:
+def main(job: NodeJob | None = None) -> NoReturn:
     """Run the node of this process to its end, then exit."""
-    run_node(RecorderOptions, run_recorder, PACKAGES)
+    run_node(RecorderOptions, run_recorder, job)

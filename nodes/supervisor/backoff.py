@@ -1,4 +1,4 @@
-"""How often a node may be started anew, and how long to wait before it is."""
+"""How often a node may restart, and how long to wait before it does."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import deque
 from semantic_mapper.nodes.supervisor.launch_config import NodeEntry
 
 
-class Restarts:
+class RestartBackoff:
     """The failures of one node. Times are monotonic seconds.
 
     Args:

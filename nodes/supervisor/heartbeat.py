@@ -1,8 +1,7 @@
-"""Signs of life: what a node tells its launcher through a pipe, and what the launcher makes of them.
+"""Heartbeats of a node: written by a thread of the node into a pipe, read by its launcher.
 
-Each byte is the phase that the node is in, so that a lost one does not matter, or a turn of its main loop, or a frame
-that a player of logs, which publishes no status, has published. A thread writes them; where even that cannot run any
-more and the launcher is gone, the kernel ends the process.
+Each byte is the phase of the node, one turn of its main loop, or one published frame (of a player of logs, which
+publishes no status). A lost byte does not matter. SIGALRM ends a node whose threads cannot run any more.
 """
 
 from __future__ import annotations
@@ -16,165 +15,156 @@ import time
 STARTING, RUNNING, ENDING = b"s", b"r", b"e"
 TURN = b"t"
 FRAME = b"f"
-BEAT_PERIOD_S = 0.2
+PERIOD_S = 0.2
 _PR_SET_PDEATHSIG = 1
 _READ_BYTES = 65536
 
 
-class Heart:
-    """The node's end.
+class HeartbeatWriter:
+    """The node's end of the pipe.
 
     Args:
-        fd: Where to write; -1 = nobody listens.
-        orphan_s: Without its launcher, the process has so many seconds to write its results.
+        fd: Where to write; -1 = no launcher listens.
+        orphan_timeout_s: Once its launcher is gone, the process has so many seconds to write its results.
     """
 
-    def __init__(self, fd: int, orphan_s: int) -> None:
+    def __init__(self, fd: int, orphan_timeout_s: int) -> None:
         self._fd = fd
-        self._orphan_s = orphan_s
+        self._orphan_timeout_s = orphan_timeout_s
         self._phase = STARTING
-        self._told_turn = 0.0
+        self._last_turn = 0.0
         if fd >= 0:
             os.set_blocking(fd, False)
 
     def start(self) -> None:
-        """Begin to beat, in a thread of its own."""
+        """Write a heartbeat every ``PERIOD_S`` from a thread."""
         if self._fd < 0:
             return
-        self.outlive_launcher()
-        signal.alarm(self._orphan_s)  # here already: it may hang before the thread has begun
-        threading.Thread(target=self._beat, name="heartbeat", daemon=True).start()
-
-    def outlive_launcher(self) -> None:
-        """Be woken when the launcher dies: who is stopped (SIGSTOP) then would never learn of it."""
-        _when_launcher_dies(signal.SIGCONT)
+        _signal_when_launcher_dies(signal.SIGCONT)  # a stopped process would never learn of it
+        signal.alarm(self._orphan_timeout_s)  # at once: the process may hang before the thread runs
+        threading.Thread(target=self._run, name="heartbeat", daemon=True).start()
 
     def ready(self) -> None:
-        """All that takes long at the start is done."""
+        """Start-up is over."""
         self._phase = RUNNING
         self._write(RUNNING)
 
     def turn(self) -> None:
-        """The main loop has come round. Who says so once is expected to go on, until ``ending``."""
+        """One turn of the main loop. After the first call, more are expected until ``ending``."""
         now = time.monotonic()
-        if now - self._told_turn > BEAT_PERIOD_S:
-            self._told_turn = now
+        if now - self._last_turn > PERIOD_S:
+            self._last_turn = now
             self._write(TURN)
 
     def frame(self) -> None:
-        """One more frame has been published."""
+        """One more frame is published."""
         self._write(FRAME)
 
     def ending(self) -> None:
-        """Nothing more is awaited; results are being written."""
+        """The stream is over; results are being written."""
         self._phase = ENDING
         self._write(ENDING)
 
-    def _write(self, sign: bytes) -> bool:
-        """False where nobody can read it any more."""
+    def _write(self, beat: bytes) -> bool:
+        """False where the launcher is gone."""
         if self._fd < 0:
             return True
         try:
-            os.write(self._fd, sign)
+            os.write(self._fd, beat)
         except BlockingIOError:  # the launcher is stopped; its pipe is full
             return True
         except OSError:
             return False
         return True
 
-    def _beat(self) -> None:
+    def _run(self) -> None:
         pause = threading.Event()
         while self._write(self._phase):
-            # A process whose threads cannot run is ended by the kernel, whether or not somebody watches over it.
-            signal.alarm(self._orphan_s)
-            pause.wait(BEAT_PERIOD_S)
+            signal.alarm(self._orphan_timeout_s)  # the kernel ends a process whose threads cannot run
+            pause.wait(PERIOD_S)
         self._end_orphan()
 
     def _end_orphan(self) -> None:
-        """Ask ourselves to stop; the kernel sees to it that nothing outlives its time, even where Python hangs."""
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, 1)  # the launcher read these
-        os.dup2(nowhere, 2)
-        signal.alarm(self._orphan_s)
+        """Request a stop; SIGALRM ends the process where that takes too long."""
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, 1)  # the launcher read these
+        os.dup2(null, 2)
+        signal.alarm(self._orphan_timeout_s)
         os.kill(os.getpid(), signal.SIGTERM)
 
 
 def end_with_launcher() -> None:
-    """For a process that has nothing to finish yet: the kernel kills it when its launcher dies."""
-    _when_launcher_dies(signal.SIGKILL)
+    """Be killed by the kernel when the parent process dies."""
+    _signal_when_launcher_dies(signal.SIGKILL)
 
 
-def _when_launcher_dies(signum: signal.Signals) -> None:
+def _signal_when_launcher_dies(signum: signal.Signals) -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signum)
 
 
-class Pulse:
-    """The launcher's end.
+class HeartbeatMonitor:
+    """The launcher's end of the pipe.
 
     Args:
         fd: Where to read; set to non-blocking here.
 
     Attributes:
-        frames: Published, as far as the node tells of each.
+        frames: Published, where the node counts them.
     """
 
     def __init__(self, fd: int) -> None:
         self._fd = fd
         self._phase = STARTING
-        self._last_sign = time.monotonic()
+        self._started = self._last_beat = time.monotonic()
         self._last_turn: float | None = None
         self._last_frame: float | None = None
         self.frames = 0
-        self.ready_after_s: float | None = None  # since the start
-        self._began = self._last_sign
         os.set_blocking(fd, False)
 
     @property
     def ready(self) -> bool:
-        """Whether its start-up is over."""
+        """Whether start-up is over."""
         return self._phase != STARTING
 
     @property
     def ending(self) -> bool:
-        """Whether it writes its results."""
+        """Whether results are being written."""
         return self._phase == ENDING
 
     @property
     def age_s(self) -> float:
-        """Seconds since it was started."""
-        return time.monotonic() - self._began
+        """Seconds since the start."""
+        return time.monotonic() - self._started
 
     @property
     def silent_s(self) -> float:
-        """Seconds since its last sign of life."""
-        return time.monotonic() - self._last_sign
+        """Seconds since the last heartbeat."""
+        return time.monotonic() - self._last_beat
 
     @property
     def stalled_s(self) -> float | None:
-        """Seconds since the last turn of its main loop; None where none is awaited."""
+        """Seconds since the last turn of the main loop; None where none is expected."""
         return None if self._last_turn is None or self.ending else time.monotonic() - self._last_turn
 
     @property
     def frame_age_s(self) -> float | None:
-        """Seconds since the last frame was published; None where it tells of none."""
+        """Seconds since the last frame was published; None where the node counts none."""
         return None if self._last_frame is None else time.monotonic() - self._last_frame
 
-    def listen(self) -> None:
-        """Take in what has come."""
+    def poll(self) -> None:
+        """Read what has come."""
         try:
-            signs = os.read(self._fd, _READ_BYTES)
+            beats = os.read(self._fd, _READ_BYTES)
         except BlockingIOError:
             return
-        if not signs:  # it has ended
+        if not beats:  # the process has ended
             return
-        self._last_sign = time.monotonic()
-        if TURN in signs:
-            self._last_turn = self._last_sign
-        if FRAME in signs:
-            self._last_frame = self._last_sign
-            self.frames += signs.count(FRAME)
-        phases = signs.replace(TURN, b"").replace(FRAME, b"")
+        self._last_beat = time.monotonic()
+        if TURN in beats:
+            self._last_turn = self._last_beat
+        if FRAME in beats:
+            self._last_frame = self._last_beat
+            self.frames += beats.count(FRAME)
+        phases = beats.replace(TURN, b"").replace(FRAME, b"")
         if phases:
             self._phase = phases[-1:]
-        if self.ready and self.ready_after_s is None:
-            self.ready_after_s = self.age_s

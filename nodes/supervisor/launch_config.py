@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
+import structlog
 
 from semantic_mapper.config import Config, convert_config, load_config
 from semantic_mapper.errors import ConfigError
@@ -35,20 +36,22 @@ STATUS_SOCKET = "launch"  # where the launcher publishes how all nodes are
 MAX_NODES = 64  # each is a process
 MAX_SHOWN = 60  # letters of an argument in a message
 MAX_TEXT = 4096  # letters of a text, once values of [set] are filled in
+_log = structlog.get_logger(__name__)
+
 _PLACE = re.compile(r"\{(\w+)\}")
 
 
 class NodeEntry(Config, frozen=True):
-    """One process."""
+    """One process; ``process_table.py`` says how its kind is started and stopped."""
 
     name: str  # unique; also the name of its endpoint
-    kind: Literal["camera", "mapper", "recorder", "finetuner"]  # runs `python -I -m nodes.KIND`
+    kind: Literal["camera", "mapper", "recorder", "finetuner"]  # a row of the process table
     options: dict[str, Any] = msgspec.field(
         default_factory=dict
     )  # see nodes/options.py; "{NAME}" stands for a value of [set]
-    # "on-failure": a node that is killed, sent away (SIGTERM of anybody but its launcher), hangs or fails comes back,
-    # and the others go on meanwhile; save where it fails by itself before it was ever ready, which the next start would
-    # not mend. "never": the launch ends then. A node that is done, such as a log played to its end, stays away.
+    # "on-failure": a node that is killed, terminated (SIGTERM of anybody but its launcher), hangs or fails restarts,
+    # and the others go on meanwhile; except where it fails by itself before it was ever ready, which the next start
+    # would not mend. "never": the launch ends then. A node that is done, such as a log played to its end, stays away.
     restart: Literal["never", "on-failure"] = "never"
     backoff_s: Positive = 0.1  # pause before the first restart; twice as long with each further one in the window
     backoff_max_s: Positive = 10.0  # but no longer than this
@@ -56,18 +59,12 @@ class NodeEntry(Config, frozen=True):
     # restarted for as long as the launch runs: back-off leaves no room for so many.
     max_restarts: Count = 20
     window_s: Positive = 60.0
-    # Keep a second process that has loaded all packages and waits, to take over at once: it costs its memory (a
-    # mapper's is half a gigabyte, part of it shared with the first one), and a core for some seconds after each start.
-    standby: bool = False
+    standby: bool = False  # does nothing any more, and is accepted with a warning: restarts are quick without it
 
 
-class LaunchFile(Config, frozen=True):
-    """A launch file as it stands on disk."""
+class Limits(Config, frozen=True):
+    """What a launch file says of the launch as a whole."""
 
-    node: Annotated[tuple[NodeEntry, ...], msgspec.Meta(max_length=MAX_NODES)]
-    # Values that `--set NAME=VALUE` replaces; an empty one has to be given. "{now}" in one of them stands for the time
-    # of the start, such as 20261123T024700Z, with a number where that is there already.
-    set: dict[str, Value] = msgspec.field(default_factory=dict)
     # A node that gives no sign of life for so long, and neither has had nor wants processor time meanwhile, is killed.
     # One that starts or ends, or is busy, or waits for a processor or a disk, may be silent for half a minute.
     heartbeat_s: Annotated[float, msgspec.Meta(ge=0.5)] = 30.0
@@ -81,7 +78,16 @@ class LaunchFile(Config, frozen=True):
     keys: str = ""  # folder of keys (`semantic-mapper keys`) for it; empty = none
 
 
-class Launch(Config, frozen=True):
+class LaunchFile(Limits, frozen=True, kw_only=True):
+    """A launch file as it stands on disk."""
+
+    node: Annotated[tuple[NodeEntry, ...], msgspec.Meta(max_length=MAX_NODES)]
+    # Values that `--set NAME=VALUE` replaces; an empty one has to be given. "{now}" in one of them stands for the time
+    # of the start, such as 20261123T024700Z, with a number where that is there already.
+    set: dict[str, Value] = msgspec.field(default_factory=dict)
+
+
+class Launch(Limits, frozen=True, kw_only=True):
     """A launch file with every option checked, ready to start.
 
     ``options`` are by node name, in the order of the file.
@@ -90,13 +96,6 @@ class Launch(Config, frozen=True):
     name: str  # of the file
     nodes: tuple[NodeEntry, ...]
     options: dict[str, NodeOptions]
-    heartbeat_s: float
-    stall_s: float
-    start_s: float
-    stop_s: float
-    finish_s: float
-    publish: str = ""
-    keys: str = ""
 
     def inputs(self, name: str) -> tuple[str, ...]:
         """Names of the nodes that a node subscribes to."""
@@ -134,6 +133,8 @@ def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = Non
         values[name] = value
     values["now"] = values["now"] or _name_start(values)
     values = {k: v.replace("{now}", str(values["now"])) if isinstance(v, str) else v for k, v in values.items()}
+    if old := [n.name for n in file.node if n.standby]:
+        _log.warning("setting_ignored", setting="standby", nodes=", ".join(old), reason="restarts are quick without it")
     names = [n.name for n in file.node]
     for name in names:
         if names.count(name) > 1 or not re.fullmatch(r"[A-Za-z0-9_.-]{1,48}", name):
@@ -149,18 +150,9 @@ def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = Non
         raise ConfigError(f"{path}: no node of kind 'camera': nothing would ever happen")
     _check_restarts(file, options, path)
     _check_cameras(options, path)
-    launch = Launch(
-        name=path.name,
-        nodes=file.node,
-        options=options,
-        heartbeat_s=file.heartbeat_s,
-        stall_s=file.stall_s,
-        start_s=file.start_s,
-        stop_s=file.stop_s,
-        finish_s=file.finish_s,
-        publish=str(_fill_in(file.publish, values, f"{path}: publish")),
-        keys=str(_fill_in(file.keys, values, f"{path}: keys")),
-    )
+    limits = {name: getattr(file, name) for name in Limits.__struct_fields__}
+    limits |= {name: str(_fill_in(limits[name], values, f"{path}: {name}")) for name in ("publish", "keys")}
+    launch = Launch(name=path.name, nodes=file.node, options=options, **limits)
     sockets = launch.sockets()
     twice = sorted({name for name in sockets if sockets.count(name) > 1})
     if twice:

@@ -13,9 +13,9 @@ import structlog
 
 from semantic_mapper.errors import CodecError, TransportError
 from semantic_mapper.nodes.public_publisher import PublicPublisher
+from semantic_mapper.nodes.supervisor.hang_detector import process_stats
 from semantic_mapper.nodes.supervisor.launch_config import STATUS_SOCKET
-from semantic_mapper.nodes.supervisor.managed_process import Member
-from semantic_mapper.nodes.supervisor.process_stats import process_figures
+from semantic_mapper.nodes.supervisor.managed_process import ManagedProcess
 from semantic_mapper.transport.codec import encode_status
 from semantic_mapper.transport.messages import NodeState, Status
 from semantic_mapper.transport.sockets import NewestSubscriber
@@ -30,9 +30,8 @@ class LaunchStatus:
     """Publishes a ``Status`` of each node, and one of the launch itself. A context manager.
 
     Counters and ages of a node's own status are passed on (a player of logs has none: its launcher counts ``published``
-    frames); added are ``pid``, ``restarts``, ``rss_kb``, ``cpu_ms``,
-    ``fds`` and ``threads``, and the ages ``start`` (of the process), ``beat`` (sign of life), ``turn`` (of its main
-    loop) and ``status`` (of what it has said itself).
+    frames). Added are ``pid``, ``restarts``, ``rss_kb``, ``cpu_ms``, ``fds`` and ``threads``, and the ages ``start``
+    (of the process), ``beat`` (last heartbeat), ``turn`` (of its main loop) and ``status`` (of its own status).
 
     Args:
         endpoints: Of the nodes and, under ``STATUS_SOCKET``, of this topic.
@@ -45,7 +44,7 @@ class LaunchStatus:
 
     def __init__(self, endpoints: Mapping[str, str], nodes: Sequence[str], public: str = "", keys: str = "") -> None:
         self._began = time.monotonic()
-        self._told_at = 0.0
+        self._reported_at = 0.0
         self._own: dict[str, Status] = {}
         self._publisher = PublicPublisher(endpoints[STATUS_SOCKET], public, keys, linger_ms=200)
         self._subscriber = NewestSubscriber([endpoints[name] for name in nodes], ("status",))
@@ -63,16 +62,16 @@ class LaunchStatus:
         self._subscriber.close()
         self._publisher.close()
 
-    def tell(self, members: Sequence[Member], state: NodeState, *, now: bool = False) -> None:
+    def report(self, processes: Sequence[ManagedProcess], state: NodeState, *, now: bool = False) -> None:
         """Publish, if it is time to."""
-        if not now and time.monotonic() - self._told_at < PERIOD_S:
+        if not now and time.monotonic() - self._reported_at < PERIOD_S:
             return
-        self._told_at = time.monotonic()
+        self._reported_at = time.monotonic()
         while (message := self._subscriber.receive(0.0)) is not None:
             if isinstance(message, Status):
                 self._own[message.node] = message
-        statuses = [node_status(member, self._own.get(member.name)) for member in members]
-        for status in (*statuses, self._of_launch(members, statuses, state)):
+        statuses = [node_status(managed, self._own.get(managed.name)) for managed in processes]
+        for status in (*statuses, self._of_launch(processes, statuses, state)):
             self._publish(status)
 
     def _publish(self, status: Status) -> None:
@@ -83,37 +82,37 @@ class LaunchStatus:
         except (CodecError, TransportError) as error:
             _log.warning("status_not_told", node=status.node, reason=str(error))
 
-    def _of_launch(self, members: Sequence[Member], statuses: Sequence[Status], state: NodeState) -> Status:
+    def _of_launch(self, processes: Sequence[ManagedProcess], statuses: Sequence[Status], state: NodeState) -> Status:
         degraded = tuple(f"node '{s.node}' is not well" for s in statuses if s.degraded)
-        counters = {"pid": os.getpid(), "nodes": len(members), "restarts": sum(m.restarts for m in members)}
+        counters = {"pid": os.getpid(), "nodes": len(processes), "restarts": sum(m.restarts for m in processes)}
         return Status(
             node=STATUS_SOCKET,
             state="degraded" if degraded and state == "running" else state,
             stamp_ns=time.monotonic_ns(),
-            counters=counters | process_figures(os.getpid()),
+            counters=counters | process_stats(os.getpid()),
             ages_s={"start": time.monotonic() - self._began},
             degraded=degraded,
         )
 
 
-def node_status(member: Member, own: Status | None) -> Status:
+def node_status(managed: ManagedProcess, own: Status | None) -> Status:
     """What a node says of itself (unless the process that said it is gone) and what its launcher knows."""
     now = time.monotonic_ns()
-    counters = {"restarts": member.restarts}
+    counters = {"restarts": managed.restarts}
     ages: dict[str, float] = {}
-    degraded = member.troubles
-    if member.child is not None:
-        pulse = member.child.pulse
-        ages |= {"start": pulse.age_s, "beat": pulse.silent_s}
-        if pulse.stalled_s is not None:
-            ages["turn"] = pulse.stalled_s
-        counters |= {"pid": member.child.pid} | process_figures(member.child.pid)
-        if pulse.frame_age_s is not None:
-            counters["published"], ages["frame"] = pulse.frames, pulse.frame_age_s
-        if own is not None and (now - own.stamp_ns) / 1e9 <= pulse.age_s:
+    degraded = managed.warnings
+    if managed.process is not None:
+        beat = managed.process.heartbeat
+        ages |= {"start": beat.age_s, "beat": beat.silent_s}
+        if beat.stalled_s is not None:
+            ages["turn"] = beat.stalled_s
+        counters |= {"pid": managed.process.pid} | process_stats(managed.process.pid)
+        if beat.frame_age_s is not None:
+            counters["published"], ages["frame"] = beat.frames, beat.frame_age_s
+        if own is not None and (now - own.stamp_ns) / 1e9 <= beat.age_s:
             said_s = (now - own.stamp_ns) / 1e9
             ages = {name: age + said_s for name, age in own.ages_s.items()} | ages | {"status": said_s}
             counters = dict(own.counters) | counters
             degraded += own.degraded
-    state: NodeState = "degraded" if degraded and member.state == "running" else member.state
-    return Status(member.name, state, now, counters, ages, degraded)
+    state: NodeState = "degraded" if degraded and managed.state == "running" else managed.state
+    return Status(managed.name, state, now, counters, ages, degraded)

@@ -13,17 +13,18 @@ import structlog
 from semantic_mapper.errors import NodeError
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.process_folder import OwnFolder, sweep
+from semantic_mapper.nodes.supervisor.fork_server import ForkServer
 from semantic_mapper.nodes.supervisor.launch_config import Launch
 from semantic_mapper.nodes.supervisor.launch_note import leave_launch_note
 from semantic_mapper.nodes.supervisor.launch_status import LaunchStatus
-from semantic_mapper.nodes.supervisor.managed_process import Member
+from semantic_mapper.nodes.supervisor.managed_process import ManagedProcess
+from semantic_mapper.nodes.supervisor.node_process import node_environment
+from semantic_mapper.nodes.supervisor.process_table import PROCESS_TABLE
 from semantic_mapper.nodes.supervisor.systemd import Notifier
 from semantic_mapper.transport.messages import NodeState
 
 POLL_S = 0.05
 END_HEARD_S = 2.0  # after the last camera has ended, a node that was not there then will not hear of it
-STOP_ORDER = ("camera", "finetuner", "recorder", "mapper")  # sources first: the others get the end of the stream
-NO_END = ("finetuner",)  # hear of no end of a stream: once it is over, nobody needs them any more
 
 _log = structlog.get_logger(__name__)
 
@@ -35,14 +36,14 @@ class Launcher:
 
     Args:
         launch: From ``load_launch``.
-        notifier: Who is told how it goes, beside the status topic.
+        notifier: Is told the state of the launch, beside the status topic.
     """
 
     def __init__(self, launch: Launch, notifier: Notifier | None = None) -> None:
         self._launch = launch
         self._notifier = notifier or Notifier("")
-        self._members: list[Member] = []
-        self._told_ready = False
+        self._processes: list[ManagedProcess] = []
+        self._reported_ready = False
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -69,15 +70,15 @@ class Launcher:
         """
         while not stop and not self._failures() and self._sources_run():
             self._look_after_all()
-            self._tell("running" if self._told_ready else "starting")
+            self._report("running" if self._reported_ready else "starting")
             time.sleep(POLL_S)
         self._look_after_all(last=True)  # a camera that has failed since the last look
         if stop:
             _log.info("stopping", by=stop.name)
-        self._notifier.stopping(sum(map(self._patience_s, {member.kind for member in self._members})))
-        for kind in STOP_ORDER:
+        self._notifier.stopping(sum(map(self._stop_limit_s, {process.kind for process in self._processes})))
+        for kind in PROCESS_TABLE:
             self._end(kind, stop)
-        self._status.tell(self._members, "ended", now=True)
+        self._status.report(self._processes, "ended", now=True)
         if failures := self._failures():
             raise NodeError("; then ".join(failures))
 
@@ -88,64 +89,65 @@ class Launcher:
         names = [n.name for n in self._launch.nodes]
         status = LaunchStatus(endpoints, names, self._launch.publish, self._launch.keys)
         self._status = self._stack.enter_context(status)
+        server = ForkServer(node_environment())
+        self._stack.callback(server.close)
         for node in self._launch.nodes:
-            self._members.append(Member(node, self._launch, endpoints, str(folder)))
+            self._processes.append(ManagedProcess(node, self._launch, endpoints, str(folder), server))
 
     def _failures(self) -> list[str]:
         """Of nodes that are not started any more: the first one may explain the others."""
-        return [m.failure for m in sorted(self._members, key=lambda m: m.failed_at) if m.failure]
+        return [p.failure for p in sorted(self._processes, key=lambda p: p.failed_at) if p.failure]
 
     def _sources_run(self) -> bool:
         """Whether a camera still runs: when none does, the others have the end of the stream and end by themselves."""
-        return any(m.runs for m in self._members if m.kind == "camera")
+        return any(p.runs for p in self._processes if p.kind == "camera")
 
     def _look_after_all(self, *, last: bool = False) -> None:
-        calm = all(m.state == "running" for m in self._members)
-        for member in self._members:
-            member.look_after(last=last, calm=calm)
+        for process in self._processes:
+            process.look_after(last=last)
 
-    def _tell(self, state: NodeState) -> None:
-        """Publish how it goes, and tell systemd."""
-        self._status.tell(self._members, state)
+    def _report(self, state: NodeState) -> None:
+        """Publish the state of all nodes, and notify systemd."""
+        self._status.report(self._processes, state)
         self._notifier.alive()
-        states = {m.name: m.state for m in self._members}
+        states = {p.name: p.state for p in self._processes}
         begun = set(states.values()) <= {"running", "stopping", "ended"}
-        if not self._told_ready and begun and not self._failures():
-            self._told_ready = True
+        if not self._reported_ready and begun and not self._failures():
+            self._reported_ready = True
             self._notifier.ready("all nodes are ready")
             _log.info("all_ready")
-        restarts = sum(m.restarts for m in self._members)
-        told = ", ".join(f"{name} {state}" for name, state in states.items())
-        self._notifier.status(f"{told}; {restarts} restarts")
+        restarts = sum(p.restarts for p in self._processes)
+        nodes = ", ".join(f"{name} {state}" for name, state in states.items())
+        self._notifier.status(f"{nodes}; {restarts} restarts")
 
-    def _patience_s(self, kind: str) -> float:
-        # One that loads its packages still, on a busy machine, hears of a stop late.
-        return self._launch.finish_s if kind in ("mapper", *NO_END) else self._launch.stop_s
+    def _stop_limit_s(self, kind: str) -> float:
+        return getattr(self._launch, PROCESS_TABLE[kind].stop_limit)
 
     def _end(self, kind: str, stop: StopRequest) -> None:
         """Wait for all nodes of a kind; ask them as soon as there is a reason not to wait for the end of the stream."""
-        patience = self._patience_s(kind)
-        members = [m for m in self._members if m.kind == kind]
+        limit_s = self._stop_limit_s(kind)
+        processes = [p for p in self._processes if p.kind == kind]
         began = time.monotonic()
-        while time.monotonic() - began < patience:
+        while time.monotonic() - began < limit_s:
             if kind == "mapper":  # its map was saved, the results that people look at were not
-                for member in members:
-                    member.start_to_finish()
-            if not any(m.runs for m in members):
+                for process in processes:
+                    process.start_to_finish()
+            if not any(p.runs for p in processes):
                 break
-            late = time.monotonic() - began > END_HEARD_S and any(m.restarts for m in self._members)
-            for member in members:
-                if stop or kind in NO_END or self._failures() or (late and member.state != "stopping"):
-                    member.ask_to_stop()
+            late = time.monotonic() - began > END_HEARD_S and any(p.restarts for p in self._processes)
+            hears_no_end = bool(stop or self._failures()) or not PROCESS_TABLE[kind].ends_with_stream
+            for process in processes:
+                if hears_no_end or (late and process.state != "stopping"):
+                    process.ask_to_stop()
             self._look_after_all(last=True)
-            self._tell("stopping")
+            self._report("stopping")
             time.sleep(POLL_S)
-        for member in members:
-            member.overstay(patience)
+        for process in processes:
+            process.overstay(limit_s)
         self._look_after_all(last=True)
 
     def _clean_up(self) -> None:
-        for member in self._members:
-            member.close()
-        self._members.clear()
+        for process in self._processes:
+            process.close()
+        self._processes.clear()
         self._stack.close()

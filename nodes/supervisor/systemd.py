@@ -15,44 +15,34 @@ _log = structlog.get_logger(__name__)
 
 
 class Notifier:
-    """Tells systemd how the service is. What cannot be told is logged, and nothing else changes.
+    """Tells systemd the state of the service. What cannot be sent is logged once.
 
     Args:
-        address: Path of the socket, "@name" for an abstract one; empty = nobody listens.
+        address: Path of the socket, "@name" for an abstract one; empty = none.
         watchdog_s: How often systemd wants a sign of life, at least; 0 = never.
     """
 
     def __init__(self, address: str, watchdog_s: float = 0.0) -> None:
-        self._address = "\0" + address[1:] if address.startswith("@") else address
+        self._address = address.replace("@", "\0", 1) if address.startswith("@") else address
         self._watchdog_s = watchdog_s
         self._last_sign = 0.0
         self._last_status = ""
         self._failed = False
 
     @classmethod
-    def from_environment(cls, environment: Mapping[str, str] | None = None) -> Notifier:
-        """As systemd has set it up; a watchdog that is meant for another process is none of ours."""
-        given = os.environ if environment is None else environment
-        address = given.get("NOTIFY_SOCKET", "")
-        usec, pid = given.get("WATCHDOG_USEC", ""), given.get("WATCHDOG_PID", "")
+    def from_environment(cls, environment: Mapping[str, str] = os.environ) -> Notifier:
+        """As systemd has set it up; a watchdog may be meant for another process."""
+        usec, pid = environment.get("WATCHDOG_USEC", ""), environment.get("WATCHDOG_PID", "")
         ours = usec.isdigit() and pid in ("", str(os.getpid()))
-        if address and not address.startswith(("/", "@")):
-            _log.warning("systemd_not_told", reason=f"NOTIFY_SOCKET={address}: neither a path nor an abstract socket")
-            address = ""
-        return cls(address, int(usec) / 1e6 if ours else 0.0)
-
-    @property
-    def wanted(self) -> bool:
-        """Whether anybody listens."""
-        return bool(self._address)
+        return cls(environment.get("NOTIFY_SOCKET", ""), int(usec) / 1e6 if ours else 0.0)
 
     def ready(self, status: str) -> None:
         """Start-up is over."""
-        self._send("READY=1", f"STATUS={_one_line(status)}")
+        self._send(f"READY=1\nSTATUS={_one_line(status)}")
 
     def stopping(self, extend_s: float) -> None:
         """The end has begun, and may take so long."""
-        self._send("STOPPING=1", f"EXTEND_TIMEOUT_USEC={round(extend_s * 1e6)}")
+        self._send(f"STOPPING=1\nEXTEND_TIMEOUT_USEC={round(extend_s * 1e6)}")
 
     def status(self, text: str) -> None:
         """One line for ``systemctl status``; sent when it changes."""
@@ -67,16 +57,15 @@ class Notifier:
             self._last_sign = now
             self._send("WATCHDOG=1")
 
-    def _send(self, *lines: str) -> None:
+    def _send(self, message: str) -> None:
         if not self._address:
             return
         try:
-            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
-                sender.setblocking(False)  # systemd that does not read must not hold the launch up
-                sender.sendto("\n".join(lines).encode(), self._address)
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
+                sender.sendto(message.encode(), self._address)
         except OSError as error:
             if not self._failed:
-                _log.warning("systemd_not_told", what=lines[0], reason=str(error))
+                _log.warning("systemd_not_told", what=message.split("\n")[0], reason=str(error))
             self._failed = True
 
 

@@ -106,7 +106,7 @@ class Running:
     def __exit__(self, *exception: object) -> None:
         if self.process.poll() is None:
             self.process.kill()
-        for pid in self.node_pids():
+        for pid in self.all_pids():
             if is_alive(pid):
                 os.kill(pid, signal.SIGKILL)
         self.process.wait()
@@ -133,6 +133,10 @@ class Running:
 
     def node_pids(self) -> list[int]:
         return [int(n) for line in self.lines for n in re.findall(r"node_started.*pid=(\d+)", line)]
+
+    def all_pids(self) -> list[int]:
+        """Of nodes, and of the process that forks them."""
+        return [int(n) for line in self.lines for n in re.findall(r"(?:node|fork_server)_started.*pid=(\d+)", line)]
 
     def node_pid(self, name: str) -> int:
         line = self.wait_for_line(rf"node_started.*node={name}\b")

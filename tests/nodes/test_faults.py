@@ -16,8 +16,6 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.options import Call, NodeJob
-from semantic_mapper.nodes.supervisor.node_process import Child
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.replay.log.recover import recover
 from tests.nodes.support import (
@@ -41,7 +39,6 @@ name = "eye"
 kind = "camera"
 restart = "on-failure"
 max_restarts = {limit}
-standby = {standby}
 [node.options]
 log = "{log}"
 mode = "realtime"
@@ -54,19 +51,15 @@ def long_log(folder: Path) -> Path:
     return write_log(folder / "minute.mcap", repeated_frames(1200))
 
 
-def alone(folder: Path, log: Path, *, limit: int = 5, standby: bool = False, extra: str = "") -> Path:
+def alone(folder: Path, log: Path, *, limit: int = 5, extra: str = "") -> Path:
     path = folder / "alone.toml"
-    path.write_text(ALONE.format(log=log, limit=limit, standby=str(standby).lower(), extra=extra))
+    path.write_text(ALONE.format(log=log, limit=limit, extra=extra))
     return path
 
 
 def wait_for_start(running: Running, name: str, restarts: int) -> int:
     line = running.wait_for_line(rf"node_started .*node={name} .*restarts={restarts}\b")
     return int(re.findall(r"pid=(\d+)", line)[0])
-
-
-def processes(running: Running) -> list[int]:
-    return running.node_pids() + [int(n) for n in re.findall(r"standby_started .*pid=(\d+)", running.text)]
 
 
 def frame_numbers(log: Path) -> list[int]:
@@ -105,7 +98,7 @@ def test_every_node_that_is_killed_or_frozen_comes_back_and_the_others_go_on(
         assert eventually(lambda: running.text.count("map_saved") > saves), running.text  # it maps on
         running.process.send_signal(signal.SIGINT)
         assert running.wait() == 0, running.text
-        assert not any(map(is_alive, processes(running)))
+        assert not any(map(is_alive, running.all_pids()))
     with capsys.disabled():
         print("\nback after:", ", ".join(f"{case} {seconds:.2f} s" for case, seconds in took.items()))  # noqa: T201
     summary = json.loads((out / "summary.json").read_text())
@@ -155,7 +148,7 @@ def test_a_mapper_that_is_given_up_leaves_the_results_of_the_map_it_saved(
             running.wait_for_line("node_restarts .*node=mapper")
             running.process.send_signal(signal.SIGINT)
         assert running.wait() == 1, running.text
-        assert not any(map(is_alive, processes(running)))
+        assert not any(map(is_alive, running.all_pids()))
     assert (out / "summary.json").exists(), running.text
     assert reason in error_line(running.text)
     saved = VoxelMap.load(out / "map.npz")
@@ -176,7 +169,7 @@ def test_node_that_a_stranger_sends_away_comes_back(long_log: Path, tmp_path: Pa
         for process in (running.process.pid, pid):  # as a service manager may, and terminals
             os.kill(process, signum)
         assert running.wait() == 0, running.text
-        assert not any(map(is_alive, processes(running)))
+        assert not any(map(is_alive, running.all_pids()))
 
 
 def test_node_that_is_not_to_come_back_and_is_sent_away_ends_the_launch_with_the_reason(
@@ -206,31 +199,30 @@ def test_node_that_never_was_ready_and_says_why_is_not_tried_again(tmp_path: Pat
     assert done.stderr.count("node_started") == 1
 
 
-def test_standby_takes_over_and_ends_with_the_launch(long_log: Path, tmp_path: Path) -> None:
-    with Running("up", alone(tmp_path, long_log, standby=True)) as running:
-        waiting = int(re.findall(r"pid=(\d+)", running.wait_for_line("standby_started"))[0])
-        os.kill(wait_for_start(running, "eye", 0), signal.SIGKILL)
-        assert wait_for_start(running, "eye", 1) == waiting
-        assert eventually(lambda: running.text.count("standby_started") == 2)
+def test_standby_of_older_launch_files_is_accepted_with_one_warning(long_log: Path, tmp_path: Path) -> None:
+    launch = alone(tmp_path, long_log)
+    launch.write_text(launch.read_text().replace("[node.options]", "standby = true\n[node.options]"))
+    with Running("up", launch) as running:
+        running.wait_for_line("all_ready")
         running.process.send_signal(signal.SIGTERM)
         assert running.wait() == 0, running.text
-        assert len(processes(running)) == 4 and not any(map(is_alive, processes(running)))
+    assert len(re.findall(r"setting_ignored .*nodes=eye .*setting=standby", running.text)) == 1
 
 
 def test_killed_launcher_leaves_no_process_even_where_one_is_frozen(long_log: Path, tmp_path: Path) -> None:
-    with Running("up", alone(tmp_path, long_log, standby=True, extra="")) as running:
-        running.wait_for_line("standby_started")
+    with Running("up", alone(tmp_path, long_log)) as running:
+        running.wait_for_line("all_ready")
         os.kill(wait_for_start(running, "eye", 0), signal.SIGSTOP)
         running.process.kill()
-        assert eventually(lambda: not any(map(is_alive, processes(running))))
+        assert eventually(lambda: not any(map(is_alive, running.all_pids())))
 
 
 HUNG = """
 import ctypes, os, sys
-from semantic_mapper.nodes.supervisor.heartbeat import Heart
-heart = Heart(int(sys.argv[1]), 1)
-heart.start()
-heart.ready()
+from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
+heartbeat = HeartbeatWriter(int(sys.argv[1]), 1)
+heartbeat.start()
+heartbeat.ready()
 print("beats", flush=True)
 ctypes.PyDLL(None).sleep(600)  # keeps the interpreter's lock: no thread runs, no Python handler either
 """
@@ -243,17 +235,6 @@ def test_kernel_ends_a_process_that_hangs_with_all_its_threads() -> None:
     assert hung.stdout is not None and hung.stdout.readline() == b"beats\n"
     assert hung.wait(60) == -signal.SIGALRM
     os.close(read)  # only now: it cannot have heard of that
-
-
-def test_process_in_waiting_ends_by_itself_where_it_is_not_needed(long_log: Path) -> None:
-    child = Child("camera", NodeJob(name="eye", options={"log": str(long_log)}, waits=True))
-    assert child.exit_code() is None
-    assert child._process.stdin is not None
-    child._process.stdin.close()
-    assert child.wait(60) and child.exit_code() == 0
-    with pytest.raises((OSError, ValueError)):
-        child.begin(Call(restarts=1))
-    child.close()
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
 from semantic_mapper.nodes.cli.report import Section, table_of, write_page
 from semantic_mapper.nodes.options import NodeJob
-from semantic_mapper.nodes.supervisor.node_process import Child
+from semantic_mapper.nodes.supervisor.node_process import NodeProcess
 from semantic_mapper.plain_text import visible
 from semantic_mapper.replay.log.format import LogAttachment, LogWriter
 from semantic_mapper.transport.messages import StreamInfo
@@ -125,7 +125,7 @@ def test_error_lines_show_names_as_they_are(tmp_path: Path) -> None:
 
 def test_events_and_lines_of_nodes_are_plain(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     options = {"log": str(tmp_path / "gone[/b]\x1b]0;x\x07.mcap"), "mode": "fast"}
-    child = Child("camera", NodeJob(name="camera", options=options))
+    child = NodeProcess("camera", NodeJob(name="camera", options=options))
     try:
         assert child.wait(60)
         assert "gone[/b]" in child.describe_end() and "\x1b" not in child.describe_end()

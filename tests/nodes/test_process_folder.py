@@ -21,8 +21,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def die(folder: OwnFolder) -> None:
     """What the kernel does where the process is killed."""
-    os.close(folder._lock)
-    folder._lock = -1
+    folder._lock.release()
 
 
 def test_only_what_its_process_has_left_is_removed(elsewhere: Path) -> None:

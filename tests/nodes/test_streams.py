@@ -23,7 +23,7 @@ from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.public_publisher import PublicPublisher
 from semantic_mapper.nodes.recorder.node import run_recorder
 from semantic_mapper.nodes.streams import Streams
-from semantic_mapper.nodes.supervisor.heartbeat import Heart
+from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info, encode_status
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
@@ -38,7 +38,7 @@ LEFT, RIGHT = StreamInfo("left eye", {"left": INTRINSICS}), StreamInfo("right ey
 @contextmanager
 def recording(path: Path, endpoints: dict[str, str]) -> Iterator[StopRequest]:
     stop = StopRequest()
-    context = NodeContext("recorder", endpoints, 0, stop, Heart(-1, 1))
+    context = NodeContext("recorder", endpoints, 0, stop, HeartbeatWriter(-1, 1))
     options = RecorderOptions(out=str(path), sources=("left", "right"), streams=2)
     thread = threading.Thread(target=run_recorder, args=(context, options))
     thread.start()
@@ -99,7 +99,7 @@ def test_two_cameras_of_different_size_are_fused_into_one_map(tmp_path: Path) ->
             config=str(config),
             query="",
         )
-        context = NodeContext("mapper", endpoints, 0, StopRequest(), Heart(-1, 1))
+        context = NodeContext("mapper", endpoints, 0, StopRequest(), HeartbeatWriter(-1, 1))
         publishers = {name: stack.enter_context(Publisher(endpoints[name], policy="block")) for name in infos}
         thread = threading.Thread(target=run_mapper, args=(context, options))
         thread.start()

@@ -80,7 +80,7 @@ def test_ctrl_c_writes_the_map_so_far_and_leaves_no_process(
         assert sockets.stat().st_mode & 0o777 == 0o700
         running.process.send_signal(signal.SIGINT)
         assert running.wait() == 0, running.text
-        assert not any(is_alive(pid) for pid in running.node_pids())
+        assert not any(is_alive(pid) for pid in running.all_pids())
         assert len(running.node_pids()) == 3
         assert not sockets.exists()
     summary = json.loads((tmp_path / "up" / "summary.json").read_text())
@@ -98,7 +98,7 @@ def test_killed_mapper_is_named_and_nothing_is_left(
         running.wait_for_line("stream_begins")
         os.kill(running.node_pid("mapper"), signal.SIGKILL)
         assert running.wait() == 1, running.text
-        assert not any(is_alive(pid) for pid in running.node_pids())
+        assert not any(is_alive(pid) for pid in running.all_pids())
         assert error_line(running.text).startswith("error: node 'mapper' (mapper) ended: killed by SIGKILL")
 
 
@@ -140,7 +140,7 @@ def test_frozen_node_is_found_out_and_killed(long_log: Path, weights: Path, conf
         assert running.wait() == 1, running.text
         line = error_line(running.text)
         assert "node 'camera'" in line and "no sign of life for 6 s" in line
-        assert not any(is_alive(pid) for pid in running.node_pids())
+        assert not any(is_alive(pid) for pid in running.all_pids())
 
 
 @pytest.mark.slow

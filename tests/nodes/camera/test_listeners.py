@@ -15,7 +15,7 @@ from semantic_mapper.nodes.camera import listeners
 from semantic_mapper.nodes.camera.listeners import drain
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.supervisor.heartbeat import Heart
+from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.transport.codec import CodecOptions, encode_end, encode_frame, encode_info
 from semantic_mapper.transport.messages import EndOfStream, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
@@ -43,7 +43,9 @@ def endpoint() -> Iterator[str]:
 def draining(publisher: Publisher) -> Iterator[None]:
     """A camera that has come to its end, until all of its listeners have left."""
     stop = StopRequest()
-    thread = threading.Thread(target=drain, args=(NodeContext("camera", {}, 1, stop, Heart(-1, 1)), publisher))
+    thread = threading.Thread(
+        target=drain, args=(NodeContext("camera", {}, 1, stop, HeartbeatWriter(-1, 1)), publisher)
+    )
     thread.start()
     try:
         yield

@@ -28,7 +28,7 @@ from semantic_mapper.nodes.camera.node import run_camera
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import CameraOptions
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.supervisor.heartbeat import TURN, Heart
+from semantic_mapper.nodes.supervisor.heartbeat import TURN, HeartbeatWriter
 from semantic_mapper.nodes.supervisor.launch_config import load_launch
 from semantic_mapper.transport.messages import EndOfStream, Message, Status, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber
@@ -115,12 +115,12 @@ class Running:
 
 @contextmanager
 def running(
-    options: dict[str, Any], *, comes_back: bool = False, beats: int = -1, busy: threading.Event | None = None
+    options: dict[str, Any], *, restartable: bool = False, beats: int = -1, busy: threading.Event | None = None
 ) -> Iterator[Running]:
     with tempfile.TemporaryDirectory(prefix="sm-") as folder:  # pytest's own may be longer than a socket's path
         endpoint = f"ipc://{folder}/eye"
         stop = StopRequest()
-        context = NodeContext("eye", {"eye": endpoint}, 1, stop, Heart(beats, 1), comes_back=comes_back)
+        context = NodeContext("eye", {"eye": endpoint}, 1, stop, HeartbeatWriter(beats, 1), restartable=restartable)
         checked = convert_config(options, CameraOptions, "test")
 
         def work() -> None:
@@ -235,7 +235,7 @@ def test_a_video_file_that_waits_for_a_reader_can_be_stopped_and_has_a_limit(tmp
 @pytest.mark.parametrize("kind", ["device", "rgbd"])
 def test_a_camera_that_tracks_itself_must_not_come_back_in_another_world(tmp_path: Path, kind: str) -> None:
     camera = v4l2(tmp_path / "video0", tmp_path)["camera"] | {"poses": {"kind": kind}}
-    with running({"camera": camera}, comes_back=True) as node:
+    with running({"camera": camera}, restartable=True) as node:
         node.thread.join(PATIENCE_S)
     assert isinstance(node.error, ConfigError) and 'set restart = "never"' in str(node.error)
     assert not node.frames()
@@ -264,9 +264,9 @@ def test_frames_get_the_poses_that_the_launch_file_names(tmp_path: Path, monkeyp
     assert all(np.array_equal(f.T_world_camera, pose) for f in frames)
 
 
-@pytest.mark.parametrize("comes_back", [False, True])
+@pytest.mark.parametrize("restartable", [False, True])
 def test_a_failure_ends_the_stream_only_where_the_camera_is_not_started_anew(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, comes_back: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, restartable: bool
 ) -> None:
     monkeypatch.undo()  # of the walking camera
     film = tmp_path / "film.avi"
@@ -277,11 +277,11 @@ def test_a_failure_ends_the_stream_only_where_the_camera_is_not_started_anew(
     config = {"source": str(film), "calibration": write_calibration(tmp_path / "lens.toml")}
     poses = {"kind": "device", "patience_s": 0.1}  # a video tells no pose of its own
     monkeypatch.setattr(live_camera, "check_world", lambda *_: None)
-    with running({"camera": {"kind": "opencv", "config": config, "poses": poses}}, comes_back=comes_back) as node:
+    with running({"camera": {"kind": "opencv", "config": config, "poses": poses}}, restartable=restartable) as node:
         node.until(lambda m: isinstance(m, EndOfStream) or (isinstance(m, Status) and m.state == "ended"))
         ends = [m for m in list(node.heard) if isinstance(m, EndOfStream)]
     assert isinstance(node.error, CameraError)
-    assert [end.reason for end in ends] == ([] if comes_back else ["error"])
+    assert [end.reason for end in ends] == ([] if restartable else ["error"])
 
 
 def test_it_stays_when_the_camera_goes_says_so_and_goes_on_when_it_is_back(machine: Machine, tmp_path: Path) -> None:

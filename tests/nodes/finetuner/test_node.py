@@ -24,7 +24,7 @@ from semantic_mapper.nodes.finetuner.throttle import AbandonedError, Throttle, r
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import FinetunerOptions, MapperOptions
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.supervisor.heartbeat import Heart
+from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.nodes.supervisor.launch_config import load_launch
 from semantic_mapper.training.keyframe_pool import Lessons
 from semantic_mapper.training.online import OnlineConfig
@@ -90,7 +90,7 @@ def finetuning(start: Path, endpoints: dict[str, str], restarts: int = 0, **more
     settings = {"config": str(start.with_name("learning.toml")), "niceness": 0, "settle_s": 0.3, **more}
     options = FinetunerOptions(weights=str(start), share=1.0, **settings)
     stop = StopRequest(patient=True)
-    context = NodeContext("finetuner", endpoints, 1, stop, Heart(-1, 1), restarts)
+    context = NodeContext("finetuner", endpoints, 1, stop, HeartbeatWriter(-1, 1), restarts)
     node = threading.Thread(target=run_finetuner, args=(context, options), daemon=True)
     with (
         LosslessSubscriber(endpoints["finetuner"], ("weights",)) as weights,

@@ -28,7 +28,7 @@ from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.supervisor.heartbeat import Heart
+from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport import query_messages as messages
 from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info
@@ -90,7 +90,7 @@ def running_robot(
             out=str(out), weights=str(weights), config=str(config_file(folder, history)), delivery="all", **more
         )
         stop = StopRequest(patient=True)
-        context = NodeContext("mapper", endpoints, 1, stop, Heart(-1, 1), restarts, notes)
+        context = NodeContext("mapper", endpoints, 1, stop, HeartbeatWriter(-1, 1), restarts, notes)
         mapper = threading.Thread(target=run_mapper, args=(context, options), daemon=True)
         status: list[Status] = []
         ended = threading.Event()

@@ -13,13 +13,13 @@ import pytest
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.camera.resume_playback import Beginning
+from semantic_mapper.nodes.camera.node import Playback
 from semantic_mapper.nodes.mapper.node import run_mapper
 from semantic_mapper.nodes.mapper.resume import forbid, keep_earlier, take_up
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.nodes.supervisor.heartbeat import Heart
+from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info
 from semantic_mapper.transport.messages import EndOfStream, StreamInfo
 from semantic_mapper.transport.sockets import Publisher
@@ -30,7 +30,7 @@ CONFIG = VoxelMapConfig(voxel_size_m=0.05, initial_blocks=200)
 
 def context(folder: Path, restarts: int) -> NodeContext:
     folder.mkdir(exist_ok=True)
-    return NodeContext("mapper", {}, 1, StopRequest(), Heart(-1, 1), restarts, folder)
+    return NodeContext("mapper", {}, 1, StopRequest(), HeartbeatWriter(-1, 1), restarts, folder)
 
 
 def some_map(frames: int) -> VoxelMap:
@@ -150,7 +150,7 @@ def map_stream(options: MapperOptions) -> None:
     """A mapper from the beginning of a stream to its end."""
     with tempfile.TemporaryDirectory(prefix="sm-") as folder:
         endpoints = {name: f"ipc://{folder}/{name}" for name in ("camera", "mapper")}
-        mapper = NodeContext("mapper", endpoints, 0, StopRequest(), Heart(-1, 1), folder=Path(folder))
+        mapper = NodeContext("mapper", endpoints, 0, StopRequest(), HeartbeatWriter(-1, 1), folder=Path(folder))
         with Publisher(endpoints["camera"], policy="block") as camera:
             thread = threading.Thread(target=run_mapper, args=(mapper, options))
             thread.start()
@@ -181,8 +181,8 @@ def test_where_no_note_can_be_written_nodes_go_on(tmp_path: Path) -> None:
     gone = context(tmp_path / "notes", 0)
     (tmp_path / "notes").rmdir()
     assert not forbid(gone, "poses had been corrected")
-    began = Beginning(gone, 1.0)
-    began.note(5)
-    began.note(6)
+    began = Playback(gone, 1.0)
+    began.note_frame(5)
+    began.note_frame(6)
     assert 5 <= began.due_stamp_ns() < 5 + 60e9
     assert forbid(context(tmp_path / "notes", 0), "poses had been corrected")

@@ -33,10 +33,10 @@ from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import RecorderOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.recorder.node import Recorder, run_recorder
-from semantic_mapper.nodes.supervisor.heartbeat import Heart
+from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.nodes.supervisor.launch_note import NOTE, LaunchNote, NodeNote, read_launch_note
 from semantic_mapper.nodes.supervisor.running_launches import launch_folder
-from semantic_mapper.replay.log.format import LogReader
+from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.recording import Recording, RecordingRules
 from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
 from semantic_mapper.transport.codec import CodecOptions, encode_end, encode_frame, encode_info, repack_rgb
@@ -84,11 +84,11 @@ class Stream:
 
 
 @contextmanager
-def streaming(tmp_path: Path, sockets: Path, **options: Any) -> Iterator[Stream]:
+def streaming(tmp_path: Path, sockets: Path, restarts: int = 0, **options: Any) -> Iterator[Stream]:
     endpoints = {name: f"ipc://{sockets}/{name}" for name in ("camera", "recorder")}
     settings = convert_config({"out": str(tmp_path / "a.mcap"), "sources": ["camera"], **options}, RecorderOptions, "t")
     stop = StopRequest()
-    context = NodeContext("recorder", endpoints, 0, stop, Heart(-1, 0), folder=sockets)
+    context = NodeContext("recorder", endpoints, 0, stop, HeartbeatWriter(-1, 0), restarts, folder=sockets)
     failures: list[BaseException] = []
 
     def work() -> None:
@@ -159,6 +159,29 @@ def test_recorder_splits_packs_and_keeps_what_belongs_to_the_log(tmp_path: Path,
     assert found["attachments"].keys() >= {NOTE, "calibration.json"} and not found["damage"]
     alone = describe_log(parts[1:2], lambda: None)
     assert alone["part"] == 1 and 0 < alone["frames"] < 28
+
+
+@pytest.mark.parametrize("cut_off", [0, 100])
+def test_a_restarted_recorder_counts_what_no_log_holds(tmp_path: Path, sockets: Path, cut_off: int) -> None:
+    with streaming(tmp_path, sockets, reserve_mb=0) as stream:
+        stream.publish(*range(10))
+        stream.end()
+    if cut_off:  # in the middle of the last frame, as where the process is killed
+        with LogWriter(tmp_path / "killed.mcap", samples.make_info()) as log:
+            for seq in range(9):
+                log.write_parts(encode_frame(samples.make_frame(seq)))
+            whole = log.bytes_written
+            log.write_parts(encode_frame(samples.make_frame(9)))
+        with (tmp_path / "killed.mcap").open("r+b") as file:
+            file.truncate(whole + cut_off)
+        (tmp_path / "killed.mcap").replace(tmp_path / "a.mcap")
+    with streaming(tmp_path, sockets, restarts=1, reserve_mb=0) as stream:
+        stream.publish(14, 15, 17)
+        stream.end()
+        told = stream.last_status().counters
+    assert (told["recorded"], told["missed"]) == (3, 6 if cut_off else 5)
+    with LogReader(tmp_path / "a-1.mcap") as log:
+        assert [envelope.seq for envelope, _ in log.frame_parts()] == [14, 15, 17]
 
 
 def test_full_disk_is_told_and_the_stream_goes_on(tmp_path: Path, sockets: Path) -> None:

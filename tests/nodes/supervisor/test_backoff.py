@@ -9,14 +9,15 @@ import sys
 import time
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.frame_gaps import Gaps
-from semantic_mapper.nodes.supervisor.backoff import Restarts
-from semantic_mapper.nodes.supervisor.heartbeat import ENDING, FRAME, RUNNING, STARTING, TURN, Pulse
+from semantic_mapper.nodes.supervisor.backoff import RestartBackoff
+from semantic_mapper.nodes.supervisor.hang_detector import HangDetector
+from semantic_mapper.nodes.supervisor.heartbeat import ENDING, FRAME, RUNNING, STARTING, TURN, HeartbeatMonitor
 from semantic_mapper.nodes.supervisor.launch_config import NodeEntry, load_launch
-from semantic_mapper.nodes.supervisor.process_stats import Stillness
 from tests.nodes.support import REPLAY_LAUNCH
 
 LIVE_LAUNCH = REPLAY_LAUNCH.with_name("replay-live.toml")
@@ -27,13 +28,13 @@ def entry(**changes: object) -> NodeEntry:
 
 
 def test_pauses_double_up_to_their_limit_and_the_number_is_limited() -> None:
-    restarts = Restarts(entry(backoff_s=0.5, backoff_max_s=3.0, max_restarts=4, window_s=60.0))
+    restarts = RestartBackoff(entry(backoff_s=0.5, backoff_max_s=3.0, max_restarts=4, window_s=60.0))
     assert [restarts.delay_s(float(t)) for t in range(5)] == [0.5, 1.0, 2.0, 3.0, None]
     assert restarts.count == 4
 
 
 def test_what_is_older_than_the_window_counts_no_more() -> None:
-    restarts = Restarts(entry(backoff_s=0.5, max_restarts=2, window_s=10.0))
+    restarts = RestartBackoff(entry(backoff_s=0.5, max_restarts=2, window_s=10.0))
     assert [restarts.delay_s(t) for t in (0.0, 1.0, 5.0)] == [0.5, 1.0, None]
     assert restarts.lately(9.9) == 2 and restarts.lately(10.5) == 1
     assert restarts.delay_s(12.0) == 0.5
@@ -41,7 +42,7 @@ def test_what_is_older_than_the_window_counts_no_more() -> None:
 
 
 def test_no_restart_at_all_where_none_is_allowed() -> None:
-    assert Restarts(entry(max_restarts=0)).delay_s(1.0) is None
+    assert RestartBackoff(entry(max_restarts=0)).delay_s(1.0) is None
 
 
 def test_replay_launches_end_with_the_first_failure_as_ever() -> None:
@@ -78,28 +79,28 @@ def test_mistakes_are_named(tmp_path: Path, old: str, new: str, says: str) -> No
 
 def test_launcher_knows_from_the_pipe_how_far_a_node_is() -> None:
     read, write = os.pipe()
-    pulse = Pulse(read)
-    pulse.listen()
-    assert not pulse.ready and pulse.stalled_s is None
+    monitor = HeartbeatMonitor(read)
+    monitor.poll()
+    assert not monitor.ready and monitor.stalled_s is None
     os.write(write, STARTING)
-    pulse.listen()
-    assert not pulse.ready
+    monitor.poll()
+    assert not monitor.ready
     os.write(write, RUNNING + TURN + RUNNING)
-    pulse.listen()
-    assert pulse.ready and not pulse.ending and pulse.stalled_s is not None
+    monitor.poll()
+    assert monitor.ready and not monitor.ending and monitor.stalled_s is not None
     time.sleep(0.02)
     os.write(write, RUNNING)  # lives, but its main loop does not come round
-    pulse.listen()
-    assert pulse.silent_s < pulse.stalled_s
+    monitor.poll()
+    assert monitor.silent_s < monitor.stalled_s
     os.write(write, ENDING)
-    pulse.listen()
-    assert pulse.ready and pulse.ending and pulse.stalled_s is None
-    assert pulse.frames == 0 and pulse.frame_age_s is None
+    monitor.poll()
+    assert monitor.ready and monitor.ending and monitor.stalled_s is None
+    assert monitor.frames == 0 and monitor.frame_age_s is None
     os.write(write, FRAME + RUNNING + FRAME + FRAME)  # of a player of logs
-    pulse.listen()
-    assert pulse.frames == 3 and pulse.frame_age_s is not None and not pulse.ending
+    monitor.poll()
+    assert monitor.frames == 3 and monitor.frame_age_s is not None and not monitor.ending
     os.close(write)
-    pulse.listen()  # has ended: no sign of life
+    monitor.poll()  # has ended: no sign of life
     os.close(read)
 
 
@@ -115,23 +116,29 @@ BUSY = "print(flush=True)\nwhile True: pass"
 
 
 @pytest.mark.parametrize(
-    ("program", "stopped", "still"), [(SLEEPS, False, True), (BUSY, False, False), (BUSY, True, True)]
+    ("program", "stopped", "hangs"), [(SLEEPS, False, True), (BUSY, False, False), (BUSY, True, True)]
 )
-def test_a_frozen_process_is_told_from_a_busy_one(program: str, stopped: bool, still: bool) -> None:
+def test_a_frozen_process_is_told_from_a_busy_one(program: str, stopped: bool, hangs: bool) -> None:
     process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
     assert process.stdout is not None and process.stdout.readline() == b"\n"
     if stopped:
         process.send_signal(signal.SIGSTOP)
         time.sleep(0.05)
-    elif still:
+    elif hangs:
         time.sleep(0.3)  # until it sleeps, on whatever machine
-    stillness = Stillness(process.pid)
-    assert not stillness.proven  # nobody has looked yet
-    stillness.watch()
+    launch = msgspec.structs.replace(load_launch(LIVE_LAUNCH, ["log=room.mcap"]), heartbeat_s=0.2)
+    read, write = os.pipe()
+    monitor = HeartbeatMonitor(read)
+    os.write(write, RUNNING)
+    detector = HangDetector(process.pid, monitor, launch)
+    assert not detector.find_hang(stopping=False)
+    time.sleep(0.15)
+    assert not detector.find_hang(stopping=False), "it is not silent for long enough"
     time.sleep(0.2)
-    stillness.watch()  # changes nothing
-    assert stillness.proven == still
-    stillness.forget()
-    assert not stillness.proven
+    assert bool(detector.find_hang(stopping=False)) == hangs
+    os.write(write, RUNNING)
+    assert not detector.find_hang(stopping=False), "it lives"
     process.kill()
     process.wait()
+    os.close(write)
+    os.close(read)

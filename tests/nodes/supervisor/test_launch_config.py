@@ -185,7 +185,7 @@ def test_launch_files_for_cameras_are_as_the_docs_say() -> None:
         assert file.heartbeat_s == 1.5, path.name
         assert "{now}" in str(file.set["out"]), path.name
         for node in file.node:
-            assert node.standby == (node.kind != "camera"), f"{path.name}: {node.name}"
+            assert not node.standby, f"{path.name}: {node.name}"
     assert live == 6
 
 

@@ -15,10 +15,10 @@ from resource import RLIMIT_NOFILE, getrlimit, setrlimit
 import pytest
 
 from semantic_mapper.nodes.options import NodeJob
-from semantic_mapper.nodes.supervisor import node_process as child_module
+from semantic_mapper.nodes.supervisor import node_process as process_module
 from semantic_mapper.nodes.supervisor.launch_config import load_launch
-from semantic_mapper.nodes.supervisor.managed_process import Member
-from semantic_mapper.nodes.supervisor.node_process import Child
+from semantic_mapper.nodes.supervisor.managed_process import ManagedProcess
+from semantic_mapper.nodes.supervisor.node_process import NodeProcess
 
 LAUNCH = """
 [[node]]
@@ -27,7 +27,6 @@ kind = "camera"
 restart = "{restart}"
 backoff_s = 0.01
 backoff_max_s = 0.01
-standby = {standby}
 [node.options]
 log = "{log}"
 mode = "realtime"
@@ -50,28 +49,28 @@ def open_files() -> int:
     return len(os.listdir("/proc/self/fd"))
 
 
-def starter(tmp_path: Path, log: Path, *, restart: str = "on-failure", standby: bool = False) -> Callable[[], Member]:
+def starter(tmp_path: Path, log: Path, *, restart: str = "on-failure") -> Callable[[], ManagedProcess]:
     """What starts the node; all that reads files is done."""
     path = tmp_path / "launch.toml"
-    path.write_text(LAUNCH.format(restart=restart, standby=str(standby).lower(), log=log))
+    path.write_text(LAUNCH.format(restart=restart, log=log))
     launch = load_launch(path)
     endpoints = {name: f"ipc://{tmp_path}/{name}" for name in launch.sockets()}
-    return lambda: Member(launch.nodes[0], launch, endpoints, str(tmp_path))
+    return lambda: ManagedProcess(launch.nodes[0], launch, endpoints, str(tmp_path))
 
 
 def test_a_node_that_cannot_be_started_is_tried_again(log: Path, tmp_path: Path) -> None:
     before, start = open_files(), starter(tmp_path, log)
     with files(0):
         eye = start()
-        assert eye.child is None and eye.runs and eye.state == "starting" and eye.restarts == 1
-        assert "could not be started: [Errno 24]" in eye.troubles[0]
+        assert eye.process is None and eye.runs and eye.state == "starting" and eye.restarts == 1
+        assert "could not be started: [Errno 24]" in eye.warnings[0]
         time.sleep(0.05)
         eye.look_after(last=False)
-        assert eye.child is None and eye.restarts == 2
+        assert eye.process is None and eye.restarts == 2
     assert open_files() == before
     time.sleep(0.05)
     eye.look_after(last=False)
-    assert eye.child is not None and eye.child.exit_code() is None
+    assert eye.process is not None and eye.process.exit_code() is None
     eye.close()
     assert open_files() == before
 
@@ -94,26 +93,9 @@ def test_a_launch_that_ends_says_what_could_not_be_started(log: Path, tmp_path: 
     assert "could not be started" in eye.failure and "had not been restarted yet" in eye.failure
 
 
-def test_a_standby_that_cannot_be_started_leaves_the_node_at_work(log: Path, tmp_path: Path) -> None:
-    before = open_files()
-    eye = starter(tmp_path, log, standby=True)()
-    try:
-        assert eye.child is not None
-        pid = eye.child.pid
-        with files(0):
-            eye.look_after(last=False, calm=True)
-            assert eye._standby is None and eye.child.pid == pid and not eye.failure
-        time.sleep(0.05)
-        eye.look_after(last=False, calm=True)
-        assert eye._standby is not None and eye.child.pid == pid
-    finally:
-        eye.close()
-    assert open_files() == before
-
-
 @pytest.mark.slow
 def test_wherever_a_start_fails_nothing_is_left_behind(log: Path) -> None:
-    job = NodeJob(name="eye", options={"log": str(log)}, waits=True)
+    job = NodeJob(name="eye", options={"log": str(log)})
     highest = max(map(int, os.listdir("/proc/self/fd")))
     fillers = []  # so that all files from now on have the numbers after it
     while not fillers or fillers[-1] < highest:
@@ -123,7 +105,7 @@ def test_wherever_a_start_fails_nothing_is_left_behind(log: Path) -> None:
         for more in range(1, 30):
             with files(fillers[-1] + more):
                 try:
-                    child = Child("camera", job)
+                    child = NodeProcess("camera", job)
                 except OSError:
                     failures += 1
                     child = None
@@ -148,7 +130,7 @@ def test_without_a_thread_no_process_is_left_behind(log: Path, monkeypatch: pyte
     with monkeypatch.context() as patch:
         patch.setattr(threading.Thread, "start", no_thread)
         with pytest.raises(OSError, match="no thread that reads what 'eye' says"):
-            Child("camera", NodeJob(name="eye", options={"log": str(log)}))
+            NodeProcess("camera", NodeJob(name="eye", options={"log": str(log)}))
     assert len(started) == 1 and not children() - others
     assert open_files() == before
 
@@ -166,9 +148,9 @@ def parent(process: Path) -> int:
 
 
 def test_a_process_that_does_not_die_holds_nobody_up(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(child_module, "KILL_S", 0.1)
-    child = Child("camera", NodeJob(name="eye", options={"log": str(log)}, waits=True))
-    monkeypatch.setattr(child._process, "kill", lambda: None)  # as where the kernel waits for a device
+    monkeypatch.setattr(process_module, "KILL_S", 0.1)
+    child = NodeProcess("camera", NodeJob(name="eye", options={"log": str(log)}))
+    monkeypatch.setattr(child._process, "send_signal", lambda signum: None)  # as where the kernel waits for a device
     closing = threading.Thread(target=child.close, daemon=True)
     closing.start()
     closing.join(20)
