@@ -40,8 +40,7 @@ from semantic_mapper.replay.artifacts import write_json
 from semantic_mapper.replay.evaluate.truth import TruthMapper
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
-from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info, encode_keyframe, encode_weights
-from semantic_mapper.transport.learning_messages import digest_of
+from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import (
     EndOfStream,
     LabelledKeyframe,
@@ -49,6 +48,7 @@ from semantic_mapper.transport.messages import (
     StreamInfo,
     WeightsInUse,
     WeightsUpdate,
+    digest_of,
 )
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
 from semantic_mapper.types import MapUpdate, PosedFrame
@@ -151,7 +151,7 @@ class Robot:
 
     def begin(self, info: StreamInfo) -> None:
         """Tell the mapper what is to come."""
-        self._camera.publish(encode_info(info))
+        self._camera.publish(encode(info))
 
     def note(self, what: str, **more: Any) -> None:
         """Keep an event, and tell of it."""
@@ -206,20 +206,20 @@ class Robot:
     def teach(self, frames: Sequence[PosedFrame], label_set: LabelSet, teacher: str) -> None:
         """Send labelled keyframes."""
         for frame in frames:
-            self._labels.publish(encode_keyframe(LabelledKeyframe(frame, label_set, teacher)))
+            self._labels.publish(encode(LabelledKeyframe(frame, label_set, teacher)))
         self.note("keyframes sent", count=len(frames), teacher=teacher)
 
     def offer(self, checkpoint: Checkpoint) -> None:
         """Offer weights to the mapper, as a finetuner would that has found them better."""
         data, version = file_of(checkpoint), self.in_use.newest + 1
         update = WeightsUpdate("script", version, data, digest_of(data), self.in_use.digest, 1.0, 0.0, 1, 1)
-        self._offers.publish(encode_weights(update))
+        self._offers.publish(encode(update))
         self.note("weights offered by a teacher that is wrong throughout", version=version)
 
     def end(self) -> dict[str, Any]:
         """End both; the mapper's summary."""
         self.finetuner.ask_to_stop()
-        self._camera.publish(encode_end(EndOfStream("script", "end", self._played)))
+        self._camera.publish(encode(EndOfStream("script", "end", self._played)))
         for child in (self.finetuner, self._mapper):
             if not child.wait(120) or child.exit_code():
                 raise SystemExit(child.describe_end())
@@ -232,7 +232,7 @@ class Robot:
                 continue
             self._passed_on = update.version
             self.note("weights offered", version=update.version, score=update.score, parent_score=update.parent_score)
-            self._offers.publish(encode_weights(update))
+            self._offers.publish(encode(update))
         while (message := self._told.receive(0.0)) is not None:
             assert isinstance(message, WeightsInUse)
             if message.version != self.version:

@@ -23,7 +23,7 @@ from semantic_mapper.nodes.options import CameraOptions, LiveCamera
 if TYPE_CHECKING:
     from semantic_mapper.drivers.base import Camera, FrameSource
     from semantic_mapper.drivers.mounts import Mount
-    from semantic_mapper.transport.codec import Parts
+    from semantic_mapper.transport.framing import Parts
     from semantic_mapper.transport.messages import EndReason, NodeState
     from semantic_mapper.transport.sockets import Publisher
     from semantic_mapper.types import PosedFrame
@@ -197,10 +197,10 @@ def _listeners(context: NodeContext, options: CameraOptions, publisher: Publishe
 def _publish(
     context: NodeContext, options: CameraOptions, publisher: Publisher, teller: _Teller, source: LiveSource
 ) -> None:
-    from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info
+    from semantic_mapper.transport.codec import encode, encode_frame
     from semantic_mapper.transport.messages import EndOfStream
 
-    publisher.publish(encode_info(source.info, context.name))
+    publisher.publish(encode(source.info, sender=context.name))
     _log.info("publishing", source=source.info.source)
     reason: EndReason = "error"
     detail = "the camera node failed"
@@ -219,7 +219,7 @@ def _publish(
         raise
     finally:
         if reason != "error" or not context.comes_back:  # else the stream goes on with the process after this one
-            _send_end(publisher, encode_end(EndOfStream(context.name, reason, teller.published, detail)))
+            _send_end(publisher, encode(EndOfStream(context.name, reason, teller.published, detail)))
         _log.info("published", frames=teller.published, reason=reason)
 
 
@@ -328,7 +328,7 @@ class _Teller:
         return "degraded" if self._source.troubles else "running"
 
     def _tell(self, state: NodeState) -> None:
-        from semantic_mapper.transport.codec import encode_status
+        from semantic_mapper.transport.codec import encode
         from semantic_mapper.transport.messages import Status
 
         counters = {"published": self.published}
@@ -341,4 +341,4 @@ class _Teller:
         ages = {} if self._sent_at is None else {"frame": time.monotonic() - self._sent_at}
         status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, troubles)
         with suppress(TransportError):  # a reader has no room for it: the next status says what this one did
-            self._publisher.publish(encode_status(status), 0.0)
+            self._publisher.publish(encode(status), 0.0)

@@ -14,10 +14,11 @@ from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.streams import Streams
 from semantic_mapper.replay.log.mcap_scan import read_payloads, scan_end
 from semantic_mapper.replay.log.sequence import parts_on_disk
-from semantic_mapper.transport.codec import decode_end, read_envelope
+from semantic_mapper.transport.codec import decode_as, read_envelope
 from semantic_mapper.transport.framing import unpack_parts
-from semantic_mapper.transport.opening import topic_name
+from semantic_mapper.transport.messages import EndOfStream
 from semantic_mapper.transport.sockets import LosslessSubscriber
+from semantic_mapper.transport.topics import read_topic
 
 MAX_BYTES = 1 << 26
 MAX_AGE_S = 60.0
@@ -49,12 +50,12 @@ class Backlog:
 
     def add(self, parts: list[bytes]) -> None:
         """Keep one message, and let the oldest go."""
-        name = topic_name(parts)
+        name = read_topic(parts)[0].name
         if name == "info":
             self._infos[bytes(parts[1])] = parts
             return
         if name == "end":
-            self._streams.end(decode_end(parts))
+            self._streams.end(decode_as(EndOfStream, parts))
         now, size = time.monotonic(), sum(map(len, parts))
         self._kept.append((now, size, parts))
         self._bytes += size

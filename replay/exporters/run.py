@@ -11,9 +11,10 @@ from semantic_mapper.errors import CodecError, ConfigError, LogError
 from semantic_mapper.replay.exporters.base import Exporter, ExportFrame, LeftOut, encoded, whole_place
 from semantic_mapper.replay.exporters.folder import FolderExporter, TrajectoryExporter, TumExporter
 from semantic_mapper.replay.log.sequence import Log
-from semantic_mapper.transport.codec import EncodedImage, Envelope, decode_frame
+from semantic_mapper.transport.codec import EncodedImage, Envelope, decode_as
 from semantic_mapper.transport.images import sniff_image
 from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.types import PosedFrame
 
 LogFormat = Literal["foxglove", "rrd", "trajectory", "tum", "folder"]
 FORMATS: tuple[LogFormat, ...] = get_args(LogFormat)
@@ -166,7 +167,7 @@ def _unpacked(envelope: Envelope, parts: list[bytes]) -> ExportFrame:
     Raises:
         CodecError: it is damaged.
     """
-    frame = decode_frame(parts)
+    frame = decode_as(PosedFrame, parts)
     if envelope.rgb_encoding == "raw":
         return ExportFrame(frame, encoded(frame.rgb), envelope.depth_scale)
     encoding, _ = sniff_image(parts[2])

@@ -20,7 +20,7 @@ from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.occupancy import occupancy
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.transport import query_messages as messages
-from semantic_mapper.transport.query_codec import encode_request
+from semantic_mapper.transport.codec import encode_request
 from tests.nodes.mapper.test_query_service import (
     PLACES,
     Stranger,
@@ -61,7 +61,7 @@ def held(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[t
 
 
 def long_question(up: tuple[float, float, float]) -> list[bytes]:
-    return [b"", *encode_request("instances", messages.InstancesRequest(up=up), {})]
+    return [b"", *encode_request("instances", messages.InstancesRequest(up=up))]
 
 
 def two_askers(
@@ -184,9 +184,9 @@ def test_checking_corrected_poses_holds_up_no_short_question(
 ) -> None:
     first, second, may_go_on = two_askers(client, held)
     poses = {"stamps_ns": np.ones(1), "camera": np.zeros(1), "poses": np.eye(4)[None]}
-    request = messages.CorrectPosesRequest(id="a", cameras=("",))
-    second.socket.send_multipart([b"", *encode_request("correct_poses", request, poses)])
-    second.socket.send_multipart([b"", *encode_request("info", messages.InfoRequest(), {})])
+    request = messages.CorrectPosesRequest(id="a", cameras=("",), **poses)
+    second.socket.send_multipart([b"", *encode_request("correct_poses", request)])
+    second.socket.send_multipart([b"", *encode_request("info", messages.InfoRequest())])
     assert client.info().version == 14
     assert not second.socket.poll(200)  # nor is its own next question answered before it
     may_go_on.set()

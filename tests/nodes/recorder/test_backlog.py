@@ -10,7 +10,7 @@ import pytest
 from semantic_mapper.nodes.recorder import backlog
 from semantic_mapper.nodes.recorder.backlog import Backlog
 from semantic_mapper.replay.log.format import LogWriter
-from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info
+from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream
 from tests.transport import samples
 
@@ -19,7 +19,7 @@ FRAMES = [encode_frame(samples.make_frame(seq)) for seq in range(12)]
 
 def heard(*messages: list[bytes]) -> Backlog:
     made = Backlog()
-    for parts in (encode_info(samples.make_info()), *messages):
+    for parts in (encode(samples.make_info()), *messages):
         made.add(parts)
     return made
 
@@ -35,7 +35,7 @@ def test_what_no_log_holds_is_taken_over_in_its_order(tmp_path: Path) -> None:
     out = write(tmp_path / "recorded.mcap", FRAMES[:5])
     write(tmp_path / "recorded-1.mcap", FRAMES[5:8])
     found = list(heard(*FRAMES[2:]).missing_in_logs(out))
-    assert found == [encode_info(samples.make_info()), *FRAMES[8:]]
+    assert found == [encode(samples.make_info()), *FRAMES[8:]]
 
 
 def test_a_message_that_was_cut_off_is_written_again(tmp_path: Path) -> None:
@@ -72,7 +72,7 @@ def test_the_oldest_messages_give_way(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_the_end_of_the_stream_is_noticed() -> None:
     assert not heard(*FRAMES[:2]).ended
-    assert heard(FRAMES[0], encode_end(EndOfStream("player", "end", 1))).ended
+    assert heard(FRAMES[0], encode(EndOfStream("player", "end", 1))).ended
 
 
 def test_the_newest_part_is_the_one_with_the_highest_number_whatever_the_clock_said(tmp_path: Path) -> None:
