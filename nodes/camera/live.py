@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import structlog
 
+from semantic_mapper.backoff import backoff_s
 from semantic_mapper.errors import CameraError, ConfigError, TransportError
 from semantic_mapper.nodes.camera.listeners import drain, wait_for_listeners
 from semantic_mapper.nodes.node import NodeContext
@@ -160,7 +161,7 @@ def _open(context: NodeContext, live: LiveCamera, teller: _Teller, stack: ExitSt
     Raises:
         CameraError: it could not be opened within ``live.open_s``.
     """
-    began, pause_s, told = time.monotonic(), FIRST_PAUSE_S, ""
+    began, failures, told = time.monotonic(), 0, ""
     while not context.stop:
         source = make_source(live)
         try:
@@ -175,8 +176,8 @@ def _open(context: NodeContext, live: LiveCamera, teller: _Teller, stack: ExitSt
         else:
             teller.watch(source)
             return source
-        _pause(context, pause_s)
-        pause_s = min(2 * pause_s, MAX_PAUSE_S)
+        failures += 1
+        _pause(context, backoff_s(failures, FIRST_PAUSE_S, MAX_PAUSE_S))
     return None
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 import structlog
 
+from semantic_mapper.backoff import backoff_s
 from semantic_mapper.errors import FrameError, LabelError, WeightsError
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import FinetunerOptions
@@ -316,7 +317,7 @@ class _Finetuner:
         """A round came to no end, which is no fault of the labels: they are kept, and tried again after a pause."""
         self._failures += 1
         self._counts["failed"] += 1
-        pause_s = min(self._options.retry_s * 2 ** (self._failures - 1), MAX_RETRY_S)
+        pause_s = backoff_s(self._failures, self._options.retry_s, MAX_RETRY_S)
         self._retry_at = time.monotonic() + pause_s
         self._failure = why
         _log.warning("round_failed", reason=why, keyframes_kept=self._pool.new, next_in_s=pause_s)

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from semantic_mapper.errors import CodecError, ConfigError, LogError
-from semantic_mapper.replay.exporters.base import Exporter, ExportFrame, LeftOut, encoded, whole_place
+from semantic_mapper.files import atomic_folder, atomic_path
+from semantic_mapper.replay.exporters.base import Exporter, ExportFrame, LeftOut, encoded
 from semantic_mapper.replay.exporters.folder import FolderExporter, TrajectoryExporter, TumExporter
 from semantic_mapper.replay.log.sequence import Log
 from semantic_mapper.transport.codec import EncodedImage, Envelope, decode_as
@@ -103,7 +104,7 @@ def export_log(log: Log, out: Path, request: LogExportRequest, on_frame: Callabl
     camera = _choose_camera(log, request)
     left_out: list[str] = []
     frames = 0
-    with whole_place(out, folder=is_folder) as place:
+    with (atomic_folder if is_folder else atomic_path)(out, raises=LogError) as place:
         exporter = _exporter(place, log.info, request.format)
         for envelope, parts in _frames(log, camera, request.max_frames):
             on_frame()
