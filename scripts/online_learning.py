@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 
@@ -305,7 +306,7 @@ def run(args: argparse.Namespace, out: Path) -> dict[str, Any]:
 
     with ExitStack() as stack:
         robot = Robot(stack, args, out, frames)
-        robot.begin(dataclasses.replace(info, frame_count=None))
+        robot.begin(msgspec.structs.replace(info, frame_count=None))
         robot.map_frames(args.frames, score)
         robot.teach([frames[i] for i in good], info.label_set, "good")
         robot.map_until(lambda: robot.version == 1, score)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
@@ -207,7 +207,7 @@ class LogReader:
                 sources.append(info.source)
         if len(sources) == 1:
             return first
-        return replace(first, source=" + ".join(sources), cameras=cameras, frame_count=None)
+        return msgspec.structs.replace(first, source=" + ".join(sources), cameras=cameras, frame_count=None)
 
     def _read_first_info(self, found: Scan) -> StreamInfo:
         for offset, length in found.attachments:

@@ -452,7 +452,7 @@ def _read(header: Mapping[str, Any], kind: type[WireT], what: str) -> WireT:
         if (lens := restored.get("intrinsics")) is not None:
             restored["intrinsics"] = lens.to_intrinsics()
         if (cameras := restored.get("cameras")) is not None:
-            restored["cameras"] = {name: lens.to_intrinsics() for name, lens in cameras.items()}
+            restored["cameras"] = {name: lens.to_intrinsics(f"camera '{name}': ") for name, lens in cameras.items()}
         if (labels := restored.get("label_set")) is not None:
             restored["label_set"] = labels.to_label_set()
     except ValueError as error:  # msgspec's, and those of the core types

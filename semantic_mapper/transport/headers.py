@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from semantic_mapper.errors import CodecError
+from semantic_mapper.errors import CodecError, FrameError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.transport.framing import MAX_PART_BYTES, Buffer
 from semantic_mapper.types import MAX_SIDE, MAX_STAMP_NS, CameraIntrinsics
@@ -53,13 +53,19 @@ class IntrinsicsForm(Wire, frozen=True):
     height: Side
     distortion: Annotated[tuple[Finite, ...], Meta(max_length=14)] = ()
 
-    def to_intrinsics(self) -> CameraIntrinsics:
+    def to_intrinsics(self, what: str = "") -> CameraIntrinsics:
         """The core type.
+
+        Args:
+            what: Begins the error.
 
         Raises:
             FrameError: they do not fit the image; see ``CameraIntrinsics``.
         """
-        return CameraIntrinsics(self.fx, self.fy, self.cx, self.cy, self.width, self.height, self.distortion)
+        try:
+            return CameraIntrinsics(self.fx, self.fy, self.cx, self.cy, self.width, self.height, self.distortion)
+        except FrameError as error:
+            raise FrameError(f"{what}{error}") from error
 
 
 class ClassForm(Wire, frozen=True):
