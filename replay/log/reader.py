@@ -9,6 +9,8 @@ from itertools import islice
 from pathlib import Path
 from types import TracebackType
 
+import msgspec
+
 from semantic_mapper.errors import CodecError, ConfigError, LogError
 from semantic_mapper.files import open_regular
 from semantic_mapper.replay.log.mcap_scan import (
