@@ -163,7 +163,7 @@ def check_header(header: object, kind: type[WireT], what: str) -> WireT:
     try:
         return msgspec.convert(header, kind)
     except (ValueError, TypeError, RecursionError, OverflowError) as error:
-        raise CodecError(f"{what}: bad header: {_BEYOND.sub('Expected a finite number', str(error))}") from error
+        raise CodecError(f"{what}: bad header: {_BEYOND.sub('only finite numbers can be sent', str(error))}") from error
 
 
 def _plain_number(value: object) -> object:

@@ -75,7 +75,7 @@ def test_an_error_is_raised_on_the_other_side(error: Exception) -> None:
         ([*at_request(), b""], "announces buffers"),
         (with_header(at_request(), v=2), "protocol version 2"),
         (with_header(at_request(), radius_m="far"), "bad header"),
-        (with_header(at_request(), radius_m=float("nan")), r"radius_m"),
+        (with_header(at_request(), radius_m=float("nan")), "only finite"),
         (with_header(at_request(), extra=1), "bad header"),
         (with_header(at_request(), arrays=[]), "has the arrays"),
         (with_header(at_request(), arrays=[{"shape": [5], "bytes": 120}]), "expected"),
