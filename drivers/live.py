@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol, Self
 
+from semantic_mapper.backoff import backoff_s
 from semantic_mapper.drivers.base import CameraImage
 from semantic_mapper.drivers.calibration import Rectifier, guess_intrinsics
 from semantic_mapper.errors import CameraError
@@ -103,7 +104,7 @@ class LiveCamera:
         self._changed = threading.Condition()
         self._newest: tuple[int, Shot] | None = None  # number and image; guarded by _changed
         self._seq = -1  # of the last image; only the thread counts
-        self._pause_s = FIRST_PAUSE_S
+        self._failures = 0  # to open the device again, in a row
         self._heard = self._read_at = self._asked_at = 0.0
         self._lost = ""
         self._device_troubles: tuple[str, ...] = ()
@@ -239,7 +240,7 @@ class LiveCamera:
             failures = 0
             if self._lost:
                 _log.info("camera_back", camera=self._camera_id, device=device.description, seq=self._seq)
-            self._pause_s, self._heard, self._lost = FIRST_PAUSE_S, now, ""
+            self._failures, self._heard, self._lost = 0, now, ""
             with self._changed:
                 self._newest = (self._seq, shot)
                 self._changed.notify()
@@ -247,9 +248,9 @@ class LiveCamera:
 
     def _open_again(self) -> Device | None:
         """Wait for the device, longer each time; None where it was stopped."""
-        while not self._stopping.wait(self._pause_s):
+        while not self._stopping.wait(backoff_s(self._failures + 1, FIRST_PAUSE_S, MAX_PAUSE_S)):
             self._read_at = time.monotonic()
-            self._pause_s = min(2 * self._pause_s, MAX_PAUSE_S)
+            self._failures += 1
             try:
                 return self._open()
             except CameraError as error:

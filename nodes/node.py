@@ -14,6 +14,7 @@ import structlog
 
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError, SemanticMapperError
+from semantic_mapper.files import write_bytes
 from semantic_mapper.memory import is_out_of_memory, memory_message
 from semantic_mapper.nodes.options import CameraOptions, NodeJob, NodeOptions
 from semantic_mapper.nodes.process import STOP_SIGNAL, StopRequest, prepare_process
@@ -64,9 +65,7 @@ class NodeContext:
             OSError: it cannot be written.
         """
         if self.folder is not None:
-            draft = self.folder / f"{self.name}.{what}.new"
-            draft.write_text(text, encoding="utf-8")
-            draft.replace(self.folder / f"{self.name}.{what}.note")
+            write_bytes(self.folder / f"{self.name}.{what}.note", text.encode(), sync="none")
 
     def try_to_leave_note(self, what: str, text: str, then: str) -> bool:
         """As ``leave_note``, for those who go on where it cannot be written.

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from semantic_mapper.transport.framing import Buffer
-from semantic_mapper.transport.publisher import Publisher
 from semantic_mapper.transport.security import load_keys
+from semantic_mapper.transport.sockets import Publisher
 
 
 class PublicPublisher(Publisher):

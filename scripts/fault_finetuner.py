@@ -13,7 +13,7 @@ from scripts.live_launch import LiveLaunch, is_alive
 from scripts.long_log import INTRINSICS
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
-from semantic_mapper.transport.codec import encode_keyframe
+from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import LabelledKeyframe, Status
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
@@ -41,7 +41,7 @@ def _finetuner_faults(settings: Sequence[str], out: Path) -> Iterator[Outcome]:
         ):
             labels.wait_for_subscribers("keyframe", timeout_s=PATIENCE_S)
             for frame in room_frames(TRAIN_SEEDS[7], KEYFRAMES, INTRINSICS):
-                labels.publish(encode_keyframe(LabelledKeyframe(frame, ROOMS, "script")))
+                labels.publish(encode(LabelledKeyframe(frame, ROOMS, "script")))
             while _next_word(words).counters["kept"] < KEYFRAMES:
                 pass
             for fault in FAULTS:

@@ -28,11 +28,10 @@ from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.nodes.options import NodeJob
 from semantic_mapper.nodes.supervisor.hang_detector import process_stats
 from semantic_mapper.nodes.supervisor.node_process import NodeProcess
-from semantic_mapper.transport.codec import decode, encode_frame, encode_info
+from semantic_mapper.transport.codec import decode, decode_request, encode, encode_frame
 from semantic_mapper.transport.framing import unpack_parts
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.transport.pose_message import PoseMessage, decode_pose, encode_pose
-from semantic_mapper.transport.query_codec import decode_request
 from semantic_mapper.transport.security import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import MapUpdate
@@ -85,7 +84,7 @@ class FloodedMapper:
         self.answers.wait_until_heard(ANSWER_S * 3)
         self._frames = distinct_frames()
         self._sent = 0
-        self.publisher.publish(encode_info(StreamInfo("flood", {"rooms": INTRINSICS}, ROOMS), "camera"))
+        self.publisher.publish(encode(StreamInfo("flood", {"rooms": INTRINSICS}, ROOMS), sender="camera"))
 
     def map_one(self) -> float:
         """Seconds until a good frame is in the map."""

@@ -11,10 +11,10 @@ import random
 import struct
 import tempfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import msgpack
 import numpy as np
@@ -23,16 +23,17 @@ from mcap.opcode import Opcode
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.labels import NYU40
 from semantic_mapper.replay.log.format import LogReader, LogWriter
-from semantic_mapper.transport import codec, query_codec
+from semantic_mapper.transport import codec
 from semantic_mapper.transport.framing import pack_parts, unpack_parts
-from semantic_mapper.transport.headers import HeaderT
+from semantic_mapper.transport.headers import LabelSetForm
+from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import EndOfStream, FrameRefused, Status, StreamInfo
-from semantic_mapper.transport.plain import label_set_header
 from semantic_mapper.transport.pose_message import PoseMessage, decode_pose, encode_pose
-from semantic_mapper.transport.query_messages import QUESTIONS, ArrayForm, WeightsEntry
+from semantic_mapper.transport.query_messages import QUESTIONS, Answer, Request, WeightsEntry, array_forms
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
 Spoil = Callable[[bytes], bytes]
+QueryT = TypeVar("QueryT", bound=Request | Answer)
 _CAMERA = CameraIntrinsics(6.5, 6.0, 3.5, 2.5, 8, 6)
 _MAGIC_BYTES = 8
 _RECORD = struct.Struct("<BQ")
@@ -54,7 +55,7 @@ _VALUES: dict[str, Any] = {
         ),
     ),
     "cameras": ("front",),
-    "label_set": label_set_header(NYU40),
+    "label_set": LabelSetForm.of(NYU40),
 }
 _STRANGE = (None, True, -1, 0, 2**63 - 1, 2**64 - 1, 1.5, float("nan"), "", "x" * 5000, b"\0\xff", [], [[[]]], {})
 
@@ -101,18 +102,18 @@ def _info() -> StreamInfo:
 
 
 def _messages() -> list[bytes]:
-    options = (codec.CodecOptions(), codec.CodecOptions(rgb="raw", depth="raw"), codec.CodecOptions(rgb="jpeg"))
+    options = (CodecOptions(), CodecOptions(rgb="raw", depth="raw"), CodecOptions(rgb="jpeg"))
     f = frame()
     assert f.depth_m is not None and f.label is not None
     confidence = np.full_like(f.depth_m, 0.5)
     update = MapUpdate(5, 3, "front", True, False, (0, 2), f.label, confidence, f.depth_m, 12, 4)
     others = (
-        codec.encode_map_update(update),
-        codec.encode_map_update(update, codec.CodecOptions(confidence="f32", depth="raw")),
-        codec.encode_refused(FrameRefused(4, 5, "front", "pose holds NaN")),
-        codec.encode_status(Status("mapper", "degraded", 5, {"fused": 7}, {"frame": 0.25}, ("no GPU",))),
-        codec.encode_info(_info()),
-        codec.encode_end(EndOfStream("player", "end", 200, "", ("damaged",))),
+        codec.encode(update),
+        codec.encode(update, CodecOptions(confidence="f32", depth="raw")),
+        codec.encode(FrameRefused(4, 5, "front", "pose holds NaN")),
+        codec.encode(Status("mapper", "degraded", 5, {"fused": 7}, {"frame": 0.25}, ("no GPU",))),
+        codec.encode(_info()),
+        codec.encode(EndOfStream("player", "end", 200, "", ("damaged",))),
     )
     return [pack_parts(parts) for parts in (*(codec.encode_frame(f, o) for o in options), *others)]
 
@@ -126,41 +127,34 @@ def _read_message(data: bytes) -> None:
             continue
 
 
-def _arrays(forms: Mapping[str, ArrayForm]) -> query_codec.Arrays:
-    return {name: np.zeros((2,) * form.free + form.tail, form.dtype) for name, form in forms.items()}
-
-
-def _filled(kind: type[HeaderT]) -> HeaderT:
-    return kind(**{name: value for name, value in _VALUES.items() if name in kind.__struct_fields__})
+def _filled(kind: type[QueryT]) -> QueryT:
+    """A question or an answer, with arrays of the right form."""
+    forms = array_forms(kind)
+    arrays = {name: np.zeros((2,) * form.free + form.tail, form.dtype) for name, form in forms.items()}
+    return kind(**{**{name: value for name, value in _VALUES.items() if name in kind.__struct_fields__}, **arrays})
 
 
 def _questions() -> list[bytes]:
-    """One of each kind, with arrays of the right form."""
-    return [
-        pack_parts(query_codec.encode_request(kind, _filled(question.request), _arrays(question.takes)))
-        for kind, question in QUESTIONS.items()
-    ]
+    """One of each kind."""
+    return [pack_parts(codec.encode_request(kind, _filled(question.request))) for kind, question in QUESTIONS.items()]
 
 
 def _read_question(data: bytes) -> None:
     parts = unpack_parts(data)
-    query_codec.decode_request(parts)
+    codec.decode_request(parts)
 
 
 def _answers() -> list[bytes]:
     """One to each kind of question, and an error."""
-    good = [
-        query_codec.encode_answer(kind, _filled(question.answer), _arrays(question.gives))
-        for kind, question in QUESTIONS.items()
-    ]
-    return [pack_parts(parts) for parts in (*good, query_codec.encode_error(MapError("no such class")))]
+    good = [codec.encode_answer(kind, _filled(question.answer)) for kind, question in QUESTIONS.items()]
+    return [pack_parts(parts) for parts in (*good, codec.encode_error(MapError("no such class")))]
 
 
 def _read_answer(data: bytes) -> None:
     parts = unpack_parts(data)
     kind = bytes(parts[0][:32]).decode("ascii", errors="replace") if parts else ""
     kind = kind if kind in QUESTIONS else next(iter(QUESTIONS))
-    query_codec.decode_answer(kind, QUESTIONS[kind].answer, parts)
+    codec.decode_answer(kind, QUESTIONS[kind].answer, parts)
 
 
 def _poses() -> list[bytes]:

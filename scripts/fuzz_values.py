@@ -325,7 +325,7 @@ def _session(bundle: Mapper) -> MapSession:
 def _send(session: MapSession, parts: list[bytes]) -> tuple[str, dict[str, float]]:
     """How a frame ended, and what its stages took."""
     try:
-        frame = codec.decode_frame(parts)
+        frame = codec.decode_as(PosedFrame, parts)
     except CodecError:
         return "refused by the codec", {}
     blocks, fused = session.pipeline.voxel_map.block_count, session.pipeline.voxel_map.frames

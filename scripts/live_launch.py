@@ -16,9 +16,11 @@ from typing import IO, Self
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.replay.log.format import LogReader
-from semantic_mapper.transport.codec import decode_map_update, decode_status, read_envelope
+from semantic_mapper.transport.codec import decode_as, read_envelope
+from semantic_mapper.transport.messages import Status
 from semantic_mapper.transport.sockets import LosslessSubscriber
 from semantic_mapper.transport.topics import TOPICS
+from semantic_mapper.types import MapUpdate
 
 COMMAND = Path(sys.executable).parent / "semantic-mapper"
 LAUNCH_FOLDER = Path(__file__).resolve().parents[1] / "launch"
@@ -111,9 +113,9 @@ class Heard:
                 now, e = time.monotonic(), read_envelope(parts)
                 self.came.append((now, (e.topic, e.source, e.stamp_ns, e.seq)))
                 if e.topic == "status":
-                    self.counters = dict(decode_status(parts).counters)
+                    self.counters = dict(decode_as(Status, parts).counters)
                 if e.topic == "map":
-                    self.worked_s[e.seq] = sum(decode_map_update(parts).stage_ms.values()) / 1000
+                    self.worked_s[e.seq] = sum(decode_as(MapUpdate, parts).stage_ms.values()) / 1000
 
 
 class LiveLaunch:

@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 
@@ -33,14 +34,13 @@ from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_pat
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.finetuner.finetune_round import file_of
 from semantic_mapper.nodes.options import NodeJob
-from semantic_mapper.plots import Curve, Panel, draw_panels, write_picture
 from semantic_mapper.nodes.supervisor.node_process import NodeProcess
+from semantic_mapper.plots import Curve, Panel, draw_panels, write_picture
 from semantic_mapper.replay.artifacts import write_json
 from semantic_mapper.replay.evaluate.truth import TruthMapper
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
-from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info, encode_keyframe, encode_weights
-from semantic_mapper.transport.learning_messages import digest_of
+from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import (
     EndOfStream,
     LabelledKeyframe,
@@ -48,6 +48,7 @@ from semantic_mapper.transport.messages import (
     StreamInfo,
     WeightsInUse,
     WeightsUpdate,
+    digest_of,
 )
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
 from semantic_mapper.types import MapUpdate, PosedFrame
@@ -150,7 +151,7 @@ class Robot:
 
     def begin(self, info: StreamInfo) -> None:
         """Tell the mapper what is to come."""
-        self._camera.publish(encode_info(info))
+        self._camera.publish(encode(info))
 
     def note(self, what: str, **more: Any) -> None:
         """Keep an event, and tell of it."""
@@ -205,20 +206,20 @@ class Robot:
     def teach(self, frames: Sequence[PosedFrame], label_set: LabelSet, teacher: str) -> None:
         """Send labelled keyframes."""
         for frame in frames:
-            self._labels.publish(encode_keyframe(LabelledKeyframe(frame, label_set, teacher)))
+            self._labels.publish(encode(LabelledKeyframe(frame, label_set, teacher)))
         self.note("keyframes sent", count=len(frames), teacher=teacher)
 
     def offer(self, checkpoint: Checkpoint) -> None:
         """Offer weights to the mapper, as a finetuner would that has found them better."""
         data, version = file_of(checkpoint), self.in_use.newest + 1
         update = WeightsUpdate("script", version, data, digest_of(data), self.in_use.digest, 1.0, 0.0, 1, 1)
-        self._offers.publish(encode_weights(update))
+        self._offers.publish(encode(update))
         self.note("weights offered by a teacher that is wrong throughout", version=version)
 
     def end(self) -> dict[str, Any]:
         """End both; the mapper's summary."""
         self.finetuner.ask_to_stop()
-        self._camera.publish(encode_end(EndOfStream("script", "end", self._played)))
+        self._camera.publish(encode(EndOfStream("script", "end", self._played)))
         for child in (self.finetuner, self._mapper):
             if not child.wait(120) or child.exit_code():
                 raise SystemExit(child.describe_end())
@@ -231,7 +232,7 @@ class Robot:
                 continue
             self._passed_on = update.version
             self.note("weights offered", version=update.version, score=update.score, parent_score=update.parent_score)
-            self._offers.publish(encode_weights(update))
+            self._offers.publish(encode(update))
         while (message := self._told.receive(0.0)) is not None:
             assert isinstance(message, WeightsInUse)
             if message.version != self.version:
@@ -304,7 +305,7 @@ def run(args: argparse.Namespace, out: Path) -> dict[str, Any]:
 
     with ExitStack() as stack:
         robot = Robot(stack, args, out, frames)
-        robot.begin(dataclasses.replace(info, frame_count=None))
+        robot.begin(msgspec.structs.replace(info, frame_count=None))
         robot.map_frames(args.frames, score)
         robot.teach([frames[i] for i in good], info.label_set, "good")
         robot.map_until(lambda: robot.version == 1, score)

@@ -8,6 +8,7 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
+import msgspec
 from browser import Browser
 from live_launch import COMMAND, LiveLaunch, Told
 from web_pictures import empty_images, map_pixels, take, what_is_missing
@@ -63,7 +64,7 @@ def write_slow_log(path: Path, log: Path | None) -> Path:
         with LogReader(log) as reader:
             step = max(1, len(reader) // FRAMES)
             frames = [frame for i, frame in enumerate(reader) if i % step == 0][:FRAMES]
-            info = dataclasses.replace(reader.info, frame_count=len(frames), frame_hz=HZ)
+            info = msgspec.structs.replace(reader.info, frame_count=len(frames), frame_hz=HZ)
     with LogWriter(path, info, overwrite=True) as writer:
         for seq, frame in enumerate(frames):
             stamp_ns = round((seq + 1) * 1e9 / HZ)

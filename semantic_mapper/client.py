@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import threading
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from semantic_mapper.errors import CodecError, ShapeError
 from semantic_mapper.labels import LabelSet
@@ -27,9 +27,8 @@ from semantic_mapper.queries.occupancy import DistanceField
 from semantic_mapper.queries.oriented_box import OrientedBox
 from semantic_mapper.queries.rays import RayHits
 from semantic_mapper.transport import query_messages as messages
+from semantic_mapper.transport.codec import decode_answer, encode_request
 from semantic_mapper.transport.endpoints import default_endpoint
-from semantic_mapper.transport.plain import to_label_set
-from semantic_mapper.transport.query_codec import Arrays, decode_answer, encode_request
 from semantic_mapper.transport.query_sockets import QuerySocket
 from semantic_mapper.transport.security import ServerIdentity
 from semantic_mapper.types import Float64, UInt8
@@ -37,7 +36,7 @@ from semantic_mapper.types import Float64, UInt8
 UP = (0.0, 0.0, 1.0)
 MIRROR_BLOCKS = 2000  # fetched at a time: 6 MB before compression
 
-AnswerT = TypeVar("AnswerT", bound=messages.AnswerHeader)
+AnswerT = TypeVar("AnswerT", bound=messages.Answer)
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,56 +150,56 @@ class MapClient:
 
     def info(self) -> MapInfo:
         """Size and classes of the map."""
-        h, _ = self._ask("info", messages.InfoAnswer, messages.InfoRequest())
-        labels = to_label_set(h.label_set)
+        h = self._ask("info", messages.InfoAnswer, messages.InfoRequest())
+        labels = h.label_set.to_label_set()
         self._labels = h.map_id, labels
         return MapInfo(h.map_id, h.version, h.epoch, h.blocks, h.voxel_size_m, h.truncation_voxels, labels)
 
     def at(self, points: ArrayLike, radius_m: float | None = None) -> PointAnswers:
         """What is at points (N, 3), world metres; see ``queries.lookup.at``."""
-        request = messages.AtRequest(radius_m=radius_m)
-        _, arrays = self._ask("at", messages.AnswerHeader, request, points=points)
-        return PointAnswers(**cast(Any, arrays))
+        request = messages.AtRequest(points=as_numbers(points, "points"), radius_m=radius_m)
+        return PointAnswers(**_arrays(self._ask("at", messages.AtAnswer, request)))
 
     def nearest(self, class_name: str, point: ArrayLike, min_confidence: float = 0.0) -> NearestSurface | None:
         """The nearest surface of a class; see ``queries.nearest.nearest``."""
         request = messages.NearestRequest(
             class_name=class_name, point=_point(point, "point"), min_confidence=min_confidence
         )
-        h, _ = self._ask("nearest", messages.NearestAnswer, request)
+        h = self._ask("nearest", messages.NearestAnswer, request)
         return NearestSurface(np.array(h.xyz, np.float64), h.distance_m, h.confidence) if h.found else None
 
     def cast_rays(self, origins: ArrayLike, directions: ArrayLike, max_m: float = 10.0) -> RayHits:
         """The first surface that each ray meets; see ``queries.rays.cast_rays``."""
-        rays = {"origins": np.atleast_2d(as_numbers(origins, "origins"))}
-        rays |= {"directions": np.atleast_2d(as_numbers(directions, "directions"))}
-        _, arrays = self._ask("cast_rays", messages.AnswerHeader, messages.RaysRequest(max_m=max_m), **rays)
-        return RayHits(**cast(Any, arrays))
+        request = messages.RaysRequest(
+            origins=np.atleast_2d(as_numbers(origins, "origins")),
+            directions=np.atleast_2d(as_numbers(directions, "directions")),
+            max_m=max_m,
+        )
+        return RayHits(**_arrays(self._ask("cast_rays", messages.RaysAnswer, request)))
 
     def points_in_box(self, lower: ArrayLike, upper: ArrayLike) -> MapPoints:
         """Surface points in a box; see ``queries.boxes.points_in_box``."""
         request = messages.BoxRequest(lower=_point(lower, "lower"), upper=_point(upper, "upper"))
-        _, arrays = self._ask("points_in_box", messages.AnswerHeader, request)
-        return MapPoints(**cast(Any, arrays))
+        return MapPoints(**_arrays(self._ask("points_in_box", messages.BoxAnswer, request)))
 
     def instances(self, up: ArrayLike = UP) -> tuple[Instance, ...]:
         """All things; their ids stay from call to call, for each ``up``; see ``queries.instances.InstanceTracker``."""
         request = messages.InstancesRequest(up=_point(up, "up"))
-        header, arrays = self._ask("instances", messages.AnswerHeader, request)
-        return _things(arrays, self._label_set(header.map_id))
+        found = self._ask("instances", messages.InstancesAnswer, request)
+        return _things(found, self._label_set(found.map_id))
 
     def occupancy(self, points: ArrayLike) -> UInt8:
         """``State`` (N,) at points (N, 3), world metres; see ``queries.occupancy.occupancy``."""
-        _, arrays = self._ask("occupancy", messages.AnswerHeader, messages.OccupancyRequest(), points=points)
-        return cast(UInt8, arrays["state"])
+        request = messages.OccupancyRequest(points=as_numbers(points, "points"))
+        return self._ask("occupancy", messages.OccupancyAnswer, request).state
 
     def distance_field(self, lower: ArrayLike, upper: ArrayLike, *, unknown_is_occupied: bool = False) -> DistanceField:
         """Distances to obstacles in a box; see ``queries.occupancy.distance_field``."""
         request = messages.DistanceRequest(
             lower=_point(lower, "lower"), upper=_point(upper, "upper"), unknown_is_occupied=unknown_is_occupied
         )
-        h, arrays = self._ask("distance_field", messages.DistanceAnswer, request)
-        return DistanceField(np.array(h.origin_m, np.float64), h.voxel_size_m, **cast(Any, arrays))
+        h = self._ask("distance_field", messages.DistanceAnswer, request)
+        return DistanceField(np.array(h.origin_m, np.float64), h.voxel_size_m, **_arrays(h))
 
     def mirror(self) -> MapMirror:
         """A mirror of the map in this process, brought up to the present; for many queries, or large ones.
@@ -213,14 +212,14 @@ class MapClient:
             while True:
                 since = 0 if self._mirror is None else self._mirror.version
                 request = messages.ChangesRequest(since=since, limit=MIRROR_BLOCKS, map_id=self._mirrored)
-                h, arrays = self._ask("changes", messages.ChangesAnswer, request)
+                h = self._ask("changes", messages.ChangesAnswer, request)
                 if self._mirror is None or h.map_id != self._mirrored:
                     info = self.info()
                     self._mirror = MapMirror(info.voxel_size_m, info.truncation_voxels, info.label_set)
                     self._mirrored, newest = info.map_id, -1
                     if h.map_id != info.map_id or h.since != 0:  # restarted between the two questions
                         continue
-                self._mirror.apply(BlockChanges(h.since, h.version, h.newest, h.epoch, **cast(Any, arrays)))
+                self._mirror.apply(BlockChanges(h.since, h.version, h.newest, h.epoch, **_arrays(h)))
                 newest = h.newest if newest < 0 else newest  # as of the first answer: the map may outrun us
                 if h.version >= newest and self._mirror.is_whole:
                     return self._mirror
@@ -243,20 +242,21 @@ class MapClient:
         """
         keys = [key if isinstance(key, tuple) else ("", key) for key in poses]
         cameras = tuple(dict.fromkeys(camera for camera, _ in keys)) or ("",)
-        arrays = {
-            "stamps_ns": np.array([stamp_ns for _, stamp_ns in keys], np.int64),
-            "camera": np.array([cameras.index(camera) for camera, _ in keys], np.int64).astype(np.uint8),
-            "poses": np.array([_pose(T, stamp_ns) for (_, stamp_ns), T in zip(keys, poses.values(), strict=True)]),
-        }
-        arrays["poses"] = arrays["poses"].reshape(-1, 4, 4)
+        matrices = [_pose(T, stamp_ns) for (_, stamp_ns), T in zip(keys, poses.values(), strict=True)]
         request = messages.CorrectPosesRequest(
-            id=uuid.uuid4().hex, cameras=cameras, until_ns=until_ns, within_ns=within_ns
+            id=uuid.uuid4().hex,
+            cameras=cameras,
+            until_ns=until_ns,
+            within_ns=within_ns,
+            stamps_ns=np.array([stamp_ns for _, stamp_ns in keys], np.int64),
+            camera=np.array([cameras.index(camera) for camera, _ in keys], np.int64).astype(np.uint8),
+            poses=np.array(matrices).reshape(-1, 4, 4),
         )
-        return self._correction("correct_poses", request, arrays)
+        return self._correction("correct_poses", request)
 
     def correction(self) -> Correction:
         """How far corrections are; ``used`` and ``left_out`` are 0."""
-        return self._correction("correction", messages.CorrectionRequest(), {})
+        return self._correction("correction", messages.CorrectionRequest())
 
     def weights(self) -> Weights:
         """Which weights the mapper uses; ``MapError`` where it takes none while it runs (option `learner`)."""
@@ -282,24 +282,17 @@ class MapClient:
     ) -> None:
         self.close()
 
-    def _ask(
-        self, kind: str, answer: type[AnswerT], request: messages.RequestHeader, **arrays: ArrayLike
-    ) -> tuple[AnswerT, Arrays]:
-        numbers = {name: as_numbers(values, name) for name, values in arrays.items()}
-        header, found = decode_answer(kind, answer, self._send(kind, request, numbers))
-        self.version = header.version
-        return header, found
+    def _ask(self, kind: str, answer: type[AnswerT], request: messages.Request) -> AnswerT:
+        found = decode_answer(kind, answer, self._send(kind, request))
+        self.version = found.version
+        return found
 
-    def _send(
-        self, kind: str, request: messages.RequestHeader, arrays: Mapping[str, NDArray[np.generic]]
-    ) -> list[bytes]:
+    def _send(self, kind: str, request: messages.Request) -> list[bytes]:
         request = replace(request, asker=self._asker, waits_s=min(self._timeout_s, messages.MAX_WAIT_S))
-        return self._socket.ask(encode_request(kind, request, arrays))
+        return self._socket.ask(encode_request(kind, request))
 
-    def _correction(
-        self, kind: str, request: messages.RequestHeader, arrays: Mapping[str, NDArray[np.generic]]
-    ) -> Correction:
-        h, _ = decode_answer(kind, messages.CorrectionAnswer, self._send(kind, request, arrays))
+    def _correction(self, kind: str, request: messages.Request) -> Correction:
+        h = decode_answer(kind, messages.CorrectionAnswer, self._send(kind, request))
         return Correction(
             running=h.running,
             done=h.done,
@@ -315,7 +308,7 @@ class MapClient:
         )
 
     def _weights(self, request: messages.WeightsRequest) -> Weights:
-        h, _ = decode_answer("weights", messages.WeightsAnswer, self._send("weights", request, {}))
+        h = decode_answer("weights", messages.WeightsAnswer, self._send("weights", request))
         return Weights(
             in_use=h.in_use,
             before=h.before,
@@ -354,14 +347,18 @@ def _pose(T_world_camera: Float64, stamp_ns: int) -> Float64:
     return pose
 
 
-def _things(arrays: Arrays, labels: LabelSet) -> tuple[Instance, ...]:
-    """Instances as ``instances`` answers them, see ``QUESTIONS``.
+def _arrays(answer: messages.Answer) -> dict[str, Any]:
+    """Array fields of an answer, as fields of a query's result."""
+    return {name: getattr(answer, name) for name in messages.array_forms(type(answer))}
+
+
+def _things(found: messages.InstancesAnswer, labels: LabelSet) -> tuple[Instance, ...]:
+    """Instances as ``instances`` answers them.
 
     Raises:
         CodecError: arrays that do not go together, or a class that the map does not have.
     """
-    numbers, places = np.asarray(arrays["numbers"], np.int64), np.asarray(arrays["places"], np.float64)
-    voxels = np.asarray(arrays["voxels"], np.int32)
+    numbers, places, voxels = found.numbers, found.places, found.voxels
     sizes = numbers[:, 2]
     if len(places) != len(numbers) or (sizes < 0).any() or sizes.sum() != len(voxels):
         raise CodecError(f"instances: {len(numbers)} things, {len(places)} places and {len(voxels)} voxels disagree")

@@ -11,13 +11,16 @@ import fcntl
 import os
 import re
 import secrets
+import shutil
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Literal
 
-from semantic_mapper.errors import ConfigError
+from semantic_mapper.errors import ConfigError, SemanticMapperError
+
+Sync = Literal["none", "file", "folder"]
 
 _PART = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{12}\.part", re.DOTALL)
 _NAME_BYTES = 200  # of the final name that are part of the other one: names end at 255
@@ -61,44 +64,63 @@ def read_regular(path: Path, limit: int) -> bytes:
 
 
 @contextmanager
-def atomic_write(path: Path) -> Iterator[BinaryIO]:
-    """Give a file to write; at the end its content is on the disk, and it takes the place of ``path``.
+def atomic_write(
+    path: Path, *, sync: Sync = "file", raises: type[SemanticMapperError] | None = None
+) -> Iterator[BinaryIO]:
+    """Give a file to write; at the end it takes the place of ``path``.
 
     After an error nothing is left of it, and ``path`` is as it was. Two writers at a time do not mix: the last one to
     end wins. What killed writers of this path have left is removed.
 
     Args:
         path: Of the file, in a folder that exists. A link is replaced, and what it points to stays as it is.
+        sync: What a power cut leaves. "none": anything, for files that live no longer than the machine runs. "file":
+            the old file or the new one. "folder": once this has returned, the new one.
+        raises: Raised in the place of an ``OSError``.
 
     Raises:
         OSError: it cannot be written; ``filename`` is ``path``.
     """
-    with atomic_path(path) as part, part.open("wb") as file:
+    with atomic_path(path, sync=sync, raises=raises) as part, part.open("wb") as file:
         yield file
 
 
 @contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
+def atomic_path(path: Path, *, sync: Sync = "file", raises: type[SemanticMapperError] | None = None) -> Iterator[Path]:
     """As ``atomic_write``, for writers that open their file themselves: an empty file to be written to."""
-    try:
+    with _explained(path, raises):
         remove_stale(path.parent, path.name)
         part, lock = _new_part(path)
         try:
             yield part
-            _sync(part)
+            if sync != "none":
+                _sync(part)
             os.replace(part, path)
+            if sync == "folder":
+                _sync(path.parent)
         finally:
             part.unlink(missing_ok=True)
             os.close(lock)
-    except OSError as error:
-        if isinstance(error.filename, str) and _PART.fullmatch(os.path.basename(error.filename)):
-            error.filename, error.filename2 = str(path), None
-        raise
 
 
-def write_bytes(path: Path, data: bytes) -> None:
+@contextmanager
+def atomic_folder(path: Path, *, raises: type[SemanticMapperError] | None = None) -> Iterator[Path]:
+    """As ``atomic_path``, for a folder, which is not synced: a new one to fill, which becomes ``path``."""
+    with _explained(path, raises):
+        draft = path.with_name(f".{_cut(path.name)}.{secrets.token_hex(6)}.part")
+        draft.mkdir()
+        try:
+            yield draft
+            os.replace(draft, path)
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+
+
+def write_bytes(
+    path: Path, data: bytes, *, sync: Sync = "file", raises: type[SemanticMapperError] | None = None
+) -> None:
     """``Path.write_bytes`` by ``atomic_write``."""
-    with atomic_write(path) as file:
+    with atomic_write(path, sync=sync, raises=raises) as file:
         file.write(data)
 
 
@@ -165,8 +187,21 @@ def _remove_unlocked(path: str) -> bool:
     return False
 
 
-def _sync(part: Path) -> None:
-    fd = open_unlinked(part, os.O_RDONLY)
+@contextmanager
+def _explained(path: Path, raises: type[SemanticMapperError] | None) -> Iterator[None]:
+    """Errors of the unfinished file are told as those of ``path``."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error.filename, str) and _PART.fullmatch(os.path.basename(error.filename)):
+            error.filename, error.filename2 = str(path), None
+        if raises is None:
+            raise
+        raise raises(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _sync(path: Path) -> None:
+    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(fd)
     finally:

@@ -29,6 +29,11 @@ def get_logger(name: str) -> Any:
     return _Logger(name)
 
 
+def is_power_of_two(count: int) -> bool:
+    """Whether to log what has now happened ``count`` times, so that what happens all the time fills no log."""
+    return count & (count - 1) == 0
+
+
 class _Logger:
     """Decides at each event: programs may set up structlog after they have imported us."""
 

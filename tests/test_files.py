@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from semantic_mapper.errors import ConfigError
-from semantic_mapper.files import atomic_write, open_unlinked, read_regular, remove_stale, write_bytes
+from semantic_mapper.errors import ConfigError, MapError
+from semantic_mapper.files import atomic_folder, atomic_write, open_unlinked, read_regular, remove_stale, write_bytes
 
 
 def test_a_regular_file_is_read_up_to_the_limit(tmp_path: Path) -> None:
@@ -79,3 +79,29 @@ def test_what_killed_writers_left_is_removed_and_what_is_being_written_stays(tmp
         assert remove_stale(tmp_path, "other") == []
         assert remove_stale(tmp_path) == [left]
     assert sorted(tmp_path.iterdir()) == sorted((*others, tmp_path / "other"))
+
+
+def test_what_reaches_the_disk_is_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[Path] = []
+    monkeypatch.setattr(os, "fsync", lambda fd: synced.append(Path(os.readlink(f"/proc/self/fd/{fd}"))))
+    write_bytes(tmp_path / "file", b"1", sync="none")
+    assert synced == []
+    write_bytes(tmp_path / "file", b"2")
+    assert [path.parent for path in synced] == [tmp_path]
+    write_bytes(tmp_path / "file", b"3", sync="folder")
+    assert synced[-1] == tmp_path and len(synced) == 3
+
+
+def test_the_error_of_the_caller_is_raised(tmp_path: Path) -> None:
+    with pytest.raises(MapError, match="file: cannot be written: No such file"):
+        write_bytes(tmp_path / "none" / "file", b"", raises=MapError)
+
+
+def test_a_folder_appears_when_it_is_complete(tmp_path: Path) -> None:
+    with atomic_folder(tmp_path / "out") as draft:
+        (draft / "file").touch()
+        assert not (tmp_path / "out").exists()
+    assert (tmp_path / "out" / "file").exists()
+    with pytest.raises(ZeroDivisionError), atomic_folder(tmp_path / "other"):
+        assert 1 // 0
+    assert list(tmp_path.iterdir()) == [tmp_path / "out"]

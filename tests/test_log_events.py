@@ -56,7 +56,7 @@ def test_library_code_says_nothing_on_stdout() -> None:
     done = run(
         "import semantic_mapper.training.rooms, semantic_mapper.replay.log.recording\n"
         "import semantic_mapper.replay.session, semantic_mapper.drivers.live\n"
-        "from semantic_mapper.transport.subscribers import log\n"
+        "from semantic_mapper.transport.sockets import log\n"
         "from semantic_mapper.benchmark.store import RecordStore\n"
         "import pathlib, tempfile\n"
         "path = pathlib.Path(tempfile.mkdtemp()) / 'records.jsonl'\n"

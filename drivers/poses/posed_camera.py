@@ -15,7 +15,7 @@ from semantic_mapper.drivers.poses.config import PoseChecks
 from semantic_mapper.drivers.poses.gate import PoseGate, Verdict
 from semantic_mapper.errors import PoseError, ShapeError
 from semantic_mapper.geometry import check_pose
-from semantic_mapper.log_events import get_logger
+from semantic_mapper.log_events import get_logger, is_power_of_two
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import MAX_POSE_SIGMA_M, Float64, PosedFrame
 
@@ -178,7 +178,7 @@ class PosedCamera:
         self._counts[reason] += 1
         count = self._counts[reason]
         self._trouble = f"image {image.seq} of '{image.camera_id}' was left out ({reason}): {detail}"
-        if count & (count - 1) == 0:
+        if is_power_of_two(count):
             _log.warning("image_left_out", reason=reason, count=count, detail=self._trouble)
 
 

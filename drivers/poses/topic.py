@@ -15,7 +15,7 @@ from semantic_mapper.drivers.base import CameraImage, PoseEstimate
 from semantic_mapper.drivers.poses.config import TopicPoses, matrix
 from semantic_mapper.drivers.poses.motion import PoseTrack, StampedPose
 from semantic_mapper.errors import CameraError, CodecError, TransportError
-from semantic_mapper.log_events import get_logger
+from semantic_mapper.log_events import get_logger, is_power_of_two
 from semantic_mapper.transport.endpoints import check_connect
 from semantic_mapper.transport.pose_message import MAX_POSE_BYTES, PoseMessage, decode_pose
 from semantic_mapper.transport.receiving import receive_bounded
@@ -256,7 +256,7 @@ class TopicPoseSource:
         self._message_trouble = f"a message of {self._config.endpoint} was dropped: {detail}"
         self.counters[reason] += 1
         count = self.counters[reason]
-        if count & (count - 1) == 0:
+        if is_power_of_two(count):
             _log.warning("pose_message_dropped", reason=reason, count=count, detail=detail)
 
 

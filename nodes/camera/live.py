@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import structlog
 
+from semantic_mapper.backoff import backoff_s
 from semantic_mapper.errors import CameraError, ConfigError, TransportError
 from semantic_mapper.nodes.camera.listeners import drain, wait_for_listeners
 from semantic_mapper.nodes.node import NodeContext
@@ -23,7 +24,7 @@ from semantic_mapper.nodes.options import CameraOptions, LiveCamera
 if TYPE_CHECKING:
     from semantic_mapper.drivers.base import Camera, FrameSource
     from semantic_mapper.drivers.mounts import Mount
-    from semantic_mapper.transport.codec import Parts
+    from semantic_mapper.transport.framing import Parts
     from semantic_mapper.transport.messages import EndReason, NodeState
     from semantic_mapper.transport.sockets import Publisher
     from semantic_mapper.types import PosedFrame
@@ -159,7 +160,7 @@ def _open(context: NodeContext, live: LiveCamera, teller: _Teller, stack: ExitSt
     Raises:
         CameraError: it could not be opened within ``live.open_s``.
     """
-    began, pause_s, told = time.monotonic(), FIRST_PAUSE_S, ""
+    began, failures, told = time.monotonic(), 0, ""
     while not context.stop:
         source = make_source(live)
         try:
@@ -174,8 +175,8 @@ def _open(context: NodeContext, live: LiveCamera, teller: _Teller, stack: ExitSt
         else:
             teller.watch(source)
             return source
-        _pause(context, pause_s)
-        pause_s = min(2 * pause_s, MAX_PAUSE_S)
+        failures += 1
+        _pause(context, backoff_s(failures, FIRST_PAUSE_S, MAX_PAUSE_S))
     return None
 
 
@@ -196,10 +197,10 @@ def _listeners(context: NodeContext, options: CameraOptions, publisher: Publishe
 def _publish(
     context: NodeContext, options: CameraOptions, publisher: Publisher, teller: _Teller, source: LiveSource
 ) -> None:
-    from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info
+    from semantic_mapper.transport.codec import encode, encode_frame
     from semantic_mapper.transport.messages import EndOfStream
 
-    publisher.publish(encode_info(source.info, context.name))
+    publisher.publish(encode(source.info, sender=context.name))
     _log.info("publishing", source=source.info.source)
     reason: EndReason = "error"
     detail = "the camera node failed"
@@ -218,7 +219,7 @@ def _publish(
         raise
     finally:
         if reason != "error" or not context.restartable:  # else the stream goes on with the process after this one
-            _send_end(publisher, encode_end(EndOfStream(context.name, reason, teller.published, detail)))
+            _send_end(publisher, encode(EndOfStream(context.name, reason, teller.published, detail)))
         _log.info("published", frames=teller.published, reason=reason)
 
 
@@ -327,7 +328,7 @@ class _Teller:
         return "degraded" if self._source.troubles else "running"
 
     def _tell(self, state: NodeState) -> None:
-        from semantic_mapper.transport.codec import encode_status
+        from semantic_mapper.transport.codec import encode
         from semantic_mapper.transport.messages import Status
 
         counters = {"published": self.published}
@@ -340,4 +341,4 @@ class _Teller:
         ages = {} if self._sent_at is None else {"frame": time.monotonic() - self._sent_at}
         status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, troubles)
         with suppress(TransportError):  # a reader has no room for it: the next status says what this one did
-            self._publisher.publish(encode_status(status), 0.0)
+            self._publisher.publish(encode(status), 0.0)

@@ -17,7 +17,7 @@ from semantic_mapper.replay.importers.base import BadFrameError, read_label
 from semantic_mapper.replay.importers.folder import read_label_set
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.training.finetune import FinetuneConfig
-from semantic_mapper.transport.codec import encode_keyframe
+from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import LabelledKeyframe
 from semantic_mapper.transport.sockets import Publisher
 from semantic_mapper.types import PosedFrame
@@ -104,7 +104,7 @@ def sending(endpoint: str, timeout_s: float, stop: StopRequest) -> Iterator[Call
                 raise TransportError(f"{endpoint}: no finetuner listens there (waited {timeout_s:g} s); does one run?")
             _wait(publisher, SLICE_S)
             waited += SLICE_S
-        yield lambda keyframe: publisher.publish(encode_keyframe(keyframe))
+        yield lambda keyframe: publisher.publish(encode(keyframe))
 
 
 def _wait(publisher: Publisher, seconds: float) -> None:

@@ -154,7 +154,7 @@ def _weights() -> Iterator[Check]:
 
 def _sockets() -> Iterator[Check]:
     """Really send something, the way the nodes do."""
-    from semantic_mapper.transport.codec import encode_status
+    from semantic_mapper.transport.codec import encode
     from semantic_mapper.transport.endpoints import default_endpoint
     from semantic_mapper.transport.messages import Status
     from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
@@ -163,7 +163,7 @@ def _sockets() -> Iterator[Check]:
         endpoint = default_endpoint(f"doctor-{os.getpid()}")
         with Publisher(endpoint) as publisher, LosslessSubscriber(endpoint, ("status",)) as subscriber:
             publisher.wait_for_subscribers("status", timeout_s=5.0)
-            publisher.publish(encode_status(Status("doctor", "running", 0)))
+            publisher.publish(encode(Status("doctor", "running", 0)))
             heard = subscriber.receive(5.0)
     except SemanticMapperError as error:
         yield Check("sockets", "bad", str(error), "set XDG_RUNTIME_DIR to a folder that you may write to")

@@ -21,11 +21,9 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.cli.outputs import free_name
 from semantic_mapper.nodes.options import Count
 from semantic_mapper.training.keyframe_pool import Kept, KeyframePool
-from semantic_mapper.transport.codec import decode_keyframe, encode_keyframe
+from semantic_mapper.transport.codec import decode_as, encode
 from semantic_mapper.transport.framing import pack_parts, unpack_parts
-from semantic_mapper.transport.headers import MAX_KEYFRAME_BYTES
-from semantic_mapper.transport.learning_messages import digest_of
-from semantic_mapper.transport.messages import LabelledKeyframe
+from semantic_mapper.transport.messages import MAX_KEYFRAME_BYTES, LabelledKeyframe, digest_of
 from semantic_mapper.types import PosedFrame
 
 FOLDER = "learning"  # beside the map
@@ -142,13 +140,13 @@ class LearningStore:
         data = path.read_bytes()
         if digest_of(data) != file.digest:
             raise CodecError(f"{path}: is damaged")
-        return decode_keyframe(unpack_parts(data))
+        return decode_as(LabelledKeyframe, unpack_parts(data))
 
     def _write(self, frame: PosedFrame) -> str:
         known = next((digest for digest, written in self._digests.items() if written is frame), None)
         if known is not None:
             return known
-        data = pack_parts(encode_keyframe(LabelledKeyframe(frame, self._label_set, "kept")))
+        data = pack_parts(encode(LabelledKeyframe(frame, self._label_set, "kept")))
         digest = digest_of(data)
         if not self._path(digest).exists():
             self._folder.mkdir(parents=True, exist_ok=True)

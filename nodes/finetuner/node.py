@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 import structlog
 
+from semantic_mapper.backoff import backoff_s
 from semantic_mapper.errors import FrameError, LabelError, WeightsError
 from semantic_mapper.nodes.node import NodeContext, run_node
 from semantic_mapper.nodes.options import FinetunerOptions, NodeJob
@@ -46,7 +47,7 @@ def run_finetuner(context: NodeContext, options: FinetunerOptions) -> None:
     from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
     from semantic_mapper.memory import keep_freed_memory
     from semantic_mapper.training.online import OnlineConfig
-    from semantic_mapper.transport.learning_messages import digest_of
+    from semantic_mapper.transport.messages import digest_of
     from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
     keep_freed_memory()
@@ -284,9 +285,8 @@ class _Finetuner:
 
     def _publish(self, lesson: Lesson, parent: str) -> None:
         from semantic_mapper.nodes.finetuner.finetune_round import file_of
-        from semantic_mapper.transport.codec import encode_weights
-        from semantic_mapper.transport.learning_messages import digest_of
-        from semantic_mapper.transport.messages import WeightsUpdate
+        from semantic_mapper.transport.codec import encode
+        from semantic_mapper.transport.messages import WeightsUpdate, digest_of
 
         version = max(self._last_version, 0 if self._in_use is None else self._in_use.newest) + 1
         lesson.checkpoint.recipe.update(version=version, parent=parent, learner=self._context.name)
@@ -302,7 +302,7 @@ class _Finetuner:
             keyframes=len(lesson.checkpoint.anchors),
             held_out=len(lesson.keys) - len(lesson.checkpoint.anchors),
         )
-        self._publisher.publish(encode_weights(update))
+        self._publisher.publish(encode(update))
         self._offer, self._last_version = _Offer(version, update.digest, parent, lesson), version
         self._counts["offered"] += 1
         _log.info("weights_offered", version=version, megabytes=round(len(data) / 1e6, 1))
@@ -311,7 +311,7 @@ class _Finetuner:
         """A round came to no end, which is no fault of the labels: they are kept, and tried again after a pause."""
         self._failures += 1
         self._counts["failed"] += 1
-        pause_s = min(self._options.retry_s * 2 ** (self._failures - 1), MAX_RETRY_S)
+        pause_s = backoff_s(self._failures, self._options.retry_s, MAX_RETRY_S)
         self._retry_at = time.monotonic() + pause_s
         self._failure = why
         _log.warning("round_failed", reason=why, keyframes_kept=self._pool.new, next_in_s=pause_s)
@@ -325,7 +325,7 @@ class _Finetuner:
         _log.warning("weights_rejected", reason=why, keyframes_set_aside=forgotten)
 
     def _tell_status(self, state: NodeState, *, now: bool = False) -> None:
-        from semantic_mapper.transport.codec import encode_status
+        from semantic_mapper.transport.codec import encode
         from semantic_mapper.transport.messages import Status
 
         if not now and time.monotonic() - self._last_status < STATUS_PERIOD_S:
@@ -350,7 +350,7 @@ class _Finetuner:
                 "same weights, or go back to weights that it knows",
             )
         status = Status(self._context.name, state, time.monotonic_ns(), counters, {}, degraded)
-        self._publisher.publish(encode_status(status))
+        self._publisher.publish(encode(status))
 
 
 def main(job: NodeJob | None = None) -> NoReturn:

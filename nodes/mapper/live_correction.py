@@ -16,7 +16,6 @@ from semantic_mapper.mapping.correction.pose_correction import CorrectedPoses
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.replay.corrected_poses import match_frames
 from semantic_mapper.replay.session import MapSession
-from semantic_mapper.transport.query_codec import Arrays
 from semantic_mapper.transport.query_messages import CorrectPosesRequest
 from semantic_mapper.types import Float64
 
@@ -61,7 +60,7 @@ class LiveCorrection:
         failure = self._pipeline.corrector.status.failure
         return (f"the last correction of poses was given up: {failure}",) if failure else ()
 
-    def begin(self, request: CorrectPosesRequest, arrays: Arrays) -> dict[str, Any]:
+    def begin(self, request: CorrectPosesRequest) -> dict[str, Any]:
         """Begin a correction, unless this very request has done so before; see ``MappingPipeline.correct_poses``.
 
         Returns:
@@ -75,7 +74,7 @@ class LiveCorrection:
             if request.id not in self._outcomes:
                 if self._ended:
                     raise MapError("poses can be corrected no more: the stream has ended, and the map is being written")
-                self._outcomes[request.id] = self._begin(request, arrays)
+                self._outcomes[request.id] = self._begin(request)
                 for old in list(self._outcomes)[:-_REMEMBERED]:
                     del self._outcomes[old]
             return self.describe(*self._outcomes[request.id])
@@ -131,18 +130,18 @@ class LiveCorrection:
         if session.unfinished_correction:
             _log.error("correction_unfinished", reason=session.unfinished_correction)
 
-    def _begin(self, request: CorrectPosesRequest, arrays: Arrays) -> tuple[int, int]:
-        poses = self._to_frames(request, arrays)
+    def _begin(self, request: CorrectPosesRequest) -> tuple[int, int]:
+        poses = self._to_frames(request)
         known = self._pipeline.corrector.poses()
         stamps = {stamp_ns for _, stamp_ns in known}
         used = sum((key in known) if isinstance(key, tuple) else (key in stamps) for key in poses)
         self._pipeline.correct_poses(poses, until_ns=request.until_ns)
-        return used, len(arrays["stamps_ns"]) - used
+        return used, len(request.stamps_ns) - used
 
-    def _to_frames(self, request: CorrectPosesRequest, arrays: Arrays) -> CorrectedPoses:
+    def _to_frames(self, request: CorrectPosesRequest) -> CorrectedPoses:
         """The poses by the frames they are of."""
-        stamps, poses = np.asarray(arrays["stamps_ns"], np.int64), np.asarray(arrays["poses"], np.float64)
-        camera, names = np.asarray(arrays["camera"], np.int64), list(request.cameras)
+        stamps, poses = request.stamps_ns, request.poses
+        camera, names = request.camera.astype(np.int64), list(request.cameras)
         if not len(stamps) == len(poses) == len(camera):
             raise CodecError(f"correct_poses: {len(stamps)} stamps, {len(camera)} cameras and {len(poses)} poses")
         if len(set(names)) < len(names) or ("" in names and len(names) > 1) or (camera >= len(names)).any():

@@ -28,9 +28,8 @@ from semantic_mapper.nodes.mapper.offered_weights import (
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.replay.session import MapSession
-from semantic_mapper.transport.codec import encode_in_use
-from semantic_mapper.transport.learning_messages import digest_of
-from semantic_mapper.transport.messages import WeightsInUse, WeightsUpdate
+from semantic_mapper.transport.codec import encode
+from semantic_mapper.transport.messages import WeightsInUse, WeightsUpdate, digest_of
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 
 COMPARED = 4  # frames of the session, well spread, in which new weights are compared with the map
@@ -349,4 +348,4 @@ class LiveWeights:
             self._counts["weights_rolled_back"],
             self._contradicts,
         )
-        self._publisher.publish(encode_in_use(in_use))
+        self._publisher.publish(encode(in_use))

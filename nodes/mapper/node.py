@@ -255,7 +255,7 @@ class _Mapper:
         _log.info("stream_begins", source=info.source, frames=info.frame_count)
 
     def _map(self, frame: PosedFrame) -> None:
-        from semantic_mapper.transport.codec import encode_map_update, encode_refused
+        from semantic_mapper.transport.codec import encode
         from semantic_mapper.transport.messages import FrameRefused
 
         if self._session is None:
@@ -269,10 +269,10 @@ class _Mapper:
         if update is None:
             reason = self._session.refusals.last.reason
             refused = FrameRefused(frame.stamp_ns, frame.seq, frame.camera_id, reason)
-            self._publisher.publish(encode_refused(refused))
+            self._publisher.publish(encode(refused))
         else:
             self._step_us += round(1e3 * sum(update.stage_ms.values()))
-            self._publisher.publish(encode_map_update(update))
+            self._publisher.publish(encode(update))
 
     def _end(self, end: EndOfStream) -> bool:
         """One stream has ended; True where all have."""
@@ -294,7 +294,7 @@ class _Mapper:
         return True
 
     def _tell_status(self, state: NodeState, *, now: bool = False) -> None:
-        from semantic_mapper.transport.codec import encode_status
+        from semantic_mapper.transport.codec import encode
         from semantic_mapper.transport.messages import Status
 
         if not now and time.monotonic() - self._last_status < STATUS_PERIOD_S:
@@ -327,7 +327,7 @@ class _Mapper:
             if self._autosave.failure:
                 degraded += (f"the map was not saved: {self._autosave.failure}",)
         status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, degraded)
-        self._publisher.publish(encode_status(status))
+        self._publisher.publish(encode(status))
 
 
 def main(job: NodeJob | None = None) -> NoReturn:

@@ -10,8 +10,7 @@ from semantic_mapper.errors import WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, check_same_shape, load_checkpoint
 from semantic_mapper.fields.learned import encode_alike
 from semantic_mapper.files import atomic_path
-from semantic_mapper.transport.learning_messages import digest_of
-from semantic_mapper.transport.messages import WeightsUpdate
+from semantic_mapper.transport.messages import WeightsUpdate, digest_of
 from semantic_mapper.transport.query_messages import WeightsEntry
 
 FOLDER = "weights"  # beside the map

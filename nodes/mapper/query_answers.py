@@ -22,9 +22,9 @@ from semantic_mapper.queries.rays import cast_rays
 from semantic_mapper.queries.relay import MirrorRelay
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.transport import query_messages as messages
-from semantic_mapper.transport.opening import Parts
-from semantic_mapper.transport.plain import label_set_header
-from semantic_mapper.transport.query_codec import Arrays, decode_request, encode_answer, encode_error
+from semantic_mapper.transport.codec import decode_request, encode_answer, encode_error
+from semantic_mapper.transport.framing import Parts
+from semantic_mapper.transport.headers import LabelSetForm
 
 # One thread answers all that takes long: what would keep the others waiting for more than about a second is refused.
 MAX_VISITED_VOXELS = 1e8  # of `at`
@@ -40,8 +40,6 @@ _MAX_TRACKERS = 4  # one for each direction that was called up
 
 _log = structlog.get_logger(__name__)
 
-Answer = tuple[messages.AnswerHeader, Arrays]
-
 
 class Question(NamedTuple):
     """One question, ready to be answered.
@@ -54,7 +52,7 @@ class Question(NamedTuple):
     """
 
     answer: Callable[[], list[bytes]]
-    header: messages.RequestHeader
+    header: messages.Request
     takes_long: bool
     about_map: bool
 
@@ -88,105 +86,103 @@ class Answers:
     def read(self, parts: Parts) -> Question:
         """Parts of a question -> what answers it."""
         try:
-            kind, header, arrays = decode_request(parts)
-            takes_long = _takes_long(self._relay.snapshot(), header, arrays)
+            kind, request = decode_request(parts)
+            takes_long = _takes_long(self._relay.snapshot(), request)
         except (SemanticMapperError, MemoryError) as error:
             refusal = encode_error(_told(error))
-            return Question(lambda: refusal, messages.RequestHeader(), takes_long=False, about_map=False)
+            return Question(lambda: refusal, messages.Request(), takes_long=False, about_map=False)
         beside = messages.CorrectPosesRequest | messages.CorrectionRequest | messages.WeightsRequest
-        about_map = not isinstance(header, beside)
-        return Question(lambda: self._encoded(kind, header, arrays), header, takes_long, about_map)
+        about_map = not isinstance(request, beside)
+        return Question(lambda: self._encoded(kind, request), request, takes_long, about_map)
 
-    def _encoded(self, kind: str, header: messages.RequestHeader, arrays: Arrays) -> list[bytes]:
+    def _encoded(self, kind: str, request: messages.Request) -> list[bytes]:
         try:
-            return encode_answer(kind, *self._answer(header, arrays))
+            return encode_answer(kind, self._answer(request))
         except (SemanticMapperError, MemoryError) as error:
             return encode_error(_told(error))
         except Exception as error:  # noqa: BLE001 -- a bug of ours must not end a thread that all wait for
             _log.exception("question_failed", question=kind)
             return encode_error(MapError(f"the mapper could not compute this: {error}"))
 
-    def _answer(self, header: messages.RequestHeader, arrays: Arrays) -> Answer:
+    def _answer(self, request: messages.Request) -> messages.Answer:
         snapshot = self._relay.snapshot()
-        match header:
+        match request:
             case messages.InfoRequest():
                 return self._describe(snapshot)
             case messages.AtRequest():
-                _bound_points(snapshot, header, len(arrays["points"]))
-                return self._plain(snapshot, "at", at(snapshot, arrays["points"], header.radius_m))
+                _bound_points(snapshot, request)
+                return self._plain(snapshot, messages.AtAnswer, at(snapshot, request.points, request.radius_m))
             case messages.NearestRequest():
-                return self._nearest(snapshot, header)
+                return self._nearest(snapshot, request)
             case messages.RaysRequest():
-                _bound_rays(header, max(len(a) for a in arrays.values()))
-                hits = cast_rays(snapshot, arrays["origins"], arrays["directions"], header.max_m)
-                return self._plain(snapshot, "cast_rays", hits)
+                _bound_rays(request)
+                hits = cast_rays(snapshot, request.origins, request.directions, request.max_m)
+                return self._plain(snapshot, messages.RaysAnswer, hits)
             case messages.BoxRequest():
-                return self._plain(snapshot, "points_in_box", points_in_box(snapshot, header.lower, header.upper))
+                found = points_in_box(snapshot, request.lower, request.upper)
+                return self._plain(snapshot, messages.BoxAnswer, found)
             case messages.InstancesRequest():
-                return self._instances(snapshot, header.up)
+                return self._instances(snapshot, request.up)
             case messages.OccupancyRequest():
-                return messages.AnswerHeader(**self._about(snapshot)), {"state": occupancy(snapshot, arrays["points"])}
+                state = occupancy(snapshot, request.points)
+                return messages.OccupancyAnswer(**self._about(snapshot), state=state)
             case messages.DistanceRequest():
-                return self._distances(snapshot, header)
+                return self._distances(snapshot, request)
             case messages.ChangesRequest():
-                return self._changes(snapshot, header)
+                return self._changes(snapshot, request)
             case messages.CorrectPosesRequest() | messages.CorrectionRequest():
-                return self._correct(snapshot, header, arrays)
+                return self._correct(snapshot, request)
             case messages.WeightsRequest():
-                return self._exchange_weights(snapshot, header)
+                return self._exchange_weights(snapshot, request)
             case _:
-                raise MapError(f"{type(header).__name__}: cannot be answered")
+                raise MapError(f"{type(request).__name__}: cannot be answered")
 
     def _correct(
         self,
         snapshot: MapSnapshot,
-        header: messages.CorrectPosesRequest | messages.CorrectionRequest,
-        arrays: Arrays,
-    ) -> Answer:
+        request: messages.CorrectPosesRequest | messages.CorrectionRequest,
+    ) -> messages.Answer:
         correction = self._correction
         if correction is None:
             raise MapError("poses cannot be corrected here: this service only answers questions")
-        is_new = isinstance(header, messages.CorrectPosesRequest)
-        state = correction.begin(header, arrays) if is_new else correction.describe()
-        return messages.CorrectionAnswer(**self._about(snapshot), **state), {}
+        is_new = isinstance(request, messages.CorrectPosesRequest)
+        state = correction.begin(request) if is_new else correction.describe()
+        return messages.CorrectionAnswer(**self._about(snapshot), **state)
 
-    def _exchange_weights(self, snapshot: MapSnapshot, header: messages.WeightsRequest) -> Answer:
+    def _exchange_weights(self, snapshot: MapSnapshot, request: messages.WeightsRequest) -> messages.Answer:
         weights = self._weights
         if weights is None:
             raise MapError("this mapper takes no weights while it runs (option `learner`)")
-        state = weights.describe() if header.to is None else weights.ask_for(header.to)
-        return messages.WeightsAnswer(**self._about(snapshot), **state), {}
+        state = weights.describe() if request.to is None else weights.ask_for(request.to)
+        return messages.WeightsAnswer(**self._about(snapshot), **state)
 
     def _about(self, snapshot: MapSnapshot) -> dict[str, Any]:
         return {"map_id": self.map_id, "version": snapshot.version, "epoch": snapshot.epoch}
 
-    def _plain(self, snapshot: MapSnapshot, kind: str, found: object) -> Answer:
+    def _plain(self, snapshot: MapSnapshot, kind: type[messages.Answer], found: object) -> messages.Answer:
         """The fields of a query's result are the arrays of its answer."""
-        arrays: Arrays = {name: getattr(found, name) for name in messages.QUESTIONS[kind].gives}
-        return messages.AnswerHeader(**self._about(snapshot)), arrays
+        return kind(**self._about(snapshot), **_arrays(found, kind))
 
-    def _describe(self, snapshot: MapSnapshot) -> Answer:
-        header = messages.InfoAnswer(
+    def _describe(self, snapshot: MapSnapshot) -> messages.Answer:
+        return messages.InfoAnswer(
             **self._about(snapshot),
             blocks=snapshot.block_count,
             voxel_size_m=snapshot.voxel_size_m,
             truncation_voxels=snapshot.truncation_voxels,
-            label_set=label_set_header(snapshot.label_set),
+            label_set=LabelSetForm.of(snapshot.label_set),
         )
-        return header, {}
 
-    def _nearest(self, snapshot: MapSnapshot, header: messages.NearestRequest) -> Answer:
-        hit = nearest(snapshot, header.class_name, header.point, header.min_confidence)
-        answer = messages.NearestAnswer(
+    def _nearest(self, snapshot: MapSnapshot, request: messages.NearestRequest) -> messages.Answer:
+        hit = nearest(snapshot, request.class_name, request.point, request.min_confidence)
+        return messages.NearestAnswer(
             **self._about(snapshot),
             found=hit is not None,
             xyz=(0.0, 0.0, 0.0) if hit is None else tuple(hit.xyz.tolist()),
             distance_m=0.0 if hit is None else hit.distance_m,
             confidence=0.0 if hit is None else hit.confidence,
         )
-        return answer, {}
 
-    def _instances(self, snapshot: MapSnapshot, up: messages.Point) -> Answer:
+    def _instances(self, snapshot: MapSnapshot, up: messages.Point) -> messages.Answer:
         tracked = self._tracked.pop(up, None)  # out of here while it updates: one that fails half way is not used again
         if tracked is None or tracked.version != snapshot.version:
             tracker = tracked.tracker if tracked else InstanceTracker(up=up)
@@ -194,28 +190,36 @@ class Answers:
         self._tracked[up] = tracked
         for old in list(self._tracked)[:-_MAX_TRACKERS]:
             del self._tracked[old]
-        return messages.AnswerHeader(**self._about(snapshot)), _thing_arrays(tracked.things)
+        return messages.InstancesAnswer(**self._about(snapshot), **_thing_arrays(tracked.things))
 
-    def _distances(self, snapshot: MapSnapshot, header: messages.DistanceRequest) -> Answer:
-        sides = _box_sides(snapshot, header)
+    def _distances(self, snapshot: MapSnapshot, request: messages.DistanceRequest) -> messages.Answer:
+        sides = _box_sides(snapshot, request)
         if min(sides) > 0 and math.prod(sides) > MAX_FIELD_VOXELS:
             raise MapError(
                 f"distance_field: a box of {' x '.join(f'{s:.0f}' for s in sides)} voxels; over a socket at most "
                 f"{MAX_FIELD_VOXELS} are computed at once; keep a mirror for more"
             )
-        found = distance_field(snapshot, header.lower, header.upper, unknown_is_occupied=header.unknown_is_occupied)
+        found = distance_field(snapshot, request.lower, request.upper, unknown_is_occupied=request.unknown_is_occupied)
         origin: messages.Point = tuple(found.origin_m.tolist())
-        about = self._about(snapshot)
-        answer = messages.DistanceAnswer(**about, origin_m=origin, voxel_size_m=found.voxel_size_m)
-        return answer, {"distance_m": found.distance_m, "state": found.state}
-
-    def _changes(self, snapshot: MapSnapshot, header: messages.ChangesRequest) -> Answer:
-        since = header.since if header.map_id in ("", self.map_id) else 0
-        found = self._relay.changes(since, min(header.limit or MAX_CHANGED_BLOCKS, MAX_CHANGED_BLOCKS))
-        answer = messages.ChangesAnswer(
-            map_id=self.map_id, version=found.version, epoch=found.epoch, since=found.since, newest=snapshot.version
+        return messages.DistanceAnswer(
+            **self._about(snapshot),
+            origin_m=origin,
+            voxel_size_m=found.voxel_size_m,
+            distance_m=found.distance_m,
+            state=found.state,
         )
-        return answer, {name: getattr(found, name) for name in messages.QUESTIONS["changes"].gives}
+
+    def _changes(self, snapshot: MapSnapshot, request: messages.ChangesRequest) -> messages.Answer:
+        since = request.since if request.map_id in ("", self.map_id) else 0
+        found = self._relay.changes(since, min(request.limit or MAX_CHANGED_BLOCKS, MAX_CHANGED_BLOCKS))
+        return messages.ChangesAnswer(
+            map_id=self.map_id,
+            version=found.version,
+            epoch=found.epoch,
+            since=found.since,
+            newest=snapshot.version,
+            **_arrays(found, messages.ChangesAnswer),
+        )
 
 
 def _told(error: SemanticMapperError | MemoryError) -> SemanticMapperError:
@@ -224,7 +228,11 @@ def _told(error: SemanticMapperError | MemoryError) -> SemanticMapperError:
     return error
 
 
-def _thing_arrays(things: Sequence[Instance]) -> Arrays:
+def _arrays(found: object, kind: type[messages.Answer]) -> dict[str, Any]:
+    return {name: getattr(found, name) for name in messages.array_forms(kind)}
+
+
+def _thing_arrays(things: Sequence[Instance]) -> dict[str, Any]:
     numbers = [(t.id, t.class_id, len(t.voxels)) for t in things]
     places = [
         np.concatenate(([t.confidence], t.centroid, t.box.center, t.box.size, t.box.R_world_box.ravel()))
@@ -237,42 +245,47 @@ def _thing_arrays(things: Sequence[Instance]) -> Arrays:
     }
 
 
-def _takes_long(snapshot: MapSnapshot, header: messages.RequestHeader, arrays: Arrays) -> bool:
-    match header:
+def _takes_long(snapshot: MapSnapshot, request: messages.Request) -> bool:
+    match request:
         case messages.AtRequest():
-            return _visited_voxels(snapshot, header, len(arrays["points"])) > LONG_VISITED_VOXELS
+            return _visited_voxels(snapshot, request) > LONG_VISITED_VOXELS
         case messages.RaysRequest():
-            return max(len(a) for a in arrays.values()) * header.max_m > LONG_RAY_METRES
+            return _ray_count(request) * request.max_m > LONG_RAY_METRES
         case messages.OccupancyRequest():
-            return len(arrays["points"]) > LONG_POINTS
+            return len(request.points) > LONG_POINTS
         case messages.BoxRequest() | messages.DistanceRequest():
-            return math.prod(_box_sides(snapshot, header)) > LONG_BOX_VOXELS
+            return math.prod(_box_sides(snapshot, request)) > LONG_BOX_VOXELS
         case messages.InstancesRequest() | messages.ChangesRequest() | messages.CorrectPosesRequest():
             return True
         case _:
             return False
 
 
-def _box_sides(snapshot: MapSnapshot, header: messages.BoxRequest | messages.DistanceRequest) -> list[float]:
-    return [(b - a) / snapshot.voxel_size_m for a, b in zip(header.lower, header.upper, strict=True)]
+def _box_sides(snapshot: MapSnapshot, request: messages.BoxRequest | messages.DistanceRequest) -> list[float]:
+    return [(b - a) / snapshot.voxel_size_m for a, b in zip(request.lower, request.upper, strict=True)]
 
 
-def _visited_voxels(snapshot: MapSnapshot, header: messages.AtRequest, count: int) -> float:
-    radius = RADIUS_VOXELS if header.radius_m is None else header.radius_m / snapshot.voxel_size_m
-    return count * (2 * min(max(radius, 0), MAX_RADIUS_VOXELS) + 2) ** 3
+def _visited_voxels(snapshot: MapSnapshot, request: messages.AtRequest) -> float:
+    radius = RADIUS_VOXELS if request.radius_m is None else request.radius_m / snapshot.voxel_size_m
+    return len(request.points) * (2 * min(max(radius, 0), MAX_RADIUS_VOXELS) + 2) ** 3
 
 
-def _bound_points(snapshot: MapSnapshot, header: messages.AtRequest, count: int) -> None:
-    if _visited_voxels(snapshot, header, count) > MAX_VISITED_VOXELS:
+def _bound_points(snapshot: MapSnapshot, request: messages.AtRequest) -> None:
+    if _visited_voxels(snapshot, request) > MAX_VISITED_VOXELS:
         raise MapError(
-            f"at: {count} points with a radius of {header.radius_m} m are too much for one question; ask for fewer "
-            "points at once, or keep a mirror"
+            f"at: {len(request.points)} points with a radius of {request.radius_m} m are too much for one question; "
+            "ask for fewer points at once, or keep a mirror"
         )
 
 
-def _bound_rays(header: messages.RaysRequest, count: int) -> None:
-    if count * header.max_m > MAX_RAY_METRES:
+def _ray_count(request: messages.RaysRequest) -> int:
+    return max(len(request.origins), len(request.directions))
+
+
+def _bound_rays(request: messages.RaysRequest) -> None:
+    count = _ray_count(request)
+    if count * request.max_m > MAX_RAY_METRES:
         raise MapError(
-            f"cast_rays: {count} rays of {header.max_m:g} m are too much for one question; at most "
+            f"cast_rays: {count} rays of {request.max_m:g} m are too much for one question; at most "
             f"{MAX_RAY_METRES:g} m together, or keep a mirror"
         )

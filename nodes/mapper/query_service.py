@@ -24,7 +24,7 @@ from semantic_mapper.nodes.mapper.query_answers import Answers, Question
 from semantic_mapper.nodes.mapper.query_queue import Asked, WaitingQuestions
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.relay import MirrorRelay
-from semantic_mapper.transport.query_codec import encode_error
+from semantic_mapper.transport.codec import encode_error
 from semantic_mapper.transport.query_sockets import QueryServer
 from semantic_mapper.transport.security import Keys
 

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from semantic_mapper.replay.log.reader import LogAttachment
     from semantic_mapper.replay.log.recording import Recording
     from semantic_mapper.transport.messages import NodeState, StreamInfo
-    from semantic_mapper.transport.publisher import Publisher
-    from semantic_mapper.transport.sockets import LosslessSubscriber
+    from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
     from semantic_mapper.types import CameraIntrinsics
 
 POLL_S = 0.05
@@ -49,7 +48,7 @@ def run_recorder(context: NodeContext, options: RecorderOptions) -> None:
             recording, not the node.
         TransportError: a source cannot be subscribed to, or the endpoint is taken.
     """
-    from semantic_mapper.transport.publisher import Publisher
+    from semantic_mapper.transport.sockets import Publisher
 
     with ExitStack() as stack:
         teller = StatusTeller(context.name, stack.enter_context(Publisher(context.endpoint(context.name))))
@@ -107,7 +106,7 @@ def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Rec
 
 def _drain(context: NodeContext, recorder: Recorder, sources: Sequence[LosslessSubscriber]) -> None:
     """Write what had come before somebody asked to stop; what there is no time for is counted."""
-    from semantic_mapper.transport.opening import topic_name
+    from semantic_mapper.transport.topics import read_topic
 
     deadline = time.monotonic() + DRAIN_S
     for source in sources:
@@ -117,7 +116,7 @@ def _drain(context: NodeContext, recorder: Recorder, sources: Sequence[LosslessS
             if now < deadline:
                 recorder.take(parts)
             elif now < deadline + COUNT_S:
-                recorder.left += topic_name(parts) not in ("info", "end")
+                recorder.left += read_topic(parts)[0].name not in ("info", "end")
             else:  # a camera that publishes on and on
                 break
     recorder.rejected = sum(source.rejected for source in sources)
@@ -158,7 +157,7 @@ class Recorder:
 
     def __init__(self, context: NodeContext, options: RecorderOptions) -> None:
         from semantic_mapper.replay.log.recording import RecordingRules, make_way
-        from semantic_mapper.transport.codec import CodecOptions
+        from semantic_mapper.transport.images import CodecOptions
 
         self._context = context
         self._options = options
@@ -199,12 +198,13 @@ class Recorder:
 
     def take(self, parts: list[bytes]) -> bool:
         """Keep one message; True where all streams have ended."""
-        from semantic_mapper.transport.codec import decode_end, decode_info
+        from semantic_mapper.transport.codec import decode_as
+        from semantic_mapper.transport.messages import EndOfStream, StreamInfo
         from semantic_mapper.transport.topics import parse_topic
 
         topic, _ = parse_topic(parts[0])
         if topic.name == "info":
-            info = decode_info(parts)
+            info = decode_as(StreamInfo, parts)
             self._cameras |= info.cameras
             if self.recording is None:
                 self._begin(info)
@@ -216,7 +216,7 @@ class Recorder:
                 self._early.append(parts)
             else:
                 self.recording.write(self._packed(parts, topic.name))
-        return topic.name == "end" and self._streams.end(decode_end(parts))
+        return topic.name == "end" and self._streams.end(decode_as(EndOfStream, parts))
 
     def close(self) -> None:
         """Finish the log."""
@@ -337,7 +337,7 @@ class StatusTeller:
 
     def tell(self, recorder: Recorder, state: NodeState) -> None:
         """Tell now."""
-        from semantic_mapper.transport.codec import encode_status
+        from semantic_mapper.transport.codec import encode
         from semantic_mapper.transport.messages import Status
 
         self._told_at = time.monotonic()
@@ -348,7 +348,7 @@ class StatusTeller:
             counters |= {"parts": r.parts, "deleted": r.deleted, "log_kb": recorder.log_bytes // 1024}
             degraded = tuple(text for text in (r.trouble,) if text)
         status = Status(self._node, state, time.monotonic_ns(), counters, degraded=degraded)
-        self._publisher.publish(encode_status(status))
+        self._publisher.publish(encode(status))
 
 
 def main(job: NodeJob | None = None) -> NoReturn:

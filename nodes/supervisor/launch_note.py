@@ -10,7 +10,7 @@ import msgspec
 from semantic_mapper.config import MAX_FILE_BYTES
 from semantic_mapper.drivers.urls import hide_password
 from semantic_mapper.errors import TransportError
-from semantic_mapper.files import read_regular
+from semantic_mapper.files import read_regular, write_bytes
 from semantic_mapper.nodes.supervisor.launch_config import Launch
 
 NOTE = "launch.json"
@@ -44,9 +44,8 @@ def leave_launch_note(launch: Launch, folder: Path) -> None:
     nodes = tuple(
         NodeNote(n.name, n.kind, _without_passwords(msgspec.to_builtins(launch.options[n.name]))) for n in launch.nodes
     )
-    draft = folder / f"{NOTE}.new"
-    draft.write_bytes(msgspec.json.format(msgspec.json.encode(LaunchNote(launch.name, nodes)), indent=1))
-    draft.replace(folder / NOTE)
+    text = msgspec.json.format(msgspec.json.encode(LaunchNote(launch.name, nodes)), indent=1)
+    write_bytes(folder / NOTE, text, sync="none")
 
 
 def _without_passwords(value: Any) -> Any:

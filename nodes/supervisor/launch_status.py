@@ -5,18 +5,18 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
 import structlog
+from msgspec.structs import replace
 
 from semantic_mapper.errors import CodecError, TransportError
 from semantic_mapper.nodes.public_publisher import PublicPublisher
 from semantic_mapper.nodes.supervisor.hang_detector import process_stats
 from semantic_mapper.nodes.supervisor.launch_config import STATUS_SOCKET
 from semantic_mapper.nodes.supervisor.managed_process import ManagedProcess
-from semantic_mapper.transport.codec import encode_status
+from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import NodeState, Status
 from semantic_mapper.transport.sockets import NewestSubscriber
 
@@ -78,7 +78,7 @@ class LaunchStatus:
         """What cannot be told is no reason to end a launch."""
         short = tuple(sentence[:MAX_SENTENCE] for sentence in status.degraded[:MAX_SENTENCES])
         try:
-            self._publisher.publish(encode_status(replace(status, degraded=short)))
+            self._publisher.publish(encode(replace(status, degraded=short)))
         except (CodecError, TransportError) as error:
             _log.warning("status_not_told", node=status.node, reason=str(error))
 

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -15,8 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from semantic_mapper.errors import LogError
-from semantic_mapper.files import atomic_path
 from semantic_mapper.transport.codec import EncodedImage
 from semantic_mapper.transport.images import encode_rgb
 from semantic_mapper.types import Float32, Float64, PosedFrame, UInt8
@@ -91,32 +85,3 @@ def quaternion(T_a_b: Float64) -> Float64:
 def seconds(stamp_ns: int) -> str:
     """Nanoseconds as seconds with nine places, exactly."""
     return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
-
-
-@contextmanager
-def whole_place(path: Path, *, folder: bool) -> Iterator[Path]:
-    """A name beside ``path`` to write to, which becomes ``path`` once all is well.
-
-    Args:
-        path: Of the file or folder to make.
-        folder: Make a folder there.
-
-    Raises:
-        LogError: it cannot be written; nothing is left behind.
-    """
-    try:
-        with _new_folder(path) if folder else atomic_path(path) as draft:
-            yield draft
-    except OSError as error:
-        raise LogError(f"{path}: cannot be written: {error.strerror or error}") from error
-
-
-@contextmanager
-def _new_folder(path: Path) -> Iterator[Path]:
-    draft = path.with_name(f".{path.name}.{os.getpid()}.exporting")
-    draft.mkdir()
-    try:
-        yield draft
-        os.replace(draft, path)
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)

@@ -9,8 +9,8 @@ from typing import Literal, get_args
 import numpy as np
 
 from semantic_mapper.errors import ConfigError, MapError
+from semantic_mapper.files import atomic_path
 from semantic_mapper.mapping.files.export import ColorBy, colored, sure_faces, sure_points
-from semantic_mapper.mapping.files.formats.files import whole_path
 from semantic_mapper.mapping.files.formats.glb import write_glb
 from semantic_mapper.mapping.files.formats.map_server import write_map_server
 from semantic_mapper.mapping.files.formats.npz import write_npz
@@ -142,7 +142,7 @@ def _export_points(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> E
     elif request.format == "npz":
         write_npz(path, points, labels)
     else:
-        with whole_path(path) as part:
+        with atomic_path(path, raises=MapError) as part:
             from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file
 
             RerunLog(recording_file(part), labels, voxel_map.config.voxel_size_m).finish(points)

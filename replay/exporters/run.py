@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from semantic_mapper.errors import CodecError, ConfigError, LogError
-from semantic_mapper.replay.exporters.base import Exporter, ExportFrame, LeftOut, encoded, whole_place
+from semantic_mapper.files import atomic_folder, atomic_path
+from semantic_mapper.replay.exporters.base import Exporter, ExportFrame, LeftOut, encoded
 from semantic_mapper.replay.exporters.folder import FolderExporter, TrajectoryExporter, TumExporter
 from semantic_mapper.replay.log.sequence import Log
-from semantic_mapper.transport.codec import EncodedImage, Envelope, decode_frame
+from semantic_mapper.transport.codec import EncodedImage, Envelope, decode_as
 from semantic_mapper.transport.images import sniff_image
 from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.types import PosedFrame
 
 LogFormat = Literal["foxglove", "rrd", "trajectory", "tum", "folder"]
 FORMATS: tuple[LogFormat, ...] = get_args(LogFormat)
@@ -102,7 +104,7 @@ def export_log(log: Log, out: Path, request: LogExportRequest, on_frame: Callabl
     camera = _choose_camera(log, request)
     left_out: list[str] = []
     frames = 0
-    with whole_place(out, folder=is_folder) as place:
+    with (atomic_folder if is_folder else atomic_path)(out, raises=LogError) as place:
         exporter = _exporter(place, log.info, request.format)
         for envelope, parts in _frames(log, camera, request.max_frames):
             on_frame()
@@ -166,7 +168,7 @@ def _unpacked(envelope: Envelope, parts: list[bytes]) -> ExportFrame:
     Raises:
         CodecError: it is damaged.
     """
-    frame = decode_frame(parts)
+    frame = decode_as(PosedFrame, parts)
     if envelope.rgb_encoding == "raw":
         return ExportFrame(frame, encoded(frame.rgb), envelope.depth_scale)
     encoding, _ = sniff_image(parts[2])

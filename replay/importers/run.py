@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LabelError, LogError
@@ -26,7 +27,7 @@ from semantic_mapper.replay.importers.tum import TumRecording
 from semantic_mapper.replay.log.atomic_log import whole_log
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.sequence import SUFFIX as LOG_SUFFIX
-from semantic_mapper.transport.codec import CodecOptions
+from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.turning import turned_frame, turned_intrinsics
 from semantic_mapper.types import PosedFrame
@@ -193,7 +194,7 @@ def _changes(
     """What the log says of its frames, and what makes its frames of those of the recording."""
     cameras = {camera: turned_intrinsics(k, options.quarters) for camera, k in info.cameras.items()}
     # What the log holds counts, not what the folder did.
-    info = dataclasses.replace(info, cameras=cameras, frame_count=None)
+    info = msgspec.structs.replace(info, cameras=cameras, frame_count=None)
     if not renames:
         return info, lambda frame: turned_frame(frame, options.quarters)
     if info.label_set is None:
@@ -204,7 +205,7 @@ def _changes(
         turned = turned_frame(frame, options.quarters)
         return turned if turned.label is None else dataclasses.replace(turned, label=new_ids[turned.label])
 
-    return dataclasses.replace(info, label_set=label_set), changed
+    return msgspec.structs.replace(info, label_set=label_set), changed
 
 
 @dataclass(slots=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 from semantic_mapper.errors import LogError
 from semantic_mapper.files import atomic_path
 from semantic_mapper.replay.log.format import LogAttachment, LogWriter
-from semantic_mapper.transport.codec import CodecOptions
+from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import StreamInfo
 
 _DEFAULTS = CodecOptions()

@@ -23,16 +23,9 @@ from semantic_mapper.errors import LogError
 from semantic_mapper.replay.log.atomic_file import WholeFile
 from semantic_mapper.replay.log.mcap_scan import MAGIC
 from semantic_mapper.replay.log.reader import INFO_ATTACHMENT, LogAttachment, LogReader
-from semantic_mapper.transport import headers
-from semantic_mapper.transport.codec import (
-    CodecOptions,
-    EncodedImage,
-    Parts,
-    encode_frame,
-    encode_info,
-    read_envelope,
-)
-from semantic_mapper.transport.framing import pack_parts
+from semantic_mapper.transport.codec import EncodedImage, encode, encode_frame, header_type, read_envelope
+from semantic_mapper.transport.framing import Parts, pack_parts
+from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 
@@ -40,14 +33,6 @@ __all__ = ["LogAttachment", "LogReader", "LogWriter"]
 
 PROFILE = "semantic-mapper"
 _DEFAULTS = CodecOptions()
-_HEADERS = {
-    "frame": headers.FrameHeader,
-    "map": headers.MapUpdateHeader,
-    "refused": headers.FrameRefusedHeader,
-    "status": headers.StatusHeader,
-    "info": headers.StreamInfoHeader,
-    "end": headers.EndOfStreamHeader,
-}
 
 
 class LogWriter:
@@ -83,7 +68,7 @@ class LogWriter:
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._last_stamp_ns = 0
-        parts = encode_info(info)  # before the file is made: what cannot be packed leaves none behind
+        parts = encode(info)  # before the file is made: what cannot be packed leaves none behind
         self._failed = False
         self.trouble: OSError | None = None
         self._file = _create(path, overwrite)
@@ -193,9 +178,9 @@ class LogWriter:
         name = f"{topic}/{source}"
         if name not in self._channels:
             if topic not in self._schemas:
-                kind = _HEADERS[topic]
+                kind = header_type(topic)
                 self._schemas[topic] = self._writer.register_schema(
-                    f"semantic_mapper.{kind.__name__.removesuffix('Header')}", "jsonschema", _schema(kind)
+                    f"semantic_mapper.{kind.__name__}", "jsonschema", _schema(kind)
                 )
             self._channels[name] = self._writer.register_channel(name, "msgpack", self._schemas[topic])
         return self._channels[name]
@@ -222,7 +207,7 @@ def _short_end() -> bytes:
     return builder.end() + MAGIC
 
 
-def _schema(kind: type[headers.Header]) -> bytes:
+def _schema(kind: type[msgspec.Struct]) -> bytes:
     described = msgspec.json.schema(kind)
     described["description"] = (
         "The payload is a msgpack array of binaries: [topic, header, buffers...]. The header is msgpack in turn and "

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+import msgspec
+
 from semantic_mapper.errors import CodecError, LogError, NodeError, TransportError
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.replay.log.sequence import Log
-from semantic_mapper.transport.codec import Envelope, Parts, decode_frame, encode_end, encode_info
+from semantic_mapper.transport.codec import Envelope, decode_as, encode
+from semantic_mapper.transport.framing import Parts
 from semantic_mapper.transport.messages import EndOfStream, FrameRefused
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
-from semantic_mapper.types import MapUpdate
+from semantic_mapper.types import MapUpdate, PosedFrame
 
 Mode = Literal["lockstep", "realtime", "fast"]
 Ack = MapUpdate | FrameRefused
@@ -149,8 +151,8 @@ def play(
     metadata = dict(log.info.metadata)
     if options.from_stamp_ns:
         metadata["played_from_stamp_ns"] = str(options.from_stamp_ns)
-    info = dataclasses.replace(log.info, frame_count=total, metadata=metadata)
-    publisher.publish(encode_info(info, options.source))
+    info = msgspec.structs.replace(log.info, frame_count=total, metadata=metadata)
+    publisher.publish(encode(info, sender=options.source))
     run = _Run(log, publisher, options, stop, on_frame)
     reason, detail = "error", "the player failed"
     try:
@@ -169,7 +171,7 @@ def play(
 
 def _say_end(publisher: Publisher, end: EndOfStream, timeout_s: float) -> None:
     try:
-        publisher.publish(encode_end(end), timeout_s)
+        publisher.publish(encode(end), timeout_s)
     except TransportError as error:  # whoever does not listen any more needs no end; what led here must not be hidden
         logger.warning("end_of_stream_not_delivered", error=str(error))
 
@@ -238,7 +240,7 @@ class _Run:
     def _can_be_decoded(self, parts: Parts, envelope: Envelope) -> bool:
         """A subscriber would drop it without a word, and lockstep would wait for its answer for ever."""
         try:
-            decode_frame(parts)
+            decode_as(PosedFrame, parts)
         except CodecError as error:
             self.errors.append(LogError(f"{self.log.path}: frame seq={envelope.seq}: {error}"))
             return False

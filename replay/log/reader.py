@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
+
+import msgspec
 
 from semantic_mapper.errors import CodecError, ConfigError, LogError
 from semantic_mapper.files import open_regular
@@ -20,7 +22,7 @@ from semantic_mapper.replay.log.mcap_scan import (
     read_payloads,
     scan,
 )
-from semantic_mapper.transport.codec import Envelope, decode_frame, decode_info, read_envelope
+from semantic_mapper.transport.codec import Envelope, decode_as, read_envelope
 from semantic_mapper.transport.framing import unpack_parts
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.transport.topics import parse_topic
@@ -138,7 +140,7 @@ class LogReader:
             raise LogError(f"{self.path}: no frame {number}; the log holds {len(self._frames)}")
         entry = self._index[self._frames[number]]
         try:
-            return decode_frame(self._read(entry))
+            return decode_as(PosedFrame, self._read(entry))
         except CodecError as error:
             raise LogError(f"{self._where(entry)}: {error}") from error
 
@@ -199,7 +201,7 @@ class LogReader:
         infos = (entry for entry in self._index if entry.topic == "info")
         for entry in islice(infos, MAX_INFOS):
             try:
-                info = decode_info(self._read(entry))
+                info = decode_as(StreamInfo, self._read(entry))
             except (LogError, CodecError):  # told when its turn comes
                 continue
             if not set(info.cameras) <= set(cameras):
@@ -207,20 +209,20 @@ class LogReader:
                 sources.append(info.source)
         if len(sources) == 1:
             return first
-        return replace(first, source=" + ".join(sources), cameras=cameras, frame_count=None)
+        return msgspec.structs.replace(first, source=" + ".join(sources), cameras=cameras, frame_count=None)
 
     def _read_first_info(self, found: Scan) -> StreamInfo:
         for offset, length in found.attachments:
             attachment = read_attachment(self._file.fileno(), offset, length)
             if attachment is not None and attachment.name == INFO_ATTACHMENT:
                 try:
-                    return decode_info(unpack_parts(attachment.data))
+                    return decode_as(StreamInfo, unpack_parts(attachment.data))
                 except CodecError as error:
                     self._report(LogError(f"{self.path}: stream information at byte {offset}: {error}"))
         infos = (entry for entry in self._index if entry.topic == "info")
         for entry in islice(infos, MAX_INFOS):
             try:
-                return decode_info(self._read(entry))
+                return decode_as(StreamInfo, self._read(entry))
             except (LogError, CodecError) as error:
                 self._report(LogError(f"{self._where(entry)}: {error}"))
         if self.errors:

@@ -16,7 +16,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.replay.log.reader import LogAttachment, LogReader
 from semantic_mapper.replay.log.sequence import Part, part_path, parts_on_disk, read_part
-from semantic_mapper.transport.codec import Parts
+from semantic_mapper.transport.framing import Parts
 from semantic_mapper.transport.messages import StreamInfo
 
 DiskFull = Literal["stop", "delete-oldest"]

@@ -1,87 +1,111 @@
-"""The one codec of wire and log: typed messages <-> multipart ``[topic, msgpack header, raw buffers...]``.
+"""The one codec of wire and log: messages, questions and answers <-> multipart ``[name, msgpack header, buffers...]``.
 
-``encode_*`` and ``decode_*`` raise nothing but ``CodecError``. Every size is bounded and checked before anything is
-allocated by it. Decoded arrays are fresh and writable.
+What encodes and decodes raises nothing but ``CodecError``; only ``decode_answer`` raises what the answer says. Every
+size is bounded and checked before anything is allocated by it. Decoded arrays are fresh and writable.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 import msgspec
 import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
 
-from semantic_mapper.errors import CodecError
-from semantic_mapper.transport import compression, headers
-from semantic_mapper.transport.buffers import (
+from semantic_mapper import errors
+from semantic_mapper.errors import CodecError, SemanticMapperError, TransportError
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.transport.compression import zstd_compress, zstd_decompress
+from semantic_mapper.transport.framing import (
+    MAX_KEYFRAME_PIXELS,
+    MAX_PART_BYTES,
+    MAX_PARTS,
+    Buffer,
+    Parts,
+    check_buffers,
+)
+from semantic_mapper.transport.headers import (
+    MAX_ENTRIES,
+    PROTOCOL_VERSION,
+    CaptureStamp,
+    Count,
+    Finite,
+    IntrinsicsForm,
+    LabelSetForm,
+    Side,
+    Source,
+    Stamp,
+    Wire,
+    WireT,
+    Word,
+    check_header,
+    pack_header,
+    to_plain,
+    unpack_header,
+)
+from semantic_mapper.transport.images import (
     CodecOptions,
+    ConfidenceSpec,
+    DepthSpec,
+    LabelSpec,
+    RgbSpec,
     decode_confidence,
     decode_depth,
+    decode_label,
+    decode_rgb,
     encode_confidence,
     encode_depth,
+    encode_label,
+    encode_rgb,
 )
-from semantic_mapper.transport.headers import pack_header
-from semantic_mapper.transport.images import decode_rgb, encode_rgb
-from semantic_mapper.transport.learning_messages import (
-    decode_in_use,
-    decode_weights,
-    encode_in_use,
-    encode_weights,
-    open_weights,
+from semantic_mapper.transport.messages import (
+    MAX_KEYFRAME_BYTES,
+    MAX_WEIGHTS_BYTES,
+    FrameRefused,
+    LabelledKeyframe,
+    Message,
+    Status,
+    StreamInfo,
+    WeightsUpdate,
+    digest_of,
 )
-from semantic_mapper.transport.messages import FrameRefused, LabelledKeyframe, Message, Status
-from semantic_mapper.transport.opening import (
-    Parts,
-    check_source,
-    message_name,
-    open_buffers,
-    open_header,
-    topic_name,
+from semantic_mapper.transport.query_messages import (
+    MAX_REQUEST_ROWS,
+    QUESTIONS,
+    Answer,
+    ArrayForm,
+    ArraySpec,
+    ErrorAnswer,
+    Request,
+    array_forms,
 )
-from semantic_mapper.transport.plain import intrinsics_header, label_set_header, to_intrinsics, to_label_set
-from semantic_mapper.transport.small_messages import (
-    decode_end,
-    decode_info,
-    decode_refused,
-    decode_status,
-    encode_end,
-    encode_info,
-    encode_refused,
-    encode_status,
-)
-from semantic_mapper.transport.topics import parse_topic, topic_bytes
-from semantic_mapper.types import MapUpdate, PosedFrame
-
-__all__ = [
-    "CodecOptions",
-    "EncodedImage",
-    "Envelope",
-    "Parts",
-    "decode",
-    "decode_end",
-    "decode_frame",
-    "decode_in_use",
-    "decode_info",
-    "decode_keyframe",
-    "decode_map_update",
-    "decode_refused",
-    "decode_status",
-    "decode_weights",
-    "encode_end",
-    "encode_frame",
-    "encode_in_use",
-    "encode_info",
-    "encode_keyframe",
-    "encode_map_update",
-    "encode_refused",
-    "encode_status",
-    "encode_weights",
-    "read_envelope",
-    "repack_rgb",
-]
+from semantic_mapper.transport.topics import TOPICS, Topic, read_topic, topic_bytes
+from semantic_mapper.types import MAX_PIXELS, MAX_POSE_SIGMA_M, CameraIntrinsics, MapUpdate, PosedFrame, UInt8
 
 _DEFAULTS = CodecOptions()
+_ROWS = {row.message: row for row in TOPICS.values()}
+_FORMS: dict[str, Any] = {  # of fields that stand otherwise in a header than in Python
+    "intrinsics": IntrinsicsForm,
+    "cameras": Annotated[dict[Source, IntrinsicsForm], Meta(max_length=64)],
+    "label_set": LabelSetForm | None,
+}
+_UPDATE_SCALARS = (
+    "stamp_ns seq camera_id fused is_keyframe source_seqs blocks blocks_touched rays samples stage_ms".split()
+)
+_WeightsBytes = Annotated[int, Meta(ge=1, le=MAX_WEIGHTS_BYTES)]
+_ERROR = "error"  # in the place of an answer's kind
+_RAISED = {
+    e.__name__: e for e in (errors.MapError, errors.LabelError, errors.CodecError, errors.ShapeError, errors.PoseError)
+}
+_ZSTD_LEVEL = 1
+_NOT_SENT_AS_0 = ("unreadable",)  # came later: what does not need it is read by older releases, too
+
+MessageT = TypeVar("MessageT")
+AnswerT = TypeVar("AnswerT", bound=Answer)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +140,114 @@ class Envelope:
     depth_scale: float = 0.0
 
 
+class FrameHeader(Wire, frozen=True):
+    """``PosedFrame`` without its images; buffers: rgb, depth, label, those that there are."""
+
+    stamp_ns: CaptureStamp
+    seq: Count
+    camera_id: Source
+    intrinsics: CameraIntrinsics
+    T_world_camera: Annotated[tuple[Finite, ...], Meta(min_length=16, max_length=16)]  # row by row, float64, exact
+    pose_source: Word
+    pose_sigma: Annotated[float, Meta(ge=0, le=MAX_POSE_SIGMA_M)]
+    rgb: RgbSpec
+    depth: DepthSpec | None = None
+    label: LabelSpec | None = None
+
+    @property
+    def name(self) -> str:
+        """How errors call the frame."""
+        return f"frame of camera '{self.camera_id}' seq={self.seq}"
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of its images."""
+        return self.intrinsics.height, self.intrinsics.width
+
+
+class MapUpdateHeader(Wire, frozen=True, kw_only=True):
+    """``MapUpdate`` without its images; buffers: label, confidence, depth."""
+
+    stamp_ns: Stamp
+    seq: Count
+    camera_id: Source
+    width: Side
+    height: Side
+    fused: bool
+    is_keyframe: bool
+    source_seqs: Annotated[tuple[Count, ...], Meta(max_length=MAX_ENTRIES)]
+    blocks: Count
+    blocks_touched: Count
+    rays: Count = 0
+    samples: Count = 0
+    stage_ms: Annotated[dict[Word, Finite], Meta(max_length=64)]
+    label: LabelSpec
+    confidence: ConfidenceSpec
+    depth: DepthSpec
+
+    def __post_init__(self) -> None:
+        if self.width * self.height > MAX_PIXELS:
+            raise CodecError(f"image of {self.width}x{self.height}; at most {MAX_PIXELS} pixels are accepted")
+
+    @property
+    def name(self) -> str:
+        """How errors call the update."""
+        return f"map of camera '{self.camera_id}' seq={self.seq}"
+
+
+class KeyframeHeader(Wire, frozen=True):
+    """``LabelledKeyframe`` without its frame; then come header and buffers of that."""
+
+    camera_id: Source
+    teacher: Word
+    label_set: LabelSet
+
+
+_HEADERS: dict[str, type[Wire]] = {"frame": FrameHeader, "map": MapUpdateHeader, "keyframe": KeyframeHeader}
+
+
+def header_type(topic: str) -> type[msgspec.Struct]:
+    """What a header of a topic looks like on the wire, to be described to other programs."""
+    kind = _HEADERS.get(topic) or cast("type[Wire]", TOPICS[topic].message)
+    described: list[Any] = [("v", int, PROTOCOL_VERSION)]
+    for item in msgspec.structs.fields(kind):
+        described.append((item.encode_name, _FORMS.get(item.name, item.type)))
+    return msgspec.defstruct(kind.__name__.removesuffix("Header"), described, kw_only=True, forbid_unknown_fields=True)
+
+
+def encode(message: Message, options: CodecOptions = _DEFAULTS, *, sender: str = "source") -> list[bytes]:
+    """Any message -> parts.
+
+    Args:
+        message: Overlong texts of it were cut when it was made.
+        options: How to pack images.
+        sender: Second word of the topic of a ``StreamInfo``; the other messages name theirs.
+
+    Raises:
+        CodecError: a value that cannot be sent: out of bounds, NaN, or of the wrong type.
+    """
+    match message:
+        case PosedFrame():
+            return encode_frame(message, options)
+        case MapUpdate():
+            return _encode_map_update(message, options)
+        case LabelledKeyframe():
+            return _encode_keyframe(message, options)
+        case WeightsUpdate():
+            return _encode_weights(message)
+        case _:
+            row = _ROWS[type(message)]
+            source = getattr(message, row.source) if row.source else sender
+            what = f"{row.name} of '{source}'"
+            header = to_plain(message, what)
+            if isinstance(message, StreamInfo) and message.label_set is not None:
+                header["label_set"] = to_plain(LabelSetForm.of(message.label_set), what)
+            for name in _NOT_SENT_AS_0:
+                if header.get(name) == 0:
+                    del header[name]
+            return [topic_bytes(row.name, source), _pack(header, row.message, what)]
+
+
 def encode_frame(
     frame: PosedFrame, options: CodecOptions = _DEFAULTS, *, encoded_rgb: EncodedImage | None = None
 ) -> list[bytes]:
@@ -127,68 +259,34 @@ def encode_frame(
         encoded_rgb: Sent instead of packing ``frame.rgb`` anew, so that an imported JPEG stays what it was.
 
     Raises:
-        CodecError: NaN in pose or intrinsics, or a camera id that a topic cannot hold.
+        CodecError: NaN in the pose, or a camera id that a topic cannot hold.
     """
-    what = message_name("frame", frame.camera_id, frame.seq)
-    intrinsics = intrinsics_header(frame.intrinsics)
-    headers.check_image_size(intrinsics.width, intrinsics.height, what)
     if encoded_rgb is None:
-        encoded_rgb_bytes = encode_rgb(frame.rgb, options.rgb, options.jpeg_quality)
+        encoded_rgb_bytes, encoding = encode_rgb(frame.rgb, options.rgb, options.jpeg_quality), options.rgb
     else:
-        encoded_rgb_bytes = encoded_rgb.data
+        encoded_rgb_bytes, encoding = encoded_rgb.data, encoded_rgb.encoding
     buffers = [encoded_rgb_bytes]
     depth = label = None
     if frame.depth_m is not None:
         depth, data = encode_depth(frame.depth_m, options)
         buffers.append(data)
     if frame.label is not None:
-        buffers.append(compression.pack_uint8(frame.label, options.zstd_level))
-        label = headers.LabelSpec(encoding="u8_zstd", bytes=len(buffers[-1]))
-    header = headers.FrameHeader(
-        stamp_ns=int(frame.stamp_ns),
-        seq=int(frame.seq),
+        label, data = encode_label(frame.label, options)
+        buffers.append(data)
+    header = FrameHeader(
+        stamp_ns=frame.stamp_ns,
+        seq=frame.seq,
         camera_id=frame.camera_id,
-        intrinsics=intrinsics,
+        intrinsics=frame.intrinsics,
         T_world_camera=tuple(frame.T_world_camera.ravel().tolist()),
         pose_source=frame.pose_source,
         pose_sigma=float(frame.pose_sigma),
-        rgb=headers.RgbSpec(
-            encoding=options.rgb if encoded_rgb is None else encoded_rgb.encoding, bytes=len(encoded_rgb_bytes)
-        ),
+        rgb=RgbSpec(encoding, len(encoded_rgb_bytes)),
         depth=depth,
         label=label,
     )
-    return [topic_bytes("frame", frame.camera_id), pack_header(header, what), *buffers]
-
-
-def decode_frame(parts: Parts) -> PosedFrame:
-    """Parts -> posed frame.
-
-    Raises:
-        CodecError: anything that ``encode_frame`` would not have made.
-    """
-    header, buffers = _open_frame(parts)
-    what = message_name("frame", header.camera_id, header.seq)
-    intrinsics = to_intrinsics(header.intrinsics, what)
-    size = (intrinsics.height, intrinsics.width)
-    try:
-        rgb = decode_rgb(buffers[0], header.rgb.encoding, *size)
-    except CodecError as error:
-        raise CodecError(f"{what}: rgb: {error}") from error
-    depth = None if header.depth is None else decode_depth(header.depth, buffers[1], size, what)
-    label = None if header.label is None else compression.unpack_uint8(buffers[-1], *size, f"{what}: label")
-    return PosedFrame(
-        stamp_ns=header.stamp_ns,
-        seq=header.seq,
-        camera_id=header.camera_id,
-        rgb=rgb,
-        depth_m=depth,
-        label=label,
-        intrinsics=intrinsics,
-        T_world_camera=np.array(header.T_world_camera, np.float64).reshape(4, 4),
-        pose_source=header.pose_source,
-        pose_sigma=header.pose_sigma,
-    )
+    what = header.name
+    return [topic_bytes("frame", frame.camera_id), _pack(to_plain(header, what), FrameHeader, what), *buffers]
 
 
 def repack_rgb(parts: Parts, options: CodecOptions) -> list[bytes]:
@@ -200,119 +298,48 @@ def repack_rgb(parts: Parts, options: CodecOptions) -> list[bytes]:
     header, buffers = _open_frame(parts)
     if header.rgb.encoding == options.rgb:
         return [bytes(part) for part in parts]
-    what = message_name("frame", header.camera_id, header.seq)
-    try:
-        rgb = decode_rgb(buffers[0], header.rgb.encoding, header.intrinsics.height, header.intrinsics.width)
-    except CodecError as error:
-        raise CodecError(f"{what}: rgb: {error}") from error
-    data = encode_rgb(rgb, options.rgb, options.jpeg_quality)
-    header = msgspec.structs.replace(header, rgb=headers.RgbSpec(encoding=options.rgb, bytes=len(data)))
-    return [bytes(parts[0]), pack_header(header, what), data, *(bytes(buffer) for buffer in buffers[1:])]
-
-
-def encode_keyframe(keyframe: LabelledKeyframe, options: CodecOptions = _DEFAULTS) -> list[bytes]:
-    """Labelled keyframe -> parts; its frame as ``encode_frame`` packs it.
-
-    Raises:
-        CodecError: a frame without labels, or one that cannot be sent.
-    """
-    frame = keyframe.frame
-    what = message_name("keyframe", frame.camera_id, frame.seq)
-    if frame.label is None:
-        raise CodecError(f"{what}: has no label image, so that there is nothing to learn from it")
-    header = headers.KeyframeHeader(
-        camera_id=frame.camera_id, teacher=keyframe.teacher[:128], label_set=label_set_header(keyframe.label_set)
-    )
-    k = frame.intrinsics
-    headers.check_keyframe_size(k.width, k.height, (), what)
-    topic = topic_bytes("keyframe", frame.camera_id)
-    parts = [topic, pack_header(header, what), *encode_frame(frame, options)[1:]]
-    headers.check_keyframe_size(k.width, k.height, [len(p) for p in parts], what)
-    return parts
-
-
-def decode_keyframe(parts: Parts) -> LabelledKeyframe:
-    """Parts -> labelled keyframe.
-
-    Raises:
-        CodecError: anything that ``encode_keyframe`` would not have made.
-    """
-    header, inner = _open_keyframe(parts)
-    return LabelledKeyframe(decode_frame(inner), to_label_set(header.label_set), header.teacher)
-
-
-def encode_map_update(update: MapUpdate, options: CodecOptions = _DEFAULTS) -> list[bytes]:
-    """Map update -> parts; exact but for the confidence, see ``CodecOptions``.
-
-    Raises:
-        CodecError: a value that cannot be sent, or images of different sizes.
-    """
-    what = message_name("map", update.camera_id, update.seq)
-    height, width = update.label.shape
-    if update.confidence.shape != (height, width) or update.depth_m.shape != (height, width):
-        raise CodecError(
-            f"{what}: label {update.label.shape}, confidence {update.confidence.shape} and depth_m "
-            f"{update.depth_m.shape} must have one size"
-        )
-    headers.check_image_size(width, height, what)
-    label = compression.pack_uint8(update.label, options.zstd_level)
-    confidence_spec, confidence = encode_confidence(update.confidence, options)
-    depth_spec, depth = encode_depth(np.ascontiguousarray(update.depth_m, np.float32), options)
-    header = headers.MapUpdateHeader(
-        stamp_ns=int(update.stamp_ns),
-        seq=int(update.seq),
-        camera_id=update.camera_id,
-        width=width,
-        height=height,
-        fused=bool(update.fused),
-        is_keyframe=bool(update.is_keyframe),
-        source_seqs=tuple(int(s) for s in update.source_seqs),
-        blocks=int(update.blocks),
-        blocks_touched=int(update.blocks_touched),
-        rays=int(update.rays),
-        samples=int(update.samples),
-        stage_ms={name: float(ms) for name, ms in update.stage_ms.items()},
-        label=headers.LabelSpec(encoding="u8_zstd", bytes=len(label)),
-        confidence=confidence_spec,
-        depth=depth_spec,
-    )
-    return [topic_bytes("map", update.camera_id), pack_header(header, what), label, confidence, depth]
-
-
-def decode_map_update(parts: Parts) -> MapUpdate:
-    """Parts -> map update.
-
-    Raises:
-        CodecError: anything that ``encode_map_update`` would not have made.
-    """
-    header, (label, confidence, depth) = _open_map_update(parts)
-    what = message_name("map", header.camera_id, header.seq)
-    size = (header.height, header.width)
-    return MapUpdate(
-        stamp_ns=header.stamp_ns,
-        seq=header.seq,
-        camera_id=header.camera_id,
-        fused=header.fused,
-        is_keyframe=header.is_keyframe,
-        source_seqs=header.source_seqs,
-        label=compression.unpack_uint8(label, *size, f"{what}: label"),
-        confidence=decode_confidence(header.confidence, confidence, size, what),
-        depth_m=decode_depth(header.depth, depth, size, what),
-        blocks=header.blocks,
-        blocks_touched=header.blocks_touched,
-        rays=header.rays,
-        samples=header.samples,
-        stage_ms=dict(header.stage_ms),
-    )
+    data = encode_rgb(_decode_rgb(header, buffers[0]), options.rgb, options.jpeg_quality)
+    header = msgspec.structs.replace(header, rgb=RgbSpec(options.rgb, len(data)))
+    packed = pack_header(to_plain(header, header.name), header.name)
+    return [bytes(parts[0]), packed, data, *(bytes(buffer) for buffer in buffers[1:])]
 
 
 def decode(parts: Parts) -> Message:
-    """Any message of ours, by its topic.
+    """Any message, by its topic.
 
     Raises:
-        CodecError: not one of ours, or damaged.
+        CodecError: anything that ``encode`` would not have made.
     """
-    return _DECODERS[topic_name(parts)](parts)
+    row, _ = read_topic(parts)
+    match row.name:
+        case "frame":
+            return _decode_frame(*_open_frame(parts))
+        case "map":
+            return _decode_map_update(*_open_map_update(parts))
+        case "keyframe":
+            header, frame = _open_keyframe(parts)
+            return LabelledKeyframe(_decode_frame(*frame), header.label_set, header.teacher)
+        case "weights":
+            update = _open_weights(parts)
+            if digest_of(update.data) != update.digest:
+                raise CodecError(f"{_weights_name(update)}: the file is not the one that its digest names")
+            return update
+        case _:
+            return _open_plain(parts, row)
+
+
+def decode_as(kind: type[MessageT], parts: Parts) -> MessageT:
+    """A message that must be of this type.
+
+    Raises:
+        CodecError: another one, or anything that ``encode`` would not have made.
+    """
+    row, _ = read_topic(parts)
+    if row.message is not kind:
+        raise CodecError(f"expected a {kind.__name__}, got a message of topic '{row.name}'")
+    message = decode(parts)
+    assert isinstance(message, kind)
+    return message
 
 
 def read_envelope(parts: Parts) -> Envelope:
@@ -321,78 +348,351 @@ def read_envelope(parts: Parts) -> Envelope:
     Raises:
         CodecError: not one of ours, or damaged.
     """
-    name = topic_name(parts)
-    if name == "frame":
-        h, _ = _open_frame(parts)
-        return Envelope(
-            topic=name,
-            source=h.camera_id,
-            stamp_ns=h.stamp_ns,
-            seq=h.seq,
-            T_world_camera=h.T_world_camera,
-            has_depth=h.depth is not None,
-            has_label=h.label is not None,
-            rgb_encoding=h.rgb.encoding,
-            depth_scale=h.depth.scale if h.depth is not None and h.depth.encoding == "u16_delta_planes_zstd" else 0.0,
-        )
-    if name == "keyframe":
-        _, inner = _open_keyframe(parts)
-        h, _ = _open_frame(inner)
-        return Envelope(name, h.camera_id, h.stamp_ns, h.seq, h.T_world_camera, h.depth is not None, has_label=True)
-    if name == "weights":
-        h, _ = open_weights(parts)
-        return Envelope(name, h.node)
-    if name == "map":
-        h, _ = _open_map_update(parts)
-        return Envelope(name, h.camera_id, h.stamp_ns, h.seq)
-    message = decode(parts)
-    _, source = parse_topic(bytes(parts[0]))
+    row, source = read_topic(parts)
+    match row.name:
+        case "frame":
+            header, _ = _open_frame(parts)
+            return _frame_envelope(row.name, header)
+        case "keyframe":
+            _, (header, _) = _open_keyframe(parts)
+            return _frame_envelope(row.name, header)
+        case "map":
+            update, _ = _open_map_update(parts)
+            return Envelope(row.name, source, update.stamp_ns, update.seq)
+        case "weights":
+            _open_weights(parts)
+            return Envelope(row.name, source)
+    message = _open_plain(parts, row)
     if isinstance(message, FrameRefused):
-        return Envelope(name, source, message.stamp_ns, message.seq)
-    return Envelope(name, source, message.stamp_ns if isinstance(message, Status) else 0)
+        return Envelope(row.name, source, message.stamp_ns, message.seq)
+    return Envelope(row.name, source, message.stamp_ns if isinstance(message, Status) else 0)
 
 
-_DECODERS = {
-    "frame": decode_frame,
-    "map": decode_map_update,
-    "refused": decode_refused,
-    "status": decode_status,
-    "info": decode_info,
-    "end": decode_end,
-    "keyframe": decode_keyframe,
-    "weights": decode_weights,
-    "in_use": decode_in_use,
-}
+def encode_request(kind: str, request: Request) -> list[bytes]:
+    """Question -> parts.
+
+    Args:
+        kind: A key of ``QUESTIONS``.
+        request: Of its type; arrays are converted to the dtypes of their forms.
+
+    Raises:
+        CodecError: too many rows, or a value that cannot be sent.
+    """
+    parts, specs = _encode_query(kind, request, kind)
+    _check_rows(specs, kind)
+    return parts
 
 
-def _open_frame(parts: Parts) -> tuple[headers.FrameHeader, Parts]:
-    header = open_header(parts, "frame", headers.FrameHeader)
-    check_source(parts, header.camera_id)
-    what = message_name("frame", header.camera_id, header.seq)
-    headers.check_image_size(header.intrinsics.width, header.intrinsics.height, what)
-    to_intrinsics(header.intrinsics, what)
-    specs = [s for s in (header.rgb, header.depth, header.label) if s is not None]
-    return header, open_buffers(parts, [s.bytes for s in specs], what)
+def decode_request(parts: Parts) -> tuple[str, Request]:
+    """Parts -> kind and question.
+
+    Raises:
+        CodecError: anything that ``encode_request`` would not have made.
+    """
+    kind = _query_kind(parts)
+    question = QUESTIONS.get(kind)
+    if question is None:
+        raise CodecError(f"question {kind!r} is none of ours; there are {', '.join(QUESTIONS)}")
+    fields, specs = _open_query(parts, question.request, kind)
+    _check_rows(specs, kind)
+    return kind, _decode_query(fields, specs, parts, question.request, kind)
 
 
-def _open_keyframe(parts: Parts) -> tuple[headers.KeyframeHeader, Parts]:
-    """Its header, and its frame as the parts of a message of its own."""
-    header = open_header(parts, "keyframe", headers.KeyframeHeader)
-    check_source(parts, header.camera_id)
+def encode_answer(kind: str, answer: Answer) -> list[bytes]:
+    """Answer -> parts; see ``encode_request``.
+
+    Raises:
+        CodecError: larger than a message may be, or a value that cannot be sent.
+    """
+    parts, _ = _encode_query(kind, answer, f"answer to '{kind}'")
+    return parts
+
+
+def encode_error(error: SemanticMapperError) -> list[bytes]:
+    """An error in the place of an answer; an overlong text is cut."""
+    text = str(error).encode("utf-8", errors="replace").decode()[:4000]
+    return [_ERROR.encode(), _pack({"error": type(error).__name__, "text": text}, ErrorAnswer, "error")]
+
+
+def decode_answer(kind: str, answer: type[AnswerT], parts: Parts) -> AnswerT:
+    """Parts -> the answer to a question.
+
+    Args:
+        kind: Of the question.
+        answer: The answer type of the question.
+        parts: What came.
+
+    Raises:
+        MapError, LabelError, CodecError, ShapeError, PoseError: the other side answered with this error.
+        TransportError: it answered with another one.
+        CodecError: anything that ``encode_answer`` would not have made, or an answer to another question.
+    """
+    what = f"answer to '{kind}'"
+    actual = _query_kind(parts)
+    if actual == _ERROR:
+        said = check_header(unpack_header(parts[1], what), ErrorAnswer, what)
+        raise _RAISED.get(said.error, TransportError)(said.text)
+    if actual != kind:
+        raise CodecError(f"{what}: got one to {actual!r}")
+    fields, specs = _open_query(parts, answer, what)
+    lengths = {s.shape[: f.free] for f, s in zip(array_forms(answer).values(), specs, strict=True)}
+    if QUESTIONS[kind].aligned and len(lengths) > 1:
+        raise CodecError(f"{what}: arrays of different lengths {sorted(lengths)}")
+    return _decode_query(fields, specs, parts, answer, what)
+
+
+def _pack(header: Mapping[str, Any], kind: type[object], what: str) -> bytes:
+    """A header, checked as its reader will check it."""
+    _read(header, kind, what)
+    return pack_header(header, what)
+
+
+def _read(header: Mapping[str, Any], kind: type[WireT], what: str) -> WireT:
+    """Plain fields -> struct; intrinsics and label sets among them become what they are in Python."""
+    try:
+        restored = {
+            name: msgspec.convert(value, _FORMS[name]) if name in _FORMS else value for name, value in header.items()
+        }
+        if (lens := restored.get("intrinsics")) is not None:
+            restored["intrinsics"] = lens.to_intrinsics()
+        if (cameras := restored.get("cameras")) is not None:
+            restored["cameras"] = {name: lens.to_intrinsics(f"camera '{name}': ") for name, lens in cameras.items()}
+        if (labels := restored.get("label_set")) is not None:
+            restored["label_set"] = labels.to_label_set()
+    except ValueError as error:  # msgspec's, and those of the core types
+        raise CodecError(f"{what}: bad header: {error}") from error
+    return check_header(restored, kind, what)
+
+
+def _open(parts: Parts, name: str, kind: type[WireT]) -> WireT:
+    """Header of a message that must be of topic ``name``; its buffers are left alone."""
+    row, source = read_topic(parts)
+    if row.name != name:
+        raise CodecError(f"expected a message of topic '{name}', got '{row.name}'")
+    what = f"{name} message"
+    header = _read(unpack_header(parts[1], what), kind, what)
+    _check_source(row, source, header)
+    return header
+
+
+def _check_source(row: Topic, source: str, header: object) -> None:
+    if row.source and getattr(header, row.source) != source:
+        raise CodecError(f"topic '{row.name}/{source}/' carries a message of '{getattr(header, row.source)}'")
+
+
+def _open_plain(parts: Parts, row: Topic) -> Any:
+    """A message without buffers."""
+    message = _open(parts, row.name, row.message)
+    check_buffers(parts, (), f"{row.name} message")
+    return message
+
+
+def _open_frame(parts: Parts) -> tuple[FrameHeader, Parts]:
+    header = _open(parts, "frame", FrameHeader)
+    specs = (header.rgb, header.depth, header.label)
+    return header, check_buffers(parts, [s.bytes for s in specs if s is not None], header.name)
+
+
+def _frame_envelope(topic: str, header: FrameHeader) -> Envelope:
+    return Envelope(
+        topic=topic,
+        source=header.camera_id,
+        stamp_ns=header.stamp_ns,
+        seq=header.seq,
+        T_world_camera=header.T_world_camera,
+        has_depth=header.depth is not None,
+        has_label=header.label is not None,
+        rgb_encoding=header.rgb.encoding,
+        depth_scale=header.depth.scale if header.depth and header.depth.encoding == "u16_delta_planes_zstd" else 0.0,
+    )
+
+
+def _decode_rgb(header: FrameHeader, buffer: Buffer) -> UInt8:
+    try:
+        return decode_rgb(buffer, header.rgb.encoding, *header.size)
+    except CodecError as error:
+        raise CodecError(f"{header.name}: rgb: {error}") from error
+
+
+def _decode_frame(header: FrameHeader, buffers: Parts) -> PosedFrame:
+    size, what = header.size, header.name
+    return PosedFrame(
+        stamp_ns=header.stamp_ns,
+        seq=header.seq,
+        camera_id=header.camera_id,
+        rgb=_decode_rgb(header, buffers[0]),
+        depth_m=None if header.depth is None else decode_depth(header.depth, buffers[1], size, what),
+        label=None if header.label is None else decode_label(buffers[-1], size, what),
+        intrinsics=header.intrinsics,
+        T_world_camera=np.array(header.T_world_camera, np.float64).reshape(4, 4),
+        pose_source=header.pose_source,
+        pose_sigma=header.pose_sigma,
+    )
+
+
+def _encode_map_update(update: MapUpdate, options: CodecOptions) -> list[bytes]:
+    height, width = update.label.shape
+    what = f"map of camera '{update.camera_id}' seq={update.seq}"
+    if update.confidence.shape != (height, width) or update.depth_m.shape != (height, width):
+        raise CodecError(
+            f"{what}: label {update.label.shape}, confidence {update.confidence.shape} and depth_m "
+            f"{update.depth_m.shape} must have one size"
+        )
+    label_spec, label = encode_label(update.label, options)
+    confidence_spec, confidence = encode_confidence(update.confidence, options)
+    depth_spec, depth = encode_depth(np.ascontiguousarray(update.depth_m, np.float32), options)
+    fields = {name: getattr(update, name) for name in MapUpdateHeader.__struct_fields__ if name in _UPDATE_SCALARS}
+    specs = {"label": label_spec, "confidence": confidence_spec, "depth": depth_spec}
+    header = MapUpdateHeader(width=width, height=height, **fields, **specs)
+    packed = _pack(to_plain(header, what), MapUpdateHeader, what)
+    return [topic_bytes("map", update.camera_id), packed, label, confidence, depth]
+
+
+def _open_map_update(parts: Parts) -> tuple[MapUpdateHeader, Parts]:
+    header = _open(parts, "map", MapUpdateHeader)
+    specs = (header.label, header.confidence, header.depth)
+    return header, check_buffers(parts, [s.bytes for s in specs], header.name)
+
+
+def _decode_map_update(header: MapUpdateHeader, buffers: Parts) -> MapUpdate:
+    size, what = (header.height, header.width), header.name
+    label, confidence, depth = buffers
+    return MapUpdate(
+        label=decode_label(label, size, what),
+        confidence=decode_confidence(header.confidence, confidence, size, what),
+        depth_m=decode_depth(header.depth, depth, size, what),
+        **{name: getattr(header, name) for name in _UPDATE_SCALARS},
+    )
+
+
+def _encode_keyframe(keyframe: LabelledKeyframe, options: CodecOptions) -> list[bytes]:
+    frame = keyframe.frame
+    what = f"keyframe of camera '{frame.camera_id}' seq={frame.seq}"
+    if frame.label is None:
+        raise CodecError(f"{what}: has no label image, so that there is nothing to learn from it")
+    _check_keyframe_size(frame.intrinsics, (), what)
+    labels = to_plain(LabelSetForm.of(keyframe.label_set), what)
+    header = {"camera_id": frame.camera_id, "teacher": keyframe.teacher, "label_set": labels}
+    parts = [
+        topic_bytes("keyframe", frame.camera_id),
+        _pack(header, KeyframeHeader, what),
+        *encode_frame(frame, options)[1:],
+    ]
+    _check_keyframe_size(frame.intrinsics, parts, what)
+    return parts
+
+
+def _open_keyframe(parts: Parts) -> tuple[KeyframeHeader, tuple[FrameHeader, Parts]]:
+    """Its header, and that of its frame with buffers."""
+    header = _open(parts, "keyframe", KeyframeHeader)
     inner = [topic_bytes("frame", header.camera_id), *parts[2:]]
     if len(inner) < 2:
         raise CodecError(f"keyframe of camera '{header.camera_id}': has no frame")
-    frame, _ = _open_frame(inner)
-    what = message_name("keyframe", frame.camera_id, frame.seq)
+    frame, buffers = _open_frame(inner)
+    what = f"keyframe of camera '{frame.camera_id}' seq={frame.seq}"
     if frame.label is None:
         raise CodecError(f"{what}: has no label image")
-    headers.check_keyframe_size(frame.intrinsics.width, frame.intrinsics.height, [len(p) for p in parts], what)
-    return header, inner
+    _check_keyframe_size(frame.intrinsics, parts, what)
+    return header, (frame, buffers)
 
 
-def _open_map_update(parts: Parts) -> tuple[headers.MapUpdateHeader, Parts]:
-    header = open_header(parts, "map", headers.MapUpdateHeader)
-    check_source(parts, header.camera_id)
-    what = message_name("map", header.camera_id, header.seq)
-    headers.check_image_size(header.width, header.height, what)
-    return header, open_buffers(parts, [header.label.bytes, header.confidence.bytes, header.depth.bytes], what)
+def _check_keyframe_size(lens: CameraIntrinsics, parts: Parts, what: str) -> None:
+    """Refuse a keyframe that is too large as a whole, packed or unpacked: learners keep dozens of them."""
+    width, height, size = lens.width, lens.height, sum(map(len, parts))
+    if width * height > MAX_KEYFRAME_PIXELS:
+        raise CodecError(f"{what}: image of {width}x{height}; a keyframe has at most {MAX_KEYFRAME_PIXELS} pixels")
+    if size > MAX_KEYFRAME_BYTES:
+        raise CodecError(f"{what}: {size} bytes in all; a keyframe has at most {MAX_KEYFRAME_BYTES}")
+
+
+def _weights_name(update: WeightsUpdate) -> str:
+    return f"weights {update.version} of '{update.node}'"
+
+
+def _encode_weights(update: WeightsUpdate) -> list[bytes]:
+    what = _weights_name(update)
+    if len(update.data) > MAX_WEIGHTS_BYTES:
+        raise CodecError(f"{what}: a file of {len(update.data)} bytes; at most {MAX_WEIGHTS_BYTES} can be sent")
+    header = to_plain(update, what)
+    _read(header, WeightsUpdate, what)
+    packed = pack_header({**header, "bytes": len(update.data)}, what)
+    return [topic_bytes("weights", update.node), packed, update.data]
+
+
+def _open_weights(parts: Parts) -> WeightsUpdate:
+    """In the header stands the size of the file; whether the file is that of the digest is not checked."""
+    row, source = read_topic(parts)
+    fields = unpack_header(parts[1], "weights message")
+    size = check_header(fields.get("bytes"), cast("type[int]", _WeightsBytes), "weights message: bytes")
+    (data,) = check_buffers(parts, [size], "weights message")
+    update = _read({**fields, "bytes": bytes(data)}, WeightsUpdate, "weights message")
+    _check_source(row, source, update)
+    return update
+
+
+def _encode_query(kind: str, message: Request | Answer, what: str) -> tuple[list[bytes], tuple[ArraySpec, ...]]:
+    forms = array_forms(type(message))
+    arrays: dict[str, NDArray[np.generic]] = {}
+    specs: list[ArraySpec] = []
+    buffers: list[bytes] = []
+    for name, form in forms.items():
+        array = arrays[name] = np.ascontiguousarray(getattr(message, name), form.dtype)
+        if array.nbytes > MAX_PART_BYTES:  # before it is copied; the rest is checked when all are there
+            raise CodecError(f"{what}: {name} of {array.nbytes} bytes, at most {MAX_PART_BYTES} can be sent")
+        data = array.tobytes()
+        buffers.append(zstd_compress(data, _ZSTD_LEVEL) if form.is_compressed else data)
+        specs.append(ArraySpec(array.shape, len(buffers[-1])))
+    _check_specs(forms, specs, what)
+    scalars = {name: getattr(message, name) for name in message.__struct_fields__ if name not in forms}
+    header = to_plain({**scalars, "arrays": specs}, what)
+    check_header({**header, **arrays}, type(message), what)
+    return [kind.encode(), pack_header(header, what), *buffers], tuple(specs)
+
+
+def _query_kind(parts: Parts) -> str:
+    if not 2 <= len(parts) <= MAX_PARTS:
+        raise CodecError(f"a question or answer has 2 to {MAX_PARTS} parts, got {len(parts)}")
+    return bytes(parts[0][:32]).decode("ascii", errors="replace")
+
+
+def _open_query(parts: Parts, kind: type[object], what: str) -> tuple[dict[str, Any], tuple[ArraySpec, ...]]:
+    """Fields of a header, and the forms of the arrays, which are checked."""
+    fields, forms = unpack_header(parts[1], what), array_forms(kind)
+    specs = check_header(fields.get("arrays", ()), tuple[ArraySpec, ...], f"{what}: arrays")
+    _check_specs(forms, specs, what)
+    if not forms.keys().isdisjoint(fields):
+        raise CodecError(f"{what}: bad header: arrays travel in buffers")
+    return fields, specs
+
+
+def _decode_query(
+    fields: Mapping[str, Any], specs: tuple[ArraySpec, ...], parts: Parts, kind: type[WireT], what: str
+) -> WireT:
+    """Fresh and writable arrays, whose sizes were checked by ``_check_specs``, in a question or answer."""
+    forms = array_forms(kind)
+    buffers = check_buffers(parts, [spec.bytes for spec in specs], what)
+    arrays: dict[str, NDArray[np.generic]] = {}
+    for (name, form), spec, buffer in zip(forms.items(), specs, buffers, strict=True):
+        data = zstd_decompress(buffer, math.prod(spec.shape), f"{what}: {name}") if form.is_compressed else buffer
+        array = np.frombuffer(data, form.dtype).reshape(spec.shape)
+        arrays[name] = array.astype(np.dtype(form.dtype).newbyteorder("="))
+    return check_header({**fields, **arrays}, kind, what)
+
+
+def _check_rows(specs: tuple[ArraySpec, ...], what: str) -> None:
+    for spec in specs:
+        if spec.shape[0] > MAX_REQUEST_ROWS:
+            raise CodecError(f"{what}: {spec.shape[0]} rows; ask for at most {MAX_REQUEST_ROWS} at once")
+
+
+def _check_specs(forms: Mapping[str, ArrayForm], specs: Sequence[ArraySpec], what: str) -> None:
+    if len(specs) != len(forms):
+        raise CodecError(f"{what}: has the arrays {list(forms)}, got {len(specs)}")
+    for (name, form), spec in zip(forms.items(), specs, strict=True):
+        if len(spec.shape) != form.free + len(form.tail) or spec.shape[form.free :] != form.tail:
+            raise CodecError(f"{what}: {name} of shape {spec.shape}, expected {('N',) * form.free + form.tail}")
+        size = math.prod(spec.shape) * np.dtype(form.dtype).itemsize
+        if size > MAX_PART_BYTES:
+            raise CodecError(f"{what}: {name} of {size} bytes, at most {MAX_PART_BYTES} are accepted; ask for less")
+        if not form.is_compressed and spec.bytes != size:
+            raise CodecError(f"{what}: {name} of shape {spec.shape} has {size} bytes, the header means {spec.bytes}")

@@ -1,8 +1,12 @@
-"""Lossless packing of depth and label images: delta, byte planes, zstd. Sizes are checked before decoding."""
+"""Lossless packing of depth and label images: delta, byte planes, zstd. Sizes are checked before decoding.
+
+The wire, logs and what a mapper keeps of its frames all pack depth by this module.
+"""
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 
 import numpy as np
 import zstandard
@@ -59,8 +63,32 @@ def depth_to_uint16(depth_m: Float32, scale: float) -> NDArray[np.uint16] | None
         if not bool(np.all((raw >= 0) & (raw <= 65535))):  # NaN compares False
             return None
     units = raw.astype(np.uint16)
-    same = np.array_equal(depth_from_uint16(units, scale).view(np.uint32), depth_m.view(np.uint32))
+    metres = depth_from_uint16(units, scale)
+    same = np.array_equal(metres.view(np.uint32), np.ascontiguousarray(depth_m).view(np.uint32))
     return units if same else None
+
+
+def pack_depth(depth_m: Float32, scales: Sequence[float], level: int) -> tuple[float, bytes]:
+    """(H, W) float32 metres -> the first scale whose units give exactly these metres, and the packed units.
+
+    Where no scale does, the scale is 0 and the floats are packed. Either way it is bit exact, NaN included.
+    """
+    for scale in scales:
+        units = depth_to_uint16(depth_m, scale)
+        if units is not None:
+            return scale, pack_uint16(units, level)
+    return 0.0, pack_float32(depth_m, level)
+
+
+def unpack_depth(data: Buffer, scale: float, height: int, width: int, what: str) -> Float32:
+    """Inverse of ``pack_depth``.
+
+    Raises:
+        CodecError: damaged, or not of that size.
+    """
+    if scale == 0:
+        return unpack_float32(data, height, width, what)
+    return depth_from_uint16(unpack_uint16(data, height, width, what), scale)
 
 
 def pack_uint16(image: NDArray[np.uint16], level: int) -> bytes:

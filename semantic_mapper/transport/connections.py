@@ -14,7 +14,7 @@ import uuid
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from semantic_mapper.log_events import get_logger
+from semantic_mapper.log_events import get_logger, is_power_of_two
 
 GIVEN_UP_S = 0.3  # ZeroMQ says at once whether it tries again
 _TRIES_AGAIN = (zmq.EVENT_CONNECT_RETRIED, zmq.EVENT_CONNECT_DELAYED, zmq.EVENT_CONNECTED)
@@ -60,7 +60,7 @@ class Connections:
                 if error.errno != errno.ENOENT:  # it knows nothing of that connection any more
                     raise
             self._socket.connect(endpoint)
-            if self.renewed & (self.renewed - 1) == 0:
+            if is_power_of_two(self.renewed):
                 _log.warning("connection_renewed", endpoint=endpoint, renewed=self.renewed)
 
     def close(self) -> None:

@@ -1,16 +1,23 @@
-"""Colour images as PNG, JPEG or raw bytes. Size and completeness are read from the file's own marks before decoding."""
+"""Images of messages as buffers: colour, depth, labels, confidence; and how the header says each is packed.
+
+Of colour images size and completeness are read from the file's own marks before decoding.
+"""
 
 from __future__ import annotations
 
 import struct
-from typing import Literal
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
+from msgspec import Meta
 
 from semantic_mapper.errors import CodecError
+from semantic_mapper.transport import compression
 from semantic_mapper.transport.framing import Buffer
-from semantic_mapper.types import UInt8
+from semantic_mapper.transport.headers import PartBytes, Wire
+from semantic_mapper.types import Float32, UInt8
 
 ImageEncoding = Literal["raw", "png", "jpeg"]
 
@@ -20,6 +27,126 @@ _JPEG_MAGIC = b"\xff\xd8\xff"
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start-of-frame marks; the three are tables
 _JPEG_SCAN, _JPEG_END = 0xDA, b"\xff\xd9"
 _FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION  # poses belong to the pixels as stored, not as turned by EXIF
+
+
+@dataclass(frozen=True, slots=True)
+class CodecOptions:
+    """How images are packed. The defaults lose nothing of a frame.
+
+    Args:
+        rgb: "png" (lossless, small), "raw" (lossless, fast), "jpeg" (lossy).
+        jpeg_quality: 1 to 100.
+        depth: "auto": uint16 where ``depth_m`` is exactly uint16 / ``depth_scale``, else float32, both compressed and
+            both bit exact; "raw": float32 as it is.
+        depth_scale: Units a metre tried by "auto".
+        confidence: Of map updates; "u8" rounds to the nearest 1/255, "f32" is exact.
+        zstd_level: 1 is ten times faster than PNG on depth.
+    """
+
+    rgb: ImageEncoding = "png"
+    jpeg_quality: int = 92
+    depth: Literal["auto", "raw"] = "auto"
+    depth_scale: float = 1000.0
+    confidence: Literal["u8", "f32"] = "u8"
+    zstd_level: int = 1
+
+
+class RgbSpec(Wire, frozen=True):
+    """How a colour buffer is packed."""
+
+    encoding: ImageEncoding
+    bytes: PartBytes
+
+
+class DepthSpec(Wire, frozen=True):
+    """How a depth buffer is packed; ``scale`` in units a metre for uint16, else 0."""
+
+    encoding: Literal["f32", "f32_planes_zstd", "u16_delta_planes_zstd"]
+    bytes: PartBytes
+    scale: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
+
+
+class LabelSpec(Wire, frozen=True):
+    """How a label buffer is packed."""
+
+    encoding: Literal["u8_zstd"]
+    bytes: PartBytes
+
+
+class ConfidenceSpec(Wire, frozen=True):
+    """How a confidence buffer is packed; "u8_zstd" rounds to the nearest 1/255."""
+
+    encoding: Literal["u8_zstd", "f32_planes_zstd"]
+    bytes: PartBytes
+
+
+def encode_depth(depth_m: Float32, options: CodecOptions) -> tuple[DepthSpec, bytes]:
+    """Depth (H, W) -> how it is packed, and the bytes; always bit exact."""
+    if options.depth == "raw":
+        data = np.ascontiguousarray(depth_m, "<f4").tobytes()
+        return DepthSpec("f32", len(data)), data
+    scale, data = compression.pack_depth(depth_m, (options.depth_scale,), options.zstd_level)
+    return DepthSpec("u16_delta_planes_zstd" if scale else "f32_planes_zstd", len(data), float(scale)), data
+
+
+def decode_depth(spec: DepthSpec, data: Buffer, size: tuple[int, int], what: str) -> Float32:
+    """Inverse of ``encode_depth``.
+
+    Raises:
+        CodecError: damaged, or not of ``size`` (height, width).
+    """
+    what = f"{what}: depth"
+    if spec.encoding == "f32":
+        if len(data) != 4 * size[0] * size[1]:
+            raise CodecError(f"{what}: {size[1]}x{size[0]} needs {4 * size[0] * size[1]} bytes, got {len(data)}")
+        return np.frombuffer(data, "<f4").reshape(size).astype(np.float32)
+    if spec.encoding == "f32_planes_zstd":
+        return compression.unpack_depth(data, 0.0, *size, what)
+    if np.float32(spec.scale) <= 0:
+        raise CodecError(f"{what}: scale must be positive, got {spec.scale}")
+    return compression.unpack_depth(data, spec.scale, *size, what)
+
+
+def encode_label(label: UInt8, options: CodecOptions) -> tuple[LabelSpec, bytes]:
+    """Class ids (H, W) -> how they are packed, and the bytes."""
+    data = compression.pack_uint8(label, options.zstd_level)
+    return LabelSpec("u8_zstd", len(data)), data
+
+
+def decode_label(data: Buffer, size: tuple[int, int], what: str) -> UInt8:
+    """Inverse of ``encode_label``.
+
+    Raises:
+        CodecError: damaged, or not of ``size`` (height, width).
+    """
+    return compression.unpack_uint8(data, *size, f"{what}: label")
+
+
+def encode_confidence(confidence: Float32, options: CodecOptions) -> tuple[ConfidenceSpec, bytes]:
+    """Confidence (H, W) -> how it is packed, and the bytes.
+
+    Raises:
+        CodecError: "u8" cannot hold values outside [0, 1].
+    """
+    if options.confidence == "f32":
+        data = compression.pack_float32(confidence, options.zstd_level)
+        return ConfidenceSpec("f32_planes_zstd", len(data)), data
+    if not bool(np.all((confidence >= 0) & (confidence <= 1 + 1e-5))):
+        raise CodecError("confidence must lie in [0, 1]; send it as float32 if it may be anything else")
+    data = compression.pack_uint8(np.rint(np.minimum(confidence, 1) * 255).astype(np.uint8), options.zstd_level)
+    return ConfidenceSpec("u8_zstd", len(data)), data
+
+
+def decode_confidence(spec: ConfidenceSpec, data: Buffer, size: tuple[int, int], what: str) -> Float32:
+    """Inverse of ``encode_confidence``.
+
+    Raises:
+        CodecError: damaged, or not of ``size`` (height, width).
+    """
+    what = f"{what}: confidence"
+    if spec.encoding == "f32_planes_zstd":
+        return compression.unpack_float32(data, *size, what)
+    return compression.unpack_uint8(data, *size, what).astype(np.float32) / np.float32(255)
 
 
 def encode_rgb(rgb: UInt8, encoding: ImageEncoding, jpeg_quality: int) -> bytes:

@@ -1,20 +1,45 @@
-"""What travels besides ``PosedFrame`` and ``MapUpdate``. Plain data; ``codec`` turns it into bytes and back."""
+"""What travels on topics: one struct a message, whose types say what its fields may hold. ``codec`` makes bytes of it.
+
+``PosedFrame`` and ``MapUpdate`` travel, too; they are core types (``semantic_mapper.types``). Bounds are checked when a
+message is sent and when one is received.
+"""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+from msgspec.structs import force_setattr
 
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.transport.framing import MAX_KEYFRAME_PIXELS, Buffer
+from semantic_mapper.transport.headers import (
+    MAX_HEADER_BYTES,
+    Count,
+    Digest,
+    Finite,
+    Sentence,
+    Source,
+    Stamp,
+    UnitInterval,
+    Wire,
+    Word,
+)
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
 NodeState = Literal["starting", "running", "degraded", "stopping", "ended"]
 EndReason = Literal["end", "stopped", "error"]
 
+MAX_DAMAGES = 50  # damaged places of a recording that its end tells of
+MAX_KEYFRAME_BYTES = 8 * MAX_KEYFRAME_PIXELS + 2 * MAX_HEADER_BYTES  # raw colour, float32 depth, labels: all of it
+MAX_WEIGHTS_BYTES = 1 << 26  # of a weights file on the wire: five times the shipped one
+_SENTENCE = 4096  # letters; longer ones are cut
 
-@dataclass(frozen=True, slots=True)
-class StreamInfo:
+
+class StreamInfo(Wire, frozen=True):
     """What a stream of frames is; sent before its first frame and kept in every log.
 
     Args:
@@ -26,16 +51,15 @@ class StreamInfo:
         metadata: Anything else worth keeping, as text.
     """
 
-    source: str
-    cameras: Mapping[str, CameraIntrinsics] = field(default_factory=dict[str, CameraIntrinsics])
+    source: Sentence
+    cameras: Annotated[Mapping[Source, CameraIntrinsics], Meta(max_length=64)] = msgspec.field(default_factory=dict)
     label_set: LabelSet | None = None
-    frame_count: int | None = None
-    frame_hz: float = 0.0
-    metadata: Mapping[str, str] = field(default_factory=dict[str, str])
+    frame_count: Count | None = None
+    frame_hz: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
+    metadata: Annotated[Mapping[Word, Sentence], Meta(max_length=64)] = msgspec.field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class Status:
+class Status(Wire, frozen=True):
     """What a node says about itself, about once a second.
 
     Args:
@@ -47,26 +71,30 @@ class Status:
         degraded: One sentence for each thing that does not work as it should; empty when all is well.
     """
 
-    node: str
+    node: Source
     state: NodeState
-    stamp_ns: int
-    counters: Mapping[str, int] = field(default_factory=dict[str, int])
-    ages_s: Mapping[str, float] = field(default_factory=dict[str, float])
-    degraded: tuple[str, ...] = ()
+    stamp_ns: Stamp
+    counters: Annotated[Mapping[Word, Count], Meta(max_length=256)] = msgspec.field(default_factory=dict)
+    ages_s: Annotated[Mapping[Word, Finite], Meta(max_length=256)] = msgspec.field(default_factory=dict)
+    degraded: Annotated[tuple[Sentence, ...], Meta(max_length=64)] = ()
+
+    def __post_init__(self) -> None:
+        force_setattr(self, "degraded", tuple(text[:_SENTENCE] for text in self.degraded))
 
 
-@dataclass(frozen=True, slots=True)
-class FrameRefused:
+class FrameRefused(Wire, frozen=True):
     """The mapper's answer to a frame that it could not use, in place of a ``MapUpdate``."""
 
-    stamp_ns: int
-    seq: int
-    camera_id: str
-    reason: str
+    stamp_ns: Stamp
+    seq: Count
+    camera_id: Source
+    reason: Sentence
+
+    def __post_init__(self) -> None:
+        force_setattr(self, "reason", self.reason[:_SENTENCE])
 
 
-@dataclass(frozen=True, slots=True)
-class EndOfStream:
+class EndOfStream(Wire, frozen=True):
     """The last message of a stream of frames.
 
     Args:
@@ -78,16 +106,19 @@ class EndOfStream:
         unreadable: How many frames of a recording could not be read, and were not sent; ``damages`` begins with them.
     """
 
-    source: str
+    source: Source
     reason: EndReason
-    published: int
-    detail: str = ""
-    damages: tuple[str, ...] = ()
-    unreadable: int = 0
+    published: Count
+    detail: Sentence = ""
+    damages: Annotated[tuple[Sentence, ...], Meta(max_length=MAX_DAMAGES)] = ()
+    unreadable: Count = 0
+
+    def __post_init__(self) -> None:
+        force_setattr(self, "detail", self.detail[:_SENTENCE])
+        force_setattr(self, "damages", tuple(text[:1024] for text in self.damages[:MAX_DAMAGES]))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LabelledKeyframe:
+class LabelledKeyframe(Wire, frozen=True, eq=False):
     """A frame with labels to learn from.
 
     Args:
@@ -98,11 +129,13 @@ class LabelledKeyframe:
 
     frame: PosedFrame
     label_set: LabelSet
-    teacher: str = ""
+    teacher: Word = ""
+
+    def __post_init__(self) -> None:
+        force_setattr(self, "teacher", self.teacher[:128])
 
 
-@dataclass(frozen=True, slots=True)
-class WeightsUpdate:
+class WeightsUpdate(Wire, frozen=True):
     """Weights that a learner offers to a mapper.
 
     Args:
@@ -115,19 +148,18 @@ class WeightsUpdate:
         keyframes, held_out: How many it learned from, and how many it was judged by.
     """
 
-    node: str
-    version: int
-    data: bytes
-    digest: str
-    parent: str
-    score: float
-    parent_score: float
-    keyframes: int
-    held_out: int
+    node: Source
+    version: Annotated[int, Meta(ge=1, le=2**31)]
+    data: Annotated[bytes, Meta(min_length=1, max_length=MAX_WEIGHTS_BYTES)] = msgspec.field(name="bytes")
+    digest: Digest
+    parent: Digest
+    score: UnitInterval
+    parent_score: UnitInterval
+    keyframes: Count
+    held_out: Count
 
 
-@dataclass(frozen=True, slots=True)
-class WeightsInUse:
+class WeightsInUse(Wire, frozen=True):
     """What weights a mapper uses, and what became of the last ones that it was offered.
 
     Args:
@@ -142,15 +174,18 @@ class WeightsInUse:
         contradicts: Whether it was not taken because it contradicts the map, rather than for any other reason.
     """
 
-    node: str
-    version: int
-    digest: str
-    newest: int = 0
-    judged: int = 0
+    node: Source
+    version: Count
+    digest: Digest
+    newest: Count = 0
+    judged: Count = 0
     accepted: bool = False
-    reason: str = ""
-    rolled_back: int = 0
+    reason: Sentence = ""
+    rolled_back: Count = 0
     contradicts: bool = False
+
+    def __post_init__(self) -> None:
+        force_setattr(self, "reason", self.reason[:_SENTENCE])
 
 
 Message = (
@@ -164,3 +199,8 @@ Message = (
     | WeightsUpdate
     | WeightsInUse
 )
+
+
+def digest_of(data: Buffer) -> str:
+    """SHA-256, hexadecimal."""
+    return hashlib.sha256(data).hexdigest()

@@ -23,7 +23,15 @@ from msgspec import Meta
 from semantic_mapper.errors import CodecError
 from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.transport.framing import Buffer
-from semantic_mapper.transport.headers import CaptureStamp, Header, pack_header, unpack_header
+from semantic_mapper.transport.headers import (
+    CaptureStamp,
+    Finite,
+    Wire,
+    check_header,
+    pack_header,
+    to_plain,
+    unpack_header,
+)
 from semantic_mapper.types import MAX_POSE_SIGMA_M, Float64
 
 MAX_POSE_BYTES = 2048
@@ -31,11 +39,11 @@ QUATERNION_TOLERANCE = 1e-2  # of its length from 1: what is further off is no r
 
 _WHAT = "pose message"
 FrameName = Annotated[str, Meta(max_length=64)]
-Three = Annotated[tuple[float, ...], Meta(min_length=3, max_length=3)]
-Four = Annotated[tuple[float, ...], Meta(min_length=4, max_length=4)]
+Three = Annotated[tuple[Finite, ...], Meta(min_length=3, max_length=3)]
+Four = Annotated[tuple[Finite, ...], Meta(min_length=4, max_length=4)]
 
 
-class PoseMessage(Header, frozen=True, kw_only=True):
+class PoseMessage(Wire, frozen=True, kw_only=True):
     """Where frame ``child`` was in frame ``parent`` at ``stamp_ns``; fields as in the module's words."""
 
     stamp_ns: CaptureStamp
@@ -44,6 +52,13 @@ class PoseMessage(Header, frozen=True, kw_only=True):
     sigma: Annotated[float, Meta(ge=0, le=MAX_POSE_SIGMA_M)] = 0.0
     parent: FrameName = ""
     child: FrameName = ""
+
+    def __post_init__(self) -> None:
+        length = float(np.linalg.norm(self.quaternion))
+        if not abs(length - 1) <= QUATERNION_TOLERANCE:  # NaN, too
+            raise CodecError(
+                f"{_WHAT}: the quaternion [x, y, z, w] has length {length:.3g}, not 1; what it turns by is not defined"
+            )
 
     @property
     def matrix(self) -> Float64:
@@ -57,8 +72,9 @@ def encode_pose(message: PoseMessage, topic: str = "pose") -> list[bytes]:
     Raises:
         CodecError: a value that cannot be sent, such as NaN or a quaternion that is not of unit length.
     """
-    _check_quaternion(message)
-    return [topic.encode(), pack_header(message, _WHAT)]
+    header = to_plain(message, _WHAT)
+    check_header(header, PoseMessage, _WHAT)
+    return [topic.encode(), pack_header(header, _WHAT)]
 
 
 def decode_pose(parts: Sequence[Buffer]) -> PoseMessage:
@@ -74,9 +90,7 @@ def decode_pose(parts: Sequence[Buffer]) -> PoseMessage:
         raise CodecError(f"{_WHAT}: of {len(parts[-1])} bytes; 1 to {MAX_POSE_BYTES} are accepted")
     if payload.lstrip()[:1] == b"{":  # no msgpack map begins like that
         payload = _json_to_msgpack(payload)
-    message = unpack_header(payload, PoseMessage, _WHAT)
-    _check_quaternion(message)
-    return message
+    return check_header(unpack_header(payload, _WHAT), PoseMessage, _WHAT)
 
 
 def _json_to_msgpack(payload: bytes) -> bytes:
@@ -86,11 +100,3 @@ def _json_to_msgpack(payload: bytes) -> bytes:
         return cast(bytes, msgpack.packb(data, use_bin_type=True))
     except (ValueError, TypeError, RecursionError, OverflowError) as error:
         raise CodecError(f"{_WHAT}: not JSON: {error}") from error
-
-
-def _check_quaternion(message: PoseMessage) -> None:
-    length = float(np.linalg.norm(message.quaternion))
-    if abs(length - 1) > QUATERNION_TOLERANCE:
-        raise CodecError(
-            f"{_WHAT}: the quaternion [x, y, z, w] has length {length:.3g}, not 1; what it turns by is not defined"
-        )

@@ -1,222 +1,34 @@
-"""Questions about a map and their answers: one table of what each carries, as typed headers and plain arrays."""
+"""Questions about a map and their answers: one struct each, whose array fields travel as buffers, and one table."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Annotated, Literal
+import functools
+from dataclasses import dataclass
+from typing import Annotated, Literal, get_type_hints
 
+import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from semantic_mapper.transport.headers import (
     Count,
     Digest,
-    Header,
-    LabelSetHeader,
+    Finite,
+    LabelSetForm,
     PartBytes,
-    Plain,
     Sentence,
     Stamp,
+    Wire,
     Word,
 )
+from semantic_mapper.types import Float32, Float64, Int32, Int64, UInt8
 
 MAX_REQUEST_ROWS = 1 << 16  # points, rays or poses of one question
 BLOCK_VOXELS = 512
 MAX_WAIT_S = 3600.0  # for an answer, of who does not say
 
-Point = tuple[float, float, float]
+Point = tuple[Finite, Finite, Finite]
 DType = Literal["u1", "i1", "<i4", "<i8", "<f4", "<f8"]
-
-
-class ArraySpec(Plain, frozen=True, kw_only=True):
-    """One buffer: its array's shape and its size as sent."""
-
-    shape: Annotated[tuple[Annotated[int, Meta(ge=0, le=1 << 31)], ...], Meta(max_length=4)]
-    bytes: PartBytes
-
-
-ArraySpecs = Annotated[tuple[ArraySpec, ...], Meta(max_length=6)]
-
-
-class RequestHeader(Header, frozen=True, kw_only=True):
-    """Of every question; the buffers are those that ``QUESTIONS`` names, in that order.
-
-    ``asker`` is the same for all questions of a client that has one at a time, through whichever socket; empty = a
-    stranger. Nobody waits for the answer after ``waits_s``.
-    """
-
-    arrays: ArraySpecs = ()
-    asker: Word = ""
-    waits_s: Annotated[float, Meta(ge=0, le=MAX_WAIT_S)] = MAX_WAIT_S
-
-
-class AnswerHeader(Header, frozen=True, kw_only=True):
-    """Of every answer: which state of which map it is about.
-
-    ``map_id`` is another one after the mapper was started anew; versions of two maps cannot be compared.
-    """
-
-    map_id: Word
-    version: Count
-    epoch: Count
-    arrays: ArraySpecs = ()
-
-
-class InfoRequest(RequestHeader, frozen=True, kw_only=True):
-    """What the map is."""
-
-
-class InfoAnswer(AnswerHeader, frozen=True, kw_only=True):
-    """What the map is."""
-
-    blocks: Count
-    voxel_size_m: float
-    truncation_voxels: float
-    label_set: LabelSetHeader
-
-
-class AtRequest(RequestHeader, frozen=True, kw_only=True):
-    """What is at points."""
-
-    radius_m: float | None = None
-
-
-class NearestRequest(RequestHeader, frozen=True, kw_only=True):
-    """Where the nearest surface of a class is."""
-
-    class_name: Word
-    point: Point
-    min_confidence: float = 0.0
-
-
-class NearestAnswer(AnswerHeader, frozen=True, kw_only=True):
-    """Where it is; zeros where ``found`` is false."""
-
-    found: bool
-    xyz: Point
-    distance_m: float
-    confidence: float
-
-
-class RaysRequest(RequestHeader, frozen=True, kw_only=True):
-    """What rays meet."""
-
-    max_m: float
-
-
-class BoxRequest(RequestHeader, frozen=True, kw_only=True):
-    """Surface points in a box."""
-
-    lower: Point
-    upper: Point
-
-
-class InstancesRequest(RequestHeader, frozen=True, kw_only=True):
-    """Countable things."""
-
-    up: Point
-
-
-class OccupancyRequest(RequestHeader, frozen=True, kw_only=True):
-    """Free, occupied or unknown at points."""
-
-
-class DistanceRequest(RequestHeader, frozen=True, kw_only=True):
-    """Distances to obstacles in a box."""
-
-    lower: Point
-    upper: Point
-    unknown_is_occupied: bool = False
-
-
-class DistanceAnswer(AnswerHeader, frozen=True, kw_only=True):
-    """Where its grid lies."""
-
-    origin_m: Point
-    voxel_size_m: float
-
-
-class ChangesRequest(RequestHeader, frozen=True, kw_only=True):
-    """Blocks changed since a version of the map ``map_id``; of another map, all blocks are sent."""
-
-    since: Count
-    limit: Count = 0  # blocks, see ``VoxelMap.changes``; 0 = all
-    map_id: Word = ""
-
-
-class ChangesAnswer(AnswerHeader, frozen=True, kw_only=True):
-    """Where these blocks begin; complete up to ``version``, while the map is at ``newest``."""
-
-    since: Count
-    newest: Count
-
-
-class CorrectPosesRequest(RequestHeader, frozen=True, kw_only=True):
-    """Move the map to corrected poses of its frames; the one request that changes something.
-
-    ``id`` makes it safe to ask again where an answer was lost: of requests with the same one, the first counts.
-    """
-
-    id: Word
-    cameras: Annotated[tuple[Word, ...], Meta(min_length=1, max_length=256)]  # ("",) = whichever took the frame
-    until_ns: Stamp | None = None  # see ``MappingPipeline.correct_poses``
-    within_ns: Annotated[int, Meta(ge=0, le=1_000_000_000)] = 0  # how far from a stamp its frame may be
-
-
-class CorrectionRequest(RequestHeader, frozen=True, kw_only=True):
-    """How far corrections are."""
-
-
-class CorrectionAnswer(AnswerHeader, frozen=True, kw_only=True):
-    """``CorrectionStatus`` of the map itself, which is ahead of the mirror that ``version`` and ``epoch`` speak of."""
-
-    used: Count  # poses of this request; 0 where none were sent
-    left_out: Count  # those of them without a frame
-    running: bool
-    done: Count
-    total: Count
-    completed: Count
-    poses: Count
-    frozen: Count
-    lost: Count
-    failure: Sentence
-    map_epoch: Count
-
-
-class WeightsRequest(RequestHeader, frozen=True, kw_only=True):
-    """Which weights there are; with ``to``, go back to these. To ask twice is as to ask once."""
-
-    to: Count | None = None
-
-
-class WeightsEntry(Plain, frozen=True, kw_only=True):
-    """Weights that a mapper was started with (version 0) or was offered."""
-
-    version: Count
-    digest: Digest
-    state: Literal["in use", "earlier", "refused", "rolled back"]
-    score: float
-    parent_score: float
-    keyframes: Count
-    reason: Sentence
-
-
-class WeightsAnswer(AnswerHeader, frozen=True, kw_only=True):
-    """Which weights there are; ``before`` were in use before, ``wanted`` are about to be."""
-
-    in_use: Count
-    before: Count | None
-    wanted: Count | None
-    weights_taken: Count
-    weights_refused: Count
-    weights_rolled_back: Count
-    entries: Annotated[tuple[WeightsEntry, ...], Meta(max_length=256)]
-
-
-class ErrorAnswer(Header, frozen=True, kw_only=True):
-    """The name of an error class of ours, and what it says."""
-
-    error: Word
-    text: Sentence
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,75 +45,303 @@ class ArrayForm:
     tail: tuple[int, ...] = ()
     free: int = 1
 
+    @property
+    def is_compressed(self) -> bool:
+        """Whether its buffer is compressed."""
+        return np.dtype(self.dtype).itemsize == 1
+
+
+Points = Annotated[Float64, ArrayForm("<f8", (3,))]
+Labels = Annotated[UInt8, ArrayForm("u1")]
+Floats = Annotated[Float32, ArrayForm("<f4")]
+Colors = Annotated[UInt8, ArrayForm("u1", (3,))]
+
+
+@functools.cache
+def array_forms(kind: type) -> dict[str, ArrayForm]:
+    """Array fields of a question or an answer, in the order of their buffers."""
+    hints = get_type_hints(kind, include_extras=True)
+    noted = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
+    return {name: notes[0] for name, notes in noted.items() if notes and isinstance(notes[0], ArrayForm)}
+
+
+class ArraySpec(Wire, frozen=True):
+    """One buffer: its array's shape and its size as sent."""
+
+    shape: Annotated[tuple[Annotated[int, Meta(ge=0, le=1 << 31)], ...], Meta(max_length=4)]
+    bytes: PartBytes
+
+
+ArraySpecs = Annotated[tuple[ArraySpec, ...], Meta(max_length=6)]
+
+
+class Request(Wire, frozen=True, kw_only=True):
+    """Of every question; ``arrays`` says how its array fields travel, and is filled in by the codec.
+
+    ``asker`` is the same for all questions of a client that has one at a time, through whichever socket; empty = a
+    stranger. Nobody waits for the answer after ``waits_s``.
+    """
+
+    arrays: ArraySpecs = ()
+    asker: Word = ""
+    waits_s: Annotated[float, Meta(ge=0, le=MAX_WAIT_S)] = MAX_WAIT_S
+
+
+class Answer(Wire, frozen=True, kw_only=True):
+    """Of every answer: which state of which map it is about.
+
+    ``map_id`` is another one after the mapper was started anew; versions of two maps cannot be compared.
+    """
+
+    map_id: Word
+    version: Count
+    epoch: Count
+    arrays: ArraySpecs = ()
+
+
+class InfoRequest(Request, frozen=True, kw_only=True):
+    """What the map is."""
+
+
+class InfoAnswer(Answer, frozen=True, kw_only=True):
+    """What the map is."""
+
+    blocks: Count
+    voxel_size_m: Finite
+    truncation_voxels: Finite
+    label_set: LabelSetForm
+
+
+class AtRequest(Request, frozen=True, kw_only=True):
+    """What is at points."""
+
+    points: Points
+    radius_m: Finite | None = None
+
+
+class AtAnswer(Answer, frozen=True, kw_only=True):
+    """``PointAnswers``."""
+
+    label: Labels
+    confidence: Floats
+    distance_m: Floats
+    state: Labels
+
+
+class NearestRequest(Request, frozen=True, kw_only=True):
+    """Where the nearest surface of a class is."""
+
+    class_name: Word
+    point: Point
+    min_confidence: Finite = 0.0
+
+
+class NearestAnswer(Answer, frozen=True, kw_only=True):
+    """Where it is; zeros where ``found`` is false."""
+
+    found: bool
+    xyz: Point
+    distance_m: Finite
+    confidence: Finite
+
+
+class RaysRequest(Request, frozen=True, kw_only=True):
+    """What rays meet."""
+
+    max_m: Finite
+    origins: Points
+    directions: Points
+
+
+class RaysAnswer(Answer, frozen=True, kw_only=True):
+    """``RayHits``."""
+
+    distance_m: Floats
+    label: Labels
+    confidence: Floats
+    rgb: Colors
+
+
+class BoxRequest(Request, frozen=True, kw_only=True):
+    """Surface points in a box."""
+
+    lower: Point
+    upper: Point
+
+
+class BoxAnswer(Answer, frozen=True, kw_only=True):
+    """``MapPoints``."""
+
+    xyz: Annotated[Float32, ArrayForm("<f4", (3,))]
+    rgb: Colors
+    label: Labels
+    confidence: Floats
+
+
+class InstancesRequest(Request, frozen=True, kw_only=True):
+    """Countable things."""
+
+    up: Point
+
+
+class InstancesAnswer(Answer, frozen=True, kw_only=True):
+    """All things, packed.
+
+    ``numbers``: id, class id, voxels. ``places``: confidence, centroid, box: center, size, R_world_box row by row.
+    ``voxels``: of all things, one behind the other.
+    """
+
+    numbers: Annotated[Int64, ArrayForm("<i8", (3,))]
+    places: Annotated[Float64, ArrayForm("<f8", (19,))]
+    voxels: Annotated[Int32, ArrayForm("<i4", (3,))]
+
+
+class OccupancyRequest(Request, frozen=True, kw_only=True):
+    """Free, occupied or unknown at points."""
+
+    points: Points
+
+
+class OccupancyAnswer(Answer, frozen=True, kw_only=True):
+    """A ``State`` for each point."""
+
+    state: Labels
+
+
+class DistanceRequest(Request, frozen=True, kw_only=True):
+    """Distances to obstacles in a box."""
+
+    lower: Point
+    upper: Point
+    unknown_is_occupied: bool = False
+
+
+class DistanceAnswer(Answer, frozen=True, kw_only=True):
+    """Where its grid lies."""
+
+    origin_m: Point
+    voxel_size_m: Finite
+    distance_m: Annotated[Float32, ArrayForm("<f4", free=3)]
+    state: Annotated[UInt8, ArrayForm("u1", free=3)]
+
+
+class ChangesRequest(Request, frozen=True, kw_only=True):
+    """Blocks changed since a version of the map ``map_id``; of another map, all blocks are sent."""
+
+    since: Count
+    limit: Count = 0  # blocks, see ``VoxelMap.changes``; 0 = all
+    map_id: Word = ""
+
+
+class ChangesAnswer(Answer, frozen=True, kw_only=True):
+    """Where these blocks begin; complete up to ``version``, while the map is at ``newest``."""
+
+    since: Count
+    newest: Count
+    keys: Annotated[Int32, ArrayForm("<i4", (3,))]
+    tsdf: Annotated[NDArray[np.int8], ArrayForm("i1", (BLOCK_VOXELS,))]
+    label: Annotated[UInt8, ArrayForm("u1", (BLOCK_VOXELS,))]
+    confidence: Annotated[UInt8, ArrayForm("u1", (BLOCK_VOXELS,))]
+    rgb: Annotated[UInt8, ArrayForm("u1", (BLOCK_VOXELS, 3))]
+
+
+class CorrectPosesRequest(Request, frozen=True, kw_only=True):
+    """Move the map to corrected poses of its frames; the one request that changes something.
+
+    ``id`` makes it safe to ask again where an answer was lost: of requests with the same one, the first counts.
+    """
+
+    id: Word
+    cameras: Annotated[tuple[Word, ...], Meta(min_length=1, max_length=256)]  # ("",) = whichever took the frame
+    until_ns: Stamp | None = None  # see ``MappingPipeline.correct_poses``
+    within_ns: Annotated[int, Meta(ge=0, le=1_000_000_000)] = 0  # how far from a stamp its frame may be
+    stamps_ns: Annotated[Int64, ArrayForm("<i8")]
+    camera: Labels  # index of ``cameras``
+    poses: Annotated[Float64, ArrayForm("<f8", (4, 4))]
+
+
+class CorrectionRequest(Request, frozen=True, kw_only=True):
+    """How far corrections are."""
+
+
+class CorrectionAnswer(Answer, frozen=True, kw_only=True):
+    """``CorrectionStatus`` of the map itself, which is ahead of the mirror that ``version`` and ``epoch`` speak of."""
+
+    used: Count  # poses of this request; 0 where none were sent
+    left_out: Count  # those of them without a frame
+    running: bool
+    done: Count
+    total: Count
+    completed: Count
+    poses: Count
+    frozen: Count
+    lost: Count
+    failure: Sentence
+    map_epoch: Count
+
+
+class WeightsRequest(Request, frozen=True, kw_only=True):
+    """Which weights there are; with ``to``, go back to these. To ask twice is as to ask once."""
+
+    to: Count | None = None
+
+
+class WeightsEntry(Wire, frozen=True):
+    """Weights that a mapper was started with (version 0) or was offered."""
+
+    version: Count
+    digest: Digest
+    state: Literal["in use", "earlier", "refused", "rolled back"]
+    score: Finite
+    parent_score: Finite
+    keyframes: Count
+    reason: Sentence
+
+
+class WeightsAnswer(Answer, frozen=True, kw_only=True):
+    """Which weights there are; ``before`` were in use before, ``wanted`` are about to be."""
+
+    in_use: Count
+    before: Count | None
+    wanted: Count | None
+    weights_taken: Count
+    weights_refused: Count
+    weights_rolled_back: Count
+    entries: Annotated[tuple[WeightsEntry, ...], Meta(max_length=256)]
+
+
+class ErrorAnswer(Wire, frozen=True):
+    """The name of an error class of ours, and what it says."""
+
+    error: Word
+    text: Sentence
+
 
 @dataclass(frozen=True, slots=True)
 class Question:
     """One row of the table.
 
     Args:
-        request, answer: Types of the headers.
-        takes, gives: Arrays of question and answer.
+        request, answer: Types of question and answer.
         aligned: Whether all arrays of the answer have the same free axes.
     """
 
-    request: type[RequestHeader]
-    answer: type[AnswerHeader] = AnswerHeader
-    takes: dict[str, ArrayForm] = field(default_factory=dict[str, ArrayForm])
-    gives: dict[str, ArrayForm] = field(default_factory=dict[str, ArrayForm])
+    request: type[Request]
+    answer: type[Answer]
     aligned: bool = True
 
 
-_POINTS = ArrayForm("<f8", (3,))
-_U8, _F32, _RGB = ArrayForm("u1"), ArrayForm("<f4"), ArrayForm("u1", (3,))
-
 QUESTIONS = {
     "info": Question(InfoRequest, InfoAnswer),
-    "at": Question(
-        AtRequest,
-        takes={"points": _POINTS},
-        gives={"label": _U8, "confidence": _F32, "distance_m": _F32, "state": _U8},
-    ),
+    "at": Question(AtRequest, AtAnswer),
     "nearest": Question(NearestRequest, NearestAnswer),
-    "cast_rays": Question(
-        RaysRequest,
-        takes={"origins": _POINTS, "directions": _POINTS},
-        gives={"distance_m": _F32, "label": _U8, "confidence": _F32, "rgb": _RGB},
-    ),
-    "points_in_box": Question(
-        BoxRequest,
-        gives={"xyz": ArrayForm("<f4", (3,)), "rgb": _RGB, "label": _U8, "confidence": _F32},
-    ),
-    "instances": Question(
-        InstancesRequest,
-        gives={
-            "numbers": ArrayForm("<i8", (3,)),  # id, class id, voxels
-            "places": ArrayForm("<f8", (19,)),  # confidence, centroid, box: center, size, R_world_box row by row
-            "voxels": ArrayForm("<i4", (3,)),  # of all things, one behind the other
-        },
-        aligned=False,
-    ),
-    "occupancy": Question(OccupancyRequest, takes={"points": _POINTS}, gives={"state": _U8}),
-    "distance_field": Question(
-        DistanceRequest,
-        DistanceAnswer,
-        gives={"distance_m": ArrayForm("<f4", free=3), "state": ArrayForm("u1", free=3)},
-    ),
-    "changes": Question(
-        ChangesRequest,
-        ChangesAnswer,
-        gives={
-            "keys": ArrayForm("<i4", (3,)),
-            "tsdf": ArrayForm("i1", (BLOCK_VOXELS,)),
-            "label": ArrayForm("u1", (BLOCK_VOXELS,)),
-            "confidence": ArrayForm("u1", (BLOCK_VOXELS,)),
-            "rgb": ArrayForm("u1", (BLOCK_VOXELS, 3)),
-        },
-    ),
-    "correct_poses": Question(
-        CorrectPosesRequest,
-        CorrectionAnswer,
-        takes={"stamps_ns": ArrayForm("<i8"), "camera": _U8, "poses": ArrayForm("<f8", (4, 4))},  # index of ``cameras``
-    ),
+    "cast_rays": Question(RaysRequest, RaysAnswer),
+    "points_in_box": Question(BoxRequest, BoxAnswer),
+    "instances": Question(InstancesRequest, InstancesAnswer, aligned=False),
+    "occupancy": Question(OccupancyRequest, OccupancyAnswer),
+    "distance_field": Question(DistanceRequest, DistanceAnswer),
+    "changes": Question(ChangesRequest, ChangesAnswer),
+    "correct_poses": Question(CorrectPosesRequest, CorrectionAnswer),
     "correction": Question(CorrectionRequest, CorrectionAnswer),
     "weights": Question(WeightsRequest, WeightsAnswer),
 }

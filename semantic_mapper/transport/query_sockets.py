@@ -10,9 +10,9 @@ from types import TracebackType
 import zmq
 
 from semantic_mapper.errors import CodecError, TransportError
+from semantic_mapper.transport.codec import encode_error
 from semantic_mapper.transport.endpoints import EndpointLock, bind, check_bind, check_connect
 from semantic_mapper.transport.framing import MAX_PART_BYTES, MAX_PARTS, Buffer
-from semantic_mapper.transport.query_codec import encode_error
 from semantic_mapper.transport.receiving import receive_bounded
 from semantic_mapper.transport.security import Keys, ServerIdentity, secure_client, secure_server
 

@@ -11,7 +11,8 @@ from typing import cast
 import zmq
 
 from semantic_mapper.transport.framing import MAX_PARTS
-from semantic_mapper.transport.headers import MAX_HEADER_BYTES, MAX_KEYFRAME_BYTES, MAX_WEIGHTS_BYTES
+from semantic_mapper.transport.headers import MAX_HEADER_BYTES
+from semantic_mapper.transport.messages import MAX_KEYFRAME_BYTES, MAX_WEIGHTS_BYTES
 from semantic_mapper.types import MAX_PIXELS
 
 MAX_MESSAGE_BYTES = 10 * MAX_PIXELS + 2 * MAX_HEADER_BYTES  # a frame's colours, depth and labels, none packed

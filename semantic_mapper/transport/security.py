@@ -24,7 +24,7 @@ from zmq.utils import z85
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.files import write_bytes
-from semantic_mapper.log_events import get_logger
+from semantic_mapper.log_events import get_logger, is_power_of_two
 
 _KEY_LETTERS = 40  # of a public key as text (Z85)
 _OWN, _PEERS = "own", "peers"
@@ -192,7 +192,7 @@ class _AllowList:
             return False
         if not allowed:
             self._refused += 1
-            if self._refused & (self._refused - 1) == 0:
+            if is_power_of_two(self._refused):
                 _log.warning("stranger_refused", key=key.decode(), refused=self._refused)
         return allowed
 

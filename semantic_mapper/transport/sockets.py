@@ -1,8 +1,598 @@
-"""ZeroMQ sockets of the system: ``Publisher``, and the two ways to subscribe."""
+"""Sockets of topics: ``Publisher``, and the two ways to subscribe, ``NewestSubscriber`` and ``LosslessSubscriber``."""
 
 from __future__ import annotations
 
-from semantic_mapper.transport.publisher import Publisher
-from semantic_mapper.transport.subscribers import LosslessSubscriber, NewestSubscriber
+import math
+import threading
+import time
+import uuid
+from collections import Counter, deque
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Literal
 
-__all__ = ["LosslessSubscriber", "NewestSubscriber", "Publisher"]
+import zmq
+
+from semantic_mapper.errors import CodecError, TransportError
+from semantic_mapper.log_events import get_logger, is_power_of_two
+from semantic_mapper.transport.codec import decode, read_envelope
+from semantic_mapper.transport.connections import Connections
+from semantic_mapper.transport.endpoints import EndpointLock, bind, check_bind, check_connect
+from semantic_mapper.transport.framing import MAX_PART_BYTES, Parts
+from semantic_mapper.transport.messages import Message
+from semantic_mapper.transport.receiving import max_bytes, receive_bounded
+from semantic_mapper.transport.security import Keys, ServerIdentity, secure_client, secure_server
+from semantic_mapper.transport.topics import TOPICS, Topic, subscription
+
+SYNC_PREFIX = b"sync/"  # a subscription to sync/TOKEN/ is answered by that very topic: "I have heard you"
+_PUMP_PERIOD_S = 0.02
+_SEND_SLICE_MS = 100
+_LATE_S = 0.1  # subscriptions of one socket come in no order; an end must not arrive before what it ends
+_MAX_SUBSCRIPTIONS = 4096  # what a stranger's subscriptions may cost us
+_MAX_EVENTS = 256  # heard at a time: a stranger who subscribes without end must not hold up what is published
+_POLL_MS = 50
+# A machine that is gone is found out within 5 s; a process that is gone at once, by the kernel.
+_KEEPALIVE = ((zmq.TCP_KEEPALIVE_IDLE, 2), (zmq.TCP_KEEPALIVE_INTVL, 1), (zmq.TCP_KEEPALIVE_CNT, 3))
+_MAX_SLOTS = 256  # cameras and nodes that a mailbox serves; a stranger's invented ones stop here
+
+log = get_logger(__name__)
+
+
+class Publisher:
+    """Binds an endpoint and sends encoded messages to whoever subscribes. Any thread may call any method.
+
+    Args:
+        endpoint: ``ipc://PATH`` or ``tcp://ADDRESS:PORT`` (``*`` as port: any free one, see ``endpoint``).
+        policy: Toward a subscriber that does not keep up. "drop" (live): it loses messages. "block" (replay,
+            recording): ``publish`` waits for it, so that nothing is lost.
+        hwm: Messages that may wait for each subscriber.
+        keys: Encrypt, and let in only their peers; needed where other machines could connect.
+        linger_ms: How long ``close`` waits for the last messages to be delivered.
+
+    Raises:
+        TransportError: the endpoint is taken, cannot be bound, or could be reached from other machines and there are
+            no keys.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        *,
+        policy: Literal["drop", "block"] = "drop",
+        hwm: int = 16,
+        linger_ms: int = 2000,
+        keys: Keys | None = None,
+        context: zmq.Context[zmq.Socket[bytes]] | None = None,
+    ) -> None:
+        check_bind(endpoint, keys)
+        self._endpoint_lock = EndpointLock(endpoint)
+        self._mutex = threading.Lock()  # a zmq socket may change threads only across a memory barrier
+        self._counts: Counter[bytes] = Counter()
+        self._latched: dict[bytes, Parts] = {}
+        self._late: dict[bytes, float] = {}  # latched ends that newcomers get yet, and when
+        self._owed: list[Parts] = []  # answers to subscriptions that found a full queue
+        self._closed = threading.Event()
+        self.published = 0
+        self._socket = (context or zmq.Context.instance()).socket(zmq.XPUB)
+        self._socket.setsockopt(zmq.LINGER, linger_ms)
+        self._socket.setsockopt(zmq.SNDHWM, hwm)
+        self._socket.setsockopt(zmq.SNDTIMEO, _SEND_SLICE_MS)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, 1024)  # subscribers send nothing but subscriptions
+        self._socket.setsockopt(zmq.XPUB_VERBOSER, 1)  # tell of every (un)subscription, so that they can be counted
+        self._socket.setsockopt(zmq.XPUB_NODROP, int(policy == "block"))
+        if keys is not None:
+            secure_server(self._socket, keys)
+        self.endpoint = bind(self._socket, endpoint, self._endpoint_lock)
+        self._pump_thread = threading.Thread(target=self._pump, name=f"publisher {endpoint}", daemon=True)
+        self._pump_thread.start()
+
+    def publish(self, parts: Parts, timeout_s: float = 30.0) -> None:
+        """Send one encoded message. The parts must not be changed afterwards.
+
+        Raises:
+            TransportError: closed; or policy "block" and a subscriber did not make room within ``timeout_s``.
+            CodecError: fewer than two parts.
+        """
+        if len(parts) < 2:
+            raise CodecError(f"a message has at least topic and header, got {len(parts)} parts")
+        topic = bytes(parts[0])
+        deadline = time.monotonic() + timeout_s
+        while True:
+            with self._mutex:
+                self._check_open()
+                self._drain()
+                if self._try_send(parts):
+                    self.published += 1
+                    self._latch(topic, parts)
+                    return
+            self._closed.wait(0.001)  # let other threads have the socket
+            if time.monotonic() > deadline:
+                with self._mutex:
+                    self._latch(topic, parts)  # who comes later, or is reminded, gets it yet
+                raise TransportError(
+                    f"{self.endpoint}: a subscriber of {topic.decode(errors='replace')} has taken nothing for "
+                    f"{timeout_s:g} s; it hangs or is too slow for a lossless stream"
+                )
+
+    def remind(self, name: str) -> None:
+        """Send the latched messages of a topic once more, for those who had no room for them; waits for nobody."""
+        with self._mutex:
+            self._check_open()
+            self._drain()
+            for topic, parts in self._latched.items():
+                if topic.startswith(subscription(name)):
+                    self._try_send(parts, zmq.NOBLOCK)
+
+    def subscribers(self, name: str, source: str | None = None) -> int:
+        """How many subscriptions a message of this topic reaches."""
+        topic = subscription(name, source)
+        with self._mutex:
+            self._check_open()
+            self._drain()
+            return sum(count for prefix, count in self._counts.items() if topic.startswith(prefix))
+
+    def wait_for_subscribers(self, name: str, count: int = 1, timeout_s: float = 10.0) -> None:
+        """Block until ``count`` subscriptions to topic ``name`` have arrived, so that no one misses the first message.
+
+        Raises:
+            TransportError: too few within ``timeout_s``.
+        """
+        deadline = time.monotonic() + timeout_s
+        while (there := self.subscribers(name)) < count:
+            if time.monotonic() > deadline:
+                raise TransportError(
+                    f"{self.endpoint}: {there} of {count} subscribers of '{name}' after {timeout_s:g} s; "
+                    "is the other node running, and does it connect to this endpoint?"
+                )
+            self._closed.wait(0.005)
+
+    def close(self) -> None:
+        """Deliver what is still waiting (at most ``linger_ms``), then free the endpoint. Harmless when repeated."""
+        if self._closed.is_set():
+            return
+        self._closed.set()
+        self._pump_thread.join()
+        with self._mutex:
+            self._socket.close()
+        self._endpoint_lock.release()
+
+    def __enter__(self) -> Publisher:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _check_open(self) -> None:
+        if self._closed.is_set():
+            raise TransportError(f"{self.endpoint}: the publisher is closed")
+
+    def _pump(self) -> None:
+        """Hear subscriptions also while nothing is published."""
+        while not self._closed.wait(_PUMP_PERIOD_S):
+            with self._mutex:
+                self._drain()
+
+    def _drain(self) -> None:
+        owed, self._owed = self._owed, []
+        for parts in owed:
+            self._answer(parts)
+        self._answer_late()
+        for _ in range(_MAX_EVENTS):
+            try:
+                event = self._socket.recv(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            if event[:1] == b"\x01":
+                self._on_subscribed(event[1:])
+            elif event[:1] == b"\x00":
+                self._counts[event[1:]] -= 1
+                if self._counts[event[1:]] <= 0:
+                    del self._counts[event[1:]]
+
+    def _on_subscribed(self, prefix: bytes) -> None:
+        if prefix not in self._counts and len(self._counts) >= _MAX_SUBSCRIPTIONS:
+            log.warning("subscription_ignored", endpoint=self.endpoint, reason="too many different topics")
+            return
+        self._counts[prefix] += 1
+        for topic, parts in self._latched.items():
+            if topic.startswith(prefix):
+                row = _row(topic)
+                if row is not None and row.closes:
+                    self._late[topic] = time.monotonic() + _LATE_S
+                else:
+                    self._answer(parts)
+        if prefix.startswith(SYNC_PREFIX):
+            self._answer([prefix, b""])
+
+    def _latch(self, topic: bytes, parts: Parts) -> None:
+        row = _row(topic)
+        if row is None or not row.latched:
+            return
+        self._latched[topic] = tuple(parts)
+        for other in TOPICS.values():
+            if other.closes == row.name:  # a stream that begins has not ended
+                ended = other.name.encode() + topic[len(row.name) :]
+                self._latched.pop(ended, None)
+                self._late.pop(ended, None)
+
+    def _answer_late(self) -> None:
+        now = time.monotonic()
+        for topic in [topic for topic, due in self._late.items() if due <= now]:
+            del self._late[topic]
+            self._answer(self._latched[topic])
+
+    def _answer(self, parts: Parts) -> None:
+        if not self._try_send(parts, zmq.NOBLOCK) and len(self._owed) < _MAX_SUBSCRIPTIONS:
+            self._owed.append(parts)
+
+    def _try_send(self, parts: Parts, flags: int = 0) -> bool:
+        try:
+            self._socket.send_multipart(parts, flags, copy=False)
+        except zmq.Again:
+            return False
+        except BaseException:  # Ctrl-C between two parts: end the message, or the next one would be glued to it
+            self._socket.send(b"", zmq.NOBLOCK)
+            raise
+        return True
+
+
+def _row(topic: bytes) -> Topic | None:
+    return TOPICS.get(topic.partition(b"/")[0].decode("ascii", errors="replace"))
+
+
+class _Subscriber:
+    """What both subscribers share: the socket, its subscriptions, the handshake, and the counting of bad messages."""
+
+    def __init__(
+        self,
+        endpoints: str | Sequence[str],
+        topics: Sequence[str],
+        hwm: int,
+        identity: ServerIdentity | None,
+        context: zmq.Context[zmq.Socket[bytes]] | None,
+    ) -> None:
+        self.endpoints = (endpoints,) if isinstance(endpoints, str) else tuple(endpoints)
+        self.topics = tuple(topics)
+        self.rejected = 0
+        self.last_error: CodecError | None = None
+        self._received_at: float | None = None
+        self._sync_topic = SYNC_PREFIX + uuid.uuid4().hex.encode() + b"/"
+        self._synced = 0
+        self._identity = identity
+        self._closed = threading.Event()
+        self._socket = (context or zmq.Context.instance()).socket(zmq.SUB)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.RCVHWM, hwm)
+        self._max_bytes = max(map(max_bytes, self.topics))
+        self._socket.setsockopt(zmq.MAXMSGSIZE, min(MAX_PART_BYTES, self._max_bytes))
+        self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
+        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 200)  # a node that was started anew is found at once
+        # Not ZeroMQ's own heartbeats: they take a reader that does not keep up for a dead peer, and where its queue was
+        # full when they cut the connection, libzmq aborts the process (4.3.5: "Assertion failed: _input_stopped").
+        self._socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
+        for option, seconds_or_probes in _KEEPALIVE:
+            self._socket.setsockopt(option, seconds_or_probes)
+        self._connections = Connections(self._socket)
+
+    def _connect(self) -> None:
+        try:
+            for endpoint in self.endpoints:
+                check_connect(endpoint, self._identity)
+            if self._identity is not None:
+                secure_client(self._socket, self._identity)
+            for topic in self.topics:
+                self._socket.subscribe(_prefix(topic))
+            # Last: publishers hear subscriptions in order, so an answer to this one proves that all others are heard.
+            self._socket.subscribe(self._sync_topic)
+            for endpoint in self.endpoints:
+                self._socket.connect(endpoint)
+        except (zmq.ZMQError, CodecError, TransportError) as error:
+            self._connections.close()
+            self._socket.close(linger=0)
+            raise TransportError(f"cannot subscribe to {self.endpoints}: {error}") from error
+
+    @property
+    def silent_s(self) -> float | None:
+        """Seconds since the last good message; None before the first."""
+        return None if self._received_at is None else time.monotonic() - self._received_at
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free the socket."""
+        raise NotImplementedError
+
+    def _take_off(self) -> list[bytes] | None:
+        """The message that waits; None where it has too much in it."""
+        parts, trouble = receive_bounded(self._socket, max_bytes=self._max_bytes)
+        if trouble:
+            self._reject(CodecError(trouble))
+        return None if trouble else parts
+
+    def _is_sync(self, parts: Sequence[bytes]) -> bool:
+        if not parts[0].startswith(SYNC_PREFIX):
+            return False
+        self._synced += parts[0] == self._sync_topic
+        return True
+
+    def _reject(self, error: CodecError) -> None:
+        """A bad message costs itself and nothing else: count it, tell of it (each power of two), go on."""
+        self.rejected += 1
+        self.last_error = error
+        if is_power_of_two(self.rejected):
+            log.warning("message_rejected", endpoints=self.endpoints, rejected=self.rejected, error=str(error))
+
+    def _check_open(self) -> None:
+        if self._closed.is_set():
+            raise TransportError(f"{self.endpoints}: the subscriber is closed")
+
+    def _not_ready(self, timeout_s: float) -> TransportError:
+        return TransportError(
+            f"{self._synced} of {len(self.endpoints)} publishers at {', '.join(self.endpoints)} have answered within "
+            f"{timeout_s:g} s; is the other node running?"
+            + ("" if self._identity is None else " Does it know this machine's key, and is its own the one we have?")
+        )
+
+
+class LosslessSubscriber(_Subscriber):
+    """Gets every message, in order; with a ``Publisher`` of policy "block" none is lost. Any thread may call it.
+
+    A publisher that was restarted hears of the subscriptions again as soon as somebody waits in ``receive``.
+
+    Args:
+        endpoints: One publisher or several.
+        topics: "frame", or "frame/CAMERA" for one source.
+        identity: Of publishers that have keys.
+        hwm: Messages that wait here before the publisher is made to wait.
+
+    Raises:
+        TransportError: an endpoint that is none, or of another machine whose identity is not given, or a server that
+            is not among the peers.
+    """
+
+    def __init__(
+        self,
+        endpoints: str | Sequence[str],
+        topics: Sequence[str],
+        *,
+        hwm: int = 16,
+        identity: ServerIdentity | None = None,
+        context: zmq.Context[zmq.Socket[bytes]] | None = None,
+    ) -> None:
+        super().__init__(endpoints, topics, hwm, identity, context)
+        self._mutex = threading.Lock()
+        self._connect()
+        self._early: deque[list[bytes]] = deque()  # arrived during ``wait_until_heard``
+
+    def __enter__(self) -> LosslessSubscriber:
+        return self
+
+    def wait_until_heard(self, timeout_s: float = 10.0) -> None:
+        """Block until every publisher knows of our subscriptions; what it sends from then on arrives.
+
+        Raises:
+            TransportError: not within ``timeout_s``.
+        """
+        deadline = time.monotonic() + timeout_s
+        while self._synced < len(self.endpoints):
+            parts = self._receive_raw(_POLL_MS)
+            if parts is not None and not self._is_sync(parts):
+                self._early.append(parts)
+            if time.monotonic() > deadline:
+                raise self._not_ready(timeout_s)
+
+    def connections(self) -> int:
+        """Publishers that are connected right now; falls at once when one dies.
+
+        Raises:
+            TransportError: closed.
+        """
+        with self._mutex:
+            self._check_open()
+            return self._connections.connected()
+
+    def receive_parts(self, timeout_s: float | None = None) -> list[bytes] | None:
+        """Next message as it came over the wire, its header checked; None when none came in time.
+
+        Bad ones are counted in ``rejected`` and passed over until the time is over: a flood of them holds nobody up.
+
+        Args:
+            timeout_s: None = wait for ever.
+
+        Raises:
+            TransportError: closed.
+        """
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            left_ms = _POLL_MS if deadline is None else max(0.0, deadline - time.monotonic()) * 1e3
+            parts = self._early.popleft() if self._early else self._receive_raw(min(_POLL_MS, left_ms))
+            if parts is not None and not self._is_sync(parts):
+                try:
+                    read_envelope(parts)
+                except CodecError as error:
+                    self._reject(error)
+                else:
+                    self._received_at = time.monotonic()
+                    return parts
+            if _is_over(deadline):
+                return None
+
+    def receive(self, timeout_s: float | None = None) -> Message | None:
+        """Next message, decoded; None when none came in time. Bad ones are passed over as in ``receive_parts``.
+
+        Raises:
+            TransportError: closed.
+        """
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            left = None if deadline is None else max(0.0, deadline - time.monotonic())
+            parts = self.receive_parts(left)
+            if parts is None:
+                return None
+            try:
+                return decode(parts)
+            except CodecError as error:
+                self._reject(error)
+            if _is_over(deadline):
+                return None
+
+    def close(self) -> None:
+        """Free the socket. Harmless when repeated."""
+        with self._mutex:
+            if self._closed.is_set():
+                return
+            self._closed.set()
+            self._connections.close()
+            self._socket.close(linger=0)
+
+    def _receive_raw(self, poll_ms: float) -> list[bytes] | None:
+        with self._mutex:
+            self._check_open()
+            self._connections.mend()
+            if not self._socket.poll(math.ceil(poll_ms)):
+                return None
+            return self._take_off()
+
+
+class NewestSubscriber(_Subscriber):
+    """Gets the newest message of each source: an unread one gives way to the next, and is counted.
+
+    A thread of its own takes messages off the socket as they come and checks their headers; images are decoded by
+    whoever calls ``receive``. Messages whose topic is marked "all" in the table (info, end, ...) never give way.
+
+    Args:
+        endpoints: One publisher or several.
+        topics: "frame", or "frame/CAMERA" for one source.
+        identity: Of publishers that have keys.
+
+    Raises:
+        TransportError: an endpoint that is none, or of another machine whose identity is not given, or a server that
+            is not among the peers.
+    """
+
+    def __init__(
+        self,
+        endpoints: str | Sequence[str],
+        topics: Sequence[str],
+        *,
+        identity: ServerIdentity | None = None,
+        context: zmq.Context[zmq.Socket[bytes]] | None = None,
+    ) -> None:
+        super().__init__(endpoints, topics, 16, identity, context)
+        self._changed = threading.Condition()
+        self._slots: dict[tuple[bytes, int], list[bytes]] = {}  # (topic, 0), or (topic, serial) where none gives way
+        self._serial = 0
+        self.overwritten = 0
+        self._failure: zmq.ZMQError | None = None  # of the thread that takes messages off the socket
+        self._connect()
+        self._thread = threading.Thread(target=self._run, name=f"subscriber {self.endpoints}", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> NewestSubscriber:
+        return self
+
+    def wait_until_heard(self, timeout_s: float = 10.0) -> None:
+        """Block until every publisher knows of our subscriptions; what it sends from then on arrives.
+
+        Raises:
+            TransportError: not within ``timeout_s``.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._synced >= len(self.endpoints) or self._failure is not None, timeout_s)
+            self._check_receiving()
+            if self._synced < len(self.endpoints):
+                raise self._not_ready(timeout_s)
+
+    def receive(self, timeout_s: float | None = None) -> Message | None:
+        """The newest message of the source that has waited longest; None when none came in time.
+
+        Bad messages are counted in ``rejected`` and passed over until the time is over.
+
+        Raises:
+            TransportError: closed; or nothing can come any more, which says why.
+        """
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            with self._changed:
+                left = None if deadline is None else max(0.0, deadline - time.monotonic())
+                self._changed.wait_for(
+                    lambda: bool(self._slots) or self._closed.is_set() or self._failure is not None, left
+                )
+                self._check_open()
+                if not self._slots:
+                    self._check_receiving()
+                    return None
+                # A message that replaced another keeps its place, so an end of stream cannot overtake a frame.
+                parts = self._slots.pop(next(iter(self._slots)))
+            try:
+                return decode(parts)
+            except CodecError as error:
+                self._reject(error)
+            if _is_over(deadline):
+                return None
+
+    def close(self) -> None:
+        """Stop the thread and free the socket. Harmless when repeated."""
+        with self._changed:
+            self._closed.set()
+            self._changed.notify_all()
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            while not self._closed.is_set():
+                self._connections.mend()
+                if self._socket.poll(_POLL_MS) and (parts := self._take_off()) is not None:
+                    self._take(parts)
+        except zmq.ZMQError as error:
+            with self._changed:
+                self._failure = error
+                self._changed.notify_all()
+        finally:
+            self._connections.close()
+            self._socket.close(linger=0)  # by the thread that used it
+
+    def _check_receiving(self) -> None:
+        if self._failure is not None:
+            raise TransportError(
+                f"{self.endpoints}: nothing is received any more: {self._failure}; subscribe anew"
+            ) from self._failure
+
+    def _take(self, parts: list[bytes]) -> None:
+        if parts[0].startswith(SYNC_PREFIX):
+            with self._changed:
+                self._is_sync(parts)
+                self._changed.notify_all()
+            return
+        try:
+            envelope = read_envelope(parts)
+        except CodecError as error:
+            self._reject(error)
+            return
+        with self._changed:
+            gives_way = TOPICS[envelope.topic].queue == "newest"
+            self._serial += not gives_way
+            key = (parts[0], 0 if gives_way else self._serial)
+            if key not in self._slots and len(self._slots) >= _MAX_SLOTS:
+                self._reject(CodecError(f"{len(self._slots)} sources wait to be read; no room for {parts[0]!r}"))
+                return
+            self.overwritten += key in self._slots
+            self._slots[key] = parts
+            self._received_at = time.monotonic()
+            self._changed.notify_all()
+
+
+def _is_over(deadline: float | None) -> bool:
+    return deadline is not None and time.monotonic() >= deadline
+
+
+def _prefix(topic: str) -> bytes:
+    name, _, source = topic.partition("/")
+    if name not in TOPICS:
+        raise CodecError(f"no topic '{name}'; there are {', '.join(TOPICS)}")
+    return subscription(name, source or None)

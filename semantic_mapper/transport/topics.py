@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from semantic_mapper.errors import CodecError
+from semantic_mapper.transport.framing import MAX_PARTS, Parts
+from semantic_mapper.transport.headers import SOURCE_PATTERN
 from semantic_mapper.transport.messages import (
     EndOfStream,
     FrameRefused,
@@ -19,7 +21,6 @@ from semantic_mapper.transport.messages import (
 )
 from semantic_mapper.types import MapUpdate, PosedFrame
 
-SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # camera ids and node names, as they stand in topics
 MAX_TOPIC_BYTES = 96
 
 
@@ -30,6 +31,7 @@ class Topic:
     Args:
         name: First word of the topic on the wire.
         message: Type of the decoded message.
+        source: Field of the header that is the second word of the topic; empty where any sender may stand there.
         logged: Whether the recorder keeps it.
         nominal_hz: Usual rate, 0 = now and then.
         queue: "newest": an unread message gives way to a newer one of the same source; "all": nothing is dropped.
@@ -39,6 +41,7 @@ class Topic:
 
     name: str
     message: type[Message]
+    source: str
     logged: bool
     nominal_hz: float
     queue: Literal["newest", "all"]
@@ -49,15 +52,15 @@ class Topic:
 TOPICS = {
     topic.name: topic
     for topic in (
-        Topic("info", StreamInfo, logged=True, nominal_hz=0, queue="all", latched=True),
-        Topic("frame", PosedFrame, logged=True, nominal_hz=15, queue="newest"),
-        Topic("end", EndOfStream, logged=False, nominal_hz=0, queue="all", latched=True, closes="info"),
-        Topic("map", MapUpdate, logged=False, nominal_hz=5, queue="newest"),
-        Topic("refused", FrameRefused, logged=True, nominal_hz=0, queue="all"),
-        Topic("status", Status, logged=True, nominal_hz=1, queue="newest", latched=True),
-        Topic("keyframe", LabelledKeyframe, logged=False, nominal_hz=0, queue="all"),
-        Topic("weights", WeightsUpdate, logged=False, nominal_hz=0, queue="all", latched=True),
-        Topic("in_use", WeightsInUse, logged=False, nominal_hz=0, queue="all", latched=True),
+        Topic("info", StreamInfo, "", logged=True, nominal_hz=0, queue="all", latched=True),
+        Topic("frame", PosedFrame, "camera_id", logged=True, nominal_hz=15, queue="newest"),
+        Topic("end", EndOfStream, "source", logged=False, nominal_hz=0, queue="all", latched=True, closes="info"),
+        Topic("map", MapUpdate, "camera_id", logged=False, nominal_hz=5, queue="newest"),
+        Topic("refused", FrameRefused, "camera_id", logged=True, nominal_hz=0, queue="all"),
+        Topic("status", Status, "node", logged=True, nominal_hz=1, queue="newest", latched=True),
+        Topic("keyframe", LabelledKeyframe, "camera_id", logged=False, nominal_hz=0, queue="all"),
+        Topic("weights", WeightsUpdate, "node", logged=False, nominal_hz=0, queue="all", latched=True),
+        Topic("in_use", WeightsInUse, "node", logged=False, nominal_hz=0, queue="all", latched=True),
     )
 }
 
@@ -93,3 +96,14 @@ def parse_topic(topic: bytes) -> tuple[Topic, str]:
     raise CodecError(
         f"topic {topic[:40]!r} is none of ours; they read '<name>/<source>/' with a name of {', '.join(TOPICS)}"
     )
+
+
+def read_topic(parts: Parts) -> tuple[Topic, str]:
+    """Topic and source of a message.
+
+    Raises:
+        CodecError: too few or too many parts, or a topic that is none of ours.
+    """
+    if not 2 <= len(parts) <= MAX_PARTS:
+        raise CodecError(f"a message has 2 to {MAX_PARTS} parts, got {len(parts)}")
+    return parse_topic(bytes(parts[0][: MAX_TOPIC_BYTES + 1]))

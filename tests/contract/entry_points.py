@@ -12,7 +12,9 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -48,7 +50,9 @@ from semantic_mapper.training.finetune import FinetuneConfig, finetune
 from semantic_mapper.training.keyframe_pool import Kept, KeyframePool
 from semantic_mapper.training.online import OnlineConfig
 from semantic_mapper.training.train_config import TrainConfig
-from semantic_mapper.transport import codec, pose_message, query_codec, query_messages
+from semantic_mapper.transport import codec, pose_message, query_messages
+from semantic_mapper.transport.headers import LabelSetForm
+from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import (
     EndOfStream,
     FrameRefused,
@@ -58,7 +62,6 @@ from semantic_mapper.transport.messages import (
     WeightsInUse,
     WeightsUpdate,
 )
-from semantic_mapper.transport.plain import label_set_header
 from semantic_mapper.transport.security import load_keys
 from semantic_mapper.transport.topics import TOPICS
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
@@ -70,6 +73,7 @@ __all__ = [
     "VALIDATION_SEEDS",
     "CameraIntrinsics",
     "Checkpoint",
+    "CodecOptions",
     "EndOfStream",
     "FinetuneConfig",
     "FrameRefused",
@@ -151,46 +155,52 @@ def command_tree() -> Any:
 # Wire.
 
 decode_message = codec.decode
-encode_message: Mapping[str, Callable[..., list[bytes]]] = {
-    "info": codec.encode_info,
-    "frame": codec.encode_frame,
-    "end": codec.encode_end,
-    "map": codec.encode_map_update,
-    "refused": codec.encode_refused,
-    "status": codec.encode_status,
-    "keyframe": codec.encode_keyframe,
-    "weights": codec.encode_weights,
-    "in_use": codec.encode_in_use,
-}
+encode_message: Mapping[str, Callable[..., list[bytes]]] = dict.fromkeys(TOPICS, codec.encode)
 TAKES_OPTIONS = ("frame", "keyframe", "map")  # their encoders know how to pack images
-CodecOptions = codec.CodecOptions
 decode_pose, encode_pose = pose_message.decode_pose, pose_message.encode_pose
-QUESTIONS = query_messages.QUESTIONS
+label_set_header = LabelSetForm.of
+
+
+def _without_arrays(kind: type[Any]) -> Callable[..., Any]:
+    """A question or answer that still lacks its arrays."""
+    return lambda **fields: partial(kind, **fields)
+
+
+# How to make a question and an answer of each kind, of which the arrays are given when it is encoded.
+QUESTIONS = {
+    kind: SimpleNamespace(request=_without_arrays(row.request), answer=_without_arrays(row.answer))
+    for kind, row in query_messages.QUESTIONS.items()
+}
 WeightsEntry = query_messages.WeightsEntry
 
 
 def decode_question(parts: Sequence[bytes]) -> tuple[Any, dict[str, Any]]:
     """Header and arrays."""
-    _, header, arrays = query_codec.decode_request(parts)
-    return header, arrays
+    _, request = codec.decode_request(parts)
+    return request, _arrays(request)
 
 
 def encode_question(kind: str, header: Any, arrays: Mapping[str, Any]) -> list[bytes]:
     """Parts of a question."""
-    return query_codec.encode_request(kind, header, arrays)
+    return codec.encode_request(kind, header(**arrays) if isinstance(header, partial) else header)
 
 
 def decode_answer(kind: str, parts: Sequence[bytes]) -> tuple[Any, dict[str, Any]]:
     """Header and arrays; raises what the other side has answered in place of these."""
-    return query_codec.decode_answer(kind, QUESTIONS[kind].answer, parts)
+    answer = codec.decode_answer(kind, query_messages.QUESTIONS[kind].answer, parts)
+    return answer, _arrays(answer)
 
 
 def encode_answer(kind: str, header: Any, arrays: Mapping[str, Any]) -> list[bytes]:
     """Parts of an answer."""
-    return query_codec.encode_answer(kind, header, arrays)
+    return codec.encode_answer(kind, header(**arrays) if isinstance(header, partial) else header)
 
 
-encode_error = query_codec.encode_error
+def _arrays(message: Any) -> dict[str, Any]:
+    return {name: getattr(message, name) for name in query_messages.array_forms(type(message))}
+
+
+encode_error = codec.encode_error
 
 
 def keep_learning(store: LearningStore, kept: Sequence[Kept]) -> None:

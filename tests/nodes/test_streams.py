@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from semantic_mapper.errors import NodeError, TransportError
@@ -25,7 +26,7 @@ from semantic_mapper.nodes.recorder.node import run_recorder
 from semantic_mapper.nodes.streams import Streams
 from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.replay.log.format import LogReader
-from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info, encode_status
+from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
 from semantic_mapper.transport.security import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
@@ -59,17 +60,17 @@ def test_two_cameras_are_recorded_until_both_have_ended_and_one_may_start_anew(t
             for restart in range(2):  # the camera's process dies after three frames and counts from 0 again
                 with Publisher(endpoints["left"]) as left:
                     left.wait_for_subscribers("frame", timeout_s=20)
-                    left.publish(encode_info(LEFT, "left"))
+                    left.publish(encode(LEFT, sender="left"))
                     for seq in range(3):
                         stamp_ns = (10 * restart + seq + 1) * 1000
                         left.publish(encode_frame(replace(frame, camera_id="left", seq=seq, stamp_ns=stamp_ns)))
                     if restart:
-                        left.publish(encode_end(EndOfStream("left", "end", 3)))
+                        left.publish(encode(EndOfStream("left", "end", 3)))
             right.wait_for_subscribers("frame", timeout_s=20)
-            right.publish(encode_info(RIGHT, "right"))
+            right.publish(encode(RIGHT, sender="right"))
             for seq in range(2):
                 right.publish(encode_frame(replace(frame, camera_id="right", seq=seq, stamp_ns=20_000 + seq)))
-            right.publish(encode_end(EndOfStream("right", "end", 2)))
+            right.publish(encode(EndOfStream("right", "end", 2)))
     with LogReader(tmp_path / "both.mcap") as log:
         frames = list(log)
         assert log.finished and not log.errors
@@ -105,7 +106,7 @@ def test_two_cameras_of_different_size_are_fused_into_one_map(tmp_path: Path) ->
         thread.start()
         for name, publisher in publishers.items():
             publisher.wait_for_subscribers("frame", timeout_s=120)
-            publisher.publish(encode_info(infos[name], name))
+            publisher.publish(encode(infos[name], sender=name))
         for frame in tiny_frames(4):
             publishers["left"].publish(encode_frame(replace(frame, camera_id="left", label=None)), 120)
             cut = replace(
@@ -117,10 +118,10 @@ def test_two_cameras_of_different_size_are_fused_into_one_map(tmp_path: Path) ->
                 intrinsics=small,
             )
             publishers["right"].publish(encode_frame(cut), 120)
-        publishers["left"].publish(encode_end(EndOfStream("left", "end", 4)))
+        publishers["left"].publish(encode(EndOfStream("left", "end", 4)))
         thread.join(0.5)
         assert thread.is_alive()  # the other one has not ended
-        publishers["right"].publish(encode_end(EndOfStream("right", "end", 5)))  # one was lost on the way
+        publishers["right"].publish(encode(EndOfStream("right", "end", 5)))  # one was lost on the way
         thread.join(200)
         assert not thread.is_alive()
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -133,7 +134,7 @@ def test_two_cameras_of_different_size_are_fused_into_one_map(tmp_path: Path) ->
 def test_streams_end_together_and_say_what_each_said() -> None:
     streams = Streams(2)
     assert not streams.begin(LEFT) and not streams.begin(RIGHT) and not streams.begin(LEFT)
-    assert streams.begin(replace(LEFT, frame_hz=5.0))
+    assert streams.begin(msgspec.structs.replace(LEFT, frame_hz=5.0))
     assert streams.source == "left eye + right eye" and streams.label_set is None
     assert not streams.end(EndOfStream("a", "end", 3))
     assert not streams.end(EndOfStream("a", "error", 4, "unplugged"))  # started anew meanwhile
@@ -147,12 +148,12 @@ def test_streams_end_together_and_say_what_each_said() -> None:
 
 def test_streams_of_different_classes_do_not_go_into_one_map() -> None:
     streams = Streams(2)
-    streams.begin(replace(LEFT, label_set=ROOMS))
+    streams.begin(msgspec.structs.replace(LEFT, label_set=ROOMS))
     with pytest.raises(NodeError, match="'right eye' have other classes than those of 'left eye'"):
-        streams.begin(replace(RIGHT, label_set=NYU40))
+        streams.begin(msgspec.structs.replace(RIGHT, label_set=NYU40))
     alone = Streams(1)
-    alone.begin(replace(LEFT, label_set=ROOMS))
-    assert alone.begin(replace(LEFT, label_set=NYU40))  # the same stream, which has changed
+    alone.begin(msgspec.structs.replace(LEFT, label_set=ROOMS))
+    assert alone.begin(msgspec.structs.replace(LEFT, label_set=NYU40))  # the same stream, which has changed
 
 
 def test_a_fixed_endpoint_serves_peers_alone_where_there_are_keys(tmp_path: Path) -> None:
@@ -174,7 +175,7 @@ def test_a_fixed_endpoint_serves_peers_alone_where_there_are_keys(tmp_path: Path
             ):
                 near.wait_until_heard(20)
                 peer.wait_until_heard(20)
-                publisher.publish(encode_status(status))
+                publisher.publish(encode(status))
                 assert near.receive(20) == peer.receive(20) == status
                 assert stranger.receive(0.2) is None
         with PublicPublisher(own, "", "") as plain:  # free again

@@ -25,7 +25,8 @@ from semantic_mapper.replay.exporters import LogExportReport, LogExportRequest, 
 from semantic_mapper.replay.importers import ImportOptions, import_recording
 from semantic_mapper.replay.importers.tum import read_trajectory
 from semantic_mapper.replay.log.format import LogReader, LogWriter
-from semantic_mapper.transport.codec import CodecOptions, encode_frame
+from semantic_mapper.transport.codec import encode_frame
+from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 from tests.transport import samples

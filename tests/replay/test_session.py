@@ -123,9 +123,17 @@ def test_summary_table_notes_and_picture_say_where_depth_comes_from(
     assert [strip.depth_rendered for strip in strips] == [frames[0].depth_m is None or measured == 0, measured < 6]
 
 
+def _draw_nothing_but_tell(subtitles: list[str]):
+    def draw(*_, subtitle, **__):
+        subtitles.append(subtitle)
+        return np.zeros((8, 8, 3), np.uint8)
+
+    return draw
+
+
 def test_a_nearly_empty_map_is_plainly_said_so_with_the_reason(tmp_path, weights, monkeypatch):
     drawn = []
-    monkeypatch.setattr(artifacts, "draw_overview", lambda *_, subtitle, **__: drawn.append(subtitle))
+    monkeypatch.setattr(artifacts, "draw_overview", _draw_nothing_but_tell(drawn))
     monkeypatch.setattr(artifacts, "MIN_POINTS_A_BLOCK", 1000)
     frames = tiny_frames()
     for name, given, why in (
@@ -154,7 +162,7 @@ def test_frames_that_a_player_could_not_read_are_refused_but_not_missed(weights)
 
 def test_poses_that_contradict_the_depth_are_in_summary_table_picture_and_notes(tmp_path, weights, monkeypatch):
     subtitles = []
-    monkeypatch.setattr(artifacts, "draw_overview", lambda *_, subtitle, **__: subtitles.append(subtitle))
+    monkeypatch.setattr(artifacts, "draw_overview", _draw_nothing_but_tell(subtitles))
     right = run(weights, tiny_frames(30)).finish(tmp_path / "right")
     assert right["pose_check"]["warning"] is None and right["pose_check"]["depth_disagreement"] < 0.01
     wrong_poses = [replace(f, T_world_camera=invert_pose(f.T_world_camera)) for f in tiny_frames(30)]

@@ -9,20 +9,9 @@ import msgpack
 import numpy as np
 
 from semantic_mapper.labels import NYU40
-from semantic_mapper.transport.codec import (
-    CodecOptions,
-    encode_end,
-    encode_frame,
-    encode_in_use,
-    encode_info,
-    encode_keyframe,
-    encode_map_update,
-    encode_refused,
-    encode_status,
-    encode_weights,
-)
+from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.compression import depth_from_uint16
-from semantic_mapper.transport.learning_messages import digest_of
+from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import (
     EndOfStream,
     FrameRefused,
@@ -31,6 +20,7 @@ from semantic_mapper.transport.messages import (
     StreamInfo,
     WeightsInUse,
     WeightsUpdate,
+    digest_of,
 )
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
@@ -95,14 +85,14 @@ def all_messages() -> dict[str, list[bytes]]:
     """One encoded message of each topic."""
     return {
         "frame": encode_frame(make_frame()),
-        "map": encode_map_update(make_update()),
-        "refused": encode_refused(FrameRefused(4, 5, CAMERA, "pose holds NaN")),
-        "status": encode_status(make_status()),
-        "info": encode_info(make_info()),
-        "end": encode_end(EndOfStream("player", "end", 200)),
-        "keyframe": encode_keyframe(LabelledKeyframe(make_frame(), NYU40, "a person")),
-        "weights": encode_weights(make_weights()),
-        "in_use": encode_in_use(make_in_use()),
+        "map": encode(make_update()),
+        "refused": encode(FrameRefused(4, 5, CAMERA, "pose holds NaN")),
+        "status": encode(make_status()),
+        "info": encode(make_info()),
+        "end": encode(EndOfStream("player", "end", 200)),
+        "keyframe": encode(LabelledKeyframe(make_frame(), NYU40, "a person")),
+        "weights": encode(make_weights()),
+        "in_use": encode(make_in_use()),
     }
 
 

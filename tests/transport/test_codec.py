@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import msgpack
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,36 +16,22 @@ from hypothesis.extra import numpy as hnp
 
 from semantic_mapper.errors import CodecError
 from semantic_mapper.labels import CAMVID11, NYU40
-from semantic_mapper.transport.codec import (
-    CodecOptions,
-    EncodedImage,
-    decode,
-    decode_end,
-    decode_frame,
-    decode_in_use,
-    decode_info,
-    decode_keyframe,
-    decode_map_update,
-    decode_refused,
-    decode_status,
-    decode_weights,
-    encode_end,
-    encode_frame,
-    encode_in_use,
-    encode_info,
-    encode_keyframe,
-    encode_map_update,
-    encode_refused,
-    encode_status,
-    encode_weights,
-    read_envelope,
-)
+from semantic_mapper.transport.codec import EncodedImage, decode, decode_as, encode, encode_frame, read_envelope
 from semantic_mapper.transport.compression import depth_from_uint16, depth_to_uint16
 from semantic_mapper.transport.framing import pack_parts, unpack_parts
-from semantic_mapper.transport.headers import MAX_KEYFRAME_BYTES, MAX_WEIGHTS_BYTES
-from semantic_mapper.transport.images import sniff_image
-from semantic_mapper.transport.messages import EndOfStream, FrameRefused, LabelledKeyframe, Status, StreamInfo
-from semantic_mapper.types import CameraIntrinsics, PosedFrame
+from semantic_mapper.transport.images import CodecOptions, sniff_image
+from semantic_mapper.transport.messages import (
+    MAX_KEYFRAME_BYTES,
+    MAX_WEIGHTS_BYTES,
+    EndOfStream,
+    FrameRefused,
+    LabelledKeyframe,
+    Status,
+    StreamInfo,
+    WeightsInUse,
+    WeightsUpdate,
+)
+from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
 from . import samples
 
@@ -92,7 +79,7 @@ def assert_same_frame(a: PosedFrame, b: PosedFrame) -> None:
 @given(frames(), st.sampled_from(("png", "raw")), st.sampled_from(("auto", "raw")))
 def test_a_frame_survives_wire_and_log_bit_for_bit(frame: PosedFrame, rgb, depth) -> None:
     parts = encode_frame(frame, CodecOptions(rgb=rgb, depth=depth))
-    assert_same_frame(decode_frame(unpack_parts(pack_parts(parts))), frame)
+    assert_same_frame(decode_as(PosedFrame, unpack_parts(pack_parts(parts))), frame)
 
 
 @given(hnp.arrays(np.uint16, sizes), st.sampled_from((1.0, 1000.0, 5000.0, 999.7)))
@@ -107,7 +94,7 @@ def test_depth_that_is_no_multiple_of_the_unit_falls_back_to_float(value: float)
     assert depth_to_uint16(depth, 1000.0) is None
     intrinsics = CameraIntrinsics(1, 1, 0, 0, 2, 1)
     frame = PosedFrame(0, 0, "a", np.zeros((1, 2, 3), np.uint8), depth, None, intrinsics, np.eye(4))
-    assert_same_frame(decode_frame(encode_frame(frame)), frame)
+    assert_same_frame(decode_as(PosedFrame, encode_frame(frame)), frame)
 
 
 def test_depth_views_that_are_not_contiguous_are_sent_right() -> None:
@@ -120,7 +107,7 @@ def test_depth_views_that_are_not_contiguous_are_sent_right() -> None:
         label=frame.label[::-1, ::-1],
     )
     for options in (CodecOptions(), CodecOptions(rgb="raw", depth="raw")):
-        assert_same_frame(decode_frame(encode_frame(turned, options)), turned)
+        assert_same_frame(decode_as(PosedFrame, encode_frame(turned, options)), turned)
 
 
 def test_an_image_file_is_sent_as_it_is() -> None:
@@ -129,12 +116,12 @@ def test_an_image_file_is_sent_as_it_is() -> None:
     assert done
     parts = encode_frame(frame, encoded_rgb=EncodedImage("jpeg", data.tobytes()))
     assert parts[2] == data.tobytes()
-    assert np.array_equal(decode_frame(parts).rgb[..., ::-1], cv2.imdecode(data, cv2.IMREAD_COLOR))
+    assert np.array_equal(decode_as(PosedFrame, parts).rgb[..., ::-1], cv2.imdecode(data, cv2.IMREAD_COLOR))
 
 
 def test_decoded_arrays_may_be_written_to() -> None:
     for parts in samples.frame_variants():
-        frame = decode_frame(parts)
+        frame = decode_as(PosedFrame, parts)
         assert frame.rgb.flags.writeable and frame.T_world_camera.flags.writeable
         assert frame.depth_m is None or frame.depth_m.flags.writeable
         assert frame.label is None or frame.label.flags.writeable
@@ -142,58 +129,58 @@ def test_decoded_arrays_may_be_written_to() -> None:
 
 def test_a_map_update_keeps_labels_and_depth_exactly_and_confidence_to_one_255th() -> None:
     update = samples.make_update()
-    back = decode_map_update(encode_map_update(update))
+    back = decode_as(MapUpdate, encode(update))
     assert np.array_equal(back.label, update.label) and np.array_equal(back.depth_m, update.depth_m)
     assert np.abs(back.confidence - update.confidence).max() <= 0.5 / 255 + 1e-6
     for name in ("stamp_ns", "seq", "camera_id", "fused", "is_keyframe", "source_seqs", "blocks", "stage_ms"):
         assert getattr(back, name) == getattr(update, name), name
-    exact = decode_map_update(encode_map_update(update, CodecOptions(confidence="f32")))
+    exact = decode_as(MapUpdate, encode(update, CodecOptions(confidence="f32")))
     assert np.array_equal(exact.confidence, update.confidence)
 
 
 @pytest.mark.parametrize("label_set", [None, NYU40, CAMVID11])
 def test_stream_info_survives(label_set) -> None:
-    info = dataclasses.replace(samples.make_info(), label_set=label_set)
-    assert decode_info(encode_info(info)) == info
-    assert decode_info(encode_info(StreamInfo("bare"))) == StreamInfo("bare")
+    info = msgspec.structs.replace(samples.make_info(), label_set=label_set)
+    assert decode_as(StreamInfo, encode(info)) == info
+    assert decode_as(StreamInfo, encode(StreamInfo("bare"))) == StreamInfo("bare")
 
 
 def test_small_messages_survive() -> None:
-    assert decode_status(encode_status(samples.make_status())) == samples.make_status()
-    assert decode_status(encode_status(Status("m", "running", 0))) == Status("m", "running", 0)
+    assert decode_as(Status, encode(samples.make_status())) == samples.make_status()
+    assert decode_as(Status, encode(Status("m", "running", 0))) == Status("m", "running", 0)
     refused = FrameRefused(1, 2, "front", "pose holds NaN")
-    assert decode_refused(encode_refused(refused)) == refused
+    assert decode_as(FrameRefused, encode(refused)) == refused
     end = EndOfStream("player", "error", 3, "the mapper has gone", ("frame seq=2: CRC",))
-    assert decode_end(encode_end(end)) == end
+    assert decode_as(EndOfStream, encode(end)) == end
 
 
 def test_messages_of_learning_survive() -> None:
-    assert decode_weights(encode_weights(samples.make_weights())) == samples.make_weights()
-    assert decode_in_use(encode_in_use(samples.make_in_use())) == samples.make_in_use()
+    assert decode_as(WeightsUpdate, encode(samples.make_weights())) == samples.make_weights()
+    assert decode_as(WeightsInUse, encode(samples.make_in_use())) == samples.make_in_use()
     frame = samples.make_frame()
-    keyframe = decode_keyframe(encode_keyframe(LabelledKeyframe(frame, NYU40, "a person")))
+    keyframe = decode_as(LabelledKeyframe, encode(LabelledKeyframe(frame, NYU40, "a person")))
     assert (keyframe.label_set, keyframe.teacher, keyframe.frame.seq) == (NYU40, "a person", frame.seq)
     assert keyframe.frame.label is not None and np.array_equal(keyframe.frame.label, frame.label)
-    envelope = read_envelope(encode_keyframe(LabelledKeyframe(frame, NYU40)))
+    envelope = read_envelope(encode(LabelledKeyframe(frame, NYU40)))
     assert (envelope.source, envelope.stamp_ns, envelope.has_label) == ("front", frame.stamp_ns, True)
 
 
 def test_what_cannot_be_learned_from_is_refused() -> None:
     with pytest.raises(CodecError, match="nothing to learn"):
-        encode_keyframe(LabelledKeyframe(samples.make_frame(label=False), NYU40))
-    parts = encode_keyframe(LabelledKeyframe(samples.make_frame(), NYU40))
+        encode(LabelledKeyframe(samples.make_frame(label=False), NYU40))
+    parts = encode(LabelledKeyframe(samples.make_frame(), NYU40))
     with pytest.raises(CodecError, match="has no label image"):
-        decode_keyframe([*parts[:2], *encode_frame(samples.make_frame(label=False))[1:]])
+        decode_as(LabelledKeyframe, [*parts[:2], *encode_frame(samples.make_frame(label=False))[1:]])
     with pytest.raises(CodecError, match="has no frame"):
-        decode_keyframe(parts[:2])
-    weights = encode_weights(samples.make_weights())
+        decode_as(LabelledKeyframe, parts[:2])
+    weights = encode(samples.make_weights())
     other = bytes([weights[2][0] ^ 1]) + weights[2][1:]
     with pytest.raises(CodecError, match="not the one that its digest names"):
-        decode_weights([*weights[:2], other])
+        decode_as(WeightsUpdate, [*weights[:2], other])
     with pytest.raises(CodecError, match="bytes"):
-        decode_weights(with_header(weights, bytes=MAX_WEIGHTS_BYTES + 1))
+        decode_as(WeightsUpdate, with_header(weights, bytes=MAX_WEIGHTS_BYTES + 1))
     with pytest.raises(CodecError, match="digest"):
-        decode_weights(with_header(weights, digest="../../etc"))
+        decode_as(WeightsUpdate, with_header(weights, digest="../../etc"))
 
 
 def test_the_envelope_tells_what_a_message_is_without_decoding_it() -> None:
@@ -207,7 +194,7 @@ def test_the_envelope_tells_what_a_message_is_without_decoding_it() -> None:
 
 
 def test_a_keyframe_is_bounded_as_a_whole_before_anything_is_allocated() -> None:
-    parts = encode_keyframe(LabelledKeyframe(samples.make_frame(), NYU40))
+    parts = encode(LabelledKeyframe(samples.make_frame(), NYU40))
     wide = with_header([b"", parts[2]], intrinsics=lens(1 << 12, (1 << 11) + 1))[1]
     padding = bytes(MAX_KEYFRAME_BYTES // 2)
     rgb, label = {"encoding": "png", "bytes": len(padding)}, {"encoding": "u8_zstd", "bytes": len(padding)}
@@ -217,7 +204,7 @@ def test_a_keyframe_is_bounded_as_a_whole_before_anything_is_allocated() -> None
         ([*parts[:2], wide, *parts[3:]], "a keyframe has at most 8388608 pixels"),
         ([*parts[:2], long, padding, padding], "a keyframe has at most 67633152"),
     ):
-        for read in (decode_keyframe, read_envelope):
+        for read in (decode, read_envelope):
             with pytest.raises(CodecError, match=says):
                 read(bad)
     peak = tracemalloc.get_traced_memory()[1]
@@ -232,7 +219,7 @@ def test_a_keyframe_is_bounded_as_a_whole_before_anything_is_allocated() -> None
         intrinsics=CameraIntrinsics(**lens(size[1], size[0])),
     )
     with pytest.raises(CodecError, match="4096x4096"):
-        encode_keyframe(LabelledKeyframe(large, NYU40))
+        encode(LabelledKeyframe(large, NYU40))
 
 
 def with_header(parts: list[bytes], **changes: object) -> list[bytes]:
@@ -259,7 +246,7 @@ def lens(width: int, height: int) -> dict[str, float]:
         ({"seq": True}, "seq"),
         ({"stamp_ns": 2**64 - 1}, "stamp_ns"),
         ({"pose_sigma": float("nan")}, "pose_sigma"),
-        ({"T_world_camera": [float("inf")] * 16}, r"T_world_camera\[0\] is inf"),
+        ({"T_world_camera": [float("inf")] * 16}, r"finite numbers .*T_world_camera\[0\]"),
         ({"T_world_camera": [0.0] * 15}, "T_world_camera"),
         ({"colour": 1}, "unknown field `colour`"),
         ({"camera_id": "a/b"}, "camera_id"),
@@ -271,7 +258,7 @@ def lens(width: int, height: int) -> dict[str, float]:
 )
 def test_a_wrong_header_is_refused_by_its_field(changes: dict[str, object], complaint: str) -> None:
     with pytest.raises(CodecError, match=complaint):
-        decode_frame(with_header(encode_frame(samples.make_frame()), **changes))
+        decode_as(PosedFrame, with_header(encode_frame(samples.make_frame()), **changes))
 
 
 @pytest.mark.parametrize(
@@ -288,8 +275,8 @@ def test_an_absurd_size_is_refused_before_anything_is_allocated(width: int, heig
     parts = encode_frame(samples.make_frame(), options)
     intrinsics = {**msgpack.unpackb(parts[1])["intrinsics"], "width": width, "height": height}
     tracemalloc.start()
-    with pytest.raises(CodecError, match="pixels are accepted"):
-        decode_frame(with_header(parts, intrinsics=intrinsics))
+    with pytest.raises(CodecError, match="is too large"):
+        decode_as(PosedFrame, with_header(parts, intrinsics=intrinsics))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 2**20
@@ -299,7 +286,7 @@ def test_an_absurd_size_is_refused_before_anything_is_allocated(width: int, heig
 def test_buffers_that_do_not_fit_the_announced_size_are_refused(options: CodecOptions) -> None:
     parts = encode_frame(samples.make_frame(), options)
     with pytest.raises(CodecError, match="4000x3000"):
-        decode_frame(with_header(parts, intrinsics=lens(4000, 3000)))
+        decode_as(PosedFrame, with_header(parts, intrinsics=lens(4000, 3000)))
 
 
 def test_a_compression_bomb_is_refused_before_it_unfolds() -> None:
@@ -309,7 +296,7 @@ def test_a_compression_bomb_is_refused_before_it_unfolds() -> None:
     parts = encode_frame(samples.make_frame(depth=False))
     parts = with_header(parts, label={"encoding": "u8_zstd", "bytes": len(bomb)})
     with pytest.raises(CodecError, match="announce 1000000000 bytes"):
-        decode_frame([*parts[:3], bomb])
+        decode_as(PosedFrame, [*parts[:3], bomb])
 
 
 def test_a_frame_that_could_not_be_decoded_is_not_encoded() -> None:
@@ -328,7 +315,7 @@ def test_a_cut_image_is_refused_not_painted_grey(rgb, cut: int) -> None:
     parts = encode_frame(samples.make_frame(depth=False, label=False), CodecOptions(rgb=rgb))
     image = parts[2][:-cut]
     with pytest.raises(CodecError):
-        decode_frame(with_header([*parts[:2], image], rgb={"encoding": rgb, "bytes": len(image)}))
+        decode_as(PosedFrame, with_header([*parts[:2], image], rgb={"encoding": rgb, "bytes": len(image)}))
 
 
 def test_ten_thousand_random_and_mutated_messages_raise_nothing_but_codec_errors() -> None:
@@ -366,6 +353,6 @@ def test_framing_bombs_are_refused(payload: bytes) -> None:
 def test_a_small_png_that_would_take_gigabytes_is_refused() -> None:
     parts = unpack_parts((Path(__file__).with_name("crashers") / "png-bomb.msg").read_bytes())
     with pytest.raises(CodecError, match=r"PNG image|bad header"):
-        decode_frame(parts)
+        decode_as(PosedFrame, parts)
     with pytest.raises(CodecError, match="PNG image"):
         sniff_image(parts[2])

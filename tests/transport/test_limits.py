@@ -10,8 +10,7 @@ import zmq
 
 from semantic_mapper.errors import TransportError
 from semantic_mapper.transport.codec import encode_frame
-from semantic_mapper.transport.headers import MAX_KEYFRAME_BYTES
-from semantic_mapper.transport.messages import LabelledKeyframe
+from semantic_mapper.transport.messages import MAX_KEYFRAME_BYTES, LabelledKeyframe
 from semantic_mapper.transport.query_sockets import QueryServer, QuerySocket
 from semantic_mapper.transport.receiving import MAX_MESSAGE_BYTES, receive_bounded
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber

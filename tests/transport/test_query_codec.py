@@ -10,20 +10,14 @@ from hypothesis import strategies as st
 
 from semantic_mapper.errors import CodecError, LabelError, MapError, TransportError, WeightsError
 from semantic_mapper.transport import query_messages as messages
-from semantic_mapper.transport.query_codec import (
-    decode_answer,
-    decode_request,
-    encode_answer,
-    encode_error,
-    encode_request,
-)
+from semantic_mapper.transport.codec import decode_answer, decode_request, encode_answer, encode_error, encode_request
 
 ABOUT = {"map_id": "m", "version": 7, "epoch": 1}
 POINTS = np.random.default_rng(3).normal(size=(5, 3))
 
 
 def at_request(points: np.ndarray = POINTS) -> list[bytes]:
-    return encode_request("at", messages.AtRequest(radius_m=0.1), {"points": points})
+    return encode_request("at", messages.AtRequest(points=points, radius_m=0.1))
 
 
 def with_header(parts: list[bytes], **changes: object) -> list[bytes]:
@@ -32,12 +26,12 @@ def with_header(parts: list[bytes], **changes: object) -> list[bytes]:
 
 
 def test_a_question_arrives_as_it_was_asked() -> None:
-    kind, header, arrays = decode_request(at_request(POINTS[::2]))
-    assert kind == "at" and isinstance(header, messages.AtRequest) and header.radius_m == 0.1
-    np.testing.assert_array_equal(arrays["points"], POINTS[::2])
-    arrays["points"][0] = 0  # its own memory
-    kind, header, arrays = decode_request(encode_request("at", messages.AtRequest(), {"points": np.empty((0, 3))}))
-    assert arrays["points"].shape == (0, 3)
+    kind, request = decode_request(at_request(POINTS[::2]))
+    assert kind == "at" and isinstance(request, messages.AtRequest) and request.radius_m == 0.1
+    np.testing.assert_array_equal(request.points, POINTS[::2])
+    request.points[0] = 0  # its own memory
+    kind, request = decode_request(at_request(np.empty((0, 3))))
+    assert isinstance(request, messages.AtRequest) and request.points.shape == (0, 3)
 
 
 def test_an_answer_arrives_as_it_was_given(rng: np.random.Generator) -> None:
@@ -48,24 +42,24 @@ def test_an_answer_arrives_as_it_was_given(rng: np.random.Generator) -> None:
         "confidence": np.zeros((4, 512), np.uint8),
         "rgb": rng.integers(0, 255, (4, 512, 3), np.uint8),
     }
-    parts = encode_answer("changes", messages.ChangesAnswer(**ABOUT, since=3, newest=9), given)
-    header, arrays = decode_answer("changes", messages.ChangesAnswer, parts)
-    assert (header.map_id, header.since, header.version, header.epoch, header.newest) == ("m", 3, 7, 1, 9)
+    parts = encode_answer("changes", messages.ChangesAnswer(**ABOUT, since=3, newest=9, **given))
+    answer = decode_answer("changes", messages.ChangesAnswer, parts)
+    assert (answer.map_id, answer.since, answer.version, answer.epoch, answer.newest) == ("m", 3, 7, 1, 9)
     for name, values in given.items():
-        np.testing.assert_array_equal(arrays[name], values)
-        assert arrays[name].dtype == values.dtype
+        np.testing.assert_array_equal(getattr(answer, name), values)
+        assert getattr(answer, name).dtype == values.dtype
     far = np.array([np.inf, 1.5], np.float32)
     found = {"label": np.ones(2), "confidence": np.ones(2), "distance_m": far, "state": np.ones(2)}
-    _, arrays = decode_answer("at", messages.AnswerHeader, encode_answer("at", messages.AnswerHeader(**ABOUT), found))
-    np.testing.assert_array_equal(arrays["distance_m"], far)
+    parts = encode_answer("at", messages.AtAnswer(**ABOUT, **found))
+    np.testing.assert_array_equal(decode_answer("at", messages.AtAnswer, parts).distance_m, far)
 
 
 @pytest.mark.parametrize("error", [MapError("the box is empty"), LabelError("no class"), CodecError("é" * 9000)])
 def test_an_error_is_raised_on_the_other_side(error: Exception) -> None:
     with pytest.raises(type(error), match=str(error)[:100]):
-        decode_answer("at", messages.AnswerHeader, encode_error(error))  # type: ignore[arg-type]
+        decode_answer("at", messages.AtAnswer, encode_error(error))  # type: ignore[arg-type]
     with pytest.raises(TransportError, match="no weights"):  # one that no query raises
-        decode_answer("at", messages.AnswerHeader, encode_error(WeightsError("no weights")))
+        decode_answer("at", messages.AtAnswer, encode_error(WeightsError("no weights")))
 
 
 @pytest.mark.parametrize(
@@ -99,8 +93,8 @@ def test_what_is_no_question_is_refused(parts: list[bytes], says: str) -> None:
 
 def test_answers_are_bounded_before_anything_is_decompressed() -> None:
     gives = {"state": np.zeros((4, 4, 4), np.uint8), "distance_m": np.zeros((4, 4, 4), np.float32)}
-    header = messages.DistanceAnswer(**ABOUT, origin_m=(0.0, 0.0, 0.0), voxel_size_m=0.1)
-    parts = encode_answer("distance_field", header, gives)
+    header = messages.DistanceAnswer(**ABOUT, origin_m=(0.0, 0.0, 0.0), voxel_size_m=0.1, **gives)
+    parts = encode_answer("distance_field", header)
     specs = msgpack.unpackb(parts[1])["arrays"]
     for shape, says in (([1 << 11] * 3, "are accepted"), ([4, 4, 5], "different lengths"), ([4, 16], "expected")):
         bad = with_header(parts, arrays=[specs[0], {**specs[1], "shape": shape}])
@@ -112,7 +106,7 @@ def test_answers_are_bounded_before_anything_is_decompressed() -> None:
             "distance_field", messages.DistanceAnswer, [*with_header(parts, arrays=both)[:2], bytes(512), parts[3]]
         )
     with pytest.raises(CodecError, match="got one to 'distance_field'"):
-        decode_answer("at", messages.AnswerHeader, parts)
+        decode_answer("at", messages.AtAnswer, parts)
 
 
 @given(st.data())
@@ -123,7 +117,7 @@ def test_no_mutation_of_a_question_raises_anything_but_codec_errors(data: st.Dat
         at = data.draw(st.integers(0, len(part)))
         part[at : at + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=4))
     try:
-        _, _, arrays = decode_request(parts)
+        _, request = decode_request(parts)
     except CodecError:
         return
-    assert all(a.ndim == 2 and a.shape[1] == 3 for a in arrays.values())
+    assert isinstance(request, messages.AtRequest) and request.points.ndim == 2 and request.points.shape[1] == 3

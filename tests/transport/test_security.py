@@ -13,11 +13,11 @@ import structlog
 import zmq
 
 from semantic_mapper.errors import TransportError
+from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.endpoints import check_connect
 from semantic_mapper.transport.messages import Status
 from semantic_mapper.transport.query_sockets import QueryServer, QuerySocket
 from semantic_mapper.transport.security import Keys, ServerIdentity, allow, forget, load_keys, make_keys
-from semantic_mapper.transport.small_messages import encode_status
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
 
 STATUS = Status(node="mapper", state="running", stamp_ns=1)
@@ -120,7 +120,7 @@ def test_topics_reach_peers_alone(
         subscriber(publisher.endpoint, ("status",)) as clear,
     ):
         peer.wait_until_heard(10)
-        publisher.publish(encode_status(STATUS))
+        publisher.publish(encode(STATUS))
         assert peer.receive(10) == STATUS
         assert other.receive(0.2) is None and clear.receive(0) is None
         with pytest.raises(TransportError, match="Does it know this machine's key"):

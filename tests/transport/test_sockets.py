@@ -12,7 +12,7 @@ import pytest
 import zmq
 
 from semantic_mapper.errors import TransportError
-from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info, encode_status
+from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
 from semantic_mapper.types import PosedFrame
@@ -69,7 +69,7 @@ def test_nothing_is_lost_between_a_blocking_publisher_and_a_slow_lossless_subscr
         def send() -> None:
             for seq in range(count):
                 publisher.publish(encode_frame(samples.make_frame(seq)), WAIT_S)
-            publisher.publish(encode_end(EndOfStream("front", "end", count)), WAIT_S)
+            publisher.publish(encode(EndOfStream("front", "end", count)), WAIT_S)
 
         sender = threading.Thread(target=send)
         sender.start()
@@ -91,7 +91,7 @@ def test_no_heartbeat_that_would_end_the_process_of_a_slow_reader(endpoint: str)
 
 
 def test_a_blocking_publisher_names_a_subscriber_that_hangs(endpoint: str) -> None:
-    big = [*encode_end(EndOfStream("front", "end", 0)), bytes(2**20)]  # fills the kernel's buffers soon
+    big = [*encode(EndOfStream("front", "end", 0)), bytes(2**20)]  # fills the kernel's buffers soon
     with (
         Publisher(endpoint, policy="block", hwm=1, linger_ms=0) as publisher,
         LosslessSubscriber(endpoint, ["end"], hwm=1) as subscriber,
@@ -112,7 +112,7 @@ def test_the_newest_frame_wins_and_the_end_does_not_overtake_it(endpoint: str) -
         for seq in range(20):
             publisher.publish(encode_frame(samples.make_frame(seq)))
             publisher.publish(encode_frame(samples.make_frame(seq, camera_id="back")))
-        publisher.publish(encode_end(EndOfStream("player", "end", 20)))
+        publisher.publish(encode(EndOfStream("player", "end", 20)))
         eventually(lambda: subscriber.overwritten == 38)
         messages = [subscriber.receive(WAIT_S) for _ in range(3)]
         assert subscriber.receive(0.01) is None
@@ -126,16 +126,16 @@ def test_messages_marked_all_never_give_way(endpoint: str) -> None:
     with Publisher(endpoint) as publisher, NewestSubscriber(endpoint, ["end"]) as subscriber:
         subscriber.wait_until_heard(WAIT_S)
         for number in range(5):
-            publisher.publish(encode_end(EndOfStream("front", "end", number)))
+            publisher.publish(encode(EndOfStream("front", "end", number)))
         ends = [subscriber.receive(WAIT_S) for _ in range(5)]
     assert [end.published for end in ends if isinstance(end, EndOfStream)] == list(range(5))
 
 
 def test_a_late_subscriber_gets_the_stream_info_and_the_last_status(endpoint: str) -> None:
     with Publisher(endpoint) as publisher:
-        publisher.publish(encode_info(samples.make_info()))
+        publisher.publish(encode(samples.make_info()))
         for stamp in range(3):
-            publisher.publish(encode_status(Status("camera", "running", stamp)))
+            publisher.publish(encode(Status("camera", "running", stamp)))
         with LosslessSubscriber(endpoint, ["info", "status"]) as subscriber:
             received = [subscriber.receive(WAIT_S), subscriber.receive(WAIT_S)]
     assert received == [samples.make_info(), Status("camera", "running", 2)]
@@ -144,8 +144,8 @@ def test_a_late_subscriber_gets_the_stream_info_and_the_last_status(endpoint: st
 def test_who_comes_after_the_end_of_a_stream_is_told_of_it_until_another_begins(endpoint: str) -> None:
     topics = ["info", "frame", "end"]
     with Publisher(endpoint) as publisher:
-        publisher.publish(encode_info(samples.make_info(), "player"))
-        publisher.publish(encode_end(EndOfStream("player", "end", 7)))
+        publisher.publish(encode(samples.make_info(), sender="player"))
+        publisher.publish(encode(EndOfStream("player", "end", 7)))
         with LosslessSubscriber(endpoint, topics) as subscriber:
             assert [subscriber.receive(WAIT_S) for _ in range(2)] == [
                 samples.make_info(),
@@ -156,7 +156,7 @@ def test_who_comes_after_the_end_of_a_stream_is_told_of_it_until_another_begins(
                 samples.make_info(),
                 EndOfStream("player", "end", 7),
             ]
-        publisher.publish(encode_info(samples.make_info(), "player"))
+        publisher.publish(encode(samples.make_info(), sender="player"))
         with LosslessSubscriber(endpoint, topics) as subscriber:
             assert subscriber.receive(WAIT_S) == samples.make_info()
             subscriber.wait_until_heard(WAIT_S)
@@ -172,8 +172,8 @@ def test_a_subscriber_may_listen_to_several_publishers(endpoint: str) -> None:
     ):
         subscriber.wait_until_heard(WAIT_S)
         assert subscriber.connections() == 2
-        one.publish(encode_info(StreamInfo("one")))
-        two.publish(encode_info(StreamInfo("two"), sender="b"))
+        one.publish(encode(StreamInfo("one")))
+        two.publish(encode(StreamInfo("two"), sender="b"))
         received = {info.source for info in (subscriber.receive(WAIT_S), subscriber.receive(WAIT_S)) if info}  # type: ignore[union-attr]
     assert received == {"one", "two"}
 
@@ -222,7 +222,7 @@ def test_ten_thousand_bad_messages_do_not_harm_a_living_subscriber(endpoint: str
             stranger.send_multipart(parts)
             sent += 1
         stranger.send_multipart(encode_frame(samples.make_frame(4242)))
-        stranger.send_multipart(encode_end(EndOfStream("player", "end", sent)))
+        stranger.send_multipart(encode(EndOfStream("player", "end", sent)))
         last_frame = None
         while not isinstance(message := subscriber.receive(WAIT_S), EndOfStream):
             assert message is not None, "the good messages did not arrive"
@@ -298,7 +298,7 @@ def test_the_endpoint_of_a_killed_publisher_is_free_again(endpoint: str) -> None
     child.stdout.close()
     with Publisher(endpoint) as publisher, LosslessSubscriber(endpoint, ["end"]) as subscriber:
         subscriber.wait_until_heard(WAIT_S)
-        publisher.publish(encode_end(EndOfStream("a", "end", 1)))
+        publisher.publish(encode(EndOfStream("a", "end", 1)))
         assert subscriber.receive(WAIT_S) == EndOfStream("a", "end", 1)
 
 
@@ -332,7 +332,7 @@ def test_loopback_tcp_works_with_any_free_port() -> None:
         LosslessSubscriber(publisher.endpoint, ["end"]) as subscriber,
     ):
         subscriber.wait_until_heard(WAIT_S)
-        publisher.publish(encode_end(EndOfStream("a", "end", 1)))
+        publisher.publish(encode(EndOfStream("a", "end", 1)))
         assert subscriber.receive(WAIT_S) == EndOfStream("a", "end", 1)
 
 
@@ -340,7 +340,7 @@ def test_the_last_message_before_close_is_delivered(endpoint: str) -> None:
     with LosslessSubscriber(endpoint, ["end"]) as subscriber:
         with Publisher(endpoint) as publisher:
             subscriber.wait_until_heard(WAIT_S)
-            publisher.publish(encode_end(EndOfStream("a", "stopped", 1)))
+            publisher.publish(encode(EndOfStream("a", "stopped", 1)))
         assert subscriber.receive(WAIT_S) == EndOfStream("a", "stopped", 1)
 
 

@@ -24,8 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import ConfigError, MapError
-from semantic_mapper.files import open_regular
-from semantic_mapper.mapping.files.atomic_file import replacing
+from semantic_mapper.files import atomic_write, open_regular
 from semantic_mapper.mapping.files.map_manifest import (
     MEND,
     MapChunk,
@@ -77,20 +76,26 @@ def write_map(path: Path, manifest: MapManifest, parts: Iterable[BlockPart]) -> 
     chunks: list[MapChunk] = []
     corners: list[NDArray[np.int32]] = []
     dtypes = _dtypes(manifest)
-    with (
-        replacing(path) as file,
-        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=_COMPRESSION_LEVEL) as archive,
-    ):
-        for keys, values in parts:
-            chunks.append(_write_chunk(archive, len(chunks), keys, values, dtypes))
-            corners += [keys.min(axis=0), keys.max(axis=0) + 1]
-        blocks = sum(chunk.blocks for chunk in chunks)
-        bounds = _bounds_m(corners, manifest.config.voxel_size_m)
-        manifest = msgspec.structs.replace(manifest, blocks=blocks, bounds_m=bounds, chunks=tuple(chunks))
-        content = encode_manifest(manifest)
-        with archive.open(_MANIFEST, "w") as member:
-            member.write(content)
-        archive.comment = _COMMENT + digest(content).encode()
+    try:
+        with (
+            atomic_write(path, sync="folder") as file,
+            zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=_COMPRESSION_LEVEL) as archive,
+        ):
+            for keys, values in parts:
+                chunks.append(_write_chunk(archive, len(chunks), keys, values, dtypes))
+                corners += [keys.min(axis=0), keys.max(axis=0) + 1]
+            blocks = sum(chunk.blocks for chunk in chunks)
+            bounds = _bounds_m(corners, manifest.config.voxel_size_m)
+            manifest = msgspec.structs.replace(manifest, blocks=blocks, bounds_m=bounds, chunks=tuple(chunks))
+            content = encode_manifest(manifest)
+            with archive.open(_MANIFEST, "w") as member:
+                member.write(content)
+            archive.comment = _COMMENT + digest(content).encode()
+    except OSError as error:
+        raise MapError(
+            f"{path}: cannot write the map: {error.strerror or error}. What is there is whole, the old map or the new "
+            "one; make room, or choose another folder"
+        ) from error
     return manifest
 
 

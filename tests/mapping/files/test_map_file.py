@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.mapping.files.atomic_file import replacing
+from semantic_mapper.files import atomic_write
 from semantic_mapper.mapping.files.map_file import describe_map, open_map
 from semantic_mapper.mapping.files.map_manifest import CHUNK_BLOCKS
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -245,7 +245,7 @@ def test_what_a_killed_save_left_is_removed_and_two_saves_do_not_mix(saved: tupl
     voxel_map, path = saved
     part = path.with_name(".map.npz.0123456789ab.part")
     part.write_bytes(b"x" * 1_000_000)
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         assert not part.exists()
         file.write(b"another writer")
         voxel_map.save(path)

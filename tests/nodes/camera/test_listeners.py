@@ -16,7 +16,8 @@ from semantic_mapper.nodes.camera.listeners import drain
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
-from semantic_mapper.transport.codec import CodecOptions, encode_end, encode_frame, encode_info
+from semantic_mapper.transport.codec import encode, encode_frame
+from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import EndOfStream, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
@@ -87,7 +88,7 @@ def test_a_live_reader_whose_queue_was_full_at_the_end_hears_of_it(
             subscriber.wait_until_heard(PATIENCE_S)
         for _ in range(30):
             publisher.publish(BIG)
-        publisher.publish(encode_end(END))
+        publisher.publish(encode(END))
         assert awake.receive(PATIENCE_S) == END
         with draining(publisher):
             came = until_end(suspended)
@@ -108,7 +109,7 @@ def test_a_lossless_stream_whose_end_found_no_room_says_it_once_there_is_some(
         while fits(publisher):
             sent += 1
         with pytest.raises(TransportError, match="has taken nothing"):
-            publisher.publish(encode_end(END), timeout_s=0.2)
+            publisher.publish(encode(END), timeout_s=0.2)
         with draining(publisher):
             assert until_end(suspended) == [BIG[0]] * sent
             suspended.close()
@@ -119,8 +120,8 @@ def test_who_comes_when_all_is_over_does_not_keep_the_camera(endpoint: str, kind
     info = StreamInfo("room")
     with Publisher(endpoint) as publisher, LosslessSubscriber(endpoint, ("frame",)) as keeps_it:
         keeps_it.wait_until_heard(PATIENCE_S)
-        publisher.publish(encode_info(info, "camera"))
-        publisher.publish(encode_end(END))
+        publisher.publish(encode(info, sender="camera"))
+        publisher.publish(encode(END))
         with draining(publisher):
             with kind(endpoint, TOPICS) as late:
                 assert [late.receive(PATIENCE_S) for _ in range(2)] == [info, END]

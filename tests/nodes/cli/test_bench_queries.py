@@ -11,7 +11,7 @@ from semantic_mapper.errors import TransportError
 from semantic_mapper.nodes.cli import bench_queries
 from semantic_mapper.nodes.cli.bench_client import KINDS
 from semantic_mapper.nodes.mapper.query_service import QueryService
-from semantic_mapper.transport.query_codec import encode_error
+from semantic_mapper.transport.codec import encode_error
 from tests.nodes.support import run
 from tests.small import tiny_config
 

@@ -97,6 +97,7 @@ def test_maps_are_named_by_file_or_folder(results: Path, tmp_path: Path) -> None
     assert map_path(results) == results / "map.npz" == map_path(results / "map.npz")
     with pytest.raises(ConfigError, match="no map"):
         map_path(tmp_path)
+    (tmp_path / "day.mcap").touch()
     with pytest.raises(ConfigError, match=r"day\.mcap: is a log; `semantic-mapper replay .*` makes a map of it"):
         map_path(tmp_path / "day.mcap")
     with pytest.raises(ConfigError, match="the map itself"):

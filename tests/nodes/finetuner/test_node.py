@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from semantic_mapper.errors import ConfigError
@@ -28,9 +29,8 @@ from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.nodes.supervisor.launch_config import load_launch
 from semantic_mapper.training.keyframe_pool import Lessons
 from semantic_mapper.training.online import OnlineConfig
-from semantic_mapper.transport.codec import encode_in_use, encode_keyframe
-from semantic_mapper.transport.learning_messages import digest_of
-from semantic_mapper.transport.messages import LabelledKeyframe, Status, WeightsInUse, WeightsUpdate
+from semantic_mapper.transport.codec import encode
+from semantic_mapper.transport.messages import LabelledKeyframe, Status, WeightsInUse, WeightsUpdate, digest_of
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
 from tests.nodes.mapper.test_live_correction import running_robot
 from tests.nodes.mapper.test_query_service import a_folder
@@ -82,7 +82,7 @@ class Heard:
         with Publisher(self.endpoints["labels"], policy="block") as publisher:
             publisher.wait_for_subscribers("keyframe", timeout_s=60)
             for frame in frames:
-                publisher.publish(encode_keyframe(LabelledKeyframe(frame, ROOMS, teacher)))
+                publisher.publish(encode(LabelledKeyframe(frame, ROOMS, teacher)))
 
 
 @contextmanager
@@ -113,7 +113,7 @@ def played_mapper(start: Path) -> Iterator[tuple[Heard, Publisher]]:
     with a_folder() as folder:
         endpoints = {name: f"ipc://{folder / name}" for name in ("mapper", "finetuner", "labels")}
         with Publisher(endpoints["mapper"]) as mapper, finetuning(start, endpoints) as heard:
-            mapper.publish(encode_in_use(WeightsInUse("mapper", 0, digest_of(start.read_bytes()))))
+            mapper.publish(encode(WeightsInUse("mapper", 0, digest_of(start.read_bytes()))))
             yield heard, mapper
 
 
@@ -129,7 +129,7 @@ def test_keyframes_become_weights_and_what_the_mapper_says_of_them_counts(start:
         made = load_checkpoint(tmp_path / "first.safetensors")
         assert made.recipe["kind"] == "online" and made.recipe["parent"] == first.parent and made.recipe["version"] == 1
         assert eventually(lambda: heard.counters().get("offered") == 1 and heard.counters()["unusable"] == 1)
-        mapper.publish(encode_in_use(WeightsInUse("mapper", 1, first.digest, 1, 1, accepted=True)))
+        mapper.publish(encode(WeightsInUse("mapper", 1, first.digest, 1, 1, accepted=True)))
         assert eventually(lambda: heard.counters().get("taken") == 1 and heard.counters()["new"] == 0)
         # Labels that contradict those which have proved right: rejected here, and forgotten.
         heard.teach([permuted(f) for f in FRAMES[4:]], "bad")
@@ -137,15 +137,15 @@ def test_keyframes_become_weights_and_what_the_mapper_says_of_them_counts(start:
         assert heard.counters()["set_aside"] == 4 and heard.counters()["kept"] == 4
         assert heard.last is not None and "the last weights were refused" in heard.last.degraded[0]
         # Going back: keyframes that only those weights were made with are forgotten, too.
-        mapper.publish(encode_in_use(WeightsInUse("mapper", 0, first.parent, 1, 1, accepted=True, rolled_back=1)))
+        mapper.publish(encode(WeightsInUse("mapper", 0, first.parent, 1, 1, accepted=True, rolled_back=1)))
         assert eventually(lambda: heard.counters().get("kept") == 0)
         heard.teach(FRAMES[:4])
         second = heard.update()
         assert (second.version, second.parent) == (2, first.parent)
         refusal = WeightsInUse("mapper", 0, first.parent, 2, 2, accepted=False, reason="no", rolled_back=1)
-        mapper.publish(encode_in_use(dataclasses.replace(refusal, contradicts=True)))
+        mapper.publish(encode(msgspec.structs.replace(refusal, contradicts=True)))
         assert eventually(lambda: heard.counters().get("refused") == 2 and heard.counters()["kept"] == 0)
-        mapper.publish(encode_in_use(WeightsInUse("mapper", 0, "ab" * 32, 2, 2, reason="no", rolled_back=1)))
+        mapper.publish(encode(WeightsInUse("mapper", 0, "ab" * 32, 2, 2, reason="no", rolled_back=1)))
         assert eventually(lambda: heard.counters() and "does not know" in heard.last.degraded[-1])  # pyright: ignore
 
 
@@ -162,12 +162,12 @@ def test_a_restarted_finetuner_goes_on_with_the_weights_and_keyframes_of_the_one
 
         with Publisher(endpoints["mapper"]) as mapper:
             with runs(0) as heard:
-                mapper.publish(encode_in_use(WeightsInUse("mapper", 0, digest_of(start.read_bytes()))))
+                mapper.publish(encode(WeightsInUse("mapper", 0, digest_of(start.read_bytes()))))
                 heard.teach(FRAMES[:4])
                 first = heard.update()
                 kept.parent.mkdir()
                 kept.write_bytes(first.data)  # as a mapper does
-                mapper.publish(encode_in_use(WeightsInUse("mapper", 1, first.digest, 1, 1, accepted=True)))
+                mapper.publish(encode(WeightsInUse("mapper", 1, first.digest, 1, 1, accepted=True)))
                 assert eventually(lambda: heard.counters().get("taken") == 1)
                 heard.teach(FRAMES[4:6])
                 assert eventually(lambda: heard.counters()["kept"] == 6)
@@ -209,7 +209,7 @@ def test_a_round_that_fails_or_dies_keeps_its_keyframes_for_the_next(
     with a_folder() as folder:
         endpoints = {name: f"ipc://{folder / name}" for name in ("mapper", "finetuner", "labels")}
         with Publisher(endpoints["mapper"]) as mapper:
-            mapper.publish(encode_in_use(WeightsInUse("mapper", 0, digest_of(start.read_bytes()))))
+            mapper.publish(encode(WeightsInUse("mapper", 0, digest_of(start.read_bytes()))))
             with finetuning(start, endpoints, out=str(tmp_path / "out"), retry_s=60.0) as heard:
                 heard.teach(FRAMES[:4])
                 assert under_way.wait(60) and eventually(lambda: heard.counters()["learning"] == 1)
@@ -225,7 +225,7 @@ def test_a_round_that_fails_or_dies_keeps_its_keyframes_for_the_next(
                 assert (update.keyframes, update.held_out) == (3, 1) and heard.counters()["failed"] == 1
                 # What hinders the mapper from taking weights says nothing about the labels, either.
                 refusal = WeightsInUse("mapper", 0, update.parent, 1, 1, reason="000001.safetensors: no space left")
-                mapper.publish(encode_in_use(refusal))
+                mapper.publish(encode(refusal))
                 assert eventually(lambda: heard.counters()["failed"] == 2)
                 assert (heard.counters()["kept"], heard.counters()["refused"]) == (4, 1)
 
@@ -261,7 +261,7 @@ def test_a_round_that_gets_no_processor_holds_up_neither_messages_nor_the_end(
         with played_mapper(start) as (heard, mapper):
             heard.teach(FRAMES[:4])
             assert under_way.wait(60)
-            mapper.publish(encode_in_use(WeightsInUse("mapper", 1, "ab" * 32, 1, 1)))  # the round is given up
+            mapper.publish(encode(WeightsInUse("mapper", 1, "ab" * 32, 1, 1)))  # the round is given up
             assert eventually(lambda: bool(heard.counters() and heard.last.degraded), 20)  # pyright: ignore
             assert "does not know" in heard.last.degraded[-1]  # pyright: ignore
             heard.teach(FRAMES[4:6])

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from structlog.testing import capture_logs
@@ -31,9 +32,8 @@ from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport import query_messages as messages
-from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info
+from semantic_mapper.transport.codec import encode, encode_frame, encode_request
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
-from semantic_mapper.transport.query_codec import encode_request
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import Float64, PosedFrame
 from tests.mapping.correction.test_corrected_map import drifted, true_poses
@@ -67,7 +67,7 @@ class Robot:
 
     def end(self, published: int) -> dict[str, object]:
         """End the stream; the summary."""
-        self.camera.publish(encode_end(EndOfStream("test", "end", published)))
+        self.camera.publish(encode(EndOfStream("test", "end", published)))
         self.thread.join(100)
         assert not self.thread.is_alive()
         return json.loads((self.out / "summary.json").read_text())
@@ -107,7 +107,7 @@ def running_robot(
 
                 ear = threading.Thread(target=listen)
                 ear.start()
-                camera.publish(encode_info(StreamInfo("test", {"rooms": INTRINSICS}, label_set=ROOMS, frame_hz=10.0)))
+                camera.publish(encode(StreamInfo("test", {"rooms": INTRINSICS}, label_set=ROOMS, frame_hz=10.0)))
                 try:
                     yield Robot(camera, endpoints["query"], out, status, mapper, stop, endpoints, weights)
                 finally:
@@ -283,26 +283,24 @@ def test_a_request_that_arrives_twice_counts_once(bundle_of):
     session = session_of(bundle_of(), drifted(frames))
     with answered(session.pipeline) as (correction, client):
         stranger = Stranger(client._socket.endpoint)
-        request = messages.CorrectPosesRequest(id="a", cameras=("",))
         arrays = {
             "stamps_ns": np.array([f.stamp_ns for f in frames]),
             "camera": np.zeros(3),
             "poses": np.array([f.T_world_camera for f in frames]),
         }
-        parts = encode_request("correct_poses", request, arrays)
+        request = messages.CorrectPosesRequest(id="a", cameras=("",), **arrays)
+        parts = encode_request("correct_poses", request)
         first = stranger.ask([b"", *parts])
         correction.carry_on(session, mapped=False)
         second = stranger.ask([b"", *parts])
         assert first[0] == second[0] == b"correct_poses"
         assert client.correction().done == 1  # goes on, and was not begun anew
         doubled = {name: np.concatenate((a, a)) for name, a in arrays.items()}
-        again = messages.CorrectPosesRequest(id="b", cameras=("",))
-        assert b"given twice" in stranger.ask([b"", *encode_request("correct_poses", again, doubled)])[1]
-        uneven = {**arrays, "camera": np.zeros(2)}
-        assert (
-            b"3 stamps, 2 cameras and 3 poses"
-            in stranger.ask([b"", *encode_request("correct_poses", again, uneven)])[1]
-        )
+        again = messages.CorrectPosesRequest(id="b", cameras=("",), **doubled)
+        assert b"given twice" in stranger.ask([b"", *encode_request("correct_poses", again)])[1]
+        uneven = msgspec.structs.replace(request, id="b", camera=np.zeros(2))
+        answer = stranger.ask([b"", *encode_request("correct_poses", uneven)])
+        assert b"3 stamps, 2 cameras and 3 poses" in answer[1]
         stranger.socket.close()
         while correction.running:
             correction.carry_on(session, mapped=False)
@@ -346,9 +344,10 @@ def test_what_was_not_finished_is_told(bundle_of, monkeypatch):
         correction.finish(session, lambda: True, lambda: waits.append(1))
     assert len(waits) == 1 and "correction_unfinished" in [e["event"] for e in logs]
     assert session.unfinished_correction.endswith("stopped after 1 of 4 frames")
-    request = messages.CorrectPosesRequest(id="late", cameras=("",))
+    arrays = {"stamps_ns": np.ones(1, np.int64), "camera": np.zeros(1, np.uint8), "poses": np.eye(4)[None]}
+    request = messages.CorrectPosesRequest(id="late", cameras=("",), **arrays)
     with pytest.raises(MapError, match="the stream has ended"):
-        correction.begin(request, {})
+        correction.begin(request)
 
 
 def test_a_correction_that_fails_leaves_the_mapper_running_and_is_told(bundle_of):

@@ -21,9 +21,8 @@ from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.nodes.finetuner.finetune_round import file_of
 from semantic_mapper.training.online import learn
-from semantic_mapper.transport.codec import encode_weights
-from semantic_mapper.transport.learning_messages import digest_of
-from semantic_mapper.transport.messages import WeightsInUse, WeightsUpdate
+from semantic_mapper.transport.codec import encode
+from semantic_mapper.transport.messages import WeightsInUse, WeightsUpdate, digest_of
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from tests.nodes.mapper.test_live_correction import Robot, running_robot
 from tests.nodes.support import eventually, run_here
@@ -56,7 +55,7 @@ class Learner:
         data = data or file_of(checkpoint)
         parent = parent or self.in_use().digest
         self.publisher.publish(
-            encode_weights(WeightsUpdate("finetuner", version, data, digest_of(data), parent, 0.9, 0.5, 3, 1))
+            encode(WeightsUpdate("finetuner", version, data, digest_of(data), parent, 0.9, 0.5, 3, 1))
         )
         assert eventually(lambda: self.in_use().judged == version, 60)
         return self.in_use()

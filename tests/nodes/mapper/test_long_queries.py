@@ -13,14 +13,14 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.errors import MapError
 from semantic_mapper.nodes.mapper import long_queries as long_questions
 from semantic_mapper.nodes.mapper import query_answers, query_service
-from semantic_mapper.nodes.mapper.query_answers import Answer, Answers
+from semantic_mapper.nodes.mapper.query_answers import Answers
 from semantic_mapper.nodes.mapper.query_queue import MAX_OF_ASKER
 from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.occupancy import occupancy
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.transport import query_messages as messages
-from semantic_mapper.transport.query_codec import encode_request
+from semantic_mapper.transport.codec import encode_request
 from tests.nodes.mapper.test_query_service import (
     PLACES,
     Stranger,
@@ -50,7 +50,7 @@ def held(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[t
     hangs, may_go_on = threading.Event(), threading.Event()
     answer = Answers._instances
 
-    def hang(self: Answers, snapshot: MapSnapshot, up: messages.Point) -> Answer:
+    def hang(self: Answers, snapshot: MapSnapshot, up: messages.Point) -> messages.Answer:
         hangs.set()
         assert may_go_on.wait(60)
         return answer(self, snapshot, up)
@@ -61,7 +61,7 @@ def held(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[t
 
 
 def long_question(up: tuple[float, float, float]) -> list[bytes]:
-    return [b"", *encode_request("instances", messages.InstancesRequest(up=up), {})]
+    return [b"", *encode_request("instances", messages.InstancesRequest(up=up))]
 
 
 def two_askers(
@@ -158,7 +158,7 @@ def test_clients_that_time_out_are_answered_in_their_turn(client: MapClient, mon
     """An answer takes longer than a client waits each time; without turns kept, none would ever come."""
     answer, computed = Answers._instances, []
 
-    def slow(self: Answers, snapshot: MapSnapshot, up: messages.Point) -> Answer:
+    def slow(self: Answers, snapshot: MapSnapshot, up: messages.Point) -> messages.Answer:
         computed.append(up)
         threading.Event().wait(0.4)
         return answer(self, snapshot, up)
@@ -184,9 +184,9 @@ def test_checking_corrected_poses_holds_up_no_short_question(
 ) -> None:
     first, second, may_go_on = two_askers(client, held)
     poses = {"stamps_ns": np.ones(1), "camera": np.zeros(1), "poses": np.eye(4)[None]}
-    request = messages.CorrectPosesRequest(id="a", cameras=("",))
-    second.socket.send_multipart([b"", *encode_request("correct_poses", request, poses)])
-    second.socket.send_multipart([b"", *encode_request("info", messages.InfoRequest(), {})])
+    request = messages.CorrectPosesRequest(id="a", cameras=("",), **poses)
+    second.socket.send_multipart([b"", *encode_request("correct_poses", request)])
+    second.socket.send_multipart([b"", *encode_request("info", messages.InfoRequest())])
     assert client.info().version == 14
     assert not second.socket.poll(200)  # nor is its own next question answered before it
     may_go_on.set()

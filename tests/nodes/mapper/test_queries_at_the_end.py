@@ -15,7 +15,7 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.query_service import QueryService
-from semantic_mapper.transport.codec import encode_end
+from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import EndOfStream
 from tests.mapping.correction.test_corrected_map import drifted, true_poses
 from tests.mapping.rendered_views import small_map
@@ -51,7 +51,7 @@ def test_questions_are_answered_while_a_correction_ends_and_while_the_map_is_wri
         robot.send(drifted(frames))
         assert robot.fused(8)
         client.correct_poses(true_poses(frames, 1))
-        robot.camera.publish(encode_end(EndOfStream("test", "end", 8)))
+        robot.camera.publish(encode(EndOfStream("test", "end", 8)))
         assert eventually(lambda: bool(robot.status) and robot.status[-1].state == "stopping")
         before = client.info()
         assert (before.version, before.epoch) == (8, 0) and before.blocks > 0

@@ -28,7 +28,7 @@ from semantic_mapper.queries.nearest import nearest
 from semantic_mapper.queries.occupancy import distance_field, occupancy
 from semantic_mapper.queries.rays import cast_rays
 from semantic_mapper.transport import query_messages as messages
-from semantic_mapper.transport.query_codec import encode_request
+from semantic_mapper.transport.codec import encode_request
 from semantic_mapper.transport.query_sockets import MAX_REQUEST_BYTES
 from semantic_mapper.transport.security import Keys
 from tests.mapping.rendered_views import small_map
@@ -181,7 +181,7 @@ def test_what_would_keep_others_waiting_is_refused(client: MapClient) -> None:
 
 
 def test_answers_that_are_too_large_are_errors(client: MapClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("semantic_mapper.transport.query_codec.MAX_PART_BYTES", 1000)
+    monkeypatch.setattr("semantic_mapper.transport.codec.MAX_PART_BYTES", 1000)
     with pytest.raises(CodecError, match=r"xyz of \d+ bytes, at most 1000"):
         client.points_in_box((-1, -1, -1), (1, 1, 1))
     monkeypatch.undo()
@@ -199,13 +199,13 @@ def good_questions() -> list[list[bytes]]:
     box = messages.BoxRequest(lower=(-1.0, -1.0, -1.0), upper=(1.0, 1.0, 1.0))
     rays = {"origins": PLACES[:2], "directions": PLACES[:2] + 1}
     return [
-        encode_request("info", messages.InfoRequest(), {}),
-        encode_request("at", messages.AtRequest(radius_m=0.1), points),
-        encode_request("nearest", messages.NearestRequest(class_name="cup", point=(0.0, 0.0, 1.0)), {}),
-        encode_request("cast_rays", messages.RaysRequest(max_m=4.0), rays),
-        encode_request("points_in_box", box, {}),
-        encode_request("occupancy", messages.OccupancyRequest(), points),
-        encode_request("changes", messages.ChangesRequest(since=3, limit=5), {}),
+        encode_request("info", messages.InfoRequest()),
+        encode_request("at", messages.AtRequest(radius_m=0.1, **points)),
+        encode_request("nearest", messages.NearestRequest(class_name="cup", point=(0.0, 0.0, 1.0))),
+        encode_request("cast_rays", messages.RaysRequest(max_m=4.0, **rays)),
+        encode_request("points_in_box", box),
+        encode_request("occupancy", messages.OccupancyRequest(**points)),
+        encode_request("changes", messages.ChangesRequest(since=3, limit=5)),
     ]
 
 
@@ -272,12 +272,12 @@ def test_every_number_is_answered(client: MapClient, stranger: Stranger, values:
     rays = {"origins": np.array(values[:6]).reshape(-1, 3), "directions": np.array(values[6:]).reshape(-1, 3)}
     three = tuple(v if np.isfinite(v) else 0.0 for v in values[:3])
     for question in (
-        encode_request("at", messages.AtRequest(radius_m=scalar), points),
-        encode_request("occupancy", messages.OccupancyRequest(), points),
-        encode_request("cast_rays", messages.RaysRequest(max_m=scalar), rays),
-        encode_request("nearest", messages.NearestRequest(class_name="cup", point=three), {}),
-        encode_request("instances", messages.InstancesRequest(up=three), {}),
-        encode_request("distance_field", messages.DistanceRequest(lower=three, upper=(scalar, 1.0, 1.0)), {}),
+        encode_request("at", messages.AtRequest(radius_m=scalar, **points)),
+        encode_request("occupancy", messages.OccupancyRequest(**points)),
+        encode_request("cast_rays", messages.RaysRequest(max_m=scalar, **rays)),
+        encode_request("nearest", messages.NearestRequest(class_name="cup", point=three)),
+        encode_request("instances", messages.InstancesRequest(up=three)),
+        encode_request("distance_field", messages.DistanceRequest(lower=three, upper=(scalar, 1.0, 1.0))),
     ):
         assert stranger.ask([b"", *question])[0] in {b"error", question[0]}
 
@@ -292,7 +292,7 @@ def test_who_sends_too_much_is_cut_off_and_others_are_not(client: MapClient) -> 
 
 def test_a_client_that_takes_no_answers_stops_nobody(client: MapClient) -> None:
     lazy = Stranger(client._socket.endpoint)
-    question = encode_request("points_in_box", messages.BoxRequest(lower=(-1.0,) * 3, upper=(1.0,) * 3), {})
+    question = encode_request("points_in_box", messages.BoxRequest(lower=(-1.0,) * 3, upper=(1.0,) * 3))
     lazy.socket.setsockopt(zmq.RCVHWM, 1)
     for _ in range(300):
         lazy.socket.send_multipart([b"", *question])

@@ -20,7 +20,7 @@ from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import MapperOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
-from semantic_mapper.transport.codec import encode_end, encode_frame, encode_info
+from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, StreamInfo
 from semantic_mapper.transport.sockets import Publisher
 from tests.small import INTRINSICS, tiny_frames
@@ -155,9 +155,9 @@ def map_stream(options: MapperOptions) -> None:
             thread = threading.Thread(target=run_mapper, args=(mapper, options))
             thread.start()
             camera.wait_for_subscribers("frame", timeout_s=200)
-            camera.publish(encode_info(StreamInfo("a wall", {"rooms": INTRINSICS}, ROOMS), "camera"))
+            camera.publish(encode(StreamInfo("a wall", {"rooms": INTRINSICS}, ROOMS), sender="camera"))
             camera.publish(encode_frame(tiny_frames(1)[0]), 120)
-            camera.publish(encode_end(EndOfStream("camera", "end", 1)), 120)
+            camera.publish(encode(EndOfStream("camera", "end", 1)), 120)
             thread.join(200)
             assert not thread.is_alive()
 

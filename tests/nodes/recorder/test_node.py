@@ -39,7 +39,8 @@ from semantic_mapper.nodes.supervisor.running_launches import launch_folder
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.recording import Recording, RecordingRules
 from semantic_mapper.replay.log.sequence import open_log, parts_on_disk
-from semantic_mapper.transport.codec import CodecOptions, encode_end, encode_frame, encode_info, repack_rgb
+from semantic_mapper.transport.codec import encode, encode_frame, repack_rgb
+from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
 from tests.nodes.support import Running, eventually, repeated_frames, run, write_log
@@ -63,7 +64,7 @@ class Stream:
             self.publisher.publish(encode_frame(samples.make_frame(seq)))
 
     def end(self) -> None:
-        self.publisher.publish(encode_end(EndOfStream("camera", "end", 0)))
+        self.publisher.publish(encode(EndOfStream("camera", "end", 0)))
         self.recorder.join(60)
         assert not self.recorder.is_alive() and not self.failures
 
@@ -102,7 +103,7 @@ def streaming(tmp_path: Path, sockets: Path, restarts: int = 0, **options: Any) 
         recorder.start()
         with NewestSubscriber(endpoints["recorder"], ("status",)) as status:
             publisher.wait_for_subscribers("frame", 1, 30)
-            publisher.publish(encode_info(samples.make_info(), "camera"))
+            publisher.publish(encode(samples.make_info(), sender="camera"))
             yield Stream(publisher, recorder, status, failures, stop)
 
 
@@ -121,7 +122,7 @@ def test_a_recorder_whose_log_was_removed_fails(tmp_path: Path, sockets: Path) -
         stream.publish(*range(4))
         assert eventually((tmp_path / "a.mcap").exists, 30)
         (tmp_path / "a.mcap").unlink()
-        stream.publisher.publish(encode_end(EndOfStream("camera", "end", 0)))
+        stream.publisher.publish(encode(EndOfStream("camera", "end", 0)))
         stream.recorder.join(60)
         assert len(stream.failures) == 1 and "a.mcap: was removed while it was written" in str(stream.failures[0])
     events = [entry["event"] for entry in told]

@@ -36,7 +36,7 @@ from semantic_mapper.nodes.viewer.sources import Live, show_live, show_log, show
 from semantic_mapper.queries.ages import BlockAges
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.replay.exporters.rerun_log import MAX_PATH, RerunLog, recording_file, recording_server
-from semantic_mapper.transport.codec import encode_end, encode_frame, encode_map_update, encode_status
+from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, NodeState, Status
 from semantic_mapper.transport.security import ServerIdentity, allow, make_keys
 from semantic_mapper.transport.sockets import Publisher
@@ -204,8 +204,8 @@ def test_a_running_system_is_shown_until_its_stream_ends(tmp_path: Path) -> None
                 assert eventually(lambda: publisher.subscribers("frame") > 0, WARM_S)
                 for frame in frames:
                     publisher.publish(encode_frame(frame))
-                    publisher.publish(encode_map_update(update_for(frame, LABELS.ids[0])))
-                publisher.publish(encode_end(EndOfStream("camera", "end", len(frames))))
+                    publisher.publish(encode(update_for(frame, LABELS.ids[0])))
+                publisher.publish(encode(EndOfStream("camera", "end", len(frames))))
                 assert eventually(lambda: "the stream has ended" in told, 60)
                 assert eventually(lambda: not publisher.subscribers("frame"), 10), "the camera may go"
     rows = logged(tmp_path / "live.rrd")
@@ -224,11 +224,11 @@ def test_several_cameras_are_shown_until_the_last_one_ends(tmp_path: Path) -> No
         stack.enter_context(watching_live(live, tmp_path / "live.rrd", told))
         assert eventually(lambda: bool(left.subscribers("frame") and right.subscribers("frame")), WARM_S)
         left.publish(encode_frame(dataclasses.replace(frame, camera_id="left")))
-        left.publish(encode_end(EndOfStream("left", "end", 1)))
+        left.publish(encode(EndOfStream("left", "end", 1)))
         left.remind("end")  # said again, it is still one camera's
         assert not eventually(lambda: not right.subscribers("frame"), 0.7) and not told, "it goes on"
         right.publish(encode_frame(dataclasses.replace(frame, camera_id="right")))
-        right.publish(encode_end(EndOfStream("right", "end", 1)))
+        right.publish(encode(EndOfStream("right", "end", 1)))
         assert eventually(lambda: "the stream has ended" in told, 60)
     rows = logged(tmp_path / "live.rrd")
     assert rows["/world/cameras/left/image/rgb"] == rows["/world/cameras/right/image/rgb"] == 1
@@ -247,7 +247,7 @@ def test_of_a_launch_the_cameras_that_have_not_ended_are_waited_for() -> None:
                 while not ended.wait(0.1):
                     for name, state in (*states.items(), (STATUS_SOCKET, "running")):
                         counters = {"nodes": len(states)}
-                        publisher.publish(encode_status(Status(name, state, time.monotonic_ns(), counters)))
+                        publisher.publish(encode(Status(name, state, time.monotonic_ns(), counters)))
 
         thread = threading.Thread(target=launcher)
         thread.start()

@@ -20,7 +20,7 @@ from semantic_mapper.labels import NYU40
 from semantic_mapper.nodes.cli.log_info import describe_log
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.recover import recover
-from semantic_mapper.transport.codec import encode_frame, encode_status
+from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.framing import pack_parts
 from semantic_mapper.transport.messages import StreamInfo
 from tests.replay.conftest import FRAMES
@@ -98,7 +98,7 @@ def test_a_log_may_hold_other_messages_beside_frames(tmp_path: Path) -> None:
     with LogWriter(path, StreamInfo("test")) as writer:
         for seq in range(3):
             writer.write_frame(samples.make_frame(seq))
-            writer.write_parts(encode_status(samples.make_status()))
+            writer.write_parts(encode(samples.make_status()))
         assert (writer.frames, writer.messages) == (3, 7)
     with LogReader(path) as reader:
         assert seqs(reader) == [0, 1, 2]

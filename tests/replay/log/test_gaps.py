@@ -34,4 +34,4 @@ def test_time_may_stand_still_while_numbers_go_on() -> None:
 def test_a_restarted_camera_and_stamps_that_go_back_are_no_missing_frames() -> None:
     gaps = find_gaps([7, 8, 0, 1, 2], [0, TENTH, 2 * TENTH, 2 * TENTH, TENTH])
     assert (gaps["frames_missing"], gaps["counter_restarts"], gaps["stamps_not_increasing"]) == (0, 1, 2)
-    assert "begin again 1 times" in gaps_text(gaps)
+    assert "begin again 1 time;" in gaps_text(gaps)

@@ -11,7 +11,7 @@ import pytest
 from semantic_mapper.errors import NodeError, TransportError
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.player import ACK_TOPICS, PlayOptions, PlayReport, play
-from semantic_mapper.transport.codec import encode_frame, encode_map_update, encode_refused
+from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, FrameRefused, Message, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber, Publisher
 from semantic_mapper.types import PosedFrame
@@ -54,7 +54,7 @@ class Mapper:
 
 
 def fuse(frame: PosedFrame) -> list[bytes]:
-    return encode_map_update(samples.make_update(frame.seq, frame.camera_id))
+    return encode(samples.make_update(frame.seq, frame.camera_id))
 
 
 def play_to(
@@ -88,7 +88,7 @@ def test_lockstep_drops_nothing_however_slow_the_mapper_is(small_log: Path, endp
 def test_a_refusal_is_an_answer_too(small_log: Path, endpoint: str) -> None:
     def answer(frame: PosedFrame) -> list[bytes]:
         if frame.seq == 3:
-            return encode_refused(FrameRefused(frame.stamp_ns, 3, frame.camera_id, "pose holds NaN"))
+            return encode(FrameRefused(frame.stamp_ns, 3, frame.camera_id, "pose holds NaN"))
         return fuse(frame)
 
     report, _ = play_to(small_log, endpoint, answer)
@@ -103,7 +103,7 @@ def test_a_mapper_that_does_not_answer_ends_the_playing_with_a_clear_error(small
 
 DYING_MAPPER = """
 import os, sys
-from semantic_mapper.transport.codec import encode_map_update
+from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
 from semantic_mapper.types import PosedFrame
 from tests.transport import samples
@@ -113,7 +113,7 @@ while True:
     frame = frames.receive()
     if frame.seq == 3:
         os.kill(os.getpid(), 9)
-    publisher.publish(encode_map_update(samples.make_update(frame.seq, frame.camera_id)))
+    publisher.publish(encode(samples.make_update(frame.seq, frame.camera_id)))
 """
 
 

@@ -21,7 +21,7 @@ from semantic_mapper.replay.log.format import LogAttachment, LogReader, LogWrite
 from semantic_mapper.replay.log.recording import Recording, RecordingRules
 from semantic_mapper.replay.log.recover import recover
 from semantic_mapper.replay.log.sequence import LogSequence, open_log, parts_on_disk
-from semantic_mapper.transport.codec import encode_frame, encode_info
+from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import StreamInfo
 from tests.transport import samples
 
@@ -110,7 +110,7 @@ def test_each_part_says_what_all_streams_are(tmp_path: Path) -> None:
     two = Recording(
         tmp_path / "a.mcap", INFO, RecordingRules(split_bytes=20_000), recording="two", attachments=lenses[:1]
     )
-    two.announce(encode_info(second, "right"), lenses[1])
+    two.announce(encode(second, sender="right"), lenses[1])
     for seq in range(20):
         write(two, range(seq, seq + 1))
         two.write(encode_frame(replace(samples.make_frame(seq), camera_id="right")))

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.files import atomic_write
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.files.formats.files import whole_file
 from semantic_mapper.mapping.files.up_axis import turn_onto
 from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.types import Float64, UInt8
@@ -82,7 +82,7 @@ def write_glb(path: Path, mesh: MapMesh, label_set: LabelSet, up: Float64) -> No
         raise MapError(
             f"{path}: {total / 2**30:.1f} GiB are more than a GLB can hold; choose ply-mesh or larger voxels"
         )
-    with whole_file(path) as file:
+    with atomic_write(path, raises=MapError) as file:
         file.write(struct.pack("<III", _MAGIC, _VERSION, total))
         file.write(struct.pack("<II", len(text), _JSON) + text)
         file.write(struct.pack("<II", start, _BIN))

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from semantic_mapper.mapping.files.formats.files import whole_file
+from semantic_mapper.errors import MapError
+from semantic_mapper.files import atomic_write
 from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, OccupancyGrid
 
 _FREE_GREY, _OCCUPIED_GREY, _UNKNOWN_GREY = 254, 0, 205
@@ -35,7 +36,7 @@ def write_map_server(path: Path, grid: OccupancyGrid) -> tuple[Path, Path]:
     grey = np.full((rows, columns), _UNKNOWN_GREY, np.uint8)
     grey[grid.cells == FREE] = _FREE_GREY
     grey[grid.cells == OCCUPIED] = _OCCUPIED_GREY
-    with whole_file(picture) as file:
+    with atomic_write(picture, raises=MapError) as file:
         file.write(f"P5\n{columns} {rows}\n255\n".encode())
         file.write(np.ascontiguousarray(grey[::-1]).tobytes())
     x, y = grid.origin_m
@@ -49,6 +50,6 @@ def write_map_server(path: Path, grid: OccupancyGrid) -> tuple[Path, Path]:
         f"free_thresh: {_FREE_BELOW}",
         f"T_grid_world: {np.round(grid.T_grid_world, 9).tolist()}",
     )
-    with whole_file(description) as file:
+    with atomic_write(description, raises=MapError) as file:
         file.write(("\n".join(lines) + "\n").encode())
     return description, picture

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from semantic_mapper.errors import MapError
+from semantic_mapper.files import atomic_write
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.files.formats.files import whole_file
 from semantic_mapper.mapping.map_types import MapPoints
 
 
@@ -20,7 +21,7 @@ def write_npz(path: Path, points: MapPoints, label_set: LabelSet) -> None:
     Raises:
         MapError: the file cannot be written.
     """
-    with whole_file(path) as file:
+    with atomic_write(path, raises=MapError) as file:
         np.savez_compressed(
             file,
             xyz=points.xyz,

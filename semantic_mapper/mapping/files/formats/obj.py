@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from semantic_mapper.errors import MapError
+from semantic_mapper.files import atomic_write
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.files.formats.files import whole_file
 from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.types import UInt8
 
@@ -35,13 +36,13 @@ def write_obj(path: Path, mesh: MapMesh, label_set: LabelSet, *, class_materials
     names[label_set.ignore_id] = _material(label_set.ignore_id, "unknown")
     label = face_labels(mesh)
     used = np.unique(label)
-    with whole_file(library) as file:
+    with atomic_write(library, raises=MapError) as file:
         for class_id in used.tolist():
             color = label_set.colorize(np.array(class_id, np.uint8)) / 255 if class_materials else np.ones(3)
             values = " ".join(f"{c:.6f}" for c in color)
             file.write(f"newmtl {names[class_id]}\nKd {values}\nKa 0 0 0\nKs 0 0 0\nillum 1\n\n".encode())
     rows = np.concatenate((mesh.vertices.astype(np.float64), mesh.rgb / 255), axis=1).tolist()
-    with whole_file(path) as file:
+    with atomic_write(path, raises=MapError) as file:
         file.write(f"mtllib {library.name}\n".encode())
         file.writelines(b"v %.6f %.6f %.6f %.4f %.4f %.4f\n" % tuple(row) for row in rows)
         for class_id in used.tolist():

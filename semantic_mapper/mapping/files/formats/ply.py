@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic_mapper.errors import MapError
+from semantic_mapper.files import atomic_write
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.files.formats.files import whole_file
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints
 from semantic_mapper.types import Float32, UInt8
 
@@ -74,7 +75,7 @@ def _write(path: Path, vertices: NDArray[np.void], faces: NDArray[np.void], labe
     if mesh:
         lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
     lines.append("end_header")
-    with whole_file(path) as file:
+    with atomic_write(path, raises=MapError) as file:
         file.write(("\n".join(lines) + "\n").encode("ascii"))
         file.write(vertices.tobytes())
         file.write(faces.tobytes())
