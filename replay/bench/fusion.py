@@ -20,8 +20,8 @@ from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.mapper import Mapper
+from semantic_mapper.mapping.files.extract import make_open3d_grid
 from semantic_mapper.mapping.open3d_loader import load_open3d
-from semantic_mapper.mapping.storage.grid_buffers import make_open3d_grid
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.scenes import TEST_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame
@@ -143,7 +143,7 @@ class _Open3DFusion:
     def __init__(self, config: VoxelMapConfig) -> None:
         self._o3d = load_open3d()
         self._config = config
-        self._grid = make_open3d_grid(config.voxel_size_m, (1, 1, 3), config.initial_blocks)
+        self._grid = make_open3d_grid(config.voxel_size_m, config.initial_blocks)
 
     @property
     def block_count(self) -> int:

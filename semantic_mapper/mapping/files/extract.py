@@ -13,7 +13,7 @@ from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.storage.block_grid import BlockGrid
 from semantic_mapper.mapping.storage.block_index import BlockIndex, find_blocks, pack_keys, unpack_keys
-from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE, GridBuffers, make_open3d_grid
+from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE, GridBuffers
 from semantic_mapper.types import Float32, Float64, Int32, Int64
 
 MESH_TILE_BLOCKS = 16_384  # Open3D fails past 262,100 blocks of 8^3 (int32), and needs 8 KiB a block to mesh
@@ -86,7 +86,7 @@ def _tile_triangles(
     found = find_blocks(index, wanted)
     keys, source = unpack_keys(wanted[found >= 0]), found[found >= 0]
     o3d = load_open3d()
-    copy = make_open3d_grid(voxel_size_m, (1, 1, 3), len(keys))
+    copy = make_open3d_grid(voxel_size_m, len(keys))
     target, _ = copy.hashmap().activate(o3d.core.Tensor.from_numpy(np.ascontiguousarray(keys)))
     for i, view in enumerate((buffers.tsdf, buffers.weight, buffers.color)):
         values = copy.hashmap().value_tensor(i).numpy()
@@ -97,6 +97,18 @@ def _tile_triangles(
     cell = np.floor(triangles.mean(axis=1) / voxel_size_m)
     own = np.isin(pack_keys((cell // BLOCK_SIDE).astype(np.int32)), pack_keys(tile))
     return triangles[own]
+
+
+def make_open3d_grid(voxel_size_m: float, capacity: int) -> Any:
+    """An empty ``open3d.t.geometry.VoxelBlockGrid`` on the CPU with TSDF, weight and colour, all float32.
+
+    Raises:
+        DependencyError: Open3D cannot be loaded.
+    """
+    o3d = load_open3d()
+    dtypes, shapes, device = (o3d.core.float32,) * 3, ((1,), (1,), (3,)), o3d.core.Device("CPU:0")
+    names = ("tsdf", "weight", "color")
+    return o3d.t.geometry.VoxelBlockGrid(names, dtypes, shapes, voxel_size_m, BLOCK_SIDE, capacity, device)
 
 
 def _triangles_of(mesh: Any) -> Float32:
