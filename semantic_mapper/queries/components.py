@@ -6,12 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
-from semantic_mapper.mapping.storage.block_index import unpack_keys
+from semantic_mapper.kernels import kernel
 from semantic_mapper.queries.class_surface import ClassSurface
+from semantic_mapper.types import Int32, Int64, UInt8
 
 
 class Components(NamedTuple):
@@ -30,28 +28,31 @@ class Components(NamedTuple):
 
 def find_components(surface: ClassSurface, min_voxels: int) -> Components:
     """Surface voxels of one class that touch by face, edge or corner; pieces of fewer voxels are left out."""
-    pairs = _touching_voxels(surface)
-    edges = coo_array((np.ones(len(pairs), np.bool_), tuple(pairs.T)), shape=(len(surface.voxel),) * 2)
-    _, piece = connected_components(edges, directed=False)
-    _, first, piece, sizes = np.unique(piece, return_index=True, return_inverse=True, return_counts=True)
+    count = len(surface.voxel)
+    used = np.diff(surface.start) > 0
+    node, first = np.full((int(used.sum()), 512), -1, np.int32), np.empty(count, np.int64)
+    connect_voxels(surface.packed, surface.start, surface.voxel, surface.label, np.cumsum(used) - 1, node, first)
+    sizes = np.bincount(first, minlength=count)  # at the first voxel of each component
     large = np.flatnonzero(sizes >= min_voxels)
-    large = large[np.argsort(first[large])]
-    number = np.full(len(sizes), -1, np.int64)
+    number = np.full(count, -1, np.int64)
     number[large] = np.arange(len(large))
-    component = number[piece]
+    component = number[first]
     kept = np.flatnonzero(component >= 0)
     # Numpy sorts integers of 16 bits, which nearly always suffice, much faster than longer ones.
     order = kept[np.argsort(component[kept].astype(np.min_scalar_type(len(large))), kind="stable")]
     return Components(component, order, np.cumsum(sizes[large]))
 
 
-def _touching_voxels(surface: ClassSurface) -> NDArray[np.intp]:
-    """Pairs (E, 2) of voxels of one class that touch, each pair once."""
-    if not len(surface.voxel):
-        return np.empty((0, 2), np.intp)
-    voxel = surface.voxel
-    blocks = unpack_keys(np.repeat(surface.packed, np.diff(surface.start)))
-    places = 8.0 * blocks + np.stack((voxel & 7, (voxel >> 3) & 7, voxel >> 6), axis=1)
-    tree = KDTree(places, compact_nodes=False, balanced_tree=False)
-    pairs = tree.query_pairs(1.0, np.inf, output_type="ndarray")
-    return pairs[surface.label[pairs[:, 0]] == surface.label[pairs[:, 1]]]
+@kernel
+def connect_voxels(
+    packed: Int64, start: Int64, voxel: Int32, label: UInt8, used: Int64, node: Int32, first: Int64
+) -> None:
+    """Write the first voxel of each voxel's component (N,): union-find over 26 neighbours.
+
+    Args:
+        packed, start, voxel, label: Of a ``ClassSurface``.
+        used: (B,) number of each block among the U that have voxels.
+        node: (U, 512) scratch, -1.
+        first: (N,) written.
+    """
+    ...

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage, sparse
+from scipy.spatial import KDTree
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.queries import class_surface as class_surface_module
@@ -290,8 +291,8 @@ def test_components_of_random_blocks_are_those_of_a_graph_of_all_pairs(seed: int
     surface = class_surface(snapshot, WANTED)
     found = find_components(surface, least)
     places = voxel_places(snapshot, block_rows(surface.start), surface.voxel)
-    touching = np.abs(places[:, None] - places).max(axis=2) <= 1
-    a, b = np.nonzero(touching & (surface.label[:, None] == surface.label))
+    pairs = KDTree(places).query_pairs(1, np.inf, output_type="ndarray")
+    a, b = pairs[surface.label[pairs[:, 0]] == surface.label[pairs[:, 1]]].T
     count = len(places)
     graph = sparse.coo_array((np.ones(len(a)), (a, b)), shape=(count, count))
     _, expected = sparse.csgraph.connected_components(graph, directed=False)
