@@ -63,7 +63,6 @@ class VoxelMap:
     Raises:
         ConfigError: a value of ``config`` that no map can be built with.
         MapError: there is no memory for ``initial_blocks``, or for ``memory_mb``.
-        DependencyError: Open3D cannot be loaded.
     """
 
     def __init__(self, config: VoxelMapConfig, label_set: LabelSet) -> None:
@@ -258,7 +257,11 @@ class VoxelMap:
         return MapPoints(*(np.concatenate([getattr(part, name) for part in parts]) for name in POINT_FIELDS))
 
     def mesh(self, min_weight: float = 1.0) -> MapMesh:
-        """Triangle mesh of the surface by marching cubes, in a fixed order; see ``points``."""
+        """Triangle mesh of the surface by marching cubes, in a fixed order; see ``points``.
+
+        Raises:
+            DependencyError: Open3D cannot be loaded.
+        """
         _check_min_weight(min_weight)
         parts: list[MapMesh] = []
         with _KERNEL_LOCK:

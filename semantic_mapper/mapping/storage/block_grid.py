@@ -69,7 +69,7 @@ class BlockGrid:
     ) -> None:
         self._max_blocks = max_blocks
         self._voxel_size_m = voxel_size_m
-        self._classes = classes
+        self.classes = classes
         self.evidence = evidence
         value_bytes = 4 * (1 + 1 + 3 + 1) + np.dtype(EVIDENCE_DTYPES[evidence]).itemsize * classes
         self.block_bytes = BLOCK_VOXELS * value_bytes + 12
@@ -88,6 +88,7 @@ class BlockGrid:
         self._used = np.zeros(capacity, np.int64)  # when last asked for
         self._version = np.zeros(capacity, np.int64)  # see ``mark_changed``
         self._resident_count = 0
+        self._ever_used = 0  # from here on, buffers are as they were made: zero
         # Called with the packed keys that ``activate`` was asked for, before anything is done with them.
         self.watchers: list[Callable[[NDArray[np.int64]], None]] = []
 
@@ -260,7 +261,7 @@ class BlockGrid:
         """A grid with these existing blocks (B,) in memory: this one where nothing is on disk, else a temporary one."""
         if not self.stored_count:
             return self
-        copy = BlockGrid(self._voxel_size_m, self._classes, len(packed), len(packed), evidence=self.evidence)
+        copy = BlockGrid(self._voxel_size_m, self.classes, len(packed), len(packed), evidence=self.evidence)
         copy.fill(packed, self.read(packed))
         return copy
 
@@ -345,7 +346,7 @@ class BlockGrid:
     def _evict(self, count: int, keep: NDArray[np.int64]) -> None:
         """Put the ``count`` blocks that were used longest ago, and some more, on disk; those of ``keep`` stay."""
         if self._store is None:
-            self._store = BlockStore(self._classes, self.evidence)
+            self._store = BlockStore(self.classes, self.evidence)
             _log.info("map_pages", resident=self._max_resident, reason="voxel_map.memory_mb is used up")
         keys, indices = self.sorted_blocks()
         packed = pack_keys(keys)
@@ -378,8 +379,8 @@ class BlockGrid:
                 f"memory for {capacity} blocks is {needed / 1e9:.1f} GB, this machine has {there / 1e9:.1f} GB; {mend}"
             )
         try:
-            return make_buffers(capacity, self._classes, self.evidence)
-        except MemoryError as error:
+            return make_buffers(capacity, self.classes, self.evidence)
+        except OSError as error:
             raise MapError(f"no memory for {capacity} blocks ({needed / 1e9:.1f} GB): {error}; {mend}") from error
 
     def _grow(self, needed: int) -> None:
@@ -405,6 +406,8 @@ class BlockGrid:
             self._index = make_block_index(*self.sorted_blocks())
         else:
             insert_blocks(self._index, packed, added)
+        used_before = added[added < self._ever_used]
         for values in self._buffers[1:]:
-            values[added] = 0
+            values[used_before] = 0
+        self._ever_used = max(self._ever_used, int(added.max(initial=-1)) + 1)
         self._version[added] = 0

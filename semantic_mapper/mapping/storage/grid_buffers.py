@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import mmap
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,20 +39,27 @@ class GridBuffers(NamedTuple):
 
 
 def make_buffers(capacity: int, classes: int, evidence: str) -> GridBuffers:
-    """Zeros for so many blocks; the machine gives the memory when it is first written.
+    """Zeros for so many blocks; the machine gives the memory page by page as it is written.
 
     Raises:
-        MemoryError: it has none.
+        OSError: it has none.
     """
     flat = (capacity, BLOCK_VOXELS)
     return GridBuffers(
-        keys=np.zeros((capacity, 3), np.int32),
-        tsdf=np.zeros(flat, np.float32),
-        weight=np.zeros(flat, np.float32),
-        color=np.zeros((*flat, 3), np.float32),
-        evidence=np.zeros((*flat, classes), EVIDENCE_DTYPES[evidence]),
-        votes=np.zeros(flat, np.float32),
+        keys=_zeros((capacity, 3), np.int32),
+        tsdf=_zeros(flat, np.float32),
+        weight=_zeros(flat, np.float32),
+        color=_zeros((*flat, 3), np.float32),
+        evidence=_zeros((*flat, classes), EVIDENCE_DTYPES[evidence]),
+        votes=_zeros(flat, np.float32),
     )
+
+
+def _zeros(shape: tuple[int, ...], dtype: type[np.generic]) -> NDArray[Any]:
+    """As ``np.zeros``, which asks for huge pages: to find these holds up a frame for long when the map grows."""
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    return np.frombuffer(memory, dtype).reshape(shape)
 
 
 def advised_mb(blocks: int, block_bytes: int) -> int:
