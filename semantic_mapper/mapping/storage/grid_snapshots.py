@@ -41,9 +41,6 @@ class GridSnapshots:
         self._moments = [_Moment(grid)]
         grid.watchers.append(self._copy)
 
-    def __len__(self) -> int:
-        return len(self._moments)
-
     @property
     def keys(self) -> NDArray[np.int64]:
         """Packed keys (B,) of the blocks that the grid had at the oldest moment, sorted."""
