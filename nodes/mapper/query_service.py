@@ -140,7 +140,7 @@ class QueryService:
         """
         now = time.monotonic()
         wanted = bool(self._catching_up) or now - self._asked_at <= ASKED_LATELY_S
-        if not wanted or not self._snapshot.done() or self._copied_version == self._map.version:
+        if not wanted or not self._snapshot.done() or self._copied_version == self._map.version or not self.alive:
             return
         if self._copied_version >= self._awaited_version and now < self._copy_again_at:
             return
@@ -164,7 +164,7 @@ class QueryService:
                 self._copy_changes()
             else:
                 time.sleep(_HAND_OVER_POLL_S)
-        return True
+        return self.alive
 
     def close(self) -> None:
         """End the threads and free the endpoint. Harmless when repeated."""
@@ -233,14 +233,14 @@ class QueryService:
         request = _PendingRequest(client, address, time.monotonic() + header.waits_s + GRACE_S, parts, question)
         if header.asker and self._replace_last(request):
             return
-        earlier = self._pending.setdefault(client, [])
+        earlier = self._pending.get(client, [])
         if len(earlier) >= MAX_PENDING_OF_CLIENT or sum(map(len, self._pending.values())) >= MAX_PENDING:
             self._send(address, encode_error(MapError(_TOO_MANY)))
-        elif lags or any(r in self._catching_up for r in earlier):
-            earlier.append(request)
+            return
+        self._pending[client] = [*earlier, request]
+        if lags or any(other in self._catching_up for other in earlier):
             self._catching_up.append(request)
         else:
-            earlier.append(request)
             self._long_queries.submit(self._work, request)
 
     def _replace_last(self, request: _PendingRequest) -> bool:
