@@ -106,10 +106,10 @@ def main() -> None:
             watches[0].time(corrector.make_room)
             watches[1].time(lambda item=item: fuse(voxel_map, item))
             watches[2].time(lambda item=item: corrector.record(item))
-            before = service._given
+            before = service._copied_version
             watch = Stopwatch()
             watch.time(service.follow)
-            if service._given != before and number > 2:
+            if service._copied_version != before and number > 2:
                 hand_over.cpu += watch.cpu
                 hand_over.wall += watch.wall
             time.sleep(given.pause)

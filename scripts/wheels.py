@@ -27,12 +27,12 @@ SMOKE = """
 from pathlib import Path
 import numpy as np
 import semantic_mapper
-from semantic_mapper.mapping.storage.key_table import KeyTable
 from semantic_mapper.nodes.cli.report import Section, write_page
+from semantic_mapper.mapping.storage.block_index import find_blocks, make_block_index, pack_keys
 write_page(Path("page.html"), "a page, whose template is in the wheel", [Section()])
-table = KeyTable()
-table.put(np.array([3, 5]), np.array([30, 50]))
-assert table.find(np.array([5, 4, 3])).tolist() == [50, -1, 30]
+keys = np.array([[0, 0, 3], [0, -1, 5]], np.int32)
+index = make_block_index(keys, np.array([30, 50], np.int32))
+assert find_blocks(index, pack_keys(keys[::-1])).tolist() == [50, 30]
 print(semantic_mapper.__file__)
 """
 

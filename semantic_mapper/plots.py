@@ -316,7 +316,7 @@ def place(figure: Figure, box: Box) -> Axes:
     x, y, w, h = box
     axes = figure.add_axes((x / width, 1 - (y + h) / height, w / width, h / height))
     axes.set_axis_off()
-    axes.set(xlim=(0, w), ylim=(h, 0))
+    axes.set(xlim=(0, w), ylim=(max(h, 1), 0))
     return axes
 
 

@@ -16,17 +16,17 @@ from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.queries.boxes import points_in_box
 from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.lookup import MAX_RADIUS_VOXELS, RADIUS_VOXELS, at
+from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.nearest import nearest
 from semantic_mapper.queries.occupancy import distance_field, occupancy
 from semantic_mapper.queries.rays import cast_rays
-from semantic_mapper.queries.relay import MirrorRelay
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.transport import query_messages as messages
 from semantic_mapper.transport.codec import decode_request, encode_answer, encode_error
 from semantic_mapper.transport.framing import Parts
 from semantic_mapper.transport.headers import LabelSetForm
 
-# One thread answers all that takes long: what would keep the others waiting for more than about a second is refused.
+# One worker answers all that takes long: what would keep the others waiting for more than about a second is refused.
 MAX_VISITED_VOXELS = 1e8  # of `at`
 MAX_RAY_METRES = 2e5  # of `cast_rays`, all rays together
 MAX_FIELD_VOXELS = 1 << 22  # of `distance_field`
@@ -46,13 +46,13 @@ class Question(NamedTuple):
 
     Args:
         answer: Gives the parts of its answer, which is an error where the question is no good; raises nothing.
-        header: What it says of itself and of who asks.
+        request: What it asks, and who asks.
         takes_long: Whether that may take more than a few milliseconds.
         about_map: Whether the answer comes from the mirror, which has to be up to date for it.
     """
 
     answer: Callable[[], list[bytes]]
-    header: messages.Request
+    request: messages.Request
     takes_long: bool
     about_map: bool
 
@@ -69,16 +69,16 @@ class Answers:
     """Answers questions about what a mirror holds. Those that take long are for one thread, all others for any.
 
     Args:
-        relay: Of the mirror.
+        mirror: Of the map.
         correction: Takes corrected poses; without it they are refused.
         weights: Says which weights are in use, and exchanges them; without it such questions are refused.
     """
 
     def __init__(
-        self, relay: MirrorRelay, correction: LiveCorrection | None = None, weights: LiveWeights | None = None
+        self, mirror: MapMirror, correction: LiveCorrection | None = None, weights: LiveWeights | None = None
     ) -> None:
         self.map_id = uuid.uuid4().hex
-        self._relay = relay
+        self._mirror = mirror
         self._correction = correction
         self._weights = weights
         self._tracked: dict[messages.Point, _Tracked] = {}  # by direction; the last one asked stands last
@@ -87,9 +87,9 @@ class Answers:
         """Parts of a question -> what answers it."""
         try:
             kind, request = decode_request(parts)
-            takes_long = _takes_long(self._relay.snapshot(), request)
+            takes_long = _takes_long(self._mirror.snapshot(), request)
         except (SemanticMapperError, MemoryError) as error:
-            refusal = encode_error(_told(error))
+            refusal = encode_error(_to_error(error))
             return Question(lambda: refusal, messages.Request(), takes_long=False, about_map=False)
         beside = messages.CorrectPosesRequest | messages.CorrectionRequest | messages.WeightsRequest
         about_map = not isinstance(request, beside)
@@ -99,13 +99,13 @@ class Answers:
         try:
             return encode_answer(kind, self._answer(request))
         except (SemanticMapperError, MemoryError) as error:
-            return encode_error(_told(error))
+            return encode_error(_to_error(error))
         except Exception as error:  # noqa: BLE001 -- a bug of ours must not end a thread that all wait for
             _log.exception("question_failed", question=kind)
             return encode_error(MapError(f"the mapper could not compute this: {error}"))
 
     def _answer(self, request: messages.Request) -> messages.Answer:
-        snapshot = self._relay.snapshot()
+        snapshot = self._mirror.snapshot()
         match request:
             case messages.InfoRequest():
                 return self._describe(snapshot)
@@ -211,7 +211,7 @@ class Answers:
 
     def _changes(self, snapshot: MapSnapshot, request: messages.ChangesRequest) -> messages.Answer:
         since = request.since if request.map_id in ("", self.map_id) else 0
-        found = self._relay.changes(since, min(request.limit or MAX_CHANGED_BLOCKS, MAX_CHANGED_BLOCKS))
+        found = snapshot.changes(since, min(request.limit or MAX_CHANGED_BLOCKS, MAX_CHANGED_BLOCKS))
         return messages.ChangesAnswer(
             map_id=self.map_id,
             version=found.version,
@@ -222,7 +222,7 @@ class Answers:
         )
 
 
-def _told(error: SemanticMapperError | MemoryError) -> SemanticMapperError:
+def _to_error(error: SemanticMapperError | MemoryError) -> SemanticMapperError:
     if isinstance(error, MemoryError):
         return MapError("the mapper has no memory left to answer this; ask for less at once")
     return error

@@ -1,7 +1,8 @@
-"""The query service of a mapper: threads that answer questions from a mirror, which the mapper's thread feeds.
+"""The query service of a mapper: answers requests from snapshots of the map.
 
-One has the socket and answers what is quick, one answers what takes long, one feeds the mirror. So a quick answer waits
-for none but quick ones.
+One thread owns the socket and answers what is quick. One worker answers what takes long, in the order of arrival, and
+one makes snapshots from the blocks that the mapper's thread copies for it. So a quick answer waits for quick ones only,
+and the mapper for none.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
@@ -19,41 +22,65 @@ from semantic_mapper.mapping.storage.changes import CopiedChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
-from semantic_mapper.nodes.mapper.long_queries import LongQuestions
 from semantic_mapper.nodes.mapper.query_answers import Answers, Question
-from semantic_mapper.nodes.mapper.query_queue import Asked, WaitingQuestions
 from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.queries.relay import MirrorRelay
 from semantic_mapper.transport.codec import encode_error
 from semantic_mapper.transport.query_sockets import QueryServer
 from semantic_mapper.transport.security import Keys
 
-PERIOD_S = 0.1  # between two deliveries, at least
-MAX_SHARE = 0.1  # of the mapper's time that deliveries may take; the pause after a dear one is longer
-ASKED_LATELY_S = 5.0  # without a question for so long, the mirror is fed no more
-CATCH_UP_S = 2.0  # how long questions after that wait for the mirror; then they are answered as it is
-FIRST_CATCH_UP_S = 60.0  # how long the very first ones wait: kernels may compile, and an empty mirror says nothing true
-MAX_BLOCKS = 600  # of a delivery (unless one frame has more): bounds what a step may cost
-GRACE_S = 0.5  # in which a client that has waited in vain asks again, and keeps its turn
-_WAIT_S = 0.5
-_HANDING_OVER_S = 0.005  # between two looks at whether a delivery has been taken
+PERIOD_S = 0.1  # between two snapshots, at least
+MAX_FRACTION = 0.1  # of the mapper's time that copying may take; the pause after a costly copy is longer
+MAX_BLOCKS = 600  # in one copy (unless one frame has more): bounds what a step may cost
+ASKED_LATELY_S = 5.0  # without a request for so long, no more snapshots are made
+CATCH_UP_S = 2.0  # how long requests after such a pause wait for a snapshot of the present map
+FIRST_CATCH_UP_S = 60.0  # how long the very first ones wait: there is no snapshot yet to answer them from
+MAX_PENDING = 64  # requests of all clients together
+MAX_PENDING_OF_CLIENT = 8
+GRACE_S = 0.5  # in which a client whose request timed out asks again, and keeps its place
+CLOSE_S = 5.0  # how long ``close`` waits for an answer that is being computed
+_POLL_S = 0.5
+_CATCH_UP_POLL_S = 0.05
+_HAND_OVER_POLL_S = 0.005
 _NOT_READY = "the mapper has not handed its map over to its query service yet: it is busy, or ending; ask again"
 _TOO_MANY = "too many questions that take long wait for an answer; ask again later, and await each answer"
 
 _log = structlog.get_logger(__name__)
 
 
-class QueryService:
-    """Answers questions about a map that another thread changes. A context manager.
+@dataclass(slots=True, eq=False)
+class _PendingRequest:
+    """A request that waits for a snapshot or for the worker, or that the worker answers.
 
-    Answers are about the map as it was a moment ago (see ``PERIOD_S``, ``MAX_SHARE``), and say about which version.
-    While nobody asks, the map is not looked at.
+    Args:
+        client: Its name, or its address where it gives none.
+        address: Socket that the answer goes to.
+        until: When the client stops waiting, monotonic seconds.
+        parts: Of the request; the same where a client asks again.
+        question: What the parts mean.
+        started: Whether the worker computes the answer.
+        answer: Its parts; None where nobody waits for it any more.
+    """
+
+    client: bytes
+    address: bytes
+    until: float
+    parts: list[bytes]
+    question: Question
+    started: bool = False
+    answer: list[bytes] | None = None
+
+
+class QueryService:
+    """Answers requests about a map that another thread changes. A context manager.
+
+    Answers are about the map as it was a moment ago (see ``PERIOD_S``, ``MAX_FRACTION``), and say about which version.
+    While nobody asks, no snapshots are made.
 
     Args:
         endpoint: Where to listen.
         voxel_map: The map; only ``follow`` reads it.
         correction: Takes corrected poses; without it they are refused.
-        weights: Takes other weights; without it questions about them are refused.
+        weights: Takes other weights; without it requests about them are refused.
         keys: See ``QueryServer``.
 
     Raises:
@@ -70,86 +97,87 @@ class QueryService:
     ) -> None:
         self._map = voxel_map
         config = voxel_map.config
-        self._relay = MirrorRelay(MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set))
-        self._answers = Answers(self._relay, correction, weights)
-        self._given = 0  # version that deliveries have come to
-        self._next_at = 0.0
-        self._delivered: deque[CopiedChanges] = deque()
-        self._delivery_came = threading.Event()
+        self._mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
+        self._answers = Answers(self._mirror, correction, weights)
+        self._copied_version = 0
+        self._copy_again_at = 0.0
         self._asked_at = -ASKED_LATELY_S  # never; monotonic seconds
-        self._awaited = 0  # version that questions after a pause wait for
-        self._patient_until = 0.0
-        self._parked = WaitingQuestions()  # for the mirror; nobody else waits for these
-        self._overdue = False  # somebody has waited in vain, or would
+        self._awaited_version = 0  # that requests after a pause wait for
+        self._catch_up_until = 0.0
+        self._map_is_busy = False  # a snapshot did not come in time, or cannot
+        # Of each client, in order of arrival, until the answer is sent. Used by the socket's thread alone.
+        self._pending: dict[bytes, list[_PendingRequest]] = {}
+        self._catching_up: deque[_PendingRequest] = deque()  # those that wait for a snapshot
+        self._finished: deque[_PendingRequest] = deque()  # from the worker
         self._closed = threading.Event()
+        self._lock = threading.Lock()  # of pending requests that the worker takes, and of ``wake`` against ``close``
         self.answered = 0
+        self.abandoned = 0  # requests dropped because nobody waited for the answer any more
         self._server = QueryServer(endpoint, keys=keys)
         self.endpoint = self._server.endpoint
-        self._long = LongQuestions(f"long queries {endpoint}", self._answer, self._server.wake)
-        self._threads = (
-            threading.Thread(target=self._serve, name=f"queries {endpoint}", daemon=True),
-            threading.Thread(target=self._feed, name=f"mirror {endpoint}", daemon=True),
-        )
-        for thread in self._threads:
-            thread.start()
+        self._long_queries = ThreadPoolExecutor(1, f"long queries {endpoint}")
+        self._snapshots = ThreadPoolExecutor(1, f"snapshots {endpoint}")
+        self._snapshot: Future[None] = Future()  # the one being made
+        self._snapshot.set_result(None)
+        self._thread = threading.Thread(target=self._serve, name=f"queries {endpoint}", daemon=True)
+        self._thread.start()
 
     @property
     def alive(self) -> bool:
-        """Whether the threads run; they end before ``close`` only by a bug."""
-        return self._long.alive and all(thread.is_alive() for thread in self._threads)
+        """Whether requests are answered; False before ``close`` only by a bug."""
+        made = self._snapshot
+        return self._thread.is_alive() and (not made.done() or made.exception() is None)
 
     @property
     def asked(self) -> bool:
         """Whether anybody has ever asked about the map."""
         return self._asked_at >= 0
 
-    @property
-    def abandoned(self) -> int:
-        """Questions that were dropped unanswered, since nobody waited for them any more."""
-        return self._long.abandoned + self._parked.abandoned
-
     def follow(self) -> None:
-        """Hand what has changed over to the service; for the thread that changes the map, after each step.
+        """Copy what has changed for the next snapshot; for the thread that changes the map, after each step.
 
         Costs nothing while nobody asks, and never waits.
         """
         now = time.monotonic()
-        if now - self._asked_at > ASKED_LATELY_S or self._delivered or self._given == self._map.version:
+        wanted = bool(self._catching_up) or now - self._asked_at <= ASKED_LATELY_S
+        if not wanted or not self._snapshot.done() or self._copied_version == self._map.version or not self.alive:
             return
-        if self._given >= self._awaited and now < self._next_at:
+        if self._copied_version >= self._awaited_version and now < self._copy_again_at:
             return
-        self._deliver()
-        self._next_at = now + max(PERIOD_S, (time.monotonic() - now) / MAX_SHARE)
+        self._copy_changes()
+        self._copy_again_at = now + max(PERIOD_S, (time.monotonic() - now) / MAX_FRACTION)
 
     def hand_over_all(self, within_s: float) -> bool:
-        """Hand all of the map over where somebody has ever asked: before its thread does something that takes long.
+        """Make a snapshot of the whole map if anybody has ever asked; for before its thread does something long.
 
         Returns:
-            Whether the service has it; False where nobody has asked, or it was not to be done in ``within_s`` seconds.
+            Whether there is one; False where nobody has asked, or it was not made within ``within_s`` seconds.
         """
         if not self.asked:
-            self._overdue = True  # whoever asks first from now on is told so at once
+            self._map_is_busy = True
             return False
         deadline = time.monotonic() + within_s
-        while self._delivered or self._given != self._map.version:
+        while not self._snapshot.done() or self._copied_version != self._map.version:
             if time.monotonic() > deadline or not self.alive:
                 return False
-            if self._delivered:
-                time.sleep(_HANDING_OVER_S)
+            if self._snapshot.done():
+                self._copy_changes()
             else:
-                self._deliver()
-        return True
+                time.sleep(_HAND_OVER_POLL_S)
+        return self.alive
 
     def close(self) -> None:
         """End the threads and free the endpoint. Harmless when repeated."""
         if self._closed.is_set():
             return
-        self._closed.set()
-        self._server.wake()
-        self._delivery_came.set()
-        for thread in self._threads:
-            thread.join()
-        self._long.close()
+        with self._lock:
+            self._closed.set()
+            self._server.wake()
+        self._thread.join()
+        self._snapshots.shutdown()
+        if wait([self._long_queries.submit(lambda: None)], CLOSE_S).not_done:
+            _log.warning("answer_left_behind", waited_s=CLOSE_S)
+        self._long_queries.shutdown(wait=False)
         self._server.close()
 
     def __enter__(self) -> Self:
@@ -160,97 +188,130 @@ class QueryService:
     ) -> None:
         self.close()
 
-    def _deliver(self) -> None:
-        changes = self._map.copy_changes(self._given, MAX_BLOCKS)
-        self._given = changes.version
-        self._delivered.append(changes)
-        self._delivery_came.set()
+    def _copy_changes(self) -> None:
+        changes = self._map.copy_changes(self._copied_version, MAX_BLOCKS)
+        self._copied_version = changes.version
+        self._snapshot = self._snapshots.submit(self._make_snapshot, changes)
+
+    def _make_snapshot(self, changes: CopiedChanges) -> None:
+        try:
+            self._mirror.apply(changes.compact())
+        except Exception:
+            _log.exception("snapshot_failed", version=changes.version)
+            raise
+        self._wake()
+
+    def _wake(self) -> None:
+        with self._lock:
+            if not self._closed.is_set():
+                self._server.wake()
 
     def _serve(self) -> None:
         _log.info("questions_welcome", endpoint=self.endpoint)
         while not self._closed.is_set():
-            self._server.wait(_WAIT_S / 10 if self._parked else _WAIT_S)
-            self._send_long_ones()
-            self._let_in()
-            # One at a time: the socket takes turns between clients, so that many questions of one delay no other.
-            while not self._closed.is_set() and (came := self._server.receive()) is not None:
-                self._take(*came)
-                self._send_long_ones()
-        while (asked := self._parked.pop()) is not None:
-            self._send(asked.client, encode_error(MapError(_NOT_READY)))
+            self._server.wait(_CATCH_UP_POLL_S if self._catching_up else _POLL_S)
+            self._send_finished()
+            self._stop_catching_up()
+            # One at a time: the socket takes turns between clients, so that many requests of one delay no other.
+            while not self._closed.is_set() and (received := self._server.receive()) is not None:
+                self._take(*received)
+                self._send_finished()
+        for request in self._catching_up:
+            self._send(request.address, encode_error(MapError(_NOT_READY)))
 
-    def _take(self, client: bytes, parts: list[bytes]) -> None:
-        """Answer a question, or let it wait: for the mirror, or because it takes long."""
+    def _take(self, address: bytes, parts: list[bytes]) -> None:
+        """Answer a request, or let it wait: for a snapshot, for the worker, or for the client's request before it."""
         question = self._answers.read(parts)
-        header = question.header
-        until = time.monotonic() + header.waits_s + GRACE_S
-        asked = Asked(client, header.asker.encode(), until, parts, question)
+        asked = question.request
         if question.about_map:
             self._note_question()
-        if self._parked.holds(asked.lane) or (question.about_map and self._mirror_lags()):
-            if not self._parked.put(asked):
-                self._send(client, encode_error(MapError(_TOO_MANY)))
+        lags = question.about_map and self._snapshot_lags()
+        client = asked.asker.encode() or address
+        if not (lags or question.takes_long or client in self._pending):
+            self._send(address, self._answer(question))
+            return
+        request = _PendingRequest(client, address, time.monotonic() + asked.waits_s + GRACE_S, parts, question)
+        if asked.asker and self._replace_last(request):
+            return
+        earlier = self._pending.get(client, [])
+        if len(earlier) >= MAX_PENDING_OF_CLIENT or sum(map(len, self._pending.values())) >= MAX_PENDING:
+            self._send(address, encode_error(MapError(_TOO_MANY)))
+            return
+        self._pending[client] = [*earlier, request]
+        if lags or any(other in self._catching_up for other in earlier):
+            self._catching_up.append(request)
         else:
-            self._pass_on(asked)
+            self._long_queries.submit(self._work, request)
 
-    def _let_in(self) -> None:
-        """Answer what has waited for the mirror, once it is there or will not come in time."""
-        self._parked.drop_late()
-        if not self._parked:
-            return
-        self._asked_at = time.monotonic()  # so that the mirror is fed as long as somebody waits for it
-        if self._mirror_lags():
-            return
-        while (asked := self._parked.pop()) is not None:
-            self._parked.done(asked)
-            self._pass_on(asked)
+    def _replace_last(self, request: _PendingRequest) -> bool:
+        """Let a client that awaits each answer ask again, or something else, in the place of its last request.
 
-    def _pass_on(self, asked: Asked) -> None:
-        question = asked.question
-        if question.about_map and self._overdue and not self._relay.snapshot().version:
-            self._send(asked.client, encode_error(MapError(_NOT_READY)))
-        elif not question.takes_long and not self._long.holds(asked.lane):
-            self._send(asked.client, self._answer(question))
-        elif not self._long.put(asked):
-            self._send(asked.client, encode_error(MapError(_TOO_MANY)))
-
-    def _answer(self, question: Question) -> list[bytes]:
-        return question.answer()
-
-    def _send(self, client: bytes, parts: list[bytes]) -> None:
-        self._server.send(client, parts)
-        self.answered += 1
-
-    def _send_long_ones(self) -> None:
-        for client, parts in self._long.collect():
-            self._send(client, parts)
-
-    def _note_question(self) -> None:
-        """After a pause, questions wait until the mirror has come up to the map as it is now."""
-        now = time.monotonic()
-        if now - self._asked_at > ASKED_LATELY_S:
-            self._awaited = self._map.version
-            self._patient_until = now + (CATCH_UP_S if self._relay.snapshot().version else FIRST_CATCH_UP_S)
-        self._asked_at = now
-
-    def _mirror_lags(self) -> bool:
-        version = self._relay.snapshot().version
-        if version >= self._awaited:
+        Returns:
+            False where it has none, or where the answer to another question is being computed.
+        """
+        if request.client not in self._pending:
             return False
-        if time.monotonic() > self._patient_until or (self._overdue and not version):
-            # The map is at rest or busy: those who ask next need not wait as well.
-            self._awaited, self._overdue = 0, True
-            return False
+        last = self._pending[request.client][-1]
+        with self._lock:
+            if last.parts != request.parts:
+                if last.started:
+                    return False
+                self.abandoned += 1
+            last.address, last.until = request.address, request.until
+            last.parts, last.question = request.parts, request.question
         return True
 
-    def _feed(self) -> None:
-        while not self._closed.is_set():
-            self._delivery_came.wait()
-            self._delivery_came.clear()
-            self._take_deliveries()
-            self._server.wake()
+    def _stop_catching_up(self) -> None:
+        """Pass on the requests that wait for a snapshot, once it is there or will not come in time."""
+        if not self._catching_up or self._snapshot_lags():
+            return
+        self._asked_at = time.monotonic()
+        while self._catching_up:
+            self._long_queries.submit(self._work, self._catching_up.popleft())
 
-    def _take_deliveries(self) -> None:
-        while self._delivered:
-            self._relay.apply(self._delivered[0].compact())
-            self._delivered.popleft()  # only now may the next one come
+    def _work(self, request: _PendingRequest) -> None:
+        with self._lock:
+            request.started = True
+            wanted = not self._closed.is_set() and time.monotonic() <= request.until
+        if wanted:
+            request.answer = self._answer(request.question)
+        self._finished.append(request)
+        self._wake()
+
+    def _send_finished(self) -> None:
+        while self._finished:
+            request = self._finished.popleft()
+            self._pending[request.client].remove(request)
+            if not self._pending[request.client]:
+                del self._pending[request.client]
+            if request.answer is None:
+                self.abandoned += 1
+            else:
+                self._send(request.address, request.answer)
+
+    def _answer(self, question: Question) -> list[bytes]:
+        if question.about_map and self._map_is_busy and not self._mirror.snapshot().version:
+            return encode_error(MapError(_NOT_READY))
+        return question.answer()
+
+    def _send(self, address: bytes, parts: list[bytes]) -> None:
+        self._server.send(address, parts)
+        self.answered += 1
+
+    def _note_question(self) -> None:
+        """After a pause, requests wait until there is a snapshot of the map as it is now."""
+        now = time.monotonic()
+        if now - self._asked_at > ASKED_LATELY_S:
+            self._awaited_version = self._map.version
+            self._catch_up_until = now + (CATCH_UP_S if self._mirror.snapshot().version else FIRST_CATCH_UP_S)
+        self._asked_at = now
+
+    def _snapshot_lags(self) -> bool:
+        """Whether requests should wait for a newer snapshot."""
+        version = self._mirror.snapshot().version
+        if version >= self._awaited_version:
+            return False
+        if time.monotonic() <= self._catch_up_until and (version or not self._map_is_busy):
+            return True
+        self._awaited_version, self._map_is_busy = 0, True  # those who ask next need not wait as well
+        return False

@@ -21,7 +21,6 @@ from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.open3d_loader import load_open3d
-from semantic_mapper.mapping.storage.grid_buffers import make_open3d_grid
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.scenes import TEST_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame
@@ -143,7 +142,7 @@ class _Open3DFusion:
     def __init__(self, config: VoxelMapConfig) -> None:
         self._o3d = load_open3d()
         self._config = config
-        self._grid = make_open3d_grid(config.voxel_size_m, (1, 1, 3), config.initial_blocks)
+        self._grid = _empty_grid(config.voxel_size_m, config.initial_blocks)
 
     @property
     def block_count(self) -> int:
@@ -179,3 +178,9 @@ def _some_probabilities(classes: int) -> Float32:
     patch: NDArray[np.int64] = rng.integers(0, classes, (COARSE[0] // 10, COARSE[1] // 10))
     sure = np.eye(classes, dtype=np.float32)[np.repeat(np.repeat(patch, 10, 0), 10, 1)]
     return np.ascontiguousarray(0.9 * sure + np.float32(0.1 / classes)).reshape(-1, classes)
+
+
+def _empty_grid(voxel_size_m: float, capacity: int) -> Any:
+    o3d = load_open3d()
+    dtypes, shapes, device = (o3d.core.float32,) * 3, ((1,), (1,), (3,)), o3d.core.Device("CPU:0")
+    return o3d.t.geometry.VoxelBlockGrid(("tsdf", "weight", "color"), dtypes, shapes, voxel_size_m, 8, capacity, device)

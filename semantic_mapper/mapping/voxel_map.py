@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
@@ -14,8 +15,8 @@ from numpy.typing import NDArray
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
-from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.files.extract import join_meshes, surface_voxels, triangle_mesh
+from semantic_mapper.labels import IGNORE_CHANNEL, LabelSet
+from semantic_mapper.mapping.files.extract import join_meshes, open3d_grid, surface_voxels, triangle_mesh
 from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.files.map_manifest import MapManifest
 from semantic_mapper.mapping.files.map_saving import MapSaving
@@ -63,7 +64,6 @@ class VoxelMap:
     Raises:
         ConfigError: a value of ``config`` that no map can be built with.
         MapError: there is no memory for ``initial_blocks``, or for ``memory_mb``.
-        DependencyError: Open3D cannot be loaded.
     """
 
     def __init__(self, config: VoxelMapConfig, label_set: LabelSet) -> None:
@@ -258,7 +258,11 @@ class VoxelMap:
         return MapPoints(*(np.concatenate([getattr(part, name) for part in parts]) for name in POINT_FIELDS))
 
     def mesh(self, min_weight: float = 1.0) -> MapMesh:
-        """Triangle mesh of the surface by marching cubes, in a fixed order; see ``points``."""
+        """Triangle mesh of the surface by marching cubes, in a fixed order; see ``points``.
+
+        Raises:
+            DependencyError: Open3D cannot be loaded.
+        """
         _check_min_weight(min_weight)
         parts: list[MapMesh] = []
         with _KERNEL_LOCK:
@@ -267,6 +271,24 @@ class VoxelMap:
                 read = self._read(grid, vertices.astype(np.float64) / self.config.voxel_size_m)
                 parts.append(MapMesh(vertices, faces, *read))
         return parts[0] if len(parts) == 1 else join_meshes(parts)
+
+    def to_open3d(self) -> Any:
+        """A copy of the whole map as an ``open3d.t.geometry.VoxelBlockGrid``, for what Open3D does with one.
+
+        Its attributes are tsdf, weight and color (float32, as Open3D's own ``integrate`` leaves them), label (uint8 id,
+        the ignore id where nothing voted), and evidence and votes as they are stored.
+
+        Raises:
+            MapError: the map is empty.
+            DependencyError: Open3D cannot be loaded.
+        """
+        state = self.block_state()
+        keys = np.asarray(state.pop("keys"), np.int32)
+        if not len(keys):
+            raise MapError("an empty map has no blocks to hand to Open3D; map a frame first")
+        flat = {name: values.reshape(len(keys), -1, *values.shape[4:]) for name, values in state.items()}
+        channel = np.where(np.asarray(flat["votes"], np.float32) > 0, flat["evidence"].argmax(axis=2), IGNORE_CHANNEL)
+        return open3d_grid(keys, self.config.voxel_size_m, **flat, label=self.label_set.to_ids(channel))
 
     def ray_cast(self, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> MapView:
         """The map as a camera would see it, up to ``depth_max_m`` away.

@@ -42,7 +42,7 @@ class MapMirror:
         slots = np.empty(0, np.int32)
         index = make_block_index(unpack_keys(none), slots)
         self._snapshot = MapSnapshot(
-            0, 0, voxel_size_m, truncation_voxels, label_set, none, slots, none, index, _new_pool(LEAST_SPARE)
+            0, 0, voxel_size_m, truncation_voxels, label_set, none, slots, none, none, index, _new_pool(LEAST_SPARE)
         )
         self._next = self._snapshot  # ahead of it while a new epoch of the map is not complete
         self._used = 0
@@ -96,8 +96,9 @@ class MapMirror:
             self._used += len(packed)
             fresh = (next(_deliveries) << 32) + np.arange(len(packed))
             serials = np.concatenate((old.serials[staying], fresh))
+            versions = np.concatenate((old.versions[staying], np.full(len(packed), changes.version)))
             order = np.argsort(merged)
-            merged, slots, serials = merged[order], slots[order], serials[order]
+            merged, slots = merged[order], slots[order]
             index = make_block_index(unpack_keys(merged), slots)
             self._next = dataclasses.replace(
                 old,
@@ -105,7 +106,8 @@ class MapMirror:
                 epoch=changes.epoch,
                 packed=merged,
                 slots=slots,
-                serials=serials,
+                serials=serials[order],
+                versions=versions[order],
                 index=index,
                 voxels=pool,
             )

@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic_mapper.errors import MapError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.storage.block_index import BlockIndex, unpack_keys
-from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS, TSDF_STEPS
+from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS, TSDF_STEPS, BlockChanges, oldest_first
 from semantic_mapper.types import Float32, UInt8
 
 
@@ -46,6 +47,7 @@ class MapSnapshot:
         packed: (B,) int64 sorted packed keys of the blocks.
         slots: (B,) int32 where each of them lies in ``voxels``.
         serials: (B,) int64; in this process no two contents of a block have the same, in whichever mirror.
+        versions: (B,) int64 version that each block came with, at most ``version``.
         index: The same as a table for compiled code.
         voxels: Memory shared with other snapshots; only ``slots`` of it belong to this one.
     """
@@ -58,6 +60,7 @@ class MapSnapshot:
     packed: NDArray[np.int64]
     slots: NDArray[np.int32]
     serials: NDArray[np.int64]
+    versions: NDArray[np.int64]
     index: BlockIndex
     voxels: BlockVoxels
 
@@ -83,3 +86,32 @@ class MapSnapshot:
     def voxels_per_step(self) -> float:
         """Length of one step of the quantised TSDF, in voxels."""
         return self.truncation_voxels / TSDF_STEPS
+
+    def changes(self, since: int, limit: int = 0) -> BlockChanges:
+        """As ``VoxelMap.changes``: what another mirror needs to follow this one.
+
+        Whole ``MapMirror.apply`` take the place of whole versions, so ``limit`` stops only between two of them.
+
+        Raises:
+            MapError: ``since`` is not a version of this map, or a negative ``limit``.
+        """
+        if not 0 <= since <= self.version or limit < 0:
+            raise MapError(
+                f"changes since version {since}, limit {limit}: versions go from 0 to {self.version}, and a limit is "
+                "not negative; a mirror of another map starts anew from version 0"
+            )
+        later = np.flatnonzero(self.versions > since)
+        chosen, version = oldest_first(self.versions[later], limit, self.version)
+        rows = later[chosen]
+        slots, voxels = self.slots[rows], self.voxels
+        return BlockChanges(
+            since,
+            version,
+            self.version,
+            self.epoch,
+            self.keys[rows],
+            voxels.tsdf[slots],
+            voxels.label[slots],
+            voxels.confidence[slots],
+            voxels.rgb[slots],
+        )

@@ -347,4 +347,4 @@ def _own_pose(entry: FrameEntry) -> Float64:
 
 
 def _write_some(journal: MapJournal) -> None:
-    journal.go_on(max(LEAST_WRITTEN, journal.waiting // WRITTEN_SHARE))
+    journal.write(max(LEAST_WRITTEN, journal.in_memory // WRITTEN_SHARE))

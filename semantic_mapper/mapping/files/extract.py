@@ -13,7 +13,7 @@ from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.storage.block_grid import BlockGrid
 from semantic_mapper.mapping.storage.block_index import BlockIndex, find_blocks, pack_keys, unpack_keys
-from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE, GridBuffers, make_open3d_grid
+from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE, GridBuffers
 from semantic_mapper.types import Float32, Float64, Int32, Int64
 
 MESH_TILE_BLOCKS = 16_384  # Open3D fails past 262,100 blocks of 8^3 (int32), and needs 8 KiB a block to mesh
@@ -85,18 +85,33 @@ def _tile_triangles(
     wanted = np.unique(pack_keys((tile[:, None] + offsets).reshape(-1, 3)))
     found = find_blocks(index, wanted)
     keys, source = unpack_keys(wanted[found >= 0]), found[found >= 0]
-    o3d = load_open3d()
-    copy = make_open3d_grid(voxel_size_m, (1, 1, 3), len(keys))
-    target, _ = copy.hashmap().activate(o3d.core.Tensor.from_numpy(np.ascontiguousarray(keys)))
-    for i, view in enumerate((buffers.tsdf, buffers.weight, buffers.color)):
-        values = copy.hashmap().value_tensor(i).numpy()
-        values.reshape(len(values), *view.shape[1:])[target.numpy()] = view[source]
+    grid = open3d_grid(
+        keys, voxel_size_m, tsdf=buffers.tsdf[source], weight=buffers.weight[source], color=buffers.color[source]
+    )
     # Open3D keeps what is strictly above its threshold.
-    mesh = copy.extract_triangle_mesh(float(np.nextafter(np.float32(min_weight), np.float32(0))))
+    mesh = grid.extract_triangle_mesh(float(np.nextafter(np.float32(min_weight), np.float32(0))))
     triangles = _triangles_of(mesh)
     cell = np.floor(triangles.mean(axis=1) / voxel_size_m)
     own = np.isin(pack_keys((cell // BLOCK_SIDE).astype(np.int32)), pack_keys(tile))
     return triangles[own]
+
+
+def open3d_grid(keys: NDArray[np.int32], voxel_size_m: float, **attributes: NDArray[np.generic]) -> Any:
+    """An ``open3d.t.geometry.VoxelBlockGrid`` on the CPU of blocks (B, 3), with attributes (B, 512) or (B, 512, C).
+
+    Raises:
+        DependencyError: Open3D cannot be loaded.
+    """
+    o3d = load_open3d()
+    dtypes = tuple(o3d.core.Tensor.from_numpy(np.empty(0, values.dtype)).dtype for values in attributes.values())
+    shapes = tuple(values.shape[2:] or (1,) for values in attributes.values())
+    device = o3d.core.Device("CPU:0")
+    grid = o3d.t.geometry.VoxelBlockGrid(tuple(attributes), dtypes, shapes, voxel_size_m, BLOCK_SIDE, len(keys), device)
+    places, _ = grid.hashmap().activate(o3d.core.Tensor.from_numpy(np.ascontiguousarray(keys)))
+    for name, values in attributes.items():
+        memory = grid.attribute(name).numpy()
+        memory.reshape(len(memory), *values.shape[1:])[places.numpy()] = values
+    return grid
 
 
 def _triangles_of(mesh: Any) -> Float32:

@@ -10,7 +10,8 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.map_file import BlockPart, write_map
 from semantic_mapper.mapping.files.map_manifest import CHUNK_BLOCKS, MapManifest
 from semantic_mapper.mapping.storage.block_grid import BlockGrid
-from semantic_mapper.mapping.storage.grid_snapshot import GridSnapshot
+from semantic_mapper.mapping.storage.block_index import unpack_keys
+from semantic_mapper.mapping.storage.grid_snapshots import GridSnapshots
 
 _log = get_logger(__name__)
 
@@ -29,7 +30,7 @@ class MapSaving:
         self._locked = locked
         self._manifest = manifest
         with locked() as grid:
-            self._snapshot = GridSnapshot(grid, len(manifest.label_set))
+            self._snapshots = GridSnapshots(grid)
 
     def write(self, path: Path, between: Callable[[], object] = lambda: None) -> None:
         """Write the file, whole or not at all, in memory for ``CHUNK_BLOCKS``.
@@ -45,16 +46,17 @@ class MapSaving:
             manifest = write_map(path, self._manifest, self._parts(between))
         finally:
             with self._locked():
-                self._snapshot.close()
+                self._snapshots.close()
         _log.info(
             "map_saved", path=str(path), frames=manifest.frames, blocks=manifest.blocks, bytes=path.stat().st_size
         )
 
     def _parts(self, between: Callable[[], object]) -> Iterator[BlockPart]:
-        while True:
+        keys = self._snapshots.keys
+        for start in range(0, len(keys), CHUNK_BLOCKS):
+            part = keys[start : start + CHUNK_BLOCKS]
             with self._locked():
-                if not len(self._snapshot):
-                    return
-                part = self._snapshot.read(CHUNK_BLOCKS)
-            yield part
+                values = self._snapshots.read(part)
+                self._snapshots.release(part)
+            yield unpack_keys(part), values
             between()

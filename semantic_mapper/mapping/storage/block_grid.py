@@ -1,4 +1,4 @@
-"""Storage of the map: Open3D's sparse voxel blocks, with numpy views of their buffers and growth in bounded steps.
+"""Storage of the map: sparse voxel blocks in one pool of memory, with one index, and growth in bounded steps.
 
 With a limit on memory, the blocks that were used longest ago go to a ``BlockStore`` on disk and come back, equal to the
 bit, when they are asked for.
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,6 @@ from numpy.typing import NDArray
 from semantic_mapper.errors import MapError
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.fusion.evidence import EVIDENCE_DTYPES
-from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.storage.block_index import (
     BlockIndex,
     find_blocks,
@@ -34,9 +32,7 @@ from semantic_mapper.mapping.storage.grid_buffers import (
     ATTRIBUTES,
     GridBuffers,
     advised_mb,
-    copy_blocks,
-    make_open3d_grid,
-    view_buffers,
+    make_buffers,
 )
 
 LEAST_RESIDENT = 256  # blocks that memory has room for, whatever the limit
@@ -45,12 +41,13 @@ EVICTED_SHARE = 32  # at least this part of what memory has room for: sorting ou
 TILE_BLOCKS = 4096  # blocks brought together at a time to be read where some are on disk
 NEIGHBOURS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
 _READ_AT_ONCE = 256  # blocks between memory and disk: a copy of them takes room beside both
+_FREE = -1  # no packed key is negative
 
 _log = get_logger(__name__)
 
 
 class BlockGrid:
-    """A VoxelBlockGrid that grows by half when full and never past ``max_blocks``.
+    """Blocks of 8^3 voxels by their key; grows by half when full and never past ``max_blocks``.
 
     Args:
         voxel_size_m: Edge of a voxel.
@@ -70,34 +67,30 @@ class BlockGrid:
         memory_bytes: int = 0,
         evidence: str = "float32",
     ) -> None:
-        self._o3d = load_open3d()
         self._max_blocks = max_blocks
         self._voxel_size_m = voxel_size_m
-        self._classes = classes
+        self.classes = classes
         self.evidence = evidence
-        channels = (1, 1, 3, classes, 1)
         value_bytes = 4 * (1 + 1 + 3 + 1) + np.dtype(EVIDENCE_DTYPES[evidence]).itemsize * classes
         self.block_bytes = BLOCK_VOXELS * value_bytes + 12
         self._max_resident = max_blocks
         if memory_bytes > 0:
             self._max_resident = min(max_blocks, max(LEAST_RESIDENT, memory_bytes // self.block_bytes))
             initial_blocks = self._max_resident  # at once: growing needs room for the old memory beside the new
-        self._channels = channels
-        self._grid = self._make_grid(max(1, min(initial_blocks, max_blocks)))
-        self._map = self._grid.hashmap()
+        capacity = max(1, min(initial_blocks, max_blocks))
+        self._buffers = self._make_buffers(capacity)
         self._index = make_block_index(np.empty((0, 3), np.int32), np.empty(0, np.int32))
         self._store: BlockStore | None = None
         self._told_of_portions = False
         self._clock = 0
-        self._used = np.zeros(self.capacity, np.int64)  # by buffer index: when last asked for
-        self._version = np.zeros(self.capacity, np.int64)  # by buffer index: see ``mark_changed``
+        # By buffer index:
+        self._packed = np.full(capacity, _FREE, np.int64)  # key of the block there
+        self._used = np.zeros(capacity, np.int64)  # when last asked for
+        self._version = np.zeros(capacity, np.int64)  # see ``mark_changed``
+        self._resident_count = 0
+        self._ever_used = 0  # from here on, buffers are as they were made: zero
         # Called with the packed keys that ``activate`` was asked for, before anything is done with them.
         self.watchers: list[Callable[[NDArray[np.int64]], None]] = []
-
-    @property
-    def grid(self) -> Any:
-        """The ``open3d.t.geometry.VoxelBlockGrid`` itself."""
-        return self._grid
 
     @property
     def index(self) -> BlockIndex:
@@ -112,7 +105,7 @@ class BlockGrid:
     @property
     def resident_count(self) -> int:
         """Blocks in memory."""
-        return int(self._map.size())
+        return self._resident_count
 
     @property
     def stored_count(self) -> int:
@@ -127,7 +120,7 @@ class BlockGrid:
     @property
     def capacity(self) -> int:
         """Blocks there is memory for."""
-        return int(self._map.capacity())
+        return len(self._packed)
 
     @property
     def memory_bytes(self) -> int:
@@ -140,15 +133,14 @@ class BlockGrid:
         return self._max_resident
 
     def buffers(self) -> GridBuffers:
-        """Views of the present buffers. Take them anew after every ``activate``: growth moves the memory."""
-        return view_buffers(self._map)
+        """The present buffers. Take them anew after every ``activate``: growth moves the memory."""
+        return self._buffers
 
     def sorted_blocks(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Keys (B, 3) in lexicographic order and their buffer indices (B,)."""
-        indices = self._map.active_buf_indices().numpy().astype(np.int32)
-        keys = self._map.key_tensor().numpy()[indices]
-        order = np.argsort(pack_keys(keys))
-        return keys[order], indices[order]
+        indices = np.flatnonzero(self._packed != _FREE).astype(np.int32)
+        indices = indices[np.argsort(self._packed[indices])]
+        return self._buffers.keys[indices], indices
 
     def activate(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
         """Make sure that the blocks of unique packed keys (B,), about to change, are in memory; return indices (B,).
@@ -213,8 +205,7 @@ class BlockGrid:
         versions = version + np.arange(count) // each
         self._version[indices] = versions[: len(indices)]
         if self._store is not None:
-            stored = self._store.versions
-            stored.put(stored.items()[0], versions[len(indices) :])
+            self._store.versions = versions[len(indices) :].copy()
         return version + max(count - 1, 0) // each
 
     def changed_since(self, version: int) -> NDArray[np.int32]:
@@ -226,15 +217,15 @@ class BlockGrid:
         keys, indices = self.sorted_blocks()
         packed, versions = pack_keys(keys), self._version[indices]
         if self._store is not None:
-            stored = self._store.versions.items()
-            packed, versions = np.concatenate((packed, stored[0])), np.concatenate((versions, stored[1]))
+            packed = np.concatenate((packed, self._store.keys))
+            versions = np.concatenate((versions, self._store.versions))
         newer = np.flatnonzero(versions > version)
         newer = newer[np.argsort(packed[newer])]
         return packed[newer], versions[newer]
 
     def stored_keys(self) -> NDArray[np.int32]:
         """Keys (B, 3) of the blocks on disk."""
-        return unpack_keys(np.empty(0, np.int64) if self._store is None else self._store.versions.items()[0])
+        return unpack_keys(np.empty(0, np.int64) if self._store is None else self._store.keys)
 
     def all_keys(self) -> NDArray[np.int32]:
         """Keys (B, 3) of all blocks in lexicographic order."""
@@ -243,7 +234,7 @@ class BlockGrid:
 
     def keys_between(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.int32]:
         """Those of ``all_keys`` from ``low`` (3,) to ``high`` (3,), both included, without sorting the others."""
-        resident = self._map.key_tensor().numpy()[self._map.active_buf_indices().numpy()]
+        resident = self._buffers.keys[self._packed != _FREE]
         parts = [keys[((keys >= low) & (keys <= high)).all(axis=1)] for keys in (resident, self.stored_keys())]
         keys = np.concatenate(parts)
         return keys[np.argsort(pack_keys(keys))]
@@ -270,7 +261,7 @@ class BlockGrid:
         """A grid with these existing blocks (B,) in memory: this one where nothing is on disk, else a temporary one."""
         if not self.stored_count:
             return self
-        copy = BlockGrid(self._voxel_size_m, self._classes, len(packed), len(packed), evidence=self.evidence)
+        copy = BlockGrid(self._voxel_size_m, self.classes, len(packed), len(packed), evidence=self.evidence)
         copy.fill(packed, self.read(packed))
         return copy
 
@@ -343,7 +334,7 @@ class BlockGrid:
         new = missing[~stored.holds(missing)]
         for start in range(0, len(back), _READ_AT_ONCE):
             part = back[start : start + _READ_AT_ONCE]
-            values, versions = stored.get(part), stored.versions.find(part)
+            values, versions = stored.get(part), stored.versions_of(part)
             stored.drop(part)  # may fail, and then the blocks are there still; what comes now does not
             self._add(part)
             indices, buffers = find_blocks(self._index, part), self.buffers()
@@ -355,7 +346,7 @@ class BlockGrid:
     def _evict(self, count: int, keep: NDArray[np.int64]) -> None:
         """Put the ``count`` blocks that were used longest ago, and some more, on disk; those of ``keep`` stay."""
         if self._store is None:
-            self._store = BlockStore(self._classes, self.evidence)
+            self._store = BlockStore(self.classes, self.evidence)
             _log.info("map_pages", resident=self._max_resident, reason="voxel_map.memory_mb is used up")
         keys, indices = self.sorted_blocks()
         packed = pack_keys(keys)
@@ -370,12 +361,13 @@ class BlockGrid:
                 part = going[start : start + _READ_AT_ONCE]
                 blobs = pack_blocks(values, indices[part]).blobs()
                 self._store.put_packed(packed[part], self._version[indices[part]], blobs)
-                self._map.erase(self._o3d.core.Tensor.from_numpy(np.ascontiguousarray(keys[part])))
+                self._packed[indices[part]] = _FREE
+                self._resident_count -= len(indices[part])
         finally:  # also where the disk is full: blocks that are there have left memory
             self._index = make_block_index(*self.sorted_blocks())
 
-    def _make_grid(self, capacity: int) -> Any:
-        """An empty Open3D grid.
+    def _make_buffers(self, capacity: int) -> GridBuffers:
+        """Memory for so many blocks, all zero.
 
         Raises:
             MapError: the machine does not have so much memory, or none that is free.
@@ -387,35 +379,38 @@ class BlockGrid:
                 f"memory for {capacity} blocks is {needed / 1e9:.1f} GB, this machine has {there / 1e9:.1f} GB; {mend}"
             )
         try:
-            return make_open3d_grid(self._voxel_size_m, self._channels, capacity, self.evidence)
-        except RuntimeError as error:
+            return make_buffers(capacity, self.classes, self.evidence)
+        except OSError as error:
             raise MapError(
-                f"no memory for {capacity} blocks ({needed / 1e9:.1f} GB); free some, raise the limit (ulimit -v), or "
-                f"{mend}"
+                f"no memory for {capacity} blocks ({needed / 1e9:.1f} GB): {error}; free some, raise the limit "
+                f"(ulimit -v), or {mend}"
             ) from error
 
     def _grow(self, needed: int) -> None:
-        capacity = min(max(needed, self.capacity + self.capacity // 2), self._max_resident)
+        before = self.capacity
+        capacity = min(max(needed, before + before // 2), self._max_resident)
         _log.debug("map_grows", blocks=self.block_count, capacity=capacity)
-        keys, before = self.sorted_blocks()
-        larger = self._make_grid(capacity)
-        indices = copy_blocks(self.buffers(), keys, before, larger.hashmap())
-        used, version = self._used[before], self._version[before]
-        self._grid, self._map = larger, larger.hashmap()
-        self._index = make_block_index(keys, indices)
-        self._used, self._version = np.zeros(self.capacity, np.int64), np.zeros(self.capacity, np.int64)
-        self._used[indices], self._version[indices] = used, version
+        larger = self._make_buffers(capacity)
+        for values, grown in zip(self._buffers, larger, strict=True):
+            grown[:before] = values
+        self._buffers = larger
+        more = capacity - before
+        self._packed = np.concatenate((self._packed, np.full(more, _FREE)))
+        self._used = np.concatenate((self._used, np.zeros(more, np.int64)))
+        self._version = np.concatenate((self._version, np.zeros(more, np.int64)))
 
     def _add(self, packed: NDArray[np.int64]) -> None:
-        keys = np.ascontiguousarray(unpack_keys(packed))
-        indices, inserted = self._map.activate(self._o3d.core.Tensor.from_numpy(keys))
-        if not bool(inserted.numpy().all()):  # the index says that they were not there: the two tables disagree
-            raise MapError(f"block table and Open3D's hash map disagree about {len(keys)} new blocks; this is a bug")
-        added = indices.numpy().astype(np.int32)
+        """Give new blocks (B,) a place in the buffers, which have room; all their voxels are zero."""
+        added = np.flatnonzero(self._packed == _FREE)[: len(packed)].astype(np.int32)
+        self._packed[added] = packed
+        self._resident_count += len(packed)
+        self._buffers.keys[added] = unpack_keys(packed)
         if not has_room(self._index, self.resident_count):
             self._index = make_block_index(*self.sorted_blocks())
         else:
             insert_blocks(self._index, packed, added)
-        for view in self.buffers()[1:]:  # Open3D hands out memory as its last user left it
-            view[added] = 0
+        used_before = added[added < self._ever_used]
+        for values in self._buffers[1:]:
+            values[used_before] = 0
+        self._ever_used = max(self._ever_used, int(added.max(initial=-1)) + 1)
         self._version[added] = 0

@@ -1,6 +1,6 @@
 """Block key -> buffer index, as an open-addressing table that compiled kernels can read (``block_index.h``).
 
-Open3D has its own hash map, but only its own kernels can ask it. A block key is the block's integer coordinate
+A block key is the block's integer coordinate
 (x, y, z); three of them packed into one int64 sort like the triple.
 """
 

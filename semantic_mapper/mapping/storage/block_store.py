@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
 from semantic_mapper.mapping.fusion.evidence import EVIDENCE_DTYPES
-from semantic_mapper.mapping.storage.key_table import ABSENT, KeyTable
 from semantic_mapper.types import Float32, Int32, Int64
 
 BLOCK_VOXELS = 512
@@ -88,19 +87,20 @@ class BlockStore:
             )
         except sqlite3.Error as error:
             raise MapError(f"no room for blocks on disk can be made: {error}; is TMPDIR full or read-only?") from error
-        self._versions = KeyTable()
+        # Of every block in the store, by ascending key.
+        self.keys = np.empty(0, np.int64)
+        self.versions = np.empty(0, np.int64)
 
     def __len__(self) -> int:
-        return len(self._versions)
-
-    @property
-    def versions(self) -> KeyTable:
-        """Packed key -> version of every block in the store."""
-        return self._versions
+        return len(self.keys)
 
     def holds(self, keys: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which of the blocks (B,) are in the store."""
-        return self._versions.find(keys) != ABSENT
+        return self._find(keys)[1]
+
+    def versions_of(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Versions (B,) of blocks (B,) that are in the store."""
+        return self.versions[self._find(keys)[0]]
 
     @property
     def file_bytes(self) -> int:
@@ -126,7 +126,12 @@ class BlockStore:
         rows = [(key, version, zlib.crc32(voxels), voxels) for key, version, voxels in packed]
         with self._all_or_nothing(f"{len(rows)} blocks cannot be put on disk"):
             self._database.executemany("INSERT OR REPLACE INTO blocks VALUES (?, ?, ?, ?)", rows)
-        self._versions.put(keys, versions)
+        row, there = self._find(keys)
+        self.versions[row[there]] = versions[there]
+        new = np.flatnonzero(~there)
+        new = new[np.argsort(keys[new])]
+        self.keys = np.insert(self.keys, row[new], keys[new])
+        self.versions = np.insert(self.versions, row[new], versions[new])
 
     def get(self, keys: NDArray[np.int64]) -> BlockValues:
         """Read blocks (B,), in the order asked for; they stay in the store.
@@ -159,11 +164,20 @@ class BlockStore:
         with self._all_or_nothing(f"{len(keys)} blocks cannot be taken off the disk"):
             for part in _parts(keys.tolist()):
                 self._database.execute(f"DELETE FROM blocks WHERE key IN ({','.join('?' * len(part))})", part)
-        self._versions.remove(keys)
+        row, there = self._find(keys)
+        self.keys, self.versions = np.delete(self.keys, row[there]), np.delete(self.versions, row[there])
 
     def close(self) -> None:
         """Give the disk space back."""
         self._database.close()
+
+    def _find(self, keys: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+        """Where blocks (B,) are, or would be, among ``keys``, and whether they are."""
+        row = np.searchsorted(self.keys, keys)
+        there = np.zeros(len(keys), np.bool_)
+        within = row < len(self.keys)
+        there[within] = self.keys[row[within]] == keys[within]
+        return row, there
 
     @contextmanager
     def _all_or_nothing(self, failure: str) -> Iterator[None]:

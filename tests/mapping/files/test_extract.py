@@ -6,6 +6,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from semantic_mapper.errors import MapError
 from semantic_mapper.mapping.files import extract
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from tests.mapping.grids import random_grid
@@ -32,6 +33,21 @@ def test_mesh_of_a_sphere_lies_on_it_and_faces_outwards(sphere: VoxelMap) -> Non
     assert (outward > 0).mean() > 0.97
     near = np.abs(radius - 0.35) < 0.01
     assert (mesh.label[near] == 9).mean() > 0.97 and (mesh.rgb[near] == 90).all()
+
+
+def test_open3d_sees_the_map_with_its_labels(sphere: VoxelMap) -> None:
+    grid, mesh, state = sphere.to_open3d(), sphere.mesh(), sphere.block_state()
+    seen = grid.extract_triangle_mesh(1.0 - 1e-6).vertex.positions.numpy()
+    assert len(seen) == len(mesh.vertices)
+    assert np.allclose(np.unique(seen, axis=0), np.unique(mesh.vertices, axis=0), atol=1e-5)
+    keys = grid.hashmap().key_tensor().numpy()[grid.hashmap().active_buf_indices().numpy()]
+    assert (np.unique(keys, axis=0) == state["keys"]).all()
+    label, weight = grid.attribute("label").numpy(), grid.attribute("weight").numpy()
+    assert weight.sum() == state["weight"].sum() and label.dtype == np.uint8
+    points, ids = grid.extract_point_cloud(1.0), set(np.unique(label).tolist())
+    assert len(points.point.positions) > 1000 and ids == {9, sphere.label_set.ignore_id}
+    with pytest.raises(MapError, match="empty map"):
+        small_map().to_open3d()
 
 
 def test_mesh_does_not_depend_on_the_tiles(sphere: VoxelMap, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,7 +43,7 @@ def test_blocks_come_back_equal_to_the_bit_in_any_order(evidence: str):
     for name in BlockValues._fields:
         assert getattr(back, name).tobytes() == getattr(blocks, name)[order].tobytes(), name
     assert len(store) == 1200
-    np.testing.assert_array_equal(store.versions.find(keys), np.arange(1200))
+    np.testing.assert_array_equal(store.versions_of(keys), np.arange(1200))
     np.testing.assert_array_equal(store.holds(np.array([keys[0], 1])), [True, False])
 
 
@@ -54,7 +54,7 @@ def test_a_block_put_away_again_replaces_the_old_one_and_a_dropped_one_is_gone()
     newer = some_blocks(1, 2)
     store.put(key, np.array([2]), newer)
     assert store.get(key).tsdf.tobytes() == newer.tsdf.tobytes()
-    assert [a.tolist() for a in store.versions.items()] == [[42], [2]]
+    assert [store.keys.tolist(), store.versions.tolist()] == [[42], [2]]
     store.drop(key)
     assert len(store) == 0
     with pytest.raises(MapError, match="missing"):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.mapping.storage import map_journal
+from semantic_mapper.mapping.storage import grid_snapshots
 from semantic_mapper.mapping.storage.block_store import BlockStore
 from semantic_mapper.mapping.storage.map_journal import MapJournal
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -30,19 +30,19 @@ def restored(journal: MapJournal, like: VoxelMap) -> VoxelMap:
 
 
 @pytest.mark.parametrize(("memory_mb", "evidence"), [(0, "float32"), (MEMORY_MB, "float32"), (0, "int16")])
-@pytest.mark.parametrize("most_aside", [10, 10**6])
+@pytest.mark.parametrize("most_in_memory", [10, 10**6])
 def test_each_moment_comes_back_although_frames_go_on(
-    memory_mb: int, evidence: str, most_aside: int, monkeypatch: pytest.MonkeyPatch
+    memory_mb: int, evidence: str, most_in_memory: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(map_journal, "_MOST_ASIDE", most_aside)
+    monkeypatch.setattr(grid_snapshots, "MOST_IN_MEMORY", most_in_memory)
     voxel_map = small_map(voxel_size_m=0.01, memory_mb=memory_mb, evidence=evidence)
     journal, before = MapJournal(voxel_map, 0), {0: (state(voxel_map), 0)}
     for number, first in ((3, 0), (7, 2), (9, 1), (12, 4)):  # goes back to where it was, and further
         walk(voxel_map, 3, first)
         journal.mark(number)
         before[number] = state(voxel_map), voxel_map.frames
-        assert journal.waiting <= most_aside
-        journal.go_on(50)
+        assert journal.in_memory <= most_in_memory
+        journal.write(50)
     walk(voxel_map, 2)
     for number, (then, frames) in before.items():
         assert journal.numbers[0] == number and then["tsdf"] != state(voxel_map)["tsdf"]
@@ -62,13 +62,13 @@ def test_a_moment_takes_no_more_room_than_what_changes_until_the_next() -> None:
     version = voxel_map.version
     walk(voxel_map, 1, first=3)
     changed = len(voxel_map.changed_since(version))
-    journal.go_on()
+    journal.write()
     walk(voxel_map, 1, first=3)
-    assert 0 < changed < voxel_map.block_count / 3 and journal.waiting == 0
-    assert len(journal._moments[0].store) == changed
+    assert 0 < changed < voxel_map.block_count / 3 and journal.in_memory == 0
+    assert len(journal._snapshots._moments[0].store) == changed
     journal.mark(1)
     journal.forget_oldest()
-    assert len(journal._moments[0].store) == 0 and len(journal.oldest_keys()) == voxel_map.block_count
+    assert len(journal._snapshots._moments[0].store) == 0 and len(journal.oldest_keys()) == voxel_map.block_count
 
 
 def test_another_thread_writes_and_restores_as_well() -> None:
@@ -80,7 +80,7 @@ def test_another_thread_writes_and_restores_as_well() -> None:
 
     def read() -> None:
         while not done.is_set() or not found:
-            journal.go_on(7)
+            journal.write(7)
             found.append(state(restored(journal, voxel_map)))
 
     reader = threading.Thread(target=read)
@@ -95,11 +95,11 @@ def test_a_disk_that_fails_is_told_to_the_journal_and_not_to_the_frame(monkeypat
     voxel_map = small_map(voxel_size_m=0.01)
     walk(voxel_map, 3)
     journal = MapJournal(voxel_map, 0)
-    monkeypatch.setattr(map_journal, "_MOST_ASIDE", 5)
-    journal._moments[0].store._database.execute("DROP TABLE blocks")
+    monkeypatch.setattr(grid_snapshots, "MOST_IN_MEMORY", 5)
+    journal._snapshots._moments[0].store._database.execute("DROP TABLE blocks")
     walk(voxel_map, 1)
     with pytest.raises(MapError, match="cannot be put on disk"):
-        journal.go_on(1)
+        journal.write(1)
     journal.close()
     assert not voxel_map._grid.watchers and voxel_map.frames == 4
 
@@ -109,12 +109,12 @@ def test_a_disk_that_is_full_for_a_while_takes_nothing_from_the_journal() -> Non
     walk(voxel_map, 3)
     journal, before = MapJournal(voxel_map, 0), state(voxel_map)
     walk(voxel_map, 3)
-    database, waiting = journal._moments[0].store._database, journal.waiting
+    database, waiting = journal._snapshots._moments[0].store._database, journal.in_memory
     (pages,) = database.execute("PRAGMA page_count").fetchone()
     database.execute(f"PRAGMA max_page_count = {pages + 1}")
     with pytest.raises(MapError, match="disk is full"):
-        restored(journal, voxel_map)
-    assert journal.waiting == waiting > 300
+        journal.write()
+    assert journal.in_memory == waiting > 300
     database.execute("PRAGMA max_page_count = 1000000")
     assert state(restored(journal, voxel_map)) == before
 
@@ -127,8 +127,8 @@ def test_looking_at_a_map_on_disk_is_no_change_of_it() -> None:
     for n in range(2):
         assert (voxel_map.ray_cast(along_the_wall(n * STEP_M), INTRINSICS).depth_m > 0).any()
     assert stored - set(map(tuple, voxel_map._grid.stored_keys().tolist()))  # came back to be looked at
-    journal.go_on()
-    assert len(journal._moments[0].store) == 0
+    journal.write()
+    assert len(journal._snapshots._moments[0].store) == 0
 
 
 def test_a_step_puts_a_bounded_part_on_disk(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,7 +145,7 @@ def test_a_step_puts_a_bounded_part_on_disk(monkeypatch: pytest.MonkeyPatch) -> 
     pipeline = make_pipeline(max_frames=8)
     a_step: list[int] = []
     for frame in frames:
-        waiting = pipeline.corrector._journal.waiting
+        waiting = pipeline.corrector._journal.in_memory
         written.clear()
         pipeline.step(frame)
         assert sum(written) <= max(10, waiting // 8)

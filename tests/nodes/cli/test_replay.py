@@ -145,7 +145,7 @@ def test_frames_that_weights_were_finetuned_on_are_never_scored(
     assert summary["frames"]["fused"] == 3
     assert summary["frames"]["scored"] == 1
     assert summary["frames"]["excluded_from_scores"] == 2
-    assert "2 frames are left out of the scores" in done.stdout
+    assert "2 frames left out of the scores" in done.stdout
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import msgpack
 import numpy as np
@@ -11,12 +12,12 @@ import pytest
 
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import MapError
-from semantic_mapper.nodes.mapper import long_queries as long_questions
 from semantic_mapper.nodes.mapper import query_answers, query_service
 from semantic_mapper.nodes.mapper.query_answers import Answers
-from semantic_mapper.nodes.mapper.query_queue import MAX_OF_ASKER
+from semantic_mapper.nodes.mapper.query_service import MAX_PENDING_OF_CLIENT
 from semantic_mapper.queries.instances import Instance, InstanceTracker
 from semantic_mapper.queries.lookup import at
+from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.occupancy import occupancy
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.transport import query_messages as messages
@@ -100,7 +101,7 @@ def test_who_asks_too_much_that_takes_long_is_told_so(
 ) -> None:
     hangs, may_go_on = held
     greedy, modest = Stranger(client._socket.endpoint), Stranger(client._socket.endpoint)
-    for _ in range(MAX_OF_ASKER):
+    for _ in range(MAX_PENDING_OF_CLIENT):
         greedy.socket.send_multipart(long_question((0.3, 0.1, 1.0)))
     assert hangs.wait(60)
     kind, header = greedy.ask(long_question((0.3, 0.1, 1.0)))
@@ -108,11 +109,33 @@ def test_who_asks_too_much_that_takes_long_is_told_so(
     modest.socket.send_multipart(long_question((0.3, 0.2, 1.0)))
     assert client.info().version == 14
     may_go_on.set()
-    assert modest.socket.poll(60_000)  # in its turn, which is the second
-    for _ in range(MAX_OF_ASKER):
+    assert modest.socket.poll(60_000)
+    for _ in range(MAX_PENDING_OF_CLIENT):
         assert greedy.socket.poll(60_000)
         assert greedy.socket.recv_multipart()[1] == b"instances"
     for stranger in (greedy, modest):
+        stranger.socket.close()
+
+
+def test_all_clients_together_may_ask_only_so_much_that_takes_long(
+    client: MapClient, held: tuple[threading.Event, threading.Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(query_service, "MAX_PENDING", 3)
+    hangs, may_go_on = held
+    first = [Stranger(client._socket.endpoint) for _ in range(3)]
+    for stranger in first:
+        stranger.socket.send_multipart(long_question((0.4, 0.1, 1.0)))
+    assert hangs.wait(60)
+    late = Stranger(client._socket.endpoint)
+    for asker in ("late", "late", ""):
+        kind, header = late.ask(asked_by(asker, 60.0, long_question((0.4, 0.2, 1.0))))
+        assert kind == b"error" and "too many questions that take long" in msgpack.unpackb(header)["text"]
+    assert late.ask([b"", *good_questions()[0]])[0] == b"info"
+    may_go_on.set()
+    for stranger in first:
+        assert stranger.socket.poll(60_000) and stranger.socket.recv_multipart()[1] == b"instances"
+    assert late.ask(long_question((0.4, 0.2, 1.0)))[0] == b"instances"
+    for stranger in (*first, late):
         stranger.socket.close()
 
 
@@ -136,10 +159,10 @@ def test_what_nobody_waits_for_any_more_is_not_computed(
         under_way.send_multipart(asked_by("u", 60.0, long_question((0.0, 0.1, 1.0))))
         assert hangs.wait(60)
         first.send_multipart(asked_by("a", 60.0, long_question((0.0, 0.2, 1.0))))
-        assert eventually(lambda: service._long.holds(b"a"), 10)
+        assert eventually(lambda: b"a" in service._pending, 10)
         second.send_multipart(asked_by("b", 60.0, long_question((0.0, 0.3, 1.0))))
         silent.send_multipart(asked_by("c", 0.1, long_question((0.0, 0.4, 1.0))))
-        assert eventually(lambda: service._long.holds(b"b") and service._long.holds(b"c"), 10)
+        assert eventually(lambda: {b"b", b"c"} <= set(service._pending), 10)
         again.send_multipart(asked_by("a", 60.0, long_question((0.0, 0.5, 1.0))))
         under_way_again.send_multipart(asked_by("u", 60.0, long_question((0.0, 0.1, 1.0))))
         assert eventually(lambda: service.abandoned == 1, 10)
@@ -237,7 +260,7 @@ def test_an_update_of_things_that_fails_spoils_no_later_one(client: MapClient, m
 def test_it_closes_while_questions_wait(
     held: tuple[threading.Event, threading.Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(long_questions, "CLOSE_S", 0.1)
+    monkeypatch.setattr(query_service, "CLOSE_S", 0.1)
     hangs, _ = held
     with a_folder() as folder:
         endpoint = f"ipc://{folder / 'query'}"
@@ -250,3 +273,18 @@ def test_it_closes_while_questions_wait(
         with answering(endpoint, whole_map()), MapClient(endpoint, timeout_s=60) as late:
             assert late.info().version == 14
     stranger.socket.close()
+
+
+def test_a_bug_in_a_snapshot_is_told_and_does_not_reach_the_mapper(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def wrong(*arguments: object) -> None:
+        raise KeyError("a bug")
+
+    monkeypatch.setattr(MapMirror, "apply", wrong)
+    monkeypatch.setattr(query_service, "FIRST_CATCH_UP_S", 0.5)
+    with answering(f"ipc://{tmp_path / 'q'}", whole_map()) as service:
+        with MapClient(service.endpoint, timeout_s=60) as client, pytest.raises(MapError, match="busy, or ending"):
+            client.info()
+        assert not service.alive and not service.hand_over_all(1.0)
+    service.follow()

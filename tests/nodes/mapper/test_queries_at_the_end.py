@@ -78,7 +78,7 @@ def test_who_asks_first_of_a_map_that_is_being_written_is_told_so(tmp_path: Path
             with pytest.raises(MapError, match="busy, or ending"):
                 client.info()
         service.follow()
-        assert eventually(lambda: service._relay.snapshot().version == 1)
+        assert eventually(lambda: service._mirror.snapshot().version == 1)
         assert client.info().blocks == voxel_map.block_count > 0
 
 
@@ -91,6 +91,6 @@ def test_who_waits_for_the_first_answer_when_the_mapper_ends_gets_it(tmp_path: P
             asking = threading.Thread(target=lambda: answers.append(client.info().blocks))
             asking.start()
             assert eventually(lambda: service.asked, 20) and not service.answered
-            assert service.hand_over_all(10.0) and service._relay.snapshot().version == voxel_map.version
+            assert service.hand_over_all(10.0) and service._mirror.snapshot().version == voxel_map.version
             asking.join(20)
         assert answers == [voxel_map.block_count]
