@@ -30,9 +30,8 @@ import torch
 from scripts.paired_steps import LAP, Turn, slowdown
 from semantic_mapper.client import MapClient
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, confusion_of
-from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint
+from semantic_mapper.fields.checkpoint import Checkpoint, checkpoint_bytes, default_checkpoint_path, load_checkpoint
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.nodes.finetuner.finetune_round import file_of
 from semantic_mapper.nodes.options import NodeJob
 from semantic_mapper.nodes.supervisor.node_process import NodeProcess
 from semantic_mapper.plots import Curve, Panel, draw_panels, write_picture
@@ -211,7 +210,7 @@ class Robot:
 
     def offer(self, checkpoint: Checkpoint) -> None:
         """Offer weights to the mapper, as a finetuner would that has found them better."""
-        data, version = file_of(checkpoint), self.in_use.newest + 1
+        data, version = checkpoint_bytes(checkpoint), self.in_use.newest + 1
         update = WeightsUpdate("script", version, data, digest_of(data), self.in_use.digest, 1.0, 0.0, 1, 1)
         self._offers.publish(encode(update))
         self.note("weights offered by a teacher that is wrong throughout", version=version)

@@ -1,53 +1,56 @@
-"""One round of learning in a thread of its own, within a share of a core."""
+"""One round of learning, in a thread of its own."""
 
 from __future__ import annotations
 
-import tempfile
+import os
 import threading
 import time
-from pathlib import Path
+from concurrent.futures import CancelledError
+
+import structlog
 
 from semantic_mapper.errors import SemanticMapperError
-from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
-from semantic_mapper.nodes.finetuner.throttle import AbandonedError, Throttle, run_again, run_when_idle
+from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.training.finetune import FinetuneProgress
-from semantic_mapper.training.keyframe_pool import Lessons, key_of
-from semantic_mapper.training.online import Lesson, OnlineConfig, learn
+from semantic_mapper.training.keyframe_pool import KeyframeSplit
+from semantic_mapper.training.online import OnlineConfig, OnlineResult, learn
+
+_log = structlog.get_logger(__name__)
 
 
-class LearningRound:
-    """Begins at once.
+class FinetuneRound:
+    """Begins at once, and rests after each step and each look at a held-out keyframe as its share says.
 
     Args:
-        lessons: To learn from, and to judge by.
-        parent: Weights in use; ``digest`` is that of their file.
+        keyframes: To learn from, and to judge by.
+        parent: Weights in use.
+        parent_digest: SHA-256 of their file, hexadecimal.
         config: Of the round.
-        share: Of a core, or of the GPU.
+        share: Of a core, or of the GPU, in 0..1.
         idle: Learn only while nobody else wants the processor.
     """
 
     def __init__(
         self,
-        lessons: Lessons,
+        keyframes: KeyframeSplit,
         parent: Checkpoint,
-        digest: str,
+        parent_digest: str,
         config: OnlineConfig,
         share: float,
         *,
-        idle: bool = False,
+        idle: bool,
     ) -> None:
-        self.digest = digest
+        self.parent_digest = parent_digest
         self.step = 0
-        self.lesson: Lesson | None = None
+        self.result: OnlineResult | None = None
         self.failure = "it failed; see the log"
-        self.abandoned = False
-        self.keys = frozenset(key_of(f) for f in (*lessons.train, *lessons.held_out))
-        self._began = time.monotonic()
-        clock = time.process_time if config.finetune.device == "cpu" else time.monotonic
-        self._throttle = Throttle(share, clock)
-        self._work = lessons, parent, config
-        self._idle = idle
-        self._thread = threading.Thread(target=self._learn, name="learning", daemon=True)
+        self._share = share
+        self._clock = time.process_time if config.finetune.device == "cpu" else time.monotonic
+        self._worked_from = self._clock()
+        self._cancelled = threading.Event()
+        self._thread = threading.Thread(
+            target=self._run, args=(keyframes, parent, config, idle), name="learning", daemon=True
+        )
         self._thread.start()
 
     @property
@@ -56,50 +59,52 @@ class LearningRound:
         return self._thread.is_alive()
 
     @property
-    def seconds(self) -> float:
-        """Since it began."""
-        return time.monotonic() - self._began
+    def cancelled(self) -> bool:
+        """Whether nobody wants the outcome any more."""
+        return self._cancelled.is_set()
 
-    @property
-    def rested_s(self) -> float:
-        """Of these, those in which it did nothing."""
-        return self._throttle.rested_s
-
-    def abandon(self) -> None:
-        """Give it up: it ends with the layer that it is in, which takes long where it gets no processor."""
-        self._throttle.abandon()
-        run_again(self._thread)
+    def cancel(self) -> None:
+        """Ask it to end after the step that it is in."""
+        self._cancelled.set()
 
     def has_ended(self, timeout_s: float) -> bool:
         """Whether it ends within this time."""
         self._thread.join(timeout_s)
         return not self.running
 
-    def _learn(self) -> None:
+    def _run(self, keyframes: KeyframeSplit, parent: Checkpoint, config: OnlineConfig, idle: bool) -> None:
         import torch
 
-        lessons, parent, config = self._work
         torch.set_num_threads(torch.get_num_threads())  # OpenMP has a limit for each thread
-        if self._idle:
+        if idle:
             run_when_idle()
         try:
-            with self._throttle.pacing():
-                self.lesson = learn(lessons, parent, config, self._on_progress)
-        except AbandonedError:
-            self.abandoned, self.failure = True, "given up: the mapper has gone on to other weights"
+            self.result = learn(keyframes, parent, config, self._on_progress, self._rest)
+        except CancelledError:
+            _log.info("round_given_up", reason="the mapper uses other weights now")
         except SemanticMapperError as error:
             self.failure = str(error)
-        except (MemoryError, RuntimeError) as error:  # torch says in a RuntimeError that it has no memory
+        except (MemoryError, RuntimeError) as error:  # torch raises a RuntimeError where memory is exhausted
             lines = str(error).strip().splitlines()
             self.failure = f"{type(error).__name__}: {lines[0] if lines else 'no more is known'}"
 
     def _on_progress(self, progress: FinetuneProgress) -> None:
         self.step = progress.step
+        self._rest()
+
+    def _rest(self) -> None:
+        worked_s = self._clock() - self._worked_from
+        if self._cancelled.wait(worked_s / self._share - worked_s):
+            raise CancelledError
+        self._worked_from = self._clock()
 
 
-def file_of(checkpoint: Checkpoint) -> bytes:
-    """The weights file of a checkpoint."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "weights.safetensors"
-        save_checkpoint(checkpoint, path)
-        return path.read_bytes()
+def run_when_idle() -> None:
+    """Let the calling thread, and those that it starts, compute only while nobody else wants the core.
+
+    The other threads of the process go on, so that messages are answered while learning gets no processor.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    except (AttributeError, OSError) as error:  # not Linux, or forbidden
+        _log.info("no_idle_scheduling", reason=str(error), niceness=os.getpriority(os.PRIO_PROCESS, 0))

@@ -1,12 +1,12 @@
-"""What a finetuner keeps on disk of its labelled keyframes, so that the process that takes its place has them, too.
+"""The labelled keyframes of a finetuner on disk, from which a restarted one goes on.
 
-A keyframe is a file of its own, the message that it came as, called by the digest of its content. ``learning.json``
-says which there are and what has become of them.
+Each keyframe is a file: the message that it came as, named by the SHA-256 of its content. ``learning.json`` lists them
+with their state.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +16,7 @@ import structlog
 
 from semantic_mapper.config import Config, convert_config
 from semantic_mapper.errors import CodecError, ConfigError, SemanticMapperError
-from semantic_mapper.files import write_bytes
+from semantic_mapper.files import read_regular, write_bytes
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.cli.outputs import free_name
 from semantic_mapper.nodes.options import Count
@@ -36,47 +36,47 @@ _SUFFIX = ".keyframe"
 _log = structlog.get_logger(__name__)
 
 
-class KeptFile(Config, frozen=True):
+class _KeptFile(Config, frozen=True):
     """A keyframe on disk, see ``Kept``."""
 
-    digest: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]  # SHA-256 of the file, which is called so
+    digest: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]  # SHA-256 of the file
     held_out: bool
     proved_at: Count | None = None
     trials: Count = 0
 
 
 class Progress(Config, frozen=True):
-    """How far a finetuner is, apart from its keyframes."""
+    """State of a finetuner apart from its keyframes."""
 
-    rolled_back: Count = 0  # as the mapper told last
-    failures: Count = 0  # rounds that failed, one after another
+    rolled_back: Count = 0  # as the mapper reported last
+    failures: Count = 0  # consecutive rounds that failed
     learning: bool = False  # in the middle of a round
 
 
 class _Record(Config, frozen=True):
-    progress: Progress
-    keyframes: Annotated[tuple[KeptFile, ...], msgspec.Meta(max_length=4096)]
+    progress: Progress = Progress()
+    keyframes: Annotated[tuple[_KeptFile, ...], msgspec.Meta(max_length=4096)] = ()
 
 
 class LearningStore:
-    """The keyframes of a pool and the progress of a finetuner, in a folder of their own.
+    """A folder with the keyframes of a pool and the progress of a finetuner.
 
     Args:
-        folder: Made when there is something to keep.
+        folder: Made when there is something to save.
         label_set: Of the pool.
     """
 
     def __init__(self, folder: Path, label_set: LabelSet) -> None:
         self._folder = folder
         self._label_set = label_set
-        self._digests: dict[str, PosedFrame] = {}  # on disk
-        self._written: _Record | None = None
+        self._saved: dict[str, PosedFrame] = {}  # by digest
+        self._record: _Record | None = None
 
     def put_aside(self) -> None:
-        """Begin with nothing; what another launch has left, which people may have labelled, stays beside.
+        """Rename the folder of another launch, whose keyframes people may have labelled; then begin with nothing.
 
         Raises:
-            OSError: it cannot be moved.
+            OSError: it cannot be renamed.
         """
         record = self._folder / _RECORD
         if not record.exists() or not any(self._folder.glob(f"*{_SUFFIX}")):
@@ -88,24 +88,29 @@ class LearningStore:
         _log.warning("earlier_keyframes_kept", folder=str(kept))
 
     def keep(self, kept: Sequence[Kept], progress: Progress) -> None:
-        """Make the files what they should be; cheap where they are.
+        """Save what has changed since the last call.
 
         Raises:
-            OSError: they cannot be written; the last complete state stays.
+            OSError: it cannot be written; the last complete state stays.
         """
-        files = tuple(_file_of(k, self._write(k.frame)) for k in kept)
+        files = tuple(
+            _KeptFile(digest=self._save(k.frame), held_out=k.held_out, proved_at=k.validated_by, trials=k.trials)
+            for k in kept
+        )
         record = _Record(progress=progress, keyframes=files)
-        if record == self._written:
+        if record == self._record:
             return
         self._folder.mkdir(parents=True, exist_ok=True)
         write_bytes(self._folder / _RECORD, msgspec.json.format(msgspec.json.encode(record), indent=1))
-        self._written = record
-        named = {file.digest for file in files}
-        self._digests = {digest: frame for digest, frame in self._digests.items() if digest in named}
-        self._delete_others(named)
+        self._record = record
+        listed = {file.digest for file in files}
+        self._saved = {digest: frame for digest, frame in self._saved.items() if digest in listed}
+        for path in self._folder.glob(f"*{_SUFFIX}"):
+            if path.stem not in listed:
+                path.unlink(missing_ok=True)
 
     def restore(self, pool: KeyframePool) -> Progress:
-        """Fill a pool with what was kept; what is damaged is told of and left out.
+        """Fill a pool with the keyframes of the folder; damaged ones are left out, with a warning.
 
         Raises:
             OSError: there are files that cannot be read.
@@ -113,56 +118,39 @@ class LearningStore:
         record = self._read_record()
         for file in record.keyframes:
             try:
-                keyframe = self._read(file)
+                keyframe = self._read(file.digest)
                 pool.restore(Kept(keyframe.frame, file.held_out, file.proved_at, file.trials), keyframe.label_set)
-            except SemanticMapperError as error:
+            except (SemanticMapperError, FileNotFoundError) as error:
                 _log.warning("keyframe_lost", file=file.digest, reason=str(error))
         return record.progress
 
     def _read_record(self) -> _Record:
-        path, nothing = self._folder / _RECORD, _Record(progress=Progress(), keyframes=())
-        if not path.exists():
-            return nothing
+        path = self._folder / _RECORD
         try:
-            if path.stat().st_size > MAX_RECORD_BYTES:
-                raise ConfigError(f"{path}: more than {MAX_RECORD_BYTES} bytes")
-            return convert_config(msgspec.json.decode(path.read_bytes()), _Record, str(path))
+            return convert_config(msgspec.json.decode(read_regular(path, MAX_RECORD_BYTES)), _Record, str(path))
+        except FileNotFoundError:
+            return _Record()
         except (ConfigError, msgspec.DecodeError, UnicodeDecodeError) as error:
             _log.warning("keyframes_lost", reason=f"{path}: {error}")
-            return nothing
+            return _Record()
 
-    def _read(self, file: KeptFile) -> LabelledKeyframe:
-        path = self._path(file.digest)
-        if not path.exists():
-            raise CodecError(f"{path}: is gone")
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise CodecError(f"{path}: more than {MAX_FILE_BYTES} bytes")
-        data = path.read_bytes()
-        if digest_of(data) != file.digest:
-            raise CodecError(f"{path}: is damaged")
+    def _read(self, digest: str) -> LabelledKeyframe:
+        data = read_regular(self._path(digest), MAX_FILE_BYTES)
+        if digest_of(data) != digest:
+            raise CodecError("the file is damaged")
         return decode_as(LabelledKeyframe, unpack_parts(data))
 
-    def _write(self, frame: PosedFrame) -> str:
-        known = next((digest for digest, written in self._digests.items() if written is frame), None)
-        if known is not None:
-            return known
+    def _save(self, frame: PosedFrame) -> str:
+        for digest, saved in self._saved.items():
+            if saved is frame:
+                return digest
         data = pack_parts(encode(LabelledKeyframe(frame, self._label_set, "kept")))
         digest = digest_of(data)
         if not self._path(digest).exists():
             self._folder.mkdir(parents=True, exist_ok=True)
             write_bytes(self._path(digest), data)
-        self._digests[digest] = frame
+        self._saved[digest] = frame
         return digest
 
     def _path(self, digest: str) -> Path:
         return self._folder / f"{digest}{_SUFFIX}"
-
-    def _delete_others(self, digests: Iterable[str]) -> None:
-        names = {self._path(digest) for digest in digests}
-        for path in self._folder.glob(f"*{_SUFFIX}"):
-            if path not in names:
-                path.unlink(missing_ok=True)
-
-
-def _file_of(kept: Kept, digest: str) -> KeptFile:
-    return KeptFile(digest=digest, held_out=kept.held_out, proved_at=kept.proved_at, trials=kept.trials)

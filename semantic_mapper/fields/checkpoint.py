@@ -81,6 +81,20 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -
     Raises:
         WeightsError: it cannot be written there.
     """
+    try:
+        data = checkpoint_bytes(checkpoint, half=half)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, data)
+    except (SafetensorError, OSError) as error:
+        raise WeightsError(f"{path}: cannot be written ({error}); give another file name") from error
+
+
+def checkpoint_bytes(checkpoint: Checkpoint, *, half: bool = False) -> bytes:
+    """The weights file of a checkpoint; ``half`` as of ``save_checkpoint``.
+
+    Raises:
+        SafetensorError: tensors that the format does not know.
+    """
     # Running variances span more powers of ten than float16 has.
     tensors = {
         f"model.{name}": _stored(t, half and "running_" not in name)
@@ -97,11 +111,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -
     if checkpoint.anchors:
         anchor_tensors, metadata["anchors"] = _pack_anchors(checkpoint.anchors)
         tensors |= anchor_tensors
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_tensors(tensors, path, metadata)
-    except (SafetensorError, OSError) as error:
-        raise WeightsError(f"{path}: cannot be written ({error}); give another file name") from error
+    return save(tensors, metadata)
 
 
 def save_tensors(tensors: dict[str, torch.Tensor], path: Path, metadata: dict[str, str]) -> None:

@@ -1,8 +1,8 @@
-"""Labelled keyframes that come one by one: which to learn from, which to judge by, and which have proved right."""
+"""Labelled keyframes that come one by one: which to learn from, which to judge by, and which have been validated."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 from semantic_mapper.errors import FrameError
@@ -11,22 +11,22 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import PosedFrame
 
 Key = tuple[str, int]  # camera_id, stamp_ns
-MAX_TRIALS = 3  # rounds in which a keyframe may take part without proving right, before it is forgotten
+MAX_TRIALS = 3  # rounds without success that a keyframe may take part in before it is dropped
 
 
 @dataclass(frozen=True, slots=True)
-class Lessons:
-    """What there is to learn at one moment.
+class KeyframeSplit:
+    """The keyframes of one round.
 
     Args:
         train: Labelled keyframes to learn from.
-        held_out: Those that are never learned from.
-        proved: Keys of the keyframes with which the weights in use were found good.
+        held_out: Labelled keyframes that are never learned from.
+        validated: Keys of those with which the weights in use were found better.
     """
 
     train: tuple[PosedFrame, ...]
     held_out: tuple[PosedFrame, ...]
-    proved: frozenset[Key]
+    validated: frozenset[Key] = frozenset()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,13 +36,13 @@ class Kept:
     Args:
         frame: With labels in the classes of the pool.
         held_out: Whether it is never learned from.
-        proved_at: Version of the weights with which it was first found good; None = with none yet.
-        trials: Rounds that it took part in since, and that came to nothing.
+        validated_by: Version of the first weights that were taken after a round with it; None = none yet.
+        trials: Rounds without success since it came.
     """
 
     frame: PosedFrame
     held_out: bool
-    proved_at: int | None = None
+    validated_by: int | None = None
     trials: int = 0
 
 
@@ -52,7 +52,7 @@ class KeyframePool:
     Args:
         label_set: Of the weights.
         held_out_every: Of so many keyframes, the last one is held out, for good.
-        capacity: Keyframes kept; past it the oldest goes.
+        capacity: Keyframes kept; past it the oldest is dropped.
     """
 
     def __init__(self, label_set: LabelSet, *, held_out_every: int, capacity: int) -> None:
@@ -60,15 +60,15 @@ class KeyframePool:
         self._held_out_every = held_out_every
         self._capacity = capacity
         self._kept: dict[Key, Kept] = {}
-        self._taken = 0  # of all that ever came, so that every so many is held out
+        self._received = 0
 
     def __len__(self) -> int:
         return len(self._kept)
 
     @property
     def new(self) -> int:
-        """Keyframes that nothing has been learned from, nor tried to be."""
-        return sum(k.proved_at is None and not k.trials for k in self._kept.values())
+        """Keyframes that have not been in a round."""
+        return sum(k.validated_by is None and not k.trials for k in self._kept.values())
 
     @property
     def kept(self) -> tuple[Kept, ...]:
@@ -76,7 +76,7 @@ class KeyframePool:
         return tuple(self._kept.values())
 
     def add(self, frame: PosedFrame, label_set: LabelSet) -> None:
-        """Take a keyframe; one of the same camera and time takes the place of the one before, and has to prove itself.
+        """Add a keyframe; one of the same camera and time is replaced, and no longer validated.
 
         Args:
             frame: With labels.
@@ -86,65 +86,64 @@ class KeyframePool:
             FrameError, PoseError, LabelError: it cannot be learned from; nothing has changed.
         """
         frame = self._translated(frame, label_set)
-        key = key_of(frame)
-        before = self._kept.pop(key, None)
-        if before is None:
-            self._taken += 1
-        held_out = self._taken % self._held_out_every == 0 if before is None else before.held_out
-        self._put(key, Kept(frame, held_out))
+        before = self._kept.pop(key_of(frame), None)
+        self._received += before is None
+        self._put(Kept(frame, self._received % self._held_out_every == 0 if before is None else before.held_out))
 
     def restore(self, kept: Kept, label_set: LabelSet) -> None:
-        """Take a keyframe of an earlier pool as it was there; from the oldest one on.
+        """Add a keyframe of an earlier pool with its state there; the oldest first.
 
         Raises:
             FrameError, PoseError, LabelError: it cannot be learned from; nothing has changed.
         """
-        self._taken += 1
-        self._put(key_of(kept.frame), replace(kept, frame=self._translated(kept.frame, label_set)))
+        kept = replace(kept, frame=self._translated(kept.frame, label_set))
+        self._received += 1
+        self._put(kept)
 
-    def lessons(self) -> Lessons:
-        """All that there is now."""
-        kept = self._kept.values()
-        return Lessons(
-            tuple(k.frame for k in kept if not k.held_out),
-            tuple(k.frame for k in kept if k.held_out),
-            frozenset(key for key, k in self._kept.items() if k.proved_at is not None),
+    def split(self) -> KeyframeSplit:
+        """The keyframes of a round that begins now."""
+        return KeyframeSplit(
+            tuple(k.frame for k in self.kept if not k.held_out),
+            tuple(k.frame for k in self.kept if k.held_out),
+            frozenset(key for key, k in self._kept.items() if k.validated_by is not None),
         )
 
-    def prove(self, keys: Collection[Key], version: int) -> None:
-        """Weights that were made and judged with these are in use."""
-        for key in keys:
-            if key in self._kept and self._kept[key].proved_at is None:
-                self._kept[key] = replace(self._kept[key], proved_at=version, trials=0)
+    def validate(self, keys: Collection[Key], version: int) -> None:
+        """Weights of a round with these keyframes are in use."""
+        for key in self._not_validated(keys):
+            self._kept[key] = replace(self._kept[key], validated_by=version, trials=0)
 
-    def try_again(self, keys: Collection[Key]) -> int:
-        """Keep those that came to nothing this time for rounds with further ones, but not for ever.
+    def reject(self, keys: Collection[Key], *, worse: bool) -> int:
+        """A round with these keyframes had no success: those not validated get ``MAX_TRIALS`` such rounds.
+
+        Args:
+            keys: Of the round.
+            worse: It made the weights worse: those not validated are dropped at once.
 
         Returns:
-            How many are forgotten, since this was not their first round.
+            How many were dropped.
         """
-        tried = [key for key in keys if key in self._kept and self._kept[key].proved_at is None]
-        for key in tried:
-            self._kept[key] = replace(self._kept[key], trials=self._kept[key].trials + 1)
-        return self._drop([key for key in tried if self._kept[key].trials >= MAX_TRIALS])
-
-    def set_aside(self, keys: Collection[Key]) -> int:
-        """Forget those of these keyframes that have not proved right; returns how many."""
-        return self._drop({key for key in keys if key in self._kept and self._kept[key].proved_at is None})
+        for key in self._not_validated(keys):
+            trials = MAX_TRIALS if worse else self._kept[key].trials + 1
+            self._kept[key] = replace(self._kept[key], trials=trials)
+        return self._drop(lambda k: k.trials >= MAX_TRIALS)
 
     def return_to(self, version: int) -> int:
-        """Forget what proved right with later weights alone; returns how many. What is new stays."""
-        return self._drop({key for key, k in self._kept.items() if k.proved_at is not None and k.proved_at > version})
+        """Drop what was validated by later weights alone, after a roll-back; returns how many."""
+        return self._drop(lambda k: k.validated_by is not None and k.validated_by > version)
 
-    def _put(self, key: Key, kept: Kept) -> None:
-        self._kept[key] = kept
+    def _not_validated(self, keys: Collection[Key]) -> list[Key]:
+        return [key for key in keys if key in self._kept and self._kept[key].validated_by is None]
+
+    def _put(self, kept: Kept) -> None:
+        self._kept[key_of(kept.frame)] = kept
         if len(self._kept) > self._capacity:
             del self._kept[next(iter(self._kept))]
 
-    def _drop(self, keys: Collection[Key]) -> int:
-        for key in keys:
-            del self._kept[key]
-        return len(keys)
+    def _drop(self, condition: Callable[[Kept], bool]) -> int:
+        before = len(self._kept)
+        self._kept = {key: kept for key, kept in self._kept.items() if not condition(kept)}
+        return before - len(self._kept)
 
     def _translated(self, frame: PosedFrame, label_set: LabelSet) -> PosedFrame:
         where = f"keyframe seq={frame.seq} of camera '{frame.camera_id}'"

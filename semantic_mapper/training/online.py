@@ -6,6 +6,8 @@ put in the place of old ones at once.
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -13,7 +15,7 @@ import torch
 
 from semantic_mapper.config import AtLeastOne, AtLeastTwo, AtLeastZero, Config, NotNegative, Share
 from semantic_mapper.errors import FrameError, WeightsError
-from semantic_mapper.evaluation.metrics import ConfusionMatrix
+from semantic_mapper.evaluation.metrics import ConfusionMatrix, SegmentationMetrics
 from semantic_mapper.fields.base import EncodedViews, stack_views
 from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.fields.device import DeviceName
@@ -21,7 +23,7 @@ from semantic_mapper.fields.learned import LearnedField, encode_alike
 from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, finetune
-from semantic_mapper.training.keyframe_pool import Key, Lessons, key_of
+from semantic_mapper.training.keyframe_pool import Key, KeyframeSplit, key_of
 from semantic_mapper.training.losses import IGNORE
 from semantic_mapper.training.overlap import view_overlap
 from semantic_mapper.training.step import StepConfig
@@ -56,20 +58,19 @@ class OnlineConfig(Config, frozen=True):
     max_keyframes: AtLeastTwo = 32  # kept; past it the oldest goes
     least_gain: Share = 0.01  # mIoU that new weights must gain on the held-out keyframes
     least_score: Share = 0.2  # mIoU that they must reach there: labels without any sense are learned worse
-    # Accuracy that they may lose on those held-out keyframes with which the weights in use were found good.
+    # Accuracy that they may lose on those held-out keyframes with which the weights in use were found better.
     tolerance: Share = 0.02
     rays: AtLeastOne = 1024  # of each held-out keyframe
     finetune: RoundConfig = RoundConfig()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lesson:
-    """What came of a round.
+class OnlineResult:
+    """Outcome of a round.
 
     Args:
         checkpoint: The new weights.
-        score, parent_score: mIoU on all held-out keyframes, new and in use.
-        proved, parent_proved: Accuracy on those among them that the weights in use were found good with; None = none.
+        score, parent_score: mIoU on all held-out keyframes, new and in use, in 0..1.
         keys: Keyframes that took part.
         refusal: Why the new weights are not worth offering; empty = they are.
         worse: Whether they are refused because they do worse: then the labels are to blame. Others may only be too few.
@@ -78,26 +79,24 @@ class Lesson:
     checkpoint: Checkpoint
     score: float
     parent_score: float
-    proved: float | None
-    parent_proved: float | None
     keys: frozenset[Key]
     refusal: str = ""
     worse: bool = False
 
 
 def learn(
-    lessons: Lessons,
+    keyframes: KeyframeSplit,
     current: Checkpoint,
     config: OnlineConfig,
     on_progress: Callable[[FinetuneProgress], None] | None = None,
     on_judged: Callable[[], None] = lambda: None,
-) -> Lesson:
+) -> OnlineResult:
     """Finetune ``current`` on the keyframes, and compare both on those held out.
 
     Each is judged as the mapper would use it: with the labels of the keyframes that it was finetuned on known.
 
     Args:
-        lessons: At least two to learn from and one to judge by.
+        keyframes: At least two to learn from and one to judge by.
         current: Weights in use.
         config: Of the round.
         on_progress: Called after every step.
@@ -107,43 +106,40 @@ def learn(
         FrameError: too few keyframes, or those held out have nothing to judge by.
         WeightsError: a kind of field whose encoder cannot rest, or one that is not trained yet.
     """
-    if len(lessons.train) < 2 or not lessons.held_out:
-        raise FrameError(
-            f"learning needs 2 keyframes, and 1 to judge by, got {len(lessons.train)} and {len(lessons.held_out)}"
-        )
+    train, held_out = keyframes.train, keyframes.held_out
+    if len(train) < 2 or not held_out:
+        raise FrameError(f"learning needs 2 keyframes, and 1 to judge by, got {len(train)} and {len(held_out)}")
     encoder = current.model.image_encoder
     if not encode_alike(current.model, current.model) or encoder is None or encoder.uncalibrated:
         raise WeightsError(
             f"these weights (kind '{current.model.kind}') cannot be finetuned with an encoder that rests: start from "
             "trained S-Ray weights"
         )
-    held_out = lessons.held_out
     seen = current.train_stamps_ns | {f.stamp_ns for f in held_out}  # judged by: not to be scored on either
-    made = finetune(lessons.train, current.label_set, current.model, config.finetune, on_progress, seen_stamps_ns=seen)
-    known_before, trained = {key_of(a) for a in current.anchors}, {key_of(f) for f in lessons.train}
-    others = [replace(f, label=None) for f in lessons.train if key_of(f) not in known_before]
+    made = finetune(train, current.label_set, current.model, config.finetune, on_progress, seen_stamps_ns=seen)
+    known_before = {key_of(a) for a in current.anchors}
+    others = [replace(f, label=None) for f in train if key_of(f) not in known_before]
     before = judge(current.model, (*current.anchors, *others), held_out, config, on_judged)
-    after = judge(made.model, lessons.train, held_out, config, on_judged)
+    after = judge(made.model, train, held_out, config, on_judged)
     if not any(matrix.counts.any() for matrix in after):
         raise FrameError("none of the held-out keyframes has a labelled pixel to judge by at this width")
-    old = [i for i, f in enumerate(held_out) if key_of(f) in lessons.proved]
-    lesson = Lesson(
-        checkpoint=made,
-        score=_miou(after),
-        parent_score=_miou(before),
-        proved=_accuracy(after[i] for i in old),
-        parent_proved=_accuracy(before[i] for i in old),
-        keys=frozenset(trained | {key_of(f) for f in held_out}),
-    )
+    score, parent_score = (_total(m).miou or 0.0 for m in (after, before))
     made.recipe.update(
         kind="online",
         held_out_keyframes=len(held_out),
-        score=lesson.score,
-        parent_score=lesson.parent_score,
-        teacher_proved=len(lessons.proved),
+        score=score,
+        parent_score=parent_score,
+        teacher_proved=len(keyframes.validated),
     )
-    refusal, worse = _refusal(lesson, config)
-    return replace(lesson, refusal=refusal, worse=worse and _shares_views(lessons, current.label_set, config))
+    refusal, worse = _refusal_by_score(score, parent_score, config), score < parent_score
+    validated = [i for i, f in enumerate(held_out) if key_of(f) in keyframes.validated]
+    if not refusal and validated:
+        accuracy, parent_accuracy = (_total(m[i] for i in validated).total_accuracy for m in (after, before))
+        refusal = _refusal_by_accuracy(accuracy, parent_accuracy, config)
+        worse = True
+    worse = bool(refusal) and worse and _shares_views(keyframes, current.label_set, config)
+    keys = frozenset(key_of(f) for f in (*train, *held_out))
+    return OnlineResult(made, score, parent_score, keys, refusal, worse)
 
 
 def judge(
@@ -190,44 +186,35 @@ def _encode(model: LearnedField, view: LabelledView, *, known: bool) -> EncodedV
     return model.encode(stack_sources([view], with_labels=known))
 
 
-def _shares_views(lessons: Lessons, label_set: LabelSet, config: OnlineConfig) -> bool:
+def _shares_views(keyframes: KeyframeSplit, label_set: LabelSet, config: OnlineConfig) -> bool:
     """Whether anything held out is seen by keyframes that are learned from, so that one can speak of the other."""
-    views = [view_from_frame(f, label_set, config.finetune.width) for f in (*lessons.held_out, *lessons.train)]
-    held_out = len(lessons.held_out)
-    return bool(view_overlap(views)[:held_out, held_out:].any())
+    frames = (*keyframes.held_out, *keyframes.train)
+    overlap = view_overlap([view_from_frame(f, label_set, config.finetune.width) for f in frames])
+    held_out = len(keyframes.held_out)
+    return bool(overlap[:held_out, held_out:].any())
 
 
-def _refusal(lesson: Lesson, config: OnlineConfig) -> tuple[str, bool]:
-    """Why the weights are refused (empty: they are not), and whether they do worse than those in use."""
-    worse = lesson.score < lesson.parent_score
-    if not lesson.score >= config.least_score:
-        return f"mIoU on held-out keyframes {lesson.score:.3f}: less than {config.least_score:g} (least_score)", worse
-    if not lesson.score >= lesson.parent_score + config.least_gain:
+def _refusal_by_score(score: float, parent_score: float, config: OnlineConfig) -> str:
+    """Why weights of this mIoU are refused; empty = they are not."""
+    if score < config.least_score:
+        return f"mIoU on held-out keyframes {score:.3f}: less than {config.least_score:g} (least_score)"
+    if score < parent_score + config.least_gain:
         return (
-            f"mIoU on held-out keyframes {lesson.score:.3f}, with the weights in use {lesson.parent_score:.3f}: less "
-            f"than {config.least_gain:g} gained"
-        ), worse
-    proved, parent_proved = lesson.proved, lesson.parent_proved
-    if proved is not None and parent_proved is not None and proved < parent_proved - config.tolerance:
-        return (
-            f"accuracy {proved:.3f} on held-out keyframes that have proved right, with the weights in use "
-            f"{parent_proved:.3f}: the new labels contradict the old ones"
-        ), True
-    return "", False
+            f"mIoU on held-out keyframes {score:.3f}, with the weights in use {parent_score:.3f}: less than "
+            f"{config.least_gain:g} gained"
+        )
+    return ""
 
 
-def _total(matrices: Iterable[ConfusionMatrix]) -> ConfusionMatrix | None:
-    total: ConfusionMatrix | None = None
-    for matrix in matrices:
-        total = matrix if total is None else total + matrix
-    return total
+def _refusal_by_accuracy(accuracy: float | None, parent_accuracy: float | None, config: OnlineConfig) -> str:
+    """Why weights of this accuracy on validated keyframes are refused; empty = they are not. None = no pixel."""
+    if accuracy is None or parent_accuracy is None or accuracy >= parent_accuracy - config.tolerance:
+        return ""
+    return (
+        f"accuracy {accuracy:.3f} on held-out keyframes that were validated, with the weights in use "
+        f"{parent_accuracy:.3f}: the new labels contradict the old ones"
+    )
 
 
-def _miou(matrices: Iterable[ConfusionMatrix]) -> float:
-    total = _total(matrices)
-    return 0.0 if total is None else total.metrics().miou or 0.0
-
-
-def _accuracy(matrices: Iterable[ConfusionMatrix]) -> float | None:
-    total = _total(matrices)
-    return None if total is None else total.metrics().total_accuracy
+def _total(matrices: Iterable[ConfusionMatrix]) -> SegmentationMetrics:
+    return functools.reduce(operator.add, matrices).metrics()

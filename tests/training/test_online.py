@@ -14,7 +14,7 @@ from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.fields.learned import encode_alike
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import NYU40, ROOMS, make_label_set
-from semantic_mapper.training.keyframe_pool import KeyframePool, Lessons, key_of
+from semantic_mapper.training.keyframe_pool import KeyframePool, KeyframeSplit, key_of
 from semantic_mapper.training.online import OnlineConfig, learn
 from semantic_mapper.types import PosedFrame
 from tests.small import settled_field, tiny_field, tiny_frames
@@ -60,45 +60,45 @@ def scrambled(frame: PosedFrame, seed: int) -> PosedFrame:
 
 def test_every_fourth_keyframe_is_held_out_for_good_and_the_oldest_goes() -> None:
     pool = pool_of(FRAMES[:6], capacity=5)
-    lessons = pool.lessons()
-    assert [f.seq for f in lessons.train] == [FRAMES[i].seq for i in (1, 2, 4, 5)]
-    assert [f.seq for f in lessons.held_out] == [FRAMES[3].seq]
+    split = pool.split()
+    assert [f.seq for f in split.train] == [FRAMES[i].seq for i in (1, 2, 4, 5)]
+    assert [f.seq for f in split.held_out] == [FRAMES[3].seq]
     pool.add(FRAMES[3], ROOMS)  # labelled once more: it judges still
-    assert [f.seq for f in pool.lessons().held_out] == [FRAMES[3].seq] and len(pool) == 5
+    assert [f.seq for f in pool.split().held_out] == [FRAMES[3].seq] and len(pool) == 5
 
 
-def test_keyframes_prove_right_are_set_aside_and_go_with_the_weights_they_were_made_for() -> None:
+def test_keyframes_are_validated_or_dropped_and_go_with_the_weights_they_were_made_for() -> None:
     pool = pool_of(FRAMES[:4])
     first = [key_of(f) for f in FRAMES[:4]]
-    pool.prove(first, 1)
-    assert pool.new == 0 and pool.lessons().proved == set(first)
+    pool.validate(first, 1)
+    assert pool.new == 0 and pool.split().validated == set(first)
     pool.add(FRAMES[4], ROOMS)
     pool.add(FRAMES[5], ROOMS)
-    assert pool.set_aside([*first, key_of(FRAMES[4])]) == 1 and len(pool) == 5
-    pool.prove([key_of(FRAMES[5])], 2)
+    assert pool.reject([*first, key_of(FRAMES[4])], worse=True) == 1 and len(pool) == 5
+    pool.validate([key_of(FRAMES[5])], 2)
     pool.add(FRAMES[6], ROOMS)
     assert pool.return_to(1) == 1 and pool.new == 1  # what has not been tried yet stays
-    pool.add(permuted(FRAMES[0]), ROOMS)  # labelled anew: it has to prove itself
-    assert pool.new == 2 and key_of(FRAMES[0]) not in pool.lessons().proved
+    pool.add(permuted(FRAMES[0]), ROOMS)  # labelled again: not validated
+    assert pool.new == 2 and key_of(FRAMES[0]) not in pool.split().validated
 
 
-def test_keyframes_that_came_to_nothing_wait_for_others_but_not_for_ever() -> None:
+def test_keyframes_of_rounds_without_success_stay_for_three_rounds() -> None:
     pool = pool_of(FRAMES[:2])
-    pool.prove([key_of(FRAMES[0])], 1)
+    pool.validate([key_of(FRAMES[0])], 1)
     keys = [key_of(f) for f in FRAMES[:2]]
-    assert [pool.try_again(keys) for _ in range(2)] == [0, 0] and (len(pool), pool.new) == (2, 0)
+    assert [pool.reject(keys, worse=False) for _ in range(2)] == [0, 0] and (len(pool), pool.new) == (2, 0)
     pool.add(FRAMES[2], ROOMS)
     again = pool_of()
     for kept in pool.kept:
         again.restore(kept, ROOMS)
-    assert [(k.frame.seq, k.proved_at, k.trials) for k in again.kept] == [
+    assert [(k.frame.seq, k.validated_by, k.trials) for k in again.kept] == [
         (FRAMES[0].seq, 1, 0),
         (FRAMES[1].seq, None, 2),
         (FRAMES[2].seq, None, 0),
     ]
-    assert again.new == 1 and again.lessons().proved == {keys[0]}
-    assert again.try_again([*keys, key_of(FRAMES[2])]) == 1 and len(again) == 2  # the third time
-    again.prove([key_of(FRAMES[2])], 2)
+    assert again.new == 1 and again.split().validated == {keys[0]}
+    assert again.reject([*keys, key_of(FRAMES[2])], worse=False) == 1 and len(again) == 2  # the third time
+    again.validate([key_of(FRAMES[2])], 2)
     assert again.kept[-1].trials == 0
 
 
@@ -108,7 +108,7 @@ def test_labels_are_translated_by_class_name() -> None:
     label[:10], label[10:20] = 3, 9
     pool = pool_of()
     pool.add(dataclasses.replace(FRAMES[0], label=label), own)
-    kept = pool.lessons().train[0].label
+    kept = pool.split().train[0].label
     assert kept is not None and set(np.unique(kept[10:20])) == {ROOMS.id_of("floor")} and not kept[:10].any()
 
 
@@ -140,47 +140,47 @@ def test_what_cannot_be_learned_from_is_refused_and_changes_nothing() -> None:
 def test_good_labels_make_better_weights_whose_encoder_is_the_old_one() -> None:
     start = start_of(77)
     steps: list[int] = []
-    lesson = learn(pool_of(FRAMES).lessons(), start, CONFIG, lambda p: steps.append(p.step))
-    assert lesson.refusal == "" and lesson.score > lesson.parent_score + 0.2
-    assert lesson.proved is None and steps[-1] == 6
-    made = lesson.checkpoint
+    result = learn(pool_of(FRAMES).split(), start, CONFIG, lambda p: steps.append(p.step))
+    assert result.refusal == "" and result.score > result.parent_score + 0.2
+    assert steps[-1] == 6
+    made = result.checkpoint
     assert encode_alike(made.model, start.model)
     assert not torch.equal(made.model.state_dict()["classifier.bias"], start.model.state_dict()["classifier.bias"])
     assert made.train_stamps_ns == {77} | {f.stamp_ns for f in FRAMES}  # those that judge are not scored on either
-    assert [a.seq for a in made.anchors] == [f.seq for f in pool_of(FRAMES).lessons().train]
-    again = learn(pool_of(FRAMES).lessons(), start, CONFIG)
-    assert again.score == lesson.score
+    assert [a.seq for a in made.anchors] == [f.seq for f in pool_of(FRAMES).split().train]
+    again = learn(pool_of(FRAMES).split(), start, CONFIG)
+    assert again.score == result.score
     state = made.model.state_dict()
     assert all(torch.equal(t, state[name]) for name, t in again.checkpoint.model.state_dict().items())
 
 
 def test_labels_that_have_nothing_to_do_with_the_images_are_refused() -> None:
-    start = learn(pool_of(FRAMES[:4]).lessons(), start_of(), CONFIG).checkpoint
+    start = learn(pool_of(FRAMES[:4]).split(), start_of(), CONFIG).checkpoint
     bad = pool_of([scrambled(f, i) for i, f in enumerate(FRAMES[4:])])
-    lesson = learn(bad.lessons(), start, CONFIG)
-    assert lesson.score < 0.2 and "less than 0.2 (least_score)" in lesson.refusal and lesson.worse
-    once_more = learn(pool_of(FRAMES[4:]).lessons(), start, without_training())
+    result = learn(bad.split(), start, CONFIG)
+    assert result.score < 0.2 and "less than 0.2 (least_score)" in result.refusal and result.worse
+    once_more = learn(pool_of(FRAMES[4:]).split(), start, without_training())
     assert once_more.score > 0.5 and "less than 0.5 gained" in once_more.refusal
 
 
 def test_weights_that_do_worse_where_nobody_has_learned_say_nothing_about_the_labels() -> None:
-    start = learn(pool_of(FRAMES[:4]).lessons(), start_of(), CONFIG).checkpoint
+    start = learn(pool_of(FRAMES[:4]).split(), start_of(), CONFIG).checkpoint
     away = np.eye(4)
     away[0, 3] = 500.0
     *train, held_out = (permuted(f) for f in FRAMES[4:])
     elsewhere = dataclasses.replace(held_out, T_world_camera=away @ held_out.T_world_camera, label=FRAMES[7].label)
     for judged_by, worse in ((dataclasses.replace(held_out, label=FRAMES[7].label), True), (elsewhere, False)):
-        lesson = learn(Lessons(tuple(train), (judged_by,), frozenset()), start, CONFIG)
-        assert lesson.score < lesson.parent_score and lesson.refusal and lesson.worse == worse
+        result = learn(KeyframeSplit(tuple(train), (judged_by,)), start, CONFIG)
+        assert result.score < result.parent_score and result.refusal and result.worse == worse
     blank = dataclasses.replace(held_out, label=np.zeros_like(held_out.label))
     with pytest.raises(FrameError, match="none of the held-out keyframes has a labelled pixel"):
-        learn(Lessons(tuple(train), (blank,), frozenset()), start, without_training())
+        learn(KeyframeSplit(tuple(train), (blank,)), start, without_training())
 
 
-def test_labels_that_contradict_those_that_proved_right_are_refused_although_they_agree_with_each_other() -> None:
+def test_labels_that_contradict_validated_ones_are_refused_although_they_agree_with_each_other() -> None:
     pool = pool_of(FRAMES[:4])
-    start = learn(pool.lessons(), start_of(), CONFIG).checkpoint
-    pool.prove([key_of(f) for f in FRAMES[:4]], 1)
+    start = learn(pool.split(), start_of(), CONFIG).checkpoint
+    pool.validate([key_of(f) for f in FRAMES[:4]], 1)
     for frame in FRAMES[4:]:
         pool.add(permuted(frame), ROOMS)
     config = convert_config(
@@ -188,18 +188,16 @@ def test_labels_that_contradict_those_that_proved_right_are_refused_although_the
         OnlineConfig,
         "test",
     )
-    lesson = learn(pool.lessons(), start, config)
-    assert lesson.proved is not None and lesson.parent_proved is not None
-    assert lesson.proved < lesson.parent_proved - 0.02
-    assert lesson.refusal and lesson.worse
+    result = learn(pool.split(), start, config)
+    assert "contradict the old ones" in result.refusal and result.worse
 
 
 def test_too_few_keyframes_and_an_encoder_that_learns_are_refused() -> None:
     start = start_of()
     with pytest.raises(FrameError, match="1 to judge by, got 2 and 0"):
-        learn(Lessons(FRAMES[:2], (), frozenset()), start, CONFIG)
+        learn(KeyframeSplit(FRAMES[:2], ()), start, CONFIG)
     with pytest.raises(ConfigError, match="resting_share must be 1"):
         convert_config({"finetune": {"resting_share": 0.5}}, OnlineConfig, "test")
     for model in (build_field("unet", {}, ROOMS), tiny_field()):
         with pytest.raises(WeightsError, match="cannot be finetuned with an encoder that rests"):
-            learn(pool_of(FRAMES).lessons(), Checkpoint(model, (), {}), CONFIG)
+            learn(pool_of(FRAMES).split(), Checkpoint(model, (), {}), CONFIG)

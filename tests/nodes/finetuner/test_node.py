@@ -8,6 +8,7 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,16 +19,16 @@ import pytest
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.nodes.finetuner import finetune_round as learning_round
-from semantic_mapper.nodes.finetuner import node as finetuner
+from semantic_mapper.nodes.finetuner import finetune_round, finetuner
+from semantic_mapper.nodes.finetuner.finetune_round import FinetuneRound, run_when_idle
 from semantic_mapper.nodes.finetuner.node import run_finetuner
-from semantic_mapper.nodes.finetuner.throttle import AbandonedError, Throttle, run_when_idle
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import FinetunerOptions, MapperOptions
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.nodes.supervisor.launch_config import load_launch
-from semantic_mapper.training.keyframe_pool import Lessons
+from semantic_mapper.training.finetune import FinetuneProgress
+from semantic_mapper.training.keyframe_pool import KeyframeSplit
 from semantic_mapper.training.online import OnlineConfig
 from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import LabelledKeyframe, Status, WeightsInUse, WeightsUpdate, digest_of
@@ -198,14 +199,14 @@ def test_a_restarted_finetuner_goes_on_with_the_weights_and_keyframes_of_the_one
 def test_a_round_that_fails_or_dies_keeps_its_keyframes_for_the_next(
     start: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    learn, under_way, go_on = learning_round.learn, threading.Event(), threading.Event()
+    learn, under_way, go_on = finetune_round.learn, threading.Event(), threading.Event()
 
     def dies(*arguments: Any) -> Any:
         under_way.set()
         go_on.wait(60)
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory\nmore of it")
 
-    monkeypatch.setattr(learning_round, "learn", dies)
+    monkeypatch.setattr(finetune_round, "learn", dies)
     with a_folder() as folder:
         endpoints = {name: f"ipc://{folder / name}" for name in ("mapper", "finetuner", "labels")}
         with Publisher(endpoints["mapper"]) as mapper:
@@ -219,7 +220,7 @@ def test_a_round_that_fails_or_dies_keeps_its_keyframes_for_the_next(
                 assert (heard.counters()["kept"], heard.counters()["set_aside"]) == (4, 0)
                 assert heard.last is not None and "RuntimeError: DefaultCPUAllocator" in heard.last.degraded[-1]
                 assert "its keyframes are kept, next try in" in heard.last.degraded[-1]
-            monkeypatch.setattr(learning_round, "learn", learn)
+            monkeypatch.setattr(finetune_round, "learn", learn)
             with finetuning(start, endpoints, 1, out=str(tmp_path / "killed"), retry_s=0.5) as heard:
                 update = heard.update()
                 assert (update.keyframes, update.held_out) == (3, 1) and heard.counters()["failed"] == 1
@@ -253,9 +254,9 @@ def test_a_round_that_gets_no_processor_holds_up_neither_messages_nor_the_end(
     def starves(*arguments: Any) -> Any:
         under_way.set()
         go_on.wait(100)
-        raise AbandonedError
+        raise CancelledError
 
-    monkeypatch.setattr(learning_round, "learn", starves)
+    monkeypatch.setattr(finetune_round, "learn", starves)
     monkeypatch.setattr(finetuner, "GIVE_UP_S", 0.1)
     try:
         with played_mapper(start) as (heard, mapper):
@@ -268,38 +269,6 @@ def test_a_round_that_gets_no_processor_holds_up_neither_messages_nor_the_end(
             assert eventually(lambda: heard.counters()["kept"] == 6, 20) and heard.counters()["learning"] == 1
     finally:
         go_on.set()
-
-
-def test_a_round_that_is_given_up_is_idle_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
-    under_way, go_on, allowed = threading.Event(), threading.Event(), []
-
-    def starves(*arguments: Any) -> Any:
-        under_way.set()
-        go_on.wait(60)
-        raise AbandonedError
-
-    def may_return() -> None:
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-        try:
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        except PermissionError:
-            return
-        allowed.append(True)
-
-    probe = threading.Thread(target=may_return)
-    probe.start()
-    probe.join()
-    monkeypatch.setattr(learning_round, "learn", starves)
-    lessons = Lessons((), (), frozenset())
-    given_up = learning_round.LearningRound(lessons, start_of(), "ab" * 32, OnlineConfig(), 1.0, idle=True)
-    assert under_way.wait(60)
-    thread = given_up._thread.native_id
-    assert thread is not None and os.sched_getscheduler(thread) == os.SCHED_IDLE
-    given_up.abandon()
-    assert given_up.running and not given_up.has_ended(0.01)
-    assert os.sched_getscheduler(thread) == (os.SCHED_OTHER if allowed else os.SCHED_IDLE)
-    go_on.set()
-    assert given_up.has_ended(60) and given_up.abandoned
 
 
 def test_a_mapper_learns_while_it_maps_from_what_the_command_line_labels(start: Path, tmp_path: Path) -> None:
@@ -318,18 +287,28 @@ def test_a_mapper_learns_while_it_maps_from_what_the_command_line_labels(start: 
     assert summary["field"]["anchors"] == 3
 
 
-def test_work_rests_as_its_share_says_and_can_be_given_up() -> None:
-    spent = [0.0]
-    throttle = Throttle(0.25, lambda: spent[0])
-    throttle.rest()
-    assert throttle.rested_s == 0
-    spent[0] += 0.05
-    began = time.monotonic()
-    throttle.rest()
-    assert time.monotonic() - began >= 0.15 and throttle.rested_s >= 0.15  # three times what it worked
-    throttle.abandon()
-    with pytest.raises(AbandonedError):
-        throttle.rest()
+def test_a_round_rests_as_its_share_says_and_can_be_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
+    rested_s: list[float] = []
+
+    def steps(*arguments: Any) -> Any:
+        on_progress = arguments[3]
+        on_progress(FinetuneProgress(1, 0.1, 0.0, 0.0, 0.0, best=False))
+        spent_s = time.process_time()
+        while time.process_time() < spent_s + 0.05:
+            pass
+        began_s = time.monotonic()
+        on_progress(FinetuneProgress(2, 0.2, 0.0, 0.0, 0.0, best=False))
+        rested_s.append(time.monotonic() - began_s)
+        while True:
+            on_progress(FinetuneProgress(3, 0.3, 0.0, 0.0, 0.0, best=False))
+
+    monkeypatch.setattr(finetune_round, "learn", steps)
+    config = OnlineConfig()
+    under_way = FinetuneRound(KeyframeSplit((), ()), start_of(), "ab" * 32, config, 0.25, idle=False)
+    assert eventually(lambda: bool(rested_s)) and rested_s[0] >= 0.15  # three times what it worked
+    assert under_way.running and under_way.step >= 2
+    under_way.cancel()
+    assert under_way.has_ended(60) and under_way.cancelled and under_way.result is None
 
 
 @pytest.mark.parametrize(

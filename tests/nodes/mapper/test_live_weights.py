@@ -16,10 +16,9 @@ import torch
 
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import MapError
-from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.checkpoint import Checkpoint, checkpoint_bytes, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import NYU40, ROOMS
-from semantic_mapper.nodes.finetuner.finetune_round import file_of
 from semantic_mapper.training.online import learn
 from semantic_mapper.transport.codec import encode
 from semantic_mapper.transport.messages import WeightsInUse, WeightsUpdate, digest_of
@@ -36,7 +35,7 @@ FRAMES = tiny_frames(8)
 def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights that know the room, of which a map is sure of itself."""
     path = tmp_path_factory.mktemp("learned") / "learned.safetensors"
-    save_checkpoint(learn(pool_of(FRAMES[:4]).lessons(), start_of(), CONFIG).checkpoint, path)
+    save_checkpoint(learn(pool_of(FRAMES[:4]).split(), start_of(), CONFIG).checkpoint, path)
     return path
 
 
@@ -52,7 +51,7 @@ class Learner:
 
     def offer(self, checkpoint: Checkpoint, version: int, parent: str = "", data: bytes = b"") -> WeightsInUse:
         """What the mapper says to it."""
-        data = data or file_of(checkpoint)
+        data = data or checkpoint_bytes(checkpoint)
         parent = parent or self.in_use().digest
         self.publisher.publish(
             encode(WeightsUpdate("finetuner", version, data, digest_of(data), parent, 0.9, 0.5, 3, 1))
@@ -156,7 +155,7 @@ def test_what_is_no_good_is_refused_and_told(learned, tmp_path):
         for version, (checkpoint, data, parent, says) in enumerate(
             (
                 (good, pickle, "", "not readable as weights"),
-                (good, file_of(good)[:-50], "", "not readable as weights"),
+                (good, checkpoint_bytes(good)[:-50], "", "not readable as weights"),
                 (other_set, b"", "", "label set 'nyu40'"),
                 (Checkpoint(wide.eval(), (), {}), b"", "", "another network"),
                 (encoder, b"", "", "image encoder is another one"),

@@ -1,0 +1,302 @@
+"""Labelled keyframes in, better weights out: the finetuner beside a mapper, between two messages."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import structlog
+
+from semantic_mapper.backoff import backoff_s
+from semantic_mapper.errors import FrameError, LabelError, WeightsError
+from semantic_mapper.fields.checkpoint import Checkpoint, checkpoint_bytes
+from semantic_mapper.nodes.finetuner.finetune_round import FinetuneRound
+from semantic_mapper.nodes.finetuner.keyframe_store import FOLDER, LearningStore, Progress
+from semantic_mapper.nodes.mapper.offered_weights import FOLDER as WEIGHTS_FOLDER
+from semantic_mapper.nodes.mapper.offered_weights import read_kept
+from semantic_mapper.nodes.node import NodeContext
+from semantic_mapper.nodes.options import FinetunerOptions
+from semantic_mapper.training.keyframe_pool import KeyframePool
+from semantic_mapper.training.online import OnlineConfig, OnlineResult
+from semantic_mapper.transport.codec import encode
+from semantic_mapper.transport.messages import (
+    LabelledKeyframe,
+    NodeState,
+    Status,
+    WeightsInUse,
+    WeightsUpdate,
+    digest_of,
+)
+from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
+
+POLL_S = 0.1
+STATUS_PERIOD_S = 1.0
+MAX_RETRY_S = 3600.0
+GIVE_UP_S = 10.0  # that a round may take to end with the node
+MAX_NICENESS = 19  # with it, learning gets only what is left over of the processors
+_COUNTERS = ("keyframes", "unusable", "set_aside", "rounds", "failed", "offered", "taken", "refused")
+
+_log = structlog.get_logger(__name__)
+
+
+@dataclass
+class Finetuner:
+    """Learns from the keyframes of ``labels``, and offers what proves better to ``mapper``.
+
+    Args:
+        context: Of the node.
+        options: Of the node.
+        config: Of its rounds.
+        publisher: Of weights and status.
+        labels: Labelled keyframes.
+        mapper: What weights it uses.
+        start: Weights that the mapper was started with.
+        start_digest: SHA-256 of their file, hexadecimal.
+    """
+
+    context: NodeContext
+    options: FinetunerOptions
+    config: OnlineConfig
+    publisher: Publisher
+    labels: LosslessSubscriber
+    mapper: LosslessSubscriber
+    start: Checkpoint
+    start_digest: str
+
+    def __post_init__(self) -> None:
+        every, capacity = self.config.held_out_every, self.config.max_keyframes
+        self._pool = KeyframePool(self.start.label_set, held_out_every=every, capacity=capacity)
+        self._last_keyframe_s = 0.0
+        self._in_use: WeightsInUse | None = None
+        self._current: Checkpoint | None = None  # the weights in use; None = unknown
+        self._round: FinetuneRound | None = None
+        self._offer: tuple[WeightsUpdate, OnlineResult] | None = None  # until the mapper has answered
+        self._last_version = 0
+        self._rolled_back = 0
+        self._counts = dict.fromkeys(_COUNTERS, 0)
+        self._refusal = ""  # why the last weights were refused
+        self._failure = ""  # why the last round failed
+        self._failures = 0  # in a row
+        self._retry_at_s = 0.0
+        self._store: LearningStore | None = None
+        self._store_failure = ""
+        self._last_status_s = 0.0
+        if self.options.out:
+            self._store = LearningStore(Path(self.options.out) / FOLDER, self.start.label_set)
+            self._restore(self._store)
+
+    def run(self) -> None:
+        """Handle messages and rounds until a stop request."""
+        while not self.context.stop:
+            self.context.heartbeat.turn()
+            if isinstance(keyframe := self.labels.receive(POLL_S), LabelledKeyframe):
+                self._add(keyframe)
+            while isinstance(in_use := self.mapper.receive(0.0), WeightsInUse):
+                self._follow(in_use)
+            self._end_round()
+            self._begin_round()
+            self._save()
+            self._publish_status("running")
+
+    def close(self) -> None:
+        """Cancel the round that runs."""
+        if self._round is not None:
+            self._round.cancel()
+            if not self._round.has_ended(GIVE_UP_S):
+                _log.warning("round_left_behind", seconds=GIVE_UP_S, reason="it gets no processor")
+            self._round = None
+        self._save()
+        self._publish_status("ended", now=True)
+
+    def _restore(self, store: LearningStore) -> None:
+        """After a restart, go on with the keyframes of the process before; a launch begins with none."""
+        if not self.context.restarts:
+            store.put_aside()
+            return
+        progress = store.restore(self._pool)
+        self._rolled_back, self._failures = progress.rolled_back, progress.failures
+        _log.info("taken_up", keyframes=len(self._pool), new=self._pool.new, failures=self._failures)
+        if progress.learning:
+            self._fail("the process before this one ended in the middle of a round")
+
+    def _save(self) -> None:
+        if self._store is None:
+            return
+        progress = Progress(rolled_back=self._rolled_back, failures=self._failures, learning=self._round is not None)
+        failure = ""
+        try:
+            self._store.keep(self._pool.kept, progress)
+        except OSError as error:
+            failure = str(error)
+            if failure != self._store_failure:
+                _log.warning("not_kept", reason=failure)
+        self._store_failure = failure
+
+    def _add(self, keyframe: LabelledKeyframe) -> None:
+        try:
+            self._pool.add(keyframe.frame, keyframe.label_set)
+        except (FrameError, LabelError) as error:
+            self._counts["unusable"] += 1
+            _log.warning("keyframe_refused", teacher=keyframe.teacher, reason=str(error))
+            return
+        self._counts["keyframes"] += 1
+        self._last_keyframe_s = time.monotonic()
+
+    def _follow(self, in_use: WeightsInUse) -> None:
+        """Go on from the weights that the mapper uses now."""
+        before, self._in_use = self._in_use, in_use
+        if in_use.rolled_back > self._rolled_back:
+            dropped = self._pool.return_to(in_use.version)
+            self._counts["set_aside"] += dropped
+            _log.info("rolled_back", version=in_use.version, keyframes_set_aside=dropped)
+        self._rolled_back = in_use.rolled_back
+        changed = before is None or before.digest != in_use.digest
+        if changed or self._current is None:
+            self._current = self._find(in_use)
+        if changed and self._round is not None:
+            self._round.cancel()
+        if self._offer is not None and in_use.judged == self._offer[0].version:
+            self._take_answer(*self._offer, in_use)
+            self._offer = None
+
+    def _find(self, in_use: WeightsInUse) -> Checkpoint | None:
+        """The weights in use: those of the start, those offered, or those that the mapper keeps in ``out``."""
+        if in_use.digest == self.start_digest:
+            return self.start
+        if self._offer is not None and in_use.digest == self._offer[0].digest:
+            return self._offer[1].checkpoint
+        if not self.options.out:
+            return None
+        folder = Path(self.options.out) / WEIGHTS_FOLDER
+        try:
+            found = read_kept(folder, in_use.version, in_use.digest, self.start)
+        except (WeightsError, OSError) as error:
+            _log.warning("weights_not_found", version=in_use.version, reason=str(error))
+            return None
+        _log.info("weights_found", version=in_use.version, keyframes=len(found.anchors))
+        return found
+
+    def _take_answer(self, update: WeightsUpdate, result: OnlineResult, in_use: WeightsInUse) -> None:
+        """The mapper's answer to an offer. Labels are to blame only where they contradict its map."""
+        reason = f"by the mapper: {in_use.reason}"
+        if in_use.accepted and in_use.digest == update.digest:
+            self._pool.validate(result.keys, update.version)
+            self._counts["taken"] += 1
+            self._refusal = ""
+        elif in_use.contradicts:
+            self._reject(result, reason, worse=True)
+        else:
+            self._counts["refused"] += 1
+            self._refusal = reason
+            if in_use.digest == update.parent:  # otherwise they are tried at once with the weights in use now
+                self._fail(reason)
+
+    def _begin_round(self) -> None:
+        if self._round is not None or self._offer is not None or self._in_use is None or self._current is None:
+            return
+        now_s = time.monotonic()
+        if now_s < self._retry_at_s or now_s - self._last_keyframe_s < self.options.settle_s:
+            return
+        keyframes = self._pool.split()
+        if self._pool.new < self.config.new_keyframes or len(keyframes.train) < 2 or not keyframes.held_out:
+            return
+        _log.info("round_begins", keyframes=len(keyframes.train), held_out=len(keyframes.held_out))
+        self._round = FinetuneRound(
+            keyframes,
+            self._current,
+            self._in_use.digest,
+            self.config,
+            self.options.share,
+            idle=self.options.niceness == MAX_NICENESS,
+        )
+
+    def _end_round(self) -> None:
+        ended = self._round
+        if ended is None or ended.running:
+            return
+        self._round = None
+        if ended.cancelled:
+            return
+        result = ended.result
+        if result is None:
+            self._fail(ended.failure)
+            return
+        self._counts["rounds"] += 1
+        self._failures, self._failure = 0, ""
+        _log.info("round_ends", score=round(result.score, 3), parent_score=round(result.parent_score, 3))
+        if result.refusal:
+            self._reject(result, result.refusal, worse=result.worse)
+        else:
+            self._publish(result, ended.parent_digest)
+
+    def _publish(self, result: OnlineResult, parent: str) -> None:
+        checkpoint = result.checkpoint
+        self._last_version = max(self._last_version, 0 if self._in_use is None else self._in_use.newest) + 1
+        checkpoint.recipe.update(version=self._last_version, parent=parent, learner=self.context.name)
+        data = checkpoint_bytes(checkpoint)
+        update = WeightsUpdate(
+            node=self.context.name,
+            version=self._last_version,
+            data=data,
+            digest=digest_of(data),
+            parent=parent,
+            score=result.score,
+            parent_score=result.parent_score,
+            keyframes=len(checkpoint.anchors),
+            held_out=len(result.keys) - len(checkpoint.anchors),
+        )
+        self.publisher.publish(encode(update))
+        self._offer = update, result
+        self._counts["offered"] += 1
+        _log.info("weights_offered", version=update.version, megabytes=round(len(data) / 1e6, 1))
+
+    def _fail(self, reason: str) -> None:
+        """A round failed through no fault of the labels: they are kept, and tried again after a pause."""
+        self._failures += 1
+        pause_s = backoff_s(self._failures, self.options.retry_s, MAX_RETRY_S)
+        self._retry_at_s = time.monotonic() + pause_s
+        self._counts["failed"] += 1
+        self._failure = reason
+        _log.warning("round_failed", reason=reason, keyframes_kept=self._pool.new, next_in_s=pause_s)
+
+    def _reject(self, result: OnlineResult, reason: str, *, worse: bool) -> None:
+        """Keyframes that made the weights worse are dropped: they would spoil every round to come."""
+        dropped = self._pool.reject(result.keys, worse=worse)
+        self._counts["refused"] += 1
+        self._counts["set_aside"] += dropped
+        self._refusal = reason
+        _log.warning("weights_rejected", reason=reason, keyframes_set_aside=dropped)
+
+    def _publish_status(self, state: NodeState, *, now: bool = False) -> None:
+        if not now and time.monotonic() - self._last_status_s < STATUS_PERIOD_S:
+            return
+        self._last_status_s = time.monotonic()
+        counters = {
+            **self._counts,
+            "kept": len(self._pool),
+            "new": self._pool.new,
+            "rejected": self.labels.rejected,
+            "learning": int(self._round is not None),
+            "step": 0 if self._round is None else self._round.step,
+        }
+        status = Status(self.context.name, state, time.monotonic_ns(), counters, {}, tuple(self._warnings()))
+        self.publisher.publish(encode(status))
+
+    def _warnings(self) -> list[str]:
+        warnings: list[str] = []
+        if self._refusal:
+            warnings.append(f"the last weights were refused: {self._refusal}")
+        if self._failure:
+            wait_s = max(0.0, self._retry_at_s - time.monotonic())
+            warnings.append(
+                f"the last round failed ({self._failure}); its keyframes are kept, next try in {wait_s:.0f} s"
+            )
+        if self._store_failure:
+            warnings.append(f"keyframes would be lost with this process: {self._store_failure}")
+        if self._in_use is not None and self._current is None:
+            warnings.append(
+                f"the mapper uses weights {self._in_use.version}, which this node does not know; start both with the "
+                "same weights, or go back to weights that it knows"
+            )
+        return warnings
