@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import PoseError, ShapeError
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, RayBatch
@@ -77,6 +78,23 @@ def pose_matrix(position: Float64, quaternion: Float64) -> Float64:
     )
     T_world_camera[:3, 3] = position
     return T_world_camera
+
+
+def rotation_vector(T_a_b: Float64) -> Float64:
+    """Axis times angle (3,), in radians, of the rotation of a rigid transform (4, 4)."""
+    return Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec().astype(np.float64)
+
+
+def interpolate_pose(T_world_a: Float64, T_world_b: Float64, fraction: float) -> Float64:
+    """The pose (4, 4) at a fraction of the way from a to b: slerp of the rotation, a line for the position.
+
+    Below 0 and above 1 the motion is extrapolated.
+    """
+    R_a_b = Rotation.from_matrix(T_world_a[:3, :3].T @ T_world_b[:3, :3])
+    T = np.eye(4)
+    T[:3, :3] = T_world_a[:3, :3] @ (R_a_b**fraction).as_matrix()
+    T[:3, 3] = (1 - fraction) * T_world_a[:3, 3] + fraction * T_world_b[:3, 3]
+    return T
 
 
 def invert_pose(T_a_b: Float64) -> Float64:

@@ -164,9 +164,9 @@ class OakCamera:
         if self._connections > 1:
             return image
         late = time.monotonic_ns() - image.stamp_ns > self._config.odometry_wait_s * 1e9
-        if not late and not odometry.track.reaches(image.stamp_ns):
+        if not late and not odometry.reaches(image.stamp_ns):
             return None
-        return replace(image, own_pose=odometry.track.at(image.stamp_ns))
+        return replace(image, own_pose=odometry.pose_at(image.stamp_ns))
 
     def _open(self, config: Config) -> None:
         """Connect and start.

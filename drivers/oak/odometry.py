@@ -10,14 +10,44 @@ import threading
 import time
 from typing import Any
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from semantic_mapper.drivers.base import PoseEstimate
 from semantic_mapper.drivers.oak.config import Config
 from semantic_mapper.drivers.oak.images import capture_ns, clock_offset_ns
 from semantic_mapper.drivers.oak.stream import Sources, StreamEnded, synced_queue, take
-from semantic_mapper.drivers.oak.tracking import PoseTrack, basalt_pose
+from semantic_mapper.drivers.poses.motion import PoseTrack, StampedPose
 from semantic_mapper.errors import CameraError, PoseError
+from semantic_mapper.geometry import check_pose
+from semantic_mapper.types import Float64
 
 ANSWER_S = 2.0  # a pair without a pose for so long will have none
 _SLICE_S = 0.1
+SOURCE = "vio"
+KEPT = 200  # poses: some seconds
+GAP_NS = 200_000_000  # nothing is interpolated across a longer silence
+
+# Basalt's poses are those of the left camera's body: x forward, y left, z up.
+T_BODY_LEFT: Float64 = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], np.float64)
+
+
+def basalt_pose(position: tuple[float, float, float], quaternion: tuple[float, float, float, float]) -> Float64:
+    """Pose (4, 4) of the left camera, from what Basalt says of its body.
+
+    Args:
+        position: Metres.
+        quaternion: x, y, z, w.
+
+    Raises:
+        PoseError: no rotation, or no finite numbers: it has lost track.
+    """
+    if not np.isfinite((*position, *quaternion)).all() or not np.linalg.norm(quaternion) > 0.5:
+        raise PoseError(f"odometry gave no pose: position {position}, quaternion {quaternion}")
+    T_world_body = np.eye(4)
+    T_world_body[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    T_world_body[:3, 3] = position
+    return T_world_body @ T_BODY_LEFT
 
 
 class Odometry:
@@ -35,7 +65,10 @@ class Odometry:
         ports = sources.odometry
         if ports is None:
             raise ValueError("these sources have no odometry")
-        self.track = PoseTrack(ports.T_left_rgb)
+        check_pose(ports.T_left_rgb, "extrinsics of the OAK's colour camera")
+        self._T_left_rgb = ports.T_left_rgb
+        self._track = PoseTrack(KEPT, GAP_NS, max_ahead_ns=0)
+        self._lock = threading.Lock()  # of the track
         self._pairs = synced_queue(
             sources.pipeline, {"left": ports.left_out, "right": ports.right_out}, 0.5 / config.fps, size=1
         )
@@ -53,6 +86,20 @@ class Odometry:
     def trouble(self) -> str:
         """What does not work now; empty when all is well."""
         return self._trouble
+
+    def reaches(self, stamp_ns: int) -> bool:
+        """Whether the poses go as far as this moment: waiting longer brings nothing new for it."""
+        with self._lock:
+            newest_ns = self._track.newest_ns
+        return newest_ns is not None and newest_ns >= stamp_ns
+
+    def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
+        """Pose of the colour camera at a moment between two poses; None where there are none round it."""
+        with self._lock:
+            found = self._track.at(stamp_ns)
+        if isinstance(found, str):
+            return None
+        return PoseEstimate(T_world_camera=found.T @ self._T_left_rgb, source=SOURCE)
 
     def start(self) -> None:
         """Begin, once the pipeline runs."""
@@ -102,7 +149,9 @@ class Odometry:
     def _add(self, stamp_ns: int, pose: Any) -> None:
         t, q = pose.getTranslation(), pose.getQuaternion()
         try:
-            self.track.add(stamp_ns, basalt_pose((t.x, t.y, t.z), (q.qx, q.qy, q.qz, q.qw)))
+            T_world_left = basalt_pose((t.x, t.y, t.z), (q.qx, q.qy, q.qz, q.qw))
+            with self._lock:
+                self._track.add(StampedPose(stamp_ns, T_world_left))
             self._trouble = ""
         except PoseError as error:
             self._trouble = f"odometry has lost track: {error}"

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from semantic_mapper.drivers.poses.config import PoseChecks
-from semantic_mapper.drivers.poses.motion import StampedPose, turn_between
+from semantic_mapper.drivers.poses.motion import StampedPose
+from semantic_mapper.geometry import invert_pose, rotation_vector
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import PosedFrame
 
@@ -181,7 +182,7 @@ def _in_order(chains: list[list[PosedFrame]]) -> list[PosedFrame]:
 def _way(a: StampedPose, b: StampedPose) -> tuple[float, float, float]:
     """Metres, degrees and seconds from a to b."""
     moved_m = float(np.linalg.norm(b.T[:3, 3] - a.T[:3, 3]))
-    turned_deg = float(np.rad2deg(np.linalg.norm(turn_between(a.T, b.T))))
+    turned_deg = float(np.rad2deg(np.linalg.norm(rotation_vector(invert_pose(a.T) @ b.T))))
     return moved_m, turned_deg, (b.stamp_ns - a.stamp_ns) / 1e9
 
 

@@ -1,4 +1,4 @@
-"""Motion between poses, and poses kept by time: interpolation, and extrapolation for a bounded while."""
+"""Poses by time: interpolated between samples, extrapolated for a bounded while."""
 
 from __future__ import annotations
 
@@ -7,30 +7,14 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Literal
 
-import cv2
 import numpy as np
 
+from semantic_mapper.geometry import interpolate_pose
 from semantic_mapper.types import Float64
 
 _BASELINE_NS = 20_000_000  # velocities are those over at least so long, where there are such poses
 
 Miss = Literal["empty", "before", "gap", "stale"]
-
-
-def turn_between(T_world_a: Float64, T_world_b: Float64) -> Float64:
-    """Rotation vector (3,) in radians, in the axes of a, that turns a's axes into b's."""
-    return np.asarray(cv2.Rodrigues(T_world_a[:3, :3].T @ T_world_b[:3, :3])[0], np.float64)[:, 0]
-
-
-def along(T_world_a: Float64, T_world_b: Float64, share: float) -> Float64:
-    """The pose (4, 4) at a share of the way from a to b: rotations by slerp, positions on a line.
-
-    Below 0 and above 1 the same motion goes on.
-    """
-    T = np.eye(4)
-    T[:3, :3] = T_world_a[:3, :3] @ np.asarray(cv2.Rodrigues(turn_between(T_world_a, T_world_b) * share)[0])
-    T[:3, 3] = (1 - share) * T_world_a[:3, 3] + share * T_world_b[:3, 3]
-    return T
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,8 +76,8 @@ class PoseTrack:
         a, b = self._samples[after - 1], self._samples[after]
         if b.stamp_ns - a.stamp_ns > self._max_gap_ns:
             return "gap"
-        share = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
-        return StampedPose(stamp_ns, along(a.T, b.T, share), max(a.sigma, b.sigma))
+        fraction = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
+        return StampedPose(stamp_ns, interpolate_pose(a.T, b.T, fraction), max(a.sigma, b.sigma))
 
     def _ahead(self, stamp_ns: int) -> StampedPose | Miss:
         last = self._samples[-1]
@@ -104,8 +88,8 @@ class PoseTrack:
         # From poses that are not close together: of two that are, the noise would be taken for motion.
         earlier = [s for s in self._samples if last.stamp_ns - s.stamp_ns <= self._max_gap_ns][:-1]
         before = next((s for s in reversed(earlier) if last.stamp_ns - s.stamp_ns >= _BASELINE_NS), earlier[0])
-        share = (stamp_ns - before.stamp_ns) / (last.stamp_ns - before.stamp_ns)
-        T = along(before.T, last.T, share)
+        fraction = (stamp_ns - before.stamp_ns) / (last.stamp_ns - before.stamp_ns)
+        T = interpolate_pose(before.T, last.T, fraction)
         # That the motion goes on is a guess, as wrong as the motion could have changed: half of what it adds.
         guessed = 0.5 * float(np.linalg.norm(T[:3, 3] - last.T[:3, 3]))
         return StampedPose(stamp_ns, T, float(np.hypot(last.sigma, guessed)) if last.sigma > 0 else 0.0)

@@ -25,9 +25,10 @@ from semantic_mapper.drivers.poses.config import OdometryPoses, matrix
 from semantic_mapper.drivers.poses.depth_view import Level, make_levels, thin_depth, thinned
 from semantic_mapper.drivers.poses.features import Features, find_features, pose_from_features
 from semantic_mapper.drivers.poses.keyframe_map import KeyframeMap, OdometryKeyframe
-from semantic_mapper.drivers.poses.motion import StampedPose, along, turn_between
+from semantic_mapper.drivers.poses.motion import StampedPose
 from semantic_mapper.drivers.poses.still import WAYS_OUT
 from semantic_mapper.errors import CameraError
+from semantic_mapper.geometry import interpolate_pose, invert_pose, rotation_vector
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
@@ -158,7 +159,7 @@ class OdometryPoseSource:
         guess = self._past[-1].T
         if len(self._past) > 1:
             a, b = self._past
-            guess = along(a.T, b.T, min((view.stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns), 3.0))
+            guess = interpolate_pose(a.T, b.T, min((view.stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns), 3.0))
         near = self._map.near(guess, self._config.neighbours)
         guesses = [(guess, near), *self._guesses_of_features(view, near)]
         return sorted(guesses, key=lambda g: fit(view.levels, g[1][0].target, g[0], self._config.outlier_m).cost_m)
@@ -204,7 +205,7 @@ class OdometryPoseSource:
 
     def _is_near(self, guess: Float64, pose: Float64) -> bool:
         moved = float(np.linalg.norm(pose[:3, 3] - guess[:3, 3]))
-        turned = float(np.rad2deg(np.linalg.norm(turn_between(guess, pose))))
+        turned = float(np.rad2deg(np.linalg.norm(rotation_vector(invert_pose(guess) @ pose))))
         return moved <= self._config.max_step_m and turned <= self._config.max_step_deg
 
     def _lies_on(self, found: Fit) -> bool:

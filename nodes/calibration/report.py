@@ -24,6 +24,7 @@ from semantic_mapper.drivers.calibration import save_calibration
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.files import write_bytes
+from semantic_mapper.geometry import rotation_vector
 
 
 class CalibrationSettings(Config, frozen=True):
@@ -94,7 +95,7 @@ def report(found: Calibration, gathered: Mapping[str, ViewGatherer], worst: int)
         for title in ("camera", "moments", "x, y, z on the rig (mm)", "+- mm", "turned (deg)", "+- deg"):
             table.add_column(title)
         for name, T in found.rig.T_rig_camera.items():
-            turned = np.degrees(np.linalg.norm(cv2.Rodrigues(T[:3, :3])[0]))
+            turned = np.degrees(np.linalg.norm(rotation_vector(T)))
             place = ", ".join(f"{1000 * v:.1f}" for v in T[:3, 3])
             sigmas = found.rig.position_sigma_m[name] * 1000, found.rig.turn_sigma_deg[name]
             moments = str(found.rig.instants[name])

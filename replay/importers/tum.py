@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.geometry import pose_matrix
+from semantic_mapper.geometry import interpolate_pose, pose_matrix
 from semantic_mapper.replay.importers.base import (
     BadFrameError,
     DepthScale,
@@ -91,7 +91,7 @@ class TumRecording:
             BadFrameError: it cannot be used.
         """
         stamp, file = self._color[number]
-        pose = interpolate_pose(stamp, self._pose_stamps, self._poses, round(self._options.match_s * 1e9))
+        pose = _pose_at(stamp, self._pose_stamps, self._poses, round(self._options.match_s * 1e9))
         if pose is None:
             raise BadFrameError(file, f"groundtruth.txt has no pose near its time {stamp / 1e9:.6f}")
         rgb, encoded = read_rgb(file)
@@ -211,7 +211,7 @@ def match_nearest(a_ns: NDArray[np.int64], b_ns: NDArray[np.int64], within_ns: i
     return result
 
 
-def interpolate_pose(stamp_ns: int, stamps_ns: NDArray[np.int64], rows: Float64, within_ns: int) -> Float64 | None:
+def _pose_at(stamp_ns: int, stamps_ns: NDArray[np.int64], rows: Float64, within_ns: int) -> Float64 | None:
     """Pose (4, 4) at a time: position linear, rotation spherical; None where there are no poses round that time.
 
     Args:
@@ -223,22 +223,11 @@ def interpolate_pose(stamp_ns: int, stamps_ns: NDArray[np.int64], rows: Float64,
     after = int(np.searchsorted(stamps_ns, stamp_ns))
     before = after - 1
     if before >= 0 and after < len(rows) and stamps_ns[after] - stamps_ns[before] <= _POSE_GAP_NS:
-        share = float(stamp_ns - stamps_ns[before]) / float(stamps_ns[after] - stamps_ns[before])
-        position = (1 - share) * rows[before, :3] + share * rows[after, :3]
-        return pose_matrix(position, _slerp(rows[before, 3:], rows[after, 3:], share))
+        fraction = float(stamp_ns - stamps_ns[before]) / float(stamps_ns[after] - stamps_ns[before])
+        a, b = (pose_matrix(row[:3], row[3:]) for row in rows[[before, after]])
+        return interpolate_pose(a, b, fraction)
     near = [i for i in (before, after) if 0 <= i < len(rows) and abs(int(stamps_ns[i]) - stamp_ns) <= within_ns]
     if not near:
         return None
     best = min(near, key=lambda i: abs(int(stamps_ns[i]) - stamp_ns))
     return pose_matrix(rows[best, :3], rows[best, 3:])
-
-
-def _slerp(a: Float64, b: Float64, share: float) -> Float64:
-    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
-    cosine = float(a @ b)
-    if cosine < 0:  # the same rotation, the short way round
-        b, cosine = -b, -cosine
-    if cosine > 0.9999:
-        return a + share * (b - a)
-    angle = np.arccos(cosine)
-    return (np.sin((1 - share) * angle) * a + np.sin(share * angle) * b) / np.sin(angle)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from semantic_mapper.geometry import invert_pose
+from semantic_mapper.geometry import interpolate_pose, invert_pose, rotation_vector
 from semantic_mapper.scenes.config import SUITE_VERSION, PoseNoiseConfig
 from semantic_mapper.types import Float64
 
@@ -25,12 +25,12 @@ def drifting_poses(poses: Float64, seed: int, config: PoseNoiseConfig) -> Float6
     jump_at = int(rng.integers(1, config.closure_frames + 1)) if config.closure_frames > 0 else 0
     for k in range(1, len(poses)):
         step = invert_pose(poses[k - 1]) @ poses[k]
-        way = float(np.linalg.norm(step[:3, 3])) + 0.35 * float(np.linalg.norm(cv2.Rodrigues(step[:3, :3])[0]))
+        way = float(np.linalg.norm(step[:3, 3])) + 0.35 * float(np.linalg.norm(rotation_vector(step)))
         turn = np.radians(config.rotation_deg_per_m) * np.sqrt(way) * rng.standard_normal(3)
         shift = config.translation_share * np.sqrt(way) * rng.standard_normal(3)
         error = error @ _about(poses[k], turn, shift)
         if config.closure_frames > 0 and k % config.closure_frames == jump_at % config.closure_frames:
-            error = _share_of(error, 1.0 - config.closure_share)
+            error = interpolate_pose(np.eye(4), error, 1.0 - config.closure_share)
         out.append(error @ poses[k])
     return np.array(out)
 
@@ -41,11 +41,3 @@ def _about(pose: Float64, turn: Float64, shift: Float64) -> Float64:
     local[:3, :3] = cv2.Rodrigues(turn)[0]
     local[:3, 3] = shift
     return pose @ local @ invert_pose(pose)
-
-
-def _share_of(T: Float64, share: float) -> Float64:
-    """(4, 4) a share of a motion: of its turn and of its shift."""
-    part = np.eye(4)
-    part[:3, :3] = cv2.Rodrigues(np.asarray(cv2.Rodrigues(T[:3, :3])[0]) * share)[0]
-    part[:3, 3] = T[:3, 3] * share
-    return part

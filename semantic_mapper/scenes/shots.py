@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
-from semantic_mapper.geometry import invert_pose
+from semantic_mapper.geometry import interpolate_pose, invert_pose, rotation_vector
 from semantic_mapper.scenes.config import SUITE_VERSION, NoiseConfig
 from semantic_mapper.types import Float64
 
@@ -77,10 +76,5 @@ def _gain(state: Float64, config: NoiseConfig) -> Float64:
 def _motion(pose: Float64, after: Float64, way_m: float) -> Float64:
     """(4, 4) the part of the motion from ``pose`` to ``after`` that is ``way_m`` long; identity where both are one."""
     T = invert_pose(pose) @ after
-    turn = np.asarray(cv2.Rodrigues(T[:3, :3])[0], np.float64)
-    full = float(np.hypot(np.linalg.norm(T[:3, 3]), _TURN_WEIGHT_M * np.linalg.norm(turn)))
-    share = min(way_m / full, 1.0) if full > 0 else 0.0
-    part = np.eye(4)
-    part[:3, :3] = cv2.Rodrigues(turn * share)[0]
-    part[:3, 3] = T[:3, 3] * share
-    return part
+    full = float(np.hypot(np.linalg.norm(T[:3, 3]), _TURN_WEIGHT_M * np.linalg.norm(rotation_vector(T))))
+    return interpolate_pose(np.eye(4), T, min(way_m / full, 1.0) if full > 0 else 0.0)

@@ -13,10 +13,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
-from semantic_mapper.geometry import invert_pose, transform
+from semantic_mapper.geometry import interpolate_pose, invert_pose, transform
 from semantic_mapper.types import Float64
 
 ALWAYS = 2**63 - 1  # later than any stamp
@@ -94,9 +93,8 @@ def _motion(pair: PosePair) -> Float64:
 def _between(a: Float64, b: Float64, share: float, T_world_camera: Float64) -> Float64:
     if np.array_equal(a, b):
         return move(a, T_world_camera)
-    turn = np.asarray(cv2.Rodrigues(a[:3, :3].T @ b[:3, :3])[0], np.float64)
     out = np.eye(4)
-    out[:3, :3] = a[:3, :3] @ np.asarray(cv2.Rodrigues(turn * share)[0]) @ T_world_camera[:3, :3]
+    out[:3, :3] = interpolate_pose(a, b, share)[:3, :3] @ T_world_camera[:3, :3]
     position = T_world_camera[:3, 3]
     out[:3, 3] = (1 - share) * transform(a, position) + share * transform(b, position)
     return out

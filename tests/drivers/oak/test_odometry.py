@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from semantic_mapper.drivers.base import CameraImage
 from semantic_mapper.drivers.oak import odometry
+from semantic_mapper.drivers.oak.odometry import T_BODY_LEFT, basalt_pose
 from semantic_mapper.drivers.oak.stream import Sources
-from semantic_mapper.drivers.oak.tracking import GAP_NS, T_BODY_LEFT, PoseTrack, basalt_pose
 from semantic_mapper.errors import CameraError, PoseError
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.types import Float64
@@ -146,14 +146,3 @@ def test_the_body_looks_along_x_and_the_camera_along_z() -> None:
 def test_no_rotation_is_no_pose(quaternion: tuple[float, float, float, float]) -> None:
     with pytest.raises(PoseError, match="gave no pose"):
         basalt_pose((0.0, 0.0, 0.0), quaternion)
-
-
-def test_nothing_is_interpolated_across_a_gap_or_beyond_the_ends() -> None:
-    track = PoseTrack(np.eye(4))
-    assert not track.reaches(0) and track.at(0) is None
-    for stamp_ns in (1_000, 1_000 + GAP_NS, 1_001 + 2 * GAP_NS):
-        track.add(stamp_ns, np.eye(4))
-    track.add(5, np.eye(4))  # late: passed over
-    assert track.reaches(1_001 + 2 * GAP_NS) and not track.reaches(1_002 + 2 * GAP_NS)
-    known = [stamp_ns for stamp_ns in (999, 1_000, 2_000, 1_000 + GAP_NS, 2_000 + GAP_NS) if track.at(stamp_ns)]
-    assert known == [1_000, 2_000, 1_000 + GAP_NS]

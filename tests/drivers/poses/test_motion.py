@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semantic_mapper.drivers.poses.motion import PoseTrack, StampedPose, along, turn_between
+from semantic_mapper.drivers.poses.motion import PoseTrack, StampedPose
+from semantic_mapper.geometry import interpolate_pose, invert_pose, rotation_vector
 from semantic_mapper.types import Float64
 
 from .images import MS, rigid
@@ -83,5 +84,7 @@ def test_late_and_doubled_samples_are_left_out_and_old_ones_forgotten() -> None:
 
 def test_a_motion_goes_on_beyond_its_ends() -> None:
     a, b = truth(0), truth(10**9)
-    assert np.allclose(along(a, b, 1.7), truth(1_700_000_000)) and np.allclose(along(a, b, -0.5), truth(-500_000_000))
-    assert np.allclose(turn_between(a, b), RATE)
+    assert np.allclose(interpolate_pose(a, b, 1.7), truth(1_700_000_000)) and np.allclose(
+        interpolate_pose(a, b, -0.5), truth(-500_000_000)
+    )
+    assert np.allclose(rotation_vector(invert_pose(a) @ b), RATE)

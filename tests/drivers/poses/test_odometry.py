@@ -12,11 +12,10 @@ from semantic_mapper.drivers.poses.config import OdometryPoses
 from semantic_mapper.drivers.poses.depth_view import make_levels, thin_depth, thinned
 from semantic_mapper.drivers.poses.features import find_features, pose_from_features
 from semantic_mapper.drivers.poses.keyframe_map import KeyframeMap, OdometryKeyframe
-from semantic_mapper.drivers.poses.motion import turn_between
 from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
 from semantic_mapper.errors import CameraError
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
-from semantic_mapper.geometry import invert_pose, unproject
+from semantic_mapper.geometry import invert_pose, rotation_vector, unproject
 from semantic_mapper.scenes import TRAIN_SEEDS, CameraPathConfig, NoiseConfig, room_frames
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
@@ -185,7 +184,7 @@ def test_corners_tell_the_way_between_two_views() -> None:
     assert found is not None and found[1] >= 15
     truth_of = invert_pose(a.T_world_camera) @ b.T_world_camera
     assert np.linalg.norm(found[0][:3, 3] - truth_of[:3, 3]) < 0.04
-    assert np.rad2deg(np.linalg.norm(turn_between(found[0], truth_of))) < 2
+    assert np.rad2deg(np.linalg.norm(rotation_vector(invert_pose(found[0]) @ truth_of))) < 2
     blank = find_features(np.full((120, 160, 3), 50, np.uint8), np.ones((120, 160), np.float32), 400)
     assert pose_from_features(blank, found_of[0], INTRINSICS, 15) is None
     assert pose_from_features(found_of[0], blank, INTRINSICS, 15) is None
