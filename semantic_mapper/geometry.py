@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import PoseError, ShapeError
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, RayBatch
@@ -82,6 +81,8 @@ def pose_matrix(position: Float64, quaternion: Float64) -> Float64:
 
 def rotation_vector(T_a_b: Float64) -> Float64:
     """Axis times angle (3,), in radians, of the rotation of a rigid transform (4, 4)."""
+    from scipy.spatial.transform import Rotation  # a machine that only trains and renders has no SciPy
+
     return Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec().astype(np.float64)
 
 

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from semantic_mapper.drivers.calibrating.config import CalibrationConfig
 from semantic_mapper.drivers.calibrating.intrinsics import ideal_pixels
 from semantic_mapper.drivers.calibrating.views import BoardView
 from semantic_mapper.drivers.poses.board import board_poses, pose_of_vector
 from semantic_mapper.errors import CameraError
-from semantic_mapper.geometry import invert_pose, transform
+from semantic_mapper.geometry import invert_pose
 from semantic_mapper.types import CameraIntrinsics, Float64
 
 _HUBER_PX = 1.0  # residuals beyond count less
-_ROUNDS = 30
-_SETTLED = 1e-9  # a step shorter than this (metres, radians) is the last one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,17 +68,17 @@ def calibrate_rig(
     sights = _sights(names, lenses, instants)
     T_rig_camera = _first_guess(names, sights, config)
     boards = {s.instant: T_rig_camera[s.camera] @ s.T_camera_board for s in reversed(sights)}
-    bundle = _Bundle(lenses, sights, T_rig_camera, boards)
-    bundle.settle()
-    rms_px = bundle.rms_px()
-    if rms_px > config.max_error_px:
+    fit = _adjust_bundle(lenses, sights, T_rig_camera, boards)
+    if fit.rms_px > config.max_error_px:
         raise CameraError(
-            f"the cameras do not agree on where the board is: corners are off by {rms_px:.2f} px (RMS; "
+            f"the cameras do not agree on where the board is: corners are off by {fit.rms_px:.2f} px (RMS; "
             f"{config.max_error_px:g} are allowed). Hold the board still, and check that stamps are of one clock and "
             "that no camera has moved on the rig"
         )
-    sigmas = bundle.camera_sigmas()
-    positions = {name: float(np.sqrt((sigmas[i, 3:] ** 2).sum() / 3)) for i, name in enumerate(names)}
+    turns, positions = (
+        {name: float(np.sqrt((own**2).mean())) for name, own in zip(names, part, strict=True)}
+        for part in (fit.sigmas[:, :3], fit.sigmas[:, 3:])
+    )
     for name, sigma in positions.items():
         if sigma > config.max_position_sigma_m:
             raise CameraError(
@@ -85,11 +86,11 @@ def calibrate_rig(
                 f"{1000 * config.max_position_sigma_m:g} are needed): show the board nearer to both cameras at once"
             )
     return RigCalibration(
-        dict(zip(names, bundle.cameras, strict=True)),
-        rms_px,
+        dict(zip(names, fit.T_rig_camera, strict=True)),
+        fit.rms_px,
         {name: sum(s.camera == i for s in sights) for i, name in enumerate(names)},
         positions,
-        {name: float(np.degrees(np.sqrt((sigmas[i, :3] ** 2).sum() / 3))) for i, name in enumerate(names)},
+        {name: float(np.degrees(sigma)) for name, sigma in turns.items()},
     )
 
 
@@ -144,115 +145,67 @@ def _middle(poses: Sequence[Float64]) -> Float64:
     return stack[int(apart.argmin())]
 
 
-class _Bundle:
-    """Gauss-Newton over the poses of cameras (but the first) and boards; small turns and shifts are right-hand."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _BundleFit:
+    """Outcome of the bundle adjustment; ``sigmas`` (C, 6): one sigma of rotation (radians) and position (metres)."""
 
-    def __init__(
-        self,
-        lenses: Sequence[CameraIntrinsics],
-        sights: Sequence[_Sight],
-        cameras: Sequence[Float64],
-        boards: Mapping[int, Float64],
-    ) -> None:
-        self._lenses = lenses
-        self._sights = sights
-        self._rows = {instant: row for row, instant in enumerate(boards)}
-        self.cameras = list(cameras)
-        self._boards = [boards[instant] for instant in boards]
-        self._hessian: Float64 = np.zeros((0, 0))
-
-    def settle(self) -> None:
-        """Fit until it moves no more."""
-        damping = 1e-6
-        cost = self._cost()
-        for _ in range(_ROUNDS):
-            hessian, gradient = self._normal_equations()
-            damped = hessian + damping * np.diag(np.diag(hessian))
-            step: Float64 = -np.linalg.solve(damped, gradient).astype(np.float64)
-            before = list(self.cameras), list(self._boards)
-            self._move(step)
-            new_cost = self._cost()
-            if new_cost > cost:
-                self.cameras, self._boards = before
-                damping *= 10
-                continue
-            cost, damping = new_cost, damping / 3
-            if np.abs(step).max() < _SETTLED:
-                break
-        self._hessian = self._normal_equations()[0]
-
-    def rms_px(self) -> float:
-        """Root mean square of the distances of corners, seen and predicted."""
-        squares = [(self._residual(s)[0] ** 2).sum(axis=1) for s in self._sights]
-        return float(np.sqrt(np.concatenate(squares).mean()))
-
-    def camera_sigmas(self) -> Float64:
-        """(C, 6) one sigma of turn (radians) and position (metres), from how well the corners fit."""
-        corners = sum(len(s.points) for s in self._sights)
-        free = max(1, 2 * corners - len(self._hessian))
-        variance = self.rms_px() ** 2 * corners / free
-        covariance = variance * np.linalg.inv(self._hessian)
-        own = np.sqrt(np.diag(covariance))[: 6 * (len(self.cameras) - 1)].reshape(-1, 6)
-        return np.concatenate((np.zeros((1, 6)), own))
-
-    def _move(self, step: Float64) -> None:
-        parts = step.reshape(-1, 6)
-        count = len(self.cameras) - 1
-        self.cameras[1:] = [T @ pose_of_vector(part) for T, part in zip(self.cameras[1:], parts[:count], strict=True)]
-        self._boards = [T @ pose_of_vector(part) for T, part in zip(self._boards, parts[count:], strict=True)]
-
-    def _cost(self) -> float:
-        total = 0.0
-        for sight in self._sights:
-            far = np.linalg.norm(self._residual(sight)[0], axis=1)
-            total += float(np.where(far < _HUBER_PX, far**2, 2 * _HUBER_PX * far - _HUBER_PX**2).sum())
-        return total
-
-    def _residual(self, sight: _Sight) -> tuple[Float64, Float64, Float64]:
-        """Predicted minus seen (N, 2), the points in the camera (N, 3), and T_camera_board."""
-        T = invert_pose(self.cameras[sight.camera]) @ self._boards[self._rows[sight.instant]]
-        lens = self._lenses[sight.camera]
-        at = transform(T, sight.points)
-        z = np.maximum(at[:, 2], 1e-6)
-        seen = np.stack((lens.fx * at[:, 0] / z + lens.cx, lens.fy * at[:, 1] / z + lens.cy), axis=1)
-        return seen - sight.pixels, at, T
-
-    def _normal_equations(self) -> tuple[Float64, Float64]:
-        count = 6 * (len(self.cameras) - 1 + len(self._boards))
-        hessian, gradient = np.zeros((count, count)), np.zeros(count)
-        for sight in self._sights:
-            off, at, T = self._residual(sight)
-            by_point = _projection_slope(at, self._lenses[sight.camera])
-            by_camera = by_point @ np.concatenate((_cross(at), np.broadcast_to(-np.eye(3), (len(at), 3, 3))), axis=2)
-            by_board = (by_point @ T[:3, :3]) @ np.concatenate(
-                (-_cross(sight.points), np.broadcast_to(np.eye(3), (len(at), 3, 3))), axis=2
-            )
-            board = 6 * (len(self.cameras) - 1 + self._rows[sight.instant])
-            columns = list(range(board, board + 6))
-            slope = by_board
-            if sight.camera:
-                columns = [*range(6 * (sight.camera - 1), 6 * sight.camera), *columns]
-                slope = np.concatenate((by_camera, by_board), axis=2)
-            weight = np.minimum(1.0, _HUBER_PX / np.maximum(np.linalg.norm(off, axis=1), 1e-12))
-            flat, rest = slope.reshape(-1, len(columns)), off.ravel()
-            heavy = flat * np.repeat(weight, 2)[:, None]
-            hessian[np.ix_(columns, columns)] += heavy.T @ flat
-            gradient[columns] += heavy.T @ rest
-        return hessian, gradient
+    T_rig_camera: Float64
+    rms_px: float
+    sigmas: Float64
 
 
-def _projection_slope(at: Float64, lens: CameraIntrinsics) -> Float64:
-    """(N, 2, 3): pixels by a point in the camera."""
-    x, y, z = at[:, 0], at[:, 1], np.maximum(at[:, 2], 1e-6)
-    zero = np.zeros_like(z)
-    u = np.stack((lens.fx / z, zero, -lens.fx * x / z**2), axis=1)
-    v = np.stack((zero, lens.fy / z, -lens.fy * y / z**2), axis=1)
-    return np.stack((u, v), axis=1)
+def _adjust_bundle(
+    lenses: Sequence[CameraIntrinsics],
+    sights: Sequence[_Sight],
+    cameras: Sequence[Float64],
+    boards: Mapping[int, Float64],
+) -> _BundleFit:
+    """Fit the poses of all cameras but the first and of all boards to the corners seen.
 
+    Args:
+        lenses: By camera.
+        sights: What was seen.
+        cameras: First guess, T_rig_camera by camera.
+        boards: First guess, T_rig_board by instant.
+    """
+    rows = {instant: len(cameras) + row for row, instant in enumerate(boards)}
+    start = np.array([*cameras, *boards.values()])  # (P, 4, 4)
+    counts = [len(sight.points) for sight in sights]
+    camera = np.repeat([sight.camera for sight in sights], counts)  # (N,)
+    board = np.repeat([rows[sight.instant] for sight in sights], counts)
+    points = np.concatenate([sight.points for sight in sights])
+    pixels = np.concatenate([sight.pixels for sight in sights])
+    focal = np.array([(lens.fx, lens.fy) for lens in lenses])[camera]
+    centre = np.array([(lens.cx, lens.cy) for lens in lenses])[camera]
 
-def _cross(points: Float64) -> Float64:
-    """(N, 3, 3) with ``cross(p) @ v = p x v``."""
-    x, y, z = points[:, 0], points[:, 1], points[:, 2]
-    zero = np.zeros_like(x)
-    rows = ((zero, -z, y), (z, zero, -x), (-y, x, zero))
-    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+    def poses(x: Float64) -> Float64:
+        """(P, 4, 4); each but the first is moved by a rotation vector and a shift in its own axes."""
+        steps = np.tile(np.eye(4), (len(start), 1, 1))
+        steps[1:, :3, :3] = Rotation.from_rotvec(x.reshape(-1, 6)[:, :3]).as_matrix()
+        steps[1:, :3, 3] = x.reshape(-1, 6)[:, 3:]
+        return start @ steps
+
+    def residuals(x: Float64) -> Float64:
+        """Predicted minus seen, (2 N,) pixels."""
+        T = poses(x)
+        T_camera_board = invert_pose(T)[camera] @ T[board]
+        p = np.einsum("nij,nj->ni", T_camera_board[:, :3, :3], points) + T_camera_board[:, :3, 3]
+        return (focal * p[:, :2] / np.maximum(p[:, 2:], 1e-6) + centre - pixels).ravel()
+
+    # A corner depends on one camera and one board: with the pattern known, few differences give all derivatives.
+    touched = np.zeros((len(points), len(start)), np.uint8)
+    touched[np.arange(len(points)), camera] = touched[np.arange(len(points)), board] = 1
+    sparsity = np.kron(touched[:, 1:], np.ones((2, 6), np.uint8))
+    guess = np.zeros(6 * (len(start) - 1))
+    fit: Any = least_squares(
+        residuals, guess, jac_sparsity=sparsity, loss="huber", f_scale=_HUBER_PX, x_scale="jac", xtol=1e-10
+    )
+    squares = (residuals(fit.x) ** 2).sum()
+    hessian = (fit.jac.T @ fit.jac).toarray()  # of the robust cost
+    covariance = squares / max(1, len(pixels) * 2 - len(guess)) * np.linalg.inv(hessian)
+    free = np.sqrt(np.diag(covariance)).reshape(-1, 6)[: len(cameras) - 1]
+    return _BundleFit(
+        poses(fit.x)[: len(cameras)],
+        float(np.sqrt(squares / len(pixels))),
+        np.concatenate((np.zeros((1, 6)), free)),
+    )

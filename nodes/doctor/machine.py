@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import os
 import platform
-import re
 import shutil
 import signal
 import subprocess
@@ -13,6 +12,9 @@ import sys
 from collections.abc import Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.version import Version
 
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.memory import is_out_of_memory
@@ -55,21 +57,21 @@ def _libc() -> Iterator[Check]:
     if name != "glibc":
         yield Check("C library", "bad", name or "unknown", "Open3D's wheels need glibc 2.35 or newer")
         return
-    good = tuple(int(n) for n in re.findall(r"\d+", version)[:2]) >= (2, 35)
+    good = Version(version) >= Version("2.35")
     yield Check("C library", "ok" if good else "bad", f"glibc {version}", "" if good else "Open3D needs glibc 2.35")
 
 
 def _packages() -> Iterator[Check]:
     missing, other, found = [], [], []
-    for requirement in metadata.requires("semantic-mapper") or ():
-        if "extra ==" in requirement:  # wanted by whoever asked for it
-            continue
-        name = re.split(r"[\s<>=!~;\[]", requirement, maxsplit=1)[0]
+    for requirement in map(Requirement, metadata.requires("semantic-mapper") or ()):
+        name = requirement.name
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+            continue  # of an extra, or for another platform
         try:
             version = metadata.version(name)
             found.append(f"{name} {version}")
-            if not _within(version, requirement):
-                other.append(f"{name} {version}, not {requirement.removeprefix(name)}")
+            if not requirement.specifier.contains(version, prereleases=True):
+                other.append(f"{name} {version}, not {requirement.specifier}")
         except metadata.PackageNotFoundError:
             missing.append(name)
     if missing:
@@ -78,17 +80,6 @@ def _packages() -> Iterator[Check]:
         yield Check("packages", "bad", "; ".join(other), "make setup")
     else:
         yield Check("packages", "ok", ", ".join(found))
-
-
-def _within(version: str, requirement: str) -> bool:
-    """Whether a version keeps the bounds ">=" and "<" of a requirement, number by number."""
-    own = [int(n) for n in re.findall(r"\d+", version.partition("+")[0])]
-    for sign, bound in re.findall(r"(>=|<)\s*([\d.]+)", requirement.partition(";")[0]):
-        limit = [int(n) for n in bound.split(".") if n]
-        below = own[: len(limit)] < limit
-        if below != (sign == "<"):
-            return False
-    return True
 
 
 def _libusb() -> Iterator[Check]:
