@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2  # SciPy has slerp, too, but a machine that only trains and renders lacks it
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -81,9 +82,7 @@ def pose_matrix(position: Float64, quaternion: Float64) -> Float64:
 
 def rotation_vector(T_a_b: Float64) -> Float64:
     """Axis times angle (3,), in radians, of the rotation of a rigid transform (4, 4)."""
-    from scipy.spatial.transform import Rotation  # a machine that only trains and renders has no SciPy
-
-    return Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec().astype(np.float64)
+    return np.asarray(cv2.Rodrigues(T_a_b[:3, :3])[0], np.float64)[:, 0]
 
 
 def interpolate_pose(T_world_a: Float64, T_world_b: Float64, fraction: float) -> Float64:
@@ -91,9 +90,9 @@ def interpolate_pose(T_world_a: Float64, T_world_b: Float64, fraction: float) ->
 
     Below 0 and above 1 the motion is extrapolated.
     """
-    R_a_b = Rotation.from_matrix(T_world_a[:3, :3].T @ T_world_b[:3, :3])
+    turn = rotation_vector(T_world_a[:3, :3].T @ T_world_b[:3, :3])
     T = np.eye(4)
-    T[:3, :3] = T_world_a[:3, :3] @ (R_a_b**fraction).as_matrix()
+    T[:3, :3] = T_world_a[:3, :3] @ cv2.Rodrigues(fraction * turn)[0]
     T[:3, 3] = (1 - fraction) * T_world_a[:3, 3] + fraction * T_world_b[:3, 3]
     return T
 
