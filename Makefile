@@ -6,12 +6,16 @@ SHELL := /bin/bash
 
 PYTHON ?= python3
 READY := .venv/.ready
+# Modules whose classes and functions the reference describes; what they import is left out.
+API := semantic_mapper semantic_mapper.types semantic_mapper.geometry semantic_mapper.labels semantic_mapper.config \
+	semantic_mapper.errors semantic_mapper.testing semantic_mapper.mapping.map_types semantic_mapper.fields.base \
+	semantic_mapper.evaluation.metrics
 KERNELS := $(wildcard semantic_mapper/kernels/src/*)
 
 # One thread of computation for each of two test processes. A worker that crashes ends the run with an error.
 PYTEST := OMP_NUM_THREADS=1 .venv/bin/python -m pytest tests -n 2 --dist worksteal --max-worker-restart 0
 
-.PHONY: help setup demo test test-slow test-all test-v4l2 test-web check bench wheels format lock clean
+.PHONY: help setup demo test test-slow test-all test-v4l2 test-web check bench wheels docs format lock clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -51,6 +55,9 @@ bench: $(READY)  ## measure speed
 
 wheels: $(READY)  ## build wheels for x86_64 and aarch64 into dist/, and check them
 	.venv/bin/python scripts/wheels.py
+
+docs: $(READY)  ## build the reference of the Python interface into dist/docs/
+	.venv/bin/pdoc --docformat google --output-directory dist/docs $(API)
 
 format: $(READY)  ## format and mend what can be mended automatically
 	.venv/bin/ruff format .

@@ -163,12 +163,15 @@ def run_node(
                 options,
             )
         code = stop.exit_code if job.heartbeat_fd >= 0 else 0
-    except (SemanticMapperError, OSError) as error:
+    except SemanticMapperError as error:
         _log.error(FAILURE_EVENT, error=str(error))
-    except (MemoryError, ImportError, RuntimeError) as error:
-        if not is_out_of_memory(error):
+    except Exception as error:
+        if is_out_of_memory(error):  # native packages raise whatever they like then
+            _log.error(FAILURE_EVENT, error=memory_message(error))
+        elif isinstance(error, OSError):
+            _log.error(FAILURE_EVENT, error=str(error))
+        else:
             raise
-        _log.error(FAILURE_EVENT, error=memory_message(error))
     sys.exit(code)
 
 

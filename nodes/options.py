@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -12,12 +13,27 @@ SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # of transport/topics.py, which lo
 # Of drivers/registry.py and drivers/poses/config.py, for the same reason.
 CAMERA_KINDS = ("v4l2", "opencv", "oak")
 POSE_KINDS = ("device", "fixed", "topic", "board", "rgbd")
+TRACKING_KINDS = ("oak",)  # cameras that can tell their own pose
 ENDPOINT_PATTERN = r"^([a-z]+://.+|)\Z"
 
 Text = Annotated[str, msgspec.Meta(min_length=1)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**31 - 1)]
 Names = Annotated[tuple[Text, ...], msgspec.Meta(min_length=1, max_length=64)]
 PoseRow = tuple[float, float, float, float]
+
+
+def check_tracking(camera_kind: str, pose_kind: object) -> None:
+    """Refuse poses of kind "device" of a camera that does not track itself: none of its images would have one.
+
+    Raises:
+        ValueError: naming what to use instead.
+    """
+    if pose_kind == "device" and camera_kind in CAMERA_KINDS and camera_kind not in TRACKING_KINDS:
+        raise ValueError(
+            f'poses = {{ kind = "device" }}: cameras of kind "{camera_kind}" do not track themselves, and no frame '
+            f'would have a pose (only {", ".join(TRACKING_KINDS)} does); use kind = "topic" (odometry from a socket), '
+            '"board" (a printed board), "rgbd" (odometry from depth) or "fixed" (it never moves)'
+        )
 
 
 class LiveCamera(Config, frozen=True):
@@ -35,6 +51,13 @@ class LiveCamera(Config, frozen=True):
     # A camera that cannot be opened when the node starts is tried again for so long; 0 = until it is there. One that is
     # lost later is waited for without end.
     open_s: Annotated[float, msgspec.Meta(ge=0)] = 0.0
+
+    def __post_init__(self) -> None:
+        if self.poses in POSE_KINDS and not Path(str(self.poses)).exists():
+            raise ValueError(
+                f'poses = "{self.poses}" names a file of settings, and there is none; for poses of that kind write '
+                f'poses = {{ kind = "{self.poses}" }}'
+            )
 
 
 class CameraOptions(Config, frozen=True):

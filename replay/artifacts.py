@@ -18,6 +18,7 @@ from semantic_mapper.evaluation.metrics import confusion_of
 from semantic_mapper.evaluation.report import ViewStrip, write_overview
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.files import write_bytes
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.formats.ply import write_ply
 from semantic_mapper.mapping.map_types import MapPoints
 
@@ -26,8 +27,13 @@ if TYPE_CHECKING:  # session imports this module
     from semantic_mapper.replay.session import MapSession, Refusal
     from semantic_mapper.replay.stats import StepTimes
 
+_log = get_logger(__name__)
+
 ItemT = TypeVar("ItemT")
 OVERVIEW_FRAMES = 2
+# Surface points that a map has at least for each of its blocks, else it is nearly empty. With sensor depth they are 25
+# to 33 in the demo, 64 where a flat surface goes through each; with rendered depth that does not agree 0 to 1.
+MIN_POINTS_A_BLOCK = 2
 MAX_LISTED = 50  # refused frames, refused labels and damages: the first ones are told in the summary
 PACKAGES = ("torch", "open3d", "numpy", "opencv-contrib-python-headless", "pyzmq", "msgpack", "mcap")
 
@@ -42,6 +48,8 @@ def write_artifacts(session: MapSession, out: Path, rerun: RerunLog | None) -> d
     if rerun is not None:
         rerun.finish(points)
     summary = build_summary(session, points)
+    if summary["map"]["nearly_empty"]:
+        _log.warning("map_nearly_empty", reason=summary["map"]["nearly_empty"])
     write_json(out / "summary.json", summary)
     return summary
 
@@ -56,7 +64,7 @@ def _draw_overview(session: MapSession, points: MapPoints, path: Path) -> None:
         points,
         label_set,
         title=f"{session.source or 'session'}: {session.fused} frames, {len(points.xyz):,} surface points, {size}",
-        subtitle=_pose_line(session) + _scores_line(session) + _depth_line(session),
+        subtitle=_pose_line(session) + _empty_line(session, points) + _scores_line(session) + _depth_line(session),
         up=camera_up(np.stack(poses)) if poses else None,
     )
 
@@ -94,6 +102,36 @@ def _depth_line(session: MapSession) -> str:
     return (
         f"; depth: rendered by the field for {100 * source['rendered_fraction']:.0f} % of the frames (no sensor depth)"
     )
+
+
+def nearly_empty(session: MapSession, points: int) -> str | None:
+    """Why a map has hardly any surface for the space that its frames measured, and what to do; None where it has.
+
+    Args:
+        session: With at least one frame mapped, else None is returned.
+        points: Surface points of the map.
+    """
+    blocks = session.pipeline.voxel_map.block_count
+    if not session.fused or points >= MIN_POINTS_A_BLOCK * blocks:
+        return None
+    found = f"the map is nearly empty: {points:,} surface points in {blocks:,} blocks, of {session.fused} frames"
+    if 2 * session.without_depth >= session.fused:
+        return (
+            f"{found}; {session.without_depth} of them have no sensor depth, and depth that the field renders does not "
+            "agree well enough from frame to frame to make a surface: record with a depth camera, or import depth "
+            "images, too; without depth, finetune the weights on this scene and move slowly, with views that overlap"
+        )
+    return (
+        f"{found}; their depth does not agree from frame to frame: check depth_scale, the intrinsics and the poses "
+        "(T_world_camera, metres, stamped with the time of capture)"
+    )
+
+
+def _empty_line(session: MapSession, points: MapPoints) -> str:
+    if nearly_empty(session, len(points.xyz)) is None:
+        return ""
+    why = "no depth" if 2 * session.without_depth >= session.fused else "depth disagrees"
+    return f"MAP NEARLY EMPTY ({why}; see summary.json); "
 
 
 def _spread(items: Sequence[ItemT], count: int) -> list[ItemT]:
@@ -142,6 +180,7 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "surface_points": len(points.xyz),
             "memory_mb": round(voxel_map.memory_bytes / 1e6, 1),
             "corrected_poses": session.corrected_poses,
+            "nearly_empty": nearly_empty(session, len(points.xyz)),
             "unfinished_correction": session.unfinished_correction or None,
         },
         "metrics": _metrics(session, points),

@@ -7,6 +7,7 @@ a log, so that both write the same map and the same summary.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,6 +68,7 @@ class MapSession:
         self.published = 0
         self.fused = 0
         self.dropped = 0
+        self.unreadable = 0  # refused by the player of a log; they never came here
         self.scored = 0
         self.excluded = 0
         self.corrected_poses = 0  # given; the map has moved with them
@@ -129,6 +131,19 @@ class MapSession:
         self.published += 1
         self.refusals.append(Refusal(seq, stamp_ns, reason))
         _log.error("frame_refused", seq=seq, reason=reason)
+
+    def refuse_unreadable(self, count: int, reasons: Sequence[str]) -> None:
+        """Count frames that a player could not read and has not sent; reasons are those of the first few."""
+        for reason in reasons[:count]:
+            self.refusals.append(Refusal(0, 0, reason))
+        self.refusals.skip(max(0, count - len(reasons)))
+        self.published += count
+        self.unreadable += count
+
+    @property
+    def received(self) -> int:
+        """Frames that came here, or were dropped on the way."""
+        return self.published - self.unreadable
 
     def note_damage(self, reason: str) -> None:
         """Keep word of a damaged stretch of a log; nobody knows how many frames it held."""

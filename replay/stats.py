@@ -48,6 +48,10 @@ class FirstAndLast(Generic[ItemT]):
         if len(self.first) < self._most:
             self.first.append(item)
 
+    def skip(self, count: int) -> None:
+        """Count so many more, of which nothing is known."""
+        self._count += count
+
 
 class StepTimes:
     """Milliseconds of steps: the first one, and percentiles of the others, right to a quarter of a percent."""

@@ -25,6 +25,6 @@ cache="${UV_CACHE_DIR:-${XDG_CACHE_HOME:-${HOME:-/nonexistent}/.cache}/uv}"
 if ! mkdir -p "$cache" 2>/dev/null || [[ ! -w $cache ]]; then
   export UV_CACHE_DIR="$PWD/.tools/cache"  # a home that cannot be written to
 fi
-"$uv" sync --frozen --python "$python"
+"$uv" sync --frozen --all-extras --python "$python"
 
 .venv/bin/python scripts/system_libs.py

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 
+def counted(count: int, one: str, many: str = "") -> str:
+    """A number of things: 1 frame, 2 frames; ``many`` where it is not ``one`` with an s."""
+    return f"{count} {one}" if count == 1 else f"{count} {many or one + 's'}"
+
+
 def visible(text: str, keep: str = "") -> str:
     r"""The text with every character that prints nothing, or steers what shows it, as an escape such as ``\x1b``.
 

@@ -29,6 +29,7 @@ MAX_PIXELS = 1 << 25  # 8192 x 4096
 # Focal lengths in image sides. 0.1 is a field of view of 157 degrees, about as far as the pinhole model of a rectified
 # image goes (a raw 180 degree fisheye has 0.3); 100 is one of 0.6 degrees, a tele lens of 3.6 m on a 35 mm camera.
 MIN_FOCAL, MAX_FOCAL = 0.1, 100.0
+ROUNDING = 1e-6  # of these bounds: intrinsics on one must still be within once an image is resized
 CENTER_MARGIN = 1.0  # image sides that the principal point may lie outside of the image, as it does in a crop
 COEFFICIENTS = (0, 4, 5, 8, 12, 14)  # how many OpenCV's lens models have
 MAX_DISTORTION = 1e6  # of a coefficient; ill-conditioned fits of the rational model reach thousands
@@ -83,9 +84,9 @@ class CameraIntrinsics:
 
 def _check_lens(k: CameraIntrinsics) -> None:
     """Focal lengths and principal point against the image size, so that every ray has a bounded slope."""
-    longest = MAX_FOCAL * max(k.width, k.height)
-    focal = MIN_FOCAL * k.width <= k.fx <= longest and MIN_FOCAL * k.height <= k.fy <= longest
-    margin_x, margin_y = CENTER_MARGIN * k.width, CENTER_MARGIN * k.height
+    least, longest = MIN_FOCAL * (1 - ROUNDING), MAX_FOCAL * (1 + ROUNDING) * max(k.width, k.height)
+    focal = least * k.width <= k.fx <= longest and least * k.height <= k.fy <= longest
+    margin_x, margin_y = CENTER_MARGIN * (1 + ROUNDING) * k.width, CENTER_MARGIN * (1 + ROUNDING) * k.height
     center = -margin_x <= k.cx + 0.5 <= k.width + margin_x and -margin_y <= k.cy + 0.5 <= k.height + margin_y
     if focal and center:
         return

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import FrameError, SemanticMapperError
+from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
 CAMERA = CameraIntrinsics(fx=50, fy=50, cx=3.5, cy=2.5, width=8, height=6)
@@ -140,3 +141,10 @@ def test_normalised_intrinsics_are_named_and_the_pixels_given() -> None:
 def test_a_number_out_of_its_range_is_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(FrameError, match=name):
         frame(**{name: value})
+
+
+@pytest.mark.parametrize("width", [32, 640, 641, 1280, 1920])
+def test_intrinsics_on_the_bound_stay_within_it_when_resized(width: int) -> None:
+    widest = CameraIntrinsics(0.1 * width, 0.1 * 480, width / 2, 240, width, 480)
+    for small in range(8, width + 1, 7):
+        scale_intrinsics(widest, small, 96)

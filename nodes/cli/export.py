@@ -9,6 +9,7 @@ import typer
 
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.plain_text import counted
 
 if TYPE_CHECKING:
     from semantic_mapper.replay.exporters.map_files import ExportRequest
@@ -127,4 +128,4 @@ def merge(
     blocks = f"{one.block_count} and {other.block_count} made {joined.block_count} blocks"
     if empty:
         blocks += f"; {empty} empty blocks of the two, in which nothing was measured, are left out"
-    output.print(f"{out}: {joined.frames} frames; {blocks}")
+    output.print(f"{out}: {counted(joined.frames, 'frame')}; {blocks}")

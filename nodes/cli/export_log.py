@@ -8,6 +8,7 @@ from pathlib import Path
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.outputs import prepare_folder
+from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.log.sequence import open_log
 
 LISTED = 10  # frames left out that are shown one by one
@@ -46,7 +47,7 @@ def export_recording(
     with open_log(source) as log, frame_progress("export", min(len(log), max_frames or len(log))) as bar:
         report = export_log(log, out, request, bar.advance)
         damage, notices = [str(e) for e in log.errors], list(log.notices)
-    output.print(f"{out}: {report.frames} frames ({request.format})")
+    output.print(f"{out}: {counted(report.frames, 'frame')} ({request.format})")
     for notice in (*notices, *report.notices):
         output.print(f"  note: {notice}")
     lost = [*damage, *report.left_out]

@@ -10,6 +10,7 @@ import typer
 from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.plain_text import counted
 
 
 @verb
@@ -61,7 +62,10 @@ def label(
         with sending(endpoint, timeout, stop) as send:
             for frame in chosen:
                 send(LabelledKeyframe(frame, label_set, teacher or f"log {log.name}"))
-    output.print(f"{len(chosen)} labelled keyframes sent: frames {', '.join(str(f.seq) for f in chosen)} of {log.name}")
+    output.print(
+        f"{counted(len(chosen), 'labelled keyframe')} sent: frames {', '.join(str(f.seq) for f in chosen)} "
+        f"of {log.name}"
+    )
 
 
 def _refuse_without_finetuner(folder: Path) -> None:

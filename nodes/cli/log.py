@@ -9,6 +9,7 @@ import typer
 
 from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
+from semantic_mapper.plain_text import counted
 
 if TYPE_CHECKING:
     from semantic_mapper.replay.importers import ImportReport
@@ -60,7 +61,9 @@ def import_(
             source, log, format, on_progress, options=options, renames=renames, overwrite=overwrite
         )
     labels = "no labels" if not report.labelled else f"{report.labelled} of them labelled"
-    output.print(f"{log}: {report.frames} frames ({labels}), {report.bytes / 1e6:.1f} MB, from a '{report.format}'")
+    output.print(
+        f"{log}: {counted(report.frames, 'frame')} ({labels}), {report.bytes / 1e6:.1f} MB, from a '{report.format}'"
+    )
     output.print(f"  depth: {_depth_line(report)}")
     for notice in report.notices:
         output.print(f"  note: {notice}")
@@ -75,7 +78,7 @@ def _depth_line(report: ImportReport) -> str:
     if not report.with_depth:
         return "no frame has a depth image"
     missing = report.frames - report.with_depth
-    without = f"; {missing} of {report.frames} frames have no depth image" if missing else ""
+    without = f"; {missing} of {counted(report.frames, 'frame')} without a depth image" if missing else ""
     median = f"; half of the first image is nearer than {report.median_depth_m:.2f} m" if report.median_depth_m else ""
     return f"{report.depth_scale}{median}{without}"
 
@@ -156,7 +159,10 @@ def recover(
     from semantic_mapper.replay.log.recover import recover as recover_log
 
     report = recover_log(source, log)
-    output.print(f"{log}: {report.frames} frames, {report.messages} messages; {len(report.lost)} could not be saved")
+    output.print(
+        f"{log}: {counted(report.frames, 'frame')}, {counted(report.messages, 'message')}; "
+        f"{len(report.lost)} could not be saved"
+    )
     if not report.finished:
         output.print("  the old log had not been closed by its writer")
     for error in report.lost[:LISTED]:

@@ -9,6 +9,7 @@ from typing import Any
 
 from rich.table import Table
 
+from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.log.gaps import find_gaps, gaps_text
 from semantic_mapper.replay.log.sequence import LogSequence, open_log, read_part
 
@@ -99,11 +100,11 @@ def info_table(found: dict[str, Any]) -> Table:
     for key, value in found["metadata"].items():
         table.add_row(key, value)
     for name, size in found["attachments"].items():
-        table.add_row(f"file {name}", f"{size} bytes")
+        table.add_row(f"file {name}", counted(size, "byte"))
     table.add_section()
     for name, topic in found["topics"].items():
-        table.add_row(f"topic {name}", f"{topic['messages']} messages, {topic['bytes'] / 1e6:.1f} MB")
+        table.add_row(f"topic {name}", f"{counted(topic['messages'], 'message')}, {topic['bytes'] / 1e6:.1f} MB")
     table.add_section()
     count = len(found["damage"])
-    table.add_row("damage", f"{count} places" if count else "none")
+    table.add_row("damage", counted(count, "place") if count else "none")
     return table

@@ -9,6 +9,7 @@ import numpy as np
 from rich.table import Table
 
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.plain_text import counted
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.lookup import PointAnswers
 from semantic_mapper.queries.nearest import NearestSurface
@@ -18,6 +19,7 @@ from semantic_mapper.queries.surface import surface_voxels
 from semantic_mapper.types import Float64
 
 DIGITS = 4  # 0.1 mm
+MIN_CLASS_WIDTH = 8  # of their column, on a narrow terminal
 
 
 def describe_map(snapshot: MapSnapshot) -> dict[str, Any]:
@@ -84,10 +86,10 @@ def answer_instances(up: Sequence[float], instances: Sequence[Instance]) -> dict
     return {"question": "instances", "up": list(up), "instances": things}
 
 
-def answer_table(found: dict[str, Any]) -> Table:
-    """An answer, for people."""
+def answer_table(found: dict[str, Any], width: int) -> Table:
+    """An answer, for people, on a terminal of ``width`` characters."""
     if found["question"] == "instances":
-        return _instance_table(found)
+        return _instance_table(found, width)
     table = Table(title=found["map"], title_justify="left", show_header=False)
     for key, value in found.items():
         if key not in ("map", "question", "classes"):
@@ -96,17 +98,37 @@ def answer_table(found: dict[str, Any]) -> Table:
         table.add_section()
         for name, count in sorted(found["classes"].items(), key=lambda item: -item[1]):
             if count:
-                table.add_row(name, f"{count} surface voxels")
+                table.add_row(name, counted(count, "surface voxel"))
     return table
 
 
-def _instance_table(found: dict[str, Any]) -> Table:
+def _instance_table(found: dict[str, Any], width: int) -> Table:
     table = Table(title=found["map"], title_justify="left")
-    for name in ("id", "class", "confidence", "voxels", "centroid, m", "box, m"):
-        table.add_column(name, no_wrap=True)
-    for thing in found["instances"]:
-        row = (thing["class"], f"{thing['confidence']:.2f}", str(thing["voxels"]))
-        table.add_row(str(thing["id"]), *row, _joined(thing["centroid"]), _joined(thing["box"]["size"]))
+    rows = [
+        (
+            str(thing["id"]),
+            thing["class"],
+            f"{thing['confidence']:.2f}",
+            str(thing["voxels"]),
+            _joined(thing["centroid"]),
+            _joined(thing["box"]["size"]),
+        )
+        for thing in found["instances"]
+    ]
+    names = ("id", "class", "confidence", "voxels", "centroid, m", "box, m")
+    widths = [max(map(len, column)) for column in zip(names, *rows, strict=True)]
+    for name, widest in zip(names, widths, strict=True):
+        if name == "class":
+            table.add_column(name, overflow="fold")
+        else:
+            table.add_column(name, no_wrap=True, min_width=widest)
+    widths[names.index("class")] = MIN_CLASS_WIDTH
+    # Numbers are never cut: one that lacks digits is another one. A terminal that is too narrow breaks the lines.
+    narrowest = sum(widths) + 3 * len(widths) + 1
+    if width < narrowest:
+        table.width = narrowest
+    for row in rows:
+        table.add_row(*row)
     return table
 
 

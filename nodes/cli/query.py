@@ -85,7 +85,7 @@ def query(
     ask = ask_mapper if "://" in source else ask_file
     asked = Asked(question, class_name, point, up, min_confidence, server, keys)
     found = {"map": source, **ask(source, asked)}
-    output.print(answer_table(found))
+    output.print(answer_table(found, output.console.width))
     if json_file is not None:
         write_json(json_file, found)
         output.print(f"written to {json_file}")

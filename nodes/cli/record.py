@@ -12,6 +12,7 @@ import typer
 from semantic_mapper.nodes.cli.console import FrameProgress, Output, frame_progress
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.plain_text import counted
 
 if TYPE_CHECKING:
     from semantic_mapper.nodes.node import NodeContext
@@ -87,17 +88,17 @@ def _tell(output: Output, log: Path, recorder: Recorder) -> int:
     done = recorder.recording
     if done is None:
         raise LogError(f"{log}: nothing was recorded: no stream has begun; `semantic-mapper top` shows the nodes")
+    if done.nothing_left:
+        raise LogError(f"{log}: its files were removed while it was recorded; record again")
     parts = f" in {done.parts} parts" if done.parts > 1 else ""
-    output.print(f"{log}: {done.frames} frames, {done.messages} messages{parts}")
+    output.print(f"{log}: {counted(done.frames, 'frame')}, {counted(done.messages, 'message')}{parts}")
     if recorder.gaps.missed:
-        output.print(
-            f"  note: {recorder.gaps.missed} frames never came: sent before they were read, or lost on the way"
-        )
+        output.print(f"  note: {counted(recorder.gaps.missed, 'frame')} never came: sent too early, or lost on the way")
     if done.deleted:
-        output.print(f"  note: {done.deleted} parts were deleted to make room")
+        output.print(f"  note: {counted(done.deleted, 'part')} deleted to make room")
     if not done.lost:
         return 0
-    output.print(f"  {done.lost} messages were not recorded: {done.trouble or 'the disk was full for a while'}")
+    output.print(f"  {counted(done.lost, 'message')} not recorded: {done.trouble or 'the disk was full for a while'}")
     return EXIT_FAILED
 
 

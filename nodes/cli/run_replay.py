@@ -17,6 +17,7 @@ from semantic_mapper.mapper import Mapper
 from semantic_mapper.nodes.cli.outputs import hold_folder
 from semantic_mapper.nodes.mapper.finish import finish_session
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.corrected_poses import correct_session, keeping_frames, read_corrections
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.session import MapSession, open_recording
@@ -102,7 +103,7 @@ def replay_log(
         summary = finish_session(session, request.out, stop.name)
     if not session.fused:
         reason = session.refusals.first[0].reason if session.refusals else "no frame has depth or finds a source view"
-        raise LogError(f"{request.log}: none of {done} frames could be mapped; the first: {reason}")
+        raise LogError(f"{request.log}: none of {counted(done, 'frame')} could be mapped; the first: {reason}")
     return summary
 
 

@@ -21,13 +21,26 @@ def map_path(path: Path) -> Path:
     Raises:
         ConfigError: there is none, or it is a log.
     """
+    if path.is_dir() and not (path / MAP_NAME).is_file():
+        raise ConfigError(f"{path}: no {MAP_NAME} in this folder; {_instead_of_map(path)}")
+    if not path.exists():
+        raise ConfigError(f"{path}: no such map file or folder")
     if is_log(path):
         raise ConfigError(f"{path}: is a log; `semantic-mapper replay {path} --out FOLDER` makes a map of it")
-    if not path.is_dir():
-        return path
-    if not (path / MAP_NAME).is_file():
-        raise ConfigError(f"{path}: no {MAP_NAME}; give a saved map or a folder that `replay` has written")
-    return path / MAP_NAME
+    return path / MAP_NAME if path.is_dir() else path
+
+
+def _instead_of_map(folder: Path) -> str:
+    """What to do about a folder without a map, from what is in it."""
+    maps = sorted(file.name for file in folder.glob(f"*{MAP_SUFFIX}"))
+    if maps:
+        return f"name the map itself, such as {folder / maps[0]}"
+    results = sorted(file.parent.name for file in folder.glob(f"*/{MAP_NAME}"))
+    if results:
+        return f"there is one in {folder / results[0]}"
+    if is_log(folder):
+        return f"its logs hold frames: `semantic-mapper replay {folder} --out FOLDER` makes a map of them"
+    return "give a saved map or a folder that `replay` has written"
 
 
 def refuse_overwriting(out: Path, *sources: Path) -> None:

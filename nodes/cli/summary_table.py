@@ -8,6 +8,7 @@ from typing import Any
 
 from rich.table import Table
 
+from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.summary import dig
 
 
@@ -46,6 +47,8 @@ def result_lines(out: Path) -> list[str]:
 def notes(summary: Mapping[str, Any]) -> list[str]:
     """What a reader of the figures has to know."""
     frames, lines = summary["frames"], []
+    if dig(summary, "map.nearly_empty"):
+        lines.append(f"warning: {summary['map']['nearly_empty']}")
     if dig(summary, "pose_check.warning"):
         lines.append(f"warning: {summary['pose_check']['warning']}")
     if fraction := dig(summary, "depth.rendered_fraction"):
@@ -55,15 +58,16 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
         )
     if frames.get("excluded_from_scores"):
         lines.append(
-            f"{frames['excluded_from_scores']} frames are left out of the scores: weights were finetuned on them"
+            f"{counted(frames['excluded_from_scores'], 'frame')} left out of the scores: weights were finetuned on them"
         )
     if frames.get("refused"):
         first = summary["refusals"][0]["reason"] if summary.get("refusals") else ""
-        lines.append(f"{frames['refused']} frames refused; the first: {first}")
+        lines.append(f"{counted(frames['refused'], 'frame')} refused; the first: {first}")
     if frames.get("labels_refused"):
-        lines.append(f"{frames['labels_refused']} frames mapped, but not scored: their labels cannot be used")
+        lines.append(f"{counted(frames['labels_refused'], 'frame')} mapped, but not scored: labels that cannot be used")
     if summary.get("damaged_stretches"):
-        lines.append(f"{len(summary['damaged_stretches'])} damaged stretches of the log passed over")
+        damaged = counted(len(summary["damaged_stretches"]), "damaged stretch", "damaged stretches")
+        lines.append(f"{damaged} of the log passed over")
     if summary.get("map", {}).get("unfinished_correction"):
         lines.append(summary["map"]["unfinished_correction"])
     if summary.get("stopped_by"):
@@ -108,7 +112,7 @@ _ROWS: Sequence[tuple[str, str, Any]] = (
     ("latency p95", "latency_ms.p95", _ms),
     ("voxel size", "map.voxel_size_m", lambda v: f"{v * 100:g} cm"),
     ("blocks", "map.blocks", str),
-    ("surface points", "map.surface_points", str),
+    ("surface points", "map", lambda m: f"{m['surface_points']}{' (nearly empty)' if m.get('nearly_empty') else ''}"),
     ("map memory", "map.memory_mb", lambda v: f"{v} MB"),
     ("mIoU", "metrics.miou", percent),
     ("total accuracy", "metrics.total_accuracy", percent),

@@ -12,6 +12,7 @@ from semantic_mapper.errors import LogError
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.plain_text import counted
 
 LaunchArgument = Annotated[
     Path, typer.Argument(metavar="LAUNCH", help="Launch file, or one of the package: `semantic-mapper launch list`.")
@@ -60,7 +61,7 @@ def up(
         if not summary["frames"]["fused"] and not stop:
             why = [r["reason"] for r in summary["refusals"]] or summary["damaged_stretches"] or ["no frames came"]
             count = summary["frames"]["published"]
-            raise LogError(f"{name}: none of {count} frames was mapped; the first: {why[0]}")
+            raise LogError(f"{name}: none of {counted(count, 'frame')} was mapped; the first: {why[0]}")
 
 
 def _written(folder: Path) -> int:

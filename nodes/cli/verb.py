@@ -51,22 +51,21 @@ def verb(function: Callable[ParamsT, int | None]) -> Callable[ParamsT, None]:
                 _log.exception("failed", error=str(error))
             show_error(str(error))
             code = EXIT_FAILED
-        except (MemoryError, ImportError, RuntimeError) as error:
-            if not is_out_of_memory(error):
-                raise
-            if Settings.verbose:
-                _log.exception("failed")
-            show_error(memory_message(error))
-            code = EXIT_FAILED
         except KeyboardInterrupt:
             show_error("interrupted")
             code = EXIT_INTERRUPTED
         except BrokenPipeError:  # the reader of our stdout is gone (`... | head`): nothing is left to be said
             code = EXIT_FAILED
-        except OSError as error:  # disk full, permission denied: the operating system's own words and the file
+        except Exception as error:
+            if is_out_of_memory(error):  # native packages raise whatever they like then
+                message = memory_message(error)
+            elif isinstance(error, OSError):  # disk full, permission denied: the system's own words and the file
+                message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+            else:
+                raise
             if Settings.verbose:
                 _log.exception("failed")
-            show_error(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+            show_error(message)
             code = EXIT_FAILED
         sys.stderr.flush()
         raise typer.Exit(code or 0)

@@ -12,6 +12,7 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
 from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.plain_text import counted
 
 if TYPE_CHECKING:
     from semantic_mapper.client import MapClient, Weights
@@ -94,7 +95,7 @@ def weights_table(state: Weights) -> Any:
     from rich.table import Table
 
     table = Table(
-        title=f"weights {state.in_use} in use; {state.taken} times taken, {state.refused} refused, "
+        title=f"weights {state.in_use} in use; {counted(state.taken, 'time')} taken, {state.refused} refused, "
         f"{state.rolled_back} rolled back",
         title_justify="left",
         box=SIMPLE,

@@ -15,6 +15,7 @@ from importlib import metadata
 from pathlib import Path
 
 from semantic_mapper.errors import SemanticMapperError
+from semantic_mapper.memory import is_out_of_memory
 from semantic_mapper.nodes.doctor import launch_file as doctor_launch
 from semantic_mapper.nodes.doctor import robot as doctor_robot
 from semantic_mapper.nodes.doctor.check import Check
@@ -126,6 +127,8 @@ def _torch() -> Iterator[Check]:
     try:
         import torch
     except ImportError as error:
+        if is_out_of_memory(error):  # all that follows would fail, too
+            raise
         yield Check("torch", "bad", str(error), "make setup")
         return
     yield Check("torch", "ok", f"{torch.__version__}, {torch.get_num_threads()} threads")

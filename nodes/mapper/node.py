@@ -298,13 +298,15 @@ class _Mapper:
         if self._session is not None:
             for damage in end.damages:
                 self._session.note_damage(damage)
+            if end.unreadable:
+                self._session.refuse_unreadable(end.unreadable, end.damages)
         _log.info("stream_ends", reason=end.reason, published=end.published, detail=end.detail)
         if not self._streams.end(end):
             return False
         self._ended_by = self._streams.ended_by
         if self._session is not None:
             broken = self._broken or self._gaps.begun_anew > 0  # then the camera has not counted all that we have had
-            missed = self._gaps.missed if broken else max(0, self._streams.published - self._session.published)
+            missed = self._gaps.missed if broken else max(0, self._streams.published - self._session.received)
             self._session.count_dropped(missed)
         return True
 

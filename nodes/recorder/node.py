@@ -234,7 +234,12 @@ class Recorder:
             return
         self.recording.close()
         r = self.recording
+        if r.nothing_left:
+            _log.error("recording_gone", log=str(r.path), reason="its files were removed while it was recorded")
+            return
         _log.info("recorded", log=str(r.path), frames=r.frames, messages=r.messages, parts=r.parts, deleted=r.deleted)
+        if r.gone:
+            _log.error("recording_incomplete", reason="a part of it was removed while it was recorded")
         if r.lost:
             _log.error("recording_incomplete", lost=r.lost, reason=r.trouble or "the disk was full for a while")
         if self.left:

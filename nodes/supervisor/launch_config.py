@@ -27,6 +27,7 @@ from semantic_mapper.nodes.options import (
     NodeOptions,
     Positive,
     RecorderOptions,
+    check_tracking,
 )
 
 Value = str | int | float | bool
@@ -228,16 +229,23 @@ def _check_camera_kinds(camera: Any, where: str) -> None:
     kind, poses = camera.get("kind"), camera.get("poses")
     if isinstance(kind, str) and kind not in CAMERA_KINDS:
         raise ConfigError(f"{where}: `camera.kind`: no kind of camera is called '{kind}'{_nearest(kind, CAMERA_KINDS)}")
-    if poses is None:
+    if poses is None or poses in ({}, ""):
         raise ConfigError(
-            f"{where}: `camera.poses` is missing: a camera alone does not know where it is. Write "
-            '[node.options.camera.poses] with kind = "topic" (odometry from a socket), "board" (a printed board), '
-            '"rgbd" (odometry from depth), "device" (it tracks itself, OAK) or "fixed" (it never moves); for example '
-            'poses = { kind = "topic", endpoint = "tcp://127.0.0.1:5560" }'
+            f"{where}: `camera.poses` is {'missing' if poses is None else 'empty'}: a camera alone does not know "
+            'where it is. Write [node.options.camera.poses] with kind = "topic" (odometry from a socket), "board" (a '
+            'printed board), "rgbd" (odometry from depth), "device" (it tracks itself, OAK) or "fixed" (it never '
+            'moves); for example poses = { kind = "topic", endpoint = "tcp://127.0.0.1:5560" }'
         )
     if isinstance(poses, dict) and poses.get("kind") not in POSE_KINDS:
-        named = str(poses.get("kind", ""))
+        if "kind" not in poses:
+            raise ConfigError(f"{where}: `camera.poses` has no kind; there are {', '.join(POSE_KINDS)}")
+        named = str(poses["kind"])
         raise ConfigError(f"{where}: `camera.poses.kind`: '{named}' is no source of poses{_nearest(named, POSE_KINDS)}")
+    if isinstance(poses, dict):
+        try:
+            check_tracking(str(kind), poses["kind"])
+        except ValueError as error:
+            raise ConfigError(f"{where}: {error}") from error
 
 
 def _fill_in(value: Any, values: Mapping[str, Value], where: str) -> Any:

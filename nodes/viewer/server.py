@@ -147,7 +147,7 @@ def _find_program() -> str:
     spec = importlib.util.find_spec("rerun_cli")
     program = None if spec is None or spec.origin is None else Path(spec.origin).parent / "rerun"
     if program is None or not program.is_file():
-        raise DependencyError("the viewer comes with the package rerun-sdk, which is not installed; run `make setup`")
+        raise DependencyError("the viewer needs the package rerun-sdk: pip install 'semantic-mapper[viewer]'")
     return str(program)
 
 

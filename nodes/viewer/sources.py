@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import rerun as rr
 import structlog
 from numpy.typing import NDArray
 
@@ -26,6 +25,7 @@ from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.replay.exporters.rerun_log import RerunLog
+from semantic_mapper.replay.exporters.rerun_sdk import rr
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport.messages import EndOfStream

@@ -20,7 +20,6 @@ from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, occupancy_grid
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file
 from semantic_mapper.types import Float64
 
 Format = Literal["ply", "ply-mesh", "obj", "glb", "npz", "grid", "rrd"]
@@ -144,6 +143,8 @@ def _export_points(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> E
         write_npz(path, points, labels)
     else:
         with whole_path(path) as part:
+            from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file
+
             RerunLog(recording_file(part), labels, voxel_map.config.voxel_size_m).finish(points)
     return ExportReport((path,), f"{len(points.xyz):,} points")
 

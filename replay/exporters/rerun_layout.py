@@ -7,14 +7,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import rerun as rr
-import rerun.blueprint as rrb
 
 from semantic_mapper.evaluation.canvas import DIM_TEXT, draw_text, new_canvas, paste
 from semantic_mapper.evaluation.legend import WIDEST, draw_legend, legend_rows
 from semantic_mapper.evaluation.splat import seen_from
 from semantic_mapper.evaluation.upright import upright_rotation
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.replay.exporters.rerun_sdk import rr, rrb
 from semantic_mapper.types import Float32, Float64, UInt8
 
 COLOURINGS = ("class", "colour", "confidence", "age")

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import rerun as rr
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.evaluation.canvas import UNKNOWN
@@ -28,6 +27,7 @@ from semantic_mapper.replay.exporters.rerun_layout import (
     layout,
     scale_colors,
 )
+from semantic_mapper.replay.exporters.rerun_sdk import rr
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, MapUpdate, PosedFrame
 
 APPLICATION = "semantic_mapper"

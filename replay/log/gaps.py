@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from semantic_mapper.plain_text import counted
+
 LONG_INTERVAL = 2.5  # times the median interval; one dropped frame makes 2
 
 
@@ -51,17 +53,19 @@ def gaps_text(gaps: dict[str, Any]) -> str:
     """What ``find_gaps`` found, for people."""
     parts: list[str] = []
     if gaps["frames_missing"]:
+        gap = counted(gaps["sequence_gaps"], "gap")
         parts.append(
-            f"{gaps['frames_missing']} frames missing in {gaps['sequence_gaps']} gaps of the sequence numbers (largest "
+            f"{counted(gaps['frames_missing'], 'frame')} missing in {gap} of the sequence numbers (largest "
             f"{gaps['largest_sequence_gap']}, after seq {gaps['largest_sequence_gap_after_seq']})"
         )
     if gaps["time_gaps"]:
         parts.append(
-            f"{gaps['time_gaps']} time gaps (longest {gaps['longest_time_gap_s']:g} s, after seq "
+            f"{counted(gaps['time_gaps'], 'time gap')} (longest {gaps['longest_time_gap_s']:g} s, after seq "
             f"{gaps['longest_time_gap_after_seq']}; typical interval {gaps['interval_s']:.3g} s)"
         )
     if gaps["counter_restarts"]:
-        parts.append(f"sequence numbers begin again {gaps['counter_restarts']} times")
+        parts.append(f"sequence numbers begin again {counted(gaps['counter_restarts'], 'time')}")
     if gaps["stamps_not_increasing"]:
-        parts.append(f"{gaps['stamps_not_increasing']} stamps are not later than the one before")
+        count = gaps["stamps_not_increasing"]
+        parts.append(f"{counted(count, 'stamp')} {'is' if count == 1 else 'are'} not later than the one before")
     return "; ".join(parts) or "none"

@@ -161,7 +161,9 @@ def play(
         raise
     finally:
         patience = STOP_TIMEOUT_S if stop.is_set() else END_TIMEOUT_S
-        _say_end(publisher, EndOfStream(options.source, reason, run.published, detail, run.damages), patience)
+        _say_end(
+            publisher, EndOfStream(options.source, reason, run.published, detail, run.damages, run.unreadable), patience
+        )
     return PlayReport(run.published, run.fused, tuple(run.refused), tuple(log.errors + run.errors), stop.is_set())
 
 
@@ -192,6 +194,7 @@ class _Run:
         self.fused = 0
         self.refused: list[FrameRefused] = []
         self.errors: list[LogError] = []
+        self._known = {str(error) for error in log.errors}  # stretches in which no frame can be made out
 
     def frames(self, lockstep: Lockstep | None) -> None:
         """Send frame after frame."""
@@ -219,8 +222,18 @@ class _Run:
 
     @property
     def damages(self) -> tuple[str, ...]:
-        """What could not be read so far."""
-        return tuple(str(error) for error in (*self.log.errors, *self.errors))
+        """What could not be read so far: frames first."""
+        told = [str(error) for error in self.log.errors]
+        return tuple(self._unreadable_frames() + [text for text in told if text in self._known])
+
+    @property
+    def unreadable(self) -> int:
+        """Frames that were left out."""
+        return len(self._unreadable_frames())
+
+    def _unreadable_frames(self) -> list[str]:
+        found = [str(error) for error in (*self.log.errors, *self.errors)]
+        return [text for text in found if text not in self._known]
 
     def _can_be_decoded(self, parts: Parts, envelope: Envelope) -> bool:
         """A subscriber would drop it without a word, and lockstep would wait for its answer for ever."""

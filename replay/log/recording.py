@@ -76,6 +76,7 @@ class Recording:
         lost: Messages that were not written, for want of room.
         deleted: Parts.
         ended: Nothing will be written any more.
+        gone: A part's file was removed by somebody else while it was written.
         trouble: Why nothing is written at the moment, for people; empty where all is well.
 
     Raises:
@@ -138,6 +139,11 @@ class Recording:
     def messages(self) -> int:
         """Written to all parts since the recording was opened."""
         return self._done_messages + (self._part.messages if self._part is not None else 0)
+
+    @property
+    def nothing_left(self) -> bool:
+        """Whether the files of the recording were removed by somebody else while it was written."""
+        return self.gone and not parts_on_disk(self._path)
 
     def write(self, parts: Parts) -> None:
         """Append one encoded message; where there is no room it is counted in ``lost``.

@@ -86,7 +86,11 @@ def _open_events(folder: Path, history: list[dict[str, Any]]) -> Any:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
-        _log.info("no_tensorboard_files", reason="tensorboard is not installed", mend="install the extra 'tensorboard'")
+        _log.info(
+            "no_tensorboard_files",
+            reason="tensorboard is not installed",
+            mend="pip install 'semantic-mapper[training]'",
+        )
         return None
     purge = history[-1]["step"] + 1 if history else None
     return SummaryWriter(os.fspath(folder), purge_step=purge)

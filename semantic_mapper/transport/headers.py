@@ -182,6 +182,7 @@ class EndOfStreamHeader(Header, frozen=True, kw_only=True):
     published: Count
     detail: Sentence
     damages: Annotated[tuple[Sentence, ...], Meta(max_length=MAX_DAMAGES)] = ()
+    unreadable: Count | msgspec.UnsetType = msgspec.UNSET  # 0 is not sent
 
 
 class KeyframeHeader(Header, frozen=True, kw_only=True):

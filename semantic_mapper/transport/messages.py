@@ -75,6 +75,7 @@ class EndOfStream:
         published: Frames that were sent.
         detail: The error, for people.
         damages: What could not be read of a recording, in words; the first few.
+        unreadable: How many frames of a recording could not be read, and were not sent; ``damages`` begins with them.
     """
 
     source: str
@@ -82,6 +83,7 @@ class EndOfStream:
     published: int
     detail: str = ""
     damages: tuple[str, ...] = ()
+    unreadable: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

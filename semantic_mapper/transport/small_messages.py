@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import msgspec
+
 from semantic_mapper.transport import headers
 from semantic_mapper.transport.headers import MAX_DAMAGES, pack_header
 from semantic_mapper.transport.messages import EndOfStream, FrameRefused, Status, StreamInfo
@@ -113,6 +115,7 @@ def encode_end(end: EndOfStream) -> list[bytes]:
         published=int(end.published),
         detail=end.detail[:4096],
         damages=tuple(text[:1024] for text in end.damages[:MAX_DAMAGES]),
+        unreadable=int(end.unreadable) or msgspec.UNSET,
     )
     return [topic_bytes("end", end.source), pack_header(header, f"end of '{end.source}'")]
 
@@ -125,4 +128,4 @@ def decode_end(parts: Parts) -> EndOfStream:
     """
     h = open_plain(parts, "end", headers.EndOfStreamHeader)
     check_source(parts, h.source)
-    return EndOfStream(h.source, h.reason, h.published, h.detail, h.damages)
+    return EndOfStream(h.source, h.reason, h.published, h.detail, h.damages, h.unreadable or 0)

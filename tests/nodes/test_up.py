@@ -172,7 +172,7 @@ def test_refused_frame_does_not_stop_the_lockstep(weights: Path, config: Path, t
     summary = json.loads((tmp_path / "up" / "summary.json").read_text())
     assert summary["frames"]["published"] == 4 and summary["frames"]["fused"] == 3
     assert "frame seq=1" in summary["refusals"][0]["reason"]
-    assert "1 frames refused" in done.stdout
+    assert "1 frame refused" in done.stdout
     with LogReader(tmp_path / "up" / "recorded.mcap") as recorded:
         assert "refused" in {envelope.topic for envelope, _ in recorded.messages()}
 

@@ -120,6 +120,35 @@ def test_summary_table_notes_and_picture_say_where_depth_comes_from(
     assert [strip.depth_rendered for strip in strips] == [frames[0].depth_m is None or measured == 0, measured < 6]
 
 
+def test_a_nearly_empty_map_is_plainly_said_so_with_the_reason(tmp_path, weights, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(artifacts, "write_overview", lambda *_, subtitle, **__: drawn.append(subtitle))
+    monkeypatch.setattr(artifacts, "MIN_POINTS_A_BLOCK", 1000)
+    frames = tiny_frames()
+    for name, given, why in (
+        ("blind", [replace(f, depth_m=None) for f in frames], "have no sensor depth"),
+        ("measured", frames, "check depth_scale, the intrinsics and the poses"),
+    ):
+        summary = run(weights, given).finish(tmp_path / name)
+        said = summary["map"]["nearly_empty"]
+        assert said.startswith("the map is nearly empty: ") and why in said
+        assert f"warning: {said}" in notes(summary)
+        assert drawn[-1].startswith("MAP NEARLY EMPTY (")
+        assert any("(nearly empty)" in cell for cell in summary_table({"run": summary}).columns[1]._cells)
+
+
+def test_a_map_of_measured_depth_is_not_called_empty(tmp_path, weights):
+    assert run(weights, tiny_frames()).finish(tmp_path)["map"]["nearly_empty"] is None
+
+
+def test_frames_that_a_player_could_not_read_are_refused_but_not_missed(weights):
+    session = run(weights, tiny_frames())
+    received = session.received
+    session.refuse_unreadable(3, ("a.mcap: frame 1 at byte 9: damaged",))
+    assert (len(session.refusals), session.received, session.published) == (3, received, received + 3)
+    assert session.refusals.first[0].reason == "a.mcap: frame 1 at byte 9: damaged"
+
+
 def test_poses_that_contradict_the_depth_are_in_summary_table_picture_and_notes(tmp_path, weights, monkeypatch):
     subtitles = []
     monkeypatch.setattr(artifacts, "write_overview", lambda *_, subtitle, **__: subtitles.append(subtitle))

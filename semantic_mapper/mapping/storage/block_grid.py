@@ -389,7 +389,10 @@ class BlockGrid:
         try:
             return make_open3d_grid(self._voxel_size_m, self._channels, capacity, self.evidence)
         except RuntimeError as error:
-            raise MapError(f"no memory for {capacity} blocks ({needed / 1e9:.1f} GB): {error}; {mend}") from error
+            raise MapError(
+                f"no memory for {capacity} blocks ({needed / 1e9:.1f} GB); free some, raise the limit (ulimit -v), or "
+                f"{mend}"
+            ) from error
 
     def _grow(self, needed: int) -> None:
         capacity = min(max(needed, self.capacity + self.capacity // 2), self._max_resident)

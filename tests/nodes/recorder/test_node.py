@@ -17,6 +17,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from structlog.testing import capture_logs
 
 import semantic_mapper.nodes.recorder.node
 from semantic_mapper.config import convert_config
@@ -116,13 +117,15 @@ def sockets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def test_a_recorder_whose_log_was_removed_fails(tmp_path: Path, sockets: Path) -> None:
-    with streaming(tmp_path, sockets, reserve_mb=0) as stream:
+    with capture_logs() as told, streaming(tmp_path, sockets, reserve_mb=0) as stream:
         stream.publish(*range(4))
         assert eventually((tmp_path / "a.mcap").exists, 30)
         (tmp_path / "a.mcap").unlink()
         stream.publisher.publish(encode_end(EndOfStream("camera", "end", 0)))
         stream.recorder.join(60)
         assert len(stream.failures) == 1 and "a.mcap: was removed while it was written" in str(stream.failures[0])
+    events = [entry["event"] for entry in told]
+    assert "recording_gone" in events and "recorded" not in events
 
 
 def test_recorder_splits_packs_and_keeps_what_belongs_to_the_log(tmp_path: Path, sockets: Path) -> None:

@@ -273,6 +273,9 @@ def test_mistakes_are_named_with_the_mend(
         ('kind = "opencv"', 'poses = { kind = "topic", endpoint = "tcp://127.0.0.1:5560" }'),
         ('kind = "opencw", poses = { kind = "fixed" }', "`camera.kind`: no kind of camera is called 'opencw'; did you"),
         ('kind = "opencv", poses = { kind = "fixt" }', "'fixt' is no source of poses; did you mean 'fixed'?"),
+        ('kind = "opencv", poses = { kind = "device" }', "do not track themselves, and no frame would have a pose"),
+        ('kind = "opencv", poses = "fixed"', 'poses = { kind = "fixed" }'),
+        ('kind = "opencv", poses = {}', "`camera.poses` is empty"),
         ('kind = "v4l2", poses = { T_world_camera = [] }', "there are device, fixed, topic, board, rgbd"),
     ],
 )

@@ -142,6 +142,8 @@ def test_damaged_frames_are_passed_over_and_reported(tmp_path: Path, endpoint: s
     report, mapper = play_to(path, endpoint, fuse)
     assert mapper.seqs == [0, 2, 3, 4] and report.published == 4
     assert len(report.errors) == 1 and "seq=1" in str(report.errors[0])
+    end = mapper.received[-1]
+    assert isinstance(end, EndOfStream) and end.unreadable == 1 and "seq=1" in end.damages[0]
 
 
 def test_playing_fast_to_a_lossless_subscriber_loses_nothing(small_log: Path, endpoint: str) -> None:

@@ -215,6 +215,7 @@ def test_disk_that_goes_away_is_told(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "disk")
     write(gone, range(3, 6))
     assert gone.ended and (gone.frames, gone.lost) == (3, 3) and "cannot be asked" in gone.trouble
+    assert gone.nothing_left
 
 
 @pytest.mark.parametrize("size", range(30_000, 32_600, 133))

@@ -1,0 +1,42 @@
+"""Without the extras, maps are made all the same, and what needs an extra names it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+HIDDEN = """
+import sys
+for name in ("rerun", "rerun_cli", "tensorboard"):
+    sys.modules[name] = None
+"""
+
+
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        ("import semantic_mapper.replay.exporters.map_files, semantic_mapper.nodes.cli.main; print('fine')", "fine"),
+        (
+            """
+            from semantic_mapper.errors import SemanticMapperError
+            try:
+                import semantic_mapper.replay.exporters.rerun_log
+            except SemanticMapperError as error:
+                print(error)
+            """,
+            "pip install 'semantic-mapper[viewer]'",
+        ),
+    ],
+)
+def test_what_an_extra_is_needed_for_names_it(lines: str, expected: str) -> None:
+    run = subprocess.run(
+        [sys.executable, "-c", HIDDEN + textwrap.dedent(lines)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert expected in run.stdout, run.stderr
