@@ -75,7 +75,7 @@ def evaluate(
     both made from those same keyframes. --mesh takes an .npz with vertices, faces and (if there are any) labels.
 
     --suite rooms renders query views of rooms that nothing was trained on, one column a weights file, and draws a
-    contact sheet. A run that was ended goes on where it was; docs/protocols.md says what each figure means.
+    contact sheet. A run that was ended goes on where it was; docs/benchmarks.md says what each figure means.
 
     Example: semantic-mapper eval runs/a runs/b
     Example: semantic-mapper eval kitchen.mcap --weights kitchen.safetensors --baselines

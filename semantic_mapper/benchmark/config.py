@@ -1,4 +1,4 @@
-"""Settings of a benchmark run. ``docs/protocols.md`` says what each protocol does."""
+"""Settings of a benchmark run. ``docs/benchmarks.md`` says what each protocol does."""
 
 from __future__ import annotations
 
