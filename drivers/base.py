@@ -79,7 +79,7 @@ class Camera(Protocol):
     """A device that gives images; otherwise as ``FrameSource``.
 
     A device that goes away and may come back is waited for within the driver: iteration goes on after a gap in
-    ``seq``, and ``troubles`` says what is the matter meanwhile.
+    ``seq``, and ``warnings`` says what is the matter meanwhile.
     """
 
     @property
@@ -88,7 +88,7 @@ class Camera(Protocol):
         ...
 
     @property
-    def troubles(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """One sentence for each thing that does not work as it should now; any thread may ask."""
         ...
 
@@ -98,7 +98,7 @@ class Camera(Protocol):
         ...
 
     @property
-    def turned_at(self) -> float:
+    def last_poll_time(self) -> float:
         """When the driver last came round (``time.monotonic``), with an image or without: while it waits for a device
         that is away or gives nothing, too, but not while a call into the device hangs. Any thread may ask."""
         ...

@@ -22,7 +22,7 @@ from semantic_mapper.types import CameraIntrinsics, UInt8
 
 FIRST_PAUSE_S = 0.1  # before a lost device is tried again; doubles each time
 MAX_PAUSE_S = 1.0
-FAILURES = 3  # reads in a row that give nothing: the device is opened anew
+FAILURES = 3  # reads in a row that give nothing: the device is opened again
 WAIT_SLICE_S = 0.2
 CLOSE_S = 1.0  # how long closing waits for a read that hangs; its thread frees the device whenever it returns
 
@@ -56,7 +56,7 @@ class Device(Protocol):
         ...
 
     @property
-    def troubles(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """What it does otherwise than asked."""
         ...
 
@@ -78,8 +78,8 @@ class LiveCamera:
 
     Args:
         camera_id: What its images are called.
-        open_device: Opens it, each time anew; raises ``CameraError`` where it is not there.
-        measured: Its calibration; None: guessed, said in ``troubles``.
+        open_device: Opens it, each time again; raises ``CameraError`` where it is not there.
+        measured: Its calibration; None: guessed, said in ``warnings``.
         stall_s: Silence after which a stream counts as stalled.
         metadata: For ``StreamInfo``.
     """
@@ -105,7 +105,7 @@ class LiveCamera:
         self._newest: tuple[int, Shot] | None = None  # number and image; guarded by _changed
         self._seq = -1  # of the last image; only the thread counts
         self._failures = 0  # to open the device again, in a row
-        self._heard = self._read_at = self._asked_at = 0.0
+        self._heard = self._read_at = self._last_request = 0.0
         self._lost = ""
         self._device_troubles: tuple[str, ...] = ()
 
@@ -117,7 +117,7 @@ class LiveCamera:
         return self._info
 
     @property
-    def troubles(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """As of ``Camera``."""
         told = list(self._device_troubles)
         if self._measured is None:
@@ -135,9 +135,9 @@ class LiveCamera:
         return False
 
     @property
-    def turned_at(self) -> float:
+    def last_poll_time(self) -> float:
         """As of ``Camera``."""
-        return min(self._read_at, self._asked_at)
+        return min(self._read_at, self._last_request)
 
     def __enter__(self) -> Self:
         """Open the device.
@@ -154,7 +154,7 @@ class LiveCamera:
             frame_hz=device.frame_hz,
             metadata=self._metadata,
         )
-        self._heard = self._read_at = self._asked_at = time.monotonic()
+        self._heard = self._read_at = self._last_request = time.monotonic()
         self._thread = threading.Thread(target=self._run, args=(device,), name=f"camera {self._camera_id}", daemon=True)
         self._thread.start()
         return self
@@ -176,7 +176,7 @@ class LiveCamera:
         if rectify is None or thread is None:
             raise CameraError(f"camera '{self._camera_id}' is not open")
         while not self._stopping.is_set():
-            self._asked_at = time.monotonic()
+            self._last_request = time.monotonic()
             with self._changed:
                 self._changed.wait_for(lambda: self._newest is not None or self._stopping.is_set(), WAIT_SLICE_S)
                 newest, self._newest = self._newest, None
@@ -200,11 +200,11 @@ class LiveCamera:
                 f"{device.description}: gives images of {device.size[0]}x{device.size[1]}, but was calibrated at "
                 f"{expected[0]}x{expected[1]}; calibrate for a size that it offers"
             )
-        self._device_troubles = device.troubles
+        self._device_troubles = device.warnings
         return device
 
     def _run(self, device: Device) -> None:
-        """Read until told to stop; open it anew when it is lost."""
+        """Read until told to stop; open it again when it is lost."""
         while True:
             try:
                 lost = self._read_on(device)
@@ -231,7 +231,7 @@ class LiveCamera:
                 return str(error)
             now = self._read_at = time.monotonic()
             self._seq += 1
-            self._device_troubles = device.troubles
+            self._device_troubles = device.warnings
             if shot is None:
                 failures += 1
                 if failures >= FAILURES or now - began >= self._stall_s:

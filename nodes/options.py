@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 
@@ -90,6 +90,8 @@ class CameraOptions(Config, frozen=True):
 class MapperOptions(Config, frozen=True):
     """Maps the frames of a camera node."""
 
+    old_names: ClassVar = {"least_agreement": "min_map_agreement"}
+
     out: Text  # folder for the map, the picture and the summary
     input: Text | Names = "camera"  # whose frames: a node, or several
     # "newest": an unread frame gives way to a newer one. "all": every frame, in order; logs and video files wait for
@@ -111,9 +113,9 @@ class MapperOptions(Config, frozen=True):
 
     # The node of kind "finetuner" whose weights are taken while mapping, if they are better; empty = none.
     learner: str = ""
-    # New weights are refused that agree with less than this share of what the map is sure of: those that contradict
+    # New weights are refused that agree with less than this fraction of what the map is sure of: those that contradict
     # most of it are more often wrong than the map is. 0 = the finetuner's own judgement is enough.
-    least_agreement: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.4
+    min_map_agreement: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.4
 
     # A fixed endpoint beside that of the launch at which its updates and status can be subscribed to: ipc://PATH,
     # tcp://127.0.0.1:PORT, with keys also tcp://0.0.0.0:PORT; empty = none.
@@ -172,19 +174,21 @@ class RecorderOptions(Config, frozen=True):
 class FinetunerOptions(Config, frozen=True):
     """Finetunes the weights of a mapper on labelled keyframes, beside it and within a budget."""
 
+    old_names: ClassVar = {"share": "cpu_fraction"}
+
     mapper: str = "mapper"  # the node that uses the weights; its `learner` is this one
     weights: str = ""  # those that the mapper was started with, the very same file; empty = those of the package
     config: str = ""  # TOML file with an OnlineConfig (semantic_mapper/training/online.py); empty = defaults
     # Where labelled keyframes come from: a name or an endpoint, at which a labelling tool, a teacher network or
     # `semantic-mapper label` binds a publisher (topic "keyframe"), for as long as it has something to say.
     labels: Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z0-9_-][A-Za-z0-9_.-]{0,47}|[a-z]+://.+)\Z")] = "labels"
-    share: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.5  # of one core (or of the GPU) that learning may take
-    threads: Annotated[int, msgspec.Meta(ge=1, le=64)] = 1  # that it computes with, all together within its share
+    cpu_fraction: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.5  # of one core (or of the GPU) that learning may take
+    threads: Annotated[int, msgspec.Meta(ge=1, le=64)] = 1  # that it computes with, all together within its fraction
     # How much others go before it, 0 to 19. With 19 (on Linux) it learns only while nobody else wants the core; where
     # others want all of every core all the time, that is a third of a per cent, and 18 some two per cent.
     niceness: Annotated[int, msgspec.Meta(ge=0, le=19)] = 19
     settle_s: Annotated[float, msgspec.Meta(ge=0)] = 2.0  # no keyframe for so long, and those that came are learned
-    # The mapper's `out`: started anew, it finds the weights that the mapper keeps there, and in the folder `learning`
+    # The mapper's `out`: restarted, it finds the weights that the mapper keeps there, and in the folder `learning`
     # the labelled keyframes that it has kept itself; empty = begin with neither.
     out: str = ""
     # After a round that failed for want of memory, say: pause before the next with the same keyframes, twice as long

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from semantic_mapper import __version__
-from semantic_mapper.config import to_plain
+from semantic_mapper.config import with_old_names
 from semantic_mapper.evaluation.metrics import confusion_of
 from semantic_mapper.evaluation.overview import ViewStrip, draw_overview
 from semantic_mapper.evaluation.upright import camera_up
@@ -27,7 +27,7 @@ from semantic_mapper.types import Float64
 if TYPE_CHECKING:  # session imports this module
     from semantic_mapper.replay.exporters.rerun_log import RerunLog
     from semantic_mapper.replay.session import MapSession, Refusal
-    from semantic_mapper.replay.stats import StepTimes
+    from semantic_mapper.replay.stats import LatencyHistogram
 
 _log = get_logger(__name__)
 
@@ -213,7 +213,7 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
         },
         "seed": pipeline.config.seed,
         "quality": pipeline.config.quality,
-        "config": to_plain(pipeline.config),  # as it was in force: with what the quality sets
+        "config": with_old_names(pipeline.config),  # as it was in force: with what the quality sets
         "refusals": [{"seq": r.seq, "stamp_ns": r.stamp_ns, "reason": r.reason} for r in _first_refusals(session)],
         "damaged_stretches": session.damages.first,
         "versions": versions(),
@@ -241,7 +241,7 @@ def _first_refusals(session: MapSession) -> list[Refusal]:
     return sorted(session.refusals.first + session.label_refusals.first, key=lambda r: r.seq)[:MAX_LISTED]
 
 
-def _percentiles(times: StepTimes) -> dict[str, float | None]:
+def _percentiles(times: LatencyHistogram) -> dict[str, float | None]:
     """Median and 95th percentile, null for nothing."""
     return {"p50": _rounded(times.percentile(50)), "p95": _rounded(times.percentile(95))}
 

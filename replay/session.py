@@ -20,7 +20,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.replay.artifacts import MAX_LISTED, write_artifacts
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
-from semantic_mapper.replay.stats import FirstAndLast, StepTimes
+from semantic_mapper.replay.stats import BoundedLog, LatencyHistogram
 from semantic_mapper.types import MapUpdate, PosedFrame
 
 if TYPE_CHECKING:
@@ -77,10 +77,10 @@ class MapSession:
         self.without_depth = 0  # their geometry was rendered, not measured
         # Frames that were not mapped, those that were but whose label image cannot be used, and stretches of a log in
         # which no frame can be made out:
-        self.refusals, self.label_refusals = FirstAndLast[Refusal](MAX_LISTED), FirstAndLast[Refusal](MAX_LISTED)
-        self.damages = FirstAndLast[str](MAX_LISTED)
-        self.step_ms = StepTimes()
-        self.stage_ms: dict[str, StepTimes] = {}
+        self.refusals, self.label_refusals = BoundedLog[Refusal](MAX_LISTED), BoundedLog[Refusal](MAX_LISTED)
+        self.damages = BoundedLog[str](MAX_LISTED)
+        self.step_ms = LatencyHistogram()
+        self.stage_ms: dict[str, LatencyHistogram] = {}
         self.confusion = ConfusionMatrix(self.pipeline.label_set)
         self.per_image = ImageMeans()
         self.truth = None if stream_labels is None else TruthMapper(stream_labels, self.pipeline.label_set)
@@ -101,7 +101,7 @@ class MapSession:
             return None
         self.step_ms.add((time.perf_counter() - began) * 1e3)
         for name, value in update.stage_ms.items():
-            self.stage_ms.setdefault(name, StepTimes()).add(value)
+            self.stage_ms.setdefault(name, LatencyHistogram()).add(value)
         self.fused += int(update.fused)
         self._note_depth(frame)
         frame = self.pipeline.corrector.place(frame)  # where the map has it

@@ -15,7 +15,7 @@ SHORTEST_MS, LONGEST_MS = 1e-3, 1e7  # times beyond count as these
 _BINS = math.ceil(math.log(LONGEST_MS / SHORTEST_MS) / math.log(BIN_GROWTH))
 
 
-class FirstAndLast(Generic[ItemT]):
+class BoundedLog(Generic[ItemT]):
     """Counts all items, and keeps the first ones and the last one.
 
     Args:
@@ -53,7 +53,7 @@ class FirstAndLast(Generic[ItemT]):
         self._count += count
 
 
-class StepTimes:
+class LatencyHistogram:
     """Milliseconds of steps: the first one, and percentiles of the others, right to a quarter of a percent."""
 
     def __init__(self) -> None:

@@ -16,7 +16,7 @@ def unpack_packages(packages: tuple[str, ...], tree: Path, what: str) -> str:
 
     Args:
         packages: Their names.
-        tree: Made anew, whole or not at all.
+        tree: Made again, whole or not at all.
         what: They are, for people.
 
     Returns:

@@ -65,9 +65,9 @@ def unplugged_cameras(rounds: int) -> Iterator[Outcome]:
 class _ListCamera:
     """Gives images of a list; its device tracks itself."""
 
-    troubles: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     can_wait = False
-    turned_at = 0.0
+    last_poll_time = 0.0
     info = StreamInfo("scrambled", {"rooms": INTRINSICS}, ROOMS)
 
     def __init__(self, images: Iterable[CameraImage]) -> None:
@@ -97,12 +97,12 @@ def scrambled_streams(weights: str, config: str, rounds: int) -> Iterator[Outcom
         images, bad = _scramble(good, random.Random(seed))
         began_s = time.monotonic()
         found = _map_of(weights, config, images)
-        refused = {name: found[1][name] for name in ("stale", "jumping", "not_rotation")}
+        refused = {name: found[1][name] for name in ("stale", "outliers", "not_rotation")}
         wrong = int(
-            refused != {"stale": bad["late"] + bad["twice"], "jumping": bad["jumping"], "not_rotation": bad["NaN"]}
+            refused != {"stale": bad["late"] + bad["twice"], "outliers": bad["outliers"], "not_rotation": bad["NaN"]}
         )
         yield Outcome(
-            "frames late, twice, out of order, jumping, NaN (map compared)",
+            "frames late, twice, out of order, outliers, NaN (map compared)",
             (time.monotonic() - began_s) / len(images),
             lost_frames=STREAM - found[1]["frames"],
             others=wrong + int(found[0] != expected[0]),
@@ -113,10 +113,10 @@ def scrambled_streams(weights: str, config: str, rounds: int) -> Iterator[Outcom
 def _scramble(good: list[PosedFrame], rng: random.Random) -> tuple[list[CameraImage], dict[str, int]]:
     """All good frames in their order; between them, ones that have to be refused, and how many of each."""
     images: list[CameraImage] = []
-    bad: dict[str, int] = {"late": 0, "twice": 0, "jumping": 0, "NaN": 0}
+    bad: dict[str, int] = {"late": 0, "twice": 0, "outliers": 0, "NaN": 0}
     for number, frame in enumerate(good):
         images.append(_image(frame))
-        kind = rng.choice(("late", "twice", "jumping", "NaN", "none"))
+        kind = rng.choice(("late", "twice", "outliers", "NaN", "none"))
         if kind == "none" or (kind == "late" and number == 0):
             continue
         bad[kind] += 1
@@ -126,7 +126,7 @@ def _scramble(good: list[PosedFrame], rng: random.Random) -> tuple[list[CameraIm
             images.append(_image(good[rng.randrange(number)]))
         elif kind == "twice":
             images.append(_image(frame))
-        elif kind == "jumping":
+        elif kind == "outliers":
             T[:3, 3] += (rng.choice((-1, 1)) * rng.uniform(1, 9), 0, 0)
             images.append(_image(dataclasses.replace(frame, stamp_ns=between, T_world_camera=T)))
         else:

@@ -114,7 +114,7 @@ def _fields(frame: object) -> dict[str, object]:
 
 def floods(weights: str, config: str, rounds: int, messages: int) -> Iterator[Outcome]:
     """``messages`` bad ones in all: after each portion, the next good one has to be answered, and rightly."""
-    portion = {kind: round(share * messages / rounds) for kind, share in SHARES.items()}
+    portion = {kind: round(fraction * messages / rounds) for kind, fraction in SHARES.items()}
     bad = {
         kind: bad_messages("message" if kind == "frame" else kind, seed)
         for seed, kind in enumerate(("frame", "question", "pose"))

@@ -72,6 +72,6 @@ def markdown(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(rows)
 
 
-def _rank(ordered: Sequence[float], share: float) -> float:
+def _rank(ordered: Sequence[float], fraction: float) -> float:
     """The smallest value that so large a share does not exceed."""
-    return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
+    return ordered[max(0, math.ceil(fraction * len(ordered)) - 1)]

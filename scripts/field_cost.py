@@ -26,7 +26,7 @@ from semantic_mapper.types import CameraIntrinsics
 
 INTRINSICS = CameraIntrinsics(110.3, 110.3, 79.5, 59.5, 160, 120)
 VIEWS = 6
-STEP = StepConfig(rays=512, depth_withheld=0.0)
+STEP = StepConfig(rays=512, depth_dropout=0.0)
 VARIANTS = {"sray, no known labels": ("sray", SRayConfig(source_labels=False))}
 
 
@@ -92,8 +92,8 @@ def main() -> None:
     print("| field | parameters, k | of them trained, k | wall ms | CPU ms | CPU against S-Ray |")
     print("|---|---|---|---|---|---|")
     for row, r in rows.items():
-        share = r["cpu_ms"] / base
-        print(f"| {row} | {r['parameters_k']} | {r['trained_k']} | {r['wall_ms']} | {r['cpu_ms']} | {share:.2f} |")
+        fraction = r["cpu_ms"] / base
+        print(f"| {row} | {r['parameters_k']} | {r['trained_k']} | {r['wall_ms']} | {r['cpu_ms']} | {fraction:.2f} |")
     print(f"\n{torch.get_num_threads()} threads, torch {torch.__version__}")
     if options.json is not None:
         options.json.write_text(json.dumps({"threads": torch.get_num_threads(), "fields": rows}, indent=1))

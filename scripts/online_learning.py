@@ -127,7 +127,7 @@ class Robot:
         self._camera = stack.enter_context(Publisher(self._endpoints["camera"], policy="block"))
         self._offers = stack.enter_context(Publisher(self._endpoints["offers"]))
         self._labels = stack.enter_context(Publisher(self._endpoints["labels"], policy="block"))
-        learning = {"share": args.share, "niceness": args.niceness, "weights": args.weights, "config": args.learning}
+        learning = {"share": args.fraction, "niceness": args.niceness, "weights": args.weights, "config": args.learning}
         self.finetuner = self._start(stack, "finetuner", learning)
         self._mapper = self._start(
             stack,
@@ -329,7 +329,7 @@ def run(args: argparse.Namespace, out: Path) -> dict[str, Any]:
         "frames": len(story.steps),
         "labelled": {"good": good, "shuffled": bad},
         "scored_classes": list(truth.shared),
-        "share_of_a_core": args.share,
+        "share_of_a_core": args.fraction,
         "miou": {
             "before": story.miou((0,), lambda s: order[id(s)] < swap),
             "after_the_swap": story.miou((1,)),

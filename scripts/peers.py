@@ -40,7 +40,7 @@ class Run:
         depth: Whether its encoder sees depth.
         encoder: The run whose encoder it starts from; empty = random weights.
         images: Trained on single images, not on rays.
-        share: Of the recipe's steps.
+        fraction: Of the recipe's steps.
         encoder_rate: Other than the recipe's; 0 = the recipe's.
         settings: Of the field, other than the default ones; the encoder's are not among them.
     """
@@ -49,7 +49,7 @@ class Run:
     depth: bool
     encoder: str = ""
     images: bool = False
-    share: float = 1.0
+    fraction: float = 1.0
     encoder_rate: float = 0.0
     settings: dict[str, Any] = field(default_factory=dict[str, Any])
 
@@ -81,8 +81,8 @@ class Budget:
 START = "start"  # what both encoders have in common; nothing to compare
 RUNS = {
     START: Run("unet", depth=False, images=True),
-    "unet-depth": Run("unet", depth=True, encoder=START, images=True, share=0.5),
-    "unet": Run("unet", depth=False, encoder=START, images=True, share=0.5),
+    "unet-depth": Run("unet", depth=True, encoder=START, images=True, fraction=0.5),
+    "unet": Run("unet", depth=False, encoder=START, images=True, fraction=0.5),
     "sray": Run("sray", depth=True, encoder="unet-depth"),
     "neuray": Run("neuray", depth=False, encoder="unet"),
     "sray-none": Run("sray-none", depth=True, encoder="unet-depth"),
@@ -102,7 +102,7 @@ def recipe(name: str, budget: Budget) -> str:
     run = RUNS[name]
     file = RECIPES / f"{budget.tier}-{'images' if run.images else 'rays'}.toml"
     plain: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
-    steps = budget.steps or round(run.share * plain["steps"])
+    steps = budget.steps or round(run.fraction * plain["steps"])
     plain |= {"kind": run.kind, "seed": budget.seed, "steps": steps}
     if run.encoder_rate:
         plain["encoder_rate"] = run.encoder_rate

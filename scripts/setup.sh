@@ -8,7 +8,7 @@ if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
   echo "setup: $("$python" --version) is too old; install Python 3.11 or newer, or name one: make setup PYTHON=python3.12" >&2
   exit 1
 fi
-# The interpreter itself: a shim of a version manager, or an active environment, would have .venv made anew every time.
+# The interpreter itself: a shim of a version manager, or an active environment, would have .venv made again every time.
 python="$("$python" -c 'import sys; print(sys._base_executable)')"
 
 # uv from the package index. --target works without the venv module and on externally managed Pythons.

@@ -25,7 +25,7 @@ from typing import Any
 
 import torch
 
-from semantic_mapper.benchmark.contestants import load_contestants
+from semantic_mapper.benchmark.entries import load_entries
 from semantic_mapper.errors import ConfigError, SemanticMapperError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint, save_checkpoint
 
@@ -78,7 +78,7 @@ def figures_of(weights: Path, table: Path) -> dict[str, Any]:
         raise ConfigError(f"{table}: not a table of `eval --suite rooms` ({error})") from error
     if not complete or suite["rooms"]:
         raise ConfigError(f"{table}: does not hold all rooms of its split; run the same command to its end")
-    digest = load_contestants([weights])[0].digest
+    digest = load_entries([weights])[0].digest
     entry = next((e for e in entries if e["digest"] == digest), None)
     if entry is None:
         raise ConfigError(f"{table}: holds no figures of {weights}; evaluate that file")

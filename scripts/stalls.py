@@ -24,7 +24,7 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.correction.corrected_map import MapCorrector
 from semantic_mapper.mapping.correction.history import FusedFrame
 from semantic_mapper.mapping.keyframes import KeyframeStore
-from semantic_mapper.mapping.views.upsample import lift
+from semantic_mapper.mapping.views.upsample import upsample
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
@@ -73,7 +73,7 @@ def fuse(voxel_map: VoxelMap, item: FusedFrame) -> None:
 
     rgb_low = np.asarray(cv2.resize(frame.rgb, low, interpolation=cv2.INTER_AREA), np.uint8)
     depth_low = np.asarray(cv2.resize(frame.depth_m, low, interpolation=cv2.INTER_NEAREST), np.float32)
-    rows = lift(item.probabilities, item.known, rgb_low, depth_low, frame.rgb, frame.depth_m)
+    rows = upsample(item.probabilities, item.known, rgb_low, depth_low, frame.rgb, frame.depth_m)
     voxel_map.integrate(frame, frame.depth_m, item.probabilities.reshape(-1, len(ROOMS)), rows=rows)
 
 

@@ -75,7 +75,7 @@ def _check_images_and_stamps() -> None:
     with _vivid() as camera:
         images = list(islice(camera, 20))
         ages = [time.monotonic_ns() - images[-1].stamp_ns]
-        assert camera.troubles == (), camera.troubles
+        assert camera.warnings == (), camera.warnings
         assert camera.info.frame_hz == 25, camera.info
     assert all(i.rgb.shape == (480, 640, 3) for i in images)
     assert images[-1].rgb.std() > 30  # a test picture, not nothing
@@ -90,8 +90,8 @@ def _check_images_and_stamps() -> None:
 def _check_what_it_cannot_do_is_told() -> None:
     with _vivid(fourcc="MJPG") as camera:
         next(iter(camera))
-        print(camera.troubles)
-        assert any("asked for pixels as MJPG, it gives" in t for t in camera.troubles)
+        print(camera.warnings)
+        assert any("asked for pixels as MJPG, it gives" in t for t in camera.warnings)
     refused = ""
     try:
         with _vivid(calibration=_calibration(650, 490)):
@@ -103,7 +103,7 @@ def _check_what_it_cannot_do_is_told() -> None:
 
 def _check_controls() -> None:
     with _vivid(gain=42, controls={"brightness": 99, "contrst": 3}, exposure_ms=5.0) as camera:
-        told = camera.troubles
+        told = camera.warnings
     print(told)
     assert len(told) == 2 and "did you mean 'contrast'" in told[1] and "no control for exposure_ms" in told[0], told
     with ioctls.opened(LINK) as fd:
@@ -121,7 +121,7 @@ def _check_dropped_buffers_are_no_end() -> None:
         _press("percentage_of_dropped_buffers", 0)
         steps = [(b.stamp_ns - a.stamp_ns) / 1e6 for a, b in pairwise(later)]
         print("ms between images with 60 % dropped:", [round(s) for s in steps])
-        assert max(steps) > 70 and camera.troubles == ()
+        assert max(steps) > 70 and camera.warnings == ()
 
 
 def _check_a_stalled_stream_is_told_and_comes_back() -> None:
@@ -129,14 +129,14 @@ def _check_a_stalled_stream_is_told_and_comes_back() -> None:
         images = iter(camera)
         first = next(images)
         _press("percentage_of_dropped_buffers", 100)
-        _until(lambda: any("stalled" in t or "no images" in t for t in camera.troubles), str(camera.troubles))
-        print(camera.troubles)
+        _until(lambda: any("stalled" in t or "no images" in t for t in camera.warnings), str(camera.warnings))
+        print(camera.warnings)
         _press("percentage_of_dropped_buffers", 0)
         going_ns = time.monotonic_ns()
         after = next(i for i in images if i.stamp_ns > going_ns)
         print("stalled; images again after s:", (after.stamp_ns - going_ns) / 1e9)
         assert after.seq > first.seq, "the count goes on"
-        _until(lambda: camera.troubles == (), str(camera.troubles))
+        _until(lambda: camera.warnings == (), str(camera.warnings))
 
 
 def _check_unplugged_and_back_under_another_index() -> None:
@@ -147,8 +147,8 @@ def _check_unplugged_and_back_under_another_index() -> None:
         holder = os.open(before, os.O_RDONLY)  # its number stays taken
         (DRIVER / "unbind").write_text("vivid.0")  # while it streams
         LINK.unlink()
-        _until(lambda: any("waited for since" in t for t in camera.troubles), str(camera.troubles))
-        print(camera.troubles)
+        _until(lambda: any("waited for since" in t for t in camera.warnings), str(camera.warnings))
+        print(camera.warnings)
         (DRIVER / "bind").write_text("vivid.0")
         _until(lambda: bool(paths.video_nodes()), "no node")
         node = _link_camera()
@@ -158,7 +158,7 @@ def _check_unplugged_and_back_under_another_index() -> None:
         print(f"was {before}, is {node}; images after s:", (time.monotonic_ns() - back_ns) / 1e9)
         assert node != before
         assert after.seq > first.seq, "the count goes on"
-        _until(lambda: camera.troubles == (), str(camera.troubles))
+        _until(lambda: camera.warnings == (), str(camera.warnings))
 
 
 def _check_the_disconnect_control() -> None:
@@ -167,7 +167,7 @@ def _check_the_disconnect_control() -> None:
         next(images)
         _press("disconnect")
         LINK.unlink()
-        _until(lambda: any("waited for since" in t for t in camera.troubles), str(camera.troubles))
+        _until(lambda: any("waited for since" in t for t in camera.warnings), str(camera.warnings))
         (DRIVER / "unbind").write_text("vivid.0")
         (DRIVER / "bind").write_text("vivid.0")
         _until(lambda: bool(paths.video_nodes()), "no node")

@@ -137,7 +137,7 @@ def boot(initrd: Path) -> int:
             "-nic",
             "none",
         ),
-        *("-L", str(TREE / "usr/share/seabios"), "-L", str(TREE / "usr/share/qemu")),
+        *("-L", str(TREE / "usr/fraction/seabios"), "-L", str(TREE / "usr/fraction/qemu")),
         *("-kernel", str(next(TREE.glob("boot/vmlinuz-*"))), "-initrd", str(initrd)),
         *("-append", "console=ttyS0 quiet panic=-1"),
         *("-virtfs", "local,path=/,mount_tag=host,security_model=none,readonly=on,multidevs=remap"),

@@ -11,9 +11,9 @@ from browser import Browser
 from semantic_mapper.plots import LegendRow
 from semantic_mapper.types import UInt8
 
-LEGEND_FROM, TOP = 0.8, 50  # the legend begins at this share of the width; above this row are the names of the views
+LEGEND_FROM, TOP = 0.8, 50  # the legend begins at this fraction of the width; above this row are the names of the views
 IMAGES_FROM, IMAGES_TO, IMAGE_WIDTH = 0.7, 0.93, 0.2  # rows of the images, and the columns of each, as shares
-MAP_TO = 0.65  # the map is above this share of the height
+MAP_TO = 0.65  # the map is above this fraction of the height
 IMAGES = ("rgb", "semantics", "depth")  # from the left
 LARGEST = 4  # classes that are looked for in the map; all of them in the legend
 LEAST_MAP, LEAST_LEGEND = 800, 80  # pixels of each

@@ -44,7 +44,7 @@ class MapInfo:
     """What a map is.
 
     Args:
-        map_id: Another one after the mapper was started anew.
+        map_id: Another one after the mapper was restarted.
         version, epoch: ``VoxelMap``'s.
         blocks: Of 8^3 voxels.
         voxel_size_m: Edge of a voxel.
@@ -205,7 +205,7 @@ class MapClient:
         """A mirror of the map in this process, brought up to the present; for many queries, or large ones.
 
         Only what has changed since the last call is fetched. The same mirror is returned again and again, and a new
-        one after the mapper was started anew.
+        one after the mapper was restarted.
         """
         with self._mirror_lock:
             newest = -1

@@ -12,12 +12,13 @@ import tomllib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, cast, get_args, get_origin
 
 import msgspec
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.files import read_regular
+from semantic_mapper.log_events import get_logger
 
 MAX_FILE_BYTES = 1 << 20  # of a file of settings
 MAX_DEPTH = 32  # tables and lists inside each other
@@ -25,13 +26,15 @@ MAX_NUMBER = 1e12  # the largest float of any setting
 MAX_DURATION_S = 1e6  # eleven days; the longest time that every system call takes in milliseconds
 MAX_COUNT = 2**31 - 1
 MAX_STORED = 2**63 - 1  # the largest whole number: stamps in nanoseconds
+_log = get_logger(__name__)
+
 _MESSAGE = 400  # letters of what a file says, in a message
 
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 NotNegative = Annotated[int, msgspec.Meta(ge=0)]
 AtLeastZero = Annotated[float, msgspec.Meta(ge=0)]
 AtLeastOne = Annotated[int, msgspec.Meta(ge=1, le=MAX_COUNT)]
-Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
 AtLeastTwo = Annotated[int, msgspec.Meta(ge=2, le=MAX_COUNT)]
 # Counts that memory is taken by, bounded before it is: no network, ray or store of use has more.
 Channels = Annotated[int, msgspec.Meta(ge=1, le=1024)]
@@ -45,6 +48,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """Base of all configuration structs."""
 
     infinite: ClassVar[bool] = False  # whether ``inf`` is a value of its numbers
+    old_names: ClassVar[Mapping[str, str]] = {}  # of settings that were renamed -> their name now
+    old_values: ClassVar[Mapping[str, Mapping[str, str]]] = {}  # by setting: values that were renamed
 
 
 class EncoderConfig(Config, frozen=True):
@@ -121,6 +126,8 @@ class SemanticNeRFConfig(Config, frozen=True):
 class SamplingConfig(Config, frozen=True):
     """Where a ray is sampled."""
 
+    old_names: ClassVar = {"least_weight": "sample_weight_threshold"}
+
     mode: Literal["reference", "streaming"] = "streaming"
     coarse: SamplesOfTwo = 64  # reference: uniform in inverse depth
     fine: Samples = 64  # reference: drawn from the coarse weights
@@ -128,7 +135,8 @@ class SamplingConfig(Config, frozen=True):
     free_space: NotNegative = 1  # of the guided samples: between the camera and the guided interval
     guided_sigma: Positive = 0.02  # half width of the guided interval: guided_sigma * z + guided_floor_m
     guided_floor_m: Positive = 0.04
-    least_weight: Share = 0.0  # streaming: samples of a smaller share of their ray's weight get no look of their own
+    # streaming: samples with a smaller fraction of their ray's weight are pruned: they take no part in the attention
+    sample_weight_threshold: Fraction = 0.0
     near_m: Metres = 0.3
     far_m: Metres = 8.0
 
@@ -165,7 +173,7 @@ class VoxelMapConfig(Config, frozen=True):
     )
     max_blocks: AtLeastOne = 200_000  # refuse to grow past this, with a clear error
     memory_mb: NotNegative = 0  # for voxels; what was used longest ago goes to disk; 0 = no limit
-    vote_discount: Share = 0.75  # rho: how much a repeated view of a voxel repeats what earlier views said
+    vote_discount: Fraction = 0.75  # rho: how much a repeated view of a voxel repeats what earlier views said
     vote_band_voxels: Positive = 2.0  # only voxels this near the surface take class votes
     evidence: Literal["float32", "int16"] = "float32"  # "int16": half the memory for classes (``evidence.py``)
 
@@ -195,11 +203,13 @@ class VirtualViewConfig(Config, frozen=True):
 class RenderConfig(Config, frozen=True):
     """Resolution and chunking of the rendered view."""
 
-    # Rendered rays a side, relative to the frame; lifted to full size along image edges.
+    old_names: ClassVar = {"share": "ray_fraction", "blind_samples": "samples_without_depth"}
+
+    # Rendered rays a side, relative to the frame; upsampled to full size along image edges.
     scale: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.25
-    # 1 = rays for all its pixels; below, for every fourth a side and, up to this share, where these do not tell enough.
-    share: Share = 0.2
-    blind_samples: SamplesOfTwo = 32  # a ray, of views of which neither sensor nor map knows any depth
+    # 1 = rays for all its pixels; below, for every fourth a side and, up to this fraction, where these are uncertain.
+    ray_fraction: Fraction = 0.2
+    samples_without_depth: SamplesOfTwo = 32  # a ray, of views of which neither sensor nor map knows any depth
     target_hz: Annotated[float, msgspec.Meta(ge=0, le=1000)] = (
         0.0  # hold this rate by fewer rays and samples than set; 0 = off, for maps that repeat
     )
@@ -216,16 +226,22 @@ class RenderConfig(Config, frozen=True):
 
 Quality = Literal["custom", "fast", "balanced", "reference"]
 QUALITIES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # of ``sampling`` and of ``render``
-    "fast": ({"mode": "streaming", "guided": 2, "free_space": 0, "least_weight": 0.05}, {"share": 0.12}),
-    "balanced": ({"mode": "streaming", "guided": 4, "free_space": 1, "least_weight": 0.02}, {"share": 0.2}),
-    "reference": ({"mode": "reference", "coarse": 64, "fine": 64}, {"share": 1.0, "target_hz": 0.0}),
+    "fast": (
+        {"mode": "streaming", "guided": 2, "free_space": 0, "sample_weight_threshold": 0.05},
+        {"ray_fraction": 0.12},
+    ),
+    "balanced": (
+        {"mode": "streaming", "guided": 4, "free_space": 1, "sample_weight_threshold": 0.02},
+        {"ray_fraction": 0.2},
+    ),
+    "reference": ({"mode": "reference", "coarse": 64, "fine": 64}, {"ray_fraction": 1.0, "target_hz": 0.0}),
 }
 
 
 class MapperConfig(Config, frozen=True):
     """Everything ``MappingPipeline`` needs. The defaults are those of the "balanced" quality."""
 
-    sampling: SamplingConfig = SamplingConfig(guided=4, least_weight=0.02)
+    sampling: SamplingConfig = SamplingConfig(guided=4, sample_weight_threshold=0.02)
     keyframes: KeyframeConfig = KeyframeConfig()
     voxel_map: VoxelMapConfig = VoxelMapConfig()
     history: HistoryConfig = HistoryConfig()
@@ -333,9 +349,49 @@ def convert_config(data: Any, kind: type[ConfigT], where: str) -> ConfigT:
     """
     check_values(data, where, infinite=issubclass(kind, Config) and kind.infinite)
     try:
-        return msgspec.convert(data, kind)
+        return msgspec.convert(rename_settings(data, kind, where), kind)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{where}: {_shorten(_explain(str(error), kind))}") from error
+
+
+def rename_settings(data: Any, kind: Any, where: str) -> Any:
+    """Plain data with the present names of settings that it has under old ones, and one warning for each.
+
+    Raises:
+        ConfigError: a setting is there under both names.
+    """
+    if isinstance(data, list | tuple):
+        return [rename_settings(item, kind, where) for item in cast("list[Any]", data)]
+    if not isinstance(data, Mapping) or not (isinstance(kind, type) and issubclass(kind, msgspec.Struct)):
+        return data
+    types = {item.encode_name: item.type for item in msgspec.structs.fields(kind)}
+    old_names, old_values = (kind.old_names, kind.old_values) if issubclass(kind, Config) else ({}, {})
+    renamed: dict[Any, Any] = {}
+    for key, value in cast("Mapping[Any, Any]", data).items():
+        name = old_names.get(key, key)
+        if name != key and name in data:
+            if data[name] == value:  # as in summaries, which hold both
+                continue
+            raise ConfigError(f"{where}: `{key}` is the old name of `{name}`, which is there, too; give one of them")
+        new_value = old_values.get(name, {}).get(value, value) if isinstance(value, str) else value
+        if (name, new_value) != (key, value):
+            _log.warning(
+                "setting_renamed", file=where, old=key, new=name, **({} if new_value == value else {"value": new_value})
+            )
+        for part in _structs(types.get(name)):
+            new_value = rename_settings(new_value, part, where)
+        renamed[name] = new_value
+    return renamed
+
+
+def with_old_names(config: Config) -> dict[str, Any]:
+    """``to_plain`` with each renamed setting under its old name, too, for programs that read results."""
+    plain = to_plain(config)
+    for item in msgspec.structs.fields(type(config)):
+        value = getattr(config, item.name)
+        if isinstance(value, Config):
+            plain[item.encode_name] = with_old_names(value)
+    return plain | {old: plain[new] for old, new in config.old_names.items()}
 
 
 def check_values(data: Any, where: str, *, infinite: bool = False) -> None:
@@ -458,6 +514,17 @@ def _types_at(path: str, kind: type[msgspec.Struct]) -> list[Any]:
             elif isinstance(part, type) and issubclass(part, msgspec.Struct):
                 inner += [item.type for item in msgspec.structs.fields(part) if item.name == step]
         found = [member for part in inner for member in _members(part)]
+    return found
+
+
+def _structs(part: Any) -> list[Any]:
+    """Structs that a value may be or hold, in a list."""
+    found: list[Any] = []
+    for member in _members(part):
+        if isinstance(member, type) and issubclass(member, msgspec.Struct):
+            found.append(member)
+        elif get_origin(member) in (list, tuple):
+            found += [struct for inner in get_args(member) for struct in _structs(inner)]
     return found
 
 

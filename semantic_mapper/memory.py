@@ -17,7 +17,7 @@ _MAX_REASON = 160  # letters: NumPy explains a failed import on two pages
 def keep_freed_memory() -> bool:
     """Let this process use freed memory again instead of returning it to the system, from now until it ends.
 
-    By default glibc maps each large tensor anew and unmaps it when it is freed, and the kernel clears its pages every
+    By default glibc maps each large tensor again and unmaps it when it is freed, and the kernel clears its pages every
     time. The price is that memory stays the process's own at its peak. For processes that do the same work over and
     over; the library itself never calls this.
 

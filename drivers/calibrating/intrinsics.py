@@ -20,7 +20,7 @@ from semantic_mapper.types import CameraIntrinsics, Float64
 COEFFICIENT_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 OUTLIER = 3.0  # times the median error of a view: it was blurred, or the board was bent
 OUTLIER_FLOOR_PX = 0.3
-MAX_LEFT_OUT = 0.2  # share of the views
+MAX_LEFT_OUT = 0.2  # fraction of the views
 _FLAGS = {4: cv2.CALIB_FIX_K3, 5: 0, 8: cv2.CALIB_RATIONAL_MODEL}
 
 
@@ -194,12 +194,13 @@ def _check(camera_id: str, found: CameraCalibration, config: CalibrationConfig) 
     if lacks:
         raise _refusal(camera_id, lacks)
     _check_error(camera_id, found, config)
-    share = max(found.sigmas["fx"] / found.intrinsics.fx, found.sigmas["fy"] / found.intrinsics.fy)
-    if share > config.max_focal_sigma:
+    fraction = max(found.sigmas["fx"] / found.intrinsics.fx, found.sigmas["fy"] / found.intrinsics.fy)
+    if fraction > config.max_focal_sigma:
         raise _refusal(
             camera_id,
             (
-                f"the focal length is known to {100 * share:.2f} % only (one sigma; {100 * config.max_focal_sigma:g} % "
+                f"the focal length is known to {100 * fraction:.2f} % only (one sigma; "
+                f"{100 * config.max_focal_sigma:g} % "
                 "is needed): show the board nearer, and lean it further, in more images",
             ),
         )

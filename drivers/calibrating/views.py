@@ -18,7 +18,7 @@ from semantic_mapper.errors import CameraError
 from semantic_mapper.types import CameraIntrinsics, Float64
 
 NEW = 0.08  # least distance of a view from those kept; see ``_signature``
-FLAT = 0.05  # corners whose spread across their main line is below this share of it are on a line
+FLAT = 0.05  # corners whose spread across their main line is below this fraction of it are on a line
 
 
 @dataclass(frozen=True, slots=True, eq=False)

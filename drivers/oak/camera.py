@@ -16,7 +16,7 @@ import msgspec
 from semantic_mapper.drivers.base import CameraImage
 from semantic_mapper.drivers.oak.config import Config
 from semantic_mapper.drivers.oak.device import connect_device
-from semantic_mapper.drivers.oak.images import ImageMaker, geometry_trouble, read_intrinsics, told_intrinsics
+from semantic_mapper.drivers.oak.images import ImageMaker, geometry_trouble, read_intrinsics, reported_intrinsics
 from semantic_mapper.drivers.oak.odometry import Odometry
 from semantic_mapper.drivers.oak.stream import Sources, Stream, StreamEnded
 from semantic_mapper.errors import CameraError, PoseError
@@ -27,8 +27,8 @@ from semantic_mapper.types import CameraIntrinsics
 Connect = Callable[[Config, Callable[[str], None]], Sources]
 
 _SLICE_S = 0.1  # how soon a stop is noticed
-_STRANGE_WORLD = (
-    "odometry began anew when the camera came back, in another world than before: images go without a pose. Start the "
+_TRACKING_RESET = (
+    "odometry began again when the camera came back, in another world than before: images go without a pose. Start the "
     "node again for a new map, or take poses from elsewhere"
 )
 
@@ -50,13 +50,13 @@ class OakCamera:
         self._connect = connect
         self._stopped = threading.Event()
         self._lock = threading.Lock()
-        self._troubles: dict[str, str] = {}
+        self._warnings: dict[str, str] = {}
         self._stream: Stream | None = None
         self._odometry: Odometry | None = None
         self._maker: ImageMaker | None = None
         self._info: StreamInfo | None = None
         self._connections = 0
-        self._turned_at = 0.0
+        self._last_poll_time = 0.0
 
     @property
     def info(self) -> StreamInfo:
@@ -70,14 +70,14 @@ class OakCamera:
         return self._info
 
     @property
-    def troubles(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """One sentence for each thing that does not work as it should now."""
         odometry = self._odometry
         with self._lock:
-            troubles = [f"camera '{self._camera_id}': {text}" for text in self._troubles.values() if text]
+            warnings = [f"camera '{self._camera_id}': {text}" for text in self._warnings.values() if text]
         if odometry is not None and odometry.trouble:
-            troubles.append(f"camera '{self._camera_id}': {odometry.trouble}")
-        return tuple(troubles)
+            warnings.append(f"camera '{self._camera_id}': {odometry.trouble}")
+        return tuple(warnings)
 
     @property
     def can_wait(self) -> bool:
@@ -85,9 +85,9 @@ class OakCamera:
         return False
 
     @property
-    def turned_at(self) -> float:
+    def last_poll_time(self) -> float:
         """As of ``Camera``."""
-        return self._turned_at
+        return self._last_poll_time
 
     def __enter__(self) -> Self:
         """Open the device.
@@ -115,7 +115,7 @@ class OakCamera:
             CameraError: what comes is not what was asked for.
         """
         while not self._stopped.is_set():
-            self._turned_at = time.monotonic()
+            self._last_poll_time = time.monotonic()
             if self._stream is None:
                 self._reopen()
                 continue
@@ -133,7 +133,7 @@ class OakCamera:
             except StreamEnded:
                 yield from waiting
                 raise
-            self._turned_at = time.monotonic()
+            self._last_poll_time = time.monotonic()
             if self._odometry is not None:
                 self._odometry.check()
             if messages is not None and (image := self._image(*messages)) is not None:
@@ -208,7 +208,7 @@ class OakCamera:
         )
         self._say("state", "")
         self._say("notes", "; ".join(sources.notes))
-        self._say("world", _STRANGE_WORLD if odometry is not None and self._connections > 1 else "")
+        self._say("world", _TRACKING_RESET if odometry is not None and self._connections > 1 else "")
         _log.info("camera_connected", camera=self._camera_id, device=sources.name, connection=self._connections)
 
     def _begin(self, stream: Stream, config: Config) -> CameraIntrinsics:
@@ -221,7 +221,7 @@ class OakCamera:
             CameraError, StreamEnded: there is no image, or neither says anything.
         """
         messages = stream.first(self._stopped)
-        told = None if messages is None else told_intrinsics(messages[0])
+        told = None if messages is None else reported_intrinsics(messages[0])
         self._say("geometry", "" if messages is None else geometry_trouble(*messages))
         return told or read_intrinsics(stream.sources.calibration, config.rgb, config.width, config.height)
 
@@ -252,8 +252,8 @@ class OakCamera:
         except CameraError as error:
             self._say("device", f"{self.info.source} is away: {error}")
             return
-        if self._odometry is not None and self._config.other_world == "end":
-            raise CameraError(f"{self.info.source} was away, and its {_STRANGE_WORLD}")
+        if self._odometry is not None and self._config.on_tracking_reset == "exit":
+            raise CameraError(f"{self.info.source} was away, and its {_TRACKING_RESET}")
 
     def _device_state(self, state: str) -> None:
         """Called by a thread of DepthAI's, where an exception would end the process: nothing here raises."""
@@ -261,4 +261,4 @@ class OakCamera:
 
     def _say(self, topic: str, trouble: str) -> None:
         with self._lock:
-            self._troubles[topic] = trouble
+            self._warnings[topic] = trouble

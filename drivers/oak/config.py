@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 
 import semantic_mapper.config
-from semantic_mapper.config import AtLeastOne, Positive, Share
+from semantic_mapper.config import AtLeastOne, Fraction, Positive
 
 Socket = Literal["CAM_A", "CAM_B", "CAM_C", "CAM_D", "CAM_E", "CAM_F"]
 Preset = Literal["default", "face", "high_detail", "robotics", "accuracy", "density", "fast_accuracy", "fast_density"]
@@ -17,6 +17,9 @@ Height = Annotated[int, msgspec.Meta(ge=48, multiple_of=2)]
 
 class Config(semantic_mapper.config.Config, frozen=True):
     """An OAK: one colour camera, depth of a stereo pair aligned to it, odometry where it is asked for."""
+
+    old_names: ClassVar = {"other_world": "on_tracking_reset"}
+    old_values: ClassVar = {"on_tracking_reset": {"end": "exit"}}
 
     # Its id (MXID), its IP address (PoE), or its USB path, as ``semantic-mapper cameras`` shows them. Empty = the only
     # one that is connected.
@@ -33,14 +36,14 @@ class Config(semantic_mapper.config.Config, frozen=True):
     # DepthAI's preset of the stereo matcher. This one would rather leave a pixel without depth than guess: a map has
     # other views of it.
     stereo_preset: Preset = "fast_accuracy"
-    ir_dots: Share = 0.0  # power of the dot projector ("Pro" boards): depth on bare walls; disturbs odometry
+    ir_dots: Fraction = 0.0  # power of the dot projector ("Pro" boards): depth on bare walls; disturbs odometry
     # Visual-inertial odometry (DepthAI's Basalt, on this machine; needs the stereo pair and an IMU) as the images' own
     # pose.
     odometry: bool = False
     odometry_wait_s: Positive = 0.3  # how long an image waits for its pose; then it goes without
     # Where a camera with odometry was away: go on with images that have no pose, or end the node, so that whoever
-    # watches over the launch starts it anew with a new map.
-    other_world: Literal["no-poses", "end"] = "no-poses"
+    # watches over the launch starts it again with a new map.
+    on_tracking_reset: Literal["no-poses", "exit"] = "no-poses"
     # JSON file (as DepthAI writes it) in place of the calibration that is stored on the device.
     calibration: str = ""
     search_s: Positive = 2.0  # how long the device is looked for before it counts as missing

@@ -44,7 +44,7 @@ def read_intrinsics(calibration: Any, socket: str, width: int, height: int) -> C
     return _pinhole(K, width, height)
 
 
-def told_intrinsics(frame: Any) -> CameraIntrinsics | None:
+def reported_intrinsics(frame: Any) -> CameraIntrinsics | None:
     """Intrinsics that a message carries: the calibration's, after every crop and scaling that the device has made.
 
     Returns:
@@ -76,7 +76,7 @@ def geometry_trouble(rgb: Any, depth: Any | None) -> str:
     """What two messages say against it that they are undistorted and show the same pixels; empty where nothing."""
     if any(rgb.getTransformation().getDistortionCoefficients()):
         return "the device says that its images are not undistorted: surfaces may bend"
-    ours, theirs = told_intrinsics(rgb), None if depth is None else told_intrinsics(depth)
+    ours, theirs = reported_intrinsics(rgb), None if depth is None else reported_intrinsics(depth)
     if ours is None or theirs is None:
         return ""
     a, b = (np.array((c.fx, c.fy, c.cx, c.cy, c.width, c.height)) for c in (ours, theirs))
@@ -156,7 +156,7 @@ class ImageMaker:
         self._shift: int | None = None  # from the device's numbers to ours; None = not known of this connection
 
     def reconnected(self, intrinsics: CameraIntrinsics) -> None:
-        """The device counts anew from here."""
+        """The device counts again from here."""
         self._shift = None
         self._intrinsics = intrinsics
 
@@ -202,7 +202,7 @@ class ImageMaker:
             number = 0
         else:
             number, last_ns = self._last
-            if self._shift is None or counted + self._shift <= number:  # the device counts anew: ask the clock
+            if self._shift is None or counted + self._shift <= number:  # the device counts again: ask the clock
                 number += max(2, round((stamp_ns - last_ns) / self._period_ns))
             else:
                 number = counted + self._shift

@@ -22,4 +22,4 @@ class Config(config.Config, frozen=True):
     stamps: Literal["container", "arrival"] = "container"
     latency_s: AtLeastZero = 0.0
     open_timeout_s: Positive = 5.0
-    stall_s: Positive = 3.0  # without an image for so long, the stream counts as stalled and is connected anew
+    stall_s: Positive = 3.0  # without an image for so long, the stream counts as stalled and is connected again

@@ -30,7 +30,7 @@ class VideoFile:
     Args:
         config: With the file's name.
         camera_id: What its images are called.
-        measured: Calibration of the camera that took it; None: guessed, said in ``troubles``.
+        measured: Calibration of the camera that took it; None: guessed, said in ``warnings``.
     """
 
     def __init__(self, config: Config, camera_id: str, measured: CameraIntrinsics | None) -> None:
@@ -41,7 +41,7 @@ class VideoFile:
         self._rectify: Rectifier | None = None
         self._info: StreamInfo | None = None
         self._stopping = threading.Event()
-        self._turned_at = 0.0
+        self._last_poll_time = 0.0
 
     @property
     def info(self) -> StreamInfo:
@@ -51,7 +51,7 @@ class VideoFile:
         return self._info
 
     @property
-    def troubles(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """As of ``Camera``."""
         if self._measured is None:
             return ("not calibrated: the intrinsics are a guess, good for calibrating only",)
@@ -63,9 +63,9 @@ class VideoFile:
         return True
 
     @property
-    def turned_at(self) -> float:
+    def last_poll_time(self) -> float:
         """As of ``Camera``."""
-        return self._turned_at
+        return self._last_poll_time
 
     def __enter__(self) -> Self:
         """Open the file.
@@ -120,7 +120,7 @@ class VideoFile:
         first_ns: int | None = None
         seq = -1
         for seq, (within_ns, bgr) in enumerate(_shots(self._capture)):
-            self._turned_at = time.monotonic()
+            self._last_poll_time = time.monotonic()
             first_ns = within_ns if first_ns is None else first_ns
             since_ns = within_ns - first_ns
             if self._config.pace == "recorded":

@@ -41,7 +41,7 @@ class StreamDevice:
             )
 
     @property
-    def troubles(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """As of ``Device``."""
         if self._config.stamps == "arrival" or self._clock.trustworthy:
             return ()

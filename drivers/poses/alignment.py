@@ -43,8 +43,8 @@ class Fit:
     """How well a view at a pose lies on a target.
 
     Args:
-        overlap: Share of the view's points that the target's image holds.
-        fitness: Share of these that lie on its surface.
+        overlap: Fraction of the view's points that the target's image holds.
+        fitness: Fraction of these that lie on its surface.
         rmse_m: Of the distances of these.
         cost_m: Mean distance of the points that the target's image holds, no one's more than the outlier distance.
         normal_matrix: (6, 6) of turning about and shifting the camera, in the world's axes, in points.

@@ -96,13 +96,13 @@ class BoardPoseSource:
         self._config = config
         self._finder = BoardFinder(config)
         self._T_world_board = matrix(config.T_world_board)
-        self._troubles: tuple[str, ...] = ()
+        self._warnings: tuple[str, ...] = ()
         self.counters: Counter[str] = Counter()
 
     @property
-    def troubles(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """Why the last image had no pose."""
-        return self._troubles
+        return self._warnings
 
     def __enter__(self) -> Self:
         return self
@@ -130,12 +130,12 @@ class BoardPoseSource:
         sigma = _position_sigma(points, pose, image.intrinsics, max(error_px, MIN_CORNER_SIGMA_PX))
         if sigma > self._config.max_sigma_m:
             return self._refuse("uncertain", f"it tells the camera's place to {sigma:.2f} m only; show it larger")
-        self._troubles = ()
+        self._warnings = ()
         return PoseEstimate(self._T_world_board @ invert_pose(pose_of_vector(pose)), "board", sigma)
 
     def _refuse(self, reason: str, detail: str) -> None:
         self.counters[reason] += 1
-        self._troubles = (f"the board gives no pose: {detail}",)
+        self._warnings = (f"the board gives no pose: {detail}",)
 
 
 def board_poses(points: Float64, pixels: Float64, intrinsics: CameraIntrinsics) -> list[tuple[float, Float64]]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 import numpy as np
 
-from semantic_mapper.config import AtLeastOne, AtLeastZero, Config, NotNegative, Positive, Share
+from semantic_mapper.config import AtLeastOne, AtLeastZero, Config, Fraction, NotNegative, Positive
 from semantic_mapper.drivers.calibration import Matrix
 from semantic_mapper.types import Float64
 
@@ -104,17 +104,17 @@ class OdometryPoses(Config, frozen=True):
     neighbours: AtLeastOne = 3  # keyframes that a frame is aligned to
     keyframe_m: Positive = 0.35  # a new one when moved this far from the nearest, or ...
     keyframe_deg: Positive = 20.0  # ... turned this far, or ...
-    keyframe_overlap: Share = 0.55  # ... seeing less than this in common with it
+    keyframe_overlap: Fraction = 0.55  # ... seeing less than this in common with it
     max_keyframes: AtLeastOne = 500  # 0.5 MB each; the oldest of the most crowded place goes first
-    min_fitness: Share = 0.5  # of the frame's points that the keyframe sees must lie on its surface
-    min_overlap: Share = 0.35  # of the frame's points that have to be in a keyframe's view
+    min_fitness: Fraction = 0.5  # of the frame's points that the keyframe sees must lie on its surface
+    min_overlap: Fraction = 0.35  # of the frame's points that have to be in a keyframe's view
     max_rmse_m: Positive = 0.025  # of the distances that count
     max_step_m: Positive = 0.25  # a result further from its first guess is none
     max_step_deg: Positive = 15.0
     features: AtLeastOne = 500  # ORB corners an image, for first guesses and for finding back
     min_matches: Annotated[int, msgspec.Meta(ge=6)] = 15  # consistent ones, for a guess
     relocalise_keyframes: AtLeastOne = 20  # tried for each image while lost, in turn
-    drift: Share = 0.05  # of the way: what ``sigma`` grows by with the chain of keyframes
+    drift: Fraction = 0.05  # of the way: what ``sigma`` grows by with the chain of keyframes
 
 
 PoseConfig = DevicePoses | FixedPose | TopicPoses | BoardPoses | OdometryPoses
@@ -148,13 +148,15 @@ KINDS: dict[str, type[DevicePoses] | type[FixedPose] | type[TopicPoses] | type[B
 class PoseChecks(Config, frozen=True):
     """What ``PosedCamera`` refuses."""
 
+    old_names: ClassVar = {"first_agree": "init_consensus", "settle": "relocalize_after"}
+
     max_speed_m_s: Positive = 3.0  # faster than this between two images is a jump
     max_turn_deg_s: Positive = 360.0
     slack_m: AtLeastZero = 0.05  # a pose may be off by so much at any rate
     slack_deg: AtLeastZero = 3.0
     # A camera's first frames are held back until so many of their poses agree with each other (and are given then): one
     # wrong pose, such as a robot's before it knows where it is, is no place to go on from. 1 = the first is believed.
-    first_agree: AtLeastOne = 5
+    init_consensus: AtLeastOne = 5
     # After a jump, so many poses in a row that agree with each other are taken for true. 0 = none: a source that begins
     # in another world would spoil the map. One that jumps back, or that was only a little too quick, passes again.
-    settle: NotNegative = 0
+    relocalize_after: NotNegative = 0

@@ -14,7 +14,7 @@ _SMOOTH_PX = 7  # width of the filter that takes the sensor's noise off points a
 _RIM_PX = _SMOOTH_PX // 2
 _SMOOTH_M = 0.05  # depths further apart are of two surfaces and stay apart
 _STEP_PX = 2  # a normal comes from the points this far to its sides
-_EDGE = 0.05  # share of the depth by which these may differ, or they are of two surfaces
+_EDGE = 0.05  # fraction of the depth by which these may differ, or they are of two surfaces
 
 
 @dataclass(frozen=True, slots=True, eq=False)

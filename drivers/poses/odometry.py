@@ -32,7 +32,7 @@ from semantic_mapper.geometry import interpolate_pose, invert_pose, rotation_vec
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
-_LEAST_DEPTH = 0.05  # share of the pixels that need depth
+_LEAST_DEPTH = 0.05  # fraction of the pixels that need depth
 _POINTS_A_VOTE = 50  # neighbouring points have the same error: so many tell as much as one
 _RECENT_NS = 700_000_000  # after so long without a pose the last motion says nothing any more
 
@@ -57,7 +57,7 @@ class _View:
 
 
 class OdometryPoseSource:
-    """Follows one RGB-D camera. Not for several threads at once, but any may read ``counters`` and ``troubles``.
+    """Follows one RGB-D camera. Not for several threads at once, but any may read ``counters`` and ``warnings``.
 
     Args:
         config: How.
@@ -77,13 +77,13 @@ class OdometryPoseSource:
         self._past: list[StampedPose] = []  # the last two poses
         self._lost = False
         self._next_try = 0  # keyframe that is tried next while lost
-        self._troubles: tuple[str, ...] = ()
+        self._warnings: tuple[str, ...] = ()
         self.counters: Counter[str] = Counter()
 
     @property
-    def troubles(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """One sentence while the camera is lost."""
-        return self._troubles
+        return self._warnings
 
     @property
     def keyframe_poses(self) -> list[Float64]:
@@ -220,7 +220,7 @@ class OdometryPoseSource:
             self.counters["relocalised"] += 1
             _log.info("odometry_relocalised", stamp_ns=view.stamp_ns)
             self._past = []
-        self._lost, self._troubles = False, ()
+        self._lost, self._warnings = False, ()
         self.counters["tracked"] += 1
         self._past = [*self._past[-1:], StampedPose(view.stamp_ns, pose)]
         way, turn = self._map.distances(pose)
@@ -239,7 +239,7 @@ class OdometryPoseSource:
         if not self._lost:
             _log.warning("odometry_lost", reason=reason)
         self._lost = True
-        self._troubles = (f"the odometry is lost ({reason}); show the camera a place that it has seen before",)
+        self._warnings = (f"the odometry is lost ({reason}); show the camera a place that it has seen before",)
         self.counters["lost"] += 1
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from semantic_mapper.drivers.base import Camera, CameraImage, PoseEstimate, PoseSource
 from semantic_mapper.drivers.poses.config import PoseChecks
-from semantic_mapper.drivers.poses.gate import PoseGate, Verdict
+from semantic_mapper.drivers.poses.outlier_filter import FilterResult, PoseOutlierFilter
 from semantic_mapper.errors import PoseError, ShapeError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.log_events import get_logger, is_power_of_two
@@ -21,17 +21,17 @@ from semantic_mapper.types import MAX_POSE_SIGMA_M, Float64, PosedFrame
 
 _DEFAULTS = PoseChecks()
 EXACT = ("fixed",)  # sources whose poses come from the settings: the first one is not doubted
-REASONS = ("no_pose", "stale", "not_rotation", "jumping", "unsettled")
+REASONS = ("no_pose", "stale", "not_rotation", "outliers", "uninitialized")
 
 _log = get_logger(__name__)
 
 
 @runtime_checkable
-class TellingPoseSource(PoseSource, Protocol):
+class DiagnosticPoseSource(PoseSource, Protocol):
     """A pose source that tells what is the matter; all of ``semantic_mapper.drivers.poses`` do."""
 
     @property
-    def troubles(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """One sentence for each thing that does not work as it should now; any thread may ask."""
         ...
 
@@ -45,7 +45,7 @@ class PosedCamera:
     """A ``FrameSource``: the images of a camera, each with its pose.
 
     An image that gets none is left out, which shows as a gap in ``seq``. A camera's first frames are held back until
-    some of their poses agree with each other (``first_agree``), and are given then.
+    some of their poses agree with each other (``init_consensus``), and are given then.
 
     Args:
         camera: Gives the images.
@@ -55,8 +55,8 @@ class PosedCamera:
 
     Attributes:
         counters: "frames" given; images left out: "no_pose" (the source has none), "stale" (the image is not later than
-            the one before: late, doubled or out of order), "not_rotation" (NaN, mirror, scale), "jumping" (faster than
-            the camera can have moved), "unsettled" (at the beginning, while poses do not agree with each
+            the one before: late, doubled or out of order), "not_rotation" (NaN, mirror, scale), "outliers" (faster than
+            the camera can have moved), "uninitialized" (at the beginning, while poses do not agree with each
             other). With "pose_" before them, those of the pose source.
     """
 
@@ -73,7 +73,7 @@ class PosedCamera:
         self._checks = checks
         self._T_rig_camera = T_rig_camera
         self._counts: Counter[str] = Counter()
-        self._gates: dict[str, PoseGate] = {}
+        self._gates: dict[str, PoseOutlierFilter] = {}
         self._last_ns: dict[str, int] = {}
         self._trouble = ""
 
@@ -86,15 +86,15 @@ class PosedCamera:
     def counters(self) -> dict[str, int]:
         """Frames given and left out; see the class."""
         own = {name: self._counts[name] for name in ("frames", *REASONS)}
-        if not isinstance(self._poses, TellingPoseSource):
+        if not isinstance(self._poses, DiagnosticPoseSource):
             return own
         return own | {f"pose_{name}": count for name, count in dict(self._poses.counters).items()}
 
     @property
-    def troubles(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """Those of the camera and of the pose source, and why the last pose was refused."""
-        told = self._poses.troubles if isinstance(self._poses, TellingPoseSource) else ()
-        return (*self._camera.troubles, *told, *((self._trouble,) if self._trouble else ()))
+        told = self._poses.warnings if isinstance(self._poses, DiagnosticPoseSource) else ()
+        return (*self._camera.warnings, *told, *((self._trouble,) if self._trouble else ()))
 
     @property
     def can_wait(self) -> bool:
@@ -102,9 +102,9 @@ class PosedCamera:
         return self._camera.can_wait
 
     @property
-    def turned_at(self) -> float:
+    def last_poll_time(self) -> float:
         """The camera's; it comes round no more while a pose is awaited that never comes."""
-        return self._camera.turned_at
+        return self._camera.last_poll_time
 
     def __enter__(self) -> Self:
         self._poses.__enter__()
@@ -136,7 +136,9 @@ class PosedCamera:
         for image in self._camera:
             estimate = self._checked_pose(image)
             if estimate is not None:
-                gate = self._gates.setdefault(image.camera_id, PoseGate(self._checks, exact=estimate.source in EXACT))
+                gate = self._gates.setdefault(
+                    image.camera_id, PoseOutlierFilter(self._checks, exact=estimate.source in EXACT)
+                )
                 yield from self._passed(gate.take(_frame(image, estimate)), image.camera_id)
         for camera_id, gate in self._gates.items():
             yield from self._passed(gate.end(), camera_id)
@@ -160,11 +162,11 @@ class PosedCamera:
             return self._refuse(image, "not_rotation", f"its pose has an uncertainty of {estimate.sigma} m")
         return estimate
 
-    def _passed(self, verdict: Verdict, camera_id: str) -> Iterator[PosedFrame]:
-        for frame, why in verdict.jumping:
-            self._refuse(frame, "jumping", why)
-        for frame, why in verdict.unsettled:
-            self._refuse(frame, "unsettled", why)
+    def _passed(self, verdict: FilterResult, camera_id: str) -> Iterator[PosedFrame]:
+        for frame, why in verdict.outliers:
+            self._refuse(frame, "outliers", why)
+        for frame, why in verdict.uninitialized:
+            self._refuse(frame, "uninitialized", why)
         if verdict.waiting:
             self._trouble = f"frames of '{camera_id}' are held back: {verdict.waiting}"
         elif verdict.passed:

@@ -18,11 +18,11 @@ from semantic_mapper.drivers.poses.config import (
     PoseConfig,
     TopicPoses,
 )
-from semantic_mapper.drivers.poses.posed_camera import TellingPoseSource
+from semantic_mapper.drivers.poses.posed_camera import DiagnosticPoseSource
 from semantic_mapper.errors import ConfigError
 
 
-def open_poses(config: Mapping[str, Any], where: str = "poses") -> TellingPoseSource:
+def open_poses(config: Mapping[str, Any], where: str = "poses") -> DiagnosticPoseSource:
     """A pose source as a launch file tells of it, ready to be entered.
 
     Args:
@@ -49,7 +49,7 @@ def read_pose_config(config: Mapping[str, Any], where: str = "poses") -> PoseCon
     return checked
 
 
-def make_poses(config: PoseConfig) -> TellingPoseSource:
+def make_poses(config: PoseConfig) -> DiagnosticPoseSource:
     """The source that checked settings stand for."""
     match config:
         case DevicePoses():

@@ -27,13 +27,13 @@ class DevicePoseSource:
         self._patience_ns = round(config.patience_s * 1e9)
         self._first_ns: int | None = None  # of the images; None once there was a pose
         self._tracked = False
-        self._troubles: tuple[str, ...] = ()
+        self._warnings: tuple[str, ...] = ()
         self.counters: dict[str, int] = {}
 
     @property
-    def troubles(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """One sentence while the device does not know where it is."""
-        return self._troubles
+        return self._warnings
 
     def __enter__(self) -> Self:
         return self
@@ -51,7 +51,7 @@ class DevicePoseSource:
         """
         self._tracked |= image.tracks_itself
         if image.own_pose is not None:
-            self._tracked, self._troubles = True, ()
+            self._tracked, self._warnings = True, ()
             return image.own_pose
         self._first_ns = image.stamp_ns if self._first_ns is None else self._first_ns
         waited_ns = image.stamp_ns - self._first_ns
@@ -60,7 +60,7 @@ class DevicePoseSource:
                 f"camera '{image.camera_id}' has told no pose of its own for {waited_ns / 1e9:.1f} s, so it does not "
                 f"track itself, or its tracking is not switched on; {WAYS_OUT}"
             )
-        self._troubles = (f"camera '{image.camera_id}' does not know where it is; frames are left out until it does",)
+        self._warnings = (f"camera '{image.camera_id}' does not know where it is; frames are left out until it does",)
         return None
 
 
@@ -76,7 +76,7 @@ class FixedPoseSource:
         self.counters: dict[str, int] = {}
 
     @property
-    def troubles(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """None, ever."""
         return ()
 

@@ -22,7 +22,7 @@ from semantic_mapper.transport.receiving import receive_bounded
 from semantic_mapper.transport.security import ServerIdentity, load_keys, secure_client
 
 _POLL_MS = 50
-_SILENCE_S = 1.0  # after so long without a message the connection is made anew
+_SILENCE_S = 1.0  # after so long without a message the connection is made again
 _FRESH_NS = 500_000_000  # a message that came so long ago was sent just now, as far as clocks go
 # A pose cannot be of a moment that has not come. So much is left to publishers that tell where the robot will be when
 # the message arrives, and to an offset between two clocks that is not exact; it is what ``max_ahead_s`` bridges, too.
@@ -75,7 +75,7 @@ class TopicPoseSource:
         self.counters: Counter[str] = Counter()
 
     @property
-    def troubles(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """What is the matter with the connection and with messages, and why the last image had no pose."""
         told = (self._connection_trouble, self._message_trouble, self._image_trouble)
         return tuple(text for text in told if text)
@@ -101,7 +101,7 @@ class TopicPoseSource:
             self._thread = None
 
     def pose(self, image: CameraImage) -> PoseEstimate | None:
-        """Pose at the image's stamp; None, counted and told in ``troubles``, where the messages do not give it."""
+        """Pose at the image's stamp; None, counted and told in ``warnings``, where the messages do not give it."""
         with self._changed:
             self._changed.wait_for(lambda: self._reaches(image.stamp_ns) or self._is_off(image), self._config.wait_s)
             if self._is_off(image):
@@ -237,7 +237,7 @@ class TopicPoseSource:
             self._changed.notify_all()
 
     def _is_set_back(self, behind_ns: int, now_ns: int) -> bool:
-        """Whether the publisher's clock was set back, or it was started anew, as told by a message so far behind.
+        """Whether the publisher's clock was set back, or it was restarted, as told by a message so far behind.
 
         Not while others keep coming that are not behind: then it is of a second publisher, on another clock.
         """

@@ -32,7 +32,7 @@ class Config(config.Config, frozen=True):
     # Any other control by the name that the device gives it, in small letters with _ (focus_absolute); see
     # `v4l2-ctl --list-ctrls`. A lens that focuses by itself changes its focal length: fix it.
     controls: dict[str, Annotated[int, msgspec.Meta(ge=LOWEST, le=HIGHEST)]] = msgspec.field(default_factory=dict)
-    stall_s: Positive = 2.0  # without an image for so long, the stream counts as stalled and is started anew
+    stall_s: Positive = 2.0  # without an image for so long, the stream counts as stalled and is restarted
 
     def __post_init__(self) -> None:
         if bool(self.width) != bool(self.height):

@@ -32,15 +32,15 @@ def apply_controls(path: Path, config: Config) -> tuple[str, ...]:
     with ioctls.opened(path) as fd:
         controls = ioctls.list_controls(fd)
         by_id = {c.id: c for c in controls.values()}
-        troubles = [_set(fd, by_id.get(wish.control), wish) for wish in _wishes(config)]
+        warnings = [_set(fd, by_id.get(wish.control), wish) for wish in _wishes(config)]
         for name, value in config.controls.items():
             if name in controls:
-                troubles.append(_set(fd, controls[name], _Wish(name, controls[name].id, value)))
+                warnings.append(_set(fd, controls[name], _Wish(name, controls[name].id, value)))
             else:
                 near = difflib.get_close_matches(name, controls, n=1, cutoff=0.5)
                 hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(controls) or 'none'}"
-                troubles.append(f"it has no control '{name}'; {hint}")
-    return tuple(trouble for trouble in troubles if trouble)
+                warnings.append(f"it has no control '{name}'; {hint}")
+    return tuple(trouble for trouble in warnings if trouble)
 
 
 def _wishes(config: Config) -> list[_Wish]:

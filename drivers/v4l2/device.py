@@ -42,17 +42,17 @@ class V4l2Device:
             raise CameraError(f"{self.description}: cannot be opened for streaming; is another program using it?")
         try:
             self._negotiate(config, size, formats)
-            self._troubles += apply_controls(path, config)
+            self._warnings += apply_controls(path, config)
         except OSError as error:
             self._capture.release()
             raise CameraError(f"{self.description}: went away while it was opened ({error.strerror})") from error
         self._clock_trouble = ""
 
     @property
-    def troubles(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """As of ``Device``."""
         clock = (self._clock_trouble,) if self._clock_trouble else ()
-        return tuple(f"{self.description}: {trouble}" for trouble in (*self._troubles, *clock))
+        return tuple(f"{self.description}: {trouble}" for trouble in (*self._warnings, *clock))
 
     def read(self) -> Shot | None:
         """As of ``Device``."""
@@ -85,19 +85,19 @@ class V4l2Device:
         capture.set(cv2.CAP_PROP_FPS, config.fps)
         self.size = (int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
         self.frame_hz = max(0.0, float(capture.get(cv2.CAP_PROP_FPS)))
-        self._troubles: tuple[str, ...] = ()
+        self._warnings: tuple[str, ...] = ()
         given = ioctls.fourcc_text(int(capture.get(cv2.CAP_PROP_FOURCC)))
         if config.fourcc and given != config.fourcc:
             more = ", ..." if len(formats) > SHOWN_FORMATS else ""
             offer = f"; it offers {', '.join(formats[:SHOWN_FORMATS])}{more}" if formats else ""
-            self._troubles += (f"asked for pixels as {config.fourcc}, it gives {given}{offer}",)
+            self._warnings += (f"asked for pixels as {config.fourcc}, it gives {given}{offer}",)
         if abs(self.frame_hz - config.fps) > RATE_TOLERANCE * config.fps:
-            self._troubles += (
+            self._warnings += (
                 f"asked for {config.fps:g} images/s, it gives {self.frame_hz:g} at this size and format",
             )
 
     def _stamp_ns(self, arrived_ns: int) -> int:
-        """When the buffer was filled, as the kernel says; else when it arrived here, which ``troubles`` tells."""
+        """When the buffer was filled, as the kernel says; else when it arrived here, which ``warnings`` tells."""
         stamp_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
         if -AHEAD_S * 1e9 < arrived_ns - stamp_ns < OLDEST_STAMP_S * 1e9:
             self._clock_trouble = ""

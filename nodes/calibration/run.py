@@ -91,12 +91,12 @@ class Gathering:
         threads = [threading.Thread(target=work, args=(s,), name="calibration", daemon=True) for s in sources]
         for thread in threads:
             thread.start()
-        deadline, told_at = time.monotonic() + seconds, 0.0
+        deadline, last_sent = time.monotonic() + seconds, 0.0
         while not stop and not errors and time.monotonic() < deadline and any(t.is_alive() for t in threads):
             time.sleep(0.1)
-            if time.monotonic() - told_at < TELL_S:
+            if time.monotonic() - last_sent < TELL_S:
                 continue
-            told_at = time.monotonic()
+            last_sent = time.monotonic()
             lacks = self.lacks(rig=rig) if len(self.cameras) == len(sources) else ["waiting for images"]
             kept = {name: len(views.kept) for name, views in list(self.cameras.items())}
             _log.info("views", **kept, lacking="; ".join(lacks) or "nothing")

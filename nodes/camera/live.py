@@ -1,4 +1,4 @@
-"""The camera node over a camera: posed frames go out, and its troubles with them.
+"""The camera node over a camera: posed frames go out, and its warnings with them.
 
 Frames of a live camera are dropped rather than held back; those of a video file wait for their readers.
 """
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
         """A camera with poses, such as ``semantic_mapper.drivers.poses.PosedCamera``."""
 
         @property
-        def troubles(self) -> tuple[str, ...]:
+        def warnings(self) -> tuple[str, ...]:
             """As of ``Camera``."""
             ...
 
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
             ...
 
         @property
-        def turned_at(self) -> float:
+        def last_poll_time(self) -> float:
             """As of ``Camera``."""
             ...
 
@@ -70,7 +70,7 @@ def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCame
     """Publish a camera's frames until it ends (a video) or somebody asks to stop.
 
     Raises:
-        ConfigError: of the camera or of the poses: unknown keys, wrong values; or the node is to be started anew, and
+        ConfigError: of the camera or of the poses: unknown keys, wrong values; or the node is to be restarted, and
             the world of its poses would be another one then.
         CameraError: the camera can never work with its config, or was not there within ``open_s``.
         DependencyError: the kind needs something that is not installed.
@@ -81,15 +81,18 @@ def run_live_camera(context: NodeContext, options: CameraOptions, live: LiveCame
     policy = "block" if make_source(live).can_wait else "drop"  # mistakes in the config are found here, before any wait
     if context.restartable:
         check_world(context.name, live)
-    with Publisher(context.endpoint(context.name), policy=policy) as publisher, _Teller(context, publisher) as teller:
+    with (
+        Publisher(context.endpoint(context.name), policy=policy) as publisher,
+        _StatusReporter(context, publisher) as reporter,
+    ):
         context.heartbeat.ready()  # a camera may be plugged in much later
         with ExitStack() as stack:
-            source = _open(context, live, teller, stack)
+            source = _open(context, live, reporter, stack)
             if source is None:
                 return
             _listeners(context, options, publisher)
-            with teller.watching_driver():
-                _publish(context, options, publisher, teller, source)
+            with reporter.watching_driver():
+                _publish(context, options, publisher, reporter, source)
         context.heartbeat.ending()
         drain(context, publisher)
 
@@ -98,7 +101,7 @@ def check_world(name: str, live: LiveCamera) -> None:
     """A camera that tracks itself must not come back: its next process would put frames where they do not belong.
 
     Raises:
-        ConfigError: it is to be started anew.
+        ConfigError: it is to be restarted.
     """
     from semantic_mapper.drivers.poses.config import begins_world
     from semantic_mapper.drivers.poses.sources import read_pose_config
@@ -107,7 +110,7 @@ def check_world(name: str, live: LiveCamera) -> None:
     poses = read_pose_config({key: value for key, value in config.items() if key != "checks"}, where)
     if begins_world(poses):
         raise ConfigError(
-            f"node '{name}' is to be started anew where it fails, but poses of kind '{poses.kind}' begin in "
+            f"node '{name}' is to be restarted where it fails, but poses of kind '{poses.kind}' begin in "
             'another world then, and its frames would spoil the map: set restart = "never" (the launch ends then, and '
             "the map is written), or take poses from a topic or a board"
         )
@@ -154,7 +157,7 @@ def table_of(named: str | dict[str, Any], where: str) -> tuple[dict[str, Any], s
     return (read_toml(Path(named)), named) if named else ({}, where)
 
 
-def _open(context: NodeContext, live: LiveCamera, teller: _Teller, stack: ExitStack) -> LiveSource | None:
+def _open(context: NodeContext, live: LiveCamera, reporter: _StatusReporter, stack: ExitStack) -> LiveSource | None:
     """An open source, which ``stack`` closes; None where a stop request came first.
 
     Raises:
@@ -164,16 +167,16 @@ def _open(context: NodeContext, live: LiveCamera, teller: _Teller, stack: ExitSt
     while not context.stop:
         source = make_source(live)
         try:
-            with teller.watching_driver():
+            with reporter.watching_driver():
                 stack.enter_context(source)
         except CameraError as error:
             if live.open_s and time.monotonic() - began > live.open_s:
                 raise
             if str(error) != told:
                 _log.warning("camera_not_open", reason=str(error))
-            told = teller.waiting_for = str(error)
+            told = reporter.waiting_for = str(error)
         else:
-            teller.watch(source)
+            reporter.watch(source)
             return source
         failures += 1
         _pause(context, backoff_s(failures, FIRST_PAUSE_S, MAX_PAUSE_S))
@@ -195,7 +198,7 @@ def _listeners(context: NodeContext, options: CameraOptions, publisher: Publishe
 
 
 def _publish(
-    context: NodeContext, options: CameraOptions, publisher: Publisher, teller: _Teller, source: LiveSource
+    context: NodeContext, options: CameraOptions, publisher: Publisher, reporter: _StatusReporter, source: LiveSource
 ) -> None:
     from semantic_mapper.transport.codec import encode, encode_frame
     from semantic_mapper.transport.messages import EndOfStream
@@ -210,8 +213,8 @@ def _publish(
                 break
             if not _send_frame(context, options, publisher, encode_frame(frame)):
                 break
-            teller.sent(frame)
-            if options.max_frames and teller.published >= options.max_frames:
+            reporter.sent(frame)
+            if options.max_frames and reporter.published >= options.max_frames:
                 break
         reason, detail = ("stopped" if context.stop else "end"), ""
     except CameraError as error:
@@ -219,8 +222,8 @@ def _publish(
         raise
     finally:
         if reason != "error" or not context.restartable:  # else the stream goes on with the process after this one
-            _send_end(publisher, encode(EndOfStream(context.name, reason, teller.published, detail)))
-        _log.info("published", frames=teller.published, reason=reason)
+            _send_end(publisher, encode(EndOfStream(context.name, reason, reporter.published, detail)))
+        _log.info("published", frames=reporter.published, reason=reason)
 
 
 def _send_frame(context: NodeContext, options: CameraOptions, publisher: Publisher, parts: Parts) -> bool:
@@ -250,7 +253,7 @@ def _send_end(publisher: Publisher, parts: Parts) -> None:
         publisher.publish(parts, SEND_SLICE_S)
 
 
-class _Teller:
+class _StatusReporter:
     """Says once a second how the camera is, whatever the camera does, and passes the stop request on to it.
 
     To the launcher it tells turns of the main loop for as long as no call into the driver hangs.
@@ -265,7 +268,7 @@ class _Teller:
         self._first_seq = self._last_seq = -1
         self._sent_at: float | None = None
         self._in_driver = False
-        self._turned_at = 0.0
+        self._last_poll_time = 0.0
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="status", daemon=True)
 
@@ -303,29 +306,29 @@ class _Teller:
         self._sent_at = time.monotonic()
 
     def _run(self) -> None:
-        told_at = 0.0
+        last_sent = 0.0
         while not self._ended.wait(POLL_S):
             source = self._source
             if self._comes_round(source):
                 self._context.heartbeat.turn()
             if self._context.stop and source is not None:
                 source.stop()
-            if time.monotonic() - told_at >= STATUS_PERIOD_S:
-                told_at = time.monotonic()
+            if time.monotonic() - last_sent >= STATUS_PERIOD_S:
+                last_sent = time.monotonic()
                 self._tell(self._state())
 
     def _comes_round(self, source: LiveSource | None) -> bool:
         if not self._in_driver:
             return True
-        before, self._turned_at = self._turned_at, source.turned_at if source is not None else 0.0
-        return self._turned_at != before
+        before, self._last_poll_time = self._last_poll_time, source.last_poll_time if source is not None else 0.0
+        return self._last_poll_time != before
 
     def _state(self) -> NodeState:
         if self._context.stop:
             return "stopping"
         if self._source is None:
             return "starting"
-        return "degraded" if self._source.troubles else "running"
+        return "degraded" if self._source.warnings else "running"
 
     def _tell(self, state: NodeState) -> None:
         from semantic_mapper.transport.codec import encode
@@ -334,11 +337,11 @@ class _Teller:
         counters = {"published": self.published}
         if self._first_seq >= 0:
             counters["missing"] = self._last_seq - self._first_seq + 1 - self.published
-        troubles = (self.waiting_for,) if self.waiting_for else ()
+        warnings = (self.waiting_for,) if self.waiting_for else ()
         if self._source is not None:
             counters |= self._source.counters
-            troubles = self._source.troubles
+            warnings = self._source.warnings
         ages = {} if self._sent_at is None else {"frame": time.monotonic() - self._sent_at}
-        status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, troubles)
+        status = Status(self._context.name, state, time.monotonic_ns(), counters, ages, warnings)
         with suppress(TransportError):  # a reader has no room for it: the next status says what this one did
             self._publisher.publish(encode(status), 0.0)

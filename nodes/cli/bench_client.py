@@ -93,8 +93,8 @@ def _questions(client: MapClient, eyes: Float64, seed: int) -> dict[str, Callabl
     def ray() -> int:
         return int(rng.choice(rays))
 
-    def on_the_way(i: int, share: float) -> Float64:
-        return origins[i] + share * float(hits.distance_m[i]) * directions[i]
+    def on_the_way(i: int, fraction: float) -> Float64:
+        return origins[i] + fraction * float(hits.distance_m[i]) * directions[i]
 
     def box() -> object:
         centre = origins[ray()]

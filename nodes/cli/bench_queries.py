@@ -114,7 +114,9 @@ class _Log:
         by_kind = {kind: [one.ms for one in self.asked if one.kind == kind] for kind in KINDS}
         by_kind = {kind: values for kind, values in by_kind.items() if values}
         turns = {"quiet": np.array(self.quiet_steps), "asked": np.array(self.asked_steps)}
-        p50, p95 = ({name: np.percentile(rows, share, axis=0) for name, rows in turns.items()} for share in (50, 95))
+        p50, p95 = (
+            {name: np.percentile(rows, fraction, axis=0) for name, rows in turns.items()} for fraction in (50, 95)
+        )
         return {
             "asked_hz": round(len(self.asked) / self.asked_s, 1),
             "asked": {kind: len(values) for kind, values in by_kind.items()},

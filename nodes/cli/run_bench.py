@@ -124,12 +124,12 @@ def run_map(request: BenchRequest, output: Output) -> dict[str, Any]:
         f"{found['rooms']} rooms, {found['minutes']:g} minutes at {found['hz']:g} Hz: a step {found['step_p50_ms']} ms "
         f"(p50), {found['step_p95_ms']} ms (p95), {found['cpu_p50_ms']} ms of processor time; {_slopes(found)}"
     )
-    growth, share = found["rss_growth_mb"], found["rss_growth_percent_of_limit"]
+    growth, fraction = found["rss_growth_mb"], found["rss_growth_percent_of_limit"]
     output.print(
         f"{found['blocks']} blocks, at most {found['blocks_in_memory_at_most']} in memory; {found['store_mb']} MB on "
         f"disk; {found['rss_last_minute_mb']} MB resident, at most {found['rss_max_mb']}"
         + ("" if growth is None else f", {growth:+g} MB since minute 5")
-        + ("" if share is None else f" ({share:+g} % of the limit)")
+        + ("" if fraction is None else f" ({fraction:+g} % of the limit)")
     )
     limit = f"it has {found['memory_mb']} MB" if found["memory_mb"] else "it has no limit"
     output.print(

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import structlog
 
-from semantic_mapper.config import MapperConfig, Quality, check_quality, convert_config, read_toml
+from semantic_mapper.config import MapperConfig, Quality, check_quality, convert_config, read_toml, rename_settings
 from semantic_mapper.errors import LogError, SemanticMapperError
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.mapper import Mapper
@@ -130,7 +130,7 @@ def mapper_config(
     Raises:
         ConfigError: see ``load_config`` and ``check_quality``.
     """
-    data = read_toml(path) if path else {}
+    data = rename_settings(read_toml(path) if path else {}, MapperConfig, str(path))
     config = convert_config(data, MapperConfig, str(path))
     check_quality(data, quality or config.quality, str(path))
     if voxel_size_m is not None:

@@ -10,9 +10,9 @@ from typing import Any
 
 from semantic_mapper import __version__
 from semantic_mapper.benchmark.config import SuiteConfig, settings_digest, suite_seeds
-from semantic_mapper.benchmark.contestants import load_contestants
+from semantic_mapper.benchmark.entries import load_entries
 from semantic_mapper.benchmark.figures import compare, draw_fit_curves, map_figures, view_figures
-from semantic_mapper.benchmark.protocols import Contestant
+from semantic_mapper.benchmark.protocols import Entry
 from semantic_mapper.benchmark.records import MapRecord
 from semantic_mapper.benchmark.run import Progress, room_records, run_suite, sheet_rows
 from semantic_mapper.benchmark.store import RecordStore
@@ -62,16 +62,16 @@ def run_suite_verb(
     paths = list(weights) or ([] if kinds else [default_checkpoint_path()])
     out = json_file or Path("runs") / f"{_file_stem(suite)}.json"
     prepare_file(out)
-    contestants = load_contestants(paths, kinds)
+    entries = load_entries(paths, kinds)
     store, pictures = RecordStore(out.with_suffix(".jsonl")), out.with_suffix(".views")
     with StopRequest() as stop:
         with frame_progress("benchmark", None, unit="%") as bar:
             bar.start(100)
-            run_suite(suite, contestants, store, pictures, lambda p: _show(bar, p), lambda: stop)
+            run_suite(suite, entries, store, pictures, lambda p: _show(bar, p), lambda: stop)
         if maps and not stop:
             with frame_progress("map the rooms", None, unit="maps") as bar:
-                _map_rooms(suite, contestants, paths, store, bar, stop)
-        found = _collect(suite, contestants, store, maps)
+                _map_rooms(suite, entries, paths, store, bar, stop)
+        found = _collect(suite, entries, store, maps)
         write_json(out, found)
         table, lines = suite_table(found), difference_lines(found)
         output.print(table)
@@ -80,7 +80,7 @@ def run_suite_verb(
         output.print(f"written to {out}")
         if reason := cannot_draw():
             output.print(f"no pictures: {reason}")
-        pictures = [] if reason else list(_draw(suite, contestants, store, found, out))
+        pictures = [] if reason else list(_draw(suite, entries, store, found, out))
         for picture in pictures:
             output.print(f"picture: {picture}")
         write_suite_report(page := out.with_suffix(".html"), table, lines, pictures, found)
@@ -91,11 +91,11 @@ def run_suite_verb(
 
 
 def _draw(
-    suite: SuiteConfig, contestants: Sequence[Contestant], store: RecordStore, found: Mapping[str, Any], out: Path
+    suite: SuiteConfig, entries: Sequence[Entry], store: RecordStore, found: Mapping[str, Any], out: Path
 ) -> Iterator[Path]:
     """Write the contact sheet, and the curves of what was fitted; yields the files."""
-    if rows := sheet_rows(suite, contestants, store, out.with_suffix(".views")):
-        names = [c.name for c in contestants]
+    if rows := sheet_rows(suite, entries, store, out.with_suffix(".views")):
+        names = [c.name for c in entries]
         write_picture(sheet := out.with_suffix(".png"), draw_sheet(rows, names, ROOMS, title=found["title"]))
         yield sheet
     figures = {name: entry["figures"] for name, entry in found["weights"].items()}
@@ -117,7 +117,7 @@ def _show(bar: FrameProgress, progress: Progress) -> None:
 
 def _map_rooms(
     suite: SuiteConfig,
-    contestants: Sequence[Contestant],
+    entries: Sequence[Entry],
     paths: Sequence[Path],
     store: RecordStore,
     bar: FrameProgress,
@@ -129,30 +129,30 @@ def _map_rooms(
     )
 
     settings, seeds = settings_digest(suite, "map"), suite_seeds(suite)
-    bar.start(len(seeds) * len(contestants))
+    bar.start(len(seeds) * len(entries))
     for seed in seeds:
-        for contestant, path in zip(contestants, paths, strict=True):
+        for entry, path in zip(entries, paths, strict=True):
             if stop:
                 return
-            if store.find(MapRecord, settings, contestant.digest, seed) is None:
-                store.add(map_room(seed, path, contestant.digest, suite))
+            if store.find(MapRecord, settings, entry.digest, seed) is None:
+                store.add(map_room(seed, path, entry.digest, suite))
             bar.advance()
 
 
-def _collect(suite: SuiteConfig, contestants: Sequence[Contestant], store: RecordStore, maps: bool) -> dict[str, Any]:
+def _collect(suite: SuiteConfig, entries: Sequence[Entry], store: RecordStore, maps: bool) -> dict[str, Any]:
     """All figures of the run as plain data."""
     seeds = suite_seeds(suite)
-    records = {c.name: room_records(suite, c, store) for c in contestants}
+    records = {c.name: room_records(suite, c, store) for c in entries}
     found: dict[str, Any] = {"title": _title(suite, len(seeds)), "suite": to_plain(suite), "weights": {}}
-    for contestant in contestants:
-        field = contestant.field
-        found["weights"][contestant.name] = {
-            "file": contestant.file or None,
-            "digest": contestant.digest,
+    for entry in entries:
+        field = entry.field
+        found["weights"][entry.name] = {
+            "file": entry.file or None,
+            "digest": entry.digest,
             "kind": field.kind,
             "parameters": sum(p.numel() for p in field.parameters()),
-            "figures": view_figures(records[contestant.name]),
-            "map": map_figures(_map_records(suite, contestant, store)) if maps else None,
+            "figures": view_figures(records[entry.name]),
+            "map": map_figures(_map_records(suite, entry, store)) if maps else None,
         }
     pairs = combinations(records, 2)
     found["differences"] = [
@@ -165,9 +165,9 @@ def _collect(suite: SuiteConfig, contestants: Sequence[Contestant], store: Recor
     return found
 
 
-def _map_records(suite: SuiteConfig, contestant: Contestant, store: RecordStore) -> list[MapRecord]:
+def _map_records(suite: SuiteConfig, entry: Entry, store: RecordStore) -> list[MapRecord]:
     settings = settings_digest(suite, "map")
-    records = (store.find(MapRecord, settings, contestant.digest, seed) for seed in suite_seeds(suite))
+    records = (store.find(MapRecord, settings, entry.digest, seed) for seed in suite_seeds(suite))
     return [record for record in records if record is not None]
 
 

@@ -68,7 +68,7 @@ class LaunchView:
         return bool(launch) and launch[-1].state == "ended"
 
     def to_json(self) -> dict[str, Any]:
-        """``launch`` and ``nodes`` by name, each with state, figures of the process, rates, totals, ages, troubles."""
+        """``launch`` and ``nodes`` by name, each with state, figures of the process, rates, totals, ages, warnings."""
         rows = {name: _describe(history) for name, history in self._history.items()}
         return {"launch": rows.pop(STATUS_SOCKET, None), "nodes": dict(sorted(rows.items()))}
 
@@ -87,9 +87,9 @@ class LaunchView:
         rows = {**shown["nodes"], **({STATUS_SOCKET: shown["launch"]} if shown["launch"] else {})}
         for name, row in rows.items():
             table.add_row(name, *(show(row) for show in _COLUMNS.values()))
-        troubles = [f"{name}: {t}" for name, row in rows.items() for t in row["degraded"] if name != STATUS_SOCKET]
-        if troubles:
-            table.caption, table.caption_justify = Text("\n".join(map(visible, troubles))), "left"
+        warnings = [f"{name}: {t}" for name, row in rows.items() for t in row["degraded"] if name != STATUS_SOCKET]
+        if warnings:
+            table.caption, table.caption_justify = Text("\n".join(map(visible, warnings))), "left"
         return table
 
 

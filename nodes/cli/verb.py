@@ -1,4 +1,4 @@
-"""What all verbs of the command line share: process set-up, one clear line for an error, exit codes.
+"""What all verbs of the command line fraction: process set-up, one clear line for an error, exit codes.
 
 0 done; 1 failed; 2 wrong usage; 130 after Ctrl-C, 143 after SIGTERM (what was done so far is written where a verb says
 so); 1 too where a result is negative (``doctor`` finds something missing).

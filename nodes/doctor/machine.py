@@ -76,9 +76,9 @@ def _packages() -> Iterator[Check]:
             missing.append(name)
     if missing:
         yield Check("packages", "bad", f"missing: {', '.join(missing)}", "make setup")
-    elif other:
+    if other:
         yield Check("packages", "bad", "; ".join(other), "make setup")
-    else:
+    if not missing and not other:
         yield Check("packages", "ok", ", ".join(found))
 
 

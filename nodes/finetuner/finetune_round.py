@@ -26,7 +26,7 @@ class FinetuneRound:
         parent: Weights in use.
         parent_digest: SHA-256 of their file, hexadecimal.
         config: Of the round.
-        share: Of a core, or of the GPU, in 0..1.
+        fraction: Of a core, or of the GPU, in 0..1.
         idle: Learn only while nobody else wants the processor.
     """
 
@@ -36,7 +36,7 @@ class FinetuneRound:
         parent: Checkpoint,
         parent_digest: str,
         config: OnlineConfig,
-        share: float,
+        fraction: float,
         *,
         idle: bool,
     ) -> None:
@@ -44,7 +44,7 @@ class FinetuneRound:
         self.step = 0
         self.result: OnlineResult | None = None
         self.failure = "it failed; see the log"
-        self._share = share
+        self._share = fraction
         self._clock = time.process_time if config.finetune.device == "cpu" else time.monotonic
         self._worked_from = self._clock()
         self._cancelled = threading.Event()

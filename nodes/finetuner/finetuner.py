@@ -207,7 +207,7 @@ class Finetuner:
             self._current,
             self._in_use.digest,
             self.config,
-            self.options.share,
+            self.options.cpu_fraction,
             idle=self.options.niceness == MAX_NICENESS,
         )
 

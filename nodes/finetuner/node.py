@@ -42,7 +42,7 @@ def run_finetuner(context: NodeContext, options: FinetunerOptions) -> None:
         LosslessSubscriber(endpoint, ("keyframe",), hwm=MAX_WAITING) as labels,
         LosslessSubscriber(context.endpoint(options.mapper), ("in_use",)) as mapper,
     ):
-        _log.info("ready", weights=path.name, labels=endpoint, share=options.share)
+        _log.info("ready", weights=path.name, labels=endpoint, fraction=options.cpu_fraction)
         finetuner = Finetuner(context, options, config, publisher, labels, mapper, start, digest)
         context.heartbeat.ready()
         finetuner.run()

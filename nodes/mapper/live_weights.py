@@ -72,7 +72,7 @@ def taking_weights(
         yield None
         return
     with LosslessSubscriber(context.endpoint(options.learner), ("weights",), hwm=_WAITING) as offers:
-        weights = LiveWeights(context, bundle, Path(options.out) / FOLDER, options.least_agreement, publisher, offers)
+        weights = LiveWeights(context, bundle, Path(options.out) / FOLDER, options.min_map_agreement, publisher, offers)
         try:
             yield weights
         finally:
@@ -86,7 +86,7 @@ class LiveWeights:
         context: Of the mapper's node.
         bundle: What the mapper was started with.
         folder: For the files of what it is offered.
-        least_agreement: With what the map is sure of, in 0..1; less is refused.
+        min_map_agreement: With what the map is sure of, in 0..1; less is refused.
         publisher: Reports which weights are in use.
         offers: Of the learner.
     """
@@ -96,14 +96,14 @@ class LiveWeights:
         context: NodeContext,
         bundle: Mapper,
         folder: Path,
-        least_agreement: float,
+        min_map_agreement: float,
         publisher: Publisher,
         offers: LosslessSubscriber,
     ) -> None:
         self._context = context
         self._bundle = bundle
         self._folder = folder
-        self._least_agreement = least_agreement
+        self._least_agreement = min_map_agreement
         self._publisher = publisher
         self._offers = offers
         self._lock = threading.Lock()  # of what requests see and change: versions, counts, the one requested
@@ -256,7 +256,7 @@ class LiveWeights:
         agreement = task.trial.agreement
         if agreement is not None and agreement < self._least_agreement:
             found = f"where the map is sure of itself, they agree with {agreement:.2f} of it"
-            wanted = f"at least {self._least_agreement:g} is wanted (least_agreement)"
+            wanted = f"at least {self._least_agreement:g} is wanted (min_map_agreement)"
             self._end_task(task, f"{found}; {wanted}", contradicts=True)
             return
         task.trial.exchange()

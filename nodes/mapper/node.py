@@ -179,7 +179,7 @@ class _Mapper:
                 self._queries.follow()
             if self._autosave is not None:
                 self._autosave.follow()
-            self._tell_status("running")
+            self._publish_status("running")
             if time.monotonic() - self._last_trim > TRIM_PERIOD_S:
                 give_back_freed_memory()
                 self._last_trim = time.monotonic()
@@ -195,7 +195,7 @@ class _Mapper:
                 _log.warning("nothing_to_write", reason="no stream has begun")
                 return
             self._session = MapSession(self._bundle, stream_labels=None)  # of the map that was saved before a restart
-        self._tell_status("stopping", now=True)
+        self._publish_status("stopping", now=True)
         if self._autosave is not None:
             self._autosave.close()
         self._correction.finish(self._session, lambda: bool(self._context.stop), self._while_stopping)
@@ -206,10 +206,10 @@ class _Mapper:
         out = Path(self._options.out)
         summary = finish_session(self._session, out, self._ended_by, self._taken_up)
         _log.info("map_written", out=str(out), **summary["frames"])
-        self._tell_status("ended", now=True)
+        self._publish_status("ended", now=True)
 
     def _while_stopping(self) -> None:
-        self._tell_status("stopping")
+        self._publish_status("stopping")
         if self._queries is not None:
             self._queries.follow()
 
@@ -293,7 +293,7 @@ class _Mapper:
             self._session.count_dropped(missed)
         return True
 
-    def _tell_status(self, state: NodeState, *, now: bool = False) -> None:
+    def _publish_status(self, state: NodeState, *, now: bool = False) -> None:
         from semantic_mapper.transport.codec import encode
         from semantic_mapper.transport.messages import Status
 

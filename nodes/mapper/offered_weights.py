@@ -56,6 +56,6 @@ def _read(path: Path, like: Checkpoint) -> Checkpoint:
     if not encode_alike(checkpoint.model, like.model):
         raise WeightsError(
             f"{path.name}: its image encoder is another one, so that keyframes would have to be encoded again; "
-            "finetune with resting_share = 1"
+            "finetune with frozen_encoder_fraction = 1"
         )
     return checkpoint

@@ -101,7 +101,7 @@ class QueryService:
         self._answers = Answers(self._mirror, correction, weights)
         self._copied_version = 0
         self._copy_again_at = 0.0
-        self._asked_at = -ASKED_LATELY_S  # never; monotonic seconds
+        self._last_request = -ASKED_LATELY_S  # never; monotonic seconds
         self._awaited_version = 0  # that requests after a pause wait for
         self._catch_up_until = 0.0
         self._map_is_busy = False  # a snapshot did not come in time, or cannot
@@ -131,7 +131,7 @@ class QueryService:
     @property
     def asked(self) -> bool:
         """Whether anybody has ever asked about the map."""
-        return self._asked_at >= 0
+        return self._last_request >= 0
 
     def follow(self) -> None:
         """Copy what has changed for the next snapshot; for the thread that changes the map, after each step.
@@ -139,7 +139,7 @@ class QueryService:
         Costs nothing while nobody asks, and never waits.
         """
         now = time.monotonic()
-        wanted = bool(self._catching_up) or now - self._asked_at <= ASKED_LATELY_S
+        wanted = bool(self._catching_up) or now - self._last_request <= ASKED_LATELY_S
         if not wanted or not self._snapshot.done() or self._copied_version == self._map.version or not self.alive:
             return
         if self._copied_version >= self._awaited_version and now < self._copy_again_at:
@@ -207,7 +207,7 @@ class QueryService:
                 self._server.wake()
 
     def _serve(self) -> None:
-        _log.info("questions_welcome", endpoint=self.endpoint)
+        _log.info("queries_ready", endpoint=self.endpoint)
         while not self._closed.is_set():
             self._server.wait(_CATCH_UP_POLL_S if self._catching_up else _POLL_S)
             self._send_finished()
@@ -265,7 +265,7 @@ class QueryService:
         """Pass on the requests that wait for a snapshot, once it is there or will not come in time."""
         if not self._catching_up or self._snapshot_lags():
             return
-        self._asked_at = time.monotonic()
+        self._last_request = time.monotonic()
         while self._catching_up:
             self._long_queries.submit(self._work, self._catching_up.popleft())
 
@@ -301,10 +301,10 @@ class QueryService:
     def _note_question(self) -> None:
         """After a pause, requests wait until there is a snapshot of the map as it is now."""
         now = time.monotonic()
-        if now - self._asked_at > ASKED_LATELY_S:
+        if now - self._last_request > ASKED_LATELY_S:
             self._awaited_version = self._map.version
             self._catch_up_until = now + (CATCH_UP_S if self._mirror.snapshot().version else FIRST_CATCH_UP_S)
-        self._asked_at = now
+        self._last_request = now
 
     def _snapshot_lags(self) -> bool:
         """Whether requests should wait for a newer snapshot."""

@@ -63,7 +63,7 @@ def forbid(context: NodeContext, why: str) -> bool:
 def keep_earlier(context: NodeContext, path: Path) -> None:
     """Move the results of an earlier launch into a folder of their own, before others take their place.
 
-    Live frames do not come again, so that their map is not to be lost to a launch that is started anew.
+    Live frames do not come again, so that their map is not to be lost to a launch that is restarted.
 
     Args:
         context: Of a mapper that has written nothing yet.

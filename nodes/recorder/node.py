@@ -51,9 +51,9 @@ def run_recorder(context: NodeContext, options: RecorderOptions) -> None:
     from semantic_mapper.transport.sockets import Publisher
 
     with ExitStack() as stack:
-        teller = StatusTeller(context.name, stack.enter_context(Publisher(context.endpoint(context.name))))
-        recorder = record(context, options, teller.follow)
-        teller.tell(recorder, "ended")
+        reporter = StatusReporter(context.name, stack.enter_context(Publisher(context.endpoint(context.name))))
+        recorder = record(context, options, reporter.follow)
+        reporter.tell(recorder, "ended")
 
 
 def record(context: NodeContext, options: RecorderOptions, follow: Callable[[Recorder], bool]) -> Recorder:
@@ -208,7 +208,7 @@ class Recorder:
             self._cameras |= info.cameras
             if self.recording is None:
                 self._begin(info)
-            elif bytes(parts[1]) not in self._told:  # of another camera, or of one that was started anew
+            elif bytes(parts[1]) not in self._told:  # of another camera, or of one that was restarted
                 self.recording.announce(parts, self._calibration())
             self._told.add(bytes(parts[1]))
         elif topic.name != "end":
@@ -316,7 +316,7 @@ def _last_frames(path: Path) -> dict[str, int]:
     return found
 
 
-class StatusTeller:
+class StatusReporter:
     """Publishes how a recorder is, about once a second.
 
     Args:
@@ -327,11 +327,11 @@ class StatusTeller:
     def __init__(self, node: str, publisher: Publisher) -> None:
         self._node = node
         self._publisher = publisher
-        self._told_at = 0.0
+        self._last_sent = 0.0
 
     def follow(self, recorder: Recorder) -> bool:
         """Tell, if it is time to; it is never enough."""
-        if time.monotonic() - self._told_at >= STATUS_PERIOD_S:
+        if time.monotonic() - self._last_sent >= STATUS_PERIOD_S:
             self.tell(recorder, "running")
         return False
 
@@ -340,7 +340,7 @@ class StatusTeller:
         from semantic_mapper.transport.codec import encode
         from semantic_mapper.transport.messages import Status
 
-        self._told_at = time.monotonic()
+        self._last_sent = time.monotonic()
         counters = {"missed": recorder.gaps.missed, "rejected": recorder.rejected, "unpacked": recorder.unpacked}
         degraded: tuple[str, ...] = ()
         if (r := recorder.recording) is not None:

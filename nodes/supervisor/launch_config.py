@@ -261,7 +261,7 @@ def _fill_in(value: Any, values: Mapping[str, Value], where: str) -> Any:
 
 
 def _name_start(values: Mapping[str, Value]) -> str:
-    """The time, and a number where something is called so already: clocks are set back, or begin anew each day."""
+    """The time, and a number where something is called so already: clocks are set back, or begin again each day."""
     time = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
     places = [value for value in values.values() if isinstance(value, str) and "{now}" in value]
     names = (time, *(f"{time}-{n}" for n in range(1, 1000)))

@@ -20,8 +20,8 @@ def bench_depthless(weights: Path | None, config: MapperConfig, frames: int = 24
     """Map a validation room with depth in all frames, in the first quarter of them, and in none.
 
     Returns:
-        A row each: frames with depth, points, median distance of these to the true surface in metres, share of them
-        within 5 cm of it (``precise``), and share of the surface within 5 cm of a point (``complete``).
+        A row each: frames with depth, points, median distance of these to the true surface in metres, fraction of them
+        within 5 cm of it (``precise``), and fraction of the surface within 5 cm of a point (``complete``).
     """
     seed = VALIDATION_SEEDS[0]
     path = CameraPathConfig(step_m=SequenceConfig().step_m)

@@ -88,7 +88,7 @@ def _pipeline(weights: Path | None, config: MapperConfig, axis: str, value: floa
     elif axis == "samples":
         plain["sampling"] |= {"guided": value, "free_space": 0}
     elif axis == "ray_share":
-        plain["render"]["share"] = value
+        plain["render"]["ray_fraction"] = value
     elif axis == "blocks":
         plain["voxel_map"]["memory_mb"] = plain["voxel_map"]["memory_mb"] or PAGED_MB
     bundle = Mapper.load(weights, convert_config(plain, MapperConfig, f"bench growth, {axis} {value:g}"))

@@ -56,8 +56,8 @@ class Timing:
 
     def scaled_to(self, rays: int) -> Timing:
         """The same rate for another number of rays."""
-        share = rays / self.rays
-        return Timing(rays, self.wall_s * share, self.cpu_s * share)
+        fraction = rays / self.rays
+        return Timing(rays, self.wall_s * fraction, self.cpu_s * fraction)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,7 +229,7 @@ def _sparse(quality: Quality, streaming: StreamingSRay, sources: EncodedViews, q
     prior = fill_holes(resize_depth(query, query.intrinsics))
     render = config.render
     scene = (streaming, sources, query.intrinsics, query.T_world_camera, prior, config.sampling)
-    return render_sparse_view(*scene, render.rays_per_chunk, query.rgb, render.share)
+    return render_sparse_view(*scene, render.rays_per_chunk, query.rgb, render.ray_fraction)
 
 
 def _eager(field: SRay, rays: RayBatch, sources: EncodedViews) -> FieldRender:

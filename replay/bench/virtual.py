@@ -24,7 +24,7 @@ from semantic_mapper.scenes import VALIDATION_SEEDS, CameraPathConfig, NoiseConf
 from semantic_mapper.types import Float32, PosedFrame, UInt8
 
 FRAMES = 40  # of a room
-FINER = {"share": 0.6, "guided": 8}  # twice the rays and samples of the "balanced" quality
+FINER = {"ray_fraction": 0.6, "guided": 8}  # twice the rays and samples of the "balanced" quality
 
 
 class Coverage(NamedTuple):
@@ -86,14 +86,14 @@ def bench_virtual(weights: Path | None, config: MapperConfig, rooms: int = 4, vi
 
     Returns:
         Plain data: coverage -> variant -> map mIoU and accuracy (a point without votes is wrong), mIoU at the points
-        that have votes without virtual views, share of points with votes, ECE of those, and CPU seconds of
+        that have votes without virtual views, fraction of points with votes, ECE of those, and CPU seconds of
         mapping, all rooms together.
     """
     config = with_quality(config)
     finer = with_fields(
         config,
         quality="custom",
-        render=with_fields(config.render, share=FINER["share"]),
+        render=with_fields(config.render, ray_fraction=FINER["ray_fraction"]),
         sampling=with_fields(config.sampling, guided=FINER["guided"]),
     )
     tallies: dict[str, dict[str, Tally]] = {c.name: {} for c in COVERAGES}

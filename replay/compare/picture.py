@@ -183,8 +183,8 @@ def _paint(
 
 
 def _blend(image: Float32, strength: Float32, color: tuple[int, int, int]) -> Float32:
-    share = np.clip(strength, 0, 1)[..., None]
-    return (image * (1 - share) + np.array(color, np.float32) * share).astype(np.float32)
+    fraction = np.clip(strength, 0, 1)[..., None]
+    return (image * (1 - fraction) + np.array(color, np.float32) * fraction).astype(np.float32)
 
 
 def _put_table(figure: Figure, comparison: Comparison, box: tuple[int, int, int, int]) -> None:

@@ -29,8 +29,8 @@ def compare_with_mesh(folder: Path, mesh: Path) -> dict[str, Any]:
             the replay's label set (0 and other ids are not counted).
 
     Returns:
-        ``median_m``, ``p95_m``: distance of map points to the mesh; ``on_mesh``: share of map points within 5 cm of it
-        (a map may hold more than the mesh); ``complete``: share of vertices with a map point within 5 cm;
+        ``median_m``, ``p95_m``: distance of map points to the mesh; ``on_mesh``: map points within 5 cm, of all
+        (a map may hold more than the mesh); ``complete``: fraction of vertices with a map point within 5 cm;
         ``mesh_miou``: labels at the vertices, null without labels.
 
     Raises:

@@ -43,7 +43,7 @@ class SurfaceMatch:
     nearest_name: NDArray[np.str_]
 
     def share(self, mask: NDArray[np.bool_], of: NDArray[np.bool_] | None = None) -> float:
-        """Share of the points ``of`` (all without it) that ``mask`` is true for; 0 of none."""
+        """Fraction of the points ``of`` (all without it) that ``mask`` is true for; 0 of none."""
         count = len(mask) if of is None else int(of.sum())
         return float(mask.sum()) / count if count else 0.0
 
@@ -106,7 +106,7 @@ class BlockMatch:
 
     @property
     def alone(self) -> float:
-        """Share of all blocks that one map has alone."""
+        """Fraction of all blocks that one map has alone."""
         count = len(self.only_a) + len(self.only_b)
         return count / max(count + len(self.common), 1)
 

@@ -1,4 +1,4 @@
-"""What all exporters of logs share: the frame they get, and files that are there only once they are whole."""
+"""What all exporters of logs fraction: the frame they get, and files that are there only once they are whole."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ExportFrame:
 
     Args:
         frame: Decoded.
-        rgb: Its colour image as the log holds it, packed anew as PNG where the log holds raw pixels.
+        rgb: Its colour image as the log holds it, packed again as PNG where the log holds raw pixels.
         depth_scale: Units a metre of its depth image as the log holds it; 0 where it has none, or float32.
     """
 

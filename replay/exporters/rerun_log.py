@@ -35,7 +35,7 @@ IMAGE_WIDTH = 320  # images are logged at this width: a recording of a long log 
 JPEG_QUALITY = 80
 FRUSTUM_M = 0.4  # how far before the camera its image stands in the world
 MAX_PATH = 4096  # positions kept of a camera's path; then every other one goes
-REGROWN = 1.5  # a map that is so much larger is looked at anew
+REGROWN = 1.5  # a map that is so much larger is looked at again
 FLUSH_S = 10.0
 
 
@@ -181,7 +181,7 @@ class RerunLog:
         return camera_path(camera)
 
     def _look_at(self, points: MapPoints, *, aged: bool) -> None:
-        """Set the view anew where the map is the first one, or has grown much."""
+        """Set the view again where the map is the first one, or has grown much."""
         if not len(points.xyz):
             return
         extent = float(np.linalg.norm(np.ptp(np.percentile(points.xyz, (1, 99), axis=0), axis=0)))

@@ -188,7 +188,7 @@ def read_rgb(file: Path) -> tuple[UInt8, EncodedImage]:
     except OSError as error:
         raise BadFrameError(file, f"cannot be read ({error.strerror or error})") from error
     except CodecError as error:
-        raise BadFrameError(file, f"{error}; export the image anew") from error
+        raise BadFrameError(file, f"{error}; export the image again") from error
     return rgb, EncodedImage(encoding, data)
 
 
@@ -239,7 +239,7 @@ def read_plane(
     except cv2.error as error:
         raise BadFrameError(file, f"the {what} image is damaged: {error}") from error
     if image is None:
-        raise BadFrameError(file, f"the {what} image is damaged or no image at all; export it anew")
+        raise BadFrameError(file, f"the {what} image is damaged or no image at all; export it again")
     wanted = "uint8 or uint16" if kind == "any" else kind
     if image.ndim != 2 or image.dtype.name not in wanted.split(" or "):
         channels = 1 if image.ndim == 2 else image.shape[2]

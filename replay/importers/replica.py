@@ -145,7 +145,7 @@ class ReplicaRecording:
                 return CameraIntrinsics(f, f, (width - 1) / 2, (height - 1) / 2, width, height)
             except FrameError as error:
                 raise ImportSourceError(f"{file}: {error}") from error
-        raise ImportSourceError(f"{self._folder / 'rgb'}: none of its images can be read; download them anew")
+        raise ImportSourceError(f"{self._folder / 'rgb'}: none of its images can be read; download them again")
 
     def _pose(self, name: int) -> Float64:
         file = self._folder / _TRAJECTORY

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LabelError, LogError
+from semantic_mapper.image_rotation import rotate_frame, rotate_intrinsics
 from semantic_mapper.replay.importers.base import (
     BadFrameError,
     ImportOptions,
@@ -24,12 +25,11 @@ from semantic_mapper.replay.importers.kitti360 import Kitti360Recording
 from semantic_mapper.replay.importers.replica import ReplicaRecording
 from semantic_mapper.replay.importers.scannet import ScanNetRecording
 from semantic_mapper.replay.importers.tum import TumRecording
-from semantic_mapper.replay.log.atomic_log import whole_log
+from semantic_mapper.replay.log.atomic_log import atomic_log
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.sequence import SUFFIX as LOG_SUFFIX
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.turning import turned_frame, turned_intrinsics
 from semantic_mapper.types import PosedFrame
 
 FORMATS: dict[str, Callable[[Path, ImportOptions], Recording]] = {
@@ -166,7 +166,7 @@ def import_recording(
     info, changed = _changes(src, recording.info, options, renames or {})
     packing = codec or CodecOptions(depth_scale=recording.depth_scale.units_per_m)
 
-    with whole_log(dst, info, options=packing, overwrite=overwrite) as writer:
+    with atomic_log(dst, info, options=packing, overwrite=overwrite) as writer:
         keep_files = codec is None and options.quarters % 4 == 0
         tally = _copy(recording, writer, total, changed, on_progress, keep_files=keep_files)
         frames = writer.frames
@@ -192,17 +192,17 @@ def _changes(
     src: Path, info: StreamInfo, options: ImportOptions, renames: Mapping[str, str]
 ) -> tuple[StreamInfo, Callable[[PosedFrame], PosedFrame]]:
     """What the log says of its frames, and what makes its frames of those of the recording."""
-    cameras = {camera: turned_intrinsics(k, options.quarters) for camera, k in info.cameras.items()}
+    cameras = {camera: rotate_intrinsics(k, options.quarters) for camera, k in info.cameras.items()}
     # What the log holds counts, not what the folder did.
     info = msgspec.structs.replace(info, cameras=cameras, frame_count=None)
     if not renames:
-        return info, lambda frame: turned_frame(frame, options.quarters)
+        return info, lambda frame: rotate_frame(frame, options.quarters)
     if info.label_set is None:
         raise LabelError(f"{src}: there are no classes to rename, it has no labels")
     label_set, new_ids = info.label_set.renamed(renames)
 
     def changed(frame: PosedFrame) -> PosedFrame:
-        turned = turned_frame(frame, options.quarters)
+        turned = rotate_frame(frame, options.quarters)
         return turned if turned.label is None else dataclasses.replace(turned, label=new_ids[turned.label])
 
     return msgspec.structs.replace(info, label_set=label_set), changed

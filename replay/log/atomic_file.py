@@ -9,7 +9,7 @@ from pathlib import Path
 from semantic_mapper.files import open_unlinked
 
 
-class WholeFile:
+class AtomicFile:
     """A new file, open for writing. ``write`` collects in memory, ``commit`` brings all of it to the file or nothing.
 
     Args:

@@ -16,7 +16,7 @@ _DEFAULTS = CodecOptions()
 
 
 @contextmanager
-def whole_log(
+def atomic_log(
     path: Path,
     info: StreamInfo,
     *,

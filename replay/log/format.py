@@ -20,7 +20,7 @@ from mcap.records import DataEnd, Footer
 from mcap.writer import CompressionType, Writer
 
 from semantic_mapper.errors import LogError
-from semantic_mapper.replay.log.atomic_file import WholeFile
+from semantic_mapper.replay.log.atomic_file import AtomicFile
 from semantic_mapper.replay.log.mcap_scan import MAGIC
 from semantic_mapper.replay.log.reader import INFO_ATTACHMENT, LogAttachment, LogReader
 from semantic_mapper.transport.codec import EncodedImage, encode, encode_frame, header_type, read_envelope
@@ -190,9 +190,9 @@ class LogWriter:
         return LogError(f"{self.path}: cannot be written ({error}); {self.frames} frames are in it and can be read")
 
 
-def _create(path: Path, overwrite: bool) -> WholeFile:
+def _create(path: Path, overwrite: bool) -> AtomicFile:
     try:
-        return WholeFile(path, overwrite=overwrite)
+        return AtomicFile(path, overwrite=overwrite)
     except FileExistsError as error:
         raise LogError(f"{path}: exists already; remove it or choose another name") from error
     except OSError as error:

@@ -105,7 +105,7 @@ class LogReader:
             self.info = self._read_info(found)
             self._report_damages(found)
             if not any(entry.topic == "frame" for entry in self._index) and not allow_empty:
-                raise LogError(f"{path}: the log holds no frames; record or import it anew")
+                raise LogError(f"{path}: the log holds no frames; record or import it again")
         except LogError:
             self._file.close()
             raise

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from semantic_mapper.errors import LogError
-from semantic_mapper.replay.log.atomic_log import whole_log
+from semantic_mapper.replay.log.atomic_log import atomic_log
 from semantic_mapper.replay.log.format import LogReader
 
 
@@ -34,7 +34,7 @@ def recover(src: Path, dst: Path) -> RecoverReport:
     """
     with (
         LogReader(src) as reader,
-        whole_log(dst, reader.info, attachments=tuple(reader.attachments().values())) as writer,
+        atomic_log(dst, reader.info, attachments=tuple(reader.attachments().values())) as writer,
     ):
         for envelope, parts in reader.messages():
             if envelope.topic != "info":  # the writer has put it there already

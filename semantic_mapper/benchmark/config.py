@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 
@@ -13,11 +13,11 @@ from semantic_mapper.config import (
     AtLeastTwo,
     AtLeastZero,
     Config,
+    Fraction,
     MapperConfig,
     NotNegative,
     Positive,
     SamplingConfig,
-    Share,
     to_plain,
 )
 from semantic_mapper.errors import ConfigError
@@ -28,7 +28,7 @@ from semantic_mapper.training.finetune import FinetuneConfig
 from semantic_mapper.training.step import StepConfig
 from semantic_mapper.types import CameraIntrinsics
 
-RECORD_VERSION = 5  # raised by a change of what a record means or how views are rendered: older ones are made anew
+RECORD_VERSION = 5  # raised by a change of what a record means or how views are rendered: older ones are made again
 
 FOCAL_PER_WIDTH = 882.5 / 1280  # an OAK-D at 1280 pixels
 MAP_WIDTH = 320
@@ -96,6 +96,12 @@ SPACINGS: dict[Baseline, SpacingConfig] = {
 class SceneBudget(Config, frozen=True):
     """How a field is fitted to one room, for ``finetune`` and ``scratch``."""
 
+    old_names: ClassVar = {
+        "head_start": "linear_probe_steps",
+        "resting_share": "frozen_encoder_fraction",
+        "doubtful_share": "hard_example_fraction",
+    }
+
     keyframes: AtLeastTwo = 12  # labelled
     unlabelled: NotNegative = 0  # further frames of the room, which bring their images (and depth) as source views
     guard: NotNegative = 3  # frames on either side of a query that are no keyframes
@@ -103,10 +109,10 @@ class SceneBudget(Config, frozen=True):
     seconds: AtLeastZero = 120.0  # wall clock; 0 = only steps count
     steps: NotNegative = 0  # 0 = only seconds count
     learning_rate: Positive = FinetuneConfig().learning_rate
-    encoder_rate: Share = FinetuneConfig().encoder_rate  # see ``FinetuneConfig``
-    head_start: NotNegative = FinetuneConfig().head_start  # see ``FinetuneConfig``
-    resting_share: Share = FinetuneConfig().resting_share  # see ``FinetuneConfig``
-    doubtful_share: Share = StepConfig().doubtful_share  # see ``StepConfig``
+    encoder_rate: Fraction = FinetuneConfig().encoder_rate  # see ``FinetuneConfig``
+    linear_probe_steps: NotNegative = FinetuneConfig().linear_probe_steps  # see ``FinetuneConfig``
+    frozen_encoder_fraction: Fraction = FinetuneConfig().frozen_encoder_fraction  # see ``FinetuneConfig``
+    hard_example_fraction: Fraction = StepConfig().hard_example_fraction  # see ``StepConfig``
     patience: NotNegative = 0  # see ``FinetuneConfig``; by default a budget is spent to its end
     shares: tuple[float, ...] = (0.0625, 0.125, 0.25, 0.5, 1.0)  # of the budget; a run, and a point of the curve, each
 
@@ -172,12 +178,12 @@ def fit_config(suite: SuiteConfig, share: float) -> FinetuneConfig:
         learning_rate=scene.learning_rate,
         encoder_rate=scene.encoder_rate,
         patience=scene.patience,
-        head_start=scene.head_start,
-        resting_share=scene.resting_share,
+        linear_probe_steps=scene.linear_probe_steps,
+        frozen_encoder_fraction=scene.frozen_encoder_fraction,
         step=StepConfig(
             sampling=sampling,
-            blind_samples=suite.tier.blind.guided,
-            doubtful_share=scene.doubtful_share,
+            samples_without_depth=suite.tier.blind.guided,
+            hard_example_fraction=scene.hard_example_fraction,
             known_labels=scene.labelled_sources,
         ),
         seed=suite.seed,

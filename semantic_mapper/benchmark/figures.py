@@ -38,7 +38,7 @@ def view_figures(records: Sequence[RoomRecord]) -> dict[str, Any]:
         "depth_abs_rel": depth.abs_rel,
         "depth_rmse_m": depth.rmse_m,
         "ece": _ece(records),
-        "consistency": agreement.share,
+        "consistency": agreement.fraction,
         "baseline_m": _mean([i.baseline_m for i in images]),
         "seen": _mean([i.seen for i in images]),
         "per_room_miou": {str(r.room): c.metrics().miou for r, c in zip(records, confusions, strict=True)},
@@ -86,7 +86,7 @@ def draw_fit_curves(figures: Mapping[str, Mapping[str, Any]], title: str) -> UIn
     """mIoU against the seconds that fitting a room took, (H, W, 3) RGB; None where nothing was fitted.
 
     Args:
-        figures: ``view_figures`` of each contestant, by name. Labels that depth alone carries over, the same for all of
+        figures: ``view_figures`` of each entry, by name. Labels that depth alone carries over, the same for all of
             them, are a line of their own.
         title: Of the picture.
     """

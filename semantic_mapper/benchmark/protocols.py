@@ -57,7 +57,7 @@ class Keyframes:
 
 
 @dataclass(frozen=True, slots=True)
-class Contestant:
+class Entry:
     """A field under test.
 
     Args:
@@ -74,7 +74,7 @@ class Contestant:
 
 def run_room(
     room: BenchmarkRoom,
-    contestant: Contestant,
+    entry: Entry,
     suite: SuiteConfig,
     on_fit: Callable[[float], None] | None = None,
     stopped: Callable[[], object] = bool,
@@ -89,9 +89,9 @@ def run_room(
         ConfigError: a budget of nothing, or a room with too few frames.
     """
     if suite.protocol == "generalize":
-        field = contestant.field.eval()
-        return _scored(room, answer_queries(room, field, suite), contestant, suite)
-    return _fit_and_score(room, contestant, suite, on_fit, stopped)
+        field = entry.field.eval()
+        return _scored(room, answer_queries(room, field, suite), entry, suite)
+    return _fit_and_score(room, entry, suite, on_fit, stopped)
 
 
 def answer_queries(room: BenchmarkRoom, field: LearnedField, suite: SuiteConfig) -> dict[int, Answer]:
@@ -171,7 +171,7 @@ def _answer(
 
 def _fit_and_score(
     room: BenchmarkRoom,
-    contestant: Contestant,
+    entry: Entry,
     suite: SuiteConfig,
     on_fit: Callable[[float], None] | None,
     stopped: Callable[[], object],
@@ -182,16 +182,18 @@ def _fit_and_score(
     frames = [as_given(room.frames[n], depth=suite.depth, label=True) for n in keyframes.labelled]
     frames += [as_given(room.frames[n], depth=suite.depth) for n in keyframes.unlabelled]
     views = stack_sources([view_from_frame(frame, ROOMS, suite.tier.width) for frame in frames])
-    field = _start(contestant.field, suite, views)
+    field = _start(entry.field, suite, views)
     answers = answer_from_keyframes(room, field.eval(), suite, keyframes)
     curve = [_curve_point(0.0, 0.0, 0, room_confusion(room, answers))]
     device = next(field.parameters()).device
     if suite.scene.seconds > 0:  # what the first step of a process costs more is no part of any budget
-        one_step = msgspec.structs.replace(fit_config(suite, 1.0), seconds=0, steps=1, head_start=1, held_out_rays=64)
-        finetune(frames, ROOMS, _start(contestant.field, suite, views), one_step)
+        one_step = msgspec.structs.replace(
+            fit_config(suite, 1.0), seconds=0, steps=1, linear_probe_steps=1, held_out_rays=64
+        )
+        finetune(frames, ROOMS, _start(entry.field, suite, views), one_step)
     spent, whole = 0.0, sum(suite.scene.shares)
     for share in sorted(suite.scene.shares):
-        start = _start(contestant.field, suite, views)
+        start = _start(entry.field, suite, views)
         progress = _progress(on_fit, spent, share, whole)
         fitted = finetune(frames, ROOMS, start, fit_config(suite, share), progress, stopped)
         if stopped():
@@ -200,7 +202,7 @@ def _fit_and_score(
         recipe = fitted.recipe
         curve.append(_curve_point(share, float(recipe["seconds"]), int(recipe["steps"]), room_confusion(room, answers)))
         spent += share
-    return _scored(room, answers, contestant, suite, keyframes.labelled, tuple(curve))
+    return _scored(room, answers, entry, suite, keyframes.labelled, tuple(curve))
 
 
 def _progress(
@@ -239,7 +241,7 @@ def _carried_labels(room: BenchmarkRoom, keyframes: Sequence[int]) -> Rows:
 def _scored(
     room: BenchmarkRoom,
     answers: dict[int, Answer],
-    contestant: Contestant,
+    entry: Entry,
     suite: SuiteConfig,
     keyframes: tuple[int, ...] = (),
     curve: tuple[CurvePoint, ...] = (),
@@ -247,9 +249,9 @@ def _scored(
     agreement = room_agreement(room, answers)
     record = RoomRecord(
         settings=settings_digest(suite, "views"),
-        weights=contestant.digest,
+        weights=entry.digest,
         room=room.seed,
-        programme=room.programme,
+        template=room.template,
         confusion=as_rows(room_confusion(room, answers)),
         images=tuple(image_record(q, answer, room.truth[q]) for q, answer in answers.items()),
         calibration=room_calibration(room, answers),

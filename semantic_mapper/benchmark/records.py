@@ -40,7 +40,7 @@ class CalibrationRecord(Config, frozen=True):
 
 
 class CurvePoint(Config, frozen=True):
-    """Where a share of the budget leads. Share 0 is the start."""
+    """Where a share of the budget leads. Fraction 0 is the start."""
 
     share: float
     seconds: float
@@ -54,7 +54,7 @@ class RoomRecord(Config, frozen=True, tag_field="record", tag="views"):
     settings: str  # digest
     weights: str  # digest
     room: int
-    programme: str
+    template: str
     confusion: Rows
     images: tuple[ImageRecord, ...]
     calibration: CalibrationRecord
@@ -71,7 +71,7 @@ class MapRecord(Config, frozen=True, tag_field="record", tag="map"):
     settings: str
     weights: str
     room: int
-    programme: str
+    template: str
     points: int  # of the map's surface
     on_surface: float  # share of them near the true surface
     confusion: Rows  # at the map's own points

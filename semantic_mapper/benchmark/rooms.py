@@ -16,7 +16,7 @@ class BenchmarkRoom:
 
     Args:
         seed: Of the room.
-        programme: Kind of room.
+        template: Kind of room.
         frames: The walk, with the noise of the sensor, in the order of their ``seq``.
         truth: By frame number of each query view, in order: colour of a perfect camera at even exposure, exact depth,
             labels.
@@ -24,7 +24,7 @@ class BenchmarkRoom:
     """
 
     seed: int
-    programme: str
+    template: str
     frames: tuple[PosedFrame, ...]
     truth: dict[int, RenderedView]
     pairs: tuple[tuple[int, int], ...]
@@ -54,23 +54,23 @@ def make_benchmark_room(seed: int, suite: SuiteConfig) -> BenchmarkRoom:
     pairs = query_pairs(suite)
     queries = [number for pair in pairs for number in pair]
     truth = {q: render_view(scene, camera, frames[q].T_world_camera) for q in queries}
-    return BenchmarkRoom(seed, scene.programme, frames, truth, pairs)
+    return BenchmarkRoom(seed, scene.template, frames, truth, pairs)
 
 
 def query_pairs(suite: SuiteConfig) -> tuple[tuple[int, int], ...]:
-    """Frame numbers of the query views: each pair in the middle of its share of the sequence.
+    """Frame numbers of the query views: each pair in the middle of its fraction of the sequence.
 
     Raises:
         ConfigError: no pair, or pairs that overlap.
     """
     sequence = suite.sequence
-    share = sequence.frames / max(sequence.query_pairs, 1)
-    if sequence.query_pairs < 1 or sequence.pair_gap < 1 or share < sequence.pair_gap + 1:
+    fraction = sequence.frames / max(sequence.query_pairs, 1)
+    if sequence.query_pairs < 1 or sequence.pair_gap < 1 or fraction < sequence.pair_gap + 1:
         raise ConfigError(
             f"{sequence.frames} frames do not hold {sequence.query_pairs} pairs of query views {sequence.pair_gap} "
             "apart; raise sequence.frames or lower sequence.query_pairs"
         )
-    firsts = [round((p + 0.5) * share - sequence.pair_gap / 2) for p in range(sequence.query_pairs)]
+    firsts = [round((p + 0.5) * fraction - sequence.pair_gap / 2) for p in range(sequence.query_pairs)]
     starts = [min(max(first, 0), sequence.frames - 1 - sequence.pair_gap) for first in firsts]
     return tuple((start, start + sequence.pair_gap) for start in starts)
 

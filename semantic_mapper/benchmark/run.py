@@ -1,4 +1,4 @@
-"""A run of the benchmark: room by room, every contestant, each result on disk before the next begins."""
+"""A run of the benchmark: room by room, every entry, each result on disk before the next begins."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from semantic_mapper.benchmark.config import SuiteConfig, check_suite, settings_digest, suite_seeds
 from semantic_mapper.benchmark.figures import image_note
-from semantic_mapper.benchmark.protocols import Contestant, RoomResult, run_room
+from semantic_mapper.benchmark.protocols import Entry, RoomResult, run_room
 from semantic_mapper.benchmark.records import RoomRecord
 from semantic_mapper.benchmark.rooms import BenchmarkRoom, make_benchmark_room
 from semantic_mapper.benchmark.store import RecordStore
@@ -25,7 +25,7 @@ SHEET_ROWS = 6
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """``done`` of ``total`` pairs of room and contestant; ``note`` says what is being done."""
+    """``done`` of ``total`` pairs of room and entry; ``note`` says what is being done."""
 
     done: float
     total: int
@@ -34,7 +34,7 @@ class Progress:
 
 def run_suite(
     suite: SuiteConfig,
-    contestants: Sequence[Contestant],
+    entries: Sequence[Entry],
     store: RecordStore,
     pictures: Path,
     on_progress: Callable[[Progress], None],
@@ -44,11 +44,11 @@ def run_suite(
 
     Args:
         suite: What to run.
-        contestants: Which fields.
+        entries: Which fields.
         store: Records that are there are kept and not made again.
         pictures: Folder for the label images of ``sheet_rows``.
         on_progress: Told of every step.
-        stopped: Asked before each room, contestant and step of a fitting; once it says so (anything true), the run
+        stopped: Asked before each room, entry and step of a fitting; once it says so (anything true), the run
             ends. A room that is not done by then leaves no record.
 
     Raises:
@@ -56,21 +56,21 @@ def run_suite(
     """
     check_suite(suite)
     settings, seeds = settings_digest(suite, "views"), suite_seeds(suite)
-    total, done = len(seeds) * len(contestants), 0
+    total, done = len(seeds) * len(entries), 0
     for seed in seeds:
-        missing = [c for c in contestants if store.find(RoomRecord, settings, c.digest, seed) is None]
-        done += len(contestants) - len(missing)
+        missing = [c for c in entries if store.find(RoomRecord, settings, c.digest, seed) is None]
+        done += len(entries) - len(missing)
         on_progress(Progress(done, total, f"room {seed}"))
         room = make_benchmark_room(seed, suite) if missing and not stopped() else None
-        for contestant in missing:
+        for entry in missing:
             if room is None or stopped():
                 return
-            name = contestant.name
+            name = entry.name
             result = run_room(
                 room,
-                contestant,
+                entry,
                 suite,
-                lambda share, at=done, name=name: on_progress(Progress(at + share, total, f"fit {name}")),
+                lambda fraction, at=done, name=name: on_progress(Progress(at + fraction, total, f"fit {name}")),
                 stopped,
             )
             if result is None:
@@ -83,16 +83,14 @@ def run_suite(
             on_progress(Progress(done, total, f"room {seed}, {name}"))
 
 
-def room_records(suite: SuiteConfig, contestant: Contestant, store: RecordStore) -> list[RoomRecord]:
-    """The records of a contestant that are there, in the order of the split."""
+def room_records(suite: SuiteConfig, entry: Entry, store: RecordStore) -> list[RoomRecord]:
+    """The records of a entry that are there, in the order of the split."""
     settings = settings_digest(suite, "views")
-    found = (store.find(RoomRecord, settings, contestant.digest, seed) for seed in suite_seeds(suite))
+    found = (store.find(RoomRecord, settings, entry.digest, seed) for seed in suite_seeds(suite))
     return [record for record in found if record is not None]
 
 
-def sheet_rows(
-    suite: SuiteConfig, contestants: Sequence[Contestant], store: RecordStore, pictures: Path
-) -> list[SheetRow]:
+def sheet_rows(suite: SuiteConfig, entries: Sequence[Entry], store: RecordStore, pictures: Path) -> list[SheetRow]:
     """Up to six rooms of the run for the contact sheet, evenly spread; those whose pictures are gone are left out."""
     settings = settings_digest(suite, "views")
     rows: list[SheetRow] = []
@@ -101,15 +99,15 @@ def sheet_rows(
         seed = seeds[int(at)]
         labels, notes = {}, {}
         name, rgb, truth = "", None, None
-        for contestant in contestants:
-            record = store.find(RoomRecord, settings, contestant.digest, seed)
-            path = _picture_path(pictures, settings, contestant.digest, seed)
+        for entry in entries:
+            record = store.find(RoomRecord, settings, entry.digest, seed)
+            path = _picture_path(pictures, settings, entry.digest, seed)
             if record is None or not path.exists():
                 continue
             with np.load(path) as data:
-                rgb, truth, labels[contestant.name] = data["rgb"], data["truth"], data["label"]
-            name = f"room {seed} ({record.programme}), frame {record.images[0].frame}"
-            notes[contestant.name] = image_note(record.images[0])
+                rgb, truth, labels[entry.name] = data["rgb"], data["truth"], data["label"]
+            name = f"room {seed} ({record.template}), frame {record.images[0].frame}"
+            notes[entry.name] = image_note(record.images[0])
         if rgb is not None and truth is not None:
             rows.append(SheetRow(name, rgb, truth, labels, notes))
     return rows

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.benchmark.config import SpacingConfig
-from semantic_mapper.coverage import LABELLED_VALUE, cover, sees
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
+from semantic_mapper.view_selection import LABELLED_VALUE, select_views, visible_points
 
 PROBE_WIDTH = 40  # pixels a row of the query that are asked what another view sees of them
 
@@ -25,7 +25,7 @@ class Sources:
     Args:
         numbers: Positions among the candidates, the most useful first.
         distance_m: Mean distance between their camera centres and the query's.
-        seen: Share of the query's surface that at least one of them sees.
+        seen: Fraction of the query's surface that at least one of them sees.
     """
 
     numbers: tuple[int, ...]
@@ -58,10 +58,10 @@ def choose_sources(
         raise ConfigError(f"{count} source views are asked for, the room has {len(candidates)} frames to choose from")
     points = _surface_points(query_pose, query_depth_m, candidates[0].intrinsics)
     seen = [_sees(frame, points) for frame in candidates]
-    share = np.array([s.mean() if len(s) else 0.0 for s in seen])
+    fraction = np.array([s.mean() if len(s) else 0.0 for s in seen])
     centre = np.stack([frame.T_world_camera[:3, 3] for frame in candidates])
     away = np.linalg.norm(centre - query_pose[:3, 3], axis=1)
-    order = [int(i) for i in np.lexsort((np.arange(len(share)), away, -share))]
+    order = [int(i) for i in np.lexsort((np.arange(len(fraction)), away, -fraction))]
     chosen: list[int] = []
     for rule in (spacing, msgspec.structs.replace(spacing, apart_m=0.0), SpacingConfig()):
         for i in order:
@@ -86,7 +86,7 @@ def choose_covering(
     points = _surface_points(query_pose, query_depth_m, candidates[0].intrinsics)
     seen = np.stack([_sees(frame, points) for frame in candidates])
     value = np.where(labelled, LABELLED_VALUE, 1.0)
-    chosen = cover(seen, value, np.zeros(len(candidates)), count) or [0]
+    chosen = select_views(seen, value, np.zeros(len(candidates)), count) or [0]
     away = [np.linalg.norm(candidates[i].T_world_camera[:3, 3] - query_pose[:3, 3]) for i in chosen]
     together = seen[chosen].any(axis=0) if len(points) else np.zeros(1)
     return Sources(tuple(chosen), float(np.mean(away)), float(together.mean()))
@@ -101,4 +101,4 @@ def _surface_points(pose: Float64, depth_m: Float32, intrinsics: CameraIntrinsic
 
 def _sees(frame: PosedFrame, points: Float64) -> NDArray[np.bool_]:
     assert frame.depth_m is not None
-    return sees(points, frame.T_world_camera, frame.intrinsics, frame.depth_m, measured=True)
+    return visible_points(points, frame.T_world_camera, frame.intrinsics, frame.depth_m, measured=True)

@@ -11,7 +11,9 @@ from semantic_mapper.errors import ShapeError
 from semantic_mapper.geometry import invert_pose, nearest_pixels, transform, unproject
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
-SAME_SURFACE = 0.02  # share of z by which two depths of one surface may differ, for the half pixel that rounding moves
+SAME_SURFACE = (
+    0.02  # fraction of z by which two depths of one surface may differ, for the half pixel that rounding moves
+)
 Indices = NDArray[np.int64]
 
 
@@ -23,7 +25,7 @@ class Agreement:
     compared: int = 0
 
     @property
-    def share(self) -> float | None:
+    def fraction(self) -> float | None:
         """In 0..1; None where nothing was compared."""
         return self.agreeing / self.compared if self.compared else None
 
@@ -48,7 +50,7 @@ def matching_pixels(
         depth_a_m, depth_b_m: (H, W) float32 true z in metres, 0 = none.
         T_world_a, T_world_b: (4, 4).
         intrinsics: Of both views.
-        tolerance: Share of z by which the depths may differ.
+        tolerance: Fraction of z by which the depths may differ.
 
     Returns:
         Flat, row-major indices (N,) int64 into a and into b.

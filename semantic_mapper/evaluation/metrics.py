@@ -30,9 +30,9 @@ class SegmentationMetrics:
 
     Args:
         miou: Mean intersection over union of the classes that occur in the truth.
-        total_accuracy: Share of the pixels that are right.
-        average_accuracy: Mean over the classes in the truth of the share of their pixels that is right.
-        coverage: Share of the pixels with any prediction but "unknown".
+        total_accuracy: Fraction of the pixels that are right.
+        average_accuracy: Mean over the classes in the truth of the fraction of their pixels that is right.
+        coverage: Fraction of the pixels with any prediction but "unknown".
         per_class: IoU by class name, for the classes that occur in the truth, in the label set's order.
         pixels: How many pixels were counted.
     """
@@ -98,7 +98,7 @@ class ConfusionMatrix:
         return np.divide(hits, union, out=np.full(len(hits), np.nan), where=occurring > 0)
 
     def class_accuracy(self) -> Float64:
-        """(L,) share of each class's pixels that is right; NaN for a class that does not occur in the truth."""
+        """(L,) fraction of each class's pixels that is right; NaN for a class that does not occur in the truth."""
         hits, occurring = self._hits(), self.counts.sum(axis=1)
         return np.divide(hits, occurring, out=np.full(len(hits), np.nan), where=occurring > 0)
 
@@ -256,7 +256,7 @@ class Calibration:
     Args:
         ece: Expected calibration error: mean over the samples of |accuracy - confidence| of their bin.
         confidence: (B,) mean confidence of each bin, NaN where it is empty.
-        accuracy: (B,) share of each bin that is right, NaN where it is empty.
+        accuracy: (B,) fraction of each bin that is right, NaN where it is empty.
         count: (B,) int64 samples of each bin.
     """
 

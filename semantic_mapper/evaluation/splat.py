@@ -162,7 +162,7 @@ def _edge_shading(depth: Float32, hit: NDArray[np.bool_], scale: float) -> Float
     total = np.zeros_like(depth)
     filled = np.where(hit, depth, np.float32(np.nanmax(depth[hit]) + 0.05))
     for radius, weight in ((2, 1.0), (5, 0.6), (11, 0.4)):
-        reach = radius / scale  # metres on the picture: a slope of 45 degrees darkens no more than by its share
+        reach = radius / scale  # metres on the picture: a slope of 45 degrees darkens no more than by its fraction
         for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7)):
             shift = np.array(((1, 0, radius * dx), (0, 1, radius * dy)), np.float32)
             beside = cv2.warpAffine(

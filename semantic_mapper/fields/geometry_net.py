@@ -15,9 +15,9 @@ from torch.nn import functional
 GEOMETRY_CHANNELS = 5  # mu_1, s_1, mu_2, s_2 in metres, weight of component 1
 NEAR_M, FAR_M = 0.2, 12.0
 OWN_DENSITY_OFFSET = 6.0  # at the start the views decide alone: 0.0025 / m of density of its own
-MEASURED_SHIFT = 0.05  # a measured depth may be moved by at most this share
-MEASURED_SCALE = 0.01  # initial spread of a measured depth, share of z
-PREDICTED_SCALE = 0.25  # initial spread of a predicted depth, share of z
+MEASURED_SHIFT = 0.05  # a measured depth may be moved by at most this fraction
+MEASURED_SCALE = 0.01  # initial spread of a measured depth, fraction of z
+PREDICTED_SCALE = 0.25  # initial spread of a predicted depth, fraction of z
 LEAST_VISIBILITY = 1e-4  # a sample that is hidden from every view that it projects into takes all of them alike
 
 
@@ -39,14 +39,14 @@ class GeometryInit(nn.Module):
         measured = depth_m > 0
         inverse = torch.where(measured, 1 / depth_m.clamp_min(NEAR_M), torch.zeros_like(depth_m))
         raw = self.net(torch.cat((feature, inverse[:, None], measured[:, None].to(feature.dtype)), dim=1))
-        shift, spread, behind, spread_behind, share, guess = raw.unbind(1)
+        shift, spread, behind, spread_behind, fraction, guess = raw.unbind(1)
         predicted = 1 / (1 / FAR_M + (1 / NEAR_M - 1 / FAR_M) * torch.sigmoid(guess - 2.0))
         mu_1 = torch.where(measured, depth_m * (1 + MEASURED_SHIFT * torch.tanh(shift)), predicted)
         start = torch.where(measured, MEASURED_SCALE, PREDICTED_SCALE)
         s_1 = mu_1 * start * torch.exp(spread.clamp(-3, 3))
         mu_2 = mu_1 * (1.02 + functional.softplus(behind))
         s_2 = mu_2 * PREDICTED_SCALE * torch.exp(spread_behind.clamp(-3, 3))
-        return torch.stack((mu_1, s_1, mu_2, s_2, torch.sigmoid(share + 3.0)), dim=1)
+        return torch.stack((mu_1, s_1, mu_2, s_2, torch.sigmoid(fraction + 3.0)), dim=1)
 
 
 def hit_and_visibility(
@@ -62,10 +62,10 @@ def hit_and_visibility(
     Returns:
         hit, visibility: (...) in [0, 1].
     """
-    mu_1, s_1, mu_2, s_2, share = geometry.unbind(-1)
+    mu_1, s_1, mu_2, s_2, fraction = geometry.unbind(-1)
     near, far = z - half_interval, z + half_interval
-    cdf_near = share * torch.sigmoid((near - mu_1) / s_1) + (1 - share) * torch.sigmoid((near - mu_2) / s_2)
-    cdf_far = share * torch.sigmoid((far - mu_1) / s_1) + (1 - share) * torch.sigmoid((far - mu_2) / s_2)
+    cdf_near = fraction * torch.sigmoid((near - mu_1) / s_1) + (1 - fraction) * torch.sigmoid((near - mu_2) / s_2)
+    cdf_far = fraction * torch.sigmoid((far - mu_1) / s_1) + (1 - fraction) * torch.sigmoid((far - mu_2) / s_2)
     return cdf_far - cdf_near, 1 - cdf_near
 
 
@@ -99,9 +99,9 @@ class DensityNet(nn.Module):
         """
         weight = (visibility + LEAST_VISIBILITY) * valid
         total = weight.sum(0).clamp_min(1e-6)  # (R, N)
-        share = weight / total
-        mean = torch.einsum("mrn,mrnc->rnc", share, feature)
-        var = torch.einsum("mrn,mrnc->rnc", share, feature * feature) - mean * mean
+        fraction = weight / total
+        mean = torch.einsum("mrn,mrnc->rnc", fraction, feature)
+        var = torch.einsum("mrn,mrnc->rnc", fraction, feature * feature) - mean * mean
         seen = (visibility * valid).sum(0)
         opacity = ((hit * valid).sum(0) / seen.clamp_min(1e-3)).clamp(0, 0.999)
         prior = -torch.log1p(-opacity) / delta.clamp_min(1e-4)

@@ -45,11 +45,11 @@ def field_render(
     )
 
 
-def weighted_moments(values: torch.Tensor, share: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def weighted_moments(values: torch.Tensor, fraction: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean and variance over the views, (R, N, C) each, of values (m, R, N, C) that count by share (m, R, N).
 
     Shares add up to 1 over the views, or are all 0 where no view counts; then both moments are 0.
     """
-    mean = torch.einsum("mrn,mrnc->rnc", share, values)
-    square = torch.einsum("mrn,mrnc->rnc", share, values * values)
+    mean = torch.einsum("mrn,mrnc->rnc", fraction, values)
+    square = torch.einsum("mrn,mrnc->rnc", fraction, values * values)
     return mean, (square - mean * mean).clamp_min(0)

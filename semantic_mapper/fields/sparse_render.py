@@ -20,7 +20,7 @@ from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 COARSEST = 4  # pixels between the first rays, a power of two
-DEPTH_STEP = 0.03  # share of z by which the depth prior leaves the plane through its neighbours across a border
+DEPTH_STEP = 0.03  # fraction of z by which the depth prior leaves the plane through its neighbours across a border
 COLOUR_STEP = 40.0  # 8-bit steps, summed over the channels, by which a colour differs from its neighbours' at an edge
 UNSURE = 0.2  # probability that is not the likeliest class's, above which agreeing rays do not tell enough
 
@@ -34,13 +34,13 @@ def render_sparse_view(
     sampling: SamplingConfig,
     rays_per_chunk: int,
     rgb: UInt8,
-    share: float,
+    fraction: float,
 ) -> tuple[Float32, NDArray[np.bool_], Float32, int]:
     """As ``render_view``, with rays for at most a ``share`` of the pixels, and for every fourth a side at least.
 
     Args:
         rgb: (H, W, 3) uint8 colours of the view, whose edges tell where to look closer.
-        share: Of the pixels that may have rays of their own, the most doubtful first; 0..1.
+        fraction: Of the pixels that may have rays of their own, the most doubtful first; 0..1.
 
     Returns:
         Class probabilities (H, W, L), known (H, W), depth (H, W) in metres, and the number of rays rendered. Pixels
@@ -80,7 +80,7 @@ def render_sparse_view(
         images = (probabilities, known, depth_m, prior_depth_m, rgb, uncertainty)
         fill_between_rays((height + half - 1) // half, step, *images, DEPTH_STEP, COLOUR_STEP, UNSURE)
         flat = np.flatnonzero(uncertainty)
-        left = max(int(share * height * width) - traced, 0)
+        left = max(int(fraction * height * width) - traced, 0)
         if len(flat) > left:
             flat = flat[np.argsort(-uncertainty.ravel()[flat], kind="stable")[:left]]
         if len(flat):

@@ -81,7 +81,7 @@ class SRay(LearnedField):
             return encoded
         return replace(encoded, channel=views.channel.to(torch.int16))
 
-    def carried_labels(self, space: ContextualSpace) -> torch.Tensor:
+    def propagate_labels(self, space: ContextualSpace) -> torch.Tensor:
         """What views with known labels say of each sample: (R, N, L), each entry and their sum in [0, 1].
 
         Not in the paper: labels are to a source view what depth is, an input that it may have. A view's label counts
@@ -98,7 +98,7 @@ class SRay(LearnedField):
         s = sources.feature.permute(0, 2, 3, 1)
         return self.classifier(s + self.semantic(s)).permute(0, 3, 1, 2)
 
-    def without_hidden(self, space: ContextualSpace) -> ContextualSpace:
+    def mask_occluded(self, space: ContextualSpace) -> ContextualSpace:
         """M without the views to which a sample is hidden, where some other view sees it.
 
         Not in the paper, which leaves it to the attention to find out. A hidden view shows another surface at that
@@ -110,7 +110,7 @@ class SRay(LearnedField):
         return replace(space, valid=torch.where(clear.any(0), clear, space.valid))
 
     def without_faint(self, space: ContextualSpace, weights: torch.Tensor, least: float) -> ContextualSpace:
-        """M without the samples whose share of the compositing weights (R, N) of their ray is below ``least``."""
+        """M without the samples whose fraction of the compositing weights (R, N) of their ray is below ``least``."""
         return replace(space, valid=space.valid & (weights >= least * weights.sum(1, keepdim=True)))
 
     def attend(self, space: ContextualSpace) -> torch.Tensor:
@@ -145,16 +145,16 @@ class SRay(LearnedField):
         return s, torch.einsum("mrn,mrnc->rnc", colour_weight, space.rgb)
 
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
-        """As every field renders; streaming, without what ``sampling.least_weight`` calls faint."""
-        least = self.sampling.least_weight if self.sampling.mode == "streaming" else 0.0
+        """As every field renders; streaming, without what ``sampling.sample_weight_threshold`` calls faint."""
+        least = self.sampling.sample_weight_threshold if self.sampling.mode == "streaming" else 0.0
         return self.render_samples(rays, self.sample(rays, sources), sources, least)[0]
 
     def render_samples(
-        self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews, least_weight: float = 0.0
+        self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews, sample_weight_threshold: float = 0.0
     ) -> tuple[FieldRender, torch.Tensor]:
         """Render rays at given sample depths z (R, N) (Eq. 13); also returns the compositing weights (R, N).
 
-        The density of a sample does not depend on the attention. With ``least_weight`` samples of a smaller share of
+        The density of a sample does not depend on the attention. With ``sample_weight_threshold`` samples of less than
         their ray's weight take no part in it, and the others' semantics and colour stand for theirs.
         """
         space = contextual_space(rays, z, sources)
@@ -163,9 +163,9 @@ class SRay(LearnedField):
         weights = compositing_weights(sigma, interval)
         opacity = weights.sum(dim=1)
         known = space.valid.flatten(2).any(2).any(0)
-        seen, looked_at = self.without_hidden(space), weights
-        if least_weight > 0:
-            seen = self.without_faint(seen, weights, least_weight)
+        seen, looked_at = self.mask_occluded(space), weights
+        if sample_weight_threshold > 0:
+            seen = self.without_faint(seen, weights, sample_weight_threshold)
             looked_at = weights * seen.valid.any(0)
             looked_at = looked_at * (opacity / looked_at.sum(1).clamp_min(1e-12))[:, None]
         s, colour = self.blend_views(self.attend(seen), seen)
@@ -173,7 +173,7 @@ class SRay(LearnedField):
         rendered = composite(looked_at, s + self.semantic(s))
         logits = functional.linear(rendered, self.classifier.weight) + opacity[:, None] * self.classifier.bias
         if self.config.source_labels:
-            logits = logits + self.label_logit * composite(weights, self.carried_labels(space))
+            logits = logits + self.label_logit * composite(weights, self.propagate_labels(space))
         logits = logits * known[:, None]
         log_p = torch.log_softmax(logits, dim=-1)
         render = FieldRender(

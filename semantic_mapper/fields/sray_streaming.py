@@ -71,10 +71,12 @@ class StreamingSRay:
 
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
         """Render rays with guided samples; not differentiable."""
-        return self.render_samples(rays, sample_guided(rays, self.sampling), sources, self.sampling.least_weight)
+        return self.render_samples(
+            rays, sample_guided(rays, self.sampling), sources, self.sampling.sample_weight_threshold
+        )
 
     def render_samples(
-        self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews, least_weight: float = 0.0
+        self, rays: RayBatch, z: torch.Tensor, sources: EncodedViews, sample_weight_threshold: float = 0.0
     ) -> FieldRender:
         """Render rays at given sample depths z (R, N); see ``SRay.render_samples``.
 
@@ -94,7 +96,7 @@ class StreamingSRay:
             count,
             _Rays(_array(rays.origin), _array(rays.direction), _array(z)),
             _source_maps(sources, channels),
-            self._settings._replace(least_weight=least_weight),
+            self._settings._replace(sample_weight_threshold=sample_weight_threshold),
             self._weights,
             _Rendered(*(t.numpy() for t in (rendered, colour, depth, opacity, known, carried))),
         )
@@ -141,7 +143,7 @@ class _Settings(NamedTuple):
     residual: bool  # attention adds to the features instead of replacing them
     occlusion: bool  # views count by their visibility
     log_ratio: float  # ln(1 / tau) of Eq. 12
-    least_weight: float  # samples of a smaller fraction of their ray's weight take no part in the attention
+    sample_weight_threshold: float  # samples of a smaller fraction of their ray's weight take no part in the attention
     hidden_below: float
     least_visibility: float
     label_doubt: float
@@ -197,7 +199,7 @@ def _settings(model: SRay) -> _Settings:
         residual=config.attention_residual,
         occlusion=config.occlusion,
         log_ratio=math.log(1 / config.tau),
-        least_weight=0.0,
+        sample_weight_threshold=0.0,
         hidden_below=HIDDEN,
         least_visibility=LEAST_VISIBILITY,
         label_doubt=DOUBT,

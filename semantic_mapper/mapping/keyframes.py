@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from semantic_mapper.config import KeyframeConfig
-from semantic_mapper.coverage import GUESSED_DEPTHS_M, LABELLED_VALUE, cover, sees
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.geometry import invert_pose_torch, transform, unproject
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
+from semantic_mapper.view_selection import GUESSED_DEPTHS_M, LABELLED_VALUE, select_views, visible_points
 
 COVERAGE_GRID = (12, 16)  # rows, columns of query points whose visibility decides the choice of views
 NEARNESS_VALUE = 0.05  # breaks ties towards near views
@@ -125,10 +125,12 @@ class KeyframeStore:
             return []
         points = _query_points(T_world_camera, intrinsics, depth_m)
         # A keyframe's depth is small and the query's may be guessed: only what stands before a point hides it.
-        seen = np.stack([sees(points, k.T_world_camera, k.intrinsics, k.depth_m, measured=False) for k in fitting])
+        seen = np.stack(
+            [visible_points(points, k.T_world_camera, k.intrinsics, k.depth_m, measured=False) for k in fitting]
+        )
         value = np.array([LABELLED_VALUE if k.labelled else 1.0 for k in fitting])
         nearness = np.exp(-_separations(np.array([k.T_world_camera for k in fitting]), T_world_camera))
-        return [fitting[i] for i in cover(seen, value, NEARNESS_VALUE * nearness, count)]
+        return [fitting[i] for i in select_views(seen, value, NEARNESS_VALUE * nearness, count)]
 
     def _poses(self) -> Float64:
         """(N, 4, 4), oldest first."""

@@ -27,7 +27,7 @@ from semantic_mapper.mapping.fusion.depth_trust import depth_trust
 from semantic_mapper.mapping.fusion.vote_fusion import add_votes
 from semantic_mapper.mapping.keyframes import EncodedSize, Keyframe, KeyframeStore
 from semantic_mapper.mapping.pose_check import PoseCheck
-from semantic_mapper.mapping.views.upsample import lift
+from semantic_mapper.mapping.views.upsample import upsample
 from semantic_mapper.mapping.views.view_renderer import RenderedView, ViewRenderer
 from semantic_mapper.mapping.views.virtual_views import ViewpointChooser, VirtualLook
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -97,7 +97,7 @@ class MappingPipeline:
         """Begin to move the map with corrected poses of frames that it was fused from, as a loop closure gives them.
 
         The map in use stays as it is until ``advance_correction`` has brought the rebuild to its end. A call during a
-        rebuild begins it anew, with this correction upon the one under way: the outcome is that of two in a row.
+        rebuild begins it again, with this correction upon the one under way: the outcome is that of two in a row.
 
         Args:
             poses: stamp_ns, or (camera_id, stamp_ns), -> T_world_camera (4, 4) float64, at least one, in the world that
@@ -192,8 +192,8 @@ class MappingPipeline:
         if view is None:
             return None
         # A ray cast of the map at full size would take longer than the rendering, and the map is no sharper.
-        share = min(1.0, VIRTUAL_SIZE * self.config.render.scale)
-        smaller = scale_intrinsics(intrinsics, round(intrinsics.width * share), round(intrinsics.height * share))
+        fraction = min(1.0, VIRTUAL_SIZE * self.config.render.scale)
+        smaller = scale_intrinsics(intrinsics, round(intrinsics.width * fraction), round(intrinsics.height * fraction))
         cast = self.voxel_map.ray_cast(view.T_world_camera, smaller)
         frame = PosedFrame(
             stamp_ns=known[-1].stamp_ns,
@@ -206,7 +206,7 @@ class MappingPipeline:
             T_world_camera=view.T_world_camera,
         )
         sources = self._choose_sources(frame, size)
-        rendered = self._render(frame, [k.encoded for k in sources], self.config.render.scale / share)
+        rendered = self._render(frame, [k.encoded for k in sources], self.config.render.scale / fraction)
         depth, rows, _ = self._lift(frame, rendered, self.voxel_map)
         table = rendered.probabilities.reshape(-1, len(self.label_set)), rows
         blocks = add_votes(self.voxel_map, view.T_world_camera, smaller, depth, table, self.config.virtual)
@@ -383,7 +383,7 @@ class MappingPipeline:
             depth = np.asarray(cv2.resize(view.depth_m, size, interpolation=cv2.INTER_LINEAR), np.float32)
         else:
             depth, trust = resize_depth(frame, frame.intrinsics), None
-        return depth, lift(view.probabilities, view.known, rgb_low, depth_low, frame.rgb, depth), trust
+        return depth, upsample(view.probabilities, view.known, rgb_low, depth_low, frame.rgb, depth), trust
 
     def _at_rows(self, table: Float32, rows: NDArray[np.int32]) -> tuple[UInt8, Float32]:
         """Class ids and confidence (H, W) of what the pixels take from a table (K, L); row -1 is unknown."""

@@ -12,7 +12,7 @@ RESERVE = 0.9  # of a frame's time is planned for: frames differ
 MEMORY = 0.7  # of what was known stays when a new frame is measured
 
 
-class Pace:
+class RateController:
     """Trades rays, then samples, for a target rate.
 
     What a frame takes is modelled as a part that does not depend on rays, and a cost a ray and sample; both are
@@ -20,19 +20,19 @@ class Pace:
 
     Args:
         target_hz: Frames a second to hold.
-        share: Largest share of the pixels that may have rays.
+        fraction: Largest fraction of the pixels that may have rays.
         sampling: The most samples a ray.
     """
 
-    def __init__(self, target_hz: float, share: float, sampling: SamplingConfig) -> None:
+    def __init__(self, target_hz: float, fraction: float, sampling: SamplingConfig) -> None:
         self._budget_ms = RESERVE * 1e3 / target_hz
-        self._share = share
+        self._share = fraction
         self._sampling = sampling
         self._other_ms: float | None = None
         self._sample_ms: float | None = None  # of one sample of one ray
 
     def choose(self, pixels: int) -> tuple[float, SamplingConfig]:
-        """Share of the ``pixels`` of the rendered view that may have rays, and the samples a ray."""
+        """Fraction of the ``pixels`` of the rendered view that may have rays, and the samples a ray."""
         if self._other_ms is None or self._sample_ms is None:
             return self._share, self._sampling
         samples = max(self._budget_ms - self._other_ms, 0.0) / self._sample_ms

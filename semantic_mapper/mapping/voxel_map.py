@@ -217,10 +217,10 @@ class VoxelMap:
             Buffer indices of those that memory has room for at a time. Together they are one new ``version``.
 
         Raises:
-            MapError: see ``BlockGrid.portions``.
+            MapError: see ``BlockGrid.batches``.
         """
         version = self.version + 1
-        for blocks in self._grid.portions(packed):
+        for blocks in self._grid.batches(packed):
             yield blocks
             self._grid.mark_changed(blocks, version)
             self.version = version

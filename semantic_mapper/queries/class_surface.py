@@ -23,7 +23,7 @@ class ClassSurface(NamedTuple):
     Args:
         packed: (B,) int64 sorted keys.
         serials: (B,) int64 which content the blocks had.
-        fresh: (B,) bool whether the block's voxels were computed anew, because it or a neighbour has changed.
+        fresh: (B,) bool whether the block's voxels were computed again, because it or a neighbour has changed.
         start: (B + 1,) int64; block b has the voxels ``start[b] .. start[b + 1] - 1``.
         voxel: (N,) int32 within the block, ascending in each.
         point: (N, 3) float64 surface point in units of voxels.

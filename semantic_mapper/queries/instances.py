@@ -194,7 +194,7 @@ def find_overlaps(old: _LabelledVoxels, new: _LabelledVoxels, count: int, pairs:
 
 
 def _changed(fresh: NDArray[np.bool_], start: Int64, component: Int64, count: int) -> NDArray[np.bool_]:
-    """Whether each component (C,) has voxels in blocks that were computed anew."""
+    """Whether each component (C,) has voxels in blocks that were computed again."""
     changed = np.zeros(count + 1, np.bool_)  # the last is for voxels without a component
     changed[component[np.repeat(fresh, np.diff(start))]] = True
     return changed[:count]

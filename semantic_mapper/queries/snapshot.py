@@ -98,7 +98,7 @@ class MapSnapshot:
         if not 0 <= since <= self.version or limit < 0:
             raise MapError(
                 f"changes since version {since}, limit {limit}: versions go from 0 to {self.version}, and a limit is "
-                "not negative; a mirror of another map starts anew from version 0"
+                "not negative; a mirror of another map restarts from version 0"
             )
         later = np.flatnonzero(self.versions > since)
         chosen, version = oldest_first(self.versions[later], limit, self.version)

@@ -100,7 +100,7 @@ def _worst_between(scene: Scene, a: Float64, b: Float64) -> float:
     """Lowest score of views on the straight way from state ``a`` to ``b``, turning the short way round."""
     delta = b - a
     delta[3] = (delta[3] + np.pi) % (2 * np.pi) - np.pi
-    return min(_score(scene, a + share * delta) for share in (0.33, 0.67))
+    return min(_score(scene, a + fraction * delta) for fraction in (0.33, 0.67))
 
 
 def _targets(scene: Scene) -> Float64:
@@ -144,8 +144,8 @@ def _free_positions(scene: Scene, rng: np.random.Generator, config: CameraPathCo
 
 
 def _line_is_free(scene: Scene, a: Float64, b: Float64, needed: float) -> bool:
-    share = np.linspace(0, 1, 12)[:, None]
-    return bool((clearance(scene, a + share * (b - a)) >= needed - 1e-9).all())
+    fraction = np.linspace(0, 1, 12)[:, None]
+    return bool((clearance(scene, a + fraction * (b - a)) >= needed - 1e-9).all())
 
 
 def _score(scene: Scene, state: Float64) -> float:

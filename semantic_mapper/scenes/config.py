@@ -19,7 +19,7 @@ DepthSensorName = Literal["oak_d", "d435", "exact", "none"]
 class RoomConfig(Config, frozen=True):
     """What a room may look like; the seed decides within these bounds."""
 
-    programme: Programme | None = None  # None: the seed decides
+    template: Programme | None = None  # None: the seed decides
     min_side_m: float = 3.0
     max_side_m: float = 6.0
     min_height_m: float = 2.35

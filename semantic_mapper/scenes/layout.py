@@ -130,11 +130,11 @@ class Layout:
         if (low[:, :2] >= 0.02).all() and (high[:, :2] <= np.array(self.size_m[:2]) - 0.02).all():
             self.groups.append(parts)
 
-    def clutter(self, share: float, names: tuple[str, ...]) -> None:
+    def clutter(self, fraction: float, names: tuple[str, ...]) -> None:
         """Small things on the tops of furniture, ``share`` a fifth of a square metre on average."""
         for top, yaw, position in list(self._tops):
             area = max(top.x1 - top.x0, 0.0) * max(top.y1 - top.y0, 0.0)
-            for _ in range(int(self.rng.poisson(share * area * 5.0 + 0.3 * share))):
+            for _ in range(int(self.rng.poisson(fraction * area * 5.0 + 0.3 * fraction))):
                 small = FURNITURE[names[int(self.rng.integers(len(names)))]].make(self.rng, self.palette)
                 low, high = small.bounds()
                 x0, x1 = top.x0 - low[0] + 0.02, top.x1 - high[0] - 0.02

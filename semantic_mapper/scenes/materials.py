@@ -56,7 +56,7 @@ class Material:
         seed: Of the pattern's noise.
         emission: Light given off, as a multiple of the albedo.
         gloss: Strength of the highlight.
-        mirror: Share of the light that is a mirror image.
+        mirror: Fraction of the light that is a mirror image.
     """
 
     pattern: Pattern

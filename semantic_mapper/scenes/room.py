@@ -9,7 +9,7 @@ from semantic_mapper.scenes.config import SUITE_VERSION, TRAIN_SEEDS, RoomConfig
 from semantic_mapper.scenes.layout import Layout
 from semantic_mapper.scenes.materials import Palette
 from semantic_mapper.scenes.primitives import Primitives, pack
-from semantic_mapper.scenes.programmes import CYCLE, PROGRAMMES, furnish
+from semantic_mapper.scenes.room_templates import CYCLE, ROOM_TEMPLATES, furnish
 from semantic_mapper.scenes.scene import Lights, Scene, extremes, shadow_cubes
 
 _ROOM_STREAM = 0  # number of the random stream; camera paths use others
@@ -23,14 +23,14 @@ def make_room(seed: int, config: RoomConfig = RoomConfig()) -> Scene:
     """
     _check(seed, config)
     rng = np.random.default_rng((SUITE_VERSION, seed, _ROOM_STREAM))
-    programme = config.programme or CYCLE[seed % len(CYCLE)]
-    size = _room_size(rng, programme, config)
+    template = config.template or CYCLE[seed % len(CYCLE)]
+    size = _room_size(rng, template, config)
     palette = Palette(rng, held_out=seed not in TRAIN_SEEDS)
-    layout = Layout(size, rng, palette, wet=programme == "bathroom")
-    furnish(layout, programme, config.clutter)
+    layout = Layout(size, rng, palette, wet=template == "bathroom")
+    furnish(layout, template, config.clutter)
     primitives = pack(layout.groups)
     lights = _make_lights(rng, primitives, layout, config.shadow_resolution)
-    return Scene(seed, programme, size, primitives, palette.table(), lights)
+    return Scene(seed, template, size, primitives, palette.table(), lights)
 
 
 def _check(seed: int, config: RoomConfig) -> None:
@@ -44,14 +44,14 @@ def _check(seed: int, config: RoomConfig) -> None:
         raise ConfigError(
             f"RoomConfig: need 2.2 <= min_height_m <= max_height_m, got {config.min_height_m} and {config.max_height_m}"
         )
-    if config.programme is not None and config.programme not in PROGRAMMES:
-        raise ConfigError(f"RoomConfig: no programme '{config.programme}'; there are {', '.join(PROGRAMMES)}")
+    if config.template is not None and config.template not in ROOM_TEMPLATES:
+        raise ConfigError(f"RoomConfig: no template '{config.template}'; there are {', '.join(ROOM_TEMPLATES)}")
     if config.clutter < 0 or config.shadow_resolution < 8:
         raise ConfigError("RoomConfig: clutter must not be negative, shadow_resolution must be at least 8")
 
 
-def _room_size(rng: np.random.Generator, programme: str, config: RoomConfig) -> tuple[float, float, float]:
-    largest = min(config.max_side_m, config.min_side_m + 0.8) if programme == "bathroom" else config.max_side_m
+def _room_size(rng: np.random.Generator, template: str, config: RoomConfig) -> tuple[float, float, float]:
+    largest = min(config.max_side_m, config.min_side_m + 0.8) if template == "bathroom" else config.max_side_m
     w, d = rng.uniform(config.min_side_m, largest, 2)
     return float(w), float(d), float(rng.uniform(config.min_height_m, config.max_height_m))
 

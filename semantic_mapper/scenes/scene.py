@@ -44,7 +44,7 @@ class Scene:
 
     Args:
         seed: That it was made from.
-        programme: Kind of room ("kitchen", ...).
+        template: Kind of room ("kitchen", ...).
         size_m: (width, depth, height); the room fills [0, width] x [0, depth] x [0, height], z up.
         primitives: Everything that can be seen, walls included.
         materials: Rows are what ``primitives.material`` counts.
@@ -52,7 +52,7 @@ class Scene:
     """
 
     seed: int
-    programme: str
+    template: str
     size_m: tuple[float, float, float]
     primitives: Primitives
     materials: MaterialTable

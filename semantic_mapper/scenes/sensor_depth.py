@@ -19,7 +19,7 @@ from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
 _NATIVE_WIDTH = 1280  # pixels; disparities of both sensors are counted at this width
 _IID_SHARE, _CORRELATED_SHARE = 0.6, 0.8  # of sigma; their squares add up to 1
 _CORRELATION_PX = 8
-_EDGE_RATIO, _EDGE_HOLE_SHARE = 0.06, 0.35  # a step of depth of this share is an edge; holes along it
+_EDGE_RATIO, _EDGE_HOLE_SHARE = 0.06, 0.35  # a step of depth of this fraction is an edge; holes along it
 _FATTEN_SHARE = 0.65  # of the edge pixels take the nearer depth
 _TEXTURE_WINDOW = 9
 _TEXTURE_WIDTH = 0.5  # grey levels over which holes become likely

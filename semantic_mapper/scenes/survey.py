@@ -27,9 +27,9 @@ from semantic_mapper.scenes.config import (
     NoiseConfig,
     RoomConfig,
 )
-from semantic_mapper.scenes.programmes import PROGRAMMES
 from semantic_mapper.scenes.render import render_view
 from semantic_mapper.scenes.room import make_room
+from semantic_mapper.scenes.room_templates import ROOM_TEMPLATES
 from semantic_mapper.scenes.sequence import room_views
 from semantic_mapper.scenes.shots import sequence_shots
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
@@ -52,24 +52,24 @@ def contact_sheet(
 ) -> UInt8:
     """Rooms as rows of pictures (H, W, 3) RGB: for each view its colours, its labels and its measured depth.
 
-    The programmes take turns, so that six seeds show all of them. ``across`` rooms share a row.
+    The room templates take turns, so that six seeds show all of them. ``across`` rooms share a row.
     """
-    names = sorted(PROGRAMMES)
+    names = sorted(ROOM_TEMPLATES)
     rows: list[UInt8] = []
     for number, seed in enumerate(seeds):
-        room = RoomConfig(programme=names[number % len(names)])  # type: ignore[arg-type]
+        room = RoomConfig(template=names[number % len(names)])  # type: ignore[arg-type]
         tiles: list[UInt8] = []
         for view in room_views(seed, views, camera, room=room, path=SPREAD, noise=noise):
             depth = view.rendered.depth_m
             tiles += [view.frame.rgb, ROOMS.colorize(view.rendered.label), _depth_picture(depth)]
         rows.append(np.concatenate(tiles, 1))
-        cv2.putText(rows[-1], f"{seed} {room.programme}", (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 0), 1)
+        cv2.putText(rows[-1], f"{seed} {room.template}", (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 0), 1)
     rows += [np.zeros_like(rows[0])] * (-len(rows) % across)
     return np.concatenate([np.concatenate(rows[k : k + across], 1) for k in range(0, len(rows), across)], 0)
 
 
 def class_shares(seeds: Iterable[int], views: int) -> dict[str, Float64]:
-    """Of each class: share of all pixels, and share of the pictures that show it (2,)."""
+    """Of each class: fraction of all pixels, and fraction of the pictures that show it (2,)."""
     small = CameraIntrinsics(55.15, 55.15, 39.5, 29.5, 80, 60)
     pixels, pictures, count = np.zeros(256), np.zeros(256), 0
     for seed in seeds:
@@ -131,7 +131,7 @@ def sheet(
     scale: Annotated[float, typer.Option(help="of the picture that is written")] = 1.0,
     clean: Annotated[bool, typer.Option(help="perfect sensors")] = False,
 ) -> None:
-    """Write pictures, labels and depth of rooms of all programmes to a PNG or JPEG."""
+    """Write pictures, labels and depth of rooms of all room templates to a PNG or JPEG."""
     seeds, noise = SPLITS[split][first : first + rooms], None if clean else NoiseConfig()
     picture = contact_sheet(seeds, views, across=across, noise=noise)
     picture = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)

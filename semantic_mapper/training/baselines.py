@@ -20,7 +20,7 @@ from semantic_mapper.training.losses import IGNORE
 from semantic_mapper.training.views import jitter_colours, mirrored_view, stack_sources, view_from_frame
 from semantic_mapper.types import PosedFrame, UInt8
 
-WARP_TOLERANCE = 0.04  # share of z by which a keyframe's depth may disagree and still show the same surface
+WARP_TOLERANCE = 0.04  # fraction of z by which a keyframe's depth may disagree and still show the same surface
 
 
 class UNetConfig(Config, frozen=True):

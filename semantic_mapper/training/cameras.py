@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from semantic_mapper.config import Config, Positive, Share
+from semantic_mapper.config import Config, Fraction, Positive
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, PoseNoiseConfig
 from semantic_mapper.scenes.config import DepthSensorName
@@ -24,7 +24,7 @@ class CameraDraw(Config, frozen=True):
     A share ``usual`` of the rooms is seen as the benchmark's rooms are, with the lens of an OAK-D held in the hand.
     """
 
-    usual: Share = 0.4
+    usual: Fraction = 0.4
     focal: Positive = 0.69  # focal length over width of the usual camera: an OAK-D at 1280 pixels has 882.5
     focal_min: Positive = 0.45
     focal_max: Positive = 1.0
@@ -33,7 +33,7 @@ class CameraDraw(Config, frozen=True):
     height_span_m: Positive = 0.3  # between the lowest and the highest point of one path
     roll_deg: Annotated[float, msgspec.Meta(ge=0, le=45)] = 12.0  # standard deviation of the mounting's
     sensors: tuple[DepthSensorName, ...] = ("oak_d", "oak_d", "oak_d", "d435", "d435", "exact")  # one of them
-    odometry: Share = 0.5  # of the rooms in which poses drift
+    odometry: Fraction = 0.5  # of the rooms in which poses drift
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,13 +11,22 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import msgspec
 import numpy as np
 import torch
 
-from semantic_mapper.config import AtLeastOne, AtLeastZero, Config, NotNegative, Positive, Share, SRayConfig, to_plain
+from semantic_mapper.config import (
+    AtLeastOne,
+    AtLeastZero,
+    Config,
+    Fraction,
+    NotNegative,
+    Positive,
+    SRayConfig,
+    to_plain,
+)
 from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.checkpoint import Checkpoint, adapt_model, anchor_from_frame
@@ -28,14 +37,14 @@ from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.training.doubt import with_doubt
-from semantic_mapper.training.head_start import fit_class_rows
+from semantic_mapper.training.frozen_encoder import encode_once, resting_loss
+from semantic_mapper.training.linear_probe import fit_class_rows
 from semantic_mapper.training.losses import IGNORE, Loss, semantic_loss
 from semantic_mapper.training.optimiser import make_optimiser, set_rates
 from semantic_mapper.training.overlap import view_overlap
-from semantic_mapper.training.resting import encode_once, resting_loss
 from semantic_mapper.training.schedule import budget_fraction, cosine_rate
 from semantic_mapper.training.step import StepConfig, pick_views, training_loss
+from semantic_mapper.training.uncertainty import with_uncertainty
 from semantic_mapper.training.views import (
     LabelledView,
     draw_pixels,
@@ -55,17 +64,23 @@ HELD_OUT_SOURCES = 8  # that a held-out ray is rendered from: those that see mos
 class FinetuneConfig(Config, frozen=True):
     """Budget and optimiser of a finetuning."""
 
+    old_names: ClassVar = {
+        "head_start": "linear_probe_steps",
+        "resting_share": "frozen_encoder_fraction",
+        "held_out_share": "held_out_fraction",
+    }
+
     # Wall-clock budget of all of it, looks at held-out rays included; 0 = only steps count (then a run repeats bit for
     # bit). The first look is made in any case.
     seconds: AtLeastZero = 300.0
     steps: NotNegative = 0  # step budget; 0 = only seconds count
     width: AtLeastOne = 320  # working width of the images
     learning_rate: AtLeastZero = 1e-3
-    encoder_rate: Share = 1.0  # of the image encoder, as a share of it; 0 = only what reads its features learns
+    encoder_rate: Fraction = 1.0  # of the image encoder, as a fraction of it; 0 = only what reads its features learns
     final_learning_rate: AtLeastZero = 5e-5
     weight_decay: AtLeastZero = 1e-4
     gradient_clip: Positive = 10.0
-    held_out_share: Annotated[float, msgspec.Meta(ge=0, lt=1)] = (
+    held_out_fraction: Annotated[float, msgspec.Meta(ge=0, lt=1)] = (
         0.1  # of each keyframe's pixels, in blocks, never trained on
     )
     held_out_rays: AtLeastOne = 512  # a keyframe, but no more than 6,144 in all
@@ -74,8 +89,10 @@ class FinetuneConfig(Config, frozen=True):
         4  # evaluations without a better loss before it stops early; 0 = the whole budget, come what may
     )
     bfloat16: bool = True  # the image encoder computes in it where that is fast (GPUs, CPUs with AMX)
-    head_start: NotNegative = 40  # steps of the classifier alone, on features as they are, before the first ray
-    resting_share: Share = 0.0  # of the budget, at its start, in which the image encoder rests, so that steps cost less
+    linear_probe_steps: NotNegative = 40  # steps of the classifier alone, on features as they are, before the first ray
+    frozen_encoder_fraction: Fraction = (
+        0.0  # of the budget, at its start, in which the image encoder rests, so that steps cost less
+    )
     seed: NotNegative = 0
     device: DeviceName = "auto"
     step: StepConfig = StepConfig()
@@ -122,7 +139,7 @@ class _Clock:
         return time.monotonic() - self._began
 
     def used(self, step: int) -> float:
-        """Share of the budget that is used after ``step`` steps."""
+        """Fraction of the budget that is used after ``step`` steps."""
         seconds = self._config.seconds
         left_for_steps = max(seconds - self._look_s, 1e-9) if seconds > 0 else 0.0
         return budget_fraction(step, self.elapsed_s, steps=self._config.steps, seconds=left_for_steps)
@@ -223,17 +240,17 @@ def _run(
     with clock.looking():
         best = _Best(*look(), 0, copy.deepcopy(model.state_dict()))
     step, evaluated, stale = 0, 0, 0
-    best, encoded = (best, None) if alive else _head_start(model, scene, config, best)
+    best, encoded = (best, None) if alive else _linear_probe(model, scene, config, best)
     latest = (best.loss, best.accuracy)
-    doubts = config.step.doubtful_share > 0
-    scene.train = with_doubt(model, scene.train) if doubts else scene.train
+    doubts = config.step.hard_example_fraction > 0
+    scene.train = with_uncertainty(model, scene.train) if doubts else scene.train
     if not math.isfinite(best.loss):
         _log.warning("nothing_held_out", reason="too few labelled pixels; the last weights are kept, not the best")
     while (fraction := clock.used(step)) < 1 and (patience == 0 or stale < patience) and not stopped():
         rate = cosine_rate(fraction, config.learning_rate, config.final_learning_rate)
         set_rates(optimiser, rate, config.encoder_rate)
         with norms():
-            kept = encoded if fraction < config.resting_share else None
+            kept = encoded if fraction < config.frozen_encoder_fraction else None
             loss = _draw_loss(model, scene, kept, config.step, generator)
         step += 1
         if loss is None:
@@ -252,7 +269,7 @@ def _run(
             stale = 0 if improved else stale + 1
             if improved:
                 best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
-            scene.train = with_doubt(model, scene.train) if doubts else scene.train
+            scene.train = with_uncertainty(model, scene.train) if doubts else scene.train
         if on_progress is not None:
             on_progress(FinetuneProgress(step, min(fraction, 1.0), float(loss.total.detach()), *latest, improved))
     if stopped() and step > 0:  # what was learned since the last look
@@ -276,7 +293,7 @@ def _draw_loss(
     return training_loss(model, scene.train, query, sources, config, generator)
 
 
-def _head_start(
+def _linear_probe(
     model: LearnedField,
     scene: _Scene,
     config: FinetuneConfig,
@@ -288,10 +305,10 @@ def _head_start(
         The better state, and the views as they are encoded now, for an encoder that rests; None without either.
     """
     # Kept features leave a kind that classifies while it encodes nothing to learn.
-    if model.needs_own_view or (config.head_start == 0 and config.resting_share == 0):
+    if model.needs_own_view or (config.linear_probe_steps == 0 and config.frozen_encoder_fraction == 0):
         return start, None
     encoded = encode_once(model, scene.train, with_labels=config.step.known_labels)
-    if not fit_class_rows(model, encoded, scene.train, config.head_start):
+    if not fit_class_rows(model, encoded, scene.train, config.linear_probe_steps):
         return start, encoded
     after = _Best(*_evaluate(model, scene, config), 0, copy.deepcopy(model.state_dict()))
     if after.loss < start.loss or not math.isfinite(start.loss):
@@ -318,7 +335,7 @@ def _settle_norms(model: LearnedField, views: Sequence[LabelledView]) -> None:
 
 
 def _make_scene(views: Sequence[LabelledView], config: FinetuneConfig, generator: torch.Generator) -> _Scene:
-    train, held_out = zip(*(_split(v, config.held_out_share, generator) for v in views), strict=True)
+    train, held_out = zip(*(_split(v, config.held_out_fraction, generator) for v in views), strict=True)
     queries = [i for i, view in enumerate(train) if bool((view.channel != IGNORE).any())]
     return _Scene(train, held_out, queries or range(len(views)), view_overlap(views))
 

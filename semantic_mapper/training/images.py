@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 
-from semantic_mapper.config import AtLeastOne, Config, Positive, Share
+from semantic_mapper.config import AtLeastOne, Config, Fraction, Positive
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.encoder import ImageEncoder
@@ -25,15 +26,19 @@ from semantic_mapper.types import SourceViews
 class ImageStepConfig(Config, frozen=True):
     """The first part of training, on single images."""
 
-    share: Share = 0.5  # of the budget; 0 = rays from the first step on
+    old_names: ClassVar = {"share": "fraction", "depth_withheld": "depth_dropout"}
+
+    fraction: Fraction = 0.5  # of the budget; 0 = rays from the first step on
     rooms: AtLeastOne = 8  # a step, of a rank
     images: AtLeastOne = 2  # of each
     learning_rate: Positive = 2e-3
-    colours_first: Share = 0.5  # of this part, without any depth; the network that sees depth then grows from the other
-    depth_withheld: Share = 0.3  # share of images without depth after that
-    mirrored: Share = 0.5  # share of images
+    colours_first: Fraction = (
+        0.5  # of this part, without any depth; the network that sees depth then grows from the other
+    )
+    depth_dropout: Fraction = 0.3  # fraction of images without depth after that
+    mirrored: Fraction = 0.5  # fraction of images
     colour_jitter: float = 0.25
-    balance: Share = 0.25  # see ``losses.image_loss``
+    balance: Fraction = 0.25  # see ``losses.image_loss``
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +71,7 @@ def draw_images(
             views.append(mirrored_view(view) if mirror else view)
     stacked = stack_sources(views, with_labels=True)
     assert stacked.channel is not None
-    withheld = 1.0 if colours_only else config.depth_withheld
+    withheld = 1.0 if colours_only else config.depth_dropout
     sources = withhold_depth(replace(stacked, channel=None), withheld, generator)
     sources = jitter_colours(to_device(sources, device), config.colour_jitter, generator)
     return ImageBatch(sources, stacked.channel.to(device))

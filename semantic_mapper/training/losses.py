@@ -13,7 +13,7 @@ from semantic_mapper.training.views import RayTargets
 from semantic_mapper.types import FieldRender
 
 IGNORE = -1
-RAREST = 1e-3  # share of the pixels below which a class is not weighted up further
+RAREST = 1e-3  # fraction of the pixels below which a class is not weighted up further
 
 
 class LossConfig(Config, frozen=True):
@@ -48,7 +48,7 @@ def image_loss(logits: torch.Tensor, channel: torch.Tensor, balance: float) -> t
     Args:
         logits: (m, L, h, w).
         channel: (m, H, W) int64, -1 = ignore; the nearest pixel counts where sizes differ.
-        balance: A class counts by its share of the pixels to the power of minus this: 0 as it comes, 1 all alike.
+        balance: A class counts by its fraction of the pixels to the power of minus this: 0 as it comes, 1 all alike.
     """
     size = logits.shape[-2:]
     small = functional.interpolate(channel[:, None].float(), size=size, mode="nearest-exact")[:, 0].long()
@@ -56,10 +56,10 @@ def image_loss(logits: torch.Tensor, channel: torch.Tensor, balance: float) -> t
     if balance <= 0:
         total = functional.cross_entropy(logits, small, ignore_index=IGNORE, reduction="sum")
         return total / labelled.sum().clamp_min(1)
-    share = torch.bincount(small[labelled], minlength=logits.shape[1]) / labelled.sum().clamp_min(1)
-    weight = (share.to(logits.dtype) + RAREST) ** -balance
+    fraction = torch.bincount(small[labelled], minlength=logits.shape[1]) / labelled.sum().clamp_min(1)
+    weight = (fraction.to(logits.dtype) + RAREST) ** -balance
     total = functional.cross_entropy(logits, small, weight, ignore_index=IGNORE, reduction="sum")
-    return total / (weight * share).sum().clamp_min(1e-6) / labelled.sum().clamp_min(1)
+    return total / (weight * fraction).sum().clamp_min(1e-6) / labelled.sum().clamp_min(1)
 
 
 def ray_loss(render: FieldRender, targets: RayTargets, config: LossConfig) -> Loss:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from semantic_mapper.config import AtLeastOne, AtLeastTwo, AtLeastZero, Config, NotNegative, Share
+from semantic_mapper.config import AtLeastOne, AtLeastTwo, AtLeastZero, Config, Fraction, NotNegative
 from semantic_mapper.errors import FrameError, WeightsError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, SegmentationMetrics
 from semantic_mapper.fields.base import EncodedViews, stack_views
@@ -34,11 +34,11 @@ SOURCES = 7  # keyframes that a held-out ray is rendered from, beside its own im
 
 
 class RoundConfig(FinetuneConfig, frozen=True):
-    """As ``FinetuneConfig``, with other defaults: short rounds on a share of a core."""
+    """As ``FinetuneConfig``, with other defaults: short rounds on a fraction of a core."""
 
     seconds: AtLeastZero = 0.0  # steps count: how long they take is for whoever holds the budget to say
     steps: NotNegative = 60
-    resting_share: Share = 1.0  # cannot be less
+    frozen_encoder_fraction: Fraction = 1.0  # cannot be less
     held_out_rays: AtLeastOne = 128
     evaluations: AtLeastOne = 3
     patience: NotNegative = 0
@@ -46,8 +46,8 @@ class RoundConfig(FinetuneConfig, frozen=True):
     step: StepConfig = StepConfig(rays=512)
 
     def __post_init__(self) -> None:
-        if self.resting_share < 1:
-            raise ValueError("resting_share must be 1: the mapper's keyframes are not encoded anew")
+        if self.frozen_encoder_fraction < 1:
+            raise ValueError("frozen_encoder_fraction must be 1: the mapper's keyframes are not encoded again")
 
 
 class OnlineConfig(Config, frozen=True):
@@ -56,10 +56,10 @@ class OnlineConfig(Config, frozen=True):
     new_keyframes: AtLeastOne = 4  # so many must have come since the last round
     held_out_every: AtLeastTwo = 4  # of so many keyframes, the last is never learned from: it judges
     max_keyframes: AtLeastTwo = 32  # kept; past it the oldest goes
-    least_gain: Share = 0.01  # mIoU that new weights must gain on the held-out keyframes
-    least_score: Share = 0.2  # mIoU that they must reach there: labels without any sense are learned worse
+    least_gain: Fraction = 0.01  # mIoU that new weights must gain on the held-out keyframes
+    least_score: Fraction = 0.2  # mIoU that they must reach there: labels without any sense are learned worse
     # Accuracy that they may lose on those held-out keyframes with which the weights in use were found better.
-    tolerance: Share = 0.02
+    tolerance: Fraction = 0.02
     rays: AtLeastOne = 1024  # of each held-out keyframe
     finetune: RoundConfig = RoundConfig()
 

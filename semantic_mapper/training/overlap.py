@@ -7,16 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from semantic_mapper.coverage import GUESSED_DEPTHS_M, sees
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.training.views import LabelledView
 from semantic_mapper.types import Float32, Float64
+from semantic_mapper.view_selection import GUESSED_DEPTHS_M, visible_points
 
 PROBE = 24  # pixels a row of a view that are asked what the others see of them
 
 
 def view_overlap(views: Sequence[LabelledView]) -> torch.Tensor:
-    """Share of what each view sees that each other view sees, too.
+    """Fraction of what each view sees that each other view sees, too.
 
     Args:
         views: n views, on the CPU or elsewhere.
@@ -31,7 +31,7 @@ def view_overlap(views: Sequence[LabelledView]) -> torch.Tensor:
         points, measured = _points(poses[i], depths[i], view)
         for j, other in enumerate(views):
             if i != j:
-                seen = sees(points, poses[j], other.intrinsics, depths[j], measured=measured)
+                seen = visible_points(points, poses[j], other.intrinsics, depths[j], measured=measured)
                 overlap[i, j] = float(seen.mean())
     return overlap
 

@@ -6,11 +6,11 @@ import math
 
 from semantic_mapper.training.train_config import TrainConfig
 
-WARM_UP = 0.01  # share of each part of a training
+WARM_UP = 0.01  # fraction of each part of a training
 
 
 def budget_fraction(step: int, elapsed_s: float, *, steps: int, seconds: float) -> float:
-    """Share of the budget that is used, by steps or by time, whichever is further; a budget of 0 does not count."""
+    """Fraction of the budget that is used, by steps or by time, whichever is further; a budget of 0 does not count."""
     by_steps = step / steps if steps > 0 else 0.0
     by_time = elapsed_s / seconds if seconds > 0 else 0.0
     return max(by_steps, by_time)

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 
-from semantic_mapper.config import AtLeastOne, AtLeastTwo, AtLeastZero, Config, SamplingConfig, Share
+from semantic_mapper.config import AtLeastOne, AtLeastTwo, AtLeastZero, Config, Fraction, SamplingConfig
 from semantic_mapper.fields.base import MAX_SOURCE_VIEWS, EncodedViews
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
@@ -19,7 +20,7 @@ from semantic_mapper.training.losses import IGNORE, Loss, LossConfig, image_loss
 from semantic_mapper.training.views import (
     LabelledView,
     RayTargets,
-    draw_doubtful,
+    draw_hard_examples,
     draw_pixels,
     jitter_colours,
     join_sources,
@@ -38,23 +39,38 @@ LEAST_WORTH = 0.05  # of a view that sees nothing of the query: it may still be 
 class StepConfig(Config, frozen=True):
     """How a training step draws its views, rays and samples."""
 
+    old_names: ClassVar = {
+        "own_view_share": "own_view_fraction",
+        "balanced_share": "balanced_fraction",
+        "doubtful_share": "hard_example_fraction",
+        "depth_withheld": "depth_dropout",
+        "blind": "no_depth",
+        "labels_withheld": "label_dropout",
+        "blind_samples": "samples_without_depth",
+        "blind_thinning": "no_depth_thinning",
+    }
+
     rays: AtLeastOne = 1024
     views_min: AtLeastOne = 3  # source views of a step are drawn from views_min..views_max
     views_max: AtLeastOne = 5
-    own_view_share: Share = 0.3  # how often the query view is itself a source, as when the current frame is mapped
-    balanced_share: Share = 0.5  # share of rays drawn with all classes equally likely
-    doubtful_share: Share = 0.0  # share of rays drawn where the field is in doubt, of views that know (finetuning)
-    depth_withheld: Share = 0.15  # share of source views, and of steps for the query's prior, without depth
-    blind: Share = 0.0  # share of steps without any depth: neither source views nor prior have it
+    own_view_fraction: Fraction = (
+        0.3  # how often the query view is itself a source, as when the current frame is mapped
+    )
+    balanced_fraction: Fraction = 0.5  # fraction of rays drawn with all classes equally likely
+    hard_example_fraction: Fraction = (
+        0.0  # fraction of rays drawn where the field is in doubt, of views that know (finetuning)
+    )
+    depth_dropout: Fraction = 0.15  # fraction of source views, and of steps for the query's prior, without depth
+    no_depth: Fraction = 0.0  # fraction of steps without any depth: neither source views nor prior have it
     known_labels: bool = True  # source views other than the query bring their labels, as keyframes of a finetuning do
-    labels_withheld: Share = 0.3  # share of source views without known labels
-    prior_noise: AtLeastZero = 0.01  # sigma of the depth prior's error as a share of z
-    blind_samples: AtLeastTwo = 32  # samples a ray in steps without a depth prior
-    blind_thinning: AtLeastOne = (
+    label_dropout: Fraction = 0.3  # fraction of source views without known labels
+    prior_noise: AtLeastZero = 0.01  # sigma of the depth prior's error as a fraction of z
+    samples_without_depth: AtLeastTwo = 32  # samples a ray in steps without a depth prior
+    no_depth_thinning: AtLeastOne = (
         1  # in steps without a depth prior, where a ray costs more, one ray in so many is rendered
     )
-    colour_jitter: Share = 0.2
-    mirrored: Share = 0.0  # share of steps in which the world is its mirror image
+    colour_jitter: Fraction = 0.2
+    mirrored: Fraction = 0.0  # fraction of steps in which the world is its mirror image
     loss: LossConfig = LossConfig()
     sampling: SamplingConfig = SamplingConfig()
 
@@ -98,7 +114,7 @@ def pick_views(
     size = int(torch.randint(config.views_min, config.views_max + 1, (1,), generator=generator))
     size = max(1, min(size, len(overlap) - 1))
     sources = torch.multinomial(worth, size, generator=generator).tolist() if len(overlap) > 1 else [query]
-    if float(torch.rand(1, generator=generator)) < config.own_view_share:
+    if float(torch.rand(1, generator=generator)) < config.own_view_fraction:
         sources = [*sources[: max(0, size - 1)], query]
     return query, sources
 
@@ -118,7 +134,7 @@ def pick_views_on_path(
     stretch = round(size * (len(others) / size) ** float(torch.rand(1, generator=generator)))
     order = torch.randperm(stretch, generator=generator)[:size].tolist()
     sources = [others[i] for i in order]
-    if float(torch.rand(1, generator=generator)) < config.own_view_share:
+    if float(torch.rand(1, generator=generator)) < config.own_view_fraction:
         sources = [*sources[: max(0, size - 1)], query]
     return query, sources
 
@@ -161,13 +177,13 @@ def draw_batch(
     if config.mirrored > 0 and float(torch.rand(1, generator=generator)) < config.mirrored:
         views = _mirrored(views, query, sources)
         resident = None if resident is None else _mirrored(resident, query, sources)
-    blind = config.blind > 0 and float(torch.rand(1, generator=generator)) < config.blind
+    blind = config.no_depth > 0 and float(torch.rand(1, generator=generator)) < config.no_depth
     drawn = draw_rays(views[query], config, generator, classes, blind=blind)
     if drawn is None:
         return None
     rays, targets, z = drawn
     stacked = _sources(resident or views, query, sources, config, generator)
-    stacked = withhold_depth(stacked, 1.0 if blind else config.depth_withheld, generator)
+    stacked = withhold_depth(stacked, 1.0 if blind else config.depth_dropout, generator)
     stacked = jitter_colours(to_device(stacked, device), config.colour_jitter, generator)
     channel = torch.stack([(resident or views)[i].channel for i in sources])
     return StepBatch(stacked, channel.to(device), to_device(rays, device), to_device(targets, device), z.to(device))
@@ -182,12 +198,12 @@ def draw_rays(
         classes: L of the label set.
         blind: Without depth priors.
     """
-    doubtful = 0 if target.doubt is None else int(config.rays * config.doubtful_share)
-    flat = draw_pixels(target.channel, config.rays - doubtful, config.balanced_share, generator, classes)
+    doubtful = 0 if target.uncertainty is None else int(config.rays * config.hard_example_fraction)
+    flat = draw_pixels(target.channel, config.rays - doubtful, config.balanced_fraction, generator, classes)
     if len(flat) == 0:
         return None
-    if target.doubt is not None and doubtful > 0:
-        flat = torch.cat((flat, draw_doubtful(target.doubt, doubtful, generator)))
+    if target.uncertainty is not None and doubtful > 0:
+        flat = torch.cat((flat, draw_hard_examples(target.uncertainty, doubtful, generator)))
     return _draw_samples(target, flat, config, blind, generator)
 
 
@@ -250,18 +266,18 @@ def _sources(
         return stacked
     own = torch.tensor([i == query for i in sources], device=stacked.channel.device)
     stacked = replace(stacked, channel=torch.where(own[:, None, None], IGNORE, stacked.channel))
-    return withhold_labels(stacked, config.labels_withheld, generator)
+    return withhold_labels(stacked, config.label_dropout, generator)
 
 
 def _draw_samples(
     target: LabelledView, flat: torch.Tensor, config: StepConfig, blind: bool, generator: torch.Generator
 ) -> tuple[RayBatch, RayTargets, torch.Tensor]:
     noise = 1 + config.prior_noise * torch.randn(len(flat), generator=generator)
-    withheld = float(torch.rand(1, generator=generator)) < config.depth_withheld
+    withheld = float(torch.rand(1, generator=generator)) < config.depth_dropout
     near_m, far_m = config.sampling.near_m, config.sampling.far_m
     if blind or withheld or not bool((target.depth_m > 0).any()):
-        rays, targets = query_rays(target, flat[:: config.blind_thinning], near_m=near_m, far_m=far_m, prior=None)
-        return rays, targets, sample_inverse_depth(rays.near_m, rays.far_m, config.blind_samples, generator)
+        rays, targets = query_rays(target, flat[:: config.no_depth_thinning], near_m=near_m, far_m=far_m, prior=None)
+        return rays, targets, sample_inverse_depth(rays.near_m, rays.far_m, config.samples_without_depth, generator)
     prior = target.depth_m.flatten()[flat] * noise
     rays, targets = query_rays(target, flat, near_m=near_m, far_m=far_m, prior=prior)
     return rays, targets, sample_guided(rays, config.sampling)

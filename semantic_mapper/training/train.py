@@ -159,7 +159,7 @@ class _Run:
         done = int(min(self._fraction(self.progress.elapsed_s), 1.0) * self.config.validation.times)
         self.progress.validated = min(self.progress.validated, done)  # fewer where the budget has grown
         self.progress.finished = False
-        if self.config.images.share == 1:  # there are no rays to go on with, so a larger budget holds more images
+        if self.config.images.fraction == 1:  # there are no rays to go on with, so a larger budget holds more images
             self.progress.past_images = False
         _log.info("training_resumed", step=self.progress.step, elapsed_s=round(self.progress.elapsed_s))
 
@@ -168,7 +168,7 @@ class _Run:
         rooms = validation_rooms(config.validation, config.pool, self.ranks, self.device)
         self._choose_precision()
         encoder = self.field.image_encoder
-        if encoder is not None and encoder.uncalibrated and config.images.share == 0 and rooms:
+        if encoder is not None and encoder.uncalibrated and config.images.fraction == 0 and rooms:
             calibrate(encoder, stack_sources(rooms[0].resident))
         pool = RoomPool(
             config.pool,
@@ -194,7 +194,7 @@ class _Run:
                     saved = time.monotonic()
                 if fraction >= self._colours_until():
                     self._grow_depth()
-                if not progress.past_images and fraction >= config.images.share > 0:
+                if not progress.past_images and fraction >= config.images.fraction > 0:
                     self._keep_after_images(pool)
                 progress.finished = fraction >= 1
                 if progress.finished or stop:
@@ -254,7 +254,7 @@ class _Run:
         if not math.isfinite(means[0]):
             raise WeightsError(
                 f"training has diverged by step {progress.step} (loss {means[0]}); lower learning_rate or "
-                "gradient_clip and start anew, the weights that were kept before are still there"
+                "gradient_clip and restart, the weights that were kept before are still there"
             )
         self.last_loss = means[0]
         losses = {f"loss_{name}": round(mean, 6) for name, mean in zip(LOSS_PARTS, means, strict=True)}
@@ -282,19 +282,19 @@ class _Run:
             save_state(self.folder / STATE_FILE, self.progress, self.field, self.optimiser, self._identity())
 
     def _images_share(self) -> float:
-        """Share of the budget that belongs to images.
+        """Fraction of the budget that belongs to images.
 
         Once they are over, what they took of it. So after a resume with a larger budget the rays go on, and all that
         it has more is theirs.
         """
         config, progress = self.config, self.progress
         if not progress.past_images:
-            return config.images.share
+            return config.images.fraction
         return budget_fraction(progress.images_steps, progress.images_s, steps=config.steps, seconds=config.seconds)
 
     def _colours_until(self) -> float:
-        """Share of the budget that belongs to images without depth."""
-        return self.config.images.share * self.config.images.colours_first
+        """Fraction of the budget that belongs to images without depth."""
+        return self.config.images.fraction * self.config.images.colours_first
 
     def _grow_depth(self) -> None:
         """From now on images bring their depth; the network that sees it begins where the one for colours is."""

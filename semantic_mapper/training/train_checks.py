@@ -43,7 +43,7 @@ def check_field(field: LearnedField, config: TrainConfig) -> None:
             f"a field of kind '{field.kind}' holds a single scene in its weights, so it has nothing to learn for other "
             f"rooms; `semantic-mapper eval --suite rooms --protocol scratch --kind {field.kind}` fits it room by room"
         )
-    if config.images.share > 0:
+    if config.images.fraction > 0:
         encoder_for_images(field)
     check_parts(field, config.bfloat16)
     if config.encode_together and not _encodes_views_separately(field):
@@ -81,8 +81,8 @@ def check_nothing_is_overwritten(state: Path) -> None:
     if stopped_at is None:
         raise ConfigError(
             f"{state}: a run has finished here; train it further with --resume and a larger budget, give the new run "
-            "another --out, or delete that file to start anew"
+            "another --out, or delete that file to restart"
         )
     raise ConfigError(
-        f"{state}: a run was stopped here at step {stopped_at}; go on with --resume, or delete that file to start anew"
+        f"{state}: a run was stopped here at step {stopped_at}; go on with --resume, or delete that file to restart"
     )

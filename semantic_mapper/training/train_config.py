@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from semantic_mapper.config import AtLeastOne, Config, Share
+from semantic_mapper.config import AtLeastOne, Config, Fraction
 from semantic_mapper.fields.device import DeviceName
 from semantic_mapper.training.images import ImageStepConfig
 from semantic_mapper.training.losses import LossConfig
@@ -19,11 +19,11 @@ class TrainStepConfig(StepConfig, frozen=True):
     """A step of training to generalize: many densities of views, no known labels, often no depth at all."""
 
     views_max: AtLeastOne = 12
-    own_view_share: Share = 0.0  # the query's own image would give the answer away
+    own_view_fraction: Fraction = 0.0  # the query's own image would give the answer away
     known_labels: bool = False
-    blind: Share = 0.25
-    blind_thinning: AtLeastOne = 4  # 32 samples a ray instead of 8
-    mirrored: Share = 0.5
+    no_depth: Fraction = 0.25
+    no_depth_thinning: AtLeastOne = 4  # 32 samples a ray instead of 8
+    mirrored: Fraction = 0.5
     loss: LossConfig = LossConfig(balance=0.25)
 
 

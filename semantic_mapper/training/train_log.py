@@ -72,7 +72,7 @@ class TrainLog(AbstractContextManager["TrainLog"]):
                     self._events.add_scalar(_NAMES[key], value, line["step"])
 
     def draw(self) -> None:
-        """Draw the curves anew."""
+        """Draw the curves again."""
         if self._folder is not None and not cannot_draw():
             write_picture(self._folder / CURVES_FILE, draw_history(self._history))
 

@@ -140,7 +140,7 @@ def load_state(path: Path, model: nn.Module, optimiser: torch.optim.Optimizer, c
     except ConfigError:
         raise
     except (KeyError, ValueError, IndexError, RuntimeError) as error:
-        raise WeightsError(f"{path}: does not fit this training ({error}); start anew in another folder") from error
+        raise WeightsError(f"{path}: does not fit this training ({error}); restart in another folder") from error
 
 
 def _read(path: Path, *, only_metadata: bool = False) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
@@ -152,11 +152,9 @@ def _read(path: Path, *, only_metadata: bool = False) -> tuple[dict[str, torch.T
             names = [] if only_metadata else list(stored.keys())
             tensors = {name: stored.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:
-        raise WeightsError(f"{path}: not a readable training state ({error}); delete it to start anew") from error
+        raise WeightsError(f"{path}: not a readable training state ({error}); delete it to restart") from error
     if metadata.get("format") != FORMAT or metadata.get("version") != str(VERSION):
-        raise WeightsError(
-            f"{path}: not a training state of this version ({FORMAT} {VERSION}); delete it to start anew"
-        )
+        raise WeightsError(f"{path}: not a training state of this version ({FORMAT} {VERSION}); delete it to restart")
     return tensors, metadata
 
 
@@ -181,4 +179,4 @@ def _check_same(stored: dict[str, Any], wanted: dict[str, Any], path: Path) -> N
     other = sorted(k for k in stored.keys() | wanted.keys() if stored.get(k) != wanted.get(k))
     if other:
         said = "; ".join(f"{k} was {stored.get(k)}, is {wanted.get(k)}" for k in other)
-        raise ConfigError(f"{path}: cannot go on with another config ({said}); start anew in another folder")
+        raise ConfigError(f"{path}: cannot go on with another config ({said}); restart in another folder")

@@ -26,7 +26,7 @@ class ValidationConfig(Config, frozen=True):
     times: int = 8  # over the whole budget
     rooms: int = 6  # the first ones of the validation seeds
     queries: int = 2  # views a room
-    rays: int = 1000  # a view; without depth one in ``blind_thinning`` of them
+    rays: int = 1000  # a view; without depth one in ``no_depth_thinning`` of them
     views: int = 8  # source views, the nearest on the path
 
 
@@ -48,7 +48,7 @@ class Scores:
 def validation_rooms(
     config: ValidationConfig, pool: RoomPoolConfig, ranks: Ranks, device: torch.device
 ) -> list[RoomViews]:
-    """This rank's share of the validation rooms.
+    """This rank's fraction of the validation rooms.
 
     Raises:
         ConfigError: more rooms than there are, or none.
@@ -111,13 +111,13 @@ def _count(
     classes = len(model.label_set)
     counts: list[torch.Tensor] = []
     for blind in (False, True):
-        chosen = flat[:: step.blind_thinning] if blind else flat  # a ray without a prior costs more, as in training
+        chosen = flat[:: step.no_depth_thinning] if blind else flat  # a ray without a prior costs more, as in training
         prior = None if blind else view.depth_m.flatten()[chosen]
         rays, targets = query_rays(view, chosen, near_m=near_m, far_m=far_m, prior=prior)
         rays = to_device(rays, device)
         seen = replace(sources, depth_m=torch.zeros_like(sources.depth_m)) if blind else sources
         if blind:
-            z = sample_inverse_depth(rays.near_m, rays.far_m, step.blind_samples)
+            z = sample_inverse_depth(rays.near_m, rays.far_m, step.samples_without_depth)
         else:
             z = sample_guided(rays, step.sampling)
         render, _ = model.render_samples(rays, z, model.encode(seen))

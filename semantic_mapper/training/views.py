@@ -24,7 +24,8 @@ class LabelledView:
         channel: (H, W) int64 class channels, -1 = ignore.
         intrinsics: Of (H, W).
         T_world_camera: (4, 4) float32.
-        doubt: (H, W) float32 how likely a pixel is drawn among the doubtful ones (``doubt.with_doubt``); None = never.
+        uncertainty: (H, W) float32 how likely a pixel is drawn among the hard examples
+            (``uncertainty.with_uncertainty``); None = never.
     """
 
     rgb: torch.Tensor
@@ -32,7 +33,7 @@ class LabelledView:
     channel: torch.Tensor
     intrinsics: CameraIntrinsics
     T_world_camera: torch.Tensor
-    doubt: torch.Tensor | None = None
+    uncertainty: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,17 +105,17 @@ def select_sources(sources: SourceViews, index: torch.Tensor) -> SourceViews:
     )
 
 
-def withhold_labels(sources: SourceViews, share: float, generator: torch.Generator) -> SourceViews:
-    """Set the known labels of a random share of the views to "none": most source views of a robot have none."""
+def withhold_labels(sources: SourceViews, fraction: float, generator: torch.Generator) -> SourceViews:
+    """Set the known labels of a random fraction of the views to "none": most source views of a robot have none."""
     if sources.channel is None:
         return sources
-    keep = (torch.rand(len(sources.rgb), generator=generator) >= share).to(sources.channel.device)
+    keep = (torch.rand(len(sources.rgb), generator=generator) >= fraction).to(sources.channel.device)
     return replace(sources, channel=torch.where(keep[:, None, None], sources.channel, -1))
 
 
-def withhold_depth(sources: SourceViews, share: float, generator: torch.Generator) -> SourceViews:
-    """Set the depth of a random share of the views to "none", so that the field learns to work without."""
-    keep = torch.rand(len(sources.depth_m), generator=generator) >= share
+def withhold_depth(sources: SourceViews, fraction: float, generator: torch.Generator) -> SourceViews:
+    """Set the depth of a random fraction of the views to "none", so that the field learns to work without."""
+    keep = torch.rand(len(sources.depth_m), generator=generator) >= fraction
     return replace(sources, depth_m=sources.depth_m * keep.to(sources.depth_m.device)[:, None, None])
 
 
@@ -130,7 +131,7 @@ def jitter_colours(sources: SourceViews, strength: float, generator: torch.Gener
 
 
 def draw_pixels(
-    channel: torch.Tensor, count: int, balanced_share: float, generator: torch.Generator, classes: int
+    channel: torch.Tensor, count: int, balanced_fraction: float, generator: torch.Generator, classes: int
 ) -> torch.Tensor:
     """Flat indices of labelled pixels (count,): partly uniform, partly with every class present equally likely.
 
@@ -142,16 +143,16 @@ def draw_pixels(
     labelled = (flat >= 0).nonzero()[:, 0]
     if len(labelled) == 0:
         return labelled
-    uniform = labelled[torch.randint(len(labelled), (count - int(count * balanced_share),), generator=generator)]
+    uniform = labelled[torch.randint(len(labelled), (count - int(count * balanced_fraction),), generator=generator)]
     histogram = torch.bincount(flat[labelled], minlength=classes).float()
     weight = torch.where(histogram > 0, 1 / histogram.clamp_min(1), torch.zeros_like(histogram))[flat[labelled]]
     cumulative = torch.cumsum(weight.double(), 0)
-    u = torch.rand(int(count * balanced_share), generator=generator, dtype=torch.float64) * cumulative[-1]
+    u = torch.rand(int(count * balanced_fraction), generator=generator, dtype=torch.float64) * cumulative[-1]
     balanced = labelled[torch.searchsorted(cumulative, u).clamp_max(len(labelled) - 1)]
     return torch.cat((uniform, balanced))
 
 
-def draw_doubtful(doubt: torch.Tensor, count: int, generator: torch.Generator) -> torch.Tensor:
+def draw_hard_examples(doubt: torch.Tensor, count: int, generator: torch.Generator) -> torch.Tensor:
     """Flat indices (count,) of pixels of ``doubt`` (H, W), each as likely as its doubt is high."""
     cumulative = torch.cumsum(doubt.flatten().double(), 0)
     u = torch.rand(count, generator=generator, dtype=torch.float64) * cumulative[-1]

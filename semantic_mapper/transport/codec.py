@@ -256,7 +256,7 @@ def encode_frame(
     Args:
         frame: With a finite pose; whether it is a rotation is for the receiver to judge.
         options: How to pack.
-        encoded_rgb: Sent instead of packing ``frame.rgb`` anew, so that an imported JPEG stays what it was.
+        encoded_rgb: Sent instead of packing ``frame.rgb`` again, so that an imported JPEG stays what it was.
 
     Raises:
         CodecError: NaN in the pose, or a camera id that a topic cannot hold.

@@ -16,7 +16,7 @@ from semantic_mapper.errors import CodecError
 from semantic_mapper.transport.framing import Buffer
 from semantic_mapper.types import Float32, UInt8
 
-_contexts = threading.local()  # zstd contexts must not be shared between threads, and cost too much to make anew
+_contexts = threading.local()  # zstd contexts must not be shared between threads, and cost too much to make again
 
 
 def zstd_compress(data: Buffer, level: int) -> bytes:

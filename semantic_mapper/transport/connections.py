@@ -1,4 +1,4 @@
-"""The connections of a subscribing socket: counted, and made anew where ZeroMQ has given them up.
+"""The connections of a subscribing socket: counted, and made again where ZeroMQ has given them up.
 
 A connection that is lost is tried again by ZeroMQ itself, save one that is cut because the other side has broken the
 protocol, such as by a message beyond MAXMSGSIZE: ZeroMQ gives that one up for good, and says no more than that it is
@@ -48,7 +48,7 @@ class Connections:
         return max(0, self._count)
 
     def mend(self) -> None:
-        """Make those anew that ZeroMQ has given up; often called, costs nothing."""
+        """Make those again that ZeroMQ has given up; often called, costs nothing."""
         self._listen()
         now = time.monotonic()
         for endpoint in [e for e, since in self._lost.items() if now - since > GIVEN_UP_S]:

@@ -90,7 +90,7 @@ class Request(Wire, frozen=True, kw_only=True):
 class Answer(Wire, frozen=True, kw_only=True):
     """Of every answer: which state of which map it is about.
 
-    ``map_id`` is another one after the mapper was started anew; versions of two maps cannot be compared.
+    ``map_id`` is another one after the mapper was restarted; versions of two maps cannot be compared.
     """
 
     map_id: Word

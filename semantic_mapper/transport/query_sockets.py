@@ -1,4 +1,4 @@
-"""The two ends of question and answer: ``QueryServer`` (ROUTER) and ``QuerySocket`` (REQ, made anew when lost)."""
+"""The two ends of question and answer: ``QueryServer`` (ROUTER) and ``QuerySocket`` (REQ, made again when lost)."""
 
 from __future__ import annotations
 

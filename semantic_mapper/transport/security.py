@@ -184,7 +184,7 @@ class _AllowList:
         self._refused = 0
 
     def callback(self, domain: str, key: bytes) -> bool:
-        """Whether the client with this key (Z85) may enter; the folder is read anew, so that changes count at once."""
+        """Whether the client with this key (Z85) may enter; the folder is read again, so that changes count at once."""
         try:
             allowed = key in self._keys.peers().values()
         except TransportError as error:
@@ -203,7 +203,7 @@ def _load(path: Path) -> tuple[bytes, bytes | None]:
     except (OSError, ValueError) as error:
         raise TransportError(f"{path}: cannot be read as a key: {error}") from error
     if not _is_key(public):
-        raise TransportError(f"{path}: holds no public key; take it out of the folder, or add the peer anew")
+        raise TransportError(f"{path}: holds no public key; take it out of the folder, or add the peer again")
     return public, secret
 
 

@@ -268,7 +268,7 @@ class _Subscriber:
         self._max_bytes = max(map(max_bytes, self.topics))
         self._socket.setsockopt(zmq.MAXMSGSIZE, min(MAX_PART_BYTES, self._max_bytes))
         self._socket.setsockopt(zmq.RECONNECT_IVL, 50)
-        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 200)  # a node that was started anew is found at once
+        self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 200)  # a node that was restarted is found at once
         # Not ZeroMQ's own heartbeats: they take a reader that does not keep up for a dead peer, and where its queue was
         # full when they cut the connection, libzmq aborts the process (4.3.5: "Assertion failed: _input_stopped").
         self._socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
@@ -560,7 +560,7 @@ class NewestSubscriber(_Subscriber):
     def _check_receiving(self) -> None:
         if self._failure is not None:
             raise TransportError(
-                f"{self.endpoints}: nothing is received any more: {self._failure}; subscribe anew"
+                f"{self.endpoints}: nothing is received any more: {self._failure}; subscribe again"
             ) from self._failure
 
     def _take(self, parts: list[bytes]) -> None:

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from semantic_mapper.benchmark.config import SuiteConfig, check_suite, fit_config
-from semantic_mapper.benchmark.contestants import load_contestants
+from semantic_mapper.benchmark.entries import load_entries
 from semantic_mapper.benchmark.figures import view_figures
 from semantic_mapper.benchmark.predict import predict_view
 from semantic_mapper.benchmark.protocols import (
-    Contestant,
+    Entry,
     Keyframes,
     RoomResult,
     answer_from_keyframes,
@@ -50,8 +50,8 @@ def watched(kind: type[Watched] = Watched) -> Watched:
     return copy
 
 
-def score(contestant: Contestant, suite: SuiteConfig, on_fit: Callable[[float], None] | None = None) -> RoomResult:
-    result = run_room(tiny_room(), contestant, suite, on_fit)
+def score(entry: Entry, suite: SuiteConfig, on_fit: Callable[[float], None] | None = None) -> RoomResult:
+    result = run_room(tiny_room(), entry, suite, on_fit)
     assert result is not None
     return result
 
@@ -70,7 +70,7 @@ def test_generalizing_scores_whole_views_from_sources_that_are_not_the_query() -
 
 
 def test_the_query_is_a_source_only_of_a_kind_that_needs_it() -> None:
-    record = score(Contestant("own", "own", watched(OwnView)), tiny_suite()).record
+    record = score(Entry("own", "own", watched(OwnView)), tiny_suite()).record
     assert all(len(i.sources) == 3 and i.sources[-1] == i.frame for i in record.images)
     figures = view_figures([record])
     assert figures["psnr_db"] is None and figures["ssim"] is None  # it could just repeat the image
@@ -78,10 +78,10 @@ def test_the_query_is_a_source_only_of_a_kind_that_needs_it() -> None:
 
 def test_without_depth_nothing_of_it_reaches_the_field() -> None:
     field = watched()
-    score(Contestant("blind", "blind", field), tiny_suite(depth=False))
+    score(Entry("blind", "blind", field), tiny_suite(depth=False))
     assert not field.seen.depth_m.any() and field.seen.channel is None
     assert field.sampling == tiny_suite().tier.blind
-    score(Contestant("seeing", "seeing", field), tiny_suite())
+    score(Entry("seeing", "seeing", field), tiny_suite())
     assert field.seen.depth_m.any() and field.sampling == tiny_suite().tier.guided
 
 
@@ -94,7 +94,7 @@ def test_without_depth_coarse_samples_may_guide_fine_ones() -> None:
 
 
 def test_the_compiled_renderer_gives_the_figures_of_the_field_itself() -> None:
-    fast, plain = (score(Contestant("x", "x", f), tiny_suite()) for f in (tiny_field(), watched()))
+    fast, plain = (score(Entry("x", "x", f), tiny_suite()) for f in (tiny_field(), watched()))
     for query, answer in fast.answers.items():
         other = plain.answers[query].prediction
         np.testing.assert_allclose(answer.prediction.confidence, other.confidence, atol=1e-4)
@@ -222,16 +222,16 @@ def test_scratch_starts_from_random_weights_whatever_the_file_holds() -> None:
 
 def test_a_kind_for_one_scene_is_fitted_in_a_box_round_what_the_keyframes_see() -> None:
     suite = tiny_suite(protocol="scratch")
-    (contestant,) = load_contestants([], ["semantic_nerf"])
-    result = run_room(tiny_room(), contestant, suite)
+    (entry,) = load_entries([], ["semantic_nerf"])
+    result = run_room(tiny_room(), entry, suite)
     assert result is not None
     before, after = (from_rows(point.confusion).metrics() for point in result.record.curve[::2])
     assert before.total_accuracy == 0, "unfitted it knows nothing"
     assert after.total_accuracy > 0
     room = tiny_room()
     views = stack_sources([view_from_frame(room.frames[n], ROOMS, 48) for n in result.record.keyframes])
-    box = contestant.field.scene_config(views, suite.tier.guided.far_m)
-    assert box.half_extent_m < contestant.field.config.half_extent_m
+    box = entry.field.scene_config(views, suite.tier.guided.far_m)
+    assert box.half_extent_m < entry.field.config.half_extent_m
     depth_m = max(float(room.frames[n].depth_m.max()) for n in result.record.keyframes)
     assert 0.5 * depth_m < box.half_extent_m
 

@@ -52,19 +52,19 @@ def test_a_second_call_makes_only_what_is_missing(tmp_path: Path) -> None:
 
 def test_a_stopped_run_keeps_what_is_done(tmp_path: Path) -> None:
     suite, store = tiny_suite(rooms=2), RecordStore(tmp_path / "run.jsonl")
-    contestant = tiny_contestant()
+    entry = tiny_contestant()
 
     def enough() -> bool:
-        return len(room_records(suite, contestant, store)) == 1
+        return len(room_records(suite, entry, store)) == 1
 
-    run_suite(suite, [contestant], store, tmp_path / "views", silent, enough)
-    assert [r.room for r in room_records(suite, contestant, store)] == [ROOM]
+    run_suite(suite, [entry], store, tmp_path / "views", silent, enough)
+    assert [r.room for r in room_records(suite, entry, store)] == [ROOM]
 
 
 def map_record(room: int = 1) -> MapRecord:
     rows = ((1, 0),)
     return MapRecord(
-        settings="s", weights="w", room=room, programme="office", points=3, on_surface=1.0,
+        settings="s", weights="w", room=room, template="office", points=3, on_surface=1.0,
         confusion=rows, surface_confusion=rows, view_confusion=rows, view_miou=0.5,
         cast_confusion=rows, cast_view_confusion=rows,
         seen_confusion=rows, one_frame_confusion=rows,
@@ -112,7 +112,7 @@ def test_the_benchmark_needs_nothing_that_a_training_machine_lacks() -> None:
     program = (
         "import sys\n"
         "for name in ('scipy', 'open3d', 'depthai', 'zmq', 'mcap', 'zstandard'): sys.modules[name] = None\n"
-        "import semantic_mapper.benchmark.run, semantic_mapper.benchmark.contestants, semantic_mapper.nodes.cli.suite\n"
+        "import semantic_mapper.benchmark.run, semantic_mapper.benchmark.entries, semantic_mapper.nodes.cli.suite\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.returncode == 0, done.stderr

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 from semantic_mapper.benchmark.config import SuiteConfig
-from semantic_mapper.benchmark.protocols import Contestant
+from semantic_mapper.benchmark.protocols import Entry
 from semantic_mapper.benchmark.rooms import BenchmarkRoom, make_benchmark_room
 from semantic_mapper.config import convert_config
 from semantic_mapper.scenes import VALIDATION_SEEDS
@@ -33,5 +33,5 @@ def tiny_room() -> BenchmarkRoom:
     return make_benchmark_room(ROOM, tiny_suite())
 
 
-def tiny_contestant(seed: int = 0) -> Contestant:
-    return Contestant(f"tiny{seed}", f"digest{seed}", tiny_field(seed=seed))
+def tiny_contestant(seed: int = 0) -> Entry:
+    return Entry(f"tiny{seed}", f"digest{seed}", tiny_field(seed=seed))

@@ -57,7 +57,7 @@ def test_every_image_of_a_file_comes_with_the_time_within_it(tmp_path: Path, suf
         assert camera.info.frame_count == COUNT and camera.info.frame_hz == HZ
         assert camera.info.source == f"video red{suffix}"
         images = list(camera)
-        assert camera.troubles == ()
+        assert camera.warnings == ()
     assert [image.seq for image in images] == list(range(COUNT))
     stamps = [image.stamp_ns for image in images]
     assert stamps == pytest.approx([5_000_000_000 + k * 100_000_000 for k in range(COUNT)], abs=1_000_000)
@@ -175,7 +175,7 @@ def test_a_stream_that_breaks_off_is_connected_anew(sender: Sender, tmp_path: Pa
         sender.refuse.set()
         sender.break_off.set()
         deadline = time.monotonic() + 20
-        while not any("waited for since" in trouble for trouble in camera.troubles):
+        while not any("waited for since" in trouble for trouble in camera.warnings):
             assert time.monotonic() < deadline
             time.sleep(0.01)
         sender.break_off.clear()
@@ -183,7 +183,7 @@ def test_a_stream_that_breaks_off_is_connected_anew(sender: Sender, tmp_path: Pa
         sender.refuse.clear()
         later = next(image for image in images if image.stamp_ns > back_ns)
         assert later.seq > first.seq + 1 and sender.connections >= 2
-        assert camera.troubles == ()
+        assert camera.warnings == ()
 
 
 def test_a_stream_whose_clock_is_none_is_stamped_on_arrival_and_told(sender: Sender, tmp_path: Path) -> None:

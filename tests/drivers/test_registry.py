@@ -46,6 +46,6 @@ def test_a_kind_that_cannot_search_is_told_and_the_others_are_listed(monkeypatch
 
 def test_a_camera_is_made_of_plain_settings_that_are_checked() -> None:
     camera = open_camera("opencv", {"source": "film.mp4", "uncalibrated": True}, "film", "launch.toml")
-    assert camera.troubles == ("not calibrated: the intrinsics are a guess, good for calibrating only",)
+    assert camera.warnings == ("not calibrated: the intrinsics are a guess, good for calibrating only",)
     with pytest.raises(ConfigError, match=r"launch.toml: .*did you mean `source`"):
         open_camera("opencv", {"sourc": "film.mp4"}, "film", "launch.toml")

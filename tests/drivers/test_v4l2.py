@@ -59,7 +59,7 @@ def test_images_are_rgb_with_the_stamps_of_their_buffers(machine: Machine, tmp_p
         after_ns = time.monotonic_ns()
         assert camera.info.source == f"V4L2 HD Webcam at {device}" and camera.info.frame_hz == 30
         assert camera.info.cameras["front"] == images[0].intrinsics
-        assert camera.troubles == ()
+        assert camera.warnings == ()
     for image in images:
         assert image.rgb.shape == (48, 64, 3) and image.rgb.dtype == np.uint8
         assert (image.rgb[7, 9] == (100, 50, 0)).all()
@@ -80,7 +80,7 @@ def test_stamps_of_another_clock_are_replaced_by_the_time_of_arrival_and_told(
         before_ns = time.monotonic_ns()
         image = next(iter(camera))
         assert before_ns - 1_000_000_000 < image.stamp_ns <= time.monotonic_ns()
-        assert len(camera.troubles) == 1 and "stamped when they arrive" in camera.troubles[0]
+        assert len(camera.warnings) == 1 and "stamped when they arrive" in camera.warnings[0]
 
 
 def test_stamps_that_foretell_the_end_of_an_exposure_are_no_later_than_the_arrival(
@@ -89,14 +89,14 @@ def test_stamps_that_foretell_the_end_of_an_exposure_are_no_later_than_the_arriv
     device = machine.plug(Sensor(clock=lambda: time.monotonic() + 0.07), 0)
     with v4l2(device, tmp_path) as camera:
         image = next(iter(camera))
-        assert image.stamp_ns <= time.monotonic_ns() and camera.troubles == ()
+        assert image.stamp_ns <= time.monotonic_ns() and camera.warnings == ()
 
 
 def test_another_pixel_format_and_rate_than_asked_for_are_told(machine: Machine, tmp_path: Path) -> None:
     device = machine.plug(Sensor(formats=("YUYV",), rate=10.0), 0)
     with v4l2(device, tmp_path) as camera:
         next(iter(camera))
-        told = " / ".join(camera.troubles)
+        told = " / ".join(camera.warnings)
         assert camera.info.frame_hz == 10
     assert "asked for pixels as MJPG, it gives YUYV; it offers YUYV" in told
     assert "asked for 30 images/s, it gives 10" in told
@@ -132,7 +132,7 @@ def test_uncalibrated_it_gives_images_for_calibrating_and_says_so(machine: Machi
     with v4l2(device, tmp_path, calibration="", uncalibrated=True, width=80, height=60) as camera:
         image = next(iter(camera))
         assert image.rgb.shape == (60, 80, 3)
-        assert any("not calibrated" in trouble for trouble in camera.troubles)
+        assert any("not calibrated" in trouble for trouble in camera.warnings)
 
 
 def test_unplugged_it_is_waited_for_and_found_under_another_index(machine: Machine, tmp_path: Path) -> None:
@@ -143,11 +143,11 @@ def test_unplugged_it_is_waited_for_and_found_under_another_index(machine: Machi
         before = next(images)
         machine.unplug(sensor)
         machine.plug(other, 0, link="usb-Other-video-index0")  # has taken its number
-        until(lambda: any("no such camera" in t and "waited for since" in t for t in camera.troubles))
+        until(lambda: any("no such camera" in t and "waited for since" in t for t in camera.warnings))
         plugged_ns = time.monotonic_ns()
         machine.plug(sensor, 3)
         after = image_where(images, lambda image: image.stamp_ns > plugged_ns)
-        until(lambda: camera.troubles == ())
+        until(lambda: camera.warnings == ())
         assert (after.rgb[0, 0] == (100, 50, 0)).all()  # not the other one
         assert after.seq > before.seq + 1
 
@@ -159,7 +159,7 @@ def test_named_by_its_number_it_is_known_by_its_id_from_then_on(machine: Machine
         images = iter(camera)
         next(images)
         machine.unplug(sensor)
-        until(lambda: camera.troubles != ())
+        until(lambda: camera.warnings != ())
         plugged_ns = time.monotonic_ns()
         machine.plug(sensor, 5)
         image_where(images, lambda image: image.stamp_ns > plugged_ns)
@@ -172,13 +172,13 @@ def test_a_stream_that_stalls_is_told_and_started_anew(machine: Machine, tmp_pat
         images = iter(camera)
         before = next(images)
         sensor.stalled = True
-        until(lambda: any("gives no images" in t for t in camera.troubles))
+        until(lambda: any("gives no images" in t for t in camera.warnings))
         going_ns = time.monotonic_ns()
         sensor.stalled = False
         after = image_where(images, lambda image: image.stamp_ns > going_ns)
         assert sensor.opens >= 2
         assert after.seq > before.seq + 1
-        until(lambda: camera.troubles == ())
+        until(lambda: camera.warnings == ())
 
 
 def test_a_read_that_hangs_is_told_while_it_hangs(
@@ -191,7 +191,7 @@ def test_a_read_that_hangs_is_told_while_it_hangs(
     with v4l2(machine.plug(sensor, 0), tmp_path) as camera:
         next(iter(camera))
         sensor.stalled = True
-        until(lambda: any("the stream has stalled" in t for t in camera.troubles))
+        until(lambda: any("the stream has stalled" in t for t in camera.warnings))
         assert sensor.opens == 1
 
 
@@ -239,7 +239,7 @@ def test_controls_are_set_automatic_ones_too(machine: Machine, tmp_path: Path) -
     with v4l2(device, tmp_path):
         assert sensor.values == {ioctls.EXPOSURE_AUTO: 3, ioctls.AUTO_WHITE_BALANCE: 1}
     with v4l2(device, tmp_path, exposure_ms=8.0, white_balance_k=5000, gain=40, controls={"focus_absolute": 10}) as c:
-        assert c.troubles == ()
+        assert c.warnings == ()
     assert sensor.values == {
         ioctls.EXPOSURE_AUTO: ioctls.EXPOSURE_MANUAL,
         ioctls.EXPOSURE_ABSOLUTE: 80,
@@ -253,13 +253,13 @@ def test_controls_are_set_automatic_ones_too(machine: Machine, tmp_path: Path) -
 def test_controls_that_do_not_follow_are_told(machine: Machine, tmp_path: Path) -> None:
     device = machine.plug(Sensor(), 0)
     with v4l2(device, tmp_path, exposure_ms=500.0, gain=101, controls={"focus_absolut": 3}) as camera:
-        told = " / ".join(camera.troubles)
+        told = " / ".join(camera.warnings)
     assert "asked for exposure_time_absolute = 5000, it has 2047; exposure_time_absolute goes from 3 to 2047" in told
     assert "gain: asked for gain = 101, it has 100" in told
     assert "no control 'focus_absolut'; did you mean 'focus_absolute'?" in told
     bare = machine.plug(Sensor(controls=()), 1, link="usb-Bare-video-index0")
     with v4l2(bare, tmp_path, gain=3) as camera:
-        assert [t.split(": ", 1)[1] for t in camera.troubles] == ["it has no control for gain"]
+        assert [t.split(": ", 1)[1] for t in camera.warnings] == ["it has no control for gain"]
 
 
 @pytest.mark.parametrize(
@@ -297,7 +297,7 @@ def test_controls_are_set_again_when_the_camera_comes_back(machine: Machine, tmp
         next(images)
         machine.unplug(sensor)
         sensor.values.clear()
-        until(lambda: camera.troubles != ())
+        until(lambda: camera.warnings != ())
         plugged_ns = time.monotonic_ns()
         machine.plug(sensor, 1)
         image_where(images, lambda image: image.stamp_ns > plugged_ns)
@@ -337,7 +337,7 @@ def test_stop_ends_the_iteration_from_another_thread_even_while_the_camera_is_go
         images = iter(camera)
         next(images)
         machine.unplug(sensor)
-        until(lambda: camera.troubles != ())
+        until(lambda: camera.warnings != ())
         threading.Timer(0.1, camera.stop).start()
         assert len(list(images)) <= 1
 

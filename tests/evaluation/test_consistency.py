@@ -45,8 +45,8 @@ def test_agreement_by_hand_where_unknown_agrees_with_nothing() -> None:
     everywhere = (np.arange(4), np.arange(4))
     found = label_agreement(a, b, everywhere, ignore_id=0)
     assert (found.agreeing, found.compared) == (2, 4)
-    assert (found + Agreement(2, 4)).share == pytest.approx(0.5)
-    assert Agreement().share is None
+    assert (found + Agreement(2, 4)).fraction == pytest.approx(0.5)
+    assert Agreement().fraction is None
 
 
 def test_depth_of_another_size_is_refused() -> None:

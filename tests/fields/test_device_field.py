@@ -13,31 +13,31 @@ from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from tests.small import tiny_config, tiny_field, tiny_frames
 
-SAMPLING = SamplingConfig(guided=4, least_weight=0.02)
+SAMPLING = SamplingConfig(guided=4, sample_weight_threshold=0.02)
 DEVICES = [
     "cpu",
     pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU on this machine")),
 ]
 
 
-def rendered(field, share: float | None = None):
+def rendered(field, fraction: float | None = None):
     frames = tiny_frames(6)
     query = frames[5]
     with torch.inference_mode():
         sources = field.encode(stack_sources([view_from_frame(f, field.label_set, 96) for f in frames[:4]]))
     scene = (field, sources, query.intrinsics, query.T_world_camera, query.depth_m, SAMPLING, 0)
-    if share is None:
+    if fraction is None:
         return render_view(*scene)
-    return render_sparse_view(*scene, query.rgb, share)[:3]
+    return render_sparse_view(*scene, query.rgb, fraction)[:3]
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("share", [None, 0.3])
-def test_a_device_renders_what_the_field_itself_renders(device: str, share: float | None):
+@pytest.mark.parametrize("fraction", [None, 0.3])
+def test_a_device_renders_what_the_field_itself_renders(device: str, fraction: float | None):
     model = tiny_field()
     model.sampling = SAMPLING
-    expected = rendered(model, share)
-    found = rendered(DeviceField(model, torch.device(device), SAMPLING), share)
+    expected = rendered(model, fraction)
+    found = rendered(DeviceField(model, torch.device(device), SAMPLING), fraction)
     for mine, theirs in zip(found, expected, strict=True):
         np.testing.assert_allclose(mine, theirs, atol=0 if device == "cpu" else 2e-3)
 

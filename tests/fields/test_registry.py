@@ -13,7 +13,7 @@ from tests.fields.scene import wall_rays, wall_sources
 from tests.fields.tiny_fields import LABELS, POSES, TINY, tiny
 from tests.small import tiny_frames
 
-STEP = StepConfig(rays=32, views_min=2, views_max=2, blind_samples=4)
+STEP = StepConfig(rays=32, views_min=2, views_max=2, samples_without_depth=4)
 
 
 def test_every_name_is_tested_here():
@@ -85,7 +85,7 @@ def test_every_kind_takes_a_training_step(name: str, own_view: bool):
 @pytest.mark.parametrize("name", field_names())
 def test_every_kind_trains_without_the_dense_loss(name: str):
     views = [view_from_frame(f, ROOMS, 48) for f in tiny_frames()]
-    step = StepConfig(rays=16, depth_withheld=1.0, blind_samples=4, loss=LossConfig(source=0.0))
+    step = StepConfig(rays=16, depth_dropout=1.0, samples_without_depth=4, loss=LossConfig(source=0.0))
     field = tiny(name, label_set=ROOMS).train()
     loss = training_loss(field, views, 2, [1, 3], step, torch.Generator().manual_seed(0))
     assert loss is not None

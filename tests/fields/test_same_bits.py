@@ -15,7 +15,8 @@ from semantic_mapper.training.views import stack_sources, view_from_frame
 from tests.small import tiny_frames
 
 frames = tiny_frames(4)
-field = StreamingSRay(load_checkpoint(default_checkpoint_path()).model, SamplingConfig(guided=4, least_weight=0.02))
+sampling = SamplingConfig(guided=4, sample_weight_threshold=0.02)
+field = StreamingSRay(load_checkpoint(default_checkpoint_path()).model, sampling)
 sources = field.encode(stack_sources([view_from_frame(frame, field.label_set, 96) for frame in frames[:3]]))
 asked = frames[3]
 seen = render_image(field, sources, asked.intrinsics, asked.T_world_camera, asked.depth_m, field.sampling, 0)

@@ -44,10 +44,10 @@ class Halves:
         return FieldRender(logits, rays.prior_depth_m, ones, torch.zeros(len(u), 3), ones, known)
 
 
-def sparse(field: Halves, prior: np.ndarray | None = None, share: float = 0.99, rgb: np.ndarray | None = None):
+def sparse(field: Halves, prior: np.ndarray | None = None, fraction: float = 0.99, rgb: np.ndarray | None = None):
     prior = np.full((30, 40), 2.0, np.float32) if prior is None else prior
     rgb = np.full((30, 40, 3), 90, np.uint8) if rgb is None else rgb
-    return render_sparse_view(field, NOTHING, CAMERA, np.eye(4), prior, SAMPLING, 128, rgb, share)  # type: ignore[arg-type]
+    return render_sparse_view(field, NOTHING, CAMERA, np.eye(4), prior, SAMPLING, 128, rgb, fraction)  # type: ignore[arg-type]
 
 
 def dense(field: Halves, prior: np.ndarray | None = None):
@@ -88,17 +88,17 @@ def test_what_has_another_colour_than_all_round_it_has_rays_of_its_own():
 
 def test_where_the_field_is_in_doubt_all_pixels_have_rays():
     field = Halves(border=-1, sure=0.1)
-    assert sparse(field, share=1.0)[3] == 30 * 40
+    assert sparse(field, fraction=1.0)[3] == 30 * 40
 
 
 def test_the_share_is_a_limit_and_the_most_doubtful_go_first():
     prior = np.full((30, 40), 2.0, np.float32)
     prior[10] = 1.0
     needed = sparse(Halves(17.5))[3]
-    p, _, _, rays = sparse(Halves(17.5), prior, share=needed / 1200)
+    p, _, _, rays = sparse(Halves(17.5), prior, fraction=needed / 1200)
     assert rays == needed < sparse(Halves(17.5), prior)[3]
     np.testing.assert_array_equal(p.argmax(2), dense(Halves(17.5))[0].argmax(2))
-    assert sparse(Halves(), share=0.0)[3] == 80
+    assert sparse(Halves(), fraction=0.0)[3] == 80
 
 
 def test_what_no_ray_knows_stays_unknown():

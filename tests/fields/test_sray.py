@@ -116,14 +116,14 @@ def test_a_view_is_left_out_where_the_sample_is_hidden_from_it_and_not_from_othe
     rays = wall_rays(pose_at(0.0), step=31)
     z = torch.tensor([[0.98 * WALL_M, 1.01 * WALL_M, 1.3 * WALL_M]]).expand(len(rays.origin), 3)
     space = contextual_space(rays, z, encoded)
-    seen = field.without_hidden(space).valid
+    seen = field.mask_occluded(space).valid
     inside = space.valid.all(0)
     assert inside.float().mean() > 0.5
     on_wall, behind = inside[:, :2], inside[:, 2]
     assert seen[:3, :, :2][:, on_wall].all() and not seen[3, :, :2][on_wall].any()
     assert seen[:, :, 2][:, behind].all()  # hidden from all: any view is better than none
     keep_all = small_field(occlusion=False)
-    assert torch.equal(keep_all.without_hidden(space).valid, space.valid)
+    assert torch.equal(keep_all.mask_occluded(space).valid, space.valid)
 
 
 def test_a_blind_view_changes_nothing():
@@ -280,7 +280,7 @@ def test_a_view_carries_no_label_to_what_is_hidden_from_it():
 
     def carried(z: float) -> torch.Tensor:
         ladder = (z + torch.tensor([-0.02, 0.0, 0.02])).expand(len(rays.origin), 3)
-        return field.carried_labels(contextual_space(rays, ladder, encoded))[:, 1, 2]
+        return field.propagate_labels(contextual_space(rays, ladder, encoded))[:, 1, 2]
 
     assert carried(WALL_M).min() > 0.6 and carried(WALL_M + 0.5).max() < 0.15 and carried(WALL_M - 0.5).max() < 0.15
 

@@ -117,7 +117,7 @@ def test_it_leaves_out_the_same_hidden_views():
     rays = wall_rays(pose_at(0.1), step=3)
     z = sample_guided(rays, SamplingConfig())
     space = contextual_space(rays, z, field.encode(views))
-    left_out = space.valid & ~field.without_hidden(space).valid
+    left_out = space.valid & ~field.mask_occluded(space).valid
     assert 0.02 < left_out.float().mean() < 0.5
     assert_equal(*render_both(field, views, rays, z))
 

@@ -131,8 +131,8 @@ def test_map_server_files_read_as_nav2_reads_them(tmp_path: Path) -> None:
     header, size, most, body = (tmp_path / "plan.pgm").read_bytes().split(b"\n", 3)
     assert (header, size, most) == (b"P5", b"3 2", b"255") and len(body) == 6
     picture = np.frombuffer(body, np.uint8).reshape(2, 3)
-    share = (255 - picture.astype(np.float64)) / 255
-    read = np.where(share > values["occupied_thresh"], 100, np.where(share < values["free_thresh"], 0, -1))
+    fraction = (255 - picture.astype(np.float64)) / 255
+    read = np.where(fraction > values["occupied_thresh"], 100, np.where(fraction < values["free_thresh"], 0, -1))
     np.testing.assert_array_equal(read[::-1], cells)  # the first row of a picture is its top
 
 

@@ -266,8 +266,8 @@ def test_fewer_rays_give_nearly_the_same_view_and_a_map_that_repeats():
     trained = load_checkpoint(default_checkpoint_path()).model
     frames = tiny_frames(3)
     updates, rays, pipelines = [], [], []
-    for share in (1.0, 0.4, 0.4):
-        config = tiny_config(render={"encode_width": 64, "share": share, "scale": 0.5})
+    for fraction in (1.0, 0.4, 0.4):
+        config = tiny_config(render={"encode_width": 64, "ray_fraction": fraction, "scale": 0.5})
         field = CountingField(trained, config.sampling)
         pipeline = MappingPipeline(config, field, ROOMS)
         updates.append([pipeline.step(f) for f in frames])

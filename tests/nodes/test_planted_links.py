@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper.nodes.cli.outputs import hold_folder
-from semantic_mapper.replay.log.atomic_file import WholeFile
+from semantic_mapper.replay.log.atomic_file import AtomicFile
 from semantic_mapper.training.folder_lock import LOCK_FILE, sole_use_of
 from tests.nodes.support import run_here
 
@@ -46,7 +46,7 @@ def test_locks_logs_and_lists_follow_no_link(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="link"), sole_use_of(tmp_path):
         pass
     (tmp_path / "log.mcap").symlink_to(target)
-    WholeFile(tmp_path / "log.mcap", overwrite=True).close()
+    AtomicFile(tmp_path / "log.mcap", overwrite=True).close()
     assert target.read_bytes() == b"precious" and not (tmp_path / "log.mcap").is_symlink()
 
 

@@ -137,7 +137,7 @@ def test_streams_end_together_and_say_what_each_said() -> None:
     assert streams.begin(msgspec.structs.replace(LEFT, frame_hz=5.0))
     assert streams.source == "left eye + right eye" and streams.label_set is None
     assert not streams.end(EndOfStream("a", "end", 3))
-    assert not streams.end(EndOfStream("a", "error", 4, "unplugged"))  # started anew meanwhile
+    assert not streams.end(EndOfStream("a", "error", 4, "unplugged"))  # restarted meanwhile
     assert streams.end(EndOfStream("b", "end", 5))
     assert (streams.published, streams.ended_by) == (9, "a: unplugged")
     streams.note_frame("left")

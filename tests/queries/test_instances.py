@@ -56,10 +56,10 @@ class Painting:
 
 
 @settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.1, 0.9), least=st.integers(1, 9))
-def test_components_are_those_of_scipy(seed: int, share: float, least: int) -> None:
+@given(seed=st.integers(0, 2**32 - 1), fraction=st.floats(0.1, 0.9), least=st.integers(1, 9))
+def test_components_are_those_of_scipy(seed: int, fraction: float, least: int) -> None:
     rng = np.random.default_rng(seed)
-    plan = np.where(rng.random((32, 24)) < share, rng.choice([TABLE, CUP, FLOOR], (32, 24)), 0).astype(np.uint8)
+    plan = np.where(rng.random((32, 24)) < fraction, rng.choice([TABLE, CUP, FLOOR], (32, 24)), 0).astype(np.uint8)
     mirror = MapMirror(0.02, 4.0, LABELS)
     surface = class_surface(mirror.apply(painted(plan, 0, 1)), np.isin(np.arange(256), (TABLE, CUP)))
     found = find_components(surface, least)
@@ -151,13 +151,13 @@ def test_neighbours_that_trade_a_few_voxels_keep_their_ids() -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.3, 0.95))
-def test_what_did_not_change_is_not_computed_again_and_nothing_is_missed(seed: int, share: float) -> None:
-    """Maps grow in pieces, blocks change shape and class and go; all is as if it were computed anew each time."""
+@given(seed=st.integers(0, 2**32 - 1), fraction=st.floats(0.3, 0.95))
+def test_what_did_not_change_is_not_computed_again_and_nothing_is_missed(seed: int, fraction: float) -> None:
+    """Maps grow in pieces, blocks change shape and class and go; all is as if it were computed again each time."""
     rng = np.random.default_rng(seed)
-    mirror, tracker, anew = MapMirror(0.02, 4.0, LABELS), InstanceTracker(min_voxels=3), InstanceTracker(min_voxels=3)
+    mirror, tracker, again = MapMirror(0.02, 4.0, LABELS), InstanceTracker(min_voxels=3), InstanceTracker(min_voxels=3)
     for version in range(6):
-        plan = np.where(rng.random((48, 24)) < share, rng.choice([TABLE, CUP, FLOOR]), 0).astype(np.uint8)
+        plan = np.where(rng.random((48, 24)) < fraction, rng.choice([TABLE, CUP, FLOOR]), 0).astype(np.uint8)
         whole_plan = painted(plan, version, version + 1)
         chosen = np.sort(rng.choice(18, rng.integers(0, 9), replace=False))
         tsdf = whole_plan.tsdf[chosen]
@@ -169,8 +169,8 @@ def test_what_did_not_change_is_not_computed_again_and_nothing_is_missed(seed: i
             **{name: getattr(whole_plan, name)[chosen] for name in ("keys", "label", "confidence", "rgb")},
         )
         snapshot = mirror.apply(changes)
-        anew._last = anew._last and with_nothing_kept(anew._last)
-        things, others = tracker.update(snapshot), anew.update(snapshot)
+        again._last = again._last and with_nothing_kept(again._last)
+        things, others = tracker.update(snapshot), again.update(snapshot)
         assert_same_things(things, others)
         assert_same_things(InstanceTracker(min_voxels=3).update(snapshot), sorted(others, key=first_voxel), ids=False)
 

@@ -23,7 +23,7 @@ from semantic_mapper.replay import artifacts
 from semantic_mapper.replay.evaluate.methods import baseline_predictors, evaluate_frames, field_predictors
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.replay.session import SNAPSHOTS, MapSession, open_recording
-from semantic_mapper.replay.stats import StepTimes
+from semantic_mapper.replay.stats import LatencyHistogram
 from tests.small import SMALL_ENCODER, tiny_config, tiny_field, tiny_frames
 
 
@@ -73,7 +73,7 @@ def test_the_summary_has_the_settings_that_were_in_force(tmp_path, weights):
     session = MapSession(Mapper.load(weights, config), stream_labels=None)
     summary = session.finish(tmp_path / "out")
     assert summary["quality"] == "fast"
-    assert (summary["config"]["sampling"]["guided"], summary["config"]["render"]["share"]) == (2, 0.12)
+    assert (summary["config"]["sampling"]["guided"], summary["config"]["render"]["ray_fraction"]) == (2, 0.12)
     assert summary["config"]["render"]["encode_width"] == 96, "that of the weights"
     again = convert_config(summary["config"], MapperConfig, "summary")
     assert again == session.pipeline.config and again.voxel_map == config.voxel_map
@@ -81,7 +81,7 @@ def test_the_summary_has_the_settings_that_were_in_force(tmp_path, weights):
 
 def test_the_first_frame_which_may_compile_kernels_does_not_count_in_the_percentiles(tmp_path, weights):
     session = run(weights, tiny_frames())
-    session.step_ms = StepTimes()
+    session.step_ms = LatencyHistogram()
     for ms in [9000.0, *[10.0] * 5]:
         session.step_ms.add(ms)
     latency = session.finish(tmp_path / "out")["latency_ms"]

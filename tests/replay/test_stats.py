@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semantic_mapper.replay.stats import LONGEST_MS, SHORTEST_MS, FirstAndLast, StepTimes
+from semantic_mapper.replay.stats import LONGEST_MS, SHORTEST_MS, BoundedLog, LatencyHistogram
 
 
 @given(st.lists(st.floats(SHORTEST_MS, LONGEST_MS), max_size=60), st.sampled_from([0.0, 50.0, 95.0, 99.5, 100.0]))
 def test_percentiles_are_those_of_all_steps_but_the_first(values: list[float], percent: float) -> None:
-    times = StepTimes()
+    times = LatencyHistogram()
     for value in values:
         times.add(value)
     if not values:
@@ -22,7 +22,7 @@ def test_percentiles_are_those_of_all_steps_but_the_first(values: list[float], p
 
 
 def test_times_beyond_the_histogram_count_as_its_ends() -> None:
-    times = StepTimes()
+    times = LatencyHistogram()
     for value in (1.0, 0.0, 0.0, 3 * LONGEST_MS):
         times.add(value)
     assert times.percentile(0) == times.percentile(50) == pytest.approx(SHORTEST_MS, rel=0.01)
@@ -30,7 +30,7 @@ def test_times_beyond_the_histogram_count_as_its_ends() -> None:
 
 
 def test_the_first_ones_and_the_last_are_kept() -> None:
-    kept = FirstAndLast[int](3)
+    kept = BoundedLog[int](3)
     assert not kept and kept.first == []
     with pytest.raises(IndexError):
         _ = kept.last

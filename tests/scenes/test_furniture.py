@@ -8,7 +8,7 @@ import pytest
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes.furniture import FURNITURE
 from semantic_mapper.scenes.materials import CAMOUFLAGE, HELD_OUT_HUES, Draw, Palette
-from semantic_mapper.scenes.programmes import CLUTTER, CYCLE, PROGRAMMES
+from semantic_mapper.scenes.room_templates import CLUTTER, CYCLE, ROOM_TEMPLATES
 
 SPECIMENS = 12
 STANDING = [name for name, kind in FURNITURE.items() if kind.place in ("wall", "corner", "centre", "small")]
@@ -44,10 +44,10 @@ def test_every_specimen_can_differ() -> None:
 
 def test_programmes_name_registered_furniture() -> None:
     sets = {"bed_set", "sofa_set", "desk_set", "dining_set", "mat"}
-    named = {entry.name for entries in PROGRAMMES.values() for entry in entries}
+    named = {entry.name for entries in ROOM_TEMPLATES.values() for entry in entries}
     named |= {name for names in CLUTTER.values() for name in names}
     assert named - sets <= set(FURNITURE)
-    assert set(CYCLE) == set(CLUTTER) == set(PROGRAMMES)
+    assert set(CYCLE) == set(CLUTTER) == set(ROOM_TEMPLATES)
 
 
 def test_each_pool_of_materials_serves_several_classes() -> None:

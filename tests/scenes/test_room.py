@@ -10,8 +10,8 @@ from semantic_mapper.errors import ConfigError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes import TEST_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, RoomConfig, Scene, make_room
 from semantic_mapper.scenes.camera import pose_of
-from semantic_mapper.scenes.programmes import PROGRAMMES
 from semantic_mapper.scenes.render import cast_view
+from semantic_mapper.scenes.room_templates import ROOM_TEMPLATES
 from semantic_mapper.types import CameraIntrinsics
 
 SEEDS = range(20)
@@ -24,7 +24,7 @@ def rooms() -> list[Scene]:
 
 def test_a_seed_gives_the_same_room_twice() -> None:
     a, b = make_room(7), make_room(7)
-    assert (a.programme, a.size_m) == (b.programme, b.size_m)
+    assert (a.template, a.size_m) == (b.template, b.size_m)
     for part in ("primitives", "materials", "lights"):
         first, second = getattr(a, part), getattr(b, part)
         for name in first.__slots__:
@@ -105,19 +105,19 @@ def test_furniture_does_not_interpenetrate(rooms: list[Scene]) -> None:
         assert not deep.any()
 
 
-@pytest.mark.parametrize("programme", sorted(PROGRAMMES))
-def test_a_programme_can_be_asked_for(programme: str) -> None:
-    config = RoomConfig(programme=programme, shadow_resolution=8)  # type: ignore[arg-type]
-    assert make_room(3, config).programme == programme
+@pytest.mark.parametrize("template", sorted(ROOM_TEMPLATES))
+def test_a_programme_can_be_asked_for(template: str) -> None:
+    config = RoomConfig(template=template, shadow_resolution=8)  # type: ignore[arg-type]
+    assert make_room(3, config).template == template
 
 
 def test_main_furniture_is_nearly_always_there() -> None:
     wanted = {"bedroom": "bed", "living": "sofa", "office": "desk", "kitchen": "counter", "bathroom": "toilet"}
-    for programme, label in wanted.items():
-        config = RoomConfig(programme=programme, shadow_resolution=8)  # type: ignore[arg-type]
+    for template, label in wanted.items():
+        config = RoomConfig(template=template, shadow_resolution=8)  # type: ignore[arg-type]
         rooms = [make_room(seed, config) for seed in range(10)]
         there = sum(ROOMS.ids[ROOMS.names.index(label)] in room.primitives.label for room in rooms)
-        assert there >= 8, (programme, there)
+        assert there >= 8, (template, there)
 
 
 @pytest.mark.parametrize(
@@ -127,7 +127,7 @@ def test_main_furniture_is_nearly_always_there() -> None:
         RoomConfig(min_side_m=1.0),
         RoomConfig(max_height_m=2.0),
         RoomConfig(clutter=-1.0),
-        RoomConfig(programme="castle"),  # type: ignore[arg-type]
+        RoomConfig(template="castle"),  # type: ignore[arg-type]
     ],
 )
 def test_impossible_settings_are_refused(config: RoomConfig) -> None:
@@ -141,5 +141,5 @@ def test_a_negative_seed_is_refused() -> None:
 
 
 def test_settings_are_plain_data() -> None:
-    config = RoomConfig(programme="kitchen", clutter=0.5)
+    config = RoomConfig(template="kitchen", clutter=0.5)
     assert msgspec.convert(msgspec.to_builtins(config), RoomConfig) == config

@@ -83,7 +83,7 @@ def test_the_survey_draws_counts_and_measures() -> None:
     assert sheet.shape == (2 * 72, 2 * 3 * 96, 3)
     assert sheet.std() > 20
     shares = class_shares(TRAIN_SEEDS[:3], 2)
-    assert sum(share[0] for share in shares.values()) == pytest.approx(1.0)
-    assert all(0 <= share[1] <= 1 for share in shares.values())
+    assert sum(fraction[0] for fraction in shares.values()) == pytest.approx(1.0)
+    assert all(0 <= fraction[1] <= 1 for fraction in shares.values())
     figures = images_per_second(islice(TRAIN_SEEDS, 1), 1, "oak_d")
     assert figures["views_per_s"] > 0

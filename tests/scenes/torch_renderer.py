@@ -203,8 +203,8 @@ def shade_hits(
     shows = (mirror > 0).nonzero()[:, 0]
     if len(shows):
         seen = _reflected(t, world[shows], view[shows], normal[shows])
-        share = mirror[shows, None]
-        color[shows] = (1 - share) * color[shows] + share * seen
+        fraction = mirror[shows, None]
+        color[shows] = (1 - fraction) * color[shows] + fraction * seen
     out[hit] = color
     return out
 
@@ -238,10 +238,10 @@ def _shade_points(
 
 
 def _openness(t: _Tensors, world: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:
-    """Share of the ambient light that reaches points (N, 3); see ``openness`` of fast_shade.c."""
+    """Fraction of the ambient light that reaches points (N, 3); see ``openness`` of fast_shade.c."""
     low, high = world / CORNER_REACH_M, (t.room - world) / CORNER_REACH_M
-    share = (1 - CORNER_DIM / (1 + low**2)) * (1 - CORNER_DIM / (1 + high**2))
-    return torch.where(normal.abs() < 0.7, share, 1.0).prod(-1)
+    fraction = (1 - CORNER_DIM / (1 + low**2)) * (1 - CORNER_DIM / (1 + high**2))
+    return torch.where(normal.abs() < 0.7, fraction, 1.0).prod(-1)
 
 
 def _own_normal(shape: torch.Tensor, local: torch.Tensor, half: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -278,7 +278,7 @@ def _light(
 
 
 def _visible(cube: torch.Tensor, softness: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
-    """Share of the light (N,) that reaches points at ``d`` (N, 3) from it; see ``scene.Lights.shadow``."""
+    """Fraction of the light (N,) that reaches points at ``d`` (N, 3) from it; see ``scene.Lights.shadow``."""
     axis = d.abs().argmax(-1)
     pick = torch.arange(len(d), device=d.device)
     major = d[pick, axis]

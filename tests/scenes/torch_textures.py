@@ -41,7 +41,7 @@ def albedo(
     return base * (1 - third[:, None]) + third[:, None] * (0.5 * color_a.flip(-1) + 0.3 * color_b)
 
 
-Weights = tuple[torch.Tensor, torch.Tensor]  # share of the second colour, share of a third one
+Weights = tuple[torch.Tensor, torch.Tensor]  # fraction of the second colour, fraction of a third one
 
 
 def _plain(s: torch.Tensor, t: torch.Tensor, seed: torch.Tensor) -> Weights:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from scripts.ship_weights import BEGIN, END, convert, figures_of, metadata_block, renew_card, ship
-from semantic_mapper.benchmark.contestants import load_contestants
+from semantic_mapper.benchmark.entries import load_entries
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from tests.small import tiny_field
@@ -43,7 +43,7 @@ def table(path: Path, digest: str, *, depth: bool = True, views: int = 8, **chan
 
 def tables(folder: Path, weights: Path, **changes: Any) -> list[Path]:
     """With depth and without."""
-    digest = load_contestants([weights])[0].digest
+    digest = load_entries([weights])[0].digest
     return [
         table(folder / "off.json", digest, depth=False),
         table(folder / "on.json", digest, **changes),
@@ -66,7 +66,7 @@ def test_what_was_measured_is_shipped_bit_by_bit_with_its_figures(tmp_path: Path
     assert [figure["depth"] for figure in shipped.recipe["figures"]] == [True, False]
     assert [figure["data_set"]["miou"] for figure in shipped.recipe["figures"]] == [0.7, 0.5]
     assert shipped.recipe["figures"][0] == figures_of(half, tmp_path / "on.json")
-    assert shipped.recipe["figures"][0]["measured"] == load_contestants([half])[0].digest
+    assert shipped.recipe["figures"][0]["measured"] == load_entries([half])[0].digest
     assert shipped.width == 160
     assert page.read_text(encoding="utf-8") == f"# Card\n\n{BEGIN}\n{metadata_block(out)}{END}\n\nProse.\n"
 
@@ -87,7 +87,7 @@ def test_figures_of_other_weights_or_of_half_a_run_are_refused(tmp_path: Path) -
     with pytest.raises(ConfigError, match="no figures of"):
         figures_of(path, table(tmp_path / "on.json", "0123"))
     with pytest.raises(ConfigError, match="all rooms"):
-        figures_of(path, table(tmp_path / "on.json", load_contestants([path])[0].digest, complete=False))
+        figures_of(path, table(tmp_path / "on.json", load_entries([path])[0].digest, complete=False))
     with pytest.raises(ConfigError, match="not a table"):
         figures_of(path, path)
 

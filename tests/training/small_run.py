@@ -20,7 +20,7 @@ def small_run(**changes: Any) -> TrainConfig:
         "log_steps": 2,
         "device": "cpu",
         "pool": POOL,
-        "step": {"rays": 64, "views_max": 4, "blind_samples": 8},
+        "step": {"rays": 64, "views_max": 4, "samples_without_depth": 8},
         "validation": {"times": 2, "rooms": 1, "queries": 1, "rays": 64, "views": 3},
     }
     return convert_config({**base, **changes}, TrainConfig, "test config")

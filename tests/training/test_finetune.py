@@ -13,9 +13,9 @@ from semantic_mapper.fields.encoder import calibrate
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.training.doubt import LEAST, with_doubt
 from semantic_mapper.training.finetune import FinetuneConfig, finetune
 from semantic_mapper.training.select import Candidate, candidate_from_frame, choose_keyframes
+from semantic_mapper.training.uncertainty import LEAST, with_uncertainty
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from tests.small import tiny_field, tiny_frames
 
@@ -36,12 +36,12 @@ def test_finetuning_improves_held_out_rays_and_says_what_it_did():
 
 def start_loss(start):
     """Held-out loss of the weights that a finetuning starts from: no learning, one look."""
-    still = config(steps=1, head_start=0, learning_rate=0.0, final_learning_rate=0.0, weight_decay=0.0)
+    still = config(steps=1, linear_probe_steps=0, learning_rate=0.0, final_learning_rate=0.0, weight_decay=0.0)
     return finetune(tiny_frames(3), ROOMS, start, still).recipe["held_out_loss"]
 
 
 def test_weights_are_never_worse_than_the_start_on_held_out_rays():
-    ruined = config(steps=12, head_start=0, learning_rate=30.0, final_learning_rate=30.0, gradient_clip=1e6)
+    ruined = config(steps=12, linear_probe_steps=0, learning_rate=30.0, final_learning_rate=30.0, gradient_clip=1e6)
     start = calibrated_field()
     result = finetune(tiny_frames(3), ROOMS, start, ruined)
     assert start_loss(start) >= result.recipe["held_out_loss"]
@@ -79,7 +79,9 @@ def test_without_patience_a_budget_is_spent_to_its_end():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU on this machine")
 def test_finetuning_runs_on_a_gpu():
-    result = finetune(tiny_frames(3), ROOMS, tiny_field().to("cuda"), config(steps=4, step={"doubtful_share": 0.5}))
+    result = finetune(
+        tiny_frames(3), ROOMS, tiny_field().to("cuda"), config(steps=4, step={"hard_example_fraction": 0.5})
+    )
     assert result.recipe["steps"] == 4 and math.isfinite(result.recipe["held_out_loss"])
 
 
@@ -106,7 +108,7 @@ def test_norms_live_in_a_field_of_which_nothing_is_trained_and_rest_in_any_other
 
     frames = tiny_frames(2)
     lived = finetune(
-        frames, ROOMS, tiny_field(), config(steps=3, held_out_share=0.0)
+        frames, ROOMS, tiny_field(), config(steps=3, held_out_fraction=0.0)
     ).model  # the last weights are kept
     means = running_means(lived)
     calibrate(lived.encoder, stack_sources([view_from_frame(f, ROOMS, 96) for f in frames]))
@@ -125,7 +127,7 @@ def test_held_out_rays_are_judged_without_labels_where_training_knows_none():
 def test_a_head_start_fits_the_classifier_alone():
     frames, start = tiny_frames(3), calibrated_field()
     still = {"steps": 1, "learning_rate": 0.0, "final_learning_rate": 0.0, "weight_decay": 0.0}
-    plain, ahead = (finetune(frames, ROOMS, start, config(**still, head_start=n)) for n in (0, 40))
+    plain, ahead = (finetune(frames, ROOMS, start, config(**still, linear_probe_steps=n)) for n in (0, 40))
     assert ahead.recipe["held_out_loss"] < plain.recipe["held_out_loss"]
     changed = {n for n, p in ahead.model.named_parameters() if not torch.equal(p, start.state_dict()[n])}
     assert changed == set(SRay.class_rows)
@@ -156,11 +158,11 @@ def test_an_encoder_of_rate_0_stays_what_it_was_and_the_rest_learns():
 
 def test_the_encoder_may_rest_at_the_start_and_its_weights_stay_what_they_were():
     start = calibrated_field()
-    result = finetune(tiny_frames(4), ROOMS, start, config(steps=30, head_start=0, resting_share=1.0))
+    result = finetune(tiny_frames(4), ROOMS, start, config(steps=30, linear_probe_steps=0, frozen_encoder_fraction=1.0))
     assert result.recipe["best_step"] > 0, "the head alone learns something"
     kept = {n: t for n, t in result.model.named_parameters() if n.startswith(("encoder.", "geometry_init."))}
     assert kept and all(torch.equal(start.state_dict()[n], t) for n, t in kept.items())
-    later = finetune(tiny_frames(4), ROOMS, start, config(steps=40, head_start=0, resting_share=0.2))
+    later = finetune(tiny_frames(4), ROOMS, start, config(steps=40, linear_probe_steps=0, frozen_encoder_fraction=0.2))
     assert later.recipe["best_step"] > 8, "it learns more once the encoder may"
     assert any(not torch.equal(t, dict(later.model.named_parameters())[n]) for n, t in kept.items())
 
@@ -168,7 +170,7 @@ def test_the_encoder_may_rest_at_the_start_and_its_weights_stay_what_they_were()
 def test_an_encoder_that_has_learned_nothing_yet_does_not_rest():
     kept, fresh = calibrated_field(), tiny_field()
     for start, rests in ((kept, True), (fresh, False)):
-        config_ = config(steps=3, resting_share=1.0, held_out_share=0.0)  # the last weights are kept
+        config_ = config(steps=3, frozen_encoder_fraction=1.0, held_out_fraction=0.0)  # the last weights are kept
         fitted = dict(finetune(tiny_frames(3), ROOMS, start, config_).model.named_parameters())
         assert all(torch.equal(fitted[n], p) for n, p in start.named_parameters() if n.startswith("encoder.")) == rests
 
@@ -180,18 +182,18 @@ def test_doubt_is_what_the_images_alone_give_to_other_classes_than_the_right_one
         field.classifier.weight.zero_()
         field.classifier.bias.zero_()
         field.classifier.bias[int(views[0].channel.max())] = 9.0
-    for view, plain in zip(with_doubt(field, views), views, strict=True):
-        assert view.doubt is not None and view.doubt.shape == plain.channel.shape
+    for view, plain in zip(with_uncertainty(field, views), views, strict=True):
+        assert view.uncertainty is not None and view.uncertainty.shape == plain.channel.shape
         sure = plain.channel == int(views[0].channel.max())
-        assert view.doubt[sure].max() == pytest.approx(LEAST)
-        assert view.doubt[~sure & (plain.channel >= 0)].min() > 0.9
-        assert not view.doubt[plain.channel < 0].any()
-    assert with_doubt(build_field("semantic_nerf", {}, ROOMS), views)[0].doubt is None
+        assert view.uncertainty[sure].max() == pytest.approx(LEAST)
+        assert view.uncertainty[~sure & (plain.channel >= 0)].min() > 0.9
+        assert not view.uncertainty[plain.channel < 0].any()
+    assert with_uncertainty(build_field("semantic_nerf", {}, ROOMS), views)[0].uncertainty is None
 
 
 def test_rays_may_go_where_the_field_is_in_doubt():
     start = tiny_field()
-    step = {"rays": 128, "doubtful_share": 0.5}
+    step = {"rays": 128, "hard_example_fraction": 0.5}
     plain, doubtful = (finetune(tiny_frames(4), ROOMS, start, config(steps=20, **c)) for c in ({}, {"step": step}))
     assert doubtful.recipe["best_step"] > 0 and plain.recipe["held_out_loss"] != doubtful.recipe["held_out_loss"]
 
@@ -202,7 +204,11 @@ def test_a_per_image_network_is_finetuned_and_judged_on_its_own_views():
     seen: list[float] = []
     start = build_field("unet", shape, ROOMS)
     result = finetune(
-        tiny_frames(4), ROOMS, start, config(steps=40, resting_share=0.5), lambda p: seen.append(p.held_out_loss)
+        tiny_frames(4),
+        ROOMS,
+        start,
+        config(steps=40, frozen_encoder_fraction=0.5),
+        lambda p: seen.append(p.held_out_loss),
     )
     assert result.recipe["held_out_loss"] < 0.9 * seen[0]
 
@@ -270,7 +276,7 @@ class FakeTime:
 def test_a_time_budget_holds_all_of_it_the_last_look_included(monkeypatch: pytest.MonkeyPatch):
     clock = FakeTime(monkeypatch)
     spent: list[float] = []
-    still = config(seconds=20.0, steps=0, patience=0, evaluations=2, head_start=0)
+    still = config(seconds=20.0, steps=0, patience=0, evaluations=2, linear_probe_steps=0)
     result = finetune(tiny_frames(3), ROOMS, calibrated_field(), still, lambda p: spent.append(p.fraction))
     assert clock.looks == 3, "at the start, in the middle and at the end"
     assert result.recipe["steps"] == len(spent) == 14
@@ -280,7 +286,7 @@ def test_a_time_budget_holds_all_of_it_the_last_look_included(monkeypatch: pytes
 
 def test_where_the_first_look_takes_all_the_time_no_step_begins(monkeypatch: pytest.MonkeyPatch):
     FakeTime(monkeypatch)
-    result = finetune(tiny_frames(3), ROOMS, calibrated_field(), config(seconds=2.5, steps=0, head_start=0))
+    result = finetune(tiny_frames(3), ROOMS, calibrated_field(), config(seconds=2.5, steps=0, linear_probe_steps=0))
     assert result.recipe["steps"] == 0 and result.recipe["seconds"] == 2.0
 
 
@@ -288,15 +294,15 @@ def test_where_the_first_look_takes_all_the_time_no_step_begins(monkeypatch: pyt
     "bad",
     [
         {"seed": -1},
-        {"held_out_share": 1.0},
+        {"held_out_fraction": 1.0},
         {"held_out_rays": 0},
         {"evaluations": 0},
         {"learning_rate": -1.0},
         {"step": {"rays": 0}},
         {"step": {"views_min": 5, "views_max": 3}},
         {"step": {"views_max": 40}},
-        {"step": {"balanced_share": 3.0}},
-        {"step": {"blind_thinning": 0}},
+        {"step": {"balanced_fraction": 3.0}},
+        {"step": {"no_depth_thinning": 0}},
     ],
 )
 def test_settings_that_make_no_sense_are_refused(bad: dict[str, object]):

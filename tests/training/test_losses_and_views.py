@@ -8,7 +8,7 @@ from semantic_mapper.training.losses import LossConfig, ray_loss, semantic_loss
 from semantic_mapper.training.step import StepConfig, _sources
 from semantic_mapper.training.views import (
     RayTargets,
-    draw_doubtful,
+    draw_hard_examples,
     draw_pixels,
     jitter_colours,
     query_rays,
@@ -61,7 +61,7 @@ def test_balanced_draws_show_rare_classes_as_often_as_common_ones():
 def test_doubtful_draws_go_where_the_doubt_is():
     doubt = torch.zeros(10, 10)
     doubt[3, 4], doubt[7, 1] = 3.0, 1.0
-    drawn = draw_doubtful(doubt, 4000, torch.Generator().manual_seed(0))
+    drawn = draw_hard_examples(doubt, 4000, torch.Generator().manual_seed(0))
     assert set(drawn.tolist()) == {34, 71}
     assert abs((drawn == 34).float().mean() - 0.75) < 0.03
 
@@ -97,9 +97,9 @@ def test_unlabelled_frame_becomes_all_ignore():
 
 def test_labels_are_known_of_other_source_views_but_never_of_the_query_itself():
     views = [view_from_frame(f, ROOMS, 48) for f in tiny_frames(3)]
-    config = StepConfig(labels_withheld=0.0)
+    config = StepConfig(label_dropout=0.0)
     stacked = _sources(views, 1, [0, 1, 2], config, torch.Generator().manual_seed(0))
     assert (stacked.channel[1] == -1).all()
     assert torch.equal(stacked.channel[0], views[0].channel) and torch.equal(stacked.channel[2], views[2].channel)
-    none = _sources(views, 1, [0, 2], StepConfig(labels_withheld=1.0), torch.Generator().manual_seed(0))
+    none = _sources(views, 1, [0, 2], StepConfig(label_dropout=1.0), torch.Generator().manual_seed(0))
     assert (none.channel == -1).all()

@@ -29,7 +29,7 @@ CONFIG = convert_config(
 
 def without_training() -> OnlineConfig:
     """Weights that are hardly other ones, of which much is expected."""
-    finetune = {"steps": 1, "head_start": 0, "learning_rate": 1e-9, "width": 96, "step": {"rays": 32}}
+    finetune = {"steps": 1, "linear_probe_steps": 0, "learning_rate": 1e-9, "width": 96, "step": {"rays": 32}}
     return convert_config({"rays": 400, "least_gain": 0.5, "finetune": finetune}, OnlineConfig, "test")
 
 
@@ -196,8 +196,8 @@ def test_too_few_keyframes_and_an_encoder_that_learns_are_refused() -> None:
     start = start_of()
     with pytest.raises(FrameError, match="1 to judge by, got 2 and 0"):
         learn(KeyframeSplit(FRAMES[:2], ()), start, CONFIG)
-    with pytest.raises(ConfigError, match="resting_share must be 1"):
-        convert_config({"finetune": {"resting_share": 0.5}}, OnlineConfig, "test")
+    with pytest.raises(ConfigError, match="frozen_encoder_fraction must be 1"):
+        convert_config({"finetune": {"frozen_encoder_fraction": 0.5}}, OnlineConfig, "test")
     for model in (build_field("unet", {}, ROOMS), tiny_field()):
         with pytest.raises(WeightsError, match="cannot be finetuned with an encoder that rests"):
             learn(pool_of(FRAMES).split(), Checkpoint(model, (), {}), CONFIG)

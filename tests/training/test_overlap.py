@@ -53,7 +53,7 @@ def test_views_with_and_without_depth_see_each_other():
 def test_source_views_are_drawn_by_what_they_see_of_the_query():
     generator = torch.Generator().manual_seed(0)
     overlap = torch.tensor([[0.0, 0.9, 0.9, 0.0, 0.0]] + [[0.5] * 5] * 4)
-    config = StepConfig(views_min=2, views_max=2, own_view_share=0.0)
+    config = StepConfig(views_min=2, views_max=2, own_view_fraction=0.0)
     drawn = [pick_views([0], overlap, config, generator) for _ in range(400)]
     assert {query for query, _ in drawn} == {0}
     assert all(len(set(sources)) == 2 and 0 not in sources for _, sources in drawn)
@@ -64,5 +64,5 @@ def test_source_views_are_drawn_by_what_they_see_of_the_query():
 
 def test_two_views_are_each_others_sources():
     generator = torch.Generator().manual_seed(0)
-    config = StepConfig(own_view_share=0.0)
+    config = StepConfig(own_view_fraction=0.0)
     assert {pick_views([0, 1], torch.zeros(2, 2), config, generator)[1][0] for _ in range(20)} == {0, 1}

@@ -90,7 +90,7 @@ def test_training_lowers_the_loss_and_keeps_the_best_weights(tmp_path: Path):
 
 
 def test_the_recipe_tells_where_the_weights_come_from():
-    recipe = train(small_run(steps=2, images={"share": 0.0})).recipe
+    recipe = train(small_run(steps=2, images={"fraction": 0.0})).recipe
     assert recipe["steps"] == 2 and recipe["seed"] == 0 and recipe["rooms"] == 3 and recipe["ranks"] == 1
     assert recipe["suite"].startswith("rooms v") and recipe["torch"] == torch.__version__
     assert recipe["device"].startswith("cpu") and recipe["width"] == 48
@@ -128,7 +128,7 @@ def test_a_folder_takes_one_training_at_a_time(tmp_path: Path):
 
 
 def test_neither_an_unfinished_nor_a_finished_run_is_overwritten_by_mistake(tmp_path: Path):
-    config = small_run(steps=2, images={"share": 0.0})
+    config = small_run(steps=2, images={"fraction": 0.0})
     train(config, tmp_path, **stop_after(1))
     with pytest.raises(ConfigError, match="stopped here at step 1; go on with --resume"):
         train(config, tmp_path)
@@ -138,7 +138,7 @@ def test_neither_an_unfinished_nor_a_finished_run_is_overwritten_by_mistake(tmp_
         train(config, tmp_path)
     assert (tmp_path / STATE_FILE).read_bytes() == finished
     (tmp_path / STATE_FILE).unlink()
-    assert train(small_run(steps=1, images={"share": 0.0}), tmp_path).recipe["steps"] == 1
+    assert train(small_run(steps=1, images={"fraction": 0.0}), tmp_path).recipe["steps"] == 1
 
 
 def test_a_state_that_is_damaged_says_so(tmp_path: Path):
@@ -198,7 +198,7 @@ def test_the_rate_warms_up_and_then_falls_to_its_end():
 def test_a_run_may_start_from_weights_of_the_same_shape_and_from_no_others(tmp_path: Path):
     first = train(small_run(steps=2))
     save_checkpoint(first, tmp_path / "first.safetensors")
-    still = {"steps": 1, "learning_rate": 0.0, "final_learning_rate": 0.0, "images": {"share": 0.0}}
+    still = {"steps": 1, "learning_rate": 0.0, "final_learning_rate": 0.0, "images": {"fraction": 0.0}}
     still["start"] = str(tmp_path / "first.safetensors")
     second = train(small_run(seed=5, **still))
     assert all(torch.equal(a, b) for a, b in zip(first.model.parameters(), second.model.parameters(), strict=True))

@@ -18,7 +18,7 @@ from semantic_mapper.types import SourceViews
 from tests.small import SMALL_MODEL, tiny_field
 from tests.training.small_run import small_run
 
-RAYS_ALONE = {"share": 0.0}
+RAYS_ALONE = {"fraction": 0.0}
 
 
 @pytest.fixture(autouse=True)

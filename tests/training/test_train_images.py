@@ -70,7 +70,7 @@ def test_a_mirrored_view_shows_the_mirror_image_of_the_same_world():
 
 
 def test_image_batches_repeat_and_withhold_depth_of_whole_images():
-    config = ImageStepConfig(rooms=2, images=3, depth_withheld=0.5, mirrored=0.5)
+    config = ImageStepConfig(rooms=2, images=3, depth_dropout=0.5, mirrored=0.5)
     a, b = (draw_images([ROOM, ROOM], config, torch.Generator().manual_seed(1), CPU) for _ in range(2))
     assert torch.equal(a.views.rgb, b.views.rgb) and torch.equal(a.channel, b.channel)
     assert a.views.rgb.shape[0] == 6 and a.views.channel is None
@@ -110,19 +110,19 @@ def test_a_run_never_meets_the_rooms_of_the_runs_it_started_from(tmp_path: Path,
     seen = [0]
     weights: dict[str, str] = {}
     for name in ("a", "b", "c"):
-        run = train(small_run(images={"share": 1.0, "rooms": 1}, steps=3, **weights), tmp_path / name)
+        run = train(small_run(images={"fraction": 1.0, "rooms": 1}, steps=3, **weights), tmp_path / name)
         seen.append(seen[-1] + run.recipe["rooms"])
         weights = {"encoder_from": str(tmp_path / name / WEIGHTS_FILE)}
     assert [first - firsts[0] for first in firsts] == seen[:-1]
 
 
 def test_weights_after_the_images_are_kept_and_another_kind_takes_their_encoder_over(tmp_path: Path):
-    images = {"share": 0.5, "rooms": 1}
+    images = {"fraction": 0.5, "rooms": 1}
     train(small_run(images=images, steps=4), tmp_path / "first")
     kept = load_checkpoint(tmp_path / "first" / IMAGES_FILE).model
     assert kept.kind == "sray" and kept.image_encoder is not None
     still = {
-        "images": {"share": 0.0},
+        "images": {"fraction": 0.0},
         "learning_rate": 0.0,
         "final_learning_rate": 0.0,
         "weight_decay": 0.0,
@@ -134,7 +134,7 @@ def test_weights_after_the_images_are_kept_and_another_kind_takes_their_encoder_
     trained = train(small_run(**still, **source, **{**peer, "field": {**peer["field"], "encoder": shape}}))
     (origin,) = trained.recipe["origins"]
     assert (origin["file"], origin["recipe"]["kind"], origin["recipe"]["steps"]) == (IMAGES_FILE, "train", 2)
-    assert origin["recipe"]["config"]["images"]["share"] == 0.5 and len(origin["sha256"]) == 64
+    assert origin["recipe"]["config"]["images"]["fraction"] == 0.5 and len(origin["sha256"]) == 64
     assert rooms_before(trained.recipe["origins"]) == origin["recipe"]["rooms"] > 0
     other = trained.model
     assert other.image_encoder is not None
@@ -155,7 +155,7 @@ def refuse(*_: Any, **__: Any) -> None:
 def test_a_larger_budget_goes_on_with_rays_once_the_images_are_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stopped: bool
 ):
-    how = {"images": {"share": 0.5, "rooms": 1}, "log_steps": 1}
+    how = {"images": {"fraction": 0.5, "rooms": 1}, "log_steps": 1}
     done: list[int] = []
     train(
         small_run(steps=6 if stopped else 4, **how),
@@ -183,14 +183,14 @@ def test_a_larger_budget_goes_on_with_rays_once_the_images_are_over(
 
 def test_a_larger_budget_of_a_run_on_images_alone_is_for_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("semantic_mapper.training.train.draw_batch", refuse)
-    images = {"share": 1.0, "rooms": 1}
+    images = {"fraction": 1.0, "rooms": 1}
     for steps in (2, 4):
         train(small_run(images=images, steps=steps), tmp_path, resume=steps > 2)
     assert load_checkpoint(tmp_path / IMAGES_FILE).recipe["steps"] == 4
 
 
 def test_the_network_for_depth_grows_from_the_one_for_colours_after_its_share_of_the_images(tmp_path: Path):
-    images = {"share": 1.0, "rooms": 1, "colours_first": 0.5, "learning_rate": 1e-12}
+    images = {"fraction": 1.0, "rooms": 1, "colours_first": 0.5, "learning_rate": 1e-12}
     rates = {"final_learning_rate": 1e-12, "weight_decay": 0.0, "validation": {"times": 1, "rooms": 1, "queries": 1}}
     encoder = train(small_run(images=images, steps=4, **rates), tmp_path).model.image_encoder
     assert encoder is not None and encoder.depth_net is not None
@@ -202,7 +202,7 @@ def test_the_network_for_depth_grows_from_the_one_for_colours_after_its_share_of
 
 
 def test_images_come_without_depth_at_first():
-    config = ImageStepConfig(rooms=1, images=4, depth_withheld=0.0)
+    config = ImageStepConfig(rooms=1, images=4, depth_dropout=0.0)
     for only in (True, False):
         batch = draw_images([ROOM], config, torch.Generator().manual_seed(1), CPU, colours_only=only)
         assert bool((batch.views.depth_m > 0).any()) is not only
@@ -218,7 +218,7 @@ def test_a_network_for_depth_grows_from_an_encoder_of_colours_that_is_taken_over
 
 
 def test_rays_from_the_first_step_on_start_with_a_calibrated_encoder(tmp_path: Path):
-    field = train(small_run(images={"share": 0.0}, steps=1)).model
+    field = train(small_run(images={"fraction": 0.0}, steps=1)).model
     assert field.image_encoder is not None and not field.image_encoder.uncalibrated
 
 

@@ -68,6 +68,6 @@ def test_recipes_of_the_comparison_are_configs_and_start_from_encoders_of_their_
     assert (config.seed, config.steps, config.kind) == (3, 100, run.kind)
     encoder = build_field(config.kind, config.field, ROOMS).image_encoder
     assert encoder is not None and (encoder.depth_net is not None) is run.depth
-    assert config.images.share == (1 if run.images else 0)
+    assert config.images.fraction == (1 if run.images else 0)
     if not run.images:
         assert peers.RUNS[run.encoder].depth is run.depth and peers.RUNS[run.encoder].images

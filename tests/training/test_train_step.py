@@ -23,7 +23,7 @@ VIEWS = [view_from_frame(f, ROOMS, 48) for f in tiny_frames()]
 
 
 def batch(seed: int = 0, sources: tuple[int, ...] = (0, 2, 3), **changes: object) -> StepBatch:
-    step = convert_config({"rays": 64, "blind": 0.0, "depth_withheld": 0.0, **changes}, TrainStepConfig, "test")
+    step = convert_config({"rays": 64, "no_depth": 0.0, "depth_dropout": 0.0, **changes}, TrainStepConfig, "test")
     generator = torch.Generator().manual_seed(seed)
     drawn = draw_batch(VIEWS, 1, sources, step, generator, len(ROOMS), torch.device("cpu"))
     assert drawn is not None
@@ -34,7 +34,7 @@ def test_source_views_are_three_to_twelve_near_and_far_and_rarely_the_query_itse
     generator = torch.Generator().manual_seed(0)
     sizes, spreads, own = set(), [], 0
     for _ in range(2000):
-        query, sources = pick_views_on_path(range(20), 20, TrainStepConfig(own_view_share=0.2), generator)
+        query, sources = pick_views_on_path(range(20), 20, TrainStepConfig(own_view_fraction=0.2), generator)
         assert len(set(sources)) == len(sources)
         own += query in sources
         sizes.add(len(sources))
@@ -47,7 +47,7 @@ def test_source_views_are_three_to_twelve_near_and_far_and_rarely_the_query_itse
 
 def test_the_query_is_one_of_the_given_views_and_short_paths_are_used_up():
     generator = torch.Generator().manual_seed(0)
-    drawn = [pick_views_on_path([1, 3], 4, TrainStepConfig(own_view_share=0), generator) for _ in range(40)]
+    drawn = [pick_views_on_path([1, 3], 4, TrainStepConfig(own_view_fraction=0), generator) for _ in range(40)]
     assert {q for q, _ in drawn} == {1, 3}
     assert all(len(s) == 3 and q not in s for q, s in drawn)
 
@@ -56,7 +56,7 @@ def test_a_blind_step_has_no_depth_anywhere_and_fewer_rays():
     seeing = batch()
     assert (seeing.sources.depth_m > 0).any() and (seeing.rays.prior_depth_m > 0).any()
     assert seeing.z.shape == (64, 8)
-    blind = batch(blind=1.0, blind_thinning=4, blind_samples=32)
+    blind = batch(no_depth=1.0, no_depth_thinning=4, samples_without_depth=32)
     assert blind.sources.depth_m.max() == 0 and blind.rays.prior_depth_m.max() == 0
     assert blind.z.shape == (16, 32) and len(blind.targets.channel) == 16
     assert (blind.targets.depth_m > 0).any(), "depth is withheld from the field, not from the loss"
@@ -64,7 +64,7 @@ def test_a_blind_step_has_no_depth_anywhere_and_fewer_rays():
 
 def test_known_labels_of_source_views_are_given_only_when_asked_for():
     assert batch().sources.channel is None
-    given = batch(known_labels=True, labels_withheld=0.0).sources.channel
+    given = batch(known_labels=True, label_dropout=0.0).sources.channel
     assert given is not None and (given >= 0).any()
 
 
@@ -131,4 +131,4 @@ def test_more_processes_than_gpus_are_refused():
 
 
 def test_finetuning_keeps_its_own_defaults():
-    assert StepConfig().known_labels and StepConfig().blind == 0
+    assert StepConfig().known_labels and StepConfig().no_depth == 0

@@ -94,7 +94,7 @@ class MVSNeRF(LearnedField):
     def encoding_volume(self, sources: EncodedViews, views: tuple[int, ...]) -> torch.Tensor:
         """S (1, volume_channels, planes, h, w) over the reference ``views[0]``, from the source views ``views``.
 
-        Without gradients the last volume is kept, so that a view rendered in chunks is swept once. It is made anew for
+        Without gradients the last volume is kept, so that a view rendered in chunks is swept once. It is made again for
         other sources, other views, or weights that were changed since.
         """
         weights = tuple(p._version for p in self.volume_net.parameters())

@@ -84,11 +84,11 @@ class NeuRay(LearnedField):
             cues: (m, R, N, 4), see ``contextual_space``.
             visibility, valid: (m, R, N).
         """
-        share = visibility_share(visibility, valid)
-        context = self.context_in(torch.cat(weighted_moments(feature, share), dim=-1))  # (R, N, 2 C)
+        fraction = visibility_share(visibility, valid)
+        context = self.context_in(torch.cat(weighted_moments(feature, fraction), dim=-1))  # (R, N, 2 C)
         hidden = functional.relu(self.view_in(torch.cat((feature, cues), dim=-1)) + context)
         view = feature + self.view_out(hidden)
-        mean, variance = weighted_moments(view, share)
+        mean, variance = weighted_moments(view, fraction)
         return view, mean + self.pooled(torch.cat((mean, variance), dim=-1))
 
     def source_logits(self, sources: EncodedViews) -> torch.Tensor:

@@ -34,7 +34,7 @@ ARRAY(void, AnyArray);
     __attribute__((visibility("default"))) int64_t name(__attribute__((unused)) int64_t start,                        \
                                                         __attribute__((unused)) int64_t stop, const Arguments *a)
 
-/* For functions that are made anew for each caller's constants, which a compiler by itself may not do. */
+/* For functions that are made again for each caller's constants, which a compiler by itself may not do. */
 #define ALWAYS_INLINE static inline __attribute__((always_inline))
 
 static inline int64_t min_i(int64_t a, int64_t b) { return a < b ? a : b; }

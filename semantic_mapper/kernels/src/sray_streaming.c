@@ -42,7 +42,7 @@ typedef struct {
     int64_t residual;          /* attention adds to the features instead of replacing them */
     int64_t occlusion;         /* views count by their visibility */
     double log_ratio;          /* ln(1 / tau) of Eq. 12 */
-    double least_weight;       /* samples of a smaller fraction of their ray's weight take no part in the attention */
+    double sample_weight_threshold;       /* samples of a smaller fraction of their ray's weight take no part in the attention */
     double hidden_below;       /* visibility below which a view is left out where another one sees the sample */
     double least_visibility;   /* added to each visibility that is a weight */
     double label_doubt;        /* hit probability at which a label that a view carries over counts by half */
@@ -477,10 +477,10 @@ static void group_by_sample(Scratch *s, int64_t count) {
     }
 }
 
-/* Move the tokens that SRay.without_hidden and without_faint keep to the front; returns how many they are. */
+/* Move the tokens that SRay.mask_occluded and without_faint keep to the front; returns how many they are. */
 static int64_t drop_tokens(Scratch *s, const Settings *set) {
     const float hidden_below = set->occlusion ? (float)set->hidden_below : 0.0f;
-    const bool drop_faint = set->least_weight > 0;
+    const bool drop_faint = set->sample_weight_threshold > 0;
     int64_t kept = 0, end = 0;
     for (int64_t k = 0; k < s->samples; k++) {
         s->clearest[k] = 0;
@@ -576,7 +576,7 @@ static void weigh_samples(Scratch *s, const Settings *set, float *opacity, float
         optical += step, sum += s->weight[k], depth_sum += s->weight[k] * s->z[k];
     }
     for (int64_t k = 0; k < s->samples; k++) {
-        s->looked_at[k] = s->weight[k] >= (float)set->least_weight * sum ? s->weight[k] : 0.0f;
+        s->looked_at[k] = s->weight[k] >= (float)set->sample_weight_threshold * sum ? s->weight[k] : 0.0f;
         kept += s->looked_at[k];
     }
     for (int64_t k = 0; k < s->samples; k++) s->looked_at[k] *= sum / max_f(kept, 1e-12f);
@@ -642,7 +642,7 @@ static void composite_semantics(Scratch *s, const Weights *w, int64_t count, flo
     for (int64_t c = 0; c < C; c++) out[c] += s->composited[c] + sum * w->semantic_out.bias.data[c];
 }
 
-/* Known labels that the views carry over to the samples, composited; see SRay.carried_labels. */
+/* Known labels that the views carry over to the samples, composited; see SRay.propagate_labels. */
 static void carry_labels(const Scratch *s, const Settings *set, float *out) {
     for (int64_t k = 0; k < s->samples; k++) {
         const int64_t *tokens = s->by_sample + k * s->views;
@@ -676,7 +676,7 @@ static void render_ray(const RenderArguments *a, Scratch *s, int64_t r) {
     weigh_samples(s, set, a->out.opacity.data + r, a->out.depth.data + r);
     memset(a->out.carried.data + r * s->classes, 0, (size_t)s->classes * sizeof(float));
     if (a->maps.labels.shape[1] > 0) carry_labels(s, set, a->out.carried.data + r * s->classes);
-    if (set->occlusion || set->least_weight > 0) {
+    if (set->occlusion || set->sample_weight_threshold > 0) {
         count = drop_tokens(s, set);
         group_by_sample(s, count);
     }

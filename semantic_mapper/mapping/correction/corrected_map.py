@@ -1,10 +1,10 @@
 """A map that follows corrected poses: it is built again from its history, beside the one in use, and then swapped in.
 
-A rebuild goes on in portions (``MapCorrector.advance``), between steps or from another thread. Until it is done, steps
+A rebuild goes on in batches (``MapCorrector.advance``), between steps or from another thread. Until it is done, steps
 and queries go on with the old map; frames that come meanwhile are in the history, too, so the rebuild catches up with
 them. The swap comes between two steps.
 
-Class probabilities are not rendered anew. They came from source views that lie near the frame in time, and a correction
+Class probabilities are not rendered again. They came from source views that lie near the frame in time; a correction
 changes where these are relative to each other far less than where all of them are in the world.
 
 The history is bounded: when it is full, its oldest segment leaves (``history``). Those frames are *frozen*: what they

@@ -1,7 +1,7 @@
 """From corrected poses of some frames to those of all frames.
 
 A pose graph gives new poses for its keyframes alone. A frame between two of them in time moves with both: with C_a and
-C_b the motions ``T_new @ T_old^-1`` of its neighbours and s its share of the time between them, its rotation is turned
+C_b the motions ``T_new @ T_old^-1`` of its neighbours and s the part of the time between them, its rotation is turned
 by the rotation s of the way from R_a to R_b (slerp), and its position p goes to ``(1 - s) C_a p + s C_b p``. Blending
 where the two motions take the camera, not their translations, makes the result the same wherever the world's origin is:
 blended translations would be off by (turn)^2 / 8 times the distance to the origin. A frame before the first given one
@@ -70,8 +70,8 @@ class PoseCorrection:
             return T_world_camera if stamp_ns > self.until_ns else move(self._motions[-1], T_world_camera)
         if after == 0 or self._stamps[after] == stamp_ns:
             return move(self._motions[after], T_world_camera)
-        share = (stamp_ns - int(self._stamps[after - 1])) / int(self._stamps[after] - self._stamps[after - 1])
-        return _between(self._motions[after - 1], self._motions[after], share, T_world_camera)
+        fraction = (stamp_ns - int(self._stamps[after - 1])) / int(self._stamps[after] - self._stamps[after - 1])
+        return _between(self._motions[after - 1], self._motions[after], fraction, T_world_camera)
 
 
 def move(motion: Float64, T_world_camera: Float64) -> Float64:
@@ -90,11 +90,11 @@ def _motion(pair: PosePair) -> Float64:
     return motion
 
 
-def _between(a: Float64, b: Float64, share: float, T_world_camera: Float64) -> Float64:
+def _between(a: Float64, b: Float64, fraction: float, T_world_camera: Float64) -> Float64:
     if np.array_equal(a, b):
         return move(a, T_world_camera)
     out = np.eye(4)
-    out[:3, :3] = interpolate_pose(a, b, share)[:3, :3] @ T_world_camera[:3, :3]
+    out[:3, :3] = interpolate_pose(a, b, fraction)[:3, :3] @ T_world_camera[:3, :3]
     position = T_world_camera[:3, 3]
-    out[:3, 3] = (1 - share) * transform(a, position) + share * transform(b, position)
+    out[:3, 3] = (1 - fraction) * transform(a, position) + fraction * transform(b, position)
     return out

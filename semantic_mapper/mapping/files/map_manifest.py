@@ -15,7 +15,7 @@ from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
 FORMAT = "semantic-mapper voxel map"
 FORMAT_VERSION = 2
 CHUNK_BLOCKS = 256  # at most; what is in memory at a time while a map is saved or loaded
-MEND = "Use another copy, or make the map anew from its log with `semantic-mapper replay`"
+MEND = "Use another copy, or make the map again from its log with `semantic-mapper replay`"
 
 Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 Corner = tuple[float, float, float]
@@ -101,7 +101,7 @@ def _plain(content: bytes, where: str) -> dict[str, Any]:
         raise MapError(f"{where}: not a voxel map but '{kind}'")
     if version != FORMAT_VERSION:
         raise MapError(
-            f"{where}: map format {version}, this version reads format {FORMAT_VERSION}; make the map anew from its "
+            f"{where}: map format {version}, this version reads format {FORMAT_VERSION}; make the map again from its "
             "log with `semantic-mapper replay`, or read it with the version of semantic-mapper that wrote it"
         )
     return plain

@@ -59,7 +59,7 @@ def check_fit(config_a: VoxelMapConfig, labels_a: LabelSet, config_b: VoxelMapCo
         a, b = getattr(config_a, name), getattr(config_b, name)
         if a != b:
             raise MapError(
-                f"maps of different voxel_map.{name} ({a:g} and {b:g}) cannot be merged; make one of them anew from "
+                f"maps of different voxel_map.{name} ({a:g} and {b:g}) cannot be merged; make one of them again from "
                 "its log with the setting of the other"
             )
     a, b = (set(zip(labels.ids, labels.names, strict=True)) for labels in (labels_a, labels_b))

@@ -15,7 +15,7 @@ from semantic_mapper.types import Float32
 MOST_TRUST = 0.5  # of a measurement's weight
 GUESS_TRUST = 0.05  # where the map has no surface yet
 LEAST_TRUST = 0.025  # below, nothing is fused
-ROUGHNESS = 0.003  # share of z by which a pixel may leave the line between its neighbours: trust falls to 1 / e
+ROUGHNESS = 0.003  # fraction of z by which a pixel may leave the line between its neighbours: trust falls to 1 / e
 
 
 def depth_trust(depth_m: Float32, map_depth_m: Float32, truncation_m: float) -> Float32:

@@ -81,7 +81,7 @@ class BlockGrid:
         self._buffers = self._make_buffers(capacity)
         self._index = make_block_index(np.empty((0, 3), np.int32), np.empty(0, np.int32))
         self._store: BlockStore | None = None
-        self._told_of_portions = False
+        self._warned_of_batches = False
         self._clock = 0
         # By buffer index:
         self._packed = np.full(capacity, _FREE, np.int64)  # key of the block there
@@ -133,7 +133,7 @@ class BlockGrid:
         return self._max_resident
 
     def buffers(self) -> GridBuffers:
-        """The present buffers. Take them anew after every ``activate``: growth moves the memory."""
+        """The present buffers. Take them again after every ``activate``: growth moves the memory."""
         return self._buffers
 
     def sorted_blocks(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -148,7 +148,7 @@ class BlockGrid:
         New ones are zero; those on disk come back as they were.
 
         Raises:
-            MapError: where the map would exceed ``max_blocks``, or these blocks alone the memory (``portions`` takes
+            MapError: where the map would exceed ``max_blocks``, or these blocks alone the memory (``batches`` takes
                 any number of them), or the disk fails; no block has changed then.
         """
         for watcher in self.watchers:
@@ -168,7 +168,7 @@ class BlockGrid:
         self._used[found] = self._clock
         return found
 
-    def portions(self, packed: NDArray[np.int64]) -> Iterator[NDArray[np.int32]]:
+    def batches(self, packed: NDArray[np.int64]) -> Iterator[NDArray[np.int32]]:
         """``activate`` unique packed keys (B,) so many at a time as memory has room for.
 
         Yields:
@@ -310,9 +310,9 @@ class BlockGrid:
             )
 
     def _tell_of_portions(self, blocks: int) -> None:
-        if self._told_of_portions:
+        if self._warned_of_batches:
             return
-        self._told_of_portions = True
+        self._warned_of_batches = True
         reason = (
             "a frame touches more blocks than memory has room for: it goes through the disk part by part, which is "
             f"slow; raise voxel_map.memory_mb to {advised_mb(blocks, self.block_bytes)} or more, or use larger voxels"

@@ -141,7 +141,7 @@ def choose_blocks(
     if not 0 <= since <= newest or limit < 0:
         raise MapError(
             f"changes since version {since}, limit {limit}: versions of this map go from 0 to {newest}, and a limit "
-            "is not negative; a mirror of another map starts anew from version 0"
+            "is not negative; a mirror of another map restarts from version 0"
         )
     packed, changed_at = grid.versions_since(since)
     rows, version = oldest_first(changed_at, limit, newest)

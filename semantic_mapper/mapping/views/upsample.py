@@ -21,7 +21,7 @@ LEAST_WEIGHT = 1e-9  # where nothing looks alike, the coarse pixels still count 
 Int32 = NDArray[np.int32]
 
 
-def lift(
+def upsample(
     probabilities: Float32, known: NDArray[np.bool_], rgb_low: UInt8, depth_low: Float32, rgb: UInt8, depth: Float32
 ) -> Int32:
     """Joint bilateral upsampling: every full pixel takes one of the 3x3 coarse pixels round it.
@@ -96,9 +96,9 @@ def upsample_view(
     colour_rate: float,
     depth_sigma: float,
     largest_step: float,
-    least_weight: float,
+    sample_weight_threshold: float,
 ) -> None:
-    """The joint bilateral upsampling of `lift`.
+    """The joint bilateral upsampling of `upsample`.
 
     Args:
         count: H, rows.

@@ -14,7 +14,7 @@ from semantic_mapper.fields.base import EncodedViews, Sampled, SemanticField
 from semantic_mapper.fields.render import render_view
 from semantic_mapper.fields.sparse_render import render_sparse_view
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.mapping.rate_controller import Pace
+from semantic_mapper.mapping.rate_controller import RateController
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 _log = get_logger(__name__)
@@ -43,7 +43,7 @@ class ViewRenderer:
 
     Args:
         field: Whose samples a ray can be set, where a rate is to be held.
-        config: Share of the rays, samples of views without any depth, rate.
+        config: Fraction of the rays, samples of views without any depth, rate.
         sampling: Of a ray with a depth prior.
 
     Raises:
@@ -54,11 +54,11 @@ class ViewRenderer:
         self._field = field
         self._config = config
         self._sampling = sampling
-        self._pace: Pace | None = None
+        self._rate_controller: RateController | None = None
         if config.target_hz > 0:
             if not isinstance(field, Sampled):
                 raise ConfigError(f"render.target_hz needs a field whose samples can be set; {type(field)} has none")
-            self._pace = Pace(config.target_hz, config.share, sampling)
+            self._rate_controller = RateController(config.target_hz, config.ray_fraction, sampling)
         self._last = (0, 0)  # rays and samples of the last view, where its time tells of the next one's
 
     def exchange_field(self, field: SemanticField) -> None:
@@ -67,8 +67,8 @@ class ViewRenderer:
 
     def note(self, render_ms: float, other_ms: float) -> None:
         """What the frame of the last view took: its rendering, and all else."""
-        if self._pace is not None:
-            self._pace.note(render_ms, other_ms, *self._last)
+        if self._rate_controller is not None:
+            self._rate_controller.note(render_ms, other_ms, *self._last)
 
     def render(
         self, sources: EncodedViews, intrinsics: CameraIntrinsics, T_world_camera: Float64, prior_m: Float32, rgb: UInt8
@@ -82,21 +82,23 @@ class ViewRenderer:
             prior_m: (h, w) float32 depth prior, 0 = none.
             rgb: (h, w, 3) uint8 colours of the view.
         """
-        share, sampling = self._config.share, self._sampling
-        if self._pace is not None:
-            share, sampling = self._pace.choose(prior_m.size)
+        fraction, sampling = self._config.ray_fraction, self._sampling
+        if self._rate_controller is not None:
+            fraction, sampling = self._rate_controller.choose(prior_m.size)
         blind = not prior_m.any()
         if blind:
-            sampling = msgspec.structs.replace(sampling, guided=max(self._config.blind_samples, sampling.guided))
+            sampling = msgspec.structs.replace(
+                sampling, guided=max(self._config.samples_without_depth, sampling.guided)
+            )
         samples = 0
         if isinstance(self._field, Sampled) and sampling.mode == "streaming":
             self._field.sampling = sampling
             samples = sampling.guided
         scene = (self._field, sources, intrinsics, T_world_camera, prior_m, sampling, self._config.rays_per_chunk)
-        if share == 1:
+        if fraction == 1:
             probabilities, known, depth_m = render_view(*scene)
             rays = prior_m.size
         else:
-            probabilities, known, depth_m, rays = render_sparse_view(*scene, rgb, share)
+            probabilities, known, depth_m, rays = render_sparse_view(*scene, rgb, fraction)
         self._last = (0 if blind else rays, samples)
         return RenderedView(probabilities, known, depth_m, rays, samples)

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.config import VirtualViewConfig
-from semantic_mapper.coverage import sees
 from semantic_mapper.geometry import invert_pose, look_at, nearest_pixels, scale_intrinsics, transform
 from semantic_mapper.mapping.fusion.fuse import FULL_TRUST_RANGE_M
 from semantic_mapper.mapping.keyframes import Keyframe
 from semantic_mapper.mapping.views.surface_patches import SurfacePatches, surface_patches
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import CameraIntrinsics, Float64
+from semantic_mapper.view_selection import visible_points
 
 ENOUGH_KEYFRAMES = 4  # more that see a surface add nothing to its score
 TARGET_CELL_M = 0.5  # surface in need is gathered in cells of this size ...
@@ -126,13 +126,13 @@ def in_free_space(points: Float64, keyframes: Sequence[Keyframe]) -> NDArray[np.
 def _worth_a_look(
     patches: SurfacePatches, keyframes: Sequence[Keyframe], least: int, looked_at: NDArray[np.int64]
 ) -> SurfacePatches:
-    """The neediest patches that enough keyframes see and that were not looked at; need times their share of views."""
+    """The neediest patches that enough keyframes see and that were not looked at; need times fraction of views."""
     fresh = np.flatnonzero((patches.need > 0) & ~np.isin(patches.packed, looked_at))
     points = patches.xyz[fresh]
     count = np.zeros(len(points), np.int64)
     for k in keyframes:
         near = ((points - k.T_world_camera[:3, 3]) ** 2).sum(1) < FARTHEST_M**2
-        count += near & sees(points, k.T_world_camera, k.intrinsics, k.depth_m, measured=True)
+        count += near & visible_points(points, k.T_world_camera, k.intrinsics, k.depth_m, measured=True)
     need = np.where(count >= least, np.minimum(count, ENOUGH_KEYFRAMES) / ENOUGH_KEYFRAMES * patches.need[fresh], 0)
     some = np.sort(np.argsort(-need, kind="stable")[:PATCHES])
     some = some[need[some] > 0]
@@ -147,7 +147,7 @@ def _candidates(patches: SurfacePatches, keyframes: Sequence[Keyframe], rng: np.
         seeing = [
             i
             for i in np.argsort(distance, kind="stable")
-            if sees(
+            if visible_points(
                 target[None], keyframes[i].T_world_camera, keyframes[i].intrinsics, keyframes[i].depth_m, measured=True
             )[0]
         ]
@@ -194,7 +194,7 @@ def _as_seen(
         return None
     p = transform(invert_pose(pose), patches.xyz)
     _, row, column = nearest_pixels(p, intrinsics)
-    seen = sees(patches.xyz, pose, intrinsics, depth, measured=True) & (depth[row, column] > 0)
+    seen = visible_points(patches.xyz, pose, intrinsics, depth, measured=True) & (depth[row, column] > 0)
     return VirtualView(pose, float((seen * _worth(p[:, 2], patches)).sum()), patches.packed[seen])
 
 

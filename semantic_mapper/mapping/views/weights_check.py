@@ -49,7 +49,7 @@ class FieldTrial:
 
     @property
     def agreement(self) -> float | None:
-        """Share of the pixels of which the map is sure that this field names as the map does; None = none was sure."""
+        """Fraction of the pixels that the map is sure of which this field names as the map does; None = none."""
         return self._same / self._compared if self._compared else None
 
     def advance(self) -> bool:

@@ -96,12 +96,12 @@ def test_intrinsics_that_the_images_carry_count_more_than_the_calibration(calibr
         message.setTransformation(cropped)
     with host.camera(lambda: host.played(calibration, rgb, depth)) as camera:
         (image,) = take(camera, 1)
-        assert camera.troubles == ()
+        assert camera.warnings == ()
     assert (image.intrinsics.fx, image.intrinsics.cy) == (70, 20)
     for message in depth:
         message.setTransformation(other)
     with host.camera(lambda: host.played(calibration, rgb, depth)) as camera:
-        (trouble,) = camera.troubles
+        (trouble,) = camera.warnings
     assert "not be aligned" in trouble
 
 
@@ -138,17 +138,17 @@ def test_a_stamp_of_the_future_does_not_stop_those_after_it(calibration: Path) -
 
 def test_a_device_that_goes_away_is_waited_for(calibration: Path) -> None:
     start = long_ago(60)
-    troubles: list[str] = []
+    warnings: list[str] = []
     turned: list[float] = []
 
     def absent() -> Sources:
-        troubles.extend(camera.troubles)
-        turned.append(camera.turned_at)
+        warnings.extend(camera.warnings)
+        turned.append(camera.last_poll_time)
         raise CameraError("no OAK camera is connected")
 
     def back() -> Sources:
-        troubles.extend(camera.troubles)
-        turned.append(camera.turned_at)
+        warnings.extend(camera.warnings)
+        turned.append(camera.last_poll_time)
         counted_anew = [host.stamped(rgb_message(k, start), k, start + 25 * PERIOD) for k in range(4)]
         return host.played(calibration, counted_anew, None)
 
@@ -156,13 +156,13 @@ def test_a_device_that_goes_away_is_waited_for(calibration: Path) -> None:
     camera = host.camera(lambda: host.played(calibration, first, None, ends=True), absent, back)
     with camera:
         images = take(camera, 8)
-        assert camera.troubles == ()
-        turned.append(camera.turned_at)
+        assert camera.warnings == ()
+        turned.append(camera.last_poll_time)
     assert 0 < turned[0] < turned[1] < turned[2], "it comes round while it waits, too"
     assert [image.seq for image in images] == [0, 1, 2, 3, 25, 26, 27, 28]  # a number for each that was lost
     assert np.diff([image.stamp_ns for image in images]).min() > 0
-    assert len(troubles) == 2 and "has gone" in troubles[0] and "no OAK camera is connected" in troubles[1]
-    assert all(host.NAME in text and "front" in text for text in troubles)
+    assert len(warnings) == 2 and "has gone" in warnings[0] and "no OAK camera is connected" in warnings[1]
+    assert all(host.NAME in text and "front" in text for text in warnings)
 
 
 def test_the_same_device_is_looked_for_again(calibration: Path) -> None:
@@ -185,10 +185,10 @@ def test_the_same_device_is_looked_for_again(calibration: Path) -> None:
 def test_a_stream_that_stalls_is_opened_again(calibration: Path) -> None:
     start = long_ago(60)
     config = host.Config(width=WIDTH, height=HEIGHT, fps=host.FPS, stall_s=1.0, retry_s=0.02)
-    troubles: list[str] = []
+    warnings: list[str] = []
 
     def again() -> Sources:
-        troubles.extend(camera.troubles)
+        warnings.extend(camera.warnings)
         return host.played(calibration, [rgb_message(k, start) for k in (40, 41)], None)
 
     first = [rgb_message(k, start) for k in range(3)]
@@ -196,7 +196,7 @@ def test_a_stream_that_stalls_is_opened_again(calibration: Path) -> None:
     with camera:
         seqs = [image.seq for image in take(camera, 5)]
     assert seqs == [0, 1, 2, 40, 41]
-    assert len(troubles) == 1 and "no image for 1 s" in troubles[0]
+    assert len(warnings) == 1 and "no image for 1 s" in warnings[0]
 
 
 def test_a_device_without_images_is_refused(calibration: Path) -> None:

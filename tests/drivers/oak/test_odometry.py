@@ -63,7 +63,7 @@ def test_images_carry_the_pose_of_their_moment(calibration: Path) -> None:
     camera = host.camera(lambda: sources, config=WAITS)
     with camera:
         images = list(itertools.islice(camera, 50))
-        assert camera.troubles == ()
+        assert camera.warnings == ()
     assert all(image.tracks_itself for image in images)
     posed = with_pose(images)
     assert len(posed) > 10  # but those from before the first pose
@@ -83,7 +83,7 @@ def test_images_do_not_wait_for_ever(calibration: Path, monkeypatch: pytest.Monk
     )
     with camera:
         images = list(itertools.islice(camera, 40))
-        assert any("odometry has not answered for 0.2 s" in trouble for trouble in camera.troubles)
+        assert any("odometry has not answered for 0.2 s" in trouble for trouble in camera.warnings)
     assert not with_pose(images)
 
 
@@ -95,7 +95,7 @@ def test_after_a_reconnection_poses_are_withheld(calibration: Path) -> None:
     before: list[CameraImage] = []
     with camera:
         for image in camera:
-            if any("began anew" in trouble for trouble in camera.troubles):
+            if any("began again" in trouble for trouble in camera.warnings):
                 break
             before.append(image)
         after = [image, *itertools.islice(camera, 20)]
@@ -107,9 +107,9 @@ def test_a_reconnection_ends_the_camera_where_that_is_asked_for(calibration: Pat
     def connect(count: int, ends: bool) -> Sources:
         return host.tracked(live(calibration, count, ends=ends), basalt_says, T_LEFT_RGB)
 
-    config = msgspec.structs.replace(WAITS, other_world="end")
+    config = msgspec.structs.replace(WAITS, on_tracking_reset="exit")
     camera = host.camera(lambda: connect(30, True), lambda: connect(60, False), config=config)
-    with camera, pytest.raises(CameraError, match="was away, and its odometry began anew"):
+    with camera, pytest.raises(CameraError, match="was away, and its odometry began again"):
         list(itertools.islice(camera, 80))
 
 
@@ -119,7 +119,7 @@ def test_a_lost_track_is_told(calibration: Path) -> None:
     camera = host.camera(lambda: host.tracked(live(calibration, 30), lambda _: lost, T_LEFT_RGB), config=config)
     with camera:
         assert not with_pose(list(itertools.islice(camera, 20)))
-        assert any("lost track" in trouble for trouble in camera.troubles)
+        assert any("lost track" in trouble for trouble in camera.warnings)
 
 
 def test_an_exception_while_tracking_ends_the_images_with_an_error(calibration: Path) -> None:

@@ -47,8 +47,8 @@ class ListCamera:
         self.is_open = False
         self.stopped = False
         self.can_wait = False
-        self.turned_at = 0.0
-        self.troubles: tuple[str, ...] = ("the lens cap is on",)
+        self.last_poll_time = 0.0
+        self.warnings: tuple[str, ...] = ("the lens cap is on",)
         self.info = StreamInfo("list", {"cam": INTRINSICS})
 
     def __enter__(self) -> Self:

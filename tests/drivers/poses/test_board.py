@@ -68,7 +68,7 @@ def test_the_camera_is_found_where_it_is(config: BoardPoses) -> None:
     errors, sigmas = [], []
     for T_board_camera in views(config):
         found = source.pose(render(config, T_board_camera))
-        assert found is not None and found.source == "board", source.troubles
+        assert found is not None and found.source == "board", source.warnings
         truth = T_world_board @ T_board_camera
         errors.append(np.linalg.norm(found.T_world_camera[:3, 3] - truth[:3, 3]))
         sigmas.append(found.sigma)
@@ -87,12 +87,12 @@ def test_no_board_and_too_little_of_it_give_no_pose() -> None:
     source = BoardPoseSource(CHARUCO)
     blank = CameraImage(1, 0, "cam", np.full((480, 640, 3), 200, np.uint8), None, INTRINSICS)
     assert source.pose(blank) is None
-    assert source.counters["no_board"] == 1 and "0 corners" in source.troubles[0]
+    assert source.counters["no_board"] == 1 and "0 corners" in source.warnings[0]
     seen = render(CHARUCO, views(CHARUCO)[0])
     covered = seen.rgb.copy()
     covered[:, 290:] = 200
     assert source.pose(CameraImage(2, 1, "cam", covered, None, INTRINSICS)) is None
-    assert source.pose(seen) is not None and source.troubles == ()
+    assert source.pose(seen) is not None and source.warnings == ()
 
 
 def test_wrong_intrinsics_are_noticed() -> None:
@@ -100,7 +100,7 @@ def test_wrong_intrinsics_are_noticed() -> None:
     seen = render(CHARUCO, views(CHARUCO)[1])
     wrong = CameraIntrinsics(520.0, 700.0, 322.0, 238.0, 640, 480)
     assert source.pose(CameraImage(1, 0, "cam", seen.rgb, None, wrong)) is None
-    assert source.counters["inexact"] == 1 and "check its sizes" in source.troubles[0]
+    assert source.counters["inexact"] == 1 and "check its sizes" in source.warnings[0]
 
 
 def test_a_small_board_is_not_guessed_at() -> None:
@@ -111,7 +111,7 @@ def test_a_small_board_is_not_guessed_at() -> None:
     for offset in ((0.0, 0.02, -0.8), (0.08, 0.06, -0.8)):
         camera = look_at(target + np.array(offset), target, np.array((0.0, -1.0, 0.0)))
         assert source.pose(render(tiny, camera)) is None
-    assert source.counters == {"uncertain": 1, "ambiguous": 1} and "mirrored" in source.troubles[0]
+    assert source.counters == {"uncertain": 1, "ambiguous": 1} and "mirrored" in source.warnings[0]
 
 
 def test_boards_that_cannot_be_are_refused() -> None:

@@ -64,7 +64,7 @@ def test_a_camera_is_followed_through_a_room() -> None:
     assert absolute_trajectory_error(found, truth()).rmse_m < 0.01 * way
     assert relative_pose_error(found, truth()).rmse_deg < 0.3
     assert np.array_equal(found[0], truth()[0])
-    assert source.counters["tracked"] == 40 and source.counters["keyframes"] > 2 and source.troubles == ()
+    assert source.counters["tracked"] == 40 and source.counters["keyframes"] > 2 and source.warnings == ()
     assert {e.source for e in estimates if e is not None} == {"odometry"}
 
 
@@ -91,10 +91,10 @@ def test_a_blacked_out_stretch_is_lost_and_the_camera_found_again() -> None:
         assert all(source.pose(f) is not None for f in frames[:20])
         for f in dark:
             assert source.pose(f) is None
-            assert "show the camera a place" in source.troubles[0]
+            assert "show the camera a place" in source.warnings[0]
         assert source.counters["lost"] == 6 and source.counters["relocalised"] == 0
         found = poses_of([source.pose(f) for f in back])
-    assert source.counters["relocalised"] == 1 and source.troubles == ()
+    assert source.counters["relocalised"] == 1 and source.warnings == ()
     assert np.linalg.norm(found[:, :3, 3] - truth()[:15, :3, 3], axis=1).max() < 0.02
 
 

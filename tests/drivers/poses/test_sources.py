@@ -12,7 +12,7 @@ from semantic_mapper.drivers.base import PoseSource
 from semantic_mapper.drivers.poses.board import BoardPoseSource
 from semantic_mapper.drivers.poses.config import IDENTITY, KINDS
 from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
-from semantic_mapper.drivers.poses.posed_camera import TellingPoseSource
+from semantic_mapper.drivers.poses.posed_camera import DiagnosticPoseSource
 from semantic_mapper.drivers.poses.sources import open_poses, read_pose_config
 from semantic_mapper.drivers.poses.still import DevicePoseSource, FixedPoseSource
 from semantic_mapper.drivers.poses.topic import TopicPoseSource
@@ -32,8 +32,8 @@ from semantic_mapper.errors import ConfigError
 def test_a_section_of_a_launch_file_becomes_a_pose_source(text: str, kind: type) -> None:
     source = open_poses(tomllib.loads(text))
     assert isinstance(source, kind)
-    assert isinstance(source, PoseSource) and isinstance(source, TellingPoseSource)
-    assert source.troubles == () and not source.counters
+    assert isinstance(source, PoseSource) and isinstance(source, DiagnosticPoseSource)
+    assert source.warnings == () and not source.counters
 
 
 def test_every_kind_has_its_name() -> None:

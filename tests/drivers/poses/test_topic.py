@@ -98,7 +98,7 @@ def test_an_image_gets_the_pose_at_its_stamp_of_where_the_camera_sits(endpoint: 
         assert np.allclose(invert_pose(base) @ left.T_world_camera, other, atol=1e-9)
         assert found.source == "topic" and found.sigma == pytest.approx(0.02)
         eventually(lambda: source.counters["messages"] == 11)
-        assert source.troubles == ()
+        assert source.warnings == ()
 
 
 def test_an_image_waits_for_the_pose_that_comes_after_it(endpoint: str, robot: Robot) -> None:
@@ -118,10 +118,10 @@ def test_beyond_the_last_pose_the_motion_goes_on_for_a_while_and_no_longer(endpo
         found = source.pose(image(1060 * MS))
         assert found is not None and found.T_world_camera[0, 3] == pytest.approx(1.06)
         assert source.pose(image(1071 * MS)) is None and source.counters["stale"] == 1
-        assert "too far ahead" in source.troubles[0] and "0.051 s older" in source.troubles[0]
+        assert "too far ahead" in source.warnings[0] and "0.051 s older" in source.warnings[0]
         robot.tell(1080)
         eventually(lambda: source.counters["messages"] == 3)
-        assert source.pose(image(1075 * MS)) is not None and source.troubles == ()
+        assert source.pose(image(1075 * MS)) is not None and source.warnings == ()
 
 
 def test_other_clocks_are_refused_with_the_difference_and_mended_by_the_offset(endpoint: str, robot: Robot) -> None:
@@ -130,8 +130,8 @@ def test_other_clocks_are_refused_with_the_difference_and_mended_by_the_offset(e
         robot.tell(5020)
         eventually(lambda: source.counters["messages"] == 2)
         assert source.pose(image(1000 * MS)) is None  # at once, not after ``wait_s``
-        assert source.counters["clock"] == 1 and "+4.020 s" in source.troubles[0]
-        assert "clock_offset_ns" in source.troubles[0]
+        assert source.counters["clock"] == 1 and "+4.020 s" in source.warnings[0]
+        assert "clock_offset_ns" in source.warnings[0]
     with listening(endpoint, robot, clock_offset_ns=-4000 * MS) as source:
         robot.tell(5000)
         robot.tell(5020)
@@ -191,8 +191,8 @@ def test_messages_of_moments_that_have_not_come_disturb_nothing(endpoint: str, r
             robot.tell(ms + ahead_ms)
         eventually(lambda: source.counters["future"] == 10)
         assert source.counters == {"messages": 10, "future": 10}
-        assert "ahead of this machine's CLOCK_MONOTONIC" in source.troubles[0]
-        assert "clock_offset_ns" in source.troubles[0]
+        assert "ahead of this machine's CLOCK_MONOTONIC" in source.warnings[0]
+        assert "clock_offset_ns" in source.warnings[0]
         found = source.pose(image(9850 * MS))
     assert found is not None and found.T_world_camera[0, 3] == pytest.approx(9.85)
 
@@ -203,11 +203,11 @@ def test_a_pose_may_be_ahead_by_as_much_as_a_robot_looks_ahead(endpoint: str, ro
         robot.tell(10_051)
         eventually(lambda: source.counters["future"] == 1)
         assert source.pose(image(10_000 * MS)) is None
-        ahead, empty = source.troubles
+        ahead, empty = source.warnings
         assert "it is stamped 0.051 s ahead" in ahead and "no pose that came from" in empty  # not told as silence
         robot.tell(10_050)
         eventually(lambda: source.counters["messages"] == 1)
-        assert source.pose(image(10_050 * MS)) is not None and source.troubles == ()
+        assert source.pose(image(10_050 * MS)) is not None and source.warnings == ()
 
 
 def test_what_is_no_pose_costs_itself_only(endpoint: str, robot: Robot) -> None:
@@ -226,7 +226,7 @@ def test_what_is_no_pose_costs_itself_only(endpoint: str, robot: Robot) -> None:
 
 def test_a_message_that_is_too_long_never_gets_in(endpoint: str, robot: Robot) -> None:
     with listening(endpoint, robot) as source:
-        robot.socket.send(b"x" * 100_000)  # cuts the connection, which is made anew
+        robot.socket.send(b"x" * 100_000)  # cuts the connection, which is made again
 
         clock = count(1000)
 
@@ -241,7 +241,7 @@ def test_a_message_that_is_too_long_never_gets_in(endpoint: str, robot: Robot) -
 def test_silence_is_told(endpoint: str) -> None:
     with TopicPoseSource(TopicPoses(endpoint=endpoint, wait_s=0.01)) as source:
         assert source.pose(image(5)) is None
-        assert source.counters["empty"] == 1 and "is its publisher running" in source.troubles[0]
+        assert source.counters["empty"] == 1 and "is its publisher running" in source.warnings[0]
 
 
 def test_what_is_no_endpoint_is_refused() -> None:
@@ -303,9 +303,9 @@ def test_a_key_that_is_missing_for_a_while_is_told_and_tried_again(
         with TopicPoseSource(settings) as source:
             before = 0
             forget(desk.folder, "robot")
-            eventually(lambda: bool(source.troubles))
-            assert "no peer 'robot'" in source.troubles[0]
+            eventually(lambda: bool(source.warnings))
+            assert "no peer 'robot'" in source.warnings[0]
             allow(desk.folder, "robot", robot.public.decode())
-            eventually(lambda: not source.troubles)
+            eventually(lambda: not source.warnings)
             before = source.counters["messages"]
             eventually(gets_through)

@@ -29,7 +29,7 @@ QUERY = pose_at(0.1, 0.02)  # in none of the tests a source
 
 
 class TwoWalls:
-    """Both walls wear waves of the same family; waves, holes and hence classes are drawn anew in every world."""
+    """Both walls wear waves of the same family; waves, holes and hence classes are drawn again in every world."""
 
     def __init__(self, generator: torch.Generator) -> None:
         def draw(*shape: int) -> torch.Tensor:
@@ -92,7 +92,7 @@ def calibrated_field() -> tuple[MVSNeRF, torch.Generator]:
 
 
 def figures(field: MVSNeRF, worlds: list[TwoWalls]) -> tuple[float, float]:
-    """Accuracy of the classes, and error of the colours as a share of their variance, seen from ``QUERY``."""
+    """Accuracy of the classes, and error of the colours as a fraction of their variance, seen from ``QUERY``."""
     right: list[float] = []
     unexplained: list[float] = []
     for world in worlds:

@@ -56,8 +56,8 @@ def test_a_blind_view_and_the_order_of_views_change_nothing():
 def test_views_that_a_sample_is_hidden_from_hardly_count():
     """The wall at 2 m hides from one view what the others, which have no wall there, see free."""
     visibility = torch.tensor([0.9, 0.9, 0.0]).view(3, 1, 1)
-    share = visibility_share(visibility, torch.ones(3, 1, 1, dtype=torch.bool))[:, 0, 0]
-    torch.testing.assert_close(share, torch.tensor([0.5, 0.5, 0.0]), atol=1e-3, rtol=0)
+    fraction = visibility_share(visibility, torch.ones(3, 1, 1, dtype=torch.bool))[:, 0, 0]
+    torch.testing.assert_close(fraction, torch.tensor([0.5, 0.5, 0.0]), atol=1e-3, rtol=0)
     hidden = visibility_share(torch.zeros(3, 1, 1), torch.tensor([True, True, False]).view(3, 1, 1))[:, 0, 0]
     torch.testing.assert_close(hidden, torch.tensor([0.5, 0.5, 0.0]))
 

@@ -50,12 +50,12 @@ def finish(pipeline: MappingPipeline) -> None:
         pass
 
 
-def drift(share: float) -> Float64:
+def drift(fraction: float) -> Float64:
     """(4, 4) in the world: up to 9 cm and 4.5 degrees away from the truth."""
-    turn = np.radians([1.0, -1.5 * np.cos(2 * share), 4.0]) * share
+    turn = np.radians([1.0, -1.5 * np.cos(2 * fraction), 4.0]) * fraction
     T = np.eye(4)
     T[:3, :3] = cv2.Rodrigues(turn)[0]
-    T[:3, 3] = 0.06 * np.sin(2.5 * share), -0.05 * share, 0.04 * share**2
+    T[:3, 3] = 0.06 * np.sin(2.5 * fraction), -0.05 * fraction, 0.04 * fraction**2
     return T
 
 

@@ -68,11 +68,11 @@ def test_another_camera_on_the_same_body_follows_in_time():
 
 
 @given(vectors, vectors, vectors, vectors, shares)
-def test_where_the_world_has_its_origin_makes_no_difference(turn_a, shift_a, turn_b, shift_b, share):
+def test_where_the_world_has_its_origin_makes_no_difference(turn_a, shift_a, turn_b, shift_b, fraction):
     """Blended translations would fail this: the far origin is a lever."""
     a, b = rigid(turn_a, shift_a), rigid(turn_b, shift_b)
     far = rigid(np.array([0.3, -1.0, 0.5]), np.array([300.0, -200.0, 50.0]))
-    stamp = int(share * 10**9)
+    stamp = int(fraction * 10**9)
 
     def placed(G: np.ndarray) -> np.ndarray:
         pairs = [PosePair("a", n * 10**9, G @ POSES[n], G @ m @ POSES[n]) for n, m in enumerate((a, b))]
@@ -82,17 +82,17 @@ def test_where_the_world_has_its_origin_makes_no_difference(turn_a, shift_a, tur
 
 
 @given(vectors, vectors, shares)
-def test_one_motion_of_all_given_frames_moves_the_others_rigidly(turn, shift, share):
+def test_one_motion_of_all_given_frames_moves_the_others_rigidly(turn, shift, fraction):
     motion = rigid(turn, shift)
     pairs = [PosePair("a", n * 10**9, POSES[n], motion @ POSES[n]) for n in (0, 1)]
-    placed = PoseCorrection(pairs, 10**9).place("a", int(share * 10**9), POSES[2])
+    placed = PoseCorrection(pairs, 10**9).place("a", int(fraction * 10**9), POSES[2])
     np.testing.assert_allclose(placed, motion @ POSES[2], atol=1e-7)
 
 
 @given(vectors, vectors, shares)
-def test_the_result_is_a_rotation_between_the_two(turn_a, turn_b, share):
+def test_the_result_is_a_rotation_between_the_two(turn_a, turn_b, fraction):
     a, b = rigid(turn_a, np.zeros(3)), rigid(turn_b, np.zeros(3))
     pairs = [PosePair("a", n * 10**9, POSES[n], m @ POSES[n]) for n, m in enumerate((a, b))]
-    placed = PoseCorrection(pairs, 10**9).place("a", int(share * 10**9), np.eye(4))
+    placed = PoseCorrection(pairs, 10**9).place("a", int(fraction * 10**9), np.eye(4))
     assert np.abs(placed[:3, :3].T @ placed[:3, :3] - np.eye(3)).max() < 1e-9
-    assert angle(a.T @ placed) == pytest.approx(share * angle(a.T @ b), abs=1e-6)
+    assert angle(a.T @ placed) == pytest.approx(fraction * angle(a.T @ b), abs=1e-6)

@@ -121,11 +121,11 @@ def test_any_flipped_bit_is_found_or_harmless(saved: tuple[VoxelMap, Path], rng:
     assert refused > 200
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.99])
-def test_truncated_file_is_refused(saved: tuple[VoxelMap, Path], share: float) -> None:
+@pytest.mark.parametrize("fraction", [0.0, 0.1, 0.5, 0.99])
+def test_truncated_file_is_refused(saved: tuple[VoxelMap, Path], fraction: float) -> None:
     path = saved[1]
     content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
+    path.write_bytes(content[: int(fraction * len(content))])
     with pytest.raises(MapError, match="damaged or not a map"):
         VoxelMap.load(path)
     for lost in (1, 2, 30, 64, 100):
@@ -161,7 +161,7 @@ def test_what_is_wrong_is_named(saved: tuple[VoxelMap, Path]) -> None:
     good = path.read_bytes()
     cases: list[tuple[dict[str, object], str]] = [
         ({"version": 99}, "format 99"),
-        ({"version": 1, "arrays": {}}, "map format 1, .*make the map anew from its log"),
+        ({"version": 1, "arrays": {}}, "map format 1, .*make the map again from its log"),
         ({"format": "cake"}, "cake"),
         ({"label_set": {"name": "x"}}, "manifest.json.*label_set"),
         ({"config": {"voxel_sise_m": 1}}, "voxel_size_m"),

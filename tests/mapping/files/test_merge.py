@@ -226,10 +226,10 @@ def test_resampled_voxels_are_those_of_plain_numpy(evidence: str, rng: np.random
         if values and max(values) - min(values) > 0.95:  # a depth edge: the nearest voxel alone
             around = seen = [max(seen, key=lambda one: one[0])]
             total = seen[0][0]
-        share = sum(f for f, _ in seen)
-        if around and share >= 0.5 * total:
+        fraction = sum(f for f, _ in seen)
+        if around and fraction >= 0.5 * total:
             mean = {
-                name: sum(f * getattr(buffers, name)[at] for f, at in seen) / share
+                name: sum(f * getattr(buffers, name)[at] for f, at in seen) / fraction
                 for name in ("weight", "tsdf", "color")
             }
         else:
@@ -237,11 +237,11 @@ def test_resampled_voxels_are_those_of_plain_numpy(evidence: str, rng: np.random
         for name, value in mean.items():
             np.testing.assert_allclose(getattr(moved, name)[n, voxel], value, rtol=1e-5, atol=1e-6)
         voted = [(f, at) for f, at in around if buffers.votes[at] > 0]
-        share = sum(f for f, _ in voted)
+        fraction = sum(f for f, _ in voted)
         votes, said = 0.0, np.zeros(4)
-        if voted and share >= 0.5 * total:
-            votes = sum(f * buffers.votes[at] for f, at in voted) / share
-            said = sum(f * sums[at] for f, at in voted) / share
+        if voted and fraction >= 0.5 * total:
+            votes = sum(f * buffers.votes[at] for f, at in voted) / fraction
+            said = sum(f * sums[at] for f, at in voted) / fraction
         np.testing.assert_allclose(moved.votes[n, voxel], votes, rtol=1e-5)
         np.testing.assert_allclose(moved.evidence[n, voxel], said, rtol=1e-5)
 

@@ -255,7 +255,7 @@ def test_going_to_disk_and_back_takes_a_bounded_part_of_memory_beside_the_voxels
     along_x[:, 0] = np.arange(len(along_x))
 
     def touch_all() -> None:
-        for blocks in grid.portions(pack_keys(along_x)):
+        for blocks in grid.batches(pack_keys(along_x)):
             for values in grid.buffers()[1:]:
                 values[blocks] = 1
 

@@ -57,13 +57,13 @@ def test_points_are_read_as_plain_numpy_reads_them(evidence: str, rng: np.random
         )
         np.testing.assert_allclose(rgb[n], color, atol=0.501)
         voted = [(f, at) for f, at in around if buffers.votes[at] > 0]
-        share = sum(f for f, _ in voted)
+        fraction = sum(f for f, _ in voted)
         if not voted:
             assert (label[n], confidence[n]) == (0, 0.0)
             continue
         total, votes = (
-            sum(f * sums[at] for f, at in voted) / share,
-            sum(f * buffers.votes[at] for f, at in voted) / share,
+            sum(f * sums[at] for f, at in voted) / fraction,
+            sum(f * buffers.votes[at] for f, at in voted) / fraction,
         )
         worth = 1 / (1 + rho * (votes - 1)) if votes > 1 else 1 / votes
         p_class = np.exp((total - total.max()) * worth)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import ShapeError
-from semantic_mapper.mapping.views.upsample import COLOUR_RATE, DEPTH_SIGMA, LARGEST_STEP, LEAST_WEIGHT, lift
+from semantic_mapper.mapping.views.upsample import COLOUR_RATE, DEPTH_SIGMA, LARGEST_STEP, LEAST_WEIGHT, upsample
 
 
 def channels(probabilities: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -20,7 +20,7 @@ def test_lifted_classes_follow_the_image_edge_not_the_coarse_grid():
     probabilities = np.zeros((8, 8, 2), np.float32)
     probabilities[..., 0] = low_rgb[..., 0] == 0
     probabilities[..., 1] = low_rgb[..., 0] > 0
-    rows = lift(probabilities, np.ones((8, 8), bool), low_rgb, depth[2::4, 2::4].copy(), rgb, depth)
+    rows = upsample(probabilities, np.ones((8, 8), bool), low_rgb, depth[2::4, 2::4].copy(), rgb, depth)
     assert (rows >= 0).all()
     assert (channels(probabilities, rows) == (rgb[..., 0] > 0)).all()
 
@@ -31,7 +31,7 @@ def test_lifted_classes_follow_a_depth_edge_between_equal_colours():
     depth[:, 18:] = 3.0
     low_depth = depth[2::4, 2::4].copy()
     probabilities = np.stack((low_depth < 2.5, low_depth > 2.5), -1).astype(np.float32)
-    rows = lift(probabilities, np.ones((8, 8), bool), rgb[2::4, 2::4].copy(), low_depth, rgb, depth)
+    rows = upsample(probabilities, np.ones((8, 8), bool), rgb[2::4, 2::4].copy(), low_depth, rgb, depth)
     assert (channels(probabilities, rows) == (depth > 2.5)).all()
 
 
@@ -39,12 +39,12 @@ def test_where_all_round_are_of_one_class_the_middle_one_speaks():
     p = np.full((6, 8, 2), (0.9, 0.1), np.float32)
     rgb = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
     depth = np.ones((24, 32), np.float32)
-    rows = lift(p, np.ones((6, 8), bool), rgb[2::4, 2::4].copy(), depth[2::4, 2::4].copy(), rgb, depth)
+    rows = upsample(p, np.ones((6, 8), bool), rgb[2::4, 2::4].copy(), depth[2::4, 2::4].copy(), rgb, depth)
     np.testing.assert_array_equal(rows, np.arange(24)[:, None] // 4 * 8 + np.arange(32)[None] // 4)
 
 
 def spoken_by(v, u, p, known, rgb_low, depth_low, rgb, depth):
-    """The rule of ``lift`` in plain words, for one pixel where the classes differ."""
+    """The rule of ``upsample`` in plain words, for one pixel where the classes differ."""
     height, width = known.shape
     y, x = (v + 0.5) * height / depth.shape[0] - 0.5, (u + 0.5) * width / depth.shape[1] - 0.5
     j0, i0 = math.floor(y + 0.5), math.floor(x + 0.5)
@@ -81,7 +81,7 @@ def test_a_pixel_takes_the_most_alike_of_the_class_that_all_give_together(holes:
     if holes:
         depth[rng.random(depth.shape) < 0.3] = 0
     low = rgb[2::4, 2::4].copy(), depth[2::4, 2::4].copy()
-    rows = lift(p, known, *low, rgb, depth)
+    rows = upsample(p, known, *low, rgb, depth)
     expected = [[spoken_by(v, u, p, known, *low, rgb, depth) for u in range(32)] for v in range(24)]
     assert (rows == np.array(expected)).mean() > 0.995  # float32 may decide a tie the other way
 
@@ -91,7 +91,7 @@ def test_pixels_without_a_known_neighbour_stay_unknown():
     known[0, 0] = True
     p = np.full((8, 8, 2), 0.5, np.float32)
     rgb, depth = np.zeros((32, 32, 3), np.uint8), np.ones((32, 32), np.float32)
-    rows = lift(p, known, rgb[::4, ::4].copy(), depth[::4, ::4].copy(), rgb, depth)
+    rows = upsample(p, known, rgb[::4, ::4].copy(), depth[::4, ::4].copy(), rgb, depth)
     assert rows[0, 0] == 0
     assert (rows[20:, 20:] == -1).all()
 
@@ -103,7 +103,7 @@ def test_images_of_any_size_follow_the_rule_up_to_their_borders(size: tuple[int,
     known = rng.random(size) < 0.8
     low = rng.integers(0, 60, (*size, 3), dtype=np.uint8), (1 + 0.05 * rng.random(size)).astype(np.float32)
     rgb, depth = rng.integers(0, 60, (*full, 3), dtype=np.uint8), (1 + 0.05 * rng.random(full)).astype(np.float32)
-    rows = lift(p, known, *low, rgb, depth)
+    rows = upsample(p, known, *low, rgb, depth)
     expected = [[spoken_by(v, u, p, known, *low, rgb, depth) for u in range(full[1])] for v in range(full[0])]
     np.testing.assert_array_equal(rows, expected)
 
@@ -114,7 +114,7 @@ def test_depths_that_are_no_numbers_leave_every_pixel_with_one_of_its_neighbours
     rgb, low = rng.integers(0, 255, (24, 32, 3), dtype=np.uint8), rng.integers(0, 255, (6, 8, 3), dtype=np.uint8)
     odd = np.array([np.nan, np.inf, -np.inf, -1, 0, 1e-30, 1e30, 2], np.float32)
     depth, depth_low = rng.choice(odd, (24, 32)), rng.choice(odd, (6, 8))
-    rows = lift(p, np.ones((6, 8), bool), low, depth_low, rgb, depth)
+    rows = upsample(p, np.ones((6, 8), bool), low, depth_low, rgb, depth)
     row, column = np.divmod(rows, 8)
     v, u = np.mgrid[0:24, 0:32] // 4
     near = (np.abs(row - v) <= 1) & (np.abs(column - u) <= 1)
@@ -124,10 +124,12 @@ def test_depths_that_are_no_numbers_leave_every_pixel_with_one_of_its_neighbours
 def test_nothing_to_upsample_and_nothing_to_upsample_to():
     none, some = np.zeros((0, 8, 2), np.float32), np.zeros((6, 8, 2), np.float32)
     rgb, depth = np.zeros((24, 32, 3), np.uint8), np.ones((24, 32), np.float32)
-    rows = lift(none, np.zeros((0, 8), bool), np.zeros((0, 8, 3), np.uint8), np.zeros((0, 8), np.float32), rgb, depth)
+    rows = upsample(
+        none, np.zeros((0, 8), bool), np.zeros((0, 8, 3), np.uint8), np.zeros((0, 8), np.float32), rgb, depth
+    )
     assert (rows == -1).all() and rows.shape == (24, 32)
     known, low = np.ones((6, 8), bool), (np.zeros((6, 8, 3), np.uint8), np.ones((6, 8), np.float32))
-    assert lift(some, known, *low, rgb[:0], depth[:0]).shape == (0, 32)
+    assert upsample(some, known, *low, rgb[:0], depth[:0]).shape == (0, 32)
 
 
 def test_images_need_not_be_contiguous():
@@ -136,7 +138,7 @@ def test_images_need_not_be_contiguous():
     rgb, depth = rng.integers(0, 99, (24, 64, 3), dtype=np.uint8)[:, ::2], rng.random((32, 24), np.float32).T + 1
     low = rng.integers(0, 99, (6, 16, 3), dtype=np.uint8)[:, ::2], rng.random((8, 6), np.float32).T + 1
     copies = (a.copy("C") for a in (p, known, *low, rgb, depth))
-    np.testing.assert_array_equal(lift(p, known, *low, rgb, depth), lift(*copies))
+    np.testing.assert_array_equal(upsample(p, known, *low, rgb, depth), upsample(*copies))
 
 
 def test_images_that_do_not_fit_together_are_refused():
@@ -150,4 +152,4 @@ def test_images_that_do_not_fit_together_are_refused():
         "rgb": (p, known, low, depth_low, rgb[:23], depth),
     }.items():
         with pytest.raises(ShapeError, match=name):
-            lift(*images)
+            upsample(*images)

@@ -53,16 +53,16 @@ class Walking:
         return self._camera.info
 
     @property
-    def troubles(self) -> tuple[str, ...]:
-        return self._camera.troubles
+    def warnings(self) -> tuple[str, ...]:
+        return self._camera.warnings
 
     @property
     def can_wait(self) -> bool:
         return self._camera.can_wait
 
     @property
-    def turned_at(self) -> float:
-        return self._camera.turned_at
+    def last_poll_time(self) -> float:
+        return self._camera.last_poll_time
 
     @property
     def counters(self) -> dict[str, int]:

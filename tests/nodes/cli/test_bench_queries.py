@@ -30,7 +30,7 @@ def test_every_kind_of_question_is_asked_while_frames_are_mapped(tmp_path: Path,
     found = written["queries"]
     assert set(found["asked"]) == set(found["p50_ms"]) == set(found["p95_ms"]) == set(KINDS)
     counts = found["asked"].values()
-    assert max(counts) - min(counts) <= 3, "in turns; each of the three turns begins anew"
+    assert max(counts) - min(counts) <= 3, "in turns; each of the three turns begins again"
     assert all(0 < found["p50_ms"][kind] <= found["p95_ms"][kind] for kind in KINDS)
     assert 0 < found["asked_hz"] <= 400
     for turn in ("quiet", "asked"):

@@ -91,7 +91,7 @@ def test_a_replay_leaves_a_report_with_its_figures_and_pictures(run: Path) -> No
     assert shown["frames refused"] == ["1"] and shown["scored"] == ["3"]
     assert shown["mIoU"] == [f"{summary['metrics']['miou'] * 100:.1f} %"]
     assert shown["3"] == ["77", "a pose that is no <pose>"]
-    assert shown["fuse"] == [f"{summary['stages_ms']['fuse'][share]:.2f}" for share in ("p50", "p95")]
+    assert shown["fuse"] == [f"{summary['stages_ms']['fuse'][fraction]:.2f}" for fraction in ("p50", "p95")]
     assert shown["torch"] == [summary["versions"]["torch"]]
     found = pictures(page)
     assert len(found) == 1 + 3 + 2, "overview, a strip a frame, stages and classes"

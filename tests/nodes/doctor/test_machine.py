@@ -111,17 +111,17 @@ def test_limits_are_read_and_low_ones_told(monkeypatch: pytest.MonkeyPatch) -> N
     assert by_name["address space"].found == "limited to 4.0 GB"
 
 
-@pytest.mark.parametrize(
-    ("version", "requirement", "good"),
-    [
-        ("0.20.0", "open3d<0.21,>=0.20", True),
-        ("0.21.0", "open3d<0.21,>=0.20", False),
-        ("0.19.9", "open3d<0.21,>=0.20", False),
-        ("2.5.1+cpu", "torch>=2.5", True),
-        ("2.4.1", "torch>=2.5", False),
-        ("1", "rich", True),
-        ("5.0.0", "opencv-contrib-python-headless<6,>=4.10", True),
-    ],
-)
-def test_versions_are_held_against_what_is_required(version: str, requirement: str, good: bool) -> None:
-    assert doctor._within(version, requirement) == good
+def test_packages_are_checked_with_their_versions_and_without_extras(monkeypatch: pytest.MonkeyPatch) -> None:
+    requires = ["open3d<0.21,>=0.20", "torch>=2.5", "rich", 'rerun-sdk; extra == "viewer"', "no-such-package>=1"]
+    versions = {"open3d": "0.21.0", "torch": "2.5.1+cpu", "rich": "13"}
+
+    def version(name: str) -> str:
+        if name not in versions:
+            raise doctor.metadata.PackageNotFoundError(name)
+        return versions[name]
+
+    monkeypatch.setattr(doctor.metadata, "requires", lambda _: requires)
+    monkeypatch.setattr(doctor.metadata, "version", version)
+    told = " ".join(f"{check.state} {check.found} {check.mend}" for check in doctor._packages())
+    assert "open3d 0.21.0, not <0.21,>=0.20" in told and "no-such-package" in told
+    assert "torch 2.5.1+cpu, not" not in told and "rerun-sdk" not in told

@@ -89,7 +89,7 @@ class Heard:
 @contextmanager
 def finetuning(start: Path, endpoints: dict[str, str], restarts: int = 0, **more: Any) -> Iterator[Heard]:
     settings = {"config": str(start.with_name("learning.toml")), "niceness": 0, "settle_s": 0.3, **more}
-    options = FinetunerOptions(weights=str(start), share=1.0, **settings)
+    options = FinetunerOptions(weights=str(start), cpu_fraction=1.0, **settings)
     stop = StopRequest(patient=True)
     context = NodeContext("finetuner", endpoints, 1, stop, HeartbeatWriter(-1, 1), restarts)
     node = threading.Thread(target=run_finetuner, args=(context, options), daemon=True)
@@ -320,7 +320,7 @@ def test_the_launch_file_starts_a_finetuner_that_has_a_socket_for_labels(
     path = REPLAY_LAUNCH.with_name(name)
     launch = load_launch(path, [*given, "share=0.25"], tmp_path)
     options = launch.options["finetuner"]
-    assert isinstance(options, FinetunerOptions) and options.share == 0.25 and options.inputs() == ("mapper",)
+    assert isinstance(options, FinetunerOptions) and options.cpu_fraction == 0.25 and options.inputs() == ("mapper",)
     assert options.niceness == (18 if name == "learning.toml" else 19)
     mapper = launch.options["mapper"]
     assert isinstance(mapper, MapperOptions) and mapper.inputs() == ("camera", "finetuner")

@@ -294,7 +294,7 @@ def test_a_request_that_arrives_twice_counts_once(bundle_of):
         correction.carry_on(session, mapped=False)
         second = stranger.ask([b"", *parts])
         assert first[0] == second[0] == b"correct_poses"
-        assert client.correction().done == 1  # goes on, and was not begun anew
+        assert client.correction().done == 1  # goes on, and was not begun again
         doubled = {name: np.concatenate((a, a)) for name, a in arrays.items()}
         again = messages.CorrectPosesRequest(id="b", cameras=("",), **doubled)
         assert b"given twice" in stranger.ask([b"", *encode_request("correct_poses", again)])[1]

@@ -161,13 +161,13 @@ def test_what_is_no_good_is_refused_and_told(learned, tmp_path):
                 (encoder, b"", "", "image encoder is another one"),
                 (broken, b"", "", "NaN"),
                 (good, b"", "ab" * 32, "compared with others than those in use"),
-                (misled(learned), b"", "", "least_agreement"),
+                (misled(learned), b"", "", "min_map_agreement"),
             ),
             1,
         ):
             said = learner.offer(checkpoint, version, parent, data)
             assert (said.version, said.digest, said.accepted) == (0, in_use.digest, False), says
-            assert says in said.reason and said.contradicts == (says == "least_agreement")
+            assert says in said.reason and said.contradicts == (says == "min_map_agreement")
         assert eventually(lambda: learner.robot.status[-1].counters.get("weights_refused") == 8)
         assert "weights 8 were refused: where the map is sure of itself" in learner.robot.status[-1].degraded[-1]
         stale = learner.offer(good, 5)
@@ -183,7 +183,7 @@ def test_what_is_no_good_is_refused_and_told(learned, tmp_path):
 
 
 def test_where_agreement_does_not_count_the_learner_has_the_last_word(learned, tmp_path):
-    with learning_robot(learned, tmp_path / "out", least_agreement=0.0) as learner:
+    with learning_robot(learned, tmp_path / "out", min_map_agreement=0.0) as learner:
         assert learner.offer(misled(learned), 1).accepted
         learner.robot.end(6)
 

@@ -1,4 +1,4 @@
-"""When a node is started anew, and when no more: the counting, and what a launch file may ask for."""
+"""When a node is restarted, and when no more: the counting, and what a launch file may ask for."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ import pytest
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.replay.importers import import_recording
-from semantic_mapper.replay.log.atomic_log import whole_log
+from semantic_mapper.replay.log.atomic_log import atomic_log
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.replay.log.recover import recover
 from semantic_mapper.transport.messages import StreamInfo
@@ -55,13 +55,13 @@ def test_a_log_that_is_to_be_replaced_stays_until_the_new_one_is_whole(
 
 
 def test_what_fails_beside_the_writing_is_not_taken_for_a_full_disk(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match="of another log"), whole_log(tmp_path / "new.mcap", StreamInfo("test")):
+    with pytest.raises(LogError, match="of another log"), atomic_log(tmp_path / "new.mcap", StreamInfo("test")):
         raise LogError("of another log") from OSError(5, "Input/output error")
     assert not list(tmp_path.iterdir())
 
 
 def test_no_log_is_made_where_there_is_no_folder(tmp_path: Path) -> None:
     path = tmp_path / "missing" / "new.mcap"
-    with pytest.raises(LogError, match="No such file") as caught, whole_log(path, StreamInfo("test")):
+    with pytest.raises(LogError, match="No such file") as caught, atomic_log(path, StreamInfo("test")):
         pass
     assert str(caught.value).startswith(f"{path}: ")

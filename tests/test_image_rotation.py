@@ -7,7 +7,7 @@ import pytest
 
 from semantic_mapper.errors import FrameError
 from semantic_mapper.geometry import check_pose, transform, unproject
-from semantic_mapper.turning import turned_frame, turned_intrinsics
+from semantic_mapper.image_rotation import rotate_frame, rotate_intrinsics
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
 INTRINSICS = CameraIntrinsics(20.0, 22.0, 9.0, 8.0, 20, 14)
@@ -42,25 +42,25 @@ def coloured_points(frame: PosedFrame) -> np.ndarray:
 @pytest.mark.parametrize("quarters", [0, 1, 2, 3, -1])
 def test_every_pixel_keeps_its_place_in_the_world(quarters: int):
     frame = a_frame()
-    turned = turned_frame(frame, quarters)
+    turned = rotate_frame(frame, quarters)
     check_pose(turned.T_world_camera, "turned")
     np.testing.assert_allclose(coloured_points(turned), coloured_points(frame), atol=1e-6)
 
 
 def test_a_quarter_clockwise_brings_the_left_edge_to_the_top():
     frame = a_frame()
-    turned = turned_frame(frame, 1)
+    turned = rotate_frame(frame, 1)
     assert (turned.intrinsics.width, turned.intrinsics.height) == (14, 20)
     np.testing.assert_array_equal(turned.rgb[0], frame.rgb[::-1, 0])
 
 
 def test_four_quarters_are_none():
     frame = a_frame()
-    again = turned_frame(turned_frame(turned_frame(frame, 1), 1), 2)
+    again = rotate_frame(rotate_frame(rotate_frame(frame, 1), 1), 2)
     assert again.intrinsics == frame.intrinsics and np.array_equal(again.rgb, frame.rgb)
     np.testing.assert_allclose(again.T_world_camera, frame.T_world_camera, atol=1e-12)
 
 
 def test_a_distorted_image_is_refused():
     with pytest.raises(FrameError, match="rectify"):
-        turned_intrinsics(replace(INTRINSICS, distortion=(0.1, 0.0, 0.0, 0.0)), 1)
+        rotate_intrinsics(replace(INTRINSICS, distortion=(0.1, 0.0, 0.0, 0.0)), 1)

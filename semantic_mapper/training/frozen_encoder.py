@@ -56,7 +56,7 @@ def resting_loss(
 def _withheld(
     channel: torch.Tensor, query: int, sources: Sequence[int], config: StepConfig, generator: torch.Generator
 ) -> torch.Tensor:
-    """Known labels (m, H, W) of the sources without the query's own and those of a random share of the others."""
-    keep = torch.rand(len(sources), generator=generator) >= config.labels_withheld
+    """Known labels (m, H, W) of the sources without the query's own and those of a random fraction of the others."""
+    keep = torch.rand(len(sources), generator=generator) >= config.label_dropout
     keep &= torch.tensor([i != query for i in sources])
     return torch.where(keep.to(channel.device)[:, None, None], channel, IGNORE)

@@ -13,29 +13,29 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import PosedFrame
 
 FAR = 2.0  # times what is allowed: a jump, whatever comes after it
-HELD = 3  # times ``first_agree``: so many frames are held back at most while the first poses do not agree
+HELD = 3  # times ``init_consensus``: so many frames are held back at most while the first poses do not agree
 
 _log = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Verdict:
+class FilterResult:
     """What comes of a frame, and of those that were held back before it.
 
     Args:
         passed: Frames to give, in the order of capture.
-        jumping, unsettled: Frames to leave out, each with why: it cannot have been reached from poses that are
+        outliers, uninitialized: Frames to leave out, each with why: it cannot have been reached from poses that are
             believed; or no poses are believed yet, and it did not agree with those around it.
         waiting: Why frames are held back though they contradict each other; empty where they do not.
     """
 
     passed: tuple[PosedFrame, ...] = ()
-    jumping: tuple[tuple[PosedFrame, str], ...] = ()
-    unsettled: tuple[tuple[PosedFrame, str], ...] = ()
+    outliers: tuple[tuple[PosedFrame, str], ...] = ()
+    uninitialized: tuple[tuple[PosedFrame, str], ...] = ()
     waiting: str = ""
 
 
-class PoseGate:
+class PoseOutlierFilter:
     """Judges the poses of one camera.
 
     Args:
@@ -44,10 +44,10 @@ class PoseGate:
     """
 
     def __init__(self, checks: PoseChecks, exact: bool = False) -> None:
-        self._beginning: _Beginning | None = _Beginning(checks, 1 if exact else checks.first_agree)
+        self._beginning: _Initializer | None = _Initializer(checks, 1 if exact else checks.init_consensus)
         self._jumps = _JumpGate(checks)
 
-    def take(self, frame: PosedFrame) -> Verdict:
+    def take(self, frame: PosedFrame) -> FilterResult:
         """Judge the next frame."""
         if self._beginning is not None:
             verdict = self._beginning.take(frame)
@@ -56,14 +56,14 @@ class PoseGate:
                 self._jumps.believe(_sample(verdict.passed[-1]))
             return verdict
         reason = self._jumps.refusal(_sample(frame))
-        return Verdict(jumping=((frame, reason),)) if reason else Verdict((frame,))
+        return FilterResult(outliers=((frame, reason),)) if reason else FilterResult((frame,))
 
-    def end(self) -> Verdict:
+    def end(self) -> FilterResult:
         """No more will come: what is held back passes where no pose has contradicted it."""
-        return Verdict() if self._beginning is None else self._beginning.end()
+        return FilterResult() if self._beginning is None else self._beginning.end()
 
 
-class _Beginning:
+class _Initializer:
     """Holds frames back until ``agree`` poses agree that nothing contradicts; nothing that agreed is lost.
 
     Frames stand in chains, in each of which a pose can be reached from the one before. A chain is believed when it is
@@ -76,7 +76,7 @@ class _Beginning:
         self._agree = agree
         self._chains: list[list[PosedFrame]] = []  # the one that was last added to is the last
 
-    def take(self, frame: PosedFrame) -> Verdict:
+    def take(self, frame: PosedFrame) -> FilterResult:
         """The frames of the chain that is believed now, or none."""
         chain = self._chain_of(frame)
         chain.append(frame)
@@ -84,21 +84,21 @@ class _Beginning:
         others = self._chains[:-1]
         if len(chain) - max((len(c) for c in others), default=0) >= self._agree:
             why = f"its pose does not agree with {len(chain)} others that agree with each other"
-            return Verdict(tuple(chain), jumping=tuple((f, why) for f in _in_order(others)))
+            return FilterResult(tuple(chain), outliers=tuple((f, why) for f in _in_order(others)))
         waiting = self._contradiction()
         if sum(len(c) for c in self._chains) < HELD * self._agree:
-            return Verdict(waiting=waiting)
+            return FilterResult(waiting=waiting)
         return self._give_up(waiting)
 
-    def end(self) -> Verdict:
-        """See ``PoseGate``."""
+    def end(self) -> FilterResult:
+        """See ``PoseOutlierFilter``."""
         if len(self._chains) == 1:
-            return Verdict(tuple(self._chains[0]))
+            return FilterResult(tuple(self._chains[0]))
         return self._give_up(self._contradiction())
 
-    def _give_up(self, why: str) -> Verdict:
+    def _give_up(self, why: str) -> FilterResult:
         held, self._chains = _in_order(self._chains), []
-        return Verdict(unsettled=tuple((f, why) for f in held), waiting=why)
+        return FilterResult(uninitialized=tuple((f, why) for f in held), waiting=why)
 
     def _chain_of(self, frame: PosedFrame) -> list[PosedFrame]:
         """The one that the frame goes on from most closely; a new one where there is none.
@@ -106,8 +106,8 @@ class _Beginning:
         Not the longest: what is within reach of a chain grows while another one goes on.
         """
         shares = [(_share(self._checks, _sample(chain[-1]), _sample(frame)), chain) for chain in self._chains]
-        share, chain = min(shares, key=lambda found: found[0], default=(np.inf, []))
-        return chain if share <= 1 else []
+        fraction, chain = min(shares, key=lambda found: found[0], default=(np.inf, []))
+        return chain if fraction <= 1 else []
 
     def _contradiction(self) -> str:
         if len(self._chains) < 2:
@@ -115,7 +115,7 @@ class _Beginning:
         before, after = sorted((self._chains[-2][-1], self._chains[-1][-1]), key=lambda f: f.stamp_ns)
         return (
             f"the first poses do not agree with each other ({_jump(self._checks, _sample(before), _sample(after))}); "
-            f"none is believed before {self._agree} agree (first_agree)"
+            f"none is believed before {self._agree} agree (init_consensus)"
         )
 
 
@@ -149,7 +149,7 @@ class _JumpGate:
             if not follows:
                 self._far = bool(_jump(self._checks, last, sample, FAR))
             self._elsewhere = sample
-            if not 0 < self._checks.settle < self._agreeing:
+            if not 0 < self._checks.relocalize_after < self._agreeing:
                 return reason
             _log.warning("jump_accepted", reason=reason, agreeing=self._agreeing)
         self.believe(sample)
@@ -157,12 +157,12 @@ class _JumpGate:
 
     def _elsewhere_trouble(self, last: StampedPose, sample: StampedPose) -> str:
         moved_m, turned_deg, seconds = _way(last, sample)
-        settle = self._checks.settle
+        needed = self._checks.relocalize_after
         way_out = (
-            f"after {settle} of them that agree with each other they are believed (settle)"
-            if settle
-            else "if they are right now, start the launch anew, or set checks = { settle = N } in the table `poses`: "
-            "after a jump, N poses in a row that agree with each other are believed then, such as N = 30"
+            f"after {needed} of them that agree with each other they are believed (relocalize_after)"
+            if needed
+            else "if they are right now, start the launch again, or set checks = { relocalize_after = N } in the table "
+            "`poses`: after a jump, N poses in a row that agree with each other are believed then, such as N = 30"
         )
         return (
             f"the poses have jumped and go on from there, now {moved_m:.2f} m and {turned_deg:.0f} degrees from the "

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from semantic_mapper.geometry import invert_pose, nearest_pixels, transform
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
 
-SAME_SURFACE = 0.05  # share of z by which a measured depth may differ from a point's and still be of its surface
+SAME_SURFACE = 0.05  # fraction of z by which a measured depth may differ from a point's and still be of its surface
 GUESSED_DEPTHS_M = (0.7, 1.5, 3.0)  # where points are put on rays without a measurement
 LABELLED_VALUE = 2.0  # of a view whose labels are known, against one without
 REPEAT_VALUE = 0.5  # a second view of the same point is worth half of the first, a third a quarter
 
 
-def sees(
+def visible_points(
     points: Float64, T_world_camera: Float64, intrinsics: CameraIntrinsics, depth_m: Float32, *, measured: bool
 ) -> NDArray[np.bool_]:
     """Which points a view sees: (P,), those in its image that nothing hides. A hole in its depth hides nothing.
@@ -34,7 +34,7 @@ def sees(
     return inside & (free | (depth <= 0))
 
 
-def cover(seen: NDArray[np.bool_], value: Float64, bonus: Float64, count: int) -> list[int]:
+def select_views(seen: NDArray[np.bool_], value: Float64, bonus: Float64, count: int) -> list[int]:
     """Choose views greedily: each adds most of what is not yet covered.
 
     Args:

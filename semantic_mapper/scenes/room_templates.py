@@ -31,7 +31,7 @@ _LOOSE = (
     Entry("bag", 0.35), Entry("shoes", 0.4, 2), Entry("basket", 0.25), Entry("ball", 0.2),
 )  # fmt: skip
 
-PROGRAMMES: dict[str, tuple[Entry, ...]] = {
+ROOM_TEMPLATES: dict[str, tuple[Entry, ...]] = {
     "bedroom": (
         Entry("bed_set"), _WINDOW,
         Entry("wardrobe", 0.8), Entry("dresser", 0.6), Entry("desk_set", 0.45),
@@ -71,7 +71,7 @@ PROGRAMMES: dict[str, tuple[Entry, ...]] = {
     ),
 }  # fmt: skip
 
-# The programme of a seed is CYCLE[seed % 20], so that any 20 rooms in a row, and each split, have the same mix:
+# The template of a seed is CYCLE[seed % 20], so that any 20 rooms in a row, and each split, have the same mix:
 # kitchens and bathrooms more often than homes have them, since their furniture is small in the picture.
 CYCLE = (
     "kitchen", "bathroom", "living", "bedroom", "bathroom", "office", "kitchen", "bathroom", "studio", "living",
@@ -89,17 +89,17 @@ CLUTTER: dict[str, tuple[str, ...]] = {
 }
 
 
-def furnish(layout: Layout, programme: str, clutter: float) -> None:
-    """Fill ``layout`` after ``PROGRAMMES[programme]``."""
+def furnish(layout: Layout, template: str, clutter: float) -> None:
+    """Fill ``layout`` after ``ROOM_TEMPLATES[template]``."""
     if not layout.has_opening or layout.rng.uniform() < 0.4:
         _place(layout, "door")
-    for entry in PROGRAMMES[programme]:
+    for entry in ROOM_TEMPLATES[template]:
         for _ in range(entry.most):
             if layout.rng.uniform() < entry.chance:
                 _place(layout, entry.name)
     _ceiling_lamps(layout)
     if clutter > 0:
-        layout.clutter(clutter, CLUTTER[programme])
+        layout.clutter(clutter, CLUTTER[template])
 
 
 def _ceiling_lamps(layout: Layout) -> None:

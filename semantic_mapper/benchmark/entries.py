@@ -1,4 +1,4 @@
-"""Weights files, and kinds of fields with random weights, as contestants of a run."""
+"""Weights files, and kinds of fields with random weights, as entries of a run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from semantic_mapper.benchmark.protocols import Contestant
+from semantic_mapper.benchmark.protocols import Entry
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import load_checkpoint
@@ -18,7 +18,7 @@ from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
 
 
-def load_contestants(paths: Sequence[Path], kinds: Sequence[str] = ()) -> list[Contestant]:
+def load_entries(paths: Sequence[Path], kinds: Sequence[str] = ()) -> list[Entry]:
     """Load weights files onto the GPU where there is one, else the CPU; each is named by its file or its folder.
 
     Args:
@@ -40,14 +40,14 @@ def load_contestants(paths: Sequence[Path], kinds: Sequence[str] = ()) -> list[C
     if twice := sorted({kind for kind in kinds if [*names, *kinds].count(kind) > 1}):
         raise ConfigError(f"--kind {', '.join(twice)}: the name of another column; give each once")
     return [
-        Contestant(name, digest, checkpoint.model.to(device).eval(), path.name)
+        Entry(name, digest, checkpoint.model.to(device).eval(), path.name)
         for name, digest, checkpoint, path in zip(names, digests, checkpoints, paths, strict=True)
     ] + [_of_kind(kind, device) for kind in kinds]
 
 
-def _of_kind(kind: str, device: torch.device) -> Contestant:
+def _of_kind(kind: str, device: torch.device) -> Entry:
     field = build_field(kind, {}, ROOMS).to(device).eval()
-    return Contestant(kind, _digest(b"", field), field)
+    return Entry(kind, _digest(b"", field), field)
 
 
 def _digest(data: bytes, field: LearnedField) -> str:

@@ -17,7 +17,7 @@ from semantic_mapper.training.views import LabelledView, stack_sources
 LEAST = 0.02  # doubt of a pixel that the field is sure of and right about: it may still be drawn
 
 
-def with_doubt(model: LearnedField, views: Sequence[LabelledView]) -> list[LabelledView]:
+def with_uncertainty(model: LearnedField, views: Sequence[LabelledView]) -> list[LabelledView]:
     """The views with 1 - p(their label) at each labelled pixel, from the image features alone.
 
     Views of a kind of field that says nothing of images by themselves come back as they are.
@@ -31,8 +31,8 @@ def with_doubt(model: LearnedField, views: Sequence[LabelledView]) -> list[Label
     if logits is None:
         return list(views)
     size = tuple(views[0].channel.shape)
-    share = functional.interpolate(torch.softmax(logits, 1), size=size, mode="bilinear", align_corners=False).cpu()
+    fraction = functional.interpolate(torch.softmax(logits, 1), size=size, mode="bilinear", align_corners=False).cpu()
     channel = torch.stack([view.channel for view in views])
-    right = share.gather(1, channel.clamp_min(0)[:, None])[:, 0]
+    right = fraction.gather(1, channel.clamp_min(0)[:, None])[:, 0]
     doubt = torch.where(channel == IGNORE, 0.0, (1 - right).clamp_min(LEAST))
-    return [replace(view, doubt=d.clone()) for view, d in zip(views, doubt, strict=True)]
+    return [replace(view, uncertainty=d.clone()) for view, d in zip(views, doubt, strict=True)]
