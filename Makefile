@@ -22,8 +22,8 @@ help:  ## list the targets
 
 setup: $(READY)  ## make .venv as uv.lock says, with everything that Open3D needs
 
-$(READY): pyproject.toml uv.lock setup.py $(KERNELS) scripts/setup.sh scripts/system_libs.py
-	PYTHON=$(PYTHON) scripts/setup.sh
+$(READY): pyproject.toml uv.lock setup.py $(KERNELS) tools/setup.sh tools/system_libs.py
+	PYTHON=$(PYTHON) tools/setup.sh
 	@touch $@
 
 demo: $(READY)  ## map an embedded scene; results in runs/demo
@@ -39,10 +39,10 @@ test-all: $(READY)  ## run all tests
 	$(PYTEST)
 
 test-v4l2: $(READY)  ## run the V4L2 driver against Debian's kernel with a virtual camera, in QEMU
-	.venv/bin/python scripts/v4l2_machine.py
+	.venv/bin/python -m benchmarks.v4l2_machine
 
 test-web: $(READY)  ## look at the viewer in a headless browser, and check the picture
-	.venv/bin/python scripts/web_viewer_check.py
+	.venv/bin/python -m benchmarks.web_viewer_check
 
 check: $(READY)  ## formatting, lint, types, import contracts
 	.venv/bin/ruff format --check .
@@ -54,7 +54,7 @@ bench: $(READY)  ## measure speed
 	.venv/bin/semantic-mapper bench
 
 wheels: $(READY)  ## build wheels for x86_64 and aarch64 into dist/, and check them
-	.venv/bin/python scripts/wheels.py
+	.venv/bin/python -m tools.wheels
 
 docs: $(READY)  ## build the reference of the Python interface into dist/docs/
 	.venv/bin/pdoc --docformat google --output-directory dist/docs $(API)

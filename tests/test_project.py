@@ -19,7 +19,11 @@ FOLDERS = ("semantic_mapper", "drivers", "replay", "nodes")
 
 
 def sources() -> list[Path]:
-    return [path for package in (*FOLDERS, "scripts", "tests") for path in sorted((ROOT / package).rglob("*.py"))]
+    return [
+        path
+        for package in (*FOLDERS, "benchmarks", "tools", "tests")
+        for path in sorted((ROOT / package).rglob("*.py"))
+    ]
 
 
 def pyproject() -> dict:
@@ -89,7 +93,7 @@ def test_every_target_sets_up_what_it_needs(target: str) -> None:
         ["make", "--dry-run", "--always-make", target], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert planned.returncode == 0, planned.stderr
-    assert "scripts/setup.sh" in planned.stdout
+    assert "tools/setup.sh" in planned.stdout
 
 
 def test_every_relative_link_of_the_documentation_leads_somewhere() -> None:

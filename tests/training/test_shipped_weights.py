@@ -7,7 +7,6 @@ import re
 import pytest
 import torch
 
-from scripts.ship_weights import BEGIN, CARD, END, chain, check_chain, metadata_block
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
@@ -17,6 +16,7 @@ from semantic_mapper.training.ranks import Ranks
 from semantic_mapper.training.rooms import RoomPoolConfig
 from semantic_mapper.training.train_config import TrainStepConfig
 from semantic_mapper.training.validation import Scores, ValidationConfig, validate, validation_rooms
+from tools.ship_weights import BEGIN, CARD, END, chain, check_chain, metadata_block
 
 ALONE = Ranks()
 
@@ -56,4 +56,4 @@ def test_they_say_how_they_were_made_and_what_was_measured(shipped: Checkpoint):
 
 def test_the_model_card_says_what_the_file_says():
     found = CARD.read_text(encoding="utf-8").partition(f"{BEGIN}\n")[2].partition(END)[0]
-    assert found == metadata_block(default_checkpoint_path()), "run `python scripts/ship_weights.py --card`"
+    assert found == metadata_block(default_checkpoint_path()), "run `python -m tools.ship_weights --card`"

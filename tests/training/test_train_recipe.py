@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from scripts import peers
+from benchmarks import peers
 from semantic_mapper.config import load_config
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
