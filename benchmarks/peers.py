@@ -181,14 +181,13 @@ def compare(names: list[str], out: Path, tier: str = "cpu") -> int:
     for depth in ("on", "off"):
         command = [
             COMMAND,
-            "eval",
-            "--suite",
+            "benchmark",
             "rooms",
             "--depth",
             depth,
             "--tier",
             tier,
-            "--json",
+            "--out",
             str(out / f"depth-{depth}.json"),
         ]
         for file in weights:

@@ -3,8 +3,8 @@
 Convert, measure what was converted with depth and without, ship it; shipping also renews the table of the model card:
 
     python -m tools.ship_weights W --half-only HALF
-    semantic-mapper eval --suite rooms --weights HALF --json on.json
-    semantic-mapper eval --suite rooms --weights HALF --json off.json --depth off
+    semantic-mapper benchmark rooms --weights HALF --out on.json
+    semantic-mapper benchmark rooms --weights HALF --out off.json --depth off
     python -m tools.ship_weights HALF --figures on.json --figures off.json
 
 Renew that table alone, from what the weights in the package say of themselves:
@@ -75,7 +75,7 @@ def figures_of(weights: Path, table: Path) -> dict[str, Any]:
         found = json.loads(table.read_text(encoding="utf-8"))
         suite, complete, entries = found["suite"], found["complete"], found["weights"].values()
     except (OSError, ValueError, KeyError) as error:
-        raise ConfigError(f"{table}: not a table of `eval --suite rooms` ({error})") from error
+        raise ConfigError(f"{table}: not a table of `benchmark rooms` ({error})") from error
     if not complete or suite["rooms"]:
         raise ConfigError(f"{table}: does not hold all rooms of its split; run the same command to its end")
     digest = load_entries([weights])[0].digest

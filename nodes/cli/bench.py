@@ -11,7 +11,7 @@ import typer
 
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.replay import ConfigOption, QualityOption, VoxelSizeOption, WeightsOption
-from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.cli.verb import PrintJsonOption, results_file, verb, warn_of_old_name
 
 
 class Part(StrEnum):
@@ -43,7 +43,7 @@ RoomsOption = Annotated[
     int | None,
     typer.Option(min=1, help="map: rooms of the building (30); virtual, evidence: validation rooms to map (4)."),
 ]
-ReturnsOption = Annotated[int, typer.Option(min=0, help="map: rooms, from the first on, visited again at the end.")]
+LoopsOption = Annotated[int, typer.Option(min=0, help="map: rooms, from the first on, visited again at the end.")]
 MinutesOption = Annotated[float, typer.Option(min=0.01, help="map: length of the walk, by the frames' stamps.")]
 HzOption = Annotated[float, typer.Option(min=0.1, max=60, help="map: frames a second of the walk.")]
 WidthOption = Annotated[
@@ -62,7 +62,7 @@ PlotOption = Annotated[
         "pipeline: the stages of a step, of qualities fast and balanced (measures both).",
     ),
 ]
-JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write the figures here.")]
+OutOption = Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Also write the figures here, as JSON.")]
 
 
 @verb
@@ -77,14 +77,16 @@ def bench(
     quality: QualityOption = None,
     voxel_size: VoxelSizeOption = None,
     rooms: RoomsOption = None,
-    returns: ReturnsOption = 6,
+    loops: LoopsOption = 6,
+    returns: Annotated[int | None, typer.Option(min=0, hidden=True)] = None,
     minutes: MinutesOption = 60.0,
     hz: HzOption = 2.0,
     width: WidthOption = None,
     rate: RateOption = 20.0,
     memory_mb: MemoryOption = None,
     plot: PlotOption = None,
-    json_file: JsonOption = None,
+    out: OutOption = None,
+    json: PrintJsonOption = None,
 ) -> None:
     """Measure speed on this machine, as ratios between things measured in one run.
 
@@ -97,14 +99,14 @@ def bench(
     evidence: what each voxel_map.evidence costs in memory and in the quality of maps.
     depthless: how good a map's surface is where frames lose their depth.
 
-    Quote ratios, not seconds: seconds depend on the machine and on what else it does. In --json the figures stand under
-    the name of the part; of render, fusion or pipeline alone at the top, too.
+    Quote ratios, not seconds: seconds depend on the machine and on what else it does. In the JSON the figures stand
+    under the name of the part; of render, fusion or pipeline alone at the top, too.
 
-    Example: semantic-mapper bench --json runs/bench.json
+    Example: semantic-mapper bench --out runs/bench.json
     Example: semantic-mapper bench pipeline --frames 40 --quality fast
-    Example: semantic-mapper bench queries --frames 60 --rate 20 --json runs/queries.json
+    Example: semantic-mapper bench queries --frames 60 --rate 20 --out runs/queries.json
     Example: semantic-mapper bench growth --frames 8 --width 160 --plot runs/growth.png
-    Example: semantic-mapper bench map --rooms 4 --returns 1 --minutes 2 --quality fast --memory-mb 200
+    Example: semantic-mapper bench map --rooms 4 --loops 1 --minutes 2 --quality fast --memory-mb 200
     """
     output = Output.guarded()
     from semantic_mapper.nodes.cli.outputs import prepare_file
@@ -112,10 +114,14 @@ def bench(
     from semantic_mapper.nodes.cli.run_replay import mapper_config
     from semantic_mapper.replay.bench.walk import WalkPlan
 
-    for path in (plot, json_file):
+    if returns is not None:
+        warn_of_old_name("--returns", "--loops")
+        loops = returns
+    out, output.quiet = results_file(out, json)
+    for path in (plot, out):
         if path is not None:
             prepare_file(path)
-    plan = WalkPlan(rooms or 30, returns, minutes, hz, width or 320)
+    plan = WalkPlan(rooms or 30, loops, minutes, hz, width or 320)
     settings = mapper_config(config, voxel_size, None, quality)
     rendering, queries = RenderRequest(repeats, views or 1, log), QueriesRequest(rate, width or 640)
     virtual = (rooms or 4, views or 8)
@@ -124,18 +130,20 @@ def bench(
     found: dict[str, Any] = {one.value: MEASUREMENTS[one.value](request, output) for one in wanted}
     if part in QUICK:
         found |= found[part.value]
-    _finish(found, output, json_file)
+    _finish(found, output, out)
 
 
-def _finish(found: dict[str, Any], output: Output, json_file: Path | None) -> None:
+def _finish(found: dict[str, Any], output: Output, out: Path | None) -> None:
     """Say where it was measured, and write the file."""
     from semantic_mapper.replay.artifacts import versions, write_json
 
     found["machine"] = {"cpu": cpu_name(), "versions": versions()}
     output.print(f"on {found['machine']['cpu']}")
-    if json_file is not None:
-        write_json(json_file, found)
-        output.print(f"written to {json_file}")
+    if out is not None:
+        write_json(out, found)
+        output.print(f"written to {out}")
+    if output.quiet:
+        output.json(found)
 
 
 def cpu_name() -> str:

@@ -25,12 +25,14 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.segment import Segment
+from rich.table import Table
 from rich.text import Text
 
 from semantic_mapper.plain_text import visible
 
 _log = structlog.get_logger(__name__)
 
+PIPED_WIDTH = 10_000  # columns of what is no terminal: nothing is wrapped or cut there
 LOG_PERIOD_S = 15.0  # how often progress is told where there is no terminal to draw a bar on
 
 
@@ -48,6 +50,8 @@ class PlainConsole(Console):
 
     def __init__(self, file: TextIO | None = None, *, stderr: bool = False) -> None:
         super().__init__(file=file, stderr=stderr, markup=False, emoji=False, highlight=False)
+        if not self.is_terminal:
+            self.width = PIPED_WIDTH
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Every string that rich is given comes by here, whatever it is part of."""
@@ -65,6 +69,7 @@ class Output:
 
     def __init__(self, stream: TextIO) -> None:
         self.console = PlainConsole(stream)
+        self.quiet = False  # ``print`` shows nothing: for verbs that were asked for JSON alone
         self._stream = stream
 
     @classmethod
@@ -78,6 +83,13 @@ class Output:
 
     def print(self, *things: Any) -> None:
         """Show something to people; what is in a text is shown as it is, on one line."""
+        if self.quiet:
+            return
+        for thing in things:
+            if (
+                isinstance(thing, Table) and not self.console.is_terminal
+            ):  # a pipe gets columns, without lines round them
+                thing.box, thing.pad_edge = None, False
         self.console.print(*things, soft_wrap=True)
         self._stream.flush()
 

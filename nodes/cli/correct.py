@@ -12,7 +12,7 @@ import typer
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
-from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb, warn_of_old_name
 
 if TYPE_CHECKING:
     from semantic_mapper.client import Correction, MapClient
@@ -22,12 +22,17 @@ POLL_S = 0.2
 
 @verb
 def correct(
-    endpoint: Annotated[str, typer.Argument(help="Where the mapper answers (ipc://PATH, tcp://127.0.0.1:PORT).")],
+    endpoint: Annotated[
+        str,
+        typer.Argument(
+            help="`live` for the launch that runs here, or where its mapper answers (ipc://PATH, tcp://HOST:PORT)."
+        ),
+    ],
     file: Annotated[
         Path, typer.Argument(help="Corrected poses, as of `replay --corrections` (TUM: stamp tx ty tz qx qy qz qw).")
     ],
     camera: Annotated[str, typer.Option(help="The camera that they are of; needed where the mapper has several.")] = "",
-    until: Annotated[
+    apply_until: Annotated[
         float | None,
         typer.Option(
             min=0,
@@ -36,6 +41,7 @@ def correct(
             "last pose of the file move with that pose, those to come as well.",
         ),
     ] = None,
+    until: Annotated[float | None, typer.Option(min=0, hidden=True)] = None,
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Until the map has moved.")] = True,
     server: ServerOption = "",
     keys: KeysOption = None,
@@ -49,12 +55,12 @@ def correct(
     and exchanges the map when the corrected one is ready. A pose goes to the frame nearest in time, within 5 ms; frames
     between two given ones move with both.
 
-    Example: semantic-mapper correct ipc:///run/robot/query optimised.tum
+    Example: semantic-mapper correct live optimised.tum
     """
     output = Output.guarded()
     from semantic_mapper.client import MapClient
     from semantic_mapper.mapping.correction.pose_correction import ALWAYS
-    from semantic_mapper.nodes.supervisor.running_launches import refuse_missing_socket
+    from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
     from semantic_mapper.replay.corrected_poses import MATCH_NS, read_corrections
 
     if "://" not in endpoint and Path(endpoint).exists():
@@ -65,8 +71,11 @@ def correct(
     trajectory = read_corrections(file)
     pairs = zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)
     poses = {(camera, stamp_ns): pose for stamp_ns, pose in pairs}
-    until_ns = ALWAYS if until is None else round(until * 1e9)
-    refuse_missing_socket(endpoint)
+    if until is not None:
+        warn_of_old_name("--until", "--apply-until")
+        apply_until = until
+    until_ns = ALWAYS if apply_until is None else round(apply_until * 1e9)
+    endpoint = map_endpoint(endpoint) or endpoint
     with MapClient(endpoint, identity=server_identity(server, keys)) as client:
         begun = client.correct_poses(poses, until_ns=until_ns, within_ns=MATCH_NS)
         state = _follow(client) if wait else begun

@@ -1,16 +1,15 @@
-"""``semantic-mapper eval``: figures of replays side by side, of a log by several methods, or of a benchmark."""
+"""``semantic-mapper eval``: figures of replays side by side, or of a log by several methods."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from semantic_mapper.nodes.cli import suite_options as suites
 from semantic_mapper.nodes.cli.console import Output
-from semantic_mapper.nodes.cli.replay import MaxFramesOption
-from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.cli.replay import ConfigOption, MaxFramesOption
+from semantic_mapper.nodes.cli.verb import PrintJsonOption, results_file, verb, warn_of_old_name
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -23,17 +22,13 @@ TargetsArgument = Annotated[
         metavar="DIR_OR_LOG...", help="Folders that `replay` has written; logs, or folders with their parts."
     ),
 ]
-JsonOption = Annotated[
+OutOption = Annotated[
     Path | None,
-    typer.Option(
-        "--json",
-        metavar="FILE",
-        help="Where to write; else eval.json in the first DIR, LOG.eval.json by the first log, or runs/rooms-*.json.",
-    ),
+    typer.Option("--out", metavar="FILE", help="JSON; else eval.json in the first DIR, or LOG.eval.json."),
 ]
 WeightsOption = Annotated[
     list[Path] | None,
-    typer.Option("--weights", help="Weights file; the one in the package without it. Suite: give several to compare."),
+    typer.Option("--weights", help="LOG: weights file; the one in the package without it."),
 ]
 BaselinesOption = Annotated[
     bool, typer.Option("--baselines", help="LOG: also fit the baselines to the keyframes of the weights.")
@@ -41,75 +36,72 @@ BaselinesOption = Annotated[
 MeshOption = Annotated[
     Path | None, typer.Option(metavar="NPZ", help="DIR: also compare its map with this reference mesh.")
 ]
+SecondsOption = Annotated[
+    float | None, typer.Option(min=0, help="--baselines: training time of the U-Net.  [default: 300]")
+]
 SeedOption = Annotated[int | None, typer.Option(min=0, help="Of everything that is drawn at random.  [default: 0]")]
 
 
 @verb
 def evaluate(
     targets: TargetsArgument = None,
-    json_file: JsonOption = None,
     weights: WeightsOption = None,
     baselines: BaselinesOption = False,
-    seconds: suites.SecondsOption = None,
+    seconds: SecondsOption = None,
     mesh: MeshOption = None,
     max_frames: MaxFramesOption = 0,
-    config: suites.EvalConfigOption = None,
+    config: ConfigOption = None,
     seed: SeedOption = None,
-    suite: suites.SuiteOption = None,
-    split: suites.SplitOption = None,
-    rooms: suites.RoomsOption = None,
-    protocol: suites.ProtocolOption = None,
-    kind: suites.KindOption = None,
-    views: suites.ViewsOption = None,
-    baseline: suites.BaselineOption = None,
-    depth: suites.DepthOption = None,
-    tier: suites.TierOption = None,
-    keyframes: suites.KeyframesOption = None,
-    steps: suites.StepsOption = None,
-    maps: suites.MapOption = False,
+    out: OutOption = None,
+    json: PrintJsonOption = None,
+    suite: Annotated[Literal["rooms"] | None, typer.Option(hidden=True)] = None,
+    split: Annotated[Literal["test", "val"] | None, typer.Option(hidden=True)] = None,
+    rooms: Annotated[int | None, typer.Option(min=0, hidden=True)] = None,
+    protocol: Annotated[Literal["generalize", "finetune", "scratch"] | None, typer.Option(hidden=True)] = None,
+    kind: Annotated[list[str] | None, typer.Option(hidden=True)] = None,
+    views: Annotated[int | None, typer.Option(min=1, max=16, hidden=True)] = None,
+    baseline: Annotated[Literal["wide", "narrow"] | None, typer.Option(hidden=True)] = None,
+    depth: Annotated[Literal["on", "off"] | None, typer.Option(hidden=True)] = None,
+    tier: Annotated[Literal["cpu", "gpu"] | None, typer.Option(hidden=True)] = None,
+    keyframes: Annotated[int | None, typer.Option(min=2, hidden=True)] = None,
+    steps: Annotated[int | None, typer.Option(min=0, hidden=True)] = None,
+    maps: Annotated[bool, typer.Option("--map", hidden=True)] = False,
 ) -> int:
-    """Print a table of figures and write them as JSON, and as a page of HTML beside it.
+    """Score runs and logs: print a table of figures, and write them as JSON and as a page of HTML beside it.
 
     A DIR gives the figures of its replay. A LOG is mapped and scored: with --weights that were finetuned on it, the
     keyframes they were fitted to never count, and --baselines adds a per-image U-Net and labels carried over by depth,
     both made from those same keyframes. --mesh takes an .npz with vertices, faces and (if there are any) labels.
-
-    --suite rooms renders query views of rooms that nothing was trained on, one column a weights file, and draws a
-    contact sheet. A run that was ended goes on where it was; docs/benchmarks.md says what each figure means.
+    `semantic-mapper benchmark` scores weights on rooms that nothing was trained on.
 
     Example: semantic-mapper eval runs/a runs/b
     Example: semantic-mapper eval kitchen.mcap --weights kitchen.safetensors --baselines
-    Example: semantic-mapper eval --suite rooms --protocol scratch --kind semantic_nerf --rooms 3 --seconds 600
-    Example: semantic-mapper eval --suite rooms --weights a.safetensors --weights b.safetensors --json runs/ab.json
     """
-    given = {"split": split, "rooms": rooms, "protocol": protocol, "views": views, "baseline": baseline, "depth": depth}
-    given |= {"keyframes": keyframes, "steps": steps}
-    if suite is None:
-        if maps or tier or kind or any(value is not None for value in given.values()):
-            raise typer.BadParameter("is what this option needs", param_hint="--suite rooms")
-        if baselines and seconds == 0:
-            raise typer.BadParameter("the U-Net needs time to learn", param_hint="--seconds")
-        baseline_s = BASELINE_SECONDS if seconds is None else seconds
-        options = _single(weights), baselines, baseline_s, max_frames, config, seed or 0
-        return _evaluate_targets(targets or [], options, mesh, json_file)
-    if targets or baselines or mesh or max_frames:
-        raise typer.BadParameter("takes no DIR_OR_LOG, --baselines, --mesh or --max-frames", param_hint="--suite")
-    if maps and protocol in ("finetune", "scratch"):
-        raise typer.BadParameter("goes with --protocol generalize only", param_hint="--map")
-    from semantic_mapper.nodes.cli.suite import run_suite_verb
+    out, print_json = results_file(out, json)
+    if suite is not None:
+        warn_of_old_name(f"eval --suite {suite}", f"benchmark {suite}")
+        from semantic_mapper.nodes.cli.suite import run_suite_verb
+        from semantic_mapper.nodes.cli.suite_options import suite_config
 
-    settings = suites.suite_config(config, tier, {**given, "seconds": seconds, "seed": seed})
-    if settings.protocol != "generalize" and baseline is not None:
-        raise typer.BadParameter("goes with --protocol generalize: keyframes are all there is", param_hint="--baseline")
-    if settings.protocol == "generalize" and not (steps is None and seconds is None and keyframes is None):
-        hint = "--steps, --seconds, --keyframes"
-        raise typer.BadParameter("go with --protocol finetune and scratch", param_hint=hint)
-    return run_suite_verb(settings, weights or [], kind or [], maps, json_file)
+        if targets or baselines or mesh or max_frames:
+            raise typer.BadParameter("takes no DIR_OR_LOG, --baselines, --mesh or --max-frames", param_hint="--suite")
+        given = {"split": split, "rooms": rooms, "protocol": protocol, "views": views, "baseline": baseline}
+        given |= {"depth": depth, "keyframes": keyframes, "steps": steps, "seconds": seconds, "seed": seed}
+        settings = suite_config(config, tier, given, maps)
+        return run_suite_verb(settings, weights or [], kind or [], maps, out, print_json=print_json)
+    given = (split, rooms, protocol, kind, views, baseline, depth, tier, keyframes, steps)
+    if maps or any(value is not None for value in given):
+        raise typer.BadParameter("is an option of `semantic-mapper benchmark rooms`", param_hint="this")
+    if baselines and seconds == 0:
+        raise typer.BadParameter("the U-Net needs time to learn", param_hint="--seconds")
+    baseline_s = BASELINE_SECONDS if seconds is None else seconds
+    options = _single(weights), baselines, baseline_s, max_frames, config, seed or 0
+    return _evaluate_targets(targets or [], options, mesh, out, print_json=print_json)
 
 
 def _single(weights: list[Path] | None) -> Path | None:
     if weights is not None and len(weights) > 1:
-        raise typer.BadParameter("several are compared with --suite only", param_hint="--weights")
+        raise typer.BadParameter("give one; `semantic-mapper benchmark` compares several", param_hint="--weights")
     return weights[0] if weights else None
 
 
@@ -118,11 +110,14 @@ def _evaluate_targets(
     options: tuple[Path | None, bool, float, int, Path | None, int],
     mesh: Path | None,
     json_file: Path | None,
+    *,
+    print_json: bool,
 ) -> int:
     """Figures of folders and logs; ``options`` are those of ``scoring.ScoreRequest`` after the log."""
     if not targets:
-        raise typer.BadParameter("give folders or logs, or --suite", param_hint="DIR_OR_LOG")
+        raise typer.BadParameter("give folders or logs", param_hint="DIR_OR_LOG")
     output = Output.guarded()
+    output.quiet = print_json
     from semantic_mapper.errors import ConfigError
     from semantic_mapper.nodes.cli.report import write_eval_report
     from semantic_mapper.nodes.cli.results import print_results
@@ -156,6 +151,8 @@ def _evaluate_targets(
     write_json(path, found)
     write_eval_report(page := path.with_suffix(".html"), found["replays"], folders, tables, found)
     output.print(f"written to {path} and, for a browser, {page}")
+    if print_json:
+        output.json(found)
     return 0
 
 

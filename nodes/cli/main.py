@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 from typing import Annotated
 
 import typer
 
 from semantic_mapper import __version__
+from semantic_mapper.nodes.cli import bench as cli_bench
+from semantic_mapper.nodes.cli import benchmark as cli_benchmark
 from semantic_mapper.nodes.cli import calibrate as cli_calibrate
 from semantic_mapper.nodes.cli import cameras as cli_cameras
 from semantic_mapper.nodes.cli import compare as cli_compare
@@ -26,10 +26,11 @@ from semantic_mapper.nodes.cli import query as cli_query
 from semantic_mapper.nodes.cli import record as cli_record
 from semantic_mapper.nodes.cli import replay as cli_replay
 from semantic_mapper.nodes.cli import top as cli_top
+from semantic_mapper.nodes.cli import train as cli_train
 from semantic_mapper.nodes.cli import up as cli_up
 from semantic_mapper.nodes.cli import view as cli_view
 from semantic_mapper.nodes.cli import weights as cli_weights
-from semantic_mapper.nodes.cli.verb import Settings
+from semantic_mapper.nodes.cli.verb import JsonCommand, Settings
 
 app = typer.Typer(
     name="semantic-mapper",
@@ -55,23 +56,22 @@ for _function in (
     cli_export.export,
     cli_export.merge,
     cli_finetune.finetune,
-    cli_eval.evaluate,
     cli_correct.correct,
     cli_label.label,
     cli_weights.weights,
     cli_doctor.doctor,
 ):
-    app.command(_function.__name__.rstrip("_").replace("evaluate", "eval"))(_function)
+    app.command(_function.__name__.rstrip("_"))(_function)
 
 app.add_typer(cli_keys.app, name="keys")
 app.add_typer(cli_launch.app, name="launch")
 
+app.command("eval", cls=JsonCommand)(cli_eval.evaluate)
 # Coordinates below 0 look like options.
-app.command("query", context_settings={"ignore_unknown_options": True})(cli_query.query)
-
-for _name in ("train", "bench"):  # measuring and training are no part of a robot's installation
-    if importlib.util.find_spec(f"semantic_mapper.nodes.cli.{_name}") is not None:
-        app.command(_name)(getattr(importlib.import_module(f"semantic_mapper.nodes.cli.{_name}"), _name))
+app.command("query", cls=JsonCommand, context_settings={"ignore_unknown_options": True})(cli_query.query)
+app.command("train")(cli_train.train)
+app.command("benchmark", cls=JsonCommand)(cli_benchmark.benchmark)
+app.command("bench", cls=JsonCommand)(cli_bench.bench)
 
 
 def _show_version(wanted: bool) -> None:

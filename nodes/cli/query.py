@@ -11,7 +11,8 @@ import typer
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
-from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.cli.verb import PrintJsonOption, results_file, verb
+from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
 
 
 class Question(StrEnum):
@@ -43,7 +44,8 @@ def query(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="MAP", help="Saved map or folder of results, or where a mapper answers (ipc://PATH, tcp://...)."
+            metavar="MAP",
+            help="Saved map, folder of results, `live` for the launch that runs here, or ipc://PATH, tcp://HOST:PORT.",
         ),
     ],
     question: Annotated[Question, typer.Argument(metavar="QUESTION", help="info, at, nearest or instances.")],
@@ -58,9 +60,8 @@ def query(
     ] = 0.0,
     server: ServerOption = "",
     keys: KeysOption = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Also write the answer here.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write the answer here, as JSON.")] = None,
+    json: PrintJsonOption = None,
 ) -> None:
     """Ask a saved map, or that of a running mapper, what is where.
 
@@ -71,8 +72,8 @@ def query(
     Example: semantic-mapper query runs/demo info
     Example: semantic-mapper query runs/demo/map.npz at 1.2 -0.4 0.8
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1 --min-confidence 0.5
-    Example: semantic-mapper query runs/demo/map.npz instances --up 0 0 1 --json things.json
-    Example: semantic-mapper query ipc:///run/robot/query nearest chair 0 0 1
+    Example: semantic-mapper query runs/demo/map.npz instances --up 0 0 1 --out things.json
+    Example: semantic-mapper query live nearest chair 0 0 1 --json
     Example: semantic-mapper query tcp://robot:5570 info --server robot
     """
     class_name, point = _read_arguments(question, arguments or [])
@@ -80,15 +81,20 @@ def query(
     from semantic_mapper.nodes.cli.map_answers import answer_table
     from semantic_mapper.replay.artifacts import write_json
 
-    if json_file is not None:
-        prepare_file(json_file)
-    ask = ask_mapper if "://" in source else ask_file
+    out, output.quiet = results_file(out, json)
+    if out is not None:
+        prepare_file(out)
+    endpoint = map_endpoint(source)
+    ask = ask_mapper if endpoint else ask_file
     asked = Asked(question, class_name, point, up, min_confidence, server, keys)
-    found = {"map": source, **ask(source, asked)}
+    found = {"map": source, **ask(endpoint or source, asked)}
+    if out is not None:
+        write_json(out, found)
+    if output.quiet:
+        output.json(found)
     output.print(answer_table(found, output.console.width))
-    if json_file is not None:
-        write_json(json_file, found)
-        output.print(f"written to {json_file}")
+    if out is not None:
+        output.print(f"written to {out}")
 
 
 def ask_file(source: str, asked: Asked) -> dict[str, Any]:
@@ -127,9 +133,7 @@ def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
     """
     from semantic_mapper.client import MapClient
     from semantic_mapper.nodes.cli import map_answers
-    from semantic_mapper.nodes.supervisor.running_launches import refuse_missing_socket
 
-    refuse_missing_socket(source)
     with MapClient(source, identity=server_identity(asked.server, asked.keys)) as client:
         match asked.question:
             case Question.INFO:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from semantic_mapper.nodes.cli.console import FrameProgress, Output, frame_progress
-from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
+from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb, warn_of_old_name
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
 
@@ -35,9 +35,10 @@ def record(
     duration: Annotated[float, typer.Option(min=0, help="Seconds; 0 = to the end of the stream, or Ctrl-C.")] = 0.0,
     split_mb: Annotated[float, typer.Option(min=0, help="Begin a new part before one grows beyond this.")] = 0.0,
     split_s: Annotated[float, typer.Option(min=0, help="Begin a new part after so many seconds.")] = 0.0,
-    disk_full: Annotated[
+    on_disk_full: Annotated[
         Literal["stop", "delete-oldest"], typer.Option(help="Stop, or delete the oldest parts of this recording.")
     ] = "stop",
+    disk_full: Annotated[Literal["stop", "delete-oldest"] | None, typer.Option(hidden=True)] = None,
     reserve_mb: Annotated[float, typer.Option(min=0, help="With so much left, the disk counts as full.")] = 500.0,
     jpeg: Annotated[
         int, typer.Option(min=0, max=100, help="Colour images as JPEG of this quality; 0 = as they are, lossless.")
@@ -52,7 +53,7 @@ def record(
     The log keeps the calibration and the launch's settings as attachments. Exit code 1 where the disk was full and
     something is missing; what was written is whole. A launch can also have a recorder of its own (launch/record.toml).
 
-    Example: semantic-mapper record runs/kitchen.mcap --split-mb 1000 --disk-full delete-oldest
+    Example: semantic-mapper record runs/kitchen.mcap --split-mb 1000 --on-disk-full delete-oldest
     """
     output = Output.guarded()
     from semantic_mapper.nodes.cli.outputs import prepare_file
@@ -60,12 +61,15 @@ def record(
     from semantic_mapper.nodes.supervisor.running_launches import launch_folder
 
     prepare_file(log)
+    if disk_full is not None:
+        warn_of_old_name("--disk-full", "--on-disk-full")
+        on_disk_full = disk_full
     wanted = {
         "out": str(log),
         "source_timeout_s": HEAR_S,
         "split_mb": split_mb,
         "split_s": split_s,
-        "disk_full": disk_full,
+        "disk_full": on_disk_full,
         "reserve_mb": reserve_mb,
         "overwrite": overwrite,
         **({"topics": topic} if topic else {}),

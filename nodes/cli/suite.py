@@ -34,7 +34,13 @@ PACKAGES = ("torch", "numpy")
 
 
 def run_suite_verb(
-    suite: SuiteConfig, weights: Sequence[Path], kinds: Sequence[str], maps: bool, json_file: Path | None
+    suite: SuiteConfig,
+    weights: Sequence[Path],
+    kinds: Sequence[str],
+    maps: bool,
+    json_file: Path | None,
+    *,
+    print_json: bool = False,
 ) -> int:
     """Run what is missing, then print, write and draw what there is.
 
@@ -44,6 +50,8 @@ def run_suite_verb(
     Args:
         weights: Files under test; the shipped ones where neither these nor ``kinds`` are given.
         kinds: Fields with random weights that are fitted to each room; protocol "scratch" only.
+        json_file: Where to write; None = named after the suite.
+        print_json: Print JSON, and nothing else.
 
     Returns:
         The exit code: 0, or that of the signal that ended the run.
@@ -51,13 +59,12 @@ def run_suite_verb(
     Raises:
         WeightsError, ConfigError, MapError: with what is wrong and the mend.
     """
-    if maps and suite.protocol != "generalize":
-        raise ConfigError(f"maps are made with weights as they are; protocol '{suite.protocol}' makes none, drop --map")
     if kinds and suite.protocol != "scratch":
         raise ConfigError(
             f"--kind has random weights, which protocol '{suite.protocol}' does not fit; --protocol scratch"
         )
     output = Output.guarded()
+    output.quiet = print_json
     keep_freed_memory()
     paths = list(weights) or ([] if kinds else [default_checkpoint_path()])
     out = json_file or Path("runs") / f"{_file_stem(suite)}.json"
@@ -85,6 +92,8 @@ def run_suite_verb(
             output.print(f"picture: {picture}")
         write_suite_report(page := out.with_suffix(".html"), table, lines, pictures, found)
         output.print(f"page: {page}")
+        if print_json:
+            output.json(found)
         if stop:
             stderr_console().print(f"stopped by {stop.name}; the same command goes on from here", style="yellow")
         return stop.exit_code

@@ -1,4 +1,4 @@
-"""Options of ``semantic-mapper eval --suite``, and the settings that come of them."""
+"""Options of ``semantic-mapper benchmark``, and the settings that come of them."""
 
 from __future__ import annotations
 
@@ -10,57 +10,58 @@ import typer
 if TYPE_CHECKING:
     from semantic_mapper.benchmark.config import SuiteConfig
 
-SuiteOption = Annotated[Literal["rooms"] | None, typer.Option(help="Run this benchmark; takes no DIR_OR_LOG.")]
-SplitOption = Annotated[Literal["test", "val"] | None, typer.Option(help="Suite: which rooms.  [default: test]")]
+SplitOption = Annotated[Literal["test", "val"] | None, typer.Option(help="Which rooms.  [default: test]")]
 RoomsOption = Annotated[
-    int | None, typer.Option(min=0, help="Suite: the first so many rooms of the split; 0 = all.  [default: 0]")
+    int | None, typer.Option(min=0, help="The first so many rooms of the split; 0 = all.  [default: 0]")
 ]
 ProtocolOption = Annotated[
     Literal["generalize", "finetune", "scratch"] | None,
-    typer.Option(help="Suite: weights as they are, fitted to each room, or random ones fitted.  [default: generalize]"),
+    typer.Option(help="Weights as they are, fitted to each room, or random ones fitted.  [default: generalize]"),
 ]
 KindOption = Annotated[
     list[str] | None,
-    typer.Option("--kind", help="Suite, scratch: a kind of field with random weights, without a file; may repeat."),
+    typer.Option("--kind", help="scratch: a kind of field with random weights, without a file; may repeat."),
 ]
-ViewsOption = Annotated[int | None, typer.Option(min=1, max=16, help="Suite: source views of a query.  [default: 8]")]
+ViewsOption = Annotated[int | None, typer.Option(min=1, max=16, help="Source views of a query.  [default: 8]")]
 BaselineOption = Annotated[
     Literal["wide", "narrow"] | None,
-    typer.Option(help="Suite, generalize: source views far from the query, or near it.  [default: narrow]"),
+    typer.Option(help="generalize: source views far from the query, or near it.  [default: narrow]"),
 ]
 DepthOption = Annotated[
-    Literal["on", "off"] | None, typer.Option(help="Suite: whether the frames have sensor depth.  [default: on]")
+    Literal["on", "off"] | None, typer.Option(help="Whether the frames have sensor depth.  [default: on]")
 ]
 TierOption = Annotated[
     Literal["cpu", "gpu"] | None,
-    typer.Option(help="Suite: 160x120 and few samples, or 320x240 and many.  [default: cpu]"),
+    typer.Option(help="160x120 and few samples, or 320x240 and many.  [default: cpu]"),
 ]
 KeyframesOption = Annotated[
-    int | None, typer.Option(min=2, help="Suite, finetune and scratch: labelled keyframes a room.  [default: 12]")
+    int | None, typer.Option(min=2, help="finetune and scratch: labelled keyframes a room.  [default: 12]")
 ]
 StepsOption = Annotated[
-    int | None, typer.Option(min=0, help="Suite, finetune and scratch: steps a room instead of --seconds.")
+    int | None, typer.Option(min=0, help="finetune and scratch: steps a room instead of --seconds.")
 ]
 SecondsOption = Annotated[
     float | None,
-    typer.Option(min=0, help="Training time: of the U-Net baseline [300], of finetune and scratch a room [120]."),
+    typer.Option(min=0, help="finetune and scratch: training time a room.  [default: 120]"),
 ]
-MapOption = Annotated[bool, typer.Option("--map", help="Suite, generalize: also fuse each room and score the map.")]
-EvalConfigOption = Annotated[
-    Path | None, typer.Option("--config", help="TOML file with settings of the mapper; with --suite, a SuiteConfig.")
-]
+MapOption = Annotated[bool, typer.Option("--map", help="generalize: also fuse each room and score the map.")]
+SuiteConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with a SuiteConfig.")]
 
 
-def suite_config(path: Path | None, tier: Literal["cpu", "gpu"] | None, given: dict[str, Any]) -> SuiteConfig:
+def suite_config(
+    path: Path | None, tier: Literal["cpu", "gpu"] | None, given: dict[str, Any], maps: bool = False
+) -> SuiteConfig:
     """Settings from a TOML file (None = defaults), with what the command line says on top.
 
     Args:
         path: Holds a ``SuiteConfig``.
         tier: Replaces the file's.
         given: Values of options by name, None = not given; ``keyframes``, ``seconds`` and ``steps`` go to ``scene``.
+        maps: Whether rooms are mapped, too.
 
     Raises:
         ConfigError: a file or value that cannot be used.
+        typer.BadParameter: an option that the protocol makes no use of.
     """
     from semantic_mapper.benchmark.config import TIERS, SuiteConfig
     from semantic_mapper.config import convert_config, load_config, to_plain
@@ -74,4 +75,23 @@ def suite_config(path: Path | None, tier: Literal["cpu", "gpu"] | None, given: d
     for name, value in given.items():
         section = plain["scene"] if name in ("keyframes", "seconds", "steps") else plain
         section[name] = value == "on" if name == "depth" else value
-    return convert_config(plain, SuiteConfig, "command line")
+    settings = convert_config(plain, SuiteConfig, "command line")
+    _refuse_idle(settings.protocol, given, maps)
+    return settings
+
+
+def _refuse_idle(protocol: str, given: dict[str, Any], maps: bool) -> None:
+    """Refuse options that the protocol makes no use of.
+
+    Raises:
+        typer.BadParameter: names them.
+    """
+    if protocol != "generalize" and "baseline" in given:
+        raise typer.BadParameter("goes with --protocol generalize: keyframes are all there is", param_hint="--baseline")
+    if protocol != "generalize" and maps:
+        raise typer.BadParameter(
+            "goes with --protocol generalize: maps are made with weights as they are", param_hint="--map"
+        )
+    if protocol == "generalize" and given.keys() & {"keyframes", "steps", "seconds"}:
+        hint = "--steps, --seconds, --keyframes"
+        raise typer.BadParameter("go with --protocol finetune and scratch", param_hint=hint)

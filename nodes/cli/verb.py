@@ -1,4 +1,4 @@
-"""What all verbs of the command line fraction: process set-up, one clear line for an error, exit codes.
+"""What all verbs of the command line share: process set-up, one clear line for an error, exit codes.
 
 0 done; 1 failed; 2 wrong usage; 130 after Ctrl-C, 143 after SIGTERM (what was done so far is written where a verb says
 so); 1 too where a result is negative (``doctor`` finds something missing).
@@ -10,11 +10,13 @@ import functools
 import inspect
 import sys
 from collections.abc import Callable, Mapping
-from typing import ParamSpec
+from pathlib import Path
+from typing import Annotated, Any, ParamSpec
 
 import structlog
 import typer
 from rich.text import Text
+from typer.core import TyperCommand
 
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.memory import is_out_of_memory, memory_message
@@ -24,11 +26,17 @@ from semantic_mapper.plain_text import visible
 
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
+STDOUT = "-"
 MAX_OPTION = 1e6  # of lengths, times and sizes; that many seconds are eleven days
 
 _log = structlog.get_logger(__name__)
 
 ParamsT = ParamSpec("ParamsT")
+
+# Of verbs whose ``--json`` named a file once; see ``JsonCommand``.
+PrintJsonOption = Annotated[
+    Path | None, typer.Option("--json", metavar="", help="Print JSON, and nothing else, on stdout.")
+]
 
 
 class Settings:
@@ -73,6 +81,32 @@ def verb(function: Callable[ParamsT, int | None]) -> Callable[ParamsT, None]:
     # Click joins the lines of a paragraph but for those after a backspace: an example is there to be copied.
     command.__doc__ = inspect.cleandoc(function.__doc__ or "").replace("\n\nExample:", "\n\n\b\nExample:", 1)
     return command
+
+
+class JsonCommand(TyperCommand):
+    """A command whose ``--json`` prints, and once named a file: ``--json FILE.json`` still writes, with a warning."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read ``--json`` without a file as ``--json -``."""
+        given: list[str] = []
+        for word, following in zip(args, [*args[1:], ""], strict=False):
+            given.append(word)
+            if word == "--json" and not following.endswith(".json") and following != "-":
+                given.append(STDOUT)
+        return super().parse_args(ctx, given)
+
+
+def results_file(out: Path | None, json: Path | None) -> tuple[Path | None, bool]:
+    """The file that ``--out`` or an old ``--json FILE`` names, and whether JSON is to be printed."""
+    if json is None or str(json) == STDOUT:
+        return out, json is not None
+    warn_of_old_name("--json FILE", "--out FILE")
+    return out or json, False
+
+
+def warn_of_old_name(old: str, new: str) -> None:
+    """One line on stderr for an option that has another name now."""
+    _log.warning("option_renamed", old=old, new=new)
 
 
 def _check_numbers(options: Mapping[str, object]) -> None:

@@ -11,7 +11,7 @@ from msgspec import to_builtins
 from semantic_mapper.errors import MapError
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.remote import KeysOption, ServerOption, server_identity
-from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.cli.verb import verb, warn_of_old_name
 from semantic_mapper.plain_text import counted
 
 if TYPE_CHECKING:
@@ -23,13 +23,20 @@ PATIENCE_S = 60.0  # in which a mapper that gets frames has long read the file
 
 @verb
 def weights(
-    endpoint: Annotated[str, typer.Argument(help="Where the mapper answers (ipc://PATH, tcp://127.0.0.1:PORT).")],
+    endpoint: Annotated[
+        str,
+        typer.Argument(
+            help="`live` for the launch that runs here, or where its mapper answers (ipc://PATH, tcp://HOST:PORT)."
+        ),
+    ],
     rollback: Annotated[
-        bool, typer.Option("--rollback", help="Go back to the weights that were in use before, or to those of --to.")
+        bool, typer.Option("--rollback", help="Return to the weights that were in use before.")
     ] = False,
-    to: Annotated[
-        int | None, typer.Option(min=0, help="With --rollback: version; 0 = those that the mapper was started with.")
+    rollback_to: Annotated[
+        int | None,
+        typer.Option(min=0, metavar="VERSION", help="Return to this version; 0 = that which the mapper started with."),
     ] = None,
+    to: Annotated[int | None, typer.Option(min=0, hidden=True)] = None,
     server: ServerOption = "",
     keys: KeysOption = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
@@ -38,18 +45,21 @@ def weights(
 
     What is in the map stays. A finetuner forgets the keyframes that only later weights were made with.
 
-    Example: semantic-mapper weights ipc:///run/robot/query
-    Example: semantic-mapper weights ipc:///run/robot/query --rollback
+    Example: semantic-mapper weights live
+    Example: semantic-mapper weights live --rollback
     """
-    if to is not None and not rollback:
-        raise typer.BadParameter("goes with --rollback", param_hint="--to")
+    if to is not None:
+        warn_of_old_name("--rollback --to", "--rollback-to")
+        if not rollback:
+            raise typer.BadParameter("goes with --rollback; --rollback-to VERSION is both", param_hint="--to")
+        rollback_to = to
     output = Output.guarded()
     from semantic_mapper.client import MapClient
-    from semantic_mapper.nodes.supervisor.running_launches import refuse_missing_socket
+    from semantic_mapper.nodes.supervisor.running_launches import map_endpoint
 
-    refuse_missing_socket(endpoint)
+    endpoint = map_endpoint(endpoint) or endpoint
     with MapClient(endpoint, identity=server_identity(server, keys)) as client:
-        state = _go_back(client, to) if rollback else client.weights()
+        state = _go_back(client, rollback_to) if rollback or rollback_to is not None else client.weights()
     if json:
         output.json(describe(state))
     else:

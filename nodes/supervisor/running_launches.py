@@ -12,6 +12,8 @@ from semantic_mapper.nodes.supervisor.launch_config import STATUS_SOCKET
 
 START_S = 180.0  # how long nodes may take to start
 LISTEN_S = 0.5
+LIVE = "live"  # on the command line: the mapper of the one launch that runs here
+QUERY_SOCKET = "query"  # where a mapper answers unless its launch file says otherwise
 
 
 def running_launches() -> list[Path]:
@@ -62,6 +64,25 @@ def refuse_missing_socket(endpoint: str) -> None:
             f"{endpoint}: there is no such socket; does the mapper run? `up` names the socket folder of its launch as "
             "it starts, and its mapper answers at ipc://FOLDER/query"
         )
+
+
+def map_endpoint(place: str) -> str:
+    """Where the mapper answers that a person means by a place; empty for anything else, such as a saved map.
+
+    Args:
+        place: An endpoint, ``live`` for the one launch that runs, or the socket folder of a launch.
+
+    Raises:
+        TransportError: there is no such socket, no launch runs, or several do.
+    """
+    if place == LIVE:
+        place = f"ipc://{launch_folder('')}/{QUERY_SOCKET}"
+    elif (Path(place) / STATUS_SOCKET).exists():
+        place = f"ipc://{Path(place).absolute()}/{QUERY_SOCKET}"
+    if "://" not in place:
+        return ""
+    refuse_missing_socket(place)
+    return place
 
 
 def node_endpoints(folder: Path) -> dict[str, str]:

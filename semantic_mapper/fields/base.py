@@ -1,4 +1,4 @@
-"""The seam that all semantic fields fraction: encode source views once, render any number of rays from them."""
+"""The seam that all semantic fields share: encode source views once, render any number of rays from them."""
 
 from __future__ import annotations
 

@@ -5,17 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import pytest
-
 from tests.nodes.support import error_line, run
 
 SMALL = ("--rooms", "2", "--returns", "1", "--minutes", "0.2", "--hz", "1", "--width", "96")
 
 
-@pytest.mark.slow
 def test_a_small_walk_is_measured_written_and_drawn(tmp_path: Path, weights: Path, config: Path) -> None:
     file, plot = tmp_path / "bench.json", tmp_path / "bench.png"
-    options = ("--weights", weights, "--config", config, "--memory-mb", "30", "--json", file, "--plot", plot)
+    options = ("--weights", weights, "--config", config, "--memory-mb", "30", "--out", file, "--plot", plot)
     done = run("bench", "map", *SMALL, *options)
     assert done.returncode == 0, done.stderr
     assert "1 of 1 rooms unchanged" in done.stdout
@@ -26,7 +23,6 @@ def test_a_small_walk_is_measured_written_and_drawn(tmp_path: Path, weights: Pat
     assert plot.read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.slow
 def test_a_walk_that_is_none_is_refused_with_what_it_needs(weights: Path, config: Path) -> None:
     done = run("bench", "map", *SMALL, "--returns", "5", "--weights", weights, "--config", config)
     assert done.returncode == 1 and "returns" in error_line(done.stderr)

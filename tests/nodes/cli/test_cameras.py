@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import json
 
-import pytest
-
 from tests.nodes.support import error_line, run
 
 
-@pytest.mark.slow
 def test_it_lists_what_is_connected_as_a_table_and_as_json() -> None:
     told = run("cameras", "--kind", "v4l2", "--kind", "opencv", "--json")
     assert told.returncode == 0, told.stderr

@@ -21,7 +21,6 @@ def fewer(log: Path, weights: Path, config: Path, tmp_path_factory: pytest.TempP
     return out
 
 
-@pytest.mark.slow
 def test_a_run_and_its_copy_are_equal_to_the_bit(replayed: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(replayed, tmp_path / "copy")
     done = run("compare", replayed, copy, "--exact", "--json")
@@ -31,7 +30,6 @@ def test_a_run_and_its_copy_are_equal_to_the_bit(replayed: Path, tmp_path: Path)
     assert found["picture"] == str(copy / "compare.png") and cv2.imread(found["picture"]).std() > 10
 
 
-@pytest.mark.slow
 def test_a_missing_frame_differs_and_is_in_table_and_json(replayed: Path, fewer: Path, tmp_path: Path) -> None:
     picture = tmp_path / "pictures" / "where.png"
     done = run("compare", replayed, fewer, "--picture", picture)
@@ -43,7 +41,6 @@ def test_a_missing_frame_differs_and_is_in_table_and_json(replayed: Path, fewer:
     assert done.returncode == 1 and (field["a"], field["b"], field["within"]) == (6, 5, False)
 
 
-@pytest.mark.slow
 def test_tolerances_come_from_a_file_and_from_options_which_win(replayed: Path, fewer: Path, tmp_path: Path) -> None:
     names = json.loads(run("compare", replayed, fewer, "--json").stdout)["fields"]
     file = tmp_path / "loose.toml"
@@ -53,7 +50,6 @@ def test_tolerances_come_from_a_file_and_from_options_which_win(replayed: Path, 
     assert run("compare", replayed, fewer, "--tolerances", file, "-t", "frames_mapped=0").returncode == 1
 
 
-@pytest.mark.slow
 def test_maps_alone_can_be_compared(replayed: Path, fewer: Path) -> None:
     done = run("compare", replayed / "map.npz", fewer / "map.npz", "-t", "frames_mapped=1", "--json")
     found = json.loads(done.stdout)
@@ -76,7 +72,6 @@ def test_wrong_tolerances_are_wrong_usage(replayed: Path, arguments: tuple[str, 
     assert done.returncode == 2 and said in error_line(done.stderr) and not done.stdout
 
 
-@pytest.mark.slow
 def test_what_cannot_be_read_is_no_difference(replayed: Path, tmp_path: Path) -> None:
     done = run("compare", replayed, tmp_path / "gone")
     assert done.returncode == 2 and "no such map file" in error_line(done.stderr)
@@ -91,7 +86,6 @@ def test_exact_leaves_nothing_to_tolerate(replayed: Path) -> None:
     assert done.returncode == 2 and "--exact" in done.stderr
 
 
-@pytest.mark.slow
 def test_logs_are_refused_with_how_to_make_what_can_be_compared(log: Path, replayed: Path) -> None:
     for a, b in ((log, replayed), (replayed, log)):
         done = run("compare", a, b)

@@ -5,13 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import pytest
-
 from semantic_mapper.fields.checkpoint import default_checkpoint_path
-from tests.nodes.support import run
+from tests.nodes.support import run, run_process
 
 
-@pytest.mark.slow
 def test_demo_ends_with_a_map_a_picture_and_a_summary(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     done = run("demo", "--out", out, "--frames", "4", "--voxel-size", "0.05")
@@ -24,9 +21,8 @@ def test_demo_ends_with_a_map_a_picture_and_a_summary(tmp_path: Path) -> None:
         assert name in done.stdout
 
 
-@pytest.mark.slow
 def test_doctor_finds_what_the_tests_themselves_need(tmp_path: Path) -> None:
-    done = run("doctor", "--json", cwd=tmp_path)
+    done = run_process("doctor", "--json", cwd=tmp_path)
     checks = {c["name"]: c for c in json.loads(done.stdout)}
     for name in ("Python", "packages", "libusb", "Open3D", "torch", "sockets", "CPU"):
         assert checks[name]["state"] == "ok", checks[name]

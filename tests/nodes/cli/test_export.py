@@ -26,7 +26,6 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
 def test_a_folder_of_results_becomes_a_glb(results: Path, tmp_path: Path) -> None:
     out = tmp_path / "new" / "sphere.glb"
     done = run("export", results, "--out", out, "--color", "class", "--up", "-y")
@@ -36,7 +35,6 @@ def test_a_folder_of_results_becomes_a_glb(results: Path, tmp_path: Path) -> Non
     np.testing.assert_array_equal(read_glb(out)[1]["_LABEL"], mesh.label)
 
 
-@pytest.mark.slow
 def test_what_cannot_be_exported_is_refused_in_one_line(results: Path, tmp_path: Path) -> None:
     done = run("export", results, "--out", results / "map.npz")
     assert done.returncode == 1 and "is the map itself" in error_line(done.stderr)
@@ -46,7 +44,6 @@ def test_what_cannot_be_exported_is_refused_in_one_line(results: Path, tmp_path:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
 def test_two_maps_become_one(results: Path, tmp_path: Path) -> None:
     out = tmp_path / "both.npz"
     done = run("merge", results, results / "map.npz", "--transform", "4 0 -0.4 90", "--out", out)
@@ -59,7 +56,6 @@ def test_two_maps_become_one(results: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(np.sort(second, axis=0), np.sort(moved, axis=0), atol=1e-5)
 
 
-@pytest.mark.slow
 def test_merging_a_map_with_itself_says_where_its_blocks_have_gone(results: Path, tmp_path: Path) -> None:
     voxel_map = VoxelMap.load(results / "map.npz")
     measured = int((voxel_map.block_state()["weight"] > 0).any(axis=(1, 2, 3)).sum())

@@ -41,7 +41,6 @@ def test_more_keyframes_than_labelled_frames_are_refused(log: Path, weights: Pat
     assert "--keyframes 7" in error_line(done.stderr)
 
 
-@pytest.mark.slow
 def test_log_without_labels_is_refused(weights: Path, tmp_path: Path) -> None:
     log = tmp_path / "plain.mcap"
     with LogWriter(log, StreamInfo(source="test", cameras={"rooms": INTRINSICS})) as writer:
@@ -61,7 +60,6 @@ def test_eval_shows_replays_side_by_side_and_writes_json(replayed: Path, tmp_pat
     assert written["replays"]["replayed"] == json.loads((replayed / "summary.json").read_text())
 
 
-@pytest.mark.slow
 def test_eval_of_a_log_compares_with_baselines_on_frames_that_nobody_was_fitted_to(
     log: Path, tuned: Path, config: Path, tmp_path: Path
 ) -> None:
@@ -93,7 +91,6 @@ def test_ctrl_c_keeps_the_best_weights_so_far(log: Path, weights: Path, tmp_path
     assert "the best weights so far" in running.text
 
 
-@pytest.mark.slow
 def test_eval_of_a_log_writes_beside_it(log: Path, weights: Path, config: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copy(log, tmp_path / "copy.mcap"))
     done = run("eval", copy, "--weights", weights, "--config", config, "--max-frames", "2")
@@ -101,7 +98,6 @@ def test_eval_of_a_log_writes_beside_it(log: Path, weights: Path, config: Path, 
     assert json.loads((tmp_path / "copy.eval.json").read_text())["logs"][str(copy)]["scored"] == 2
 
 
-@pytest.mark.slow
 def test_finetuning_on_top_remembers_the_keyframes_of_both(log: Path, tuned: Path, tmp_path: Path) -> None:
     out = tmp_path / "again.safetensors"
     arguments = ("--keyframes", "2", "--seed", "5", "--seconds", "0", "--steps", "1", "--weights", tuned)
@@ -118,7 +114,6 @@ def test_a_folder_in_place_of_the_weights_file_is_refused_before_training(
     assert "step 1" not in done.stderr
 
 
-@pytest.mark.slow
 def test_labelled_frames_of_another_size_are_left_out(weights: Path, tmp_path: Path) -> None:
     frames = list(tiny_frames(4))
     k = frames[1].intrinsics

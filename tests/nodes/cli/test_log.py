@@ -8,7 +8,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.replay.log.format import LogWriter
@@ -40,7 +39,6 @@ def _write_sequence(folder: Path, frames: tuple[PosedFrame, ...]) -> Path:
     return folder
 
 
-@pytest.mark.slow
 def test_recording_with_a_broken_pose_is_imported_but_for_that_frame(tmp_path: Path) -> None:
     source = _write_sequence(tmp_path / "sequence", tiny_frames(4))
     poses = (source / "poses.txt").read_text().splitlines()
@@ -73,7 +71,6 @@ def test_info_shows_topics_frames_and_classes(log: Path) -> None:
         assert text in done.stdout
 
 
-@pytest.mark.slow
 def test_info_lists_the_gaps_of_each_camera(tmp_path: Path) -> None:
     """Frames that a recorder dropped, and a camera that stood still; another camera is whole."""
     whole, frames = tiny_frames(6), []
@@ -97,7 +94,6 @@ def test_info_lists_the_gaps_of_each_camera(tmp_path: Path) -> None:
     assert "gaps left" in shown and "4 frames missing" in shown and "after seq 2" in shown
 
 
-@pytest.mark.slow
 def test_info_of_a_map_says_what_it_is(tmp_path: Path) -> None:
     voxel_map = small_map(voxel_size_m=0.03)
     fuse_sphere(voxel_map, 3)
@@ -119,7 +115,6 @@ def test_info_of_a_map_says_what_it_is(tmp_path: Path) -> None:
     assert found["config"]["voxel_size_m"] == 0.03 and found["size_bytes"] == path.stat().st_size
 
 
-@pytest.mark.slow
 def test_info_of_a_damaged_map_says_so(tmp_path: Path) -> None:
     path = tmp_path / "map.npz"
     small_map().save(path)
@@ -130,7 +125,6 @@ def test_info_of_a_damaged_map_says_so(tmp_path: Path) -> None:
     assert "map.npz: damaged: it is cut off" in error_line(done.stderr)
 
 
-@pytest.mark.slow
 def test_damaged_log_is_reported_and_recovered(log: Path, tmp_path: Path) -> None:
     content = bytearray(log.read_bytes())
     content[len(content) // 2] ^= 0xFF

@@ -11,7 +11,6 @@ from semantic_mapper.nodes.cli.outputs import free_name, hold_folder
 from tests.nodes.support import REPLAY_LAUNCH, error_line, run
 
 
-@pytest.mark.slow
 def test_two_runs_do_not_write_their_results_into_one_folder(log: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with hold_folder(out):

@@ -24,12 +24,11 @@ def map_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def ask(map_file: Path, *arguments: object) -> tuple[dict, str]:
     answer = map_file.with_name("answer.json")
-    done = run("query", map_file, *map(str, arguments), "--json", answer)
+    done = run("query", map_file, *map(str, arguments), "--out", answer)
     assert done.returncode == 0, done.stderr
     return json.loads(answer.read_text()), done.stdout
 
 
-@pytest.mark.slow
 def test_info(map_file: Path) -> None:
     found, shown = ask(map_file, "info")
     assert (found["frames"], found["blocks"], found["label_set"]) == (14, whole_map().block_count, "known")
@@ -49,7 +48,6 @@ def test_a_folder_with_a_map_is_that_map(map_file: Path) -> None:
     assert code == 1 and "is a map alone; give the folder" in said
 
 
-@pytest.mark.slow
 def test_at_points_below_zero_too(map_file: Path) -> None:
     x, y, z = BOX + np.array([0.0, 0.0, HALF[2]])
     assert x < 0
@@ -60,7 +58,6 @@ def test_at_points_below_zero_too(map_file: Path) -> None:
     assert (found["class"], found["state"], found["surface_distance_m"]) == (None, "unknown", None)
 
 
-@pytest.mark.slow
 def test_nearest(map_file: Path) -> None:
     above = BALL + np.array([0.0, 0.0, 1.0])
     found, shown = ask(map_file, "nearest", "cup", *above)
@@ -73,7 +70,6 @@ def test_nearest(map_file: Path) -> None:
     assert done.returncode == 1 and "floor, table, cup, lamp" in done.stderr.replace("\n", " ")
 
 
-@pytest.mark.slow
 def test_instances(map_file: Path) -> None:
     found, shown = ask(map_file, "instances", "--up", "0", "0", "-1")
     large = {thing["class"]: thing for thing in found["instances"] if thing["voxels"] > 200}
@@ -91,7 +87,6 @@ def answers(endpoint: str) -> bool:
     return True
 
 
-@pytest.mark.slow
 def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
     with a_folder() as folder, answering(f"ipc://{folder / 'query'}", whole_map()) as service:
         assert eventually(lambda: answers(service.endpoint), 120), "no answer, not even once kernels are compiled"
@@ -104,14 +99,22 @@ def test_a_running_mapper_answers_as_the_file_does(map_file: Path) -> None:
         ):
             asked = Asked(question, name, point)
             assert ask_mapper(service.endpoint, asked) == ask_file(str(map_file), asked)
-        done = run("query", service.endpoint, "nearest", "cup", "0", "0", "1", "--json", folder / "live.json")
+        done = run("query", service.endpoint, "nearest", "cup", "0", "0", "1", "--out", folder / "live.json")
         assert done.returncode == 0 and "cup" in done.stdout, done.stderr
         assert json.loads((folder / "live.json").read_text())["map"] == service.endpoint
         wrong = run("query", service.endpoint, "nearest", "kettle", "0", "0", "0")
         assert wrong.returncode == 1 and "floor, table, cup, lamp" in wrong.stderr.replace("\n", " ")
 
 
-@pytest.mark.slow
+def test_json_is_printed_alone_and_an_old_file_is_still_written(map_file: Path, tmp_path: Path) -> None:
+    printed = run("query", map_file, "--json", "nearest", "cup", "0", "0", "1")
+    assert json.loads(printed.stdout)["class"] == "cup"
+    old = run("query", map_file, "info", "--json", tmp_path / "old.json")
+    assert json.loads((tmp_path / "old.json").read_text())["frames"] == 14 and "old='--json FILE'" in old.stderr
+    piped = run("query", map_file, "instances").stdout
+    assert "table" in piped and not set("│┃━─") & set(piped)
+
+
 def test_what_cannot_be_asked_is_said(map_file: Path, tmp_path: Path) -> None:
     missing = run("query", tmp_path / "none.npz", "info")
     assert missing.returncode == 1 and "no such map file" in missing.stderr

@@ -37,7 +37,6 @@ def test_missing_weights_are_named(log: Path, tmp_path: Path) -> None:
     assert done.stdout == ""
 
 
-@pytest.mark.slow
 def test_missing_and_foreign_logs_are_named(tmp_path: Path) -> None:
     for name, content in (("gone.mcap", None), ("noise.mcap", b"\x89 no log" * 999)):
         if content is not None:
@@ -62,7 +61,6 @@ def test_folder_that_cannot_be_made_is_named(log: Path, tmp_path: Path) -> None:
     assert "cannot hold the results" in error_line(done.stderr)
 
 
-@pytest.mark.slow
 def test_impossible_and_damaged_frames_are_named_and_the_rest_is_mapped(
     tmp_path: Path, weights: Path, config: Path
 ) -> None:
@@ -100,7 +98,6 @@ def test_impossible_and_damaged_frames_are_named_and_the_rest_is_mapped(
         assert reason.removeprefix("mapped, but not scored: ")[:40] in done.stderr
 
 
-@pytest.mark.slow
 def test_a_frame_whose_intrinsics_do_not_fit_is_refused_and_the_rest_is_mapped(
     tmp_path: Path, weights: Path, config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -130,7 +127,6 @@ def test_interrupted_replay_still_writes_the_map_so_far(tmp_path: Path, weights:
     assert (out / "map.ply").exists()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("how", ["--weights", "--eval-exclude"])
 def test_frames_that_weights_were_finetuned_on_are_never_scored(
     how: str, log: Path, weights: Path, config: Path, tmp_path: Path
@@ -148,7 +144,6 @@ def test_frames_that_weights_were_finetuned_on_are_never_scored(
     assert "2 frames left out of the scores" in done.stdout
 
 
-@pytest.mark.slow
 def test_corrections_move_the_map_at_the_end_and_bad_ones_are_named_before_it_begins(
     log: Path, weights: Path, tmp_path: Path
 ) -> None:

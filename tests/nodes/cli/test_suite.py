@@ -1,4 +1,4 @@
-"""``eval --suite``."""
+"""``benchmark``."""
 
 from __future__ import annotations
 
@@ -48,12 +48,11 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return paths
 
 
-@pytest.mark.slow
 def test_weights_side_by_side_with_maps_and_a_second_call_that_continues(
     suite: Path, two: tuple[Path, Path], tmp_path: Path
 ) -> None:
     out = tmp_path / "runs" / "ab.json"
-    common = ("eval", "--suite", "rooms", "--config", suite, "--json", out)
+    common = ("benchmark", "rooms", "--config", suite, "--out", out)
     first = run(*common, "--weights", two[0], "--rooms", "1", "--map")
     assert first.returncode == 0, first.stderr
     records = out.with_suffix(".jsonl").read_text().splitlines()
@@ -74,7 +73,7 @@ def test_weights_side_by_side_with_maps_and_a_second_call_that_continues(
 def test_fitting_shows_its_curve(suite: Path, two: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "fit.json"
     options = ("--protocol", "scratch", "--steps", "2", "--rooms", "1", "--depth", "off")
-    done = run("eval", "--suite", "rooms", "--config", suite, "--weights", two[0], *options, "--json", out)
+    done = run("benchmark", "rooms", "--config", suite, "--weights", two[0], *options, "--out", out)
     assert done.returncode == 0, done.stderr
     assert "mIoU before fitting" in done.stdout and "2 steps" in done.stdout
     assert out.with_suffix(".curves.png").stat().st_size > 1000
@@ -86,53 +85,59 @@ def test_fitting_shows_its_curve(suite: Path, two: tuple[Path, Path], tmp_path: 
 def test_a_file_that_cannot_be_written_is_refused_before_a_room_is_made(suite: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     out = tmp_path / "file" / "a.json"
-    refused = run("eval", "--suite", "rooms", "--config", suite, "--rooms", "1", "--json", out)
+    refused = run("benchmark", "rooms", "--config", suite, "--rooms", "1", "--out", out)
     assert refused.returncode == 1 and str(tmp_path / "file") in error_line(refused.stderr)
-    assert "benchmark" not in refused.stderr, "no room was begun"
+    assert "rooms" not in refused.stdout, "no room was begun"
 
 
-@pytest.mark.slow
 def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Path) -> None:
     out = tmp_path / "kind.json"
-    options = ("--suite", "rooms", "--config", suite, "--kind", "semantic_nerf", "--json", out)
-    done = run("eval", *options, "--protocol", "scratch", "--steps", "2", "--rooms", "1")
+    options = ("--config", suite, "--kind", "semantic_nerf", "--out", out)
+    done = run("benchmark", "rooms", *options, "--protocol", "scratch", "--steps", "2", "--rooms", "1")
     assert done.returncode == 0, done.stderr
     (column,) = json.loads(out.read_text())["weights"].items()
     assert column[0] == "semantic_nerf" and column[1]["file"] is None
-    refused = run("eval", *options)
+    refused = run("benchmark", "rooms", *options)
     assert refused.returncode == 1 and "--protocol scratch" in refused.stderr
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("log.mcap", "--suite", "rooms"),
-        ("log.mcap", "--kind", "unet"),
-        ("log.mcap", "--rooms", "2"),
-        ("log.mcap", "--weights", "a", "--weights", "b"),
-        ("--suite", "rooms", "--protocol", "finetune", "--baseline", "wide"),
-        ("--suite", "rooms", "--seconds", "3"),
-        ("--suite", "rooms", "--keyframes", "3"),
-        ("--suite", "klevr"),
-        ("--suite", "rooms", "--protocol", "finetune", "--map"),
-        ("--suite", "rooms", "--views", "17"),
+        ("eval", "log.mcap", "--suite", "rooms"),
+        ("eval", "log.mcap", "--kind", "unet"),
+        ("eval", "log.mcap", "--rooms", "2"),
+        ("eval", "log.mcap", "--weights", "a", "--weights", "b"),
+        ("benchmark", "rooms", "--protocol", "finetune", "--baseline", "wide"),
+        ("benchmark", "rooms", "--seconds", "3"),
+        ("benchmark", "rooms", "--keyframes", "3"),
+        ("benchmark", "klevr"),
+        ("benchmark", "rooms", "--protocol", "finetune", "--map"),
+        ("benchmark", "rooms", "--views", "17"),
     ],
 )
 def test_options_that_do_not_go_together_are_wrong_usage(arguments: tuple[str, ...]) -> None:
-    done = run("eval", *arguments)
+    done = run(*arguments)
     assert done.returncode == 2, done.stderr
     assert "Usage: semantic-mapper" in done.stderr
 
 
+def test_the_old_form_of_the_verb_warns_and_does_the_same(tmp_path: Path) -> None:
+    out = tmp_path / "old.json"
+    old = run("eval", "--suite", "rooms", "--rooms", "21", "--json", out)
+    assert old.returncode == 1 and "has 20 rooms" in old.stderr
+    assert "old='eval --suite rooms'" in old.stderr and "new='benchmark rooms'" in old.stderr
+    assert "old='--json FILE'" in old.stderr
+
+
 def test_more_rooms_than_there_are_is_refused() -> None:
-    done = run("eval", "--suite", "rooms", "--rooms", "21")
+    done = run("benchmark", "rooms", "--rooms", "21")
     assert done.returncode == 1 and "has 20 rooms" in error_line(done.stderr)
 
 
 def test_an_unknown_setting_names_the_nearest_one(tmp_path: Path) -> None:
     path = tmp_path / "suite.toml"
     path.write_text("veiws = 3\n", encoding="utf-8")
-    done = run("eval", "--suite", "rooms", "--config", path)
+    done = run("benchmark", "rooms", "--config", path)
     assert done.returncode == 1
     assert "did you mean `views`" in error_line(done.stderr)

@@ -47,7 +47,6 @@ def recipe(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.slow
 def test_training_into_a_folder_leaves_weights_state_history_and_curves(recipe: Path, tmp_path: Path) -> None:
     out = tmp_path / "made" / "run"
     done = run("train", "--config", recipe, "--out", out, "--seed", "3", "--half")

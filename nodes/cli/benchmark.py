@@ -1,0 +1,58 @@
+"""``semantic-mapper benchmark``: score weights on rooms that nothing was trained on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from semantic_mapper.nodes.cli import suite_options as suites
+from semantic_mapper.nodes.cli.verb import PrintJsonOption, results_file, verb
+
+WeightsOption = Annotated[
+    list[Path] | None,
+    typer.Option("--weights", help="Weights file, several to compare them; the one in the package without it."),
+]
+OutOption = Annotated[Path | None, typer.Option("--out", metavar="FILE", help="JSON; else runs/SUITE-*.json.")]
+SeedOption = Annotated[int | None, typer.Option(min=0, help="Of everything that is drawn at random.  [default: 0]")]
+
+
+@verb
+def benchmark(
+    suite: Annotated[Literal["rooms"], typer.Argument(help="The suite.")] = "rooms",
+    weights: WeightsOption = None,
+    protocol: suites.ProtocolOption = None,
+    split: suites.SplitOption = None,
+    rooms: suites.RoomsOption = None,
+    kind: suites.KindOption = None,
+    views: suites.ViewsOption = None,
+    baseline: suites.BaselineOption = None,
+    depth: suites.DepthOption = None,
+    tier: suites.TierOption = None,
+    keyframes: suites.KeyframesOption = None,
+    seconds: suites.SecondsOption = None,
+    steps: suites.StepsOption = None,
+    maps: suites.MapOption = False,
+    config: suites.SuiteConfigOption = None,
+    seed: SeedOption = None,
+    out: OutOption = None,
+    json: PrintJsonOption = None,
+) -> int:
+    """Score weights on the rooms of a suite, one column a weights file, and draw a contact sheet.
+
+    Query views of rooms that nothing was trained on are rendered from source views. A run that was interrupted goes on
+    where it was. docs/benchmarks.md says what each figure means. Writes JSON, and beside it a page of HTML, the contact
+    sheet and the records of the rooms.
+
+    Example: semantic-mapper benchmark rooms --weights a.safetensors --weights b.safetensors --out runs/ab.json
+    Example: semantic-mapper benchmark rooms --baseline wide --depth off --rooms 5 --json
+    Example: semantic-mapper benchmark rooms --protocol scratch --kind semantic_nerf --rooms 3 --seconds 600
+    """
+    from semantic_mapper.nodes.cli.suite import run_suite_verb
+
+    given = {"split": split, "rooms": rooms, "protocol": protocol, "views": views, "baseline": baseline, "depth": depth}
+    given |= {"keyframes": keyframes, "steps": steps, "seconds": seconds, "seed": seed}
+    settings = suites.suite_config(config, tier, given, maps)
+    out, print_json = results_file(out, json)
+    return run_suite_verb(settings, weights or [], kind or [], maps, out, print_json=print_json)
