@@ -38,6 +38,29 @@ def resize_depth(frame: PosedFrame, intrinsics: CameraIntrinsics) -> Float32:
     return np.where(measured, depth, 0).astype(np.float32)
 
 
+class FrameViews:
+    """A frame with its colour and depth at the sizes that a step needs, each resized once. Do not write to them."""
+
+    def __init__(self, frame: PosedFrame) -> None:
+        self.frame = frame
+        self._rgb: dict[tuple[int, int], UInt8] = {}
+        self._depth: dict[tuple[int, int], Float32] = {}
+
+    def rgb(self, intrinsics: CameraIntrinsics) -> UInt8:
+        """See ``resize_rgb``."""
+        size = (intrinsics.width, intrinsics.height)
+        if size not in self._rgb:
+            self._rgb[size] = resize_rgb(self.frame, intrinsics)
+        return self._rgb[size]
+
+    def depth(self, intrinsics: CameraIntrinsics) -> Float32:
+        """See ``resize_depth``."""
+        size = (intrinsics.width, intrinsics.height)
+        if size not in self._depth:
+            self._depth[size] = resize_depth(self.frame, intrinsics)
+        return self._depth[size]
+
+
 def resize_label(label: UInt8, intrinsics: CameraIntrinsics) -> UInt8:
     """Label image at the size of ``intrinsics`` by nearest pixel."""
     size = (intrinsics.width, intrinsics.height)

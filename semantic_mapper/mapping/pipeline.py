@@ -18,7 +18,7 @@ from semantic_mapper.config import MapperConfig, with_quality
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.base import EncodedViews, SemanticField, check_classes, stack_views
 from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
-from semantic_mapper.imaging import fill_holes, resize_depth, resize_label, resize_rgb, working_intrinsics
+from semantic_mapper.imaging import FrameViews, fill_holes, resize_label, working_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.correction.corrected_map import CorrectedPoses, CorrectionStatus, MapCorrector
@@ -143,7 +143,8 @@ class MappingPipeline:
 
     def encode_anchor(self, anchor: PosedFrame) -> Keyframe:
         """A labelled keyframe that a field was finetuned on, as ``exchange_field`` takes it."""
-        return self._make_keyframe(anchor, self._encode(anchor, self._known_channel(anchor)), labelled=True)
+        resized = FrameViews(anchor)
+        return self._make_keyframe(resized, self._encode(resized, self._known_channel(anchor)), labelled=True)
 
     def exchange_field(self, field: SemanticField, anchors: Sequence[Keyframe]) -> None:
         """Go on with other weights. What is in the map stays, with the weight that it has.
@@ -172,10 +173,11 @@ class MappingPipeline:
             Pixels of the coarse view that it names as the map does, and those that are compared.
         """
         frame = self.corrector.place(frame)
-        current = self._encode(frame)
+        resized = FrameViews(frame)
+        current = self._encode(resized)
         own = [current] if self.config.keyframes.use_current_view else []
-        sources = [k.encoded for k in self._choose_sources(frame, current.size, keyframes)]
-        view = self._render(frame, [*sources, *own], self.config.render.scale, renderer)
+        sources = [k.encoded for k in self._choose_sources(resized, current.size, keyframes)]
+        view = self._render(resized, [*sources, *own], self.config.render.scale, renderer)
         low = scale_intrinsics(frame.intrinsics, view.known.shape[1], view.known.shape[0])
         seen = self.voxel_map.ray_cast(frame.T_world_camera, low)
         sure = view.known & (seen.confidence >= SURE)
@@ -205,9 +207,10 @@ class MappingPipeline:
             intrinsics=smaller,
             T_world_camera=view.T_world_camera,
         )
-        sources = self._choose_sources(frame, size)
-        rendered = self._render(frame, [k.encoded for k in sources], self.config.render.scale / fraction)
-        depth, rows, _ = self._lift(frame, rendered, self.voxel_map)
+        resized = FrameViews(frame)
+        sources = self._choose_sources(resized, size)
+        rendered = self._render(resized, [k.encoded for k in sources], self.config.render.scale / fraction)
+        depth, rows, _ = self._lift(resized, rendered, self.voxel_map)
         table = rendered.probabilities.reshape(-1, len(self.label_set)), rows
         blocks = add_votes(self.voxel_map, view.T_world_camera, smaller, depth, table, self.config.virtual)
         return VirtualLook(view, tuple(k.seq for k in sources), blocks)
@@ -215,15 +218,16 @@ class MappingPipeline:
     def _map_frame(self, frame: PosedFrame) -> MapUpdate:
         self._check(frame)
         self._stage_ms = {}
+        resized = FrameViews(frame)
         with self._stage("encode"):
-            current = self._encode(frame)
+            current = self._encode(resized)
         with self._stage("choose"):
-            sources = self._choose_sources(frame, current.size)
+            sources = self._choose_sources(resized, current.size)
         with self._stage("render"):
             own = [current] if self.config.keyframes.use_current_view else []
-            view = self._render(frame, [*(k.encoded for k in sources), *own], self.config.render.scale)
+            view = self._render(resized, [*(k.encoded for k in sources), *own], self.config.render.scale)
         with self._stage("lift"):
-            depth, rows, trust = self._lift(frame, view, self.voxel_map)
+            depth, rows, trust = self._lift(resized, view, self.voxel_map)
         table = view.probabilities.reshape(-1, len(self.label_set))
         with self._stage("fuse"):
             touched = self.voxel_map.integrate(frame, depth, table, rows=rows, trust=trust)
@@ -233,7 +237,7 @@ class MappingPipeline:
         with self._stage("keyframe"):
             is_keyframe = self.keyframes.wants(frame.T_world_camera, current.size)
             if is_keyframe:
-                keyframe = self._make_keyframe(frame, current)
+                keyframe = self._make_keyframe(resized, current)
                 self.pose_check.add(keyframe, sources, self.keyframes.keyframes)
                 self.keyframes.add(keyframe)
         self._intrinsics[frame.camera_id] = frame.intrinsics
@@ -312,10 +316,11 @@ class MappingPipeline:
         label = resize_label(anchor.label, working_intrinsics(anchor.intrinsics, width))
         return torch.from_numpy(self.label_set.to_channels(label, f"anchor seq={anchor.seq}"))[None]
 
-    def _encode(self, frame: PosedFrame, channel: torch.Tensor | None = None) -> EncodedViews:
+    def _encode(self, resized: FrameViews, channel: torch.Tensor | None = None) -> EncodedViews:
         """Encode one frame at working width, where that is not larger than the frame."""
+        frame = resized.frame
         intrinsics = working_intrinsics(frame.intrinsics, self.config.render.encode_width or frame.intrinsics.width)
-        rgb, depth = resize_rgb(frame, intrinsics), resize_depth(frame, intrinsics)
+        rgb, depth = resized.rgb(intrinsics), resized.depth(intrinsics)
         views = SourceViews(
             rgb=torch.from_numpy(rgb).permute(2, 0, 1).float().div(255)[None],
             depth_m=torch.from_numpy(depth)[None],
@@ -327,11 +332,12 @@ class MappingPipeline:
             return self.field.encode(views)
 
     def _choose_sources(
-        self, frame: PosedFrame, size: EncodedSize, keyframes: KeyframeStore | None = None
+        self, resized: FrameViews, size: EncodedSize, keyframes: KeyframeStore | None = None
     ) -> list[Keyframe]:
+        frame = resized.frame
         config = self.config.keyframes
         intrinsics = working_intrinsics(frame.intrinsics, COVERAGE_WIDTH)
-        depth = resize_depth(frame, intrinsics)
+        depth = resized.depth(intrinsics)
         count = config.source_views - (1 if config.use_current_view else 0)
         store = self.keyframes if keyframes is None else keyframes
         # Cameras of another shape have feature maps of another size; one render takes views of one size.
@@ -348,21 +354,23 @@ class MappingPipeline:
         return chosen
 
     def _render(
-        self, frame: PosedFrame, views: list[EncodedViews], scale: float, renderer: ViewRenderer | None = None
+        self, resized: FrameViews, views: list[EncodedViews], scale: float, renderer: ViewRenderer | None = None
     ) -> RenderedView:
         """The coarse view (h, w), ``scale`` times the size of the frame."""
+        frame = resized.frame
         width, height = round(frame.intrinsics.width * scale), round(frame.intrinsics.height * scale)
         if not views:
             empty = np.zeros((height, width), np.float32)
             return RenderedView(np.zeros((height, width, len(self.label_set)), np.float32), empty > 0, empty, 0, 0)
         intrinsics = scale_intrinsics(frame.intrinsics, width, height)
-        prior = self._depth_prior(frame, intrinsics)
-        rgb = resize_rgb(frame, intrinsics)
+        prior = self._depth_prior(resized, intrinsics)
+        rgb = resized.rgb(intrinsics)
         return (renderer or self._renderer).render(stack_views(views), intrinsics, frame.T_world_camera, prior, rgb)
 
-    def _depth_prior(self, frame: PosedFrame, intrinsics: CameraIntrinsics) -> Float32:
+    def _depth_prior(self, resized: FrameViews, intrinsics: CameraIntrinsics) -> Float32:
         """Where the surface is expected: the sensor's depth with its holes filled, else the map's own ray cast."""
-        depth = resize_depth(frame, intrinsics)
+        frame = resized.frame
+        depth = resized.depth(intrinsics)
         if frame.depth_m is None:
             if self.voxel_map.block_count == 0:
                 return depth
@@ -370,19 +378,20 @@ class MappingPipeline:
         return fill_holes(depth)
 
     def _lift(
-        self, frame: PosedFrame, view: RenderedView, voxel_map: VoxelMap
+        self, resized: FrameViews, view: RenderedView, voxel_map: VoxelMap
     ) -> tuple[Float32, NDArray[np.int32], Float32 | None]:
         """Full-size depth to fuse, which coarse pixel each pixel takes its probabilities from, and trust in depth."""
+        frame = resized.frame
         size = (frame.intrinsics.width, frame.intrinsics.height)
         low = scale_intrinsics(frame.intrinsics, view.known.shape[1], view.known.shape[0])
-        rgb_low, depth_low = resize_rgb(frame, low), resize_depth(frame, low)
+        rgb_low, depth_low = resized.rgb(low), resized.depth(low)
         if frame.depth_m is None:
             map_depth = voxel_map.ray_cast(frame.T_world_camera, low).depth_m
             low_trust = depth_trust(view.depth_m, map_depth, voxel_map.truncation_m)
             trust = np.asarray(cv2.resize(low_trust, size, interpolation=cv2.INTER_NEAREST), np.float32)
             depth = np.asarray(cv2.resize(view.depth_m, size, interpolation=cv2.INTER_LINEAR), np.float32)
         else:
-            depth, trust = resize_depth(frame, frame.intrinsics), None
+            depth, trust = resized.depth(frame.intrinsics), None
         return depth, upsample(view.probabilities, view.known, rgb_low, depth_low, frame.rgb, depth), trust
 
     def _at_rows(self, table: Float32, rows: NDArray[np.int32]) -> tuple[UInt8, Float32]:
@@ -392,13 +401,14 @@ class MappingPipeline:
 
     def _fuse_again(self, voxel_map: VoxelMap, fused: FusedFrame) -> None:
         view = RenderedView(fused.probabilities, fused.known, fused.rendered_depth_m, 0, 0)
-        depth, rows, trust = self._lift(fused.frame, view, voxel_map)
+        depth, rows, trust = self._lift(FrameViews(fused.frame), view, voxel_map)
         table = view.probabilities.reshape(-1, len(self.label_set))
         voxel_map.integrate(fused.frame, depth, table, rows=rows, trust=trust)
 
-    def _make_keyframe(self, frame: PosedFrame, encoded: EncodedViews, *, labelled: bool = False) -> Keyframe:
+    def _make_keyframe(self, resized: FrameViews, encoded: EncodedViews, *, labelled: bool = False) -> Keyframe:
+        frame = resized.frame
         intrinsics = working_intrinsics(frame.intrinsics, COVERAGE_WIDTH)
-        depth = resize_depth(frame, intrinsics)
+        depth = resized.depth(intrinsics)
         return Keyframe(
             frame.seq, frame.stamp_ns, frame.T_world_camera, intrinsics, depth, encoded, labelled, frame.camera_id
         )
