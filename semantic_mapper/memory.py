@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import mmap
+import os
 import resource
 import traceback
 
@@ -11,6 +13,8 @@ _SHORTAGE = ("failed to map segment", "annot allocate memory", "can't allocate m
 LARGEST = 1 << 30  # bytes: tensors of a step are smaller
 # What mapping the demo takes, libraries included: a replay fails with 5.2 GB of address space, and holds 1 GB at most.
 NEEDED_ADDRESS_SPACE_GB, NEEDED_MEMORY_GB = 6, 1.5
+_SCIPY_BYTES = 200 << 20  # of address space, for the libraries that scipy.spatial loads
+_OPENBLAS_BYTES_A_THREAD, _OPENBLAS_THREADS = 40 << 20, 64
 _MAX_REASON = 160  # letters: NumPy explains a failed import on two pages
 
 
@@ -107,3 +111,16 @@ def _is_of_import(error: BaseException) -> bool:
         return False
     files = [frame.f_code.co_filename for frame, _ in traceback.walk_tb(error.__traceback__)]
     return isinstance(error, ImportError) or any(file.startswith("<frozen importlib") for file in files)
+
+
+def check_room_for_scipy() -> None:
+    """Call it before SciPy is imported late: its OpenBLAS tries for ever where it cannot map its buffers.
+
+    Raises:
+        MemoryError: too little memory or address space is left.
+    """
+    size = _SCIPY_BYTES + _OPENBLAS_BYTES_A_THREAD * min(os.cpu_count() or 1, _OPENBLAS_THREADS)
+    try:
+        mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS).close()
+    except OSError as error:
+        raise MemoryError(f"SciPy needs {size / 1e6:.0f} MB of address space") from error

@@ -82,3 +82,19 @@ def test_a_verb_that_may_not_use_enough_memory_says_so() -> None:
     assert done.returncode == 1
     line = error_line(done.stderr)
     assert "not enough memory or address space" in line and "ulimit -v" in line and "make setup" not in line
+
+
+def test_scipy_is_not_loaded_where_its_blas_would_try_for_ever() -> None:
+    program = """
+import resource, sys
+from semantic_mapper.evaluation.splat import point_spacing
+import numpy as np
+size = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (size + (90 << 20),) * 2)
+try:
+    point_spacing(np.random.default_rng(0).random((50, 3)))
+except MemoryError as error:
+    print(error, "scipy.spatial" in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    assert done.stdout.startswith("SciPy needs ") and done.stdout.endswith("False\n"), done.stderr

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import ShapeError
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.memory import check_room_for_scipy
 from semantic_mapper.types import Float32, Float64, UInt8
 
 
@@ -202,6 +203,7 @@ def nearest_labels(
         )
     if not len(from_xyz) or not len(at_xyz):
         return np.full(len(at_xyz), label_set.ignore_id, np.uint8)
+    check_room_for_scipy()
     from scipy.spatial import KDTree  # a machine that only trains and renders has no SciPy
 
     _, nearest = KDTree(from_xyz).query(at_xyz, distance_upper_bound=max_distance_m, workers=-1)
