@@ -85,12 +85,15 @@ class Output:
         """Show something to people; what is in a text is shown as it is, on one line."""
         if self.quiet:
             return
-        for thing in things:
-            if (
-                isinstance(thing, Table) and not self.console.is_terminal
-            ):  # a pipe gets columns, without lines round them
-                thing.box, thing.pad_edge = None, False
-        self.console.print(*things, soft_wrap=True)
+        if self.console.is_terminal:
+            self.console.print(*things, soft_wrap=True)
+        else:  # a pipe gets columns, without lines round them or blanks behind them
+            for thing in things:
+                if isinstance(thing, Table):
+                    thing.box, thing.pad_edge = None, False
+            with self.console.capture() as printed:
+                self.console.print(*things, soft_wrap=True)
+            self._stream.write("\n".join(line.rstrip(" ") for line in printed.get().split("\n")))
         self._stream.flush()
 
     def json(self, data: Any) -> None:

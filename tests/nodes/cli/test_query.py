@@ -112,7 +112,7 @@ def test_json_is_printed_alone_and_an_old_file_is_still_written(map_file: Path, 
     old = run("query", map_file, "info", "--json", tmp_path / "old.json")
     assert json.loads((tmp_path / "old.json").read_text())["frames"] == 14 and "old='--json FILE'" in old.stderr
     piped = run("query", map_file, "instances").stdout
-    assert "table" in piped and not set("│┃━─") & set(piped)
+    assert "table" in piped and not set("│┃━─") & set(piped) and " \n" not in piped
 
 
 def test_what_cannot_be_asked_is_said(map_file: Path, tmp_path: Path) -> None:
