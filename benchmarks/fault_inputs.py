@@ -1,4 +1,4 @@
-"""What strangers send: a flood of garbage to a mapper, to its questions and to a pose topic; a wrong key."""
+"""What unknown clients send: a flood of garbage to a mapper, to its questions and to a pose topic; a wrong key."""
 
 from __future__ import annotations
 

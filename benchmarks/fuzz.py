@@ -1,11 +1,11 @@
-"""Coverage-guided fuzzing of all that reads what strangers send: messages, logs, questions, answers, poses.
+"""Coverage-guided fuzzing of all that reads what unknown clients send: messages, logs, questions, answers, poses.
 
 Each target runs in a process of its own under atheris (libFuzzer), which is no dependency of the project: `uv pip
 install atheris`. Whatever is raised beside ``SemanticMapperError`` ends it with a crash, as does more than --memory-mb.
 
 Example: python -m benchmarks.fuzz --minutes 10 --out runs/fuzz
 
-With --frames, values instead of bytes are spoiled: so many frames go through the whole step of the mapper, in this
+With --frames, values instead of bytes are spoiled: this many frames go through the whole step of the mapper, in this
 process and without atheris; see ``fuzz_values``.
 
 Example: python -m benchmarks.fuzz --frames 100000 --out runs/fuzz
@@ -128,7 +128,7 @@ def main() -> None:
     parser.add_argument("--targets", nargs="+", default=["message", "log", "question", "answer", "pose"])
     parser.add_argument("--memory-mb", type=int, default=2048, help="a process that takes more has failed")
     parser.add_argument("--out", type=Path, default=Path("runs/fuzz"), help="corpora, crashes, report.json")
-    parser.add_argument("--frames", type=int, help="spoil the values of so many frames instead of bytes")
+    parser.add_argument("--frames", type=int, help="spoil the values of this many frames instead of bytes")
     parser.add_argument("--seed", type=int, default=0, help="of the values")
     arguments = parser.parse_args()
     out = arguments.out.absolute()

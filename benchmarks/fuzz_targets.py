@@ -1,4 +1,5 @@
-"""What strangers may send us, and how to spoil it: good inputs, mutations that keep their structure, and the readers.
+"""What unknown clients may send us, and how to spoil it: good inputs, mutations that keep their structure, and the
+readers.
 
 Inputs are plain bytes: a message is a payload of ``framing.pack_parts``, a log is its file. Mutations take a source of
 chance and a way to spoil bytes, so that a fuzzer can bring its own.

@@ -253,7 +253,7 @@ class FrameMaker:
 
 
 def run(frames: int, seed: int = 0, on_progress: Callable[[Report], None] | None = None) -> Report:
-    """Send so many frames through a session.
+    """Send this many frames through a session.
 
     Args:
         frames: How many.

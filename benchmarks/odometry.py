@@ -99,7 +99,7 @@ def main() -> None:
     parser.add_argument("log", type=Path)
     parser.add_argument("--config", type=Path, help="TOML with settings of the odometry (drivers/poses/config.py)")
     parser.add_argument("--max-frames", type=int, default=0, help="0 = all")
-    parser.add_argument("--every", type=int, default=1, help="use every so many frames")
+    parser.add_argument("--every", type=int, default=1, help="use every n frames")
     parser.add_argument("--picture", type=Path, help="PNG with both paths from above")
     parser.add_argument("--write", type=Path, help="log with the odometry's poses, to be mapped like any other")
     parser.add_argument("--json", type=Path, help="the figures, for programs")

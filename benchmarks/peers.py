@@ -121,7 +121,7 @@ def train(name: str, out: Path, budget: Budget) -> int:
     folder = out / name
     state, config, wanted = folder / STATE_FILE, folder / "recipe.toml", recipe(name, budget)
     if state.is_file() and tomllib.loads(config.read_text(encoding="utf-8")) != tomllib.loads(wanted):
-        print(f"{name}: {config} differs from what is asked for (--seed, --steps?); take another --out", flush=True)
+        print(f"{name}: {config} differs from what is requested (--seed, --steps?); take another --out", flush=True)
         return 1
     if finished(folder):
         print(f"{name}: done", flush=True)

@@ -91,7 +91,7 @@ def _check_what_it_cannot_do_is_told() -> None:
     with _vivid(fourcc="MJPG") as camera:
         next(iter(camera))
         print(camera.warnings)
-        assert any("asked for pixels as MJPG, it gives" in t for t in camera.warnings)
+        assert any("requested pixels as MJPG, it gives" in t for t in camera.warnings)
     refused = ""
     try:
         with _vivid(calibration=_calibration(650, 490)):

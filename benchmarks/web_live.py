@@ -25,7 +25,7 @@ WIDTH, HEIGHT = 1500, 1000
 FRAMES, HZ = 60, 1.0  # slow, because the browser renders without a GPU beside it
 CAMERA = CameraIntrinsics(220.0, 220.0, 159.5, 119.5, 320, 240)
 LOOK_S = 4.0
-GROWTH = 1.2  # the map comes to so many times the pixels of the first one seen, before the eye moves back in the end
+GROWTH = 1.2  # the map comes to this many times the pixels of the first one seen, before the eye moves back in the end
 
 
 def look_at_live(out: Path, log: Path | None, weights: Path | None) -> list[str]:

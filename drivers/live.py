@@ -57,7 +57,7 @@ class Device(Protocol):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What it does otherwise than asked."""
+        """What it does other than requested."""
         ...
 
     def read(self) -> Shot | None:

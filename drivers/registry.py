@@ -1,4 +1,4 @@
-"""Kinds of cameras by name. Each is a package ``drivers.<kind>`` that is loaded when it is asked for.
+"""Kinds of cameras by name. Each is a package ``drivers.<kind>`` that is loaded when it is requested.
 
 A package offers ``Config``, ``open_camera(config, camera_id)`` and ``list_devices()``; see ``Driver``.
 """

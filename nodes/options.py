@@ -83,7 +83,7 @@ class CameraOptions(Config, frozen=True):
 
     @property
     def live(self) -> bool:
-        """Whether frames come when they come, whoever listens: only then may a node be away for a moment."""
+        """Whether frames come when they come, no matter who listens: only then may a node be away for a moment."""
         return self.camera is not None or self.mode == "realtime"
 
 
@@ -102,7 +102,7 @@ class MapperOptions(Config, frozen=True):
     voxel_size_m: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0  # 0 = what the config says
     eval_exclude: str = ""  # weights whose finetuning frames are left out of the scores, too
     rerun: str = ""  # write a Rerun recording there; empty = none
-    # Also write the map of the moment to ``map.npz`` in ``out`` every so many seconds, beside mapping: what a killed
+    # Also write the map of the moment to ``map.npz`` in ``out`` every n seconds, beside mapping: what a killed
     # process leaves. It costs one frame the time to copy what it touches (some 20 ms), and the next ones up to half of
     # a core while it is written. 0 = only at the end.
     save_every_s: Annotated[float, msgspec.Meta(ge=0)] = 0.0
@@ -146,7 +146,7 @@ class RecorderOptions(Config, frozen=True):
     overwrite: bool = False  # replace a log that is there; where there are splits, with all its parts
     source_timeout_s: Positive = 180.0  # how long the others may take to start
     split_mb: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # a new part before one grows beyond this; 0 = any size
-    split_s: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # a new part after so many seconds; 0 = any time
+    split_s: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # a new part after this many seconds; 0 = any time
     # Where the disk is full: "stop" recording, or "delete-oldest" parts of this recording. The other nodes go on.
     disk_full: Literal["stop", "delete-oldest"] = "stop"
     reserve_mb: Annotated[float, msgspec.Meta(ge=0)] = 500.0  # so much of the disk is left free: then it counts as full
@@ -219,9 +219,9 @@ class NodeJob(Config, frozen=True):
     name: str
     options: dict[str, Any]
     endpoints: dict[str, str] = msgspec.field(default_factory=dict)  # by node name
-    subscribers: Count = 1  # a camera waits for so many before its first frame
+    subscribers: Count = 1  # a camera waits for this many before its first frame
     heartbeat_fd: int = -1  # where to tell that it lives; -1 = nowhere
     restarts: Count = 0  # how often it was restarted
     restartable: bool = False  # it restarts where it fails: its failure is no end of its stream
     folder: str = ""  # of the launch; a node leaves notes there for the process that replaces it
-    orphan_timeout_s: Count = 120  # without its launcher, it has so many seconds to write its results
+    orphan_timeout_s: Count = 120  # without its launcher, it has this many seconds to write its results

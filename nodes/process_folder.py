@@ -1,4 +1,4 @@
-"""Folders of one process under TMPDIR, and how those that a killed one has left are told from those in use.
+"""Folders of one process under TMPDIR, and how those that a killed one has left are distinguished from those in use.
 
 A lock in the folder says so, not the process number in its name: containers that share /tmp count theirs by themselves.
 """

@@ -36,7 +36,7 @@ OVERVIEW_FRAMES = 2
 # Surface points that a map has at least for each of its blocks, else it is nearly empty. With sensor depth they are 25
 # to 33 in the demo, 64 where a flat surface goes through each; with rendered depth that does not agree 0 to 1.
 MIN_POINTS_A_BLOCK = 2
-MAX_LISTED = 50  # refused frames, refused labels and damages: the first ones are told in the summary
+MAX_LISTED = 50  # refused frames, refused labels and damages: the first ones are reported in the summary
 PACKAGES = ("torch", "open3d", "numpy", "opencv-contrib-python-headless", "pyzmq", "msgpack", "mcap")
 
 

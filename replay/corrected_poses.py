@@ -58,7 +58,7 @@ def read_corrections(path: Path) -> Trajectory:
 
 
 def keeping_frames(config: MapperConfig, frames: int) -> MapperConfig:
-    """The config with a history that holds a log of so many frames, where it says nothing else."""
+    """The config with a history that holds a log of this many frames, where it says nothing else."""
     if config.history.max_frames:
         return config
     # One segment for all: none will leave, and so nothing has to be kept of what the map was before.

@@ -49,7 +49,7 @@ class BoundedLog(Generic[ItemT]):
             self.first.append(item)
 
     def skip(self, count: int) -> None:
-        """Count so many more, of which nothing is known."""
+        """Count this many more, of which nothing is known."""
         self._count += count
 
 
@@ -80,6 +80,6 @@ class LatencyHistogram:
         return low + (high - low) * (rank - math.floor(rank))
 
     def _ranked(self, rank: int) -> float:
-        """About the time that so many are shorter than."""
+        """About the time that this many are shorter than."""
         at = int(np.searchsorted(np.cumsum(self._counts), rank, side="right"))
         return min(max(SHORTEST_MS * BIN_GROWTH ** (at + 0.5), self._least), self._most)

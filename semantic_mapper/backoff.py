@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def backoff_s(failures: int, first_s: float, max_s: float) -> float:
-    """Pause after so many failures in a row: ``first_s`` after the first, twice as long after each further one.
+    """Pause after this many failures in a row: ``first_s`` after the first, twice as long after each further one.
 
     Args:
         failures: From 1.

@@ -181,7 +181,7 @@ class VoxelMapConfig(Config, frozen=True):
 class HistoryConfig(Config, frozen=True):
     """Fused frames kept on disk, so that the map can follow corrected poses (loop closures)."""
 
-    # Corrections reach the last so many frames, and at times up to an eighth more; older ones stay in the map where
+    # Corrections reach the last this many frames, and at times up to an eighth more; older ones stay in the map where
     # they are. 0 = keep none.
     max_frames: NotNegative = 0
     # In the folder for temporary files, for frames and for what the map was before each eighth of them (the blocks that
@@ -192,7 +192,7 @@ class HistoryConfig(Config, frozen=True):
 class VirtualViewConfig(Config, frozen=True):
     """Views from where no camera stood, rendered from keyframes, that add class votes where the map is in doubt."""
 
-    # After every so many frames, in time that ``render.target_hz`` knows nothing of; 0 = only where asked for.
+    # After every n frames, in time that ``render.target_hz`` knows nothing of; 0 = only where asked for.
     every_n_frames: NotNegative = 0
     views: Annotated[int, msgspec.Meta(ge=1, le=64)] = 1  # at a time
     weight: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.3  # of their votes, against those of a frame

@@ -2,7 +2,7 @@
 
 What is written goes to a new file beside the one that it becomes, under a name that nobody can foresee, and takes its
 place in one step (``rename``): an existing link is replaced, never written through. The new file is locked while it is
-written, so that what a killed process has left can be told from what another one is about to finish.
+written, so that what a killed process has left can be distinguished from what another one is about to finish.
 """
 
 from __future__ import annotations
@@ -189,7 +189,7 @@ def _remove_unlocked(path: str) -> bool:
 
 @contextmanager
 def _explained(path: Path, raises: type[SemanticMapperError] | None) -> Iterator[None]:
-    """Errors of the unfinished file are told as those of ``path``."""
+    """Errors of the unfinished file are reported as those of ``path``."""
     try:
         yield
     except OSError as error:

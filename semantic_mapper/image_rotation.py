@@ -11,7 +11,7 @@ from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
 
 def rotate_intrinsics(intrinsics: CameraIntrinsics, quarters: int) -> CameraIntrinsics:
-    """Intrinsics of an image that was turned clockwise by so many quarters of a full turn.
+    """Intrinsics of an image that was turned clockwise by this many quarters of a full turn.
 
     Raises:
         FrameError: an image that is not rectified.
@@ -25,7 +25,7 @@ def rotate_intrinsics(intrinsics: CameraIntrinsics, quarters: int) -> CameraIntr
 
 
 def rotate_frame(frame: PosedFrame, quarters: int) -> PosedFrame:
-    """The frame with its images turned clockwise by so many quarters of a full turn, and its pose and intrinsics with
+    """The frame with its images turned clockwise by this many quarters of a full turn, and its pose and intrinsics with
     them: every pixel keeps its ray in the world.
 
     Raises:

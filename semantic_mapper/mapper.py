@@ -42,7 +42,7 @@ class Mapper:
             config: Settings, or a TOML file of them; None = the defaults.
 
         Raises:
-            ConfigError: a setting cannot be used, or a GPU is asked for that is not there.
+            ConfigError: a setting cannot be used, or a GPU is requested that is not there.
             WeightsError: missing, damaged or foreign weights.
         """
         if not isinstance(config, MapperConfig):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from semantic_mapper.drivers.calibrating.config import CalibrationConfig
 from semantic_mapper.types import Float64
 
-CELLS = 6  # a side; the image is divided into so many cells
+CELLS = 6  # a side; the image is divided into this many cells
 REGIONS = ("top left", "top", "top right", "left", "middle", "right", "bottom left", "bottom", "bottom right")
 _ACROSS = 3  # regions a side
 _SEEN_CELLS = 2  # of the four of a region that must have corners in them
@@ -44,24 +44,24 @@ def shortfalls(
     """What is missing for a calibration that can be believed, as sentences that say what to do.
 
     Args:
-        config: What is asked for.
+        config: What is requested.
         views: How many there are.
         counts: See ``area_counts``.
         tilts: (N, 2) degrees; None where they are not known yet.
     """
-    told: list[str] = []
+    lacks: list[str] = []
     if views < config.min_views:
-        told.append(f"{views} views that differ from each other, {config.min_views} are needed: move the board about")
+        lacks.append(f"{views} views that differ from each other, {config.min_views} are needed: move the board about")
     missing = missing_regions(counts)
     if missing:
-        told.append(f"the board was not seen in these parts of the image: {', '.join(missing)}; hold it there, too")
+        lacks.append(f"the board was not seen in these parts of the image: {', '.join(missing)}; hold it there, too")
     if tilts is None:
-        return tuple(told)
+        return tuple(lacks)
     steepest = np.abs(tilts).max(axis=0) if len(tilts) else np.zeros(2)
     for name, most in zip(("up or down", "to the left or right"), steepest, strict=True):
         if most < config.min_tilt_deg:
-            told.append(
+            lacks.append(
                 f"the board never leaned {name} by {config.min_tilt_deg:g} degrees (at most {most:.0f}); without that "
-                "the focal length cannot be told from the distance"
+                "the focal length cannot be distinguished from the distance"
             )
-    return tuple(told)
+    return tuple(lacks)

@@ -153,12 +153,12 @@ def _calibrate(views: Sequence[BoardView], size: tuple[int, int], config: Calibr
     except FrameError as error:
         raise CameraError(f"the views lead to an impossible camera: {error}; are board and its sizes right?") from error
     names = ("fx", "fy", "cx", "cy", *COEFFICIENT_NAMES[: config.coefficients])
-    told: dict[str, float] = dict(zip(names, (float(v) for v in np.ravel(sigmas)), strict=False))
+    sigma_by_name: dict[str, float] = dict(zip(names, (float(v) for v in np.ravel(sigmas)), strict=False))
     vectors = [
         np.concatenate((np.ravel(r), np.ravel(t))).astype(np.float64) for r, t in zip(turns, shifts, strict=True)
     ]
     residuals = [v.pixels - _project(v.points, pose, intrinsics) for v, pose in zip(views, vectors, strict=True)]
-    return _gather(intrinsics, True, told, views, residuals, [pose_of_vector(v) for v in vectors])
+    return _gather(intrinsics, True, sigma_by_name, views, residuals, [pose_of_vector(v) for v in vectors])
 
 
 def _gather(

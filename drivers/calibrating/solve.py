@@ -17,7 +17,7 @@ class Calibration:
     """All that came out.
 
     Args:
-        cameras: By name; rig: None where it was not asked for.
+        cameras: By name; rig: None where it was not requested.
     """
 
     cameras: dict[str, CameraCalibration]

@@ -112,7 +112,7 @@ class OakCamera:
         """Images in the order of capture, until ``stop``; a device that goes away is waited for.
 
         Raises:
-            CameraError: what comes is not what was asked for.
+            CameraError: what comes is not what was requested.
         """
         while not self._stopped.is_set():
             self._last_poll_time = time.monotonic()
@@ -221,9 +221,9 @@ class OakCamera:
             CameraError, StreamEnded: there is no image, or neither says anything.
         """
         messages = stream.first(self._stopped)
-        told = None if messages is None else reported_intrinsics(messages[0])
+        reported = None if messages is None else reported_intrinsics(messages[0])
         self._say("geometry", "" if messages is None else geometry_trouble(*messages))
-        return told or read_intrinsics(stream.sources.calibration, config.rgb, config.width, config.height)
+        return reported or read_intrinsics(stream.sources.calibration, config.rgb, config.width, config.height)
 
     def _close(self) -> None:
         stream, odometry = self._stream, self._odometry

@@ -16,7 +16,7 @@ Height = Annotated[int, msgspec.Meta(ge=48, multiple_of=2)]
 
 
 class Config(semantic_mapper.config.Config, frozen=True):
-    """An OAK: one colour camera, depth of a stereo pair aligned to it, odometry where it is asked for."""
+    """An OAK: one colour camera, depth of a stereo pair aligned to it, odometry where it is requested."""
 
     old_names: ClassVar = {"other_world": "on_tracking_reset"}
     old_values: ClassVar = {"on_tracking_reset": {"end": "exit"}}
@@ -41,8 +41,8 @@ class Config(semantic_mapper.config.Config, frozen=True):
     # pose.
     odometry: bool = False
     odometry_wait_s: Positive = 0.3  # how long an image waits for its pose; then it goes without
-    # Where a camera with odometry was away: go on with images that have no pose, or end the node, so that whoever
-    # watches over the launch starts it again with a new map.
+    # Where a camera with odometry was away: go on with images that have no pose, or end the node, so that the program
+    # that watches over the launch starts it again with a new map.
     on_tracking_reset: Literal["no-poses", "exit"] = "no-poses"
     # JSON file (as DepthAI writes it) in place of the calibration that is stored on the device.
     calibration: str = ""

@@ -219,6 +219,6 @@ class ImageMaker:
         if (width, height) != (self._intrinsics.width, self._intrinsics.height):
             raise CameraError(
                 f"the {what} of camera '{self._camera_id}' is {width}x{height}, but "
-                f"{self._intrinsics.width}x{self._intrinsics.height} was asked for: choose a `width` and `height` that "
+                f"{self._intrinsics.width}x{self._intrinsics.height} was requested: choose a `width` and `height` that "
                 "this device can give"
             )

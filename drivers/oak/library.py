@@ -20,7 +20,8 @@ def load_depthai() -> Any:
     # Its handler of signals would end the process where writing to a full disk is an error to be told (SIGXFSZ), and
     # print a trace of its own in the place of Python's. Who wants it sets the variable to 1.
     os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")
-    # A robot does not report to its maker unless it is told to, and leaves no files for that in its working folder.
+    # A robot does not report to its maker unless it is instructed to, and leaves no files for that in its working
+    # folder.
     os.environ.setdefault("DEPTHAI_TELEMETRY", "0")
     os.environ.setdefault("DEPTHAI_DISABLE_STARTUP_NOTIFICATIONS", "1")
     try:

@@ -128,7 +128,7 @@ class Odometry:
                     self._track_pair(pair)
         except StreamEnded:  # the reader of the images says so
             pass
-        except Exception as error:  # noqa: BLE001 -- whatever it is, it must be told where the images are read
+        except Exception as error:  # noqa: BLE001 -- whatever it is, it must be reported where the images are read
             self._error = error
 
     def _track_pair(self, pair: Any) -> None:

@@ -154,9 +154,11 @@ class PoseChecks(Config, frozen=True):
     max_turn_deg_s: Positive = 360.0
     slack_m: AtLeastZero = 0.05  # a pose may be off by so much at any rate
     slack_deg: AtLeastZero = 3.0
-    # A camera's first frames are held back until so many of their poses agree with each other (and are given then): one
+    # A camera's first frames are held back until this many of their poses agree with each other (and are given then):
+    # one
     # wrong pose, such as a robot's before it knows where it is, is no place to go on from. 1 = the first is believed.
     init_consensus: AtLeastOne = 5
-    # After a jump, so many poses in a row that agree with each other are taken for true. 0 = none: a source that begins
+    # After a jump, this many poses in a row that agree with each other are taken for true. 0 = none: a source that
+    # begins
     # in another world would spoil the map. One that jumps back, or that was only a little too quick, passes again.
     relocalize_after: NotNegative = 0

@@ -33,7 +33,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 _LEAST_DEPTH = 0.05  # fraction of the pixels that need depth
-_POINTS_A_VOTE = 50  # neighbouring points have the same error: so many tell as much as one
+_POINTS_A_VOTE = 50  # neighbouring points have the same error: that many tell as much as one
 _RECENT_NS = 700_000_000  # after so long without a pose the last motion says nothing any more
 
 _log = get_logger(__name__)
@@ -165,7 +165,7 @@ class OdometryPoseSource:
         return sorted(guesses, key=lambda g: fit(view.levels, g[1][0].target, g[0], self._config.outlier_m).cost_m)
 
     def _guesses_while_lost(self, view: _View) -> list[tuple[Float64, list[OdometryKeyframe]]]:
-        """What corners say of keyframes near the last pose, then of the others, so many an image in turn."""
+        """What corners say of keyframes near the last pose, then of the others, this many an image in turn."""
         last = self._past[-1]
         near = self._map.near(last.T, self._config.neighbours)
         guesses: list[tuple[Float64, list[OdometryKeyframe]]] = []

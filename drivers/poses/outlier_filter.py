@@ -13,7 +13,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import PosedFrame
 
 FAR = 2.0  # times what is allowed: a jump, whatever comes after it
-HELD = 3  # times ``init_consensus``: so many frames are held back at most while the first poses do not agree
+HELD = 3  # times ``init_consensus``: this many frames are held back at most while the first poses do not agree
 
 _log = get_logger(__name__)
 
@@ -199,7 +199,7 @@ def _allowed(checks: PoseChecks, seconds: float) -> tuple[float, float]:
 
 
 def _jump(checks: PoseChecks, a: StampedPose, b: StampedPose, times: float = 1.0) -> str:
-    """Why b cannot have been reached from a, with so many times the limits; empty where it can."""
+    """Why b cannot have been reached from a, with this many times the limits; empty where it can."""
     moved_m, turned_deg, seconds = _way(a, b)
     allowed_m, allowed_deg = (times * limit for limit in _allowed(checks, seconds))
     if moved_m <= allowed_m and turned_deg <= allowed_deg:

@@ -16,7 +16,7 @@ def open_camera(config: Config, camera_id: str = "camera") -> LiveCamera:
     """A camera that is opened when it is entered; see ``drivers/registry.py``.
 
     Raises:
-        CameraError: no device or no calibration is named, or the calibration is for another size than asked for.
+        CameraError: no device or no calibration is named, or the calibration is for another size than requested.
         ConfigError: the calibration cannot be read.
     """
     if not config.device:

@@ -19,10 +19,10 @@ class Config(config.Config, frozen=True):
     device: str = ""  # /dev/v4l/by-id/..., as `semantic-mapper cameras` lists it; has to be given
     calibration: str = ""  # file; see drivers/calibration.py
     uncalibrated: bool = False  # images as the lens gives them, for calibrating only
-    width: NotNegative = 0  # uncalibrated: of the images asked for; 0 = as the device has it
+    width: NotNegative = 0  # uncalibrated: of the requested images; 0 = as the device has it
     height: NotNegative = 0
-    fps: Positive = 30.0  # asked for; what the device gives instead is told
-    # Pixel format asked for, four letters. MJPG passes through USB at full rate; YUYV is without artefacts. Empty = as
+    fps: Positive = 30.0  # asked for; what the device gives instead is reported
+    # Pixel requested format, four letters. MJPG passes through USB at full rate; YUYV is without artefacts. Empty = as
     # the device has it.
     fourcc: Annotated[str, msgspec.Meta(pattern=r"^(.{4}|)\Z")] = "MJPG"
     # 0 = automatic; a short one blurs less while the robot moves

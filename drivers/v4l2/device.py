@@ -1,4 +1,4 @@
-"""One open V4L2 device: asked for size, rate and pixel format, and what it gives instead is read back."""
+"""One open V4L2 device: requested size, rate and pixel format, and what it gives instead is read back."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class V4l2Device:
         if config.fourcc and given != config.fourcc:
             more = ", ..." if len(formats) > SHOWN_FORMATS else ""
             offer = f"; it offers {', '.join(formats[:SHOWN_FORMATS])}{more}" if formats else ""
-            self._warnings += (f"asked for pixels as {config.fourcc}, it gives {given}{offer}",)
+            self._warnings += (f"requested pixels as {config.fourcc}, it gives {given}{offer}",)
         if abs(self.frame_hz - config.fps) > RATE_TOLERANCE * config.fps:
             self._warnings += (
                 f"asked for {config.fps:g} images/s, it gives {self.frame_hz:g} at this size and format",

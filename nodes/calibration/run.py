@@ -55,13 +55,15 @@ class Gathering:
 
     def lacks(self, *, rig: bool) -> list[str]:
         """What is still missing, as sentences with the camera's name."""
-        told = [f"{name}: {lack}" for name, views in list(self.cameras.items()) for lack in views.lacks()]
+        lacks_text = [f"{name}: {lack}" for name, views in list(self.cameras.items()) for lack in views.lacks()]
         if rig:
             shared = len(simultaneous({n: list(v.steady) for n, v in list(self.cameras.items())}, self._config))
             needed = self._config.min_instants + SPARE_INSTANTS
             if shared < needed:
-                told.append(f"{shared} moments at which several cameras saw the board held still; {needed} are awaited")
-        return told
+                lacks_text.append(
+                    f"{shared} moments at which several cameras saw the board held still; {needed} are awaited"
+                )
+        return lacks_text
 
     def _take_all(self, source: Source, advance: Callable[[], None], stop: StopRequest) -> None:
         for name, image in source.images():

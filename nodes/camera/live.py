@@ -163,7 +163,7 @@ def _open(context: NodeContext, live: LiveCamera, reporter: _StatusReporter, sta
     Raises:
         CameraError: it could not be opened within ``live.open_s``.
     """
-    began, failures, told = time.monotonic(), 0, ""
+    began, failures, last_error = time.monotonic(), 0, ""
     while not context.stop:
         source = make_source(live)
         try:
@@ -172,9 +172,9 @@ def _open(context: NodeContext, live: LiveCamera, reporter: _StatusReporter, sta
         except CameraError as error:
             if live.open_s and time.monotonic() - began > live.open_s:
                 raise
-            if str(error) != told:
+            if str(error) != last_error:
                 _log.warning("camera_not_open", reason=str(error))
-            told = reporter.waiting_for = str(error)
+            last_error = reporter.waiting_for = str(error)
         else:
             reporter.watch(source)
             return source

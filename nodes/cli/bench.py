@@ -30,7 +30,7 @@ class Part(StrEnum):
 
 
 QUICK = (Part.RENDER, Part.FUSION, Part.PIPELINE)  # what "all" stands for
-RepeatsOption = Annotated[int, typer.Option(min=1, help="render: best of so many runs of all but the reference.")]
+RepeatsOption = Annotated[int, typer.Option(min=1, help="render: best of this many runs of all but the reference.")]
 FramesOption = Annotated[
     int, typer.Option(min=1, help="fusion, pipeline, growth, queries, depthless: frames that count.")
 ]

@@ -28,7 +28,7 @@ class Asked(NamedTuple):
     ms: float
 
 
-def ask_when_told(told: Connection, endpoint: str, eyes: Float64, rate_hz: float) -> None:
+def query_on_command(told: Connection, endpoint: str, eyes: Float64, rate_hz: float) -> None:
     """Ask everything once, uncounted, and say ``READY``; then answer every ``ASK`` with ``ASKING`` and begin.
 
     Before ``ASKING`` a few questions pass uncounted, so that the mapper has brought its mirror up to date. ``REST`` is

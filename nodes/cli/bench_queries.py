@@ -22,7 +22,7 @@ from semantic_mapper.errors import TransportError
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.nodes.cli.bench_client import ASK, ASKING, KINDS, READY, REST, Asked, ask_when_told
+from semantic_mapper.nodes.cli.bench_client import ASK, ASKING, KINDS, READY, REST, Asked, query_on_command
 from semantic_mapper.nodes.mapper.query_answers import Question
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from semantic_mapper.replay.bench.fusion import STEP_M, WARM_UP
@@ -193,7 +193,7 @@ class _Asker:
 def _asker(service: QueryService, eyes: np.ndarray, rate_hz: float) -> Iterator[_Asker]:
     context = get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=ask_when_told, args=(theirs, service.endpoint, eyes, rate_hz), daemon=True)
+    process = context.Process(target=query_on_command, args=(theirs, service.endpoint, eyes, rate_hz), daemon=True)
     process.start()
     theirs.close()
     try:

@@ -18,7 +18,7 @@ def cameras(
 ) -> None:
     """List the cameras that are connected, with the address that a launch file or a config names them by.
 
-    Video files and streams (kind opencv) are named, not found. A kind whose packages are missing is told, too.
+    Video files and streams (kind opencv) are named, not found. A kind whose packages are missing is reported, too.
 
     Example: semantic-mapper cameras
     Example: semantic-mapper cameras --kind v4l2 --json

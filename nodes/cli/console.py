@@ -33,7 +33,7 @@ from semantic_mapper.plain_text import visible
 _log = structlog.get_logger(__name__)
 
 PIPED_WIDTH = 10_000  # columns of what is no terminal: nothing is wrapped or cut there
-LOG_PERIOD_S = 15.0  # how often progress is told where there is no terminal to draw a bar on
+LOG_PERIOD_S = 15.0  # how often progress is logged where there is no terminal to draw a bar on
 
 
 class PlainConsole(Console):
@@ -69,7 +69,7 @@ class Output:
 
     def __init__(self, stream: TextIO) -> None:
         self.console = PlainConsole(stream)
-        self.quiet = False  # ``print`` shows nothing: for verbs that were asked for JSON alone
+        self.quiet = False  # ``print`` shows nothing: for verbs that were requested JSON alone
         self._stream = stream
 
     @classmethod
@@ -126,11 +126,11 @@ class FrameProgress:
         self._progress.reset(self._task, total=total, description=self._what)
 
     def advance(self, count: int = 1) -> None:
-        """So many more are done."""
+        """This many more are done."""
         self.set(self._done + count)
 
     def set(self, done: int, note: str = "") -> None:
-        """So many are done by now; ``note`` replaces the text beside the bar."""
+        """This many are done by now; ``note`` replaces the text beside the bar."""
         self._done = done
         changes: dict[str, Any] = {"note": note} if note else {}
         self._progress.update(self._task, completed=done, **changes)

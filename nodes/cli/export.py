@@ -43,7 +43,7 @@ def export(
     resolution: Annotated[float | None, typer.Option(help="grid: side of a cell in metres.  [default: 0.05]")] = None,
     floor: Annotated[float | None, typer.Option(help="grid: height of the floor; found when not given.")] = None,
     camera: Annotated[str, typer.Option(help="Logs: the frames of this camera only.")] = "",
-    max_frames: Annotated[int, typer.Option(min=0, help="Logs: stop after so many; 0 = all.")] = 0,
+    max_frames: Annotated[int, typer.Option(min=0, help="Logs: stop after this many; 0 = all.")] = 0,
 ) -> None:
     """Write a saved map, or a log, in a format of other programs.
 

@@ -34,7 +34,7 @@ def choose_keyframes(
 
     Args:
         path: The log.
-        count: Of its labelled frames, so many that together show most of what it shows, where nothing names others.
+        count: Of its labelled frames, this many that together show most of what it shows, where nothing names others.
         frames: By number in the log.
         images: Folder of label images NNNNNN.png in place of the log's, each named by the number of its frame, with a
             labels.json or in the log's classes; without ``frames``, those are meant that have one.

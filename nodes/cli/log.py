@@ -25,12 +25,12 @@ def import_(
         Literal["folder", "tum", "scannet", "replica", "kitti360"] | None,
         typer.Option(help="Found out when not given."),
     ] = None,
-    max_frames: Annotated[int, typer.Option(min=0, help="Stop after so many; 0 = all.")] = 0,
+    max_frames: Annotated[int, typer.Option(min=0, help="Stop after this many; 0 = all.")] = 0,
     rename: Annotated[
         Path | None, typer.Option(help='TOML: [classes] couch = "sofa", ...; classes that get one name become one.')
     ] = None,
     rotate: Annotated[
-        Literal["0", "90", "180", "270"], typer.Option(help="Turn every image clockwise by so many degrees.")
+        Literal["0", "90", "180", "270"], typer.Option(help="Turn every image clockwise by this many degrees.")
     ] = "0",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a log that is there.")] = False,
 ) -> None:

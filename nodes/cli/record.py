@@ -34,7 +34,7 @@ def record(
     ] = None,
     duration: Annotated[float, typer.Option(min=0, help="Seconds; 0 = to the end of the stream, or Ctrl-C.")] = 0.0,
     split_mb: Annotated[float, typer.Option(min=0, help="Begin a new part before one grows beyond this.")] = 0.0,
-    split_s: Annotated[float, typer.Option(min=0, help="Begin a new part after so many seconds.")] = 0.0,
+    split_s: Annotated[float, typer.Option(min=0, help="Begin a new part after this many seconds.")] = 0.0,
     on_disk_full: Annotated[
         Literal["stop", "delete-oldest"], typer.Option(help="Stop, or delete the oldest parts of this recording.")
     ] = "stop",

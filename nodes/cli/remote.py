@@ -20,7 +20,7 @@ KeysOption = Annotated[
 
 
 def default_folder() -> Path:
-    """Where this user's keys lie unless told otherwise."""
+    """Where this user's keys lie unless set otherwise."""
     return Path(typer.get_app_dir("semantic-mapper")) / "keys"
 
 

@@ -18,7 +18,7 @@ WeightsOption = Annotated[
 VoxelSizeOption = Annotated[
     float | None, typer.Option("--voxel-size", min=0.002, max=1.0, help="Edge of a voxel in metres.  [default: 0.02]")
 ]
-MaxFramesOption = Annotated[int, typer.Option("--max-frames", min=0, help="Stop after so many; 0 = all.")]
+MaxFramesOption = Annotated[int, typer.Option("--max-frames", min=0, help="Stop after this many; 0 = all.")]
 QualityOption = Annotated[
     Literal["fast", "balanced", "reference"] | None,
     typer.Option("--quality", help="Rays and samples: fewer, some or all; without it as --config says."),

@@ -27,7 +27,7 @@ from semantic_mapper.replay.bench.walk import SLOPE_MINUTES, WalkPlan, bench_wal
 
 @dataclass(frozen=True, slots=True)
 class RenderRequest:
-    """Best of ``repeats`` over so many views, of a labelled ``log`` or (None) of test rooms."""
+    """Best of ``repeats`` over this many views, of a labelled ``log`` or (None) of test rooms."""
 
     repeats: int
     views: int
@@ -36,7 +36,7 @@ class RenderRequest:
 
 @dataclass(frozen=True, slots=True)
 class QueriesRequest:
-    """So many questions a second, while images of this width are mapped."""
+    """This many questions a second, while images of this width are mapped."""
 
     rate_hz: float
     width: int

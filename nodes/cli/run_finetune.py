@@ -24,7 +24,7 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class FinetuneRequest:
-    """What the verb was asked for; ``weights`` None = those in the package, ``from_scratch`` = random ones."""
+    """What the verb was requested; ``weights`` None = those in the package, ``from_scratch`` = random ones."""
 
     log: Path
     keyframes: int
@@ -79,7 +79,7 @@ def choose_labelled(
     """The labelled frames that show most of what the log shows.
 
     Raises:
-        LogError: fewer usable labelled frames than asked for.
+        LogError: fewer usable labelled frames than requested.
         KeyboardInterrupt: a stop request came.
     """
     candidates, numbers = [], []

@@ -58,13 +58,13 @@ def replay_log(
 ) -> dict[str, Any]:
     """Map a log and write summary, map and picture; after a stop request, those of the frames so far.
 
-    Damaged frames of the log and frames that the mapper refuses are counted and told of; the rest is mapped.
+    Damaged frames of the log and frames that the mapper refuses are counted and reported; the rest is mapped.
 
     Args:
         request: What to do.
         stop: Looked at before every frame.
-        on_start: Told how many frames there are.
-        on_frame: Told how many are done.
+        on_start: Called with how many frames there are.
+        on_frame: Called with how many are done.
 
     Returns:
         The summary, as in ``summary.json``; ``stopped_by`` names the signal that ended it early, else null.

@@ -21,7 +21,7 @@ from semantic_mapper.types import PosedFrame
 
 @dataclass(frozen=True, slots=True)
 class ScoreRequest:
-    """What the verb was asked for; ``weights`` None = those in the package, ``max_frames`` 0 = all."""
+    """What the verb was requested; ``weights`` None = those in the package, ``max_frames`` 0 = all."""
 
     log: Path
     weights: Path | None

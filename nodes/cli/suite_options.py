@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 SplitOption = Annotated[Literal["test", "val"] | None, typer.Option(help="Which rooms.  [default: test]")]
 RoomsOption = Annotated[
-    int | None, typer.Option(min=0, help="The first so many rooms of the split; 0 = all.  [default: 0]")
+    int | None, typer.Option(min=0, help="The first this many rooms of the split; 0 = all.  [default: 0]")
 ]
 ProtocolOption = Annotated[
     Literal["generalize", "finetune", "scratch"] | None,

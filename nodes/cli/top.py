@@ -73,7 +73,7 @@ def _wait_for_all(view: LaunchView, subscriber: NewestSubscriber, endpoint: str)
     waited = 0.0
     while not view.complete:
         if waited > ANSWER_S:
-            raise TransportError(f"{endpoint}: no launcher has told of its nodes for {ANSWER_S:g} s; does it run?")
+            raise TransportError(f"{endpoint}: no launcher has reported its nodes for {ANSWER_S:g} s; does it run?")
         view.listen(subscriber, REFRESH_S)
         waited += REFRESH_S
 

@@ -136,8 +136,8 @@ def _age(name: str) -> Any:
 
 def _lost(counters: Mapping[str, int]) -> int | None:
     """What a node lost, of what it should have passed on, mapped or recorded; None where it does not say."""
-    told = [counters[name] for name in _LOSSES if name in counters]
-    return sum(told) if told else None
+    known = [counters[name] for name in _LOSSES if name in counters]
+    return sum(known) if known else None
 
 
 def _frame_rate(row: Mapping[str, Any]) -> str:

@@ -71,8 +71,8 @@ def train(
         save_checkpoint(checkpoint, file, half=half)
         output.print(f"{file}: {_told(checkpoint.recipe)}")
         if stop:
-            told = f"stopped by {stop.name}; the state and {_kept(checkpoint.recipe)} are saved, --resume goes on"
-            stderr_console().print(told, style="yellow", soft_wrap=True)
+            summary = f"stopped by {stop.name}; the state and {_kept(checkpoint.recipe)} are saved, --resume goes on"
+            stderr_console().print(summary, style="yellow", soft_wrap=True)
     return stop.exit_code
 
 

@@ -31,7 +31,7 @@ def launch_file(path: Path, settings: Sequence[str]) -> Iterator[Check]:
     checks = {keys: keys_in(Path(keys).expanduser()) for _, keys in _listening(launch) if keys}
     yield from checks.values()
     for endpoint, keys in _listening(launch):
-        if not keys or checks[keys].state != "bad":  # else it is told already why nothing can listen there
+        if not keys or checks[keys].state != "bad":  # else it is reported already why nothing can listen there
             yield _address(endpoint, keys)
 
 

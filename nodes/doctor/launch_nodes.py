@@ -1,4 +1,4 @@
-"""Examinations of what the nodes of a launch file are told: what each of them would refuse as it starts."""
+"""Examinations of what the nodes of a launch file are given: what each of them would refuse as it starts."""
 
 from __future__ import annotations
 

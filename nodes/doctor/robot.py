@@ -86,9 +86,9 @@ def ports() -> Iterator[Check]:
     """Ports of the launch files and of the viewer that somebody else has."""
     taken = [port for port in PORTS if port_is_taken(port)]
     if taken:
-        told = ", ".join(map(str, taken))
+        text = ", ".join(map(str, taken))
         mend = f"`ss -ltnp 'sport = :{taken[0]}'` says who; give others: `up --set`, `view --port --data-port`"
-        yield Check("ports", "note", f"in use: {told} (a launch or a viewer of ours, perhaps)", mend)
+        yield Check("ports", "note", f"in use: {text} (a launch or a viewer of ours, perhaps)", mend)
     else:
         yield Check("ports", "ok", f"free: {', '.join(map(str, PORTS))}")
 
@@ -142,8 +142,8 @@ def room() -> Iterator[Check]:
     yield Check("shared memory", "note" if tight else "ok", f"{shm_mb:.0f} MB in {shm}", mend)
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     few = files != resource.RLIM_INFINITY and files < LEAST_FILES
-    told = "unlimited" if files == resource.RLIM_INFINITY else str(files)
-    yield Check("open files", "note" if few else "ok", f"limit {told}", f"ulimit -n {LEAST_FILES}" if few else "")
+    text = "unlimited" if files == resource.RLIM_INFINITY else str(files)
+    yield Check("open files", "note" if few else "ok", f"limit {text}", f"ulimit -n {LEAST_FILES}" if few else "")
     address = resource.getrlimit(resource.RLIMIT_AS)[0]
     if address != resource.RLIM_INFINITY:
         mend = "ulimit -v unlimited: torch and Open3D reserve far more addresses than they use"

@@ -62,7 +62,7 @@ class Autosave:
         self._thread.start()
 
     def end(self, why: str) -> None:
-        """Save no more; ``why`` is told as the failure of the last save."""
+        """Save no more; ``why`` is reported as the failure of the last save."""
         self.close()
         self.failure = why
         _log.error("autosave_ends", reason=why)
@@ -88,7 +88,7 @@ class Autosave:
             _log.info("autosave_given_up", reason="the mapper ends")
         except MapError as error:
             self._fail(str(error))
-        except Exception as error:  # noqa: BLE001 -- whatever it is, it must be told, and the next save tried
+        except Exception as error:  # noqa: BLE001 -- whatever it is, it must be reported, and the next save tried
             _log.exception("autosave_dies")
             self._fail(f"{type(error).__name__}: {error}")
         else:

@@ -103,8 +103,8 @@ class LiveCorrection:
     def finish(self, session: MapSession, stopped: Callable[[], bool], on_wait: Callable[[], None]) -> None:
         """End a correction that is under way, before the results are written; refuse those that come later.
 
-        Once somebody has asked to stop, it goes on for ``STOPPED_S`` at most; what is left then is told in the log and
-        in ``session.unfinished_correction``.
+        Once somebody has asked to stop, it goes on for ``STOPPED_S`` at most; what is left then is reported in the
+        log and in ``session.unfinished_correction``.
 
         Args:
             session: As for ``carry_on``.

@@ -236,7 +236,7 @@ class _Mapper:
         from semantic_mapper.nodes.mapper.resume import keep_earlier
         from semantic_mapper.replay.session import MapSession, open_recording
 
-        # A stream is told again to a newcomer, or by a restarted camera; or another camera begins.
+        # A stream is announced again to a newcomer, or by a restarted camera; or another camera begins.
         self._broken |= self._streams.begin(info)
         if self._session is not None:
             self._session.source = self._streams.source

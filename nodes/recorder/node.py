@@ -286,7 +286,7 @@ class Recorder:
             return parts
         try:
             return repack_rgb(parts, self._packing)
-        except CodecError as error:  # whoever reads the log will judge it
+        except CodecError as error:  # the reader of the log judges it
             self.unpacked += 1
             _log.warning("frame_kept_as_sent", seq=envelope.seq, error=str(error))
             return parts

@@ -25,7 +25,7 @@ class HeartbeatWriter:
 
     Args:
         fd: Where to write; -1 = no launcher listens.
-        orphan_timeout_s: Once its launcher is gone, the process has so many seconds to write its results.
+        orphan_timeout_s: Once its launcher is gone, the process has this many seconds to write its results.
     """
 
     def __init__(self, fd: int, orphan_timeout_s: int) -> None:

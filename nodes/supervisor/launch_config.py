@@ -55,8 +55,8 @@ class NodeEntry(Config, frozen=True):
     restart: Literal["never", "on-failure"] = "never"
     backoff_s: Positive = 0.1  # pause before the first restart; twice as long with each further one in the window
     backoff_max_s: Positive = 10.0  # but no longer than this
-    # So many within the window; the next failure ends the launch. With the defaults a node that was ever ready is
-    # restarted for as long as the launch runs: back-off leaves no room for so many.
+    # This many within the window; the next failure ends the launch. With the defaults a node that was ever ready is
+    # restarted for as long as the launch runs: back-off leaves no room for that many.
     max_restarts: Count = 20
     window_s: Positive = 60.0
     standby: bool = False  # does nothing any more, and is accepted with a warning: restarts are quick without it
@@ -180,7 +180,7 @@ def _check_restarts(file: LaunchFile, options: Mapping[str, NodeOptions], path: 
 
 
 def _check_cameras(options: Mapping[str, NodeOptions], path: Path) -> None:
-    """Frames that go to one place are told apart by the names of their cameras.
+    """Frames that go to one place are distinguished by the names of their cameras.
 
     Raises:
         ConfigError: two cameras of one name.

@@ -75,7 +75,7 @@ class LaunchStatus:
             self._publish(status)
 
     def _publish(self, status: Status) -> None:
-        """What cannot be told is no reason to end a launch."""
+        """What cannot be published is no reason to end a launch."""
         short = tuple(sentence[:MAX_SENTENCE] for sentence in status.degraded[:MAX_SENTENCES])
         try:
             self._publisher.publish(encode(replace(status, degraded=short)))

@@ -116,7 +116,7 @@ class ManagedProcess:
                 self.process.wait(KILL_S)
                 self._on_failure(self.process, hang, last=last)
         elif last and self.process.was_terminated:
-            self.process.ask_to_stop()  # whoever ends us may have sent the signal to all of us
+            self.process.ask_to_stop()  # the process that ends us may have sent the signal to all of us
         elif self.process.has_failed() and not self.failure:
             self._on_failure(self.process, "", last=last)
 

@@ -1,6 +1,6 @@
 """A page of a server on this machine, passed on to browsers with the order to speak to nobody else.
 
-Rerun's viewer reports its use, looks for newer releases and loads a font, whatever it is told. A content security
+Rerun's viewer reports its use, looks for newer releases and loads a font, whatever its settings. A content security
 policy is what a browser obeys.
 """
 

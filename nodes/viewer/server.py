@@ -1,8 +1,8 @@
 """Rerun's own web viewer, served to browsers of this machine by a process of its own.
 
 The SDK could serve it from within this process, but on all interfaces; the program that comes with it listens where it
-is told to. It never calls home: analytics are switched off in a folder of settings that it alone uses, and the browser
-gets its pages through ``QuietPage``.
+is instructed to. It never calls home: analytics are switched off in a folder of settings that it alone uses, and the
+browser gets its pages through ``QuietPage``.
 """
 
 from __future__ import annotations
@@ -109,9 +109,9 @@ class WebViewer:
         program = _find_program()
         settings = {f"XDG_{kind}_HOME": f"{self._folder.path}/{kind.lower()}" for kind in ("CONFIG", "DATA", "CACHE")}
         environment = {**os.environ, **settings}
-        told = subprocess.run([program, "analytics", "disable"], env=environment, capture_output=True, check=False)
-        if told.returncode != 0:  # then it would call home
-            raise DependencyError(f"{program}: analytics cannot be switched off: {told.stderr.decode().strip()}")
+        result = subprocess.run([program, "analytics", "disable"], env=environment, capture_output=True, check=False)
+        if result.returncode != 0:  # then it would call home
+            raise DependencyError(f"{program}: analytics cannot be switched off: {result.stderr.decode().strip()}")
         # All three are held until all are chosen: a port that was let go may be given out again.
         with (
             _hold_port(self._ports[0], "--port") as page,

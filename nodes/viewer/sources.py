@@ -108,17 +108,17 @@ def show_log(
     on_start: Callable[[int], None],
     on_frame: Callable[[int], None],
 ) -> None:
-    """Map a log and show it meanwhile, its map every so many seconds and at the end.
+    """Map a log and show it meanwhile, its map every n seconds and at the end.
 
     Args:
         path: The log.
         weights, config: See ``Mapper.load``.
-        frames: At most so many; 0 = all.
+        frames: At most this many; 0 = all.
         begin: Says where to write it, once log and weights are open.
         refresh_s: Time between two maps.
         going: Whether to go on.
-        on_start: Told how many frames there are.
-        on_frame: Told how many are done.
+        on_start: Called with how many frames there are.
+        on_frame: Called with how many are done.
 
     Raises:
         LogError, WeightsError, ConfigError, MapError: it cannot be mapped.
@@ -159,7 +159,7 @@ def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tel
         begin: Says where to write it, once the endpoint is known to be one.
         refresh_s: Time between two maps.
         stop: Somebody wants to end it.
-        tell: Told in words how it goes.
+        tell: Called with a line of progress.
 
     Raises:
         TransportError: an endpoint that is none.
@@ -189,14 +189,14 @@ def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tel
 
 def _first_snapshot(client: MapClient, stop: StopRequest, tell: Callable[[str], None]) -> MapSnapshot | None:
     """The map as it is, once its mapper answers; None where a stop request came first."""
-    told = False
+    logged = False
     while not stop:
         try:
             return client.mirror().snapshot()
         except TransportError as error:
-            if not told:
+            if not logged:
                 tell(f"waiting for the mapper: {error}")
-            told = True
+            logged = True
             time.sleep(ASK_AGAIN_S)
     return None
 

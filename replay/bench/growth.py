@@ -47,7 +47,7 @@ def bench_growth(
         config: Of the mapper; what each run does not change.
         frames: That count, in each run.
         width: Of the images, 4 : 3.
-        on_run: Told how many runs are done.
+        on_run: Called with how many runs are done.
 
     Returns:
         One dict a run: ``axis`` and ``value`` (what was changed), medians ``step_ms``, ``cpu_ms`` (processor time of

@@ -32,8 +32,8 @@ class Coverage(NamedTuple):
 
     Args:
         name: For the table.
-        every: Every so many-th frame is mapped.
-        rendered: Every so many-th of those is rendered.
+        every: Every n-th frame is mapped.
+        rendered: Every n-th of those is rendered.
         more: The same where more time is spent on rendering; 0 = that is not measured.
     """
 

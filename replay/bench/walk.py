@@ -83,7 +83,7 @@ def bench_walk(
         weights: None = those that ship with the package.
         config: Of the mapper.
         plan: The walk.
-        on_frame: Told how many frames are done.
+        on_frame: Called with how many frames are done.
 
     Returns:
         Plain data, flat. Lists named ``minute_*`` have one value for each minute of the walk (by stamps). ``step_*`` is

@@ -27,7 +27,7 @@ class FieldResult:
     Args:
         name: In ``FIELDS``.
         a, b: Value of each run; None where it has none.
-        difference: Between them, None where that cannot be told; then the field differs.
+        difference: Between them, None where that is unknown; then the field differs.
         tolerance: That it is held against.
         detail: What else there is to know.
     """

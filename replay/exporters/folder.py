@@ -192,15 +192,15 @@ class _DepthFiles:
     @property
     def notices(self) -> list[str]:
         """For people."""
-        told: list[str] = []
+        notes: list[str] = []
         if self._inexact:
-            told.append(
+            notes.append(
                 f"depth of {self._inexact} frames is not exact in steps of 1/{self.scale:g} m: off by up to "
                 f"{self._largest_error * 1e3:.3g} mm"
             )
         if self._made_up:
-            told.append(f"{self._made_up} frames have no depth; their depth images are empty (0 = no measurement)")
-        return told
+            notes.append(f"{self._made_up} frames have no depth; their depth images are empty (0 = no measurement)")
+        return notes
 
     def write(self, file: Path, item: ExportFrame) -> bool:
         """False where the frame has no depth."""

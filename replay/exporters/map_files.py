@@ -48,7 +48,7 @@ AXES = {sign + name: s * np.eye(3)[i] for sign, s in (("", 1.0), ("-", -1.0)) fo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExportRequest:
-    """What to write; None = the default, and not asked for.
+    """What to write; None = the default, and not requested.
 
     Args:
         format: Of the file.

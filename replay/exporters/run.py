@@ -37,7 +37,7 @@ class LogExportRequest:
     Args:
         format: Of the file or folder.
         camera: Only the frames of this one; empty = all, which trajectory, tum and folder can hold of one camera only.
-        max_frames: Stop after so many; 0 = all.
+        max_frames: Stop after this many; 0 = all.
     """
 
     format: LogFormat

@@ -32,7 +32,7 @@ class ImportOptions:
         frame_hz: Rate from which stamps are made where the recording has none; None = what the format has (folder 6,
             scannet 30).
         max_frames: Stop after this many frames; None = all.
-        quarters: Turn every image clockwise by so many quarters of a full turn: for a camera mounted on its side.
+        quarters: Turn every image clockwise by this many quarters of a full turn: for a camera mounted on its side.
         match_s: TUM: largest time between a colour image, its depth image and its pose.
     """
 

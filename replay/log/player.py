@@ -134,7 +134,7 @@ def play(
         acks: The mapper's answers; needed for lockstep. Subscribe to ``ACK_TOPICS`` of the mapper.
         options: See ``PlayOptions``.
         stop: Ends the playing early when set.
-        on_frame: Told of each frame sent, with the mapper's answer in lockstep.
+        on_frame: Called with each frame sent, with the mapper's answer in lockstep.
 
     Raises:
         NodeError: lockstep, and the mapper has gone or does not answer. ``EndOfStream`` has been sent then too.
@@ -172,7 +172,9 @@ def play(
 def _say_end(publisher: Publisher, end: EndOfStream, timeout_s: float) -> None:
     try:
         publisher.publish(encode(end), timeout_s)
-    except TransportError as error:  # whoever does not listen any more needs no end; what led here must not be hidden
+    except (
+        TransportError
+    ) as error:  # a peer that does not listen any more needs no end; what led here must not be hidden
         logger.warning("end_of_stream_not_delivered", error=str(error))
 
 
@@ -225,8 +227,8 @@ class _Run:
     @property
     def damages(self) -> tuple[str, ...]:
         """What could not be read so far: frames first."""
-        told = [str(error) for error in self.log.errors]
-        return tuple(self._unreadable_frames() + [text for text in told if text in self._known])
+        texts = [str(error) for error in self.log.errors]
+        return tuple(self._unreadable_frames() + [text for text in texts if text in self._known])
 
     @property
     def unreadable(self) -> int:

@@ -67,7 +67,7 @@ class LogReader:
 
     Args:
         path: Of the file; may be unfinished (its writer was killed) or cut off.
-        on_error: Told of each error as it is found.
+        on_error: Called with each error as it is found.
         allow_empty: Open a log without frames too.
 
     Attributes:
@@ -202,7 +202,7 @@ class LogReader:
         for entry in islice(infos, MAX_INFOS):
             try:
                 info = decode_as(StreamInfo, self._read(entry))
-            except (LogError, CodecError):  # told when its turn comes
+            except (LogError, CodecError):  # reported when its turn comes
                 continue
             if not set(info.cameras) <= set(cameras):
                 cameras |= info.cameras

@@ -33,7 +33,7 @@ class RecordingRules:
     Args:
         split_bytes: Messages of a part take at most so much (one that is larger has a part of its own), its index some
             kilobytes more; 0 = any size.
-        split_s: A part covers at most so many seconds of recording; 0 = any time.
+        split_s: A part covers at most this many seconds of recording; 0 = any time.
         disk_full: "stop": what is recorded stays, and recording ends. "delete-oldest": the oldest parts of this
             recording are deleted, never the one that is being written; where none is left, recording pauses until
             there is room.
@@ -244,7 +244,7 @@ class Recording:
                     )
                     return False
         except OSError as error:  # unmounted, or a folder that somebody has removed
-            self._stop(f"the disk cannot be asked for its room: {error}")
+            self._stop(f"the free space of the disk cannot be read: {error}")
             return False
         return True
 

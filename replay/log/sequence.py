@@ -37,7 +37,7 @@ class LogSequence:
 
     Args:
         paths: Of the parts, in any order.
-        on_error: Told of each error as it is found.
+        on_error: Called with each error as it is found.
         allow_empty: Open parts without a single frame too.
 
     Attributes:
@@ -160,7 +160,7 @@ def open_log(
 
     Args:
         paths: A file (that log alone), several (the parts of one recording, in any order), or a folder: all logs in it.
-        on_error: Told of each error as it is found.
+        on_error: Called with each error as it is found.
         allow_empty: Open one without frames too.
 
     Raises:

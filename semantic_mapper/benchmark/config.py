@@ -75,7 +75,7 @@ class SequenceConfig(Config, frozen=True):
     frames: AtLeastTwo = 80
     step_m: Positive = 0.08  # way (a turn of 1 rad counts as 0.35 m) between frames
     query_pairs: AtLeastOne = 2  # spread evenly over the sequence
-    pair_gap: AtLeastOne = 4  # the second view of a pair is so many frames on
+    pair_gap: AtLeastOne = 4  # the second view of a pair is this many frames on
     camera: CameraConfig = CameraConfig()
 
 
@@ -121,7 +121,7 @@ class SuiteConfig(Config, frozen=True):
     """A run of the benchmark."""
 
     split: Split = "test"
-    rooms: NotNegative = 0  # the first so many of the split; 0 = all
+    rooms: NotNegative = 0  # the first this many of the split; 0 = all
     protocol: Protocol = "generalize"
     views: Annotated[int, msgspec.Meta(ge=1, le=MAX_SOURCE_VIEWS)] = 8  # source views of a query
     baseline: Baseline = "narrow"
@@ -142,7 +142,7 @@ def check_suite(suite: SuiteConfig) -> None:
     """
     seeds = TEST_SEEDS if suite.split == "test" else VALIDATION_SEEDS
     if not 0 <= suite.rooms <= len(seeds):
-        raise ConfigError(f"rooms: split '{suite.split}' has {len(seeds)} rooms, {suite.rooms} are asked for; 0 = all")
+        raise ConfigError(f"rooms: split '{suite.split}' has {len(seeds)} rooms, {suite.rooms} are requested; 0 = all")
     if suite.depth and suite.sequence.camera.sensor == "none":
         raise ConfigError("sequence.camera: a camera without a depth sensor gives no depth; --depth off")
     if suite.protocol == "generalize":
@@ -193,7 +193,7 @@ def fit_config(suite: SuiteConfig, share: float) -> FinetuneConfig:
 def settings_digest(suite: SuiteConfig, part: Literal["views", "map"]) -> str:
     """What tells records apart that were made in another way: 16 hex digits.
 
-    Which rooms are asked for plays no part, nor do settings that this part of the run does not look at.
+    Which rooms are requested plays no part, nor do settings that this part of the run does not look at.
     """
     plain = to_plain(suite)
     for key in ("split", "rooms"):

@@ -82,7 +82,7 @@ def run_room(
     """One room by one field, as ``suite.protocol`` says; None where it was stopped while it fitted.
 
     Args:
-        on_fit: Told the share of the fitting that is done.
+        on_fit: Called with the fraction of the fitting that is done.
         stopped: Asked before every step of the fitting; once it says so (anything true), the room is given up.
 
     Raises:
@@ -132,7 +132,7 @@ def choose_fitted(room: BenchmarkRoom, suite: SuiteConfig) -> Keyframes:
     free = [n for n in range(len(room.frames)) if all(abs(n - q) > guard for q in room.queries)]
     if len(free) < max(2, suite.scene.keyframes):
         raise ConfigError(
-            f"{suite.scene.keyframes} keyframes are asked for; {len(free)} frames of the room are no query view and "
+            f"{suite.scene.keyframes} keyframes are requested; {len(free)} frames of the room are no query view and "
             f"not within {guard} frames of one, and 2 are the least"
         )
     labelled = _most_telling(room, free, suite.scene.keyframes, suite.seed)

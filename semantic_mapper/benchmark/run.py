@@ -47,7 +47,7 @@ def run_suite(
         entries: Which fields.
         store: Records that are there are kept and not made again.
         pictures: Folder for the label images of ``sheet_rows``.
-        on_progress: Told of every step.
+        on_progress: Called with every step.
         stopped: Asked before each room, entry and step of a fitting; once it says so (anything true), the run
             ends. A room that is not done by then leaves no record.
 

@@ -55,7 +55,7 @@ def choose_sources(
         ConfigError: fewer candidates than ``count``.
     """
     if len(candidates) < count:
-        raise ConfigError(f"{count} source views are asked for, the room has {len(candidates)} frames to choose from")
+        raise ConfigError(f"{count} source views are requested, the room has {len(candidates)} frames to choose from")
     points = _surface_points(query_pose, query_depth_m, candidates[0].intrinsics)
     seen = [_sees(frame, points) for frame in candidates]
     fraction = np.array([s.mean() if len(s) else 0.0 for s in seen])
@@ -81,7 +81,7 @@ def choose_covering(
     Args:
         query_pose, query_depth_m, candidates: As for ``choose_sources``.
         labelled: Of each candidate, whether it brings labels: such a view counts twice.
-        count: At most so many; at least one is chosen, whatever it sees.
+        count: At most this many; at least one is chosen, whatever it sees.
     """
     points = _surface_points(query_pose, query_depth_m, candidates[0].intrinsics)
     seen = np.stack([_sees(frame, points) for frame in candidates])

@@ -27,7 +27,7 @@ def choose_device(name: DeviceName, local_rank: int) -> torch.device:
     """``auto`` takes a GPU where there is one; of several, each rank of this machine takes its own.
 
     Raises:
-        ConfigError: ``cuda`` is asked for and there are fewer GPUs than ranks.
+        ConfigError: ``cuda`` is requested and there are fewer GPUs than ranks.
     """
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if name == "cpu" or (name == "auto" and count == 0):

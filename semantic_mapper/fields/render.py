@@ -46,7 +46,7 @@ def render_image(
         prior_depth_m: (H, W), 0 = no prior.
         sampling: Near and far bounds.
         rays_per_chunk: Rays rendered at once; 0 = what suits the device.
-        on_chunk: Told the number of rays done after each chunk.
+        on_chunk: Called with the number of rays done after each chunk.
 
     Returns:
         ``FieldRender`` of H * W rays.

@@ -117,7 +117,7 @@ class KeyframeStore:
             T_world_camera: (4, 4) pose of the query.
             intrinsics: Of ``depth_m``.
             depth_m: (H, W) float32, 0 = none.
-            count: At most so many.
+            count: At most this many.
             size: Only those whose encoded view is of this size; None = all.
         """
         fitting = [k for k in self._keyframes if size in (None, k.encoded.size)]

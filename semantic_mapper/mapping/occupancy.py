@@ -23,7 +23,7 @@ from semantic_mapper.types import Float64
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1  # as in ROS's OccupancyGrid
 LAYER_M = 0.04  # thickness of the layers among which the floor is looked for
-FLOOR_SHARE = 0.25  # of the fullest layer: the lowest one with so many points is the floor
+FLOOR_SHARE = 0.25  # of the fullest layer: the lowest one with this many points is the floor
 MAX_CELLS = 100_000_000
 
 

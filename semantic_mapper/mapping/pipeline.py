@@ -116,7 +116,7 @@ class MappingPipeline:
         return self.corrector.start(poses, until_ns)
 
     def advance_correction(self, max_frames: int = 1) -> bool:
-        """Carry a correction on by so many frames of the history; see ``MapCorrector.advance``."""
+        """Carry a correction on by this many frames of the history; see ``MapCorrector.advance``."""
         return self.corrector.advance(max_frames)
 
     def look_around(self, views: int = 1) -> tuple[VirtualLook, ...]:
@@ -129,7 +129,7 @@ class MappingPipeline:
         save those that were in the map when its oldest frames were frozen; afterwards all may be looked at again.
 
         Args:
-            views: At most so many.
+            views: At most this many.
 
         Returns:
             What was looked at, empty where no view is worth its time: no frame mapped yet, too few keyframes, or all

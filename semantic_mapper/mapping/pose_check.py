@@ -47,7 +47,7 @@ PARTNERS = 3  # earlier keyframes that a new one is compared with, beside the ne
 OLDEST = 4  # of its neighbourhood, as many again
 NEIGHBOURS_M, NEIGHBOURS_DEG = 2.0, 40.0  # what counts as its neighbourhood
 FAR = 2  # times the range of the map; depth beyond may be noise
-STEP = 3  # every so many rows and columns of a keyframe's small depth image
+STEP = 3  # every n rows and columns of a keyframe's small depth image
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 # What is often wrong with a recording, as the change that would mend it.

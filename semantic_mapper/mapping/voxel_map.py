@@ -117,8 +117,8 @@ class VoxelMap:
 
         Args:
             since: 0 for the whole map; else the ``version`` of the changes before.
-            limit: At most so many blocks, those that have been waiting longest, but never less than one whole version
-                (a frame; a loaded map is one version); 0 = all. Whoever goes on asking with the version they got
+            limit: At most this many blocks, those that have been waiting longest, but never less than one whole version
+                (a frame; a loaded map is one version); 0 = all. A caller that goes on asking with the version they got
                 comes to the present map.
             min_weight: Voxels with fewer depth measurements count as not observed; > 0.
 
@@ -226,7 +226,7 @@ class VoxelMap:
             self.version = version
 
     def take_over(self, other: VoxelMap) -> None:
-        """Become ``other``, all at once for whoever reads from another thread; ``other`` must not be used any more.
+        """Become ``other``, all at once for readers in other threads; ``other`` must not be used any more.
 
         Every block counts as changed, and ``epoch`` goes up: blocks that ``other`` does not have are gone. For
         ``changes`` with a limit, ``version`` grows by one for each ``BLOCKS_A_VERSION`` of them.

@@ -18,7 +18,7 @@ from semantic_mapper.types import Float64, Int32, Int64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NearestSurface:
-    """A place of the class that was asked for.
+    """A place of the class that was requested.
 
     Args:
         xyz: (3,) float64 point of the surface, world metres.

@@ -31,7 +31,7 @@ class Visit:
         room: Which of the building's rooms, from 0; its seed is the one of that number in ``TRAIN_SEEDS``.
         returning: The walk has been here before; it takes the same way through the room again.
         low, high: (3,) float64 corners of the room's cell, world, metres.
-        frames: Of this visit, rendered as they are asked for; may be gone through once.
+        frames: Of this visit, rendered as they are requested; may be gone through once.
     """
 
     number: int

@@ -63,5 +63,5 @@ class PoseNoiseConfig(Config, frozen=True):
 
     translation_share: float = 0.0075  # drift per metre of way
     rotation_deg_per_m: float = 0.15
-    closure_frames: int = 60  # a loop closure jumps back towards the truth after so many frames; 0 = never
+    closure_frames: int = 60  # a loop closure jumps back towards the truth after this many frames; 0 = never
     closure_share: float = 0.7  # of the error that a loop closure takes away

@@ -56,7 +56,7 @@ def room_views(
     """
     scene = make_room(seed, room) if scene is None else scene
     poses = camera_path(scene, count, seed, path)
-    told = poses if pose_noise is None else drifting_poses(poses, seed, pose_noise)
+    frame_poses = poses if pose_noise is None else drifting_poses(poses, seed, pose_noise)
     shots = [None] * count if noise is None else sequence_shots(poses, seed, noise)
     for index, shot in enumerate(shots):
         noise_seed = None if noise is None else seed * 100_003 + index
@@ -71,7 +71,7 @@ def room_views(
             depth_m=None if noise is not None and noise.depth == "none" else view.depth_m,
             label=view.label,
             intrinsics=intrinsics,
-            T_world_camera=told[index],
+            T_world_camera=frame_poses[index],
             pose_source="rooms",
         )
         yield RoomView(frame, view, poses[index])

@@ -183,7 +183,7 @@ def finetune(
 
     Raises:
         FrameError: fewer than two frames, or none with labels.
-        ConfigError: no budget, or no GPU where one is asked for.
+        ConfigError: no budget, or no GPU where one is requested.
     """
     if config.seconds <= 0 and config.steps <= 0:
         raise ConfigError("finetuning needs a budget: set seconds, steps, or both")

@@ -51,7 +51,7 @@ class KeyframePool:
 
     Args:
         label_set: Of the weights.
-        held_out_every: Of so many keyframes, the last one is held out, for good.
+        held_out_every: Of this many keyframes, the last one is held out, for good.
         capacity: Keyframes kept; past it the oldest is dropped.
     """
 

@@ -36,7 +36,7 @@ SOURCES = 7  # keyframes that a held-out ray is rendered from, beside its own im
 class RoundConfig(FinetuneConfig, frozen=True):
     """As ``FinetuneConfig``, with other defaults: short rounds on a fraction of a core."""
 
-    seconds: AtLeastZero = 0.0  # steps count: how long they take is for whoever holds the budget to say
+    seconds: AtLeastZero = 0.0  # steps count: how long they take is for the owner of the budget to say
     steps: NotNegative = 60
     frozen_encoder_fraction: Fraction = 1.0  # cannot be less
     held_out_rays: AtLeastOne = 128
@@ -53,8 +53,8 @@ class RoundConfig(FinetuneConfig, frozen=True):
 class OnlineConfig(Config, frozen=True):
     """When a learner learns, and when it finds new weights better."""
 
-    new_keyframes: AtLeastOne = 4  # so many must have come since the last round
-    held_out_every: AtLeastTwo = 4  # of so many keyframes, the last is never learned from: it judges
+    new_keyframes: AtLeastOne = 4  # this many must have come since the last round
+    held_out_every: AtLeastTwo = 4  # of this many keyframes, the last is never learned from: it judges
     max_keyframes: AtLeastTwo = 32  # kept; past it the oldest goes
     least_gain: Fraction = 0.01  # mIoU that new weights must gain on the held-out keyframes
     least_score: Fraction = 0.2  # mIoU that they must reach there: labels without any sense are learned worse

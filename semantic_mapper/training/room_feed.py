@@ -16,7 +16,7 @@ from semantic_mapper.training.worker import prepare_worker, render
 if TYPE_CHECKING:
     from semantic_mapper.training.rooms import PackedRoom, RoomPoolConfig
 
-AHEAD = 2  # rooms a worker renders ahead of what is asked for
+AHEAD = 2  # rooms a worker renders ahead of what is requested
 
 
 class RoomFeed(Protocol):
@@ -45,7 +45,7 @@ def open_feed(seeds: Iterator[int], config: RoomPoolConfig, workers: int) -> Roo
 
 
 class InlineFeed:
-    """Renders a room when it is asked for: nothing to wait for where the CPU does the training anyway."""
+    """Renders a room when it is requested: nothing to wait for where the CPU does the training anyway."""
 
     def __init__(self, seeds: Iterator[int], config: RoomPoolConfig) -> None:
         self._seeds = seeds

@@ -67,7 +67,7 @@ class StepConfig(Config, frozen=True):
     prior_noise: AtLeastZero = 0.01  # sigma of the depth prior's error as a fraction of z
     samples_without_depth: AtLeastTwo = 32  # samples a ray in steps without a depth prior
     no_depth_thinning: AtLeastOne = (
-        1  # in steps without a depth prior, where a ray costs more, one ray in so many is rendered
+        1  # in steps without a depth prior, where a ray costs more, one ray in n is rendered
     )
     colour_jitter: Fraction = 0.2
     mirrored: Fraction = 0.0  # fraction of steps in which the world is its mirror image

@@ -54,7 +54,7 @@ def view_from_frame(frame: PosedFrame, label_set: LabelSet, width: int) -> Label
         channel = label_set.to_channels(resize_label(frame.label, intrinsics), f"frame seq={frame.seq}")
     return LabelledView(
         torch.from_numpy(resize_rgb(frame, intrinsics)).permute(2, 0, 1).float().div_(255).contiguous(),
-        torch.from_numpy(resize_depth(frame, intrinsics)),
+        torch.tensor(resize_depth(frame, intrinsics)),  # a copy: the frame's own array is read-only
         torch.from_numpy(channel),
         intrinsics,
         torch.from_numpy(frame.T_world_camera).float(),

@@ -2,7 +2,7 @@
 
 A connection that is lost is tried again by ZeroMQ itself, save one that is cut because the other side has broken the
 protocol, such as by a message beyond MAXMSGSIZE: ZeroMQ gives that one up for good, and says no more than that it is
-closed. A stranger's single message would end a subscription for ever.
+closed. An unknown client's single message would end a subscription for ever.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ class Connections:
 
     def _listen(self) -> None:
         while self._monitor.poll(0):
-            told = recv_monitor_message(self._monitor)
-            event, endpoint = told["event"], told["endpoint"].decode(errors="replace")
+            report = recv_monitor_message(self._monitor)
+            event, endpoint = report["event"], report["endpoint"].decode(errors="replace")
             if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 self._count += 1
             elif event == zmq.EVENT_DISCONNECTED:

@@ -28,18 +28,18 @@ SYNC_PREFIX = b"sync/"  # a subscription to sync/TOKEN/ is answered by that very
 _PUMP_PERIOD_S = 0.02
 _SEND_SLICE_MS = 100
 _LATE_S = 0.1  # subscriptions of one socket come in no order; an end must not arrive before what it ends
-_MAX_SUBSCRIPTIONS = 4096  # what a stranger's subscriptions may cost us
-_MAX_EVENTS = 256  # heard at a time: a stranger who subscribes without end must not hold up what is published
+_MAX_SUBSCRIPTIONS = 4096  # what an unknown client's subscriptions may cost us
+_MAX_EVENTS = 256  # heard at a time: an unknown client that subscribes without end must not hold up what is published
 _POLL_MS = 50
 # A machine that is gone is found out within 5 s; a process that is gone at once, by the kernel.
 _KEEPALIVE = ((zmq.TCP_KEEPALIVE_IDLE, 2), (zmq.TCP_KEEPALIVE_INTVL, 1), (zmq.TCP_KEEPALIVE_CNT, 3))
-_MAX_SLOTS = 256  # cameras and nodes that a mailbox serves; a stranger's invented ones stop here
+_MAX_SLOTS = 256  # cameras and nodes that a mailbox serves; an unknown client's invented ones stop here
 
 log = get_logger(__name__)
 
 
 class Publisher:
-    """Binds an endpoint and sends encoded messages to whoever subscribes. Any thread may call any method.
+    """Binds an endpoint and sends encoded messages to all subscribers. Any thread may call any method.
 
     Args:
         endpoint: ``ipc://PATH`` or ``tcp://ADDRESS:PORT`` (``*`` as port: any free one, see ``endpoint``).
@@ -463,7 +463,7 @@ class NewestSubscriber(_Subscriber):
     """Gets the newest message of each source: an unread one gives way to the next, and is counted.
 
     A thread of its own takes messages off the socket as they come and checks their headers; images are decoded by
-    whoever calls ``receive``. Messages whose topic is marked "all" in the table (info, end, ...) never give way.
+    the caller of ``receive``. Messages whose topic is marked "all" in the table (info, end, ...) never give way.
 
     Args:
         endpoints: One publisher or several.

@@ -121,7 +121,7 @@ def test_labels_of_another_set_are_compared_by_name() -> None:
 def test_keyframes_are_no_queries_and_not_next_to_one() -> None:
     chosen = choose_fitted(tiny_room(), tiny_suite())
     assert len(chosen.labelled) == 3 and not set(chosen.labelled) & {5, 6, 7, 8, 9} and not chosen.unlabelled
-    with pytest.raises(ConfigError, match="9 keyframes are asked for"):
+    with pytest.raises(ConfigError, match="9 keyframes are requested"):
         choose_fitted(tiny_room(), tiny_suite(scene={"keyframes": 9, "guard": 2}))
 
 

@@ -7,7 +7,7 @@
 Golden data says what users have. Record again only what was meant to change, look at `git diff` of the JSON files, and
 say in the commit why users can live with it. Old bytes of the wire are never replaced: where a message is packed
 otherwise now, the new bytes are added beside the old ones, and files of the first recording stay (delete one by hand to
-make it anew). The group ``kitchen`` needs the recording redkitchen (SEMANTIC_MAPPER_SHARED_DATA); only numbers of it
+make it again). The group ``kitchen`` needs the recording redkitchen (SEMANTIC_MAPPER_SHARED_DATA); only numbers of it
 are kept.
 """
 

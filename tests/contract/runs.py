@@ -94,7 +94,7 @@ def numbers_of(run: Path) -> dict[str, Any]:
 
 
 def save_points(path: Path, points: Points) -> None:
-    """Golden points, rounded to steps far below what is told apart."""
+    """Golden points, rounded to steps far below what is distinguished."""
     least = points.xyz.min(0)
     np.savez_compressed(
         path,

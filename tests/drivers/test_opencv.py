@@ -108,7 +108,7 @@ def test_files_are_not_found_but_named() -> None:
 
 
 class Sender:
-    """Sends motion JPEG over HTTP until told to break off; then whoever connects again gets more."""
+    """Sends motion JPEG over HTTP until told to break off; then clients that connect again gets more."""
 
     def __init__(self) -> None:
         self.connections = 0

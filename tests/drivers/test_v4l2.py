@@ -1,4 +1,4 @@
-"""V4L2 cameras that do what they are asked for, and all the ways in which they do not."""
+"""V4L2 cameras that do what they are requested, and all the ways in which they do not."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_another_pixel_format_and_rate_than_asked_for_are_told(machine: Machine,
         next(iter(camera))
         told = " / ".join(camera.warnings)
         assert camera.info.frame_hz == 10
-    assert "asked for pixels as MJPG, it gives YUYV; it offers YUYV" in told
+    assert "requested pixels as MJPG, it gives YUYV; it offers YUYV" in told
     assert "asked for 30 images/s, it gives 10" in told
 
 

@@ -1,6 +1,6 @@
 """The plain torch renderer: every ray against every primitive, any device. ``render.render_view`` is the fast one.
 
-Runs in float64 on the CPU (as the compiled path does) and in float32 elsewhere unless told otherwise.
+Runs in float64 on the CPU (as the compiled path does) and in float32 elsewhere unless set otherwise.
 """
 
 from __future__ import annotations

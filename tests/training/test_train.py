@@ -24,7 +24,7 @@ TIMES = {"seconds", "waited_s"}
 
 
 def stop_after(steps: int):
-    """What to hand to ``train`` to stop after so many steps of this sitting."""
+    """What to hand to ``train`` to stop after this many steps of this sitting."""
     done: list[int] = []
 
     def on_progress(progress: TrainProgress) -> None:

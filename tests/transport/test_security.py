@@ -233,7 +233,7 @@ def test_bad_keys_and_names_are_refused(tmp_path: Path, robot: Keys) -> None:
 
 
 class Relay:
-    """Passes bytes on between whoever connects and an endpoint, and keeps a copy."""
+    """Passes bytes on between clients that connect and an endpoint, and keeps a copy."""
 
     def __init__(self, endpoint: str, seen: bytearray) -> None:
         self._port = int(endpoint.rpartition(":")[2])

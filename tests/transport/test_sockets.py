@@ -208,7 +208,7 @@ def test_ten_thousand_bad_messages_do_not_harm_a_living_subscriber(endpoint: str
     stranger.setsockopt(zmq.SNDHWM, 0)
     stranger.bind(endpoint)
     with stranger, kind(endpoint, ["frame", "map", "end"]) as subscriber:
-        for _ in range(4):  # three topics and the handshake, which a stranger does not answer
+        for _ in range(4):  # three topics and the handshake, which an unknown client does not answer
             assert stranger.poll(WAIT_S * 1e3)
             stranger.recv()
         sent = 0

@@ -93,7 +93,7 @@ def own_view(rays: RayBatch, sources: EncodedViews) -> tuple[torch.Tensor, torch
     """The source view that each ray was taken from, if any.
 
     A ray starts at the centre of its camera, and its direction has depth 1 in its camera, so a view that turned on the
-    spot is told apart too.
+    spot is distinguished too.
 
     Returns:
         index (R,) int64 of the best view, same (R,) bool: whether that view's camera is the ray's.

@@ -74,7 +74,7 @@ typedef struct {
     I64 rows; /* (B,) of the blocks to fill, whose voxels are all zero */
 } UnpackArguments;
 
-/* Returns how many were unpacked: fewer than B where the data of the next are no packed block of so many classes. */
+/* Returns how many were unpacked: fewer than B where the data of the next are no packed block of this many classes. */
 KERNEL(unpack_block_values, UnpackArguments) {
     const BlockValues *values = &a->values;
     int64_t classes = values->evidence.shape[2], voxel_bytes = classes * values->evidence.itemsize;

@@ -16,7 +16,7 @@ static inline double evidence_at(const void *evidence, int64_t itemsize, int64_t
     return itemsize == 4 ? (double)((const float *)evidence)[at] : ((const double *)evidence)[at];
 }
 
-/* What stored evidence of a voxel with so many votes is multiplied with to be the sum of log probabilities. */
+/* What stored evidence of a voxel with this many votes is multiplied with to be the sum of log probabilities. */
 static inline double evidence_scale(int64_t itemsize, double votes) {
     return itemsize == 2 ? votes / STEPS_PER_NAT : 1.0;
 }

@@ -34,7 +34,7 @@ static inline int64_t count_mask(const uint8_t *mask) {
 /* How many float32 the evidence of one voxel takes up: whole ones. */
 static inline int64_t evidence_floats(int64_t classes, int64_t itemsize) { return (classes * itemsize + 3) / 4; }
 
-/* The parts of a packed block with so many measured and voted voxels. */
+/* The parts of a packed block with this many measured and voted voxels. */
 static inline PackedBlock packed_parts(float *data, int64_t measured, int64_t voted, int64_t width) {
     float *tsdf = data + MASK_FLOATS, *evidence = tsdf + 5 * measured;
     uint8_t *masks = (uint8_t *)data;

@@ -6,7 +6,7 @@ typedef struct {
     GridBuffers buffers;
     double near; /* |TSDF| of the voxels that belong to the surface, at most */
     double vote_discount;
-    double max_votes; /* voxels with so many need none */
+    double max_votes; /* voxels with this many need none */
     F64 total;        /* (B, 3) zeros; sum of positions in voxels */
     F64 need;         /* (B,) zeros */
     I64 count;        /* (B,) zeros; surface voxels */

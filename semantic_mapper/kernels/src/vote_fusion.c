@@ -8,7 +8,7 @@ typedef struct {
     FusionLimits limits;
     F32 depth; /* (H, W) metres */
     Votes votes;
-    double max_votes; /* voxels with so many take none */
+    double max_votes; /* voxels with this many take none */
     F32 dither;       /* see evidence.h */
     int64_t moment;
 } VoteArguments;

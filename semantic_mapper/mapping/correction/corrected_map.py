@@ -219,7 +219,7 @@ class MapCorrector:
             return self.status
 
     def advance(self, max_frames: int = 1) -> bool:
-        """Carry a rebuild on by so many frames and swap the maps where it has caught up; returns if it still runs.
+        """Carry a rebuild on by this many frames and swap the maps where it has caught up; returns if it still runs.
 
         May be called from any thread, but not from within a step. Waits for a step that is under way before a swap.
 

@@ -42,7 +42,7 @@ def pair_poses(
     frozen: FrozenFrames,
     old_pose: Callable[[FrameEntry], Float64],
 ) -> list[PosePair]:
-    """Old and new poses of the given frames that are in the history; those that have left it are told of in the log.
+    """Old and new poses of the given frames that are in the history; those that have left it are reported in the log.
 
     Args:
         poses: As given.

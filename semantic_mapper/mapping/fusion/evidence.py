@@ -6,8 +6,8 @@ dozens of sure votes, and confidence with it. What readout does to a sum of n vo
 below 1 / rho, it does to ``n_eff`` of the mean: half a step is then less than 0.001 nat.
 
 Late and small votes move a mean by less than a step. They are rounded up as often as their fraction says, by a table of
-evenly spread numbers that a hash of block, voxel and frame reads from: so many small votes add up to what they say, and
-the same frames give the same bits.
+evenly spread numbers that a hash of block, voxel and frame reads from: that many small votes add up to what they say,
+and the same frames give the same bits.
 """
 
 from __future__ import annotations

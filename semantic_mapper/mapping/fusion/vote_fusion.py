@@ -86,6 +86,6 @@ def _vote_into_blocks(
         count: B.
         indices: (B,) buffer indices, each once.
         buffers, camera, limits, depth, votes, dither, moment: As of ``fusion.fuse_blocks``.
-        max_votes: Voxels with so many take none.
+        max_votes: Voxels with this many take none.
     """
     ...

@@ -1,7 +1,7 @@
 """Storage of the map: sparse voxel blocks in one pool of memory, with one index, and growth in bounded steps.
 
 With a limit on memory, the blocks that were used longest ago go to a ``BlockStore`` on disk and come back, equal to the
-bit, when they are asked for.
+bit, when they are requested.
 
 A block holds 8 x 8 x 8 voxels in the order [z][y][x]; voxel (i, j, k) of block (x, y, z) is the point
 ``(8 * (x, y, z) + (i, j, k)) * voxel_size_m`` in the world.
@@ -89,7 +89,7 @@ class BlockGrid:
         self._version = np.zeros(capacity, np.int64)  # see ``mark_changed``
         self._resident_count = 0
         self._ever_used = 0  # from here on, buffers are as they were made: zero
-        # Called with the packed keys that ``activate`` was asked for, before anything is done with them.
+        # Called with the packed keys that ``activate`` gets, before anything is done with them.
         self.watchers: list[Callable[[NDArray[np.int64]], None]] = []
 
     @property
@@ -169,7 +169,7 @@ class BlockGrid:
         return found
 
     def batches(self, packed: NDArray[np.int64]) -> Iterator[NDArray[np.int32]]:
-        """``activate`` unique packed keys (B,) so many at a time as memory has room for.
+        """``activate`` unique packed keys (B,) this many at a time as memory has room for.
 
         Yields:
             Buffer indices of a part of them, valid until the next; one empty part where there are no keys.
@@ -186,7 +186,7 @@ class BlockGrid:
             yield self.activate(packed[start : start + self._max_resident])
 
     def reserve(self, blocks: int) -> None:
-        """Make room for so many blocks at once, as far as the limit on memory goes."""
+        """Make room for this many blocks at once, as far as the limit on memory goes."""
         if min(blocks, self._max_resident) > self.capacity:
             self._grow(blocks)
 
@@ -367,7 +367,7 @@ class BlockGrid:
             self._index = make_block_index(*self.sorted_blocks())
 
     def _make_buffers(self, capacity: int) -> GridBuffers:
-        """Memory for so many blocks, all zero.
+        """Memory for this many blocks, all zero.
 
         Raises:
             MapError: the machine does not have so much memory, or none that is free.

@@ -60,7 +60,7 @@ class BlockChanges:
 
 
 class ChosenBlocks(NamedTuple):
-    """Which blocks are to be told of, and how.
+    """Which blocks are to be reported, and how.
 
     Args:
         packed: (B,) sorted keys of existing blocks.
@@ -126,7 +126,7 @@ def oldest_first(versions: NDArray[np.int64], limit: int, newest: int) -> tuple[
 def choose_blocks(
     grid: BlockGrid, versions: tuple[int, int, int], limit: int, decision: tuple[LabelSet, float, float]
 ) -> ChosenBlocks:
-    """Which blocks have changed after a version, and how they are to be told of.
+    """Which blocks have changed after a version, and how they are to be reported.
 
     Args:
         grid: The map's storage.

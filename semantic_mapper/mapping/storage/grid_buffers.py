@@ -39,7 +39,7 @@ class GridBuffers(NamedTuple):
 
 
 def make_buffers(capacity: int, classes: int, evidence: str) -> GridBuffers:
-    """Zeros for so many blocks; the machine gives the memory page by page as it is written.
+    """Zeros for this many blocks; the machine gives the memory page by page as it is written.
 
     Raises:
         OSError: it has none.
@@ -63,5 +63,5 @@ def _zeros(shape: tuple[int, ...], dtype: type[np.generic]) -> NDArray[Any]:
 
 
 def advised_mb(blocks: int, block_bytes: int) -> int:
-    """The ``voxel_map.memory_mb`` that so many blocks of one frame, and some of the frames before, fit in."""
+    """The ``voxel_map.memory_mb`` that this many blocks of one frame, and some of the frames before, fit in."""
     return math.ceil(SPARE_SHARE * blocks * block_bytes / 1e6)

@@ -25,7 +25,7 @@ _WRITTEN_AT_ONCE = 256  # blocks
 class GridSnapshots:
     """Moments of a grid's past, oldest first; the first one is now. Reads are of the oldest.
 
-    Whoever calls any of this, or a method of the grid, holds the lock of the map. Where a block cannot be copied, the
+    The caller of any of this, or a method of the grid, holds the lock of the map. Where a block cannot be copied, the
     frame that changes it goes on; the next ``read`` or ``write`` fails.
 
     Args:
@@ -87,7 +87,7 @@ class GridSnapshots:
         self._moments[0].release(packed)
 
     def write(self, blocks: int | None = None) -> None:
-        """Put so many of the copies in memory on disk, or all.
+        """Put this many of the copies in memory on disk, or all.
 
         Raises:
             MapError: the disk is full or fails, or has failed; what is in memory stays there.
@@ -160,7 +160,7 @@ class _Moment:
         self.store.drop(packed[self.store.holds(packed)])
 
     def write(self, count: int) -> int:
-        """Put so many copies on disk, or as many as are in memory; returns how many."""
+        """Put this many copies on disk, or as many as are in memory; returns how many."""
         count = left = min(count, len(self.copies))
         while left:
             some = dict(islice(self.copies.items(), min(left, _WRITTEN_AT_ONCE)))

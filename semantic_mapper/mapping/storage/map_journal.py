@@ -72,7 +72,7 @@ class MapJournal:
             self._marks.pop(0)
 
     def write(self, blocks: int | None = None) -> None:
-        """Put so many of the blocks that wait in memory on disk, or all.
+        """Put this many of the blocks that wait in memory on disk, or all.
 
         Raises:
             MapError: the disk is full or fails, or has failed since the last call.

@@ -36,7 +36,7 @@ def surface_patches(voxel_map: VoxelMap, max_votes: float) -> SurfacePatches:
 
     Args:
         voxel_map: Whose surface it is.
-        max_votes: Voxels with so many need none.
+        max_votes: Voxels with this many need none.
     """
     config = voxel_map.config
     with voxel_map.locked() as grid:

@@ -80,7 +80,7 @@ def depth_message(k: int, start: timedelta) -> dai.ImgFrame:
 
 
 def long_ago(count: int) -> timedelta:
-    """A start for so many stamps that the last of them is past."""
+    """A start for this many stamps that the last of them is past."""
     return dai.Clock.now() - (count + 1) * PERIOD
 
 

@@ -224,7 +224,7 @@ def test_another_size_than_asked_for_is_an_error(calibration: Path) -> None:
     config = host.Config(width=80, height=60, fps=host.FPS)
     with (
         host.camera(lambda: host.played(calibration, rgb, None), config=config) as camera,
-        pytest.raises(CameraError, match="64x48, but 80x60 was asked for"),
+        pytest.raises(CameraError, match="64x48, but 80x60 was requested"),
     ):
         take(camera, 1)
 

@@ -95,7 +95,7 @@ def test_a_closed_store_says_so():
 
 @contextmanager
 def files_at_most(size: int) -> Iterator[None]:
-    """Writing beyond so many bytes of any file fails meanwhile, as on a disk that is full."""
+    """Writing beyond this many bytes of any file fails meanwhile, as on a disk that is full."""
     before = getrlimit(RLIMIT_FSIZE)
     setrlimit(RLIMIT_FSIZE, (size, before[1]))
     try:

@@ -73,7 +73,7 @@ def plenty(folder: Path) -> int:
 
 @contextmanager
 def files_at_most(size: int) -> Iterator[None]:
-    """Writing beyond so many bytes of any file fails meanwhile."""
+    """Writing beyond this many bytes of any file fails meanwhile."""
     before = getrlimit(RLIMIT_FSIZE)
     setrlimit(RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -208,13 +208,13 @@ def test_recording_pauses_where_nothing_is_left_to_delete_and_goes_on(tmp_path: 
     assert frames_in(tmp_path) == [0, 1, 2, 6, 7]
 
 
-def test_disk_that_goes_away_is_told(tmp_path: Path) -> None:
+def test_disk_that_goes_away_is_reported(tmp_path: Path) -> None:
     (tmp_path / "disk").mkdir()
     gone = recording(tmp_path / "disk" / "a.mcap", RecordingRules())
     write(gone, range(3))
     shutil.rmtree(tmp_path / "disk")
     write(gone, range(3, 6))
-    assert gone.ended and (gone.frames, gone.lost) == (3, 3) and "cannot be asked" in gone.trouble
+    assert gone.ended and (gone.frames, gone.lost) == (3, 3) and "cannot be read" in gone.trouble
     assert gone.nothing_left
 
 
