@@ -57,7 +57,7 @@ def view_from_frame(frame: PosedFrame, label_set: LabelSet, width: int) -> Label
         torch.tensor(resize_depth(frame, intrinsics)),  # a copy: the frame's own array is read-only
         torch.from_numpy(channel),
         intrinsics,
-        torch.from_numpy(frame.T_world_camera).float(),
+        torch.tensor(frame.T_world_camera, dtype=torch.float32),
     )
 
 
