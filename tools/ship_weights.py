@@ -32,7 +32,7 @@ from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_pat
 CARD = Path(__file__).resolve().parent.parent / "docs" / "model-card.md"
 BEGIN, END = "<!-- metadata -->", "<!-- /metadata -->"
 MOST_BYTES = 16_000_000
-SETTINGS = ("split", "protocol", "views", "baseline", "depth")
+SETTINGS = ("split", "protocol", "views", "sources", "own_image", "depth")
 FIGURES = ("rooms", "images", "data_set", "psnr_db", "ssim", "depth_abs_rel", "ece", "consistency")
 COMMIT = re.compile(r"[0-9a-f]{40}")
 
@@ -185,6 +185,13 @@ def _run_table(recipe: dict[str, Any]) -> list[str]:
     return _markdown(rows)
 
 
+def _sources(figure: dict[str, Any]) -> str:
+    """Which views the figures are of; files of before say `baseline`, and had no image of the query's own."""
+    if "sources" not in figure:
+        return f"baseline `{figure['baseline']}`"
+    return f"sources `{figure['sources']}`" + (" with the query's own image" if figure["own_image"] else "")
+
+
 def _figure_table(figures: Sequence[dict[str, Any]]) -> list[str]:
     if not figures:
         return ["Nothing was measured."]
@@ -192,7 +199,7 @@ def _figure_table(figures: Sequence[dict[str, Any]]) -> list[str]:
     of_what = "these float16 weights" if first.get("measured") else "the float32 weights that these were made of"
     title = (
         f"Measured with {of_what} on {first['rooms']} rooms of the {first['split']} split, {first['images']} images, "
-        f"protocol `{first['protocol']}`, {first['views']} views, baseline `{first['baseline']}`:"
+        f"protocol `{first['protocol']}`, {first['views']} views, {_sources(first)}:"
     )
     rows = [("", *("sensor depth" if figure["depth"] else "no depth" for figure in figures))]
     for name, key in (("mIoU", "miou"), ("total accuracy", "total_accuracy"), ("average accuracy", "average_accuracy")):

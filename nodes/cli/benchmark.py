@@ -27,6 +27,9 @@ def benchmark(
     rooms: suites.RoomsOption = None,
     kind: suites.KindOption = None,
     views: suites.ViewsOption = None,
+    sources: suites.SourcesOption = None,
+    own_image: suites.OwnImageOption = None,
+    current: suites.CurrentOption = None,
     baseline: suites.BaselineOption = None,
     depth: suites.DepthOption = None,
     tier: suites.TierOption = None,
@@ -41,17 +44,19 @@ def benchmark(
 ) -> int:
     """Score weights on the rooms of a suite, one column a weights file, and draw a contact sheet.
 
-    Query views of rooms that nothing was trained on are rendered from source views. A run that was interrupted goes on
-    where it was. docs/benchmarks.md says what each figure means. Writes JSON, and beside it a page of HTML, the contact
-    sheet and the records of the rooms.
+    Query views of rooms that nothing was trained on are rendered from source views. Below them stand the same views
+    without learned fusion, and by a per-image U-Net where one is among the weights. An interrupted run continues where
+    it was. docs/benchmarks.md says what each figure means. Writes JSON, and beside it a page of HTML, the contact sheet
+    and the records of the rooms.
 
     Example: semantic-mapper benchmark rooms --weights a.safetensors --weights b.safetensors --out runs/ab.json
-    Example: semantic-mapper benchmark rooms --baseline wide --depth off --rooms 5 --json
+    Example: semantic-mapper benchmark rooms --sources wide --depth off --rooms 5 --json
     Example: semantic-mapper benchmark rooms --protocol scratch --kind semantic_nerf --rooms 3 --seconds 600
     """
     from semantic_mapper.nodes.cli.suite import run_suite_verb
 
     given = {"split": split, "rooms": rooms, "protocol": protocol, "views": views, "baseline": baseline, "depth": depth}
+    given |= {"sources": sources, "own_image": own_image, "current": current}
     given |= {"keyframes": keyframes, "steps": steps, "seconds": seconds, "seed": seed}
     settings = suites.suite_config(config, tier, given, maps)
     out, print_json = results_file(out, json)

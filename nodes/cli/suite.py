@@ -11,9 +11,17 @@ from typing import Any
 from semantic_mapper import __version__
 from semantic_mapper.benchmark.config import SuiteConfig, settings_digest, suite_seeds
 from semantic_mapper.benchmark.entries import load_entries
-from semantic_mapper.benchmark.figures import compare, draw_fit_curves, map_figures, view_figures
+from semantic_mapper.benchmark.figures import (
+    compare,
+    compare_with_baselines,
+    comparison_rows,
+    draw_fit_curves,
+    map_figures,
+    row_figures,
+    view_figures,
+)
 from semantic_mapper.benchmark.protocols import Entry
-from semantic_mapper.benchmark.records import MapRecord
+from semantic_mapper.benchmark.records import MapRecord, RoomRecord
 from semantic_mapper.benchmark.run import Progress, room_records, run_suite, sheet_rows
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.config import to_plain
@@ -25,7 +33,7 @@ from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.cli.console import FrameProgress, Output, frame_progress, stderr_console
 from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.cli.report import write_suite_report
-from semantic_mapper.nodes.cli.suite_table import difference_lines, suite_table
+from semantic_mapper.nodes.cli.suite_table import difference_lines, rows_table, suite_table
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plots import cannot_draw, write_picture
 from semantic_mapper.replay.artifacts import write_json
@@ -82,6 +90,8 @@ def run_suite_verb(
         write_json(out, found)
         table, lines = suite_table(found), difference_lines(found)
         output.print(table)
+        if found["rows"]:
+            output.print(rows_table(found))
         for line in lines:
             output.print(line)
         output.print(f"written to {out}")
@@ -116,7 +126,9 @@ def _draw(
 def _file_stem(suite: SuiteConfig) -> str:
     """One file for each table that a comparison usually has."""
     depth = "depth" if suite.depth else "no-depth"
-    views = f"{suite.baseline}-" if suite.protocol == "generalize" else ""
+    own = "" if suite.own_image else "novel-"
+    views = f"{suite.sources}-{own}" if suite.protocol == "generalize" else ""
+    views += "hard-" if suite.current == "hard" else ""
     return f"rooms-{suite.split}-{suite.protocol}-{views}{depth}-{suite.tier.width}"
 
 
@@ -169,9 +181,34 @@ def _collect(suite: SuiteConfig, entries: Sequence[Entry], store: RecordStore, m
         for a, b in pairs
         if (difference := compare(records[a], records[b], seed=suite.seed)) is not None
     ]
+    found["rows"], more = _rows(suite, entries, records)
+    found["differences"] += more
     found["complete"] = all(len(r) == len(seeds) for r in records.values())
     found["versions"] = {"semantic_mapper": __version__} | {name: metadata.version(name) for name in PACKAGES}
     return found
+
+
+def _rows(
+    suite: SuiteConfig, entries: Sequence[Entry], records: Mapping[str, list[RoomRecord]]
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The first multi-view field beside what its views say without it, and differences to each; nothing where fitted.
+
+    The row ``unet`` is the first per-image network among the weights, None without one.
+    """
+    fused = next((entry for entry in entries if not entry.field.needs_own_view), None)
+    if fused is None or suite.protocol != "generalize" or not records[fused.name]:
+        return {}, []
+    ours, kind = records[fused.name], fused.field.kind
+    rows: dict[str, Any] = {kind: row_figures(ours)} | comparison_rows(ours)
+    differences = [
+        {"first": kind, "second": name, **found}
+        for name, found in compare_with_baselines(ours, seed=suite.seed).items()
+    ]
+    image = next((entry for entry in entries if entry.field.needs_own_view), None)
+    rows["unet"] = row_figures(records[image.name]) if image is not None and records[image.name] else None
+    if image is not None and (found := compare(ours, records[image.name], seed=suite.seed)) is not None:
+        differences.append({"first": kind, "second": "unet", **found})
+    return rows, differences
 
 
 def _map_records(suite: SuiteConfig, entry: Entry, store: RecordStore) -> list[MapRecord]:
@@ -181,7 +218,9 @@ def _map_records(suite: SuiteConfig, entry: Entry, store: RecordStore) -> list[M
 
 
 def _title(suite: SuiteConfig, rooms: int) -> str:
-    sources = f"{suite.views} {suite.baseline} views" if suite.protocol == "generalize" else _fit_title(suite)
+    own = ", the query's own image among them" if suite.own_image else ""
+    sources = f"{suite.views} {suite.sources} views{own}" if suite.protocol == "generalize" else _fit_title(suite)
+    sources += ", hard query images" if suite.current == "hard" else ""
     depth = "with depth" if suite.depth else "without depth"
     width, count = suite.tier.width, "1 room" if rooms == 1 else f"{rooms} rooms"
     return f"ROOMS {suite.split}, {count}, {suite.protocol}: {sources}, {depth}, {width}x{width * 3 // 4}"

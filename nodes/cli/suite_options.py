@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from semantic_mapper.nodes.cli.verb import warn_of_old_name
+
 if TYPE_CHECKING:
     from semantic_mapper.benchmark.config import SuiteConfig
 
@@ -23,10 +25,23 @@ KindOption = Annotated[
     typer.Option("--kind", help="scratch: a kind of field with random weights, without a file; may repeat."),
 ]
 ViewsOption = Annotated[int | None, typer.Option(min=1, max=16, help="Source views of a query.  [default: 8]")]
-BaselineOption = Annotated[
-    Literal["wide", "narrow"] | None,
-    typer.Option(help="generalize: source views far from the query, or near it.  [default: narrow]"),
+SourcesOption = Annotated[
+    Literal["near", "wide", "cover"] | None,
+    typer.Option(
+        help="generalize: source views near the query, far from it, or the mapper's keyframes.  [default: near]"
+    ),
 ]
+OwnImageOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--own-image/--no-own-image", help="generalize: the query's own image is a source view.  [default: on]"
+    ),
+]
+CurrentOption = Annotated[
+    Literal["clean", "hard"] | None,
+    typer.Option(help="Query images as all others, or blurred, noisy, dark, narrow or too close.  [default: clean]"),
+]
+BaselineOption = Annotated[Literal["wide", "narrow"] | None, typer.Option(hidden=True)]
 DepthOption = Annotated[
     Literal["on", "off"] | None, typer.Option(help="Whether the frames have sensor depth.  [default: on]")
 ]
@@ -70,6 +85,10 @@ def suite_config(
     if tier is not None:
         plain["tier"] = to_plain(TIERS[tier])
     given = {name: value for name, value in given.items() if value is not None}
+    if (baseline := given.pop("baseline", None)) is not None:
+        sources = {"narrow": "near"}.get(baseline, baseline)
+        warn_of_old_name(f"--baseline {baseline}", f"--sources {sources} --no-own-image")
+        given = {"sources": sources, "own_image": False} | given
     if given.get("steps") and "seconds" not in given:
         given["seconds"] = 0.0
     for name, value in given.items():
@@ -86,8 +105,9 @@ def _refuse_idle(protocol: str, given: dict[str, Any], maps: bool) -> None:
     Raises:
         typer.BadParameter: names them.
     """
-    if protocol != "generalize" and "baseline" in given:
-        raise typer.BadParameter("goes with --protocol generalize: keyframes are all there is", param_hint="--baseline")
+    if protocol != "generalize" and given.keys() & {"sources", "own_image"}:
+        hint = "--sources, --own-image"
+        raise typer.BadParameter("go with --protocol generalize: keyframes are all there is", param_hint=hint)
     if protocol != "generalize" and maps:
         raise typer.BadParameter(
             "goes with --protocol generalize: maps are made with weights as they are", param_hint="--map"

@@ -32,6 +32,20 @@ def suite_table(found: Mapping[str, Any]) -> Table:
     return table
 
 
+def rows_table(found: Mapping[str, Any]) -> Table:
+    """The field beside what its source views say without it."""
+    table = Table(title="the same query views without learned fusion", title_justify="left")
+    columns = {"mIoU": "miou", "total accuracy": "total_accuracy", "average accuracy": "average_accuracy"}
+    columns |= {"mIoU, interior": "interior_miou", "ECE": "ece"}
+    table.add_column("")
+    for column in columns:
+        table.add_column(column, justify="right")
+    for name, row in found["rows"].items():
+        values = [None if row is None else row[key] for key in columns.values()]
+        table.add_row(_ROW_NAMES.get(name, name), *("-" if v is None else percent(v) for v in values))
+    return table
+
+
 def difference_lines(found: Mapping[str, Any]) -> list[str]:
     """One sentence a pair of weights files."""
     return [
@@ -78,6 +92,13 @@ def _dig(entry: Mapping[str, Any], path: str) -> Any:
     return value
 
 
+_ROW_NAMES = {
+    "own": "own image alone",
+    "vote": "vote of the views",
+    "vote_exact": "vote at exact depth",
+    "oracle": "oracle over views",
+    "unet": "U-Net",
+}
 _Rows = Sequence[tuple[str, str, Callable[[Any], str]]]
 
 _VIEW_ROWS: _Rows = (
@@ -95,6 +116,7 @@ _VIEW_ROWS: _Rows = (
     ("SSIM", "figures.ssim", lambda v: f"{v:.3f}"),
     ("depth, relative error", "figures.depth_abs_rel", lambda v: f"{v:.3f}"),
     ("depth, RMSE", "figures.depth_rmse_m", lambda v: f"{v:.3f} m"),
+    ("mIoU, interior", "figures.interior_miou", percent),
     ("calibration error (ECE)", "figures.ece", percent),
     ("multi-view consistency", "figures.consistency", percent),
     ("distance of source views", "figures.baseline_m", lambda v: f"{v:.2f} m"),

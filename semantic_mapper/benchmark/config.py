@@ -28,14 +28,15 @@ from semantic_mapper.training.finetune import FinetuneConfig
 from semantic_mapper.training.step import StepConfig
 from semantic_mapper.types import CameraIntrinsics
 
-RECORD_VERSION = 5  # raised by a change of what a record means or how views are rendered: older ones are made again
+RECORD_VERSION = 6  # raised by a change of what a record means or how views are rendered: older ones are made again
 
 FOCAL_PER_WIDTH = 882.5 / 1280  # an OAK-D at 1280 pixels
 MAP_WIDTH = 320
 
 Split = Literal["test", "val"]
 Protocol = Literal["generalize", "finetune", "scratch"]
-Baseline = Literal["wide", "narrow"]
+SourceChoice = Literal["near", "wide", "cover"]
+CurrentFrame = Literal["clean", "hard"]
 Tier = Literal["cpu", "gpu"]
 
 
@@ -87,8 +88,8 @@ class SpacingConfig(Config, frozen=True):
     apart_m: float = 0.0
 
 
-SPACINGS: dict[Baseline, SpacingConfig] = {
-    "narrow": SpacingConfig(from_query_m=0.05, to_query_m=0.5, apart_m=0.05),
+SPACINGS: dict[SourceChoice, SpacingConfig] = {  # "cover": the mapper's own choice of keyframes
+    "near": SpacingConfig(from_query_m=0.05, to_query_m=0.5, apart_m=0.05),
     "wide": SpacingConfig(from_query_m=0.5, apart_m=0.2),
 }
 
@@ -120,11 +121,18 @@ class SceneBudget(Config, frozen=True):
 class SuiteConfig(Config, frozen=True):
     """A run of the benchmark."""
 
+    old_names: ClassVar = {"baseline": "sources"}
+    old_values: ClassVar = {"sources": {"narrow": "near"}}
+
     split: Split = "test"
     rooms: NotNegative = 0  # the first this many of the split; 0 = all
     protocol: Protocol = "generalize"
     views: Annotated[int, msgspec.Meta(ge=1, le=MAX_SOURCE_VIEWS)] = 8  # source views of a query
-    baseline: Baseline = "narrow"
+    sources: SourceChoice = "near"
+    own_image: bool = True  # generalize: the query's own image is the last of the source views, as in the mapper
+    current: CurrentFrame = (
+        "clean"  # "hard": query images with blur, noise, 2 stops too dark, a narrow lens, or too close
+    )
     depth: bool = True  # whether fields are given sensor depth
     tier: TierConfig = TierConfig()
     sequence: SequenceConfig = SequenceConfig()
@@ -204,9 +212,9 @@ def settings_digest(suite: SuiteConfig, part: Literal["views", "map"]) -> str:
         del plain["map_frames"], plain["mapper"]
         if suite.protocol == "generalize":
             del plain["scene"]
-            plain["spacing"] = repr(SPACINGS[suite.baseline])
+            plain["spacing"] = repr(SPACINGS.get(suite.sources))
         else:
-            del plain["baseline"]
+            del plain["sources"], plain["own_image"]
             plain["fit"] = to_plain(fit_config(suite, 1.0))  # with its defaults, which may change
     plain |= {"part": part, "suite_version": SUITE_VERSION, "record_version": RECORD_VERSION}
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]

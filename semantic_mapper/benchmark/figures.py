@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from semantic_mapper.benchmark.records import CurvePoint, ImageRecord, MapRecord, RoomRecord
+from semantic_mapper.benchmark.records import BaselineRecord, CurvePoint, ImageRecord, MapRecord, RoomRecord
 from semantic_mapper.benchmark.scoring import from_rows
 from semantic_mapper.evaluation.bootstrap import paired_bootstrap
 from semantic_mapper.evaluation.consistency import Agreement
@@ -39,6 +39,11 @@ def view_figures(records: Sequence[RoomRecord]) -> dict[str, Any]:
         "depth_rmse_m": depth.rmse_m,
         "ece": _ece(records),
         "consistency": agreement.fraction,
+        "interior_miou": _summed([from_rows(r.interior) for r in records]).metrics().miou,
+        "by_condition": {
+            name: _mean([i.miou for i in images if i.condition == name])
+            for name in sorted({i.condition for i in images})
+        },
         "baseline_m": _mean([i.baseline_m for i in images]),
         "seen": _mean([i.seen for i in images]),
         "per_room_miou": {str(r.room): c.metrics().miou for r, c in zip(records, confusions, strict=True)},
@@ -47,6 +52,38 @@ def view_figures(records: Sequence[RoomRecord]) -> dict[str, Any]:
         "seconds_to_95_percent": _seconds_to_most(_curve(records)),
         "last_gain": _last_gain(_curve(records)),
     }
+
+
+def row_figures(records: Sequence[RoomRecord] | Sequence[BaselineRecord]) -> dict[str, float | None]:
+    """One row of the comparison table: a field, or one baseline, over its rooms."""
+    total = _summed([from_rows(r.confusion) for r in records]).metrics()
+    return {
+        "miou": total.miou,
+        "total_accuracy": total.total_accuracy,
+        "average_accuracy": total.average_accuracy,
+        "interior_miou": _summed([from_rows(r.interior) for r in records]).metrics().miou,
+        "ece": _ece(records),
+    }
+
+
+def comparison_rows(records: Sequence[RoomRecord]) -> dict[str, dict[str, float | None]]:
+    """``row_figures`` of each baseline that all of the rooms have, by name."""
+    return {name: row_figures([r.rows[name] for r in records]) for name in _common_rows(records)}
+
+
+def compare_with_baselines(records: Sequence[RoomRecord], *, seed: int = 0) -> dict[str, dict[str, Any]]:
+    """Difference in data-set mIoU, field minus baseline, by baseline; empty for fewer than 2 rooms."""
+    if len(records) < 2:
+        return {}
+    own = [from_rows(r.confusion) for r in records]
+    return {
+        name: asdict(paired_bootstrap(own, [from_rows(r.rows[name].confusion) for r in records], seed=seed))
+        for name in _common_rows(records)
+    }
+
+
+def _common_rows(records: Sequence[RoomRecord]) -> list[str]:
+    return [name for name in records[0].rows if all(name in r.rows for r in records)] if records else []
 
 
 def map_figures(records: Sequence[MapRecord]) -> dict[str, Any]:
@@ -107,7 +144,7 @@ def _summed(confusions: Sequence[ConfusionMatrix]) -> ConfusionMatrix:
     return sum(confusions, ConfusionMatrix(ROOMS))
 
 
-def _ece(records: Sequence[RoomRecord] | Sequence[MapRecord]) -> float | None:
+def _ece(records: Sequence[RoomRecord] | Sequence[MapRecord] | Sequence[BaselineRecord]) -> float | None:
     if not records:
         return None
     count = np.array([r.calibration.count for r in records], np.int64)

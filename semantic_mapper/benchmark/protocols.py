@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import msgspec
 import torch
 
+from semantic_mapper.benchmark.baselines import baseline_predictions
 from semantic_mapper.benchmark.config import (
     SPACINGS,
     SuiteConfig,
@@ -25,8 +26,10 @@ from semantic_mapper.benchmark.scoring import (
     room_agreement,
     room_calibration,
     room_confusion,
+    room_interior,
+    room_rows,
 )
-from semantic_mapper.benchmark.views import Sources, choose_covering, choose_sources
+from semantic_mapper.benchmark.views import Sources, choose_as_mapper, choose_covering, choose_sources
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.fields.checkpoint import adapt_model
@@ -95,14 +98,17 @@ def run_room(
 
 
 def answer_queries(room: BenchmarkRoom, field: LearnedField, suite: SuiteConfig) -> dict[int, Answer]:
-    """Render all query views from source views without labels, chosen by the baseline of the run."""
+    """Render all query views from source views without labels, chosen as ``suite.sources`` says."""
     answers: dict[int, Answer] = {}
     for q in room.queries:
         pool = [n for n in range(len(room.frames)) if n != q]
         count = max(1, min(_source_count(field, suite), len(pool)))
-        candidates = [room.frames[n] for n in pool]
-        pose, depth_m = room.frames[q].T_world_camera, room.truth[q].depth_m
-        sources = choose_sources(pose, depth_m, candidates, count, SPACINGS[suite.baseline])
+        current, depth_m = room.current[q], room.truth[q].depth_m
+        if suite.sources == "cover":
+            sources = choose_as_mapper(room.frames[:q], current, depth_m, count)
+        else:
+            candidates, spacing = [room.frames[n] for n in pool], SPACINGS[suite.sources]
+            sources = choose_sources(current.T_world_camera, depth_m, candidates, count, spacing, current.intrinsics)
         answers[q] = _answer(room, field, suite, q, pool, sources)
     return answers
 
@@ -116,7 +122,7 @@ def answer_from_keyframes(
     candidates, brings = [room.frames[n] for n in pool], [n in labelled for n in pool]
     answers: dict[int, Answer] = {}
     for q in room.queries:
-        pose, depth_m = room.frames[q].T_world_camera, room.truth[q].depth_m
+        pose, depth_m = room.current[q].T_world_camera, room.truth[q].depth_m
         sources = choose_covering(pose, depth_m, candidates, brings, max(1, _source_count(field, suite)))
         answers[q] = _answer(room, field, suite, q, pool, sources, labelled)
     return answers
@@ -147,7 +153,12 @@ def _most_telling(room: BenchmarkRoom, numbers: Sequence[int], count: int, seed:
 
 def _source_count(field: LearnedField, suite: SuiteConfig) -> int:
     """Source views of a query besides the query's own image."""
-    return suite.views - (1 if field.needs_own_view else 0)
+    return suite.views - (1 if _shows_own(field, suite) else 0)
+
+
+def _shows_own(field: LearnedField, suite: SuiteConfig) -> bool:
+    """Whether the query's own image is a source view."""
+    return field.needs_own_view or (suite.protocol == "generalize" and suite.own_image)
 
 
 def _answer(
@@ -163,10 +174,17 @@ def _answer(
     frames = room.frames
     chosen = [pool[i] for i in sources.numbers][: _source_count(field, suite)]
     given = [as_given(frames[n], depth=suite.depth, label=n in labelled) for n in chosen]
-    asked = as_given(frames[query], depth=suite.depth)
-    if field.needs_own_view:  # last, where the mapping pipeline has the current view, too
-        given, chosen = [*given, asked], [*chosen, query]
-    return Answer(predict_view(field, given, asked, suite.tier), sources, tuple(chosen))
+    asked = as_given(room.current[query], depth=suite.depth)
+    own = _shows_own(field, suite)
+    # The own image comes last, where the mapping pipeline has the current view, too.
+    prediction = predict_view(field, [*given, asked] if own else given, asked, suite.tier)
+    rows = {}
+    if suite.protocol == "generalize" and not field.needs_own_view:
+        sensed, truth = [as_given(frames[n], depth=True) for n in chosen], room.truth[query]
+        rows = baseline_predictions(
+            field, given, sensed, asked, prediction, truth.exact_depth_m, truth.label, own_image=own
+        )
+    return Answer(prediction, sources, (*chosen, query) if own else tuple(chosen), room.condition[query], rows)
 
 
 def _fit_and_score(
@@ -234,7 +252,7 @@ def _carried_labels(room: BenchmarkRoom, keyframes: Sequence[int]) -> Rows:
     carried = WarpBaseline(ROOMS, [as_given(room.frames[n], depth=True, label=True) for n in keyframes])
     total = ConfusionMatrix(ROOMS)
     for query, truth in room.truth.items():
-        total.update(truth.label, carried.predict(as_given(room.frames[query], depth=True)), f"query view {query}")
+        total.update(truth.label, carried.predict(as_given(room.current[query], depth=True)), f"query view {query}")
     return as_rows(total)
 
 
@@ -257,6 +275,8 @@ def _scored(
         calibration=room_calibration(room, answers),
         agreeing=agreement.agreeing,
         compared=agreement.compared,
+        interior=as_rows(room_interior(room, answers)),
+        rows=room_rows(room, answers),
         keyframes=keyframes,
         curve=curve,
         carried=_carried_labels(room, keyframes) if keyframes and suite.depth else None,

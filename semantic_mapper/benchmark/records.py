@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import msgspec
+
 from semantic_mapper.config import Config
 
 Rows = tuple[tuple[int, ...], ...]  # a confusion's counts
@@ -29,6 +31,7 @@ class ImageRecord(Config, frozen=True):
     psnr_db: float | None  # None where the field was shown this very image
     ssim: float | None
     depth: DepthRecord
+    condition: str = "clean"  # of the query's own image; see ``rooms.HARD``
 
 
 class CalibrationRecord(Config, frozen=True):
@@ -37,6 +40,14 @@ class CalibrationRecord(Config, frozen=True):
     count: tuple[int, ...]
     confidence: tuple[float, ...]
     right: tuple[float, ...]
+
+
+class BaselineRecord(Config, frozen=True):
+    """One of ``baselines.BASELINES`` over the query views of a room."""
+
+    confusion: Rows
+    interior: Rows
+    calibration: CalibrationRecord
 
 
 class CurvePoint(Config, frozen=True):
@@ -60,6 +71,8 @@ class RoomRecord(Config, frozen=True, tag_field="record", tag="views"):
     calibration: CalibrationRecord
     agreeing: int  # of the pixels of one query view that are found again in its neighbour
     compared: int
+    interior: Rows  # of the pixels more than 2 px from a border between labels
+    rows: dict[str, BaselineRecord] = msgspec.field(default_factory=dict[str, BaselineRecord])  # by name
     keyframes: tuple[int, ...] = ()  # that the field was fitted to
     curve: tuple[CurvePoint, ...] = ()
     carried: Rows | None = None  # of the keyframes' labels carried over by depth alone

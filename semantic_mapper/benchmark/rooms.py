@@ -4,10 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from semantic_mapper.benchmark.config import SuiteConfig, camera_of_width
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, RenderedView, make_room, render_view, room_frames
-from semantic_mapper.types import PosedFrame
+from semantic_mapper.scenes.scene import Scene
+from semantic_mapper.scenes.shots import motion_between, sequence_shots
+from semantic_mapper.types import Float64, PosedFrame
+
+CLEAN = "clean"
+HARD = ("blur", "noise", "dark", "narrow", "close")  # what the query images of a room suffer from, in turn
+BLUR_WAY_M = 0.05  # way of the camera while the shutter is open: five times what clean frames have at most
+ISO_FACTOR = 8.0
+DARK_GAIN = 0.25  # two stops
+NARROW_FOCAL = 1.4  # image widths
+CLOSE_M = (0.3, 0.6)  # from what is in the middle of the image
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,7 +32,9 @@ class BenchmarkRoom:
         frames: The walk, with the noise of the sensor, in the order of their ``seq``.
         truth: By frame number of each query view, in order: colour of a perfect camera at even exposure, exact depth,
             labels.
-        pairs: Frame numbers of neighbouring query views.
+        pairs: Frame numbers of neighbouring query views by one camera.
+        current: By frame number of each query view, what the camera gives there; ``frames`` has it only where clean.
+        condition: By frame number of each query view, "clean" or one of ``HARD``.
     """
 
     seed: int
@@ -28,6 +42,8 @@ class BenchmarkRoom:
     frames: tuple[PosedFrame, ...]
     truth: dict[int, RenderedView]
     pairs: tuple[tuple[int, int], ...]
+    current: dict[int, PosedFrame]
+    condition: dict[int, str]
 
     @property
     def queries(self) -> tuple[int, ...]:
@@ -49,12 +65,61 @@ def make_benchmark_room(seed: int, suite: SuiteConfig) -> BenchmarkRoom:
         max_height_m=asked.max_height_m,
         roll_deg=asked.roll_deg,
     )
-    frames = tuple(room_frames(seed, suite.sequence.frames, camera, path=path, noise=NoiseConfig(depth=asked.sensor)))
+    noise = NoiseConfig(depth=asked.sensor)
+    frames = tuple(room_frames(seed, suite.sequence.frames, camera, path=path, noise=noise))
     scene = make_room(seed)
     pairs = query_pairs(suite)
     queries = [number for pair in pairs for number in pair]
-    truth = {q: render_view(scene, camera, frames[q].T_world_camera) for q in queries}
-    return BenchmarkRoom(seed, scene.template, frames, truth, pairs)
+    if suite.current == "hard":
+        condition = {q: HARD[(seed + turn) % len(HARD)] for turn, q in enumerate(queries)}
+        current = {q: hard_frame(scene, frames, q, seed, kind, noise) for q, kind in condition.items()}
+        pairs = ()  # consistency compares two views by one camera
+    else:
+        condition, current = dict.fromkeys(queries, CLEAN), {q: frames[q] for q in queries}
+    truth = {q: render_view(scene, frame.intrinsics, frame.T_world_camera) for q, frame in current.items()}
+    return BenchmarkRoom(seed, scene.template, frames, truth, pairs, current, condition)
+
+
+def hard_frame(
+    scene: Scene, frames: tuple[PosedFrame, ...], query: int, seed: int, kind: str, noise: NoiseConfig
+) -> PosedFrame:
+    """The frame that a camera in trouble takes in the place of ``frames[query]``, with its own depth and labels.
+
+    Args:
+        scene: The room of ``seed``.
+        frames: The walk; the last one is no query.
+        kind: One of ``HARD``.
+        noise: Of the walk.
+    """
+    frame = frames[query]
+    pose, intrinsics = frame.T_world_camera, frame.intrinsics
+    poses = np.stack([f.T_world_camera for f in frames])
+    shot = sequence_shots(poses, seed, noise)[query]
+    if kind == "blur":
+        shot = replace(shot, T_open_close=motion_between(pose, poses[query + 1], BLUR_WAY_M))
+    elif kind == "noise":
+        shot = replace(shot, iso=shot.iso * ISO_FACTOR)
+    elif kind == "dark":
+        shot = replace(shot, gain=shot.gain * DARK_GAIN)
+    elif kind == "narrow":
+        intrinsics = camera_of_width(intrinsics.width, NARROW_FOCAL)
+    else:
+        pose = _moved_close(scene, frame, np.random.default_rng((seed, query)).uniform(*CLOSE_M))
+    number = seed * 100_003 + query
+    view = render_view(scene, intrinsics, pose, noise=number, noise_config=noise, shot=shot)
+    depth_m = None if noise.depth == "none" else view.depth_m
+    return replace(frame, rgb=view.rgb, depth_m=depth_m, label=view.label, intrinsics=intrinsics, T_world_camera=pose)
+
+
+def _moved_close(scene: Scene, frame: PosedFrame, away_m: float) -> Float64:
+    """The pose moved along its optical axis until the nearest thing in the middle of the image is ``away_m`` away."""
+    depth_m = render_view(scene, frame.intrinsics, frame.T_world_camera).exact_depth_m
+    height, width = depth_m.shape
+    middle = depth_m[height // 3 : -(height // 3), width // 3 : -(width // 3)]
+    pose = frame.T_world_camera.copy()
+    if (middle > 0).any():
+        pose[:3, 3] += pose[:3, 2] * max(0.0, float(middle[middle > 0].min()) - away_m)
+    return pose
 
 
 def query_pairs(suite: SuiteConfig) -> tuple[tuple[int, int], ...]:

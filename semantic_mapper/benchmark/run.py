@@ -119,7 +119,7 @@ def _keep_picture(pictures: Path, room: BenchmarkRoom, result: RoomResult) -> No
     record = result.record
     with atomic_write(_picture_path(pictures, record.settings, record.weights, room.seed)) as file:
         np.savez_compressed(
-            file, rgb=room.frames[query].rgb, truth=room.truth[query].label, label=answer.prediction.label
+            file, rgb=room.current[query].rgb, truth=room.truth[query].label, label=answer.prediction.label
         )
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic_mapper.benchmark.baselines import BaselinePrediction
 from semantic_mapper.benchmark.predict import Prediction
-from semantic_mapper.benchmark.records import CalibrationRecord, DepthRecord, ImageRecord
+from semantic_mapper.benchmark.records import BaselineRecord, CalibrationRecord, DepthRecord, ImageRecord
 from semantic_mapper.benchmark.rooms import BenchmarkRoom
 from semantic_mapper.benchmark.views import Sources
 from semantic_mapper.evaluation.colour import match_colours, psnr, ssim
@@ -18,16 +20,20 @@ from semantic_mapper.evaluation.depth_error import depth_errors
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration, confusion_of
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes import RenderedView
-from semantic_mapper.types import Float32
+from semantic_mapper.types import Float32, UInt8
+
+BORDER_PX = 2  # pixels at most this far from another label are not interior
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """A rendered query view and what it was rendered from."""
+    """A rendered query view and what it was rendered from; ``baselines`` by name, where the field has any."""
 
     prediction: Prediction
     sources: Sources
     source_frames: tuple[int, ...]
+    condition: str = "clean"
+    baselines: Mapping[str, BaselinePrediction] = field(default_factory=dict[str, BaselinePrediction])
 
 
 def image_record(frame: int, answer: Answer, truth: RenderedView) -> ImageRecord:
@@ -50,23 +56,61 @@ def image_record(frame: int, answer: Answer, truth: RenderedView) -> ImageRecord
         psnr_db=None if was_shown else psnr(colour, rendered),
         ssim=None if was_shown else ssim(colour, rendered),
         depth=DepthRecord(relative_sum=depth.relative_sum, square_sum=depth.square_sum, count=depth.count),
+        condition=answer.condition,
     )
+
+
+def interior_truth(label: UInt8) -> UInt8:
+    """True ids (H, W) with the ignore id wherever another label is at most ``BORDER_PX`` away."""
+    window = np.ones((2 * BORDER_PX + 1, 2 * BORDER_PX + 1), np.uint8)
+    same = cv2.dilate(label, window) == cv2.erode(label, window)
+    return np.where(same, label, np.uint8(ROOMS.ignore_id))
 
 
 def room_confusion(room: BenchmarkRoom, answers: Mapping[int, Answer]) -> ConfusionMatrix:
     """One matrix over all query views of a room."""
-    total = ConfusionMatrix(ROOMS)
-    for frame, answer in answers.items():
-        total.update(room.truth[frame].label, answer.prediction.label, f"query view {frame}")
-    return total
+    return _confusion(room, {frame: answer.prediction for frame, answer in answers.items()}, interior=False)
+
+
+def room_interior(room: BenchmarkRoom, answers: Mapping[int, Answer]) -> ConfusionMatrix:
+    """The same over the pixels that are not near a border between labels."""
+    return _confusion(room, {frame: answer.prediction for frame, answer in answers.items()}, interior=True)
+
+
+def room_rows(room: BenchmarkRoom, answers: Mapping[int, Answer]) -> dict[str, BaselineRecord]:
+    """What the baselines say of all query views of a room, by name."""
+    names = next(iter(answers.values())).baselines if answers else {}
+    found: dict[str, BaselineRecord] = {}
+    for name in names:
+        predictions = {frame: answer.baselines[name] for frame, answer in answers.items()}
+        found[name] = BaselineRecord(
+            confusion=as_rows(_confusion(room, predictions, interior=False)),
+            interior=as_rows(_confusion(room, predictions, interior=True)),
+            calibration=_calibration(room, predictions),
+        )
+    return found
 
 
 def room_calibration(room: BenchmarkRoom, answers: Mapping[int, Answer]) -> CalibrationRecord:
     """Confidence against accuracy over the pixels with truth and prediction."""
+    return _calibration(room, {frame: answer.prediction for frame, answer in answers.items()})
+
+
+def _confusion(
+    room: BenchmarkRoom, predictions: Mapping[int, Prediction | BaselinePrediction], *, interior: bool
+) -> ConfusionMatrix:
+    total = ConfusionMatrix(ROOMS)
+    for frame, prediction in predictions.items():
+        truth = room.truth[frame].label
+        total.update(interior_truth(truth) if interior else truth, prediction.label, f"query view {frame}")
+    return total
+
+
+def _calibration(room: BenchmarkRoom, predictions: Mapping[int, Prediction | BaselinePrediction]) -> CalibrationRecord:
     confidence: list[Float32] = []
     right: list[np.ndarray] = []
-    for frame, answer in answers.items():
-        truth, prediction = room.truth[frame].label, answer.prediction
+    for frame, prediction in predictions.items():
+        truth = room.truth[frame].label
         counted = (truth != ROOMS.ignore_id) & prediction.known
         confidence.append(np.clip(prediction.confidence[counted], 0, 1))
         right.append(prediction.label[counted] == truth[counted])

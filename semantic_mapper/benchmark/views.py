@@ -7,11 +7,15 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from semantic_mapper.benchmark.config import SpacingConfig
+from semantic_mapper.config import KeyframeConfig
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.geometry import transform, unproject
+from semantic_mapper.mapping.keyframes import Keyframe, KeyframeStore
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 from semantic_mapper.view_selection import LABELLED_VALUE, select_views, visible_points
 
@@ -39,6 +43,7 @@ def choose_sources(
     candidates: Sequence[PosedFrame],
     count: int,
     spacing: SpacingConfig,
+    intrinsics: CameraIntrinsics | None = None,
 ) -> Sources:
     """The ``count`` frames that see most of what the query sees, among those that keep the distances of ``spacing``.
 
@@ -50,13 +55,14 @@ def choose_sources(
         query_depth_m: (H, W) exact z of the query view.
         candidates: Frames of one size, the query not among them; each with its sensor depth.
         count: How many to choose.
+        intrinsics: Of the query; None = that of the candidates.
 
     Raises:
         ConfigError: fewer candidates than ``count``.
     """
     if len(candidates) < count:
         raise ConfigError(f"{count} source views are requested, the room has {len(candidates)} frames to choose from")
-    points = _surface_points(query_pose, query_depth_m, candidates[0].intrinsics)
+    points = _surface_points(query_pose, query_depth_m, intrinsics or candidates[0].intrinsics)
     seen = [_sees(frame, points) for frame in candidates]
     fraction = np.array([s.mean() if len(s) else 0.0 for s in seen])
     centre = np.stack([frame.T_world_camera[:3, 3] for frame in candidates])
@@ -71,6 +77,34 @@ def choose_sources(
                 chosen.append(i)
     together = np.any([seen[i] for i in chosen], axis=0) if len(points) else np.zeros(1)
     return Sources(tuple(chosen), float(away[chosen].mean()), float(together.mean()))
+
+
+def choose_as_mapper(past: Sequence[PosedFrame], current: PosedFrame, query_depth_m: Float32, count: int) -> Sources:
+    """The keyframes that the mapper would render the current frame from, had it mapped the frames before.
+
+    As the other choices, this one looks at sensor depth and poses alone, whatever the field is given.
+
+    Args:
+        past: All frames before the current one, at least one, each with its sensor depth.
+        current: The query's frame.
+        query_depth_m: (H, W) exact z of the query view.
+        count: At most this many; at least one is chosen.
+    """
+    store = KeyframeStore(KeyframeConfig())
+    nothing = torch.zeros(1, 1, 1, 1)
+    encoded = EncodedViews(nothing, nothing, nothing, torch.eye(3)[None], torch.eye(4)[None], nothing)
+    for number, frame in enumerate(past):
+        assert frame.depth_m is not None
+        if store.wants(frame.T_world_camera):
+            pose = frame.T_world_camera
+            store.add(Keyframe(number, frame.stamp_ns, pose, frame.intrinsics, frame.depth_m, encoded))
+    depth_m = np.zeros_like(query_depth_m) if current.depth_m is None else current.depth_m
+    found = store.choose(current.T_world_camera, current.intrinsics, depth_m, count)
+    chosen = [keyframe.seq for keyframe in found] or [len(past) - 1]
+    points = _surface_points(current.T_world_camera, query_depth_m, current.intrinsics)
+    together = np.any([_sees(past[i], points) for i in chosen], axis=0) if len(points) else np.zeros(1)
+    away = [np.linalg.norm(past[i].T_world_camera[:3, 3] - current.T_world_camera[:3, 3]) for i in chosen]
+    return Sources(tuple(chosen), float(np.mean(away)), float(together.mean()))
 
 
 def choose_covering(

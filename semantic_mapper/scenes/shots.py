@@ -50,7 +50,7 @@ def sequence_shots(poses: Float64, seed: int, config: NoiseConfig) -> list[Shot]
             state = _KEEP * state + np.sqrt(1 - _KEEP**2) * rng.standard_normal(3)
         way = config.max_blur_way_m * rng.uniform() ** 2
         after = poses[k + 1] if k + 1 < len(poses) else pose
-        shots.append(Shot(_gain(state, config), *look, T_open_close=_motion(pose, after, way)))
+        shots.append(Shot(_gain(state, config), *look, T_open_close=motion_between(pose, after, way)))
     return shots
 
 
@@ -73,7 +73,7 @@ def _gain(state: Float64, config: NoiseConfig) -> Float64:
     return exposure * np.exp(config.white_balance * np.array([state[1], 0.0, state[2]]))
 
 
-def _motion(pose: Float64, after: Float64, way_m: float) -> Float64:
+def motion_between(pose: Float64, after: Float64, way_m: float) -> Float64:
     """(4, 4) the part of the motion from ``pose`` to ``after`` that is ``way_m`` long; identity where both are one."""
     T = invert_pose(pose) @ after
     full = float(np.hypot(np.linalg.norm(T[:3, 3]), _TURN_WEIGHT_M * np.linalg.norm(rotation_vector(T))))

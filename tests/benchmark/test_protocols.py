@@ -57,11 +57,14 @@ def score(entry: Entry, suite: SuiteConfig, on_fit: Callable[[float], None] | No
 
 
 @pytest.mark.slow
-def test_generalizing_scores_whole_views_from_sources_that_are_not_the_query() -> None:
+@pytest.mark.parametrize("own_image", [True, False])
+def test_generalizing_scores_whole_views_with_or_without_the_image_of_the_query(own_image: bool) -> None:
     room = tiny_room()
-    record = score(tiny_contestant(), tiny_suite()).record
+    record = score(tiny_contestant(), tiny_suite(own_image=own_image)).record
     assert [i.frame for i in record.images] == [6, 8]
-    assert all(len(i.sources) == 3 and i.frame not in i.sources for i in record.images)
+    for image in record.images:
+        assert len(image.sources) == 3 and (image.sources[-1] == image.frame) == own_image
+        assert image.frame not in image.sources[:-1] and (image.psnr_db is None) == own_image
     labelled = sum(int((t.label != ROOMS.ignore_id).sum()) for t in room.truth.values())
     assert from_rows(record.confusion).metrics().pixels == labelled
     assert record.compared > 100 and 0 <= record.agreeing <= record.compared
@@ -185,7 +188,7 @@ def test_fitting_gives_a_curve_and_renders_from_the_labelled_keyframes() -> None
 def test_labels_of_the_keyframes_can_be_kept_from_the_queries() -> None:
     field = watched()
     for given in (True, False):
-        suite = tiny_suite(scene={"labelled_sources": given})
+        suite = tiny_suite(protocol="finetune", scene={"labelled_sources": given})
         answer_from_keyframes(tiny_room(), field, suite, Keyframes((0, 2, 12), ()))
         assert (field.seen.channel is not None) == given
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from semantic_mapper.benchmark.config import TIERS, SuiteConfig, settings_digest, suite_seeds
-from semantic_mapper.benchmark.rooms import as_given, make_benchmark_room, query_pairs
+from semantic_mapper.benchmark.rooms import CLEAN, HARD, as_given, make_benchmark_room, query_pairs
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.scenes import TEST_SEEDS, VALIDATION_SEEDS
-from tests.benchmark.tiny import tiny_room, tiny_suite
+from tests.benchmark.tiny import ROOM, tiny_room, tiny_suite
 
 
 def test_truth_is_exact_where_the_sensor_is_not() -> None:
@@ -50,14 +50,17 @@ def test_records_are_told_apart_by_what_made_them_and_by_nothing_else() -> None:
     assert settings_digest(tiny_suite(scene={"steps": 99}), "views") == base  # generalize fits nothing
     different = [
         settings_digest(tiny_suite(depth=False), "views"),
-        settings_digest(tiny_suite(baseline="wide"), "views"),
+        settings_digest(tiny_suite(sources="wide"), "views"),
+        settings_digest(tiny_suite(sources="cover"), "views"),
+        settings_digest(tiny_suite(own_image=False), "views"),
+        settings_digest(tiny_suite(current="hard"), "views"),
         settings_digest(tiny_suite(protocol="finetune"), "views"),
         settings_digest(tiny_suite(protocol="scratch"), "views"),
         settings_digest(tiny_suite(protocol="scratch", scene={"steps": 99}), "views"),
         settings_digest(tiny_suite(), "map"),
         settings_digest(tiny_suite(map_frames=9), "map"),
     ]
-    assert len({base, *different}) == 8
+    assert len({base, *different}) == 11
     assert settings_digest(tiny_suite(views=5), "map") == settings_digest(tiny_suite(), "map")
 
 
@@ -74,3 +77,37 @@ def test_the_camera_of_the_sequence_may_be_another():
     assert min(heights) > 0.45 and max(heights) < 0.75
     assert room.frames[0].intrinsics.fx == pytest.approx(0.9 * suite.tier.width) and room.frames[0].depth_m is None
     assert settings_digest(suite, "views") != settings_digest(SuiteConfig(), "views")
+
+
+def test_the_old_name_of_the_source_views_still_works() -> None:
+    assert tiny_suite(baseline="narrow").sources == "near" and tiny_suite(baseline="wide").sources == "wide"
+
+
+@pytest.mark.parametrize("seed", range(ROOM, ROOM + 5))
+def test_hard_query_images_are_what_they_are_called_and_all_else_is_clean(seed: int) -> None:
+    suite = tiny_suite(current="hard")
+    clean, hard = make_benchmark_room(seed, tiny_suite()), make_benchmark_room(seed, suite)
+    assert set(hard.condition.values()) <= set(HARD) and set(clean.condition.values()) == {CLEAN}
+    assert not hard.pairs and all((a.rgb == b.rgb).all() for a, b in zip(clean.frames, hard.frames, strict=True))
+    for query, kind in hard.condition.items():
+        before, after = clean.frames[query], hard.current[query]
+        assert after.label is not None and (after.label == hard.truth[query].label).all()
+        if kind == "dark":
+            assert after.rgb.mean() < 0.75 * before.rgb.mean()
+        elif kind == "noise":
+            assert roughness(after.rgb) > roughness(before.rgb)
+        elif kind == "blur":
+            assert roughness(after.rgb) < roughness(before.rgb)
+        elif kind == "narrow":
+            assert after.intrinsics.fx == pytest.approx(1.4 * after.intrinsics.width)
+        else:
+            moved = np.linalg.norm(after.T_world_camera[:3, 3] - before.T_world_camera[:3, 3])
+            h, w = hard.truth[query].exact_depth_m.shape
+            middle = hard.truth[query].exact_depth_m[h // 2 - 3 : h // 2 + 3, w // 2 - 3 : w // 2 + 3]
+            assert moved == 0 or middle.min() > 0.25
+    conditions = {make_benchmark_room(s, suite).condition[q] for s in range(ROOM, ROOM + 5) for q in hard.queries[:1]}
+    assert conditions == set(HARD)
+
+
+def roughness(rgb: np.ndarray) -> float:
+    return float(np.abs(np.diff(rgb.astype(np.float32), axis=1)).mean())

@@ -105,7 +105,7 @@ def test_settings_decide_which_records_count(tmp_path: Path) -> None:
     run_suite(tiny_suite(), [tiny_contestant()], RecordStore(path), tmp_path / "views", silent)
     store = RecordStore(path)
     assert store.find(RoomRecord, settings_digest(tiny_suite(), "views"), "digest0", ROOM) is not None
-    assert room_records(tiny_suite(baseline="wide"), tiny_contestant(), store) == []
+    assert room_records(tiny_suite(sources="wide"), tiny_contestant(), store) == []
 
 
 def test_the_benchmark_needs_nothing_that_a_training_machine_lacks() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.benchmark.config import SpacingConfig
-from semantic_mapper.benchmark.views import choose_covering, choose_sources
+from semantic_mapper.benchmark.views import choose_as_mapper, choose_covering, choose_sources
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
@@ -79,3 +79,14 @@ def test_covering_views_add_to_each_other_and_labelled_ones_count_twice() -> Non
 def test_a_view_is_chosen_even_where_none_sees_anything() -> None:
     blind = choose_covering(np.eye(4), WALL, [frame(0.0, turned=True)], [True], 3)
     assert blind.numbers == (0,) and blind.seen == 0
+
+
+def test_the_choice_of_the_mapper_takes_keyframes_of_the_past_that_cover_the_query() -> None:
+    past = [frame(0.01 * n) for n in range(30)] + [frame(0.0, turned=True), frame(0.9)]
+    found = choose_as_mapper(past, frame(0.3), WALL, 8)
+    moves = [past[i].T_world_camera[0, 3] for i in found.numbers]
+    assert 30 not in found.numbers, "it looks away"
+    assert 1 < len(moves) <= 8 and all(abs(a - b) > 0.05 for a in moves for b in moves if a != b), "keyframes are apart"
+    assert found.seen == pytest.approx(1) and 0 < found.distance_m < 1
+    lonely = choose_as_mapper([frame(0.0, turned=True)], frame(0.0), WALL, 3)
+    assert lonely.numbers == (0,) and lonely.seen == 0

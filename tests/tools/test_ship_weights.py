@@ -33,7 +33,14 @@ def weights(folder: Path, recipe: dict[str, Any] | None = None) -> Path:
 
 
 def table(path: Path, digest: str, *, depth: bool = True, views: int = 8, **changes: Any) -> Path:
-    suite = {"split": "test", "protocol": "generalize", "views": views, "baseline": "narrow", "depth": depth}
+    suite = {
+        "split": "test",
+        "protocol": "generalize",
+        "views": views,
+        "sources": "near",
+        "own_image": True,
+        "depth": depth,
+    }
     figures = {"rooms": 20, "images": 80, "data_set": {"miou": 0.7 if depth else 0.5}, "ece": 0.02}
     entry = {"digest": digest, "figures": figures}
     found = {"suite": suite | {"rooms": 0}, "complete": True, "weights": {"w": entry}} | changes

@@ -108,6 +108,8 @@ def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Pat
         ("eval", "log.mcap", "--kind", "unet"),
         ("eval", "log.mcap", "--rooms", "2"),
         ("eval", "log.mcap", "--weights", "a", "--weights", "b"),
+        ("benchmark", "rooms", "--protocol", "finetune", "--sources", "wide"),
+        ("benchmark", "rooms", "--protocol", "finetune", "--no-own-image"),
         ("benchmark", "rooms", "--protocol", "finetune", "--baseline", "wide"),
         ("benchmark", "rooms", "--seconds", "3"),
         ("benchmark", "rooms", "--keyframes", "3"),
