@@ -9,14 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from semantic_mapper import __version__
-from semantic_mapper.benchmark.config import SuiteConfig, settings_digest, suite_seeds
+from semantic_mapper.benchmark.config import SuiteConfig, own_image_suite, settings_digest, suite_seeds
 from semantic_mapper.benchmark.entries import load_entries
 from semantic_mapper.benchmark.figures import (
     compare,
+    compare_maps,
     compare_with_baselines,
     comparison_rows,
     draw_fit_curves,
     map_figures,
+    map_row_figures,
     row_figures,
     view_figures,
 )
@@ -33,7 +35,7 @@ from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.cli.console import FrameProgress, Output, frame_progress, stderr_console
 from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.cli.report import write_suite_report
-from semantic_mapper.nodes.cli.suite_table import difference_lines, rows_table, suite_table
+from semantic_mapper.nodes.cli.suite_table import difference_lines, map_rows_table, rows_table, suite_table
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plots import cannot_draw, write_picture
 from semantic_mapper.replay.artifacts import write_json
@@ -92,6 +94,8 @@ def run_suite_verb(
         output.print(table)
         if found["rows"]:
             output.print(rows_table(found))
+        if found["map_rows"]:
+            output.print(map_rows_table(found))
         for line in lines:
             output.print(line)
         output.print(f"written to {out}")
@@ -144,19 +148,21 @@ def _map_rooms(
     bar: FrameProgress,
     stop: StopRequest,
 ) -> None:
-    """Make the map records that are missing."""
+    """Make the map records that are missing; of fields that fuse views also those of each frame's own image alone."""
     from semantic_mapper.replay.evaluate.room_map import (
         map_room,  # loads the mapping pipeline, which the rest of a run does without
     )
 
-    settings, seeds = settings_digest(suite, "map"), suite_seeds(suite)
-    bar.start(len(seeds) * len(entries))
+    seeds, alone = suite_seeds(suite), own_image_suite(suite)
+    runs = [(suite, entry, path) for entry, path in zip(entries, paths, strict=True)]
+    runs += [(alone, entry, path) for _, entry, path in runs if not entry.field.needs_own_view]
+    bar.start(len(seeds) * len(runs))
     for seed in seeds:
-        for entry, path in zip(entries, paths, strict=True):
+        for how, entry, path in runs:
             if stop:
                 return
-            if store.find(MapRecord, settings, entry.digest, seed) is None:
-                store.add(map_room(seed, path, entry.digest, suite))
+            if store.find(MapRecord, settings_digest(how, "map"), entry.digest, seed) is None:
+                store.add(map_room(seed, path, entry.digest, how))
             bar.advance()
 
 
@@ -183,6 +189,8 @@ def _collect(suite: SuiteConfig, entries: Sequence[Entry], store: RecordStore, m
     ]
     found["rows"], more = _rows(suite, entries, records)
     found["differences"] += more
+    found["map_rows"], more = _map_rows(suite, entries, store) if maps else ({}, [])
+    found["differences"] += more
     found["complete"] = all(len(r) == len(seeds) for r in records.values())
     found["versions"] = {"semantic_mapper": __version__} | {name: metadata.version(name) for name in PACKAGES}
     return found
@@ -208,6 +216,27 @@ def _rows(
     rows["unet"] = row_figures(records[image.name]) if image is not None and records[image.name] else None
     if image is not None and (found := compare(ours, records[image.name], seed=suite.seed)) is not None:
         differences.append({"first": kind, "second": "unet", **found})
+    return rows, differences
+
+
+def _map_rows(
+    suite: SuiteConfig, entries: Sequence[Entry], store: RecordStore
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Maps of the first multi-view field, of its own images and voxel votes, and of a U-Net's; with differences."""
+    fused = next((entry for entry in entries if not entry.field.needs_own_view), None)
+    if fused is None:
+        return {}, []
+    image = next((entry for entry in entries if entry.field.needs_own_view), None)
+    ours, kind = _map_records(suite, fused, store), f"{fused.field.kind} map"
+    others = {"own image + votes": _map_records(own_image_suite(suite), fused, store)}
+    others["unet + votes"] = [] if image is None else _map_records(suite, image, store)
+    rows = {kind: map_row_figures(ours) if ours else None}
+    rows |= {name: map_row_figures(records) if records else None for name, records in others.items()}
+    differences = [
+        {"first": kind, "second": name, **found}
+        for name, records in others.items()
+        if (found := compare_maps(ours, records, seed=suite.seed)) is not None
+    ]
     return rows, differences
 
 

@@ -34,16 +34,26 @@ def suite_table(found: Mapping[str, Any]) -> Table:
 
 def rows_table(found: Mapping[str, Any]) -> Table:
     """The field beside what its source views say without it."""
-    table = Table(title="the same query views without learned fusion", title_justify="left")
     columns = {"mIoU": "miou", "total accuracy": "total_accuracy", "average accuracy": "average_accuracy"}
     columns |= {"mIoU, interior": "interior_miou", "ECE": "ece"}
+    return _plain_table("the same query views without learned fusion", columns, found["rows"])
+
+
+def _plain_table(title: str, columns: Mapping[str, str], rows: Mapping[str, Any]) -> Table:
+    table = Table(title=title, title_justify="left")
     table.add_column("")
     for column in columns:
         table.add_column(column, justify="right")
-    for name, row in found["rows"].items():
+    for name, row in rows.items():
         values = [None if row is None else row[key] for key in columns.values()]
         table.add_row(_ROW_NAMES.get(name, name), *("-" if v is None else percent(v) for v in values))
     return table
+
+
+def map_rows_table(found: Mapping[str, Any]) -> Table:
+    """The fused map beside maps whose frames are classified one by one."""
+    columns = {"points": "map_miou", "true surface": "surface_miou", "seen from frames": "cast_miou"}
+    return _plain_table("mIoU of the map", columns | {"its frames": "views_miou", "ECE": "ece"}, found["map_rows"])
 
 
 def difference_lines(found: Mapping[str, Any]) -> list[str]:

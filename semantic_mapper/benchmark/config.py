@@ -142,6 +142,12 @@ class SuiteConfig(Config, frozen=True):
     seed: NotNegative = 0
 
 
+def own_image_suite(suite: SuiteConfig) -> SuiteConfig:
+    """The same run with maps of each frame's own image alone: votes of voxels are all that joins views."""
+    keyframes = msgspec.structs.replace(suite.mapper.keyframes, source_views=1)
+    return msgspec.structs.replace(suite, mapper=msgspec.structs.replace(suite.mapper, keyframes=keyframes))
+
+
 def check_suite(suite: SuiteConfig) -> None:
     """Refuse settings that no run can follow.
 

@@ -109,8 +109,25 @@ def map_figures(records: Sequence[MapRecord]) -> dict[str, Any]:
     }
 
 
+def map_row_figures(records: Sequence[MapRecord]) -> dict[str, float | None]:
+    """One row of the comparison of maps."""
+    found = map_figures(records)
+    return {name: found[name] for name in ("map_miou", "surface_miou", "cast_miou", "views_miou", "ece")}
+
+
+def compare_maps(first: Sequence[MapRecord], second: Sequence[MapRecord], *, seed: int = 0) -> dict[str, Any] | None:
+    """Difference in mIoU of the maps' points, ``first`` minus ``second``; None for fewer than 2 common rooms."""
+    return _compare(first, second, seed)
+
+
 def compare(first: Sequence[RoomRecord], second: Sequence[RoomRecord], *, seed: int = 0) -> dict[str, Any] | None:
     """Difference in data-set mIoU, ``first`` minus ``second``, over the rooms of both; None for fewer than 2 rooms."""
+    return _compare(first, second, seed)
+
+
+def _compare(
+    first: Sequence[RoomRecord] | Sequence[MapRecord], second: Sequence[RoomRecord] | Sequence[MapRecord], seed: int
+) -> dict[str, Any] | None:
     others = {r.room: r for r in second}
     both = [(r, others[r.room]) for r in first if r.room in others]
     if len(both) < 2:

@@ -56,16 +56,27 @@ def test_weights_side_by_side_with_maps_and_a_second_call_that_continues(
     first = run(*common, "--weights", two[0], "--rooms", "1", "--map")
     assert first.returncode == 0, first.stderr
     records = out.with_suffix(".jsonl").read_text().splitlines()
-    assert len(records) == 2 and "map: mIoU of its points" in first.stdout
+    assert len(records) == 3 and "map: mIoU of its points" in first.stdout, "views, map, map of own images"
+    found = json.loads(out.read_text())
+    assert (
+        list(found["rows"]) == ["sray", "own", "vote", "vote_exact", "oracle", "unet"] and found["rows"]["unet"] is None
+    )
+    keys = {"miou", "total_accuracy", "average_accuracy", "interior_miou", "ece"}
+    assert all(set(row) == keys for row in found["rows"].values() if row is not None)
+    assert list(found["map_rows"]) == ["sray map", "own image + votes", "unet + votes"]
+    assert found["map_rows"]["own image + votes"]["map_miou"] is not None
+    assert "own image + votes" in first.stdout and "vote of the views" in first.stdout
     both = run(*common, "--weights", two[0], "--weights", two[1], "--rooms", "2")
     assert both.returncode == 0, both.stderr
     lines = out.with_suffix(".jsonl").read_text().splitlines()
-    assert lines[:2] == records and len(lines) == 5
+    assert lines[:3] == records and len(lines) == 6
     assert "first minus second" in both.stdout and "95 % interval" in both.stdout
     found = json.loads(out.read_text())
     assert found["complete"] and list(found["weights"]) == ["first", "second"]
     assert found["weights"]["first"]["figures"]["rooms"] == 2 and found["weights"]["first"]["map"] is None
-    assert found["differences"][0]["scenes"] == 2
+    assert found["differences"][0]["scenes"] == 2 and not found["map_rows"]
+    pairs = [(d["first"], d["second"]) for d in found["differences"]]
+    assert pairs == [("first", "second"), *(("sray", name) for name in ("own", "vote", "vote_exact", "oracle"))]
     assert out.with_suffix(".png").stat().st_size > 1000
 
 
@@ -130,6 +141,14 @@ def test_the_old_form_of_the_verb_warns_and_does_the_same(tmp_path: Path) -> Non
     assert old.returncode == 1 and "has 20 rooms" in old.stderr
     assert "old='eval --suite rooms'" in old.stderr and "new='benchmark rooms'" in old.stderr
     assert "old='--json FILE'" in old.stderr
+
+
+def test_the_old_option_of_the_source_views_warns_and_leaves_the_own_image_out(suite: Path, tmp_path: Path) -> None:
+    out = tmp_path / "old.json"
+    old = run("benchmark", "rooms", "--config", suite, "--rooms", "1", "--baseline", "wide", "--out", out)
+    assert old.returncode == 0 and "new='--sources wide --no-own-image'" in old.stderr
+    found = json.loads(out.read_text())["suite"]
+    assert found["sources"] == "wide" and found["own_image"] is False
 
 
 def test_more_rooms_than_there_are_is_refused() -> None:
