@@ -122,6 +122,7 @@ class ImageEncoder(nn.Module):
         self.colour_net = ResidualUNet(COLOURS, config, feature_dim)
         self.depth_net = ResidualUNet(COLOURS + SURFACE_CHANNELS, config, feature_dim) if config.depth else None
         self._of_batch = False
+        self._colours_frozen = False
         # Channels-last convolutions take a quarter of the CPU time at these widths (forward and backward).
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         self.train()  # which is where the norms learn that they are constants
@@ -165,7 +166,16 @@ class ImageEncoder(nn.Module):
         super().train(mode)
         for norm in self._norms():
             norm.train(mode and self._of_batch)
+        if self._colours_frozen:
+            self.colour_net.eval()
         return self
+
+    def freeze_colours(self, frozen: bool) -> None:
+        """Whether the network for colours alone keeps its weights and statistics, whatever is trained."""
+        if frozen != self._colours_frozen:
+            self._colours_frozen = frozen
+            self.colour_net.requires_grad_(not frozen)
+            self.train(self.training)
 
     @contextmanager
     def batch_statistics(self) -> Generator[None]:

@@ -65,6 +65,14 @@ class LearnedField(nn.Module, ABC):
         """Logits (m, L, h, w) of the source images by themselves, for a dense loss; None where a kind has none."""
         return None
 
+    def image_classifier(self) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """Weight (L, C) and bias (L,) of a classifier of relu(image features); None where a kind has another one."""
+        return None
+
+    def start_from_classifier(self, weight: torch.Tensor, bias: torch.Tensor) -> bool:
+        """Classify images as an ``image_classifier`` of another field does; False where a kind cannot."""
+        return False
+
     def scene_config(self, views: SourceViews, far_m: float) -> Config:
         """The config that a field of this kind and shape should have to be fitted to the scene that ``views`` show.
 

@@ -98,6 +98,24 @@ class SRay(LearnedField):
         s = sources.feature.permute(0, 2, 3, 1)
         return self.classifier(s + self.semantic(s)).permute(0, 3, 1, 2)
 
+    def start_from_classifier(self, weight: torch.Tensor, bias: torch.Tensor) -> bool:
+        """Classify semantic rays as relu(features) were: s + relu(-s) = relu(s), so half of the residual MLP fits it
+        exactly; the other half begins without effect."""
+        if weight.shape != self.classifier.weight.shape:
+            return False
+        hidden, out = self.semantic[0], self.semantic[2]
+        assert isinstance(hidden, nn.Linear) and isinstance(out, nn.Linear)
+        dim = self.config.feature_dim
+        with torch.no_grad():
+            hidden.weight[:dim] = -torch.eye(dim)
+            hidden.bias[:dim] = 0
+            out.weight.zero_()
+            out.bias.zero_()
+            out.weight[:, :dim] = torch.eye(dim)
+            self.classifier.weight.copy_(weight)
+            self.classifier.bias.copy_(bias)
+        return True
+
     def mask_occluded(self, space: ContextualSpace) -> ContextualSpace:
         """M without the views to which a sample is hidden, where some other view sees it.
 

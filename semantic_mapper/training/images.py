@@ -35,6 +35,9 @@ class ImageStepConfig(Config, frozen=True):
     colours_first: Fraction = (
         0.5  # of this part, without any depth; the network that sees depth then grows from the other
     )
+    # After that the network for colours rests: trained on a fraction of the images only, it would get worse. Then all
+    # images have depth. False: it goes on with the images of ``depth_dropout``.
+    frozen_colours: bool = True
     depth_dropout: Fraction = 0.3  # fraction of images without depth after that
     mirrored: Fraction = 0.5  # fraction of images
     colour_jitter: float = 0.25
@@ -71,7 +74,7 @@ def draw_images(
             views.append(mirrored_view(view) if mirror else view)
     stacked = stack_sources(views, with_labels=True)
     assert stacked.channel is not None
-    withheld = 1.0 if colours_only else config.depth_dropout
+    withheld = 1.0 if colours_only else 0.0 if config.frozen_colours else config.depth_dropout
     sources = withhold_depth(replace(stacked, channel=None), withheld, generator)
     sources = jitter_colours(to_device(sources, device), config.colour_jitter, generator)
     return ImageBatch(sources, stacked.channel.to(device))

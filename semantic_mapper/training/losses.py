@@ -36,8 +36,16 @@ class Loss:
     depth: torch.Tensor
 
 
-def semantic_loss(logits: torch.Tensor, channel: torch.Tensor) -> torch.Tensor:
-    """Cross-entropy over the rays (S-Ray Eq. 14), ignored rays masked; 0 where all are ignored."""
+def semantic_loss(logits: torch.Tensor, channel: torch.Tensor, weight: torch.Tensor | None = None) -> torch.Tensor:
+    """Cross-entropy over the rays (S-Ray Eq. 14), ignored rays masked; 0 where all are ignored.
+
+    Args:
+        weight: (R,) what each ray counts; None = all alike.
+    """
+    if weight is not None:
+        each = functional.cross_entropy(logits, channel, ignore_index=IGNORE, reduction="none")
+        weight = weight * (channel != IGNORE)
+        return (each * weight).sum() / weight.sum().clamp_min(1e-6)
     counted = (channel != IGNORE).sum().clamp_min(1)
     return functional.cross_entropy(logits, channel, ignore_index=IGNORE, reduction="sum") / counted
 
@@ -69,7 +77,7 @@ def ray_loss(render: FieldRender, targets: RayTargets, config: LossConfig) -> Lo
     """
     known = render.known
     channel = torch.where(known, targets.channel, torch.full_like(targets.channel, IGNORE))
-    semantic = semantic_loss(render.logits, channel)
+    semantic = semantic_loss(render.logits, channel, targets.weight)
     count = known.sum().clamp_min(1)
     colour = (((render.rgb - targets.rgb) ** 2).mean(-1) * known).sum() / count
     measured = known & (targets.depth_m > 0) & (render.opacity > 0.1)

@@ -38,7 +38,8 @@ def take_over(field: LearnedField, path: Path) -> dict[str, Any]:
 def take_over_encoder(field: LearnedField, path: Path) -> dict[str, Any]:
     """Copy the image encoder of a file, whatever its kind, into ``field``; returns the file's ``recipe.origin``.
 
-    An encoder that sees colours alone may become one that sees depth: the network for depth grows from it.
+    An encoder that sees colours alone may become one that sees depth: the network for depth grows from it. Where the
+    field can, and the classes are the same, it takes over the classifier, too.
 
     Raises:
         WeightsError: the file cannot be read.
@@ -55,7 +56,12 @@ def take_over_encoder(field: LearnedField, path: Path) -> dict[str, Any]:
     into.load_state_dict(weights.state_dict())
     if grows:
         own.grow_depth()
-    _log.info("encoder_taken_over", weights=path.name, depth="grown from colours" if grows else "as it is")
+    classifier = checkpoint.model.image_classifier()
+    same_classes = checkpoint.model.label_set == field.label_set
+    started = classifier is not None and same_classes and field.start_from_classifier(*classifier)
+    _log.info(
+        "encoder_taken_over", weights=path.name, depth="grown from colours" if grows else "as it is", classifier=started
+    )
     return origin(path, checkpoint.recipe)
 
 

@@ -20,11 +20,13 @@ from semantic_mapper.training.losses import IGNORE, Loss, LossConfig, image_loss
 from semantic_mapper.training.views import (
     LabelledView,
     RayTargets,
+    degrade_view,
     draw_hard_examples,
     draw_pixels,
     jitter_colours,
     join_sources,
     mirrored_view,
+    natural_weights,
     query_rays,
     select_sources,
     stack_sources,
@@ -56,7 +58,12 @@ class StepConfig(Config, frozen=True):
     own_view_fraction: Fraction = (
         0.3  # how often the query view is itself a source, as when the current frame is mapped
     )
+    own_view_degraded: Fraction = (
+        0.0  # how often that source is spoiled: blur, noise, exposure, covered parts, no depth
+    )
+    wide_fraction: Fraction = 0.0  # training: how often the nearer half of the path round the query has no source view
     balanced_fraction: Fraction = 0.5  # fraction of rays drawn with all classes equally likely
+    natural_prior: bool = False  # rays count by how much likelier balancing made them: classes as frequent as they are
     hard_example_fraction: Fraction = (
         0.0  # fraction of rays drawn where the field is in doubt, of views that know (finetuning)
     )
@@ -131,6 +138,8 @@ def pick_views_on_path(
     others = sorted((i for i in range(count) if i != query), key=lambda i: abs(i - query))
     size = int(torch.randint(config.views_min, config.views_max + 1, (1,), generator=generator))
     size = max(1, min(size, len(others)))
+    if config.wide_fraction > 0 and float(torch.rand(1, generator=generator)) < config.wide_fraction:
+        others = others[min(len(others) // 2, len(others) - size) :]
     stretch = round(size * (len(others) / size) ** float(torch.rand(1, generator=generator)))
     order = torch.randperm(stretch, generator=generator)[:size].tolist()
     sources = [others[i] for i in order]
@@ -183,6 +192,9 @@ def draw_batch(
         return None
     rays, targets, z = drawn
     stacked = _sources(resident or views, query, sources, config, generator)
+    may_spoil = config.own_view_degraded > 0 and query in sources
+    if may_spoil and float(torch.rand(1, generator=generator)) < config.own_view_degraded:
+        stacked = degrade_view(stacked, list(sources).index(query), generator)
     stacked = withhold_depth(stacked, 1.0 if blind else config.depth_dropout, generator)
     stacked = jitter_colours(to_device(stacked, device), config.colour_jitter, generator)
     channel = torch.stack([(resident or views)[i].channel for i in sources])
@@ -204,7 +216,10 @@ def draw_rays(
         return None
     if target.uncertainty is not None and doubtful > 0:
         flat = torch.cat((flat, draw_hard_examples(target.uncertainty, doubtful, generator)))
-    return _draw_samples(target, flat, config, blind, generator)
+    rays, targets, z = _draw_samples(target, flat, config, blind, generator)
+    if config.natural_prior:
+        targets = replace(targets, weight=natural_weights(targets.channel, target.channel, config.balanced_fraction))
+    return rays, targets, z
 
 
 def batch_loss(

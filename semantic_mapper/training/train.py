@@ -214,6 +214,9 @@ class _Run:
         torch.manual_seed(seed)  # for kinds of fields that draw from it
         generator = torch.Generator().manual_seed(seed)
         share = self._images_share()
+        if (encoder := self.field.image_encoder) is not None and encoder.depth_net is not None:
+            frozen = config.images.frozen_colours and progress.depth_grown and fraction < share
+            encoder.freeze_colours(frozen)
         batch = self._draw_images(pool, generator) if fraction < share else self._draw(pool, generator)
         rate = learning_rate(fraction, share, config)
         set_rates(self.optimiser, rate, 1.0 if isinstance(batch, ImageBatch) else config.encoder_rate)

@@ -19,7 +19,10 @@ class TrainStepConfig(StepConfig, frozen=True):
     """A step of training to generalize: many densities of views, no known labels, often no depth at all."""
 
     views_max: AtLeastOne = 12
-    own_view_fraction: Fraction = 0.0  # the query's own image would give the answer away
+    own_view_fraction: Fraction = 0.5  # as when a robot maps: its current frame is a source view
+    own_view_degraded: Fraction = 0.5
+    wide_fraction: Fraction = 0.3
+    natural_prior: bool = True
     known_labels: bool = False
     no_depth: Fraction = 0.25
     no_depth_thinning: AtLeastOne = 4  # 32 samples a ray instead of 8

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch.nn import functional
 
 from semantic_mapper.geometry import camera_matrix, pixel_rays
 from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, working_intrinsics
@@ -38,11 +39,15 @@ class LabelledView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayTargets:
-    """What R query rays should render to: channel (R,) int64, rgb (R, 3), depth_m (R,) with 0 = none."""
+    """What R query rays should render to: channel (R,) int64, rgb (R, 3), depth_m (R,) with 0 = none.
+
+    ``weight`` (R,) is what each counts in the class loss; None = all alike.
+    """
 
     channel: torch.Tensor
     rgb: torch.Tensor
     depth_m: torch.Tensor
+    weight: torch.Tensor | None = None
 
 
 def view_from_frame(frame: PosedFrame, label_set: LabelSet, width: int) -> LabelledView:
@@ -128,6 +133,63 @@ def jitter_colours(sources: SourceViews, strength: float, generator: torch.Gener
     device = sources.rgb.device
     rgb = (sources.rgb.clamp_min(1e-3) ** gamma.to(device)) * (gain * tint).to(device)
     return replace(sources, rgb=rgb.clamp(0, 1))
+
+
+def degrade_view(sources: SourceViews, index: int, generator: torch.Generator) -> SourceViews:
+    """Spoil one view as a moving camera in bad light does, so that the field learns when to believe the others.
+
+    Exposure and gamma, blur, noise, parts of the image covered; depth is lost in one of three cases.
+    """
+
+    def uniform(low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand(1, generator=generator))
+
+    rgb = sources.rgb[index].cpu()
+    height, width = rgb.shape[-2:]
+    rgb = rgb.clamp_min(1e-3) ** uniform(0.7, 1.4) * 2 ** uniform(-2.0, 0.5)
+    if (sigma := uniform(-1.0, 2.5) * width / 160) > 0.3:
+        rgb = _blurred(rgb, sigma)
+    rgb = rgb + uniform(0.0, 0.1) * torch.randn(rgb.shape, generator=generator)
+    for _ in range(int(torch.randint(0, 4, (1,), generator=generator))):
+        h, w = int(uniform(0.1, 0.5) * height), int(uniform(0.1, 0.5) * width)
+        top, left = int(uniform(0, height - h)), int(uniform(0, width - w))
+        rgb[:, top : top + h, left : left + w] = torch.rand(3, 1, 1, generator=generator)
+    whole = sources.rgb.clone()
+    whole[index] = rgb.clamp(0, 1).to(whole.device)
+    depth_m = sources.depth_m
+    if uniform(0, 1) < 1 / 3:
+        depth_m = depth_m.clone()
+        depth_m[index] = 0
+    return replace(sources, rgb=whole, depth_m=depth_m)
+
+
+def _blurred(rgb: torch.Tensor, sigma: float) -> torch.Tensor:
+    """(3, H, W) with a Gaussian of ``sigma`` pixels."""
+    radius = max(1, round(2.5 * sigma))
+    x = torch.arange(-radius, radius + 1, dtype=rgb.dtype)
+    kernel = torch.exp(-(x**2) / (2 * sigma**2))
+    kernel = (kernel / kernel.sum()).expand(3, 1, 1, -1)
+    padded = functional.pad(rgb[None], (radius, radius, radius, radius), mode="replicate")
+    across = functional.conv2d(padded, kernel, groups=3)
+    return functional.conv2d(across, kernel.transpose(2, 3), groups=3)[0]
+
+
+def natural_weights(drawn: torch.Tensor, channel: torch.Tensor, balanced_fraction: float) -> torch.Tensor:
+    """(R,) weights that take back what ``draw_pixels`` did to the frequency of classes, in the mean over draws.
+
+    Half of the rays drawn with all classes equally likely teach rare classes, but leave a field that expects them
+    everywhere. A ray's weight is the probability of its pixel without balancing over that with it.
+
+    Args:
+        drawn: (R,) channels of the drawn pixels, -1 = ignore.
+        channel: (H, W) that they were drawn from.
+        balanced_fraction: Of ``draw_pixels``.
+    """
+    labelled = channel[channel >= 0]
+    histogram = torch.bincount(labelled, minlength=int(drawn.max()) + 1 if len(drawn) else 1).float()
+    classes = (histogram > 0).sum().clamp_min(1)
+    favoured = len(labelled) / (classes * histogram.clamp_min(1))  # how much likelier a balanced draw is, by class
+    return 1 / (1 - balanced_fraction + balanced_fraction * favoured[drawn.clamp_min(0)])
 
 
 def draw_pixels(

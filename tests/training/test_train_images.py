@@ -70,12 +70,14 @@ def test_a_mirrored_view_shows_the_mirror_image_of_the_same_world():
 
 
 def test_image_batches_repeat_and_withhold_depth_of_whole_images():
-    config = ImageStepConfig(rooms=2, images=3, depth_dropout=0.5, mirrored=0.5)
+    config = ImageStepConfig(rooms=2, images=3, frozen_colours=False, depth_dropout=0.5, mirrored=0.5)
     a, b = (draw_images([ROOM, ROOM], config, torch.Generator().manual_seed(1), CPU) for _ in range(2))
     assert torch.equal(a.views.rgb, b.views.rgb) and torch.equal(a.channel, b.channel)
     assert a.views.rgb.shape[0] == 6 and a.views.channel is None
     without = (a.views.depth_m == 0).flatten(1).all(1)
     assert 0 < int(without.sum()) < 6
+    frozen = draw_images([ROOM, ROOM], ImageStepConfig(rooms=2, images=3, depth_dropout=0.5), torch.Generator(), CPU)
+    assert frozen.views.depth_m.flatten(1).any(1).all(), "the network for colours rests, so all have depth"
 
 
 def test_every_kind_with_a_classifier_learns_from_images_and_the_others_say_so():

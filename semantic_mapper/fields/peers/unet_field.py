@@ -61,6 +61,11 @@ class UNetField(LearnedField):
         """Logits (m, L, h, w) of the source images: what ``encode`` made of them."""
         return sources.feature
 
+    def image_classifier(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """See ``LearnedField``."""
+        assert self.classifier.bias is not None
+        return self.classifier.weight[:, :, 0, 0], self.classifier.bias
+
     def predict_image(self, views: SourceViews) -> torch.Tensor:
         """Logits (m, L, H, W) of m images; what rays through their own pixels render to."""
         size = views.rgb.shape[-2:]
