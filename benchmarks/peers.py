@@ -183,6 +183,7 @@ def compare(names: list[str], out: Path, tier: str = "cpu") -> int:
             COMMAND,
             "benchmark",
             "rooms",
+            "--no-own-image",
             "--depth",
             depth,
             "--tier",
