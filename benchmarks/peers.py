@@ -93,7 +93,7 @@ RUNS = {
     "sray-colours": Run("sray", depth=False, encoder="unet"),
     "neuray-depth": Run("neuray", depth=True, encoder="unet-depth"),
     "mvsnerf-depth": Run("mvsnerf", depth=True, encoder="unet-depth", encoder_rate=1.0),
-    "sray-paper": Run("sray", depth=True, encoder="unet-depth", settings={"occlusion": False}),
+    "sray-paper": Run("sray-paper", depth=True, encoder="unet-depth", settings={"occlusion": False}),
 }
 
 

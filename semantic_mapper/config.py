@@ -62,6 +62,9 @@ class EncoderConfig(Config, frozen=True):
         192,
     )  # of each stage; the first works at half the size of the image
     blocks: Annotated[tuple[Layers, ...], msgspec.Meta(max_length=8)] = (1, 2, 3, 3)  # residual blocks a stage
+    # "efficientnet-lite0": a network that may start from ImageNet weights, between a small stem and a decoder;
+    # ``channels`` and ``blocks`` are the decoder's then
+    backbone: Literal["residual", "efficientnet-lite0"] = "residual"
     depth: bool = False  # whether it sees measured depth (as ``fields.surface`` puts it) beside colours
 
 
@@ -71,9 +74,12 @@ class SRayConfig(Config, frozen=True):
     feature_dim: Channels = 32  # C of the paper
     heads: Channels = 4  # H; d_k = C / H
     encoder: EncoderConfig = EncoderConfig(depth=True)
+    # What attention and view weights work on: one token a view, at the surface that the ray meets (untrained, a vote of
+    # the views); or, as in the paper, one token a view and sample
+    tokens: Literal["surface", "samples"] = "surface"
     tau: float = 0.02  # Eq. 12: view weights lie in (tau / m, 1 / (tau m))
     positional_encoding: bool = False  # sinusoid along the ray; the paper uses none
-    intra_view_attention: bool = True  # Eq. 6 to 9
+    intra_view_attention: bool = False  # Eq. 6 to 9; without effect on tokens at the surface
     cross_view_attention: bool = True  # Eq. 10
     occlusion: bool = True  # views count by how much they see a sample; False = all alike, as in the paper
     source_labels: bool = True  # known labels of source views (finetuning keyframes) are part of their features

@@ -150,7 +150,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
         label_set = _label_set_from_plain(json.loads(metadata["label_set"]))
         recipe = _checked_recipe(json.loads(metadata["recipe"]))
         anchors = _unpack_anchors(tensors, json.loads(metadata["anchors"])) if "anchors" in metadata else ()
-        model = build_field(metadata.get("field", SRay.kind), json.loads(metadata["model_config"]), label_set)
+        kind = metadata.get("field", SRay.kind)
+        model = build_field(kind, _of_its_time(kind, json.loads(metadata["model_config"])), label_set)
     except (KeyError, TypeError, ValueError, ArithmeticError, RuntimeError, SemanticMapperError) as error:
         reason = " ".join(str(error).split())[:MESSAGE]
         raise WeightsError(f"{path}: its metadata is damaged: {type(error).__name__}: {reason}") from error
@@ -165,6 +166,11 @@ def load_checkpoint(path: Path) -> Checkpoint:
     return Checkpoint(model.eval(), anchors, recipe)
 
 
+def _of_its_time(kind: str, config: dict[str, Any]) -> dict[str, Any]:
+    """The config of a file that was written before some settings existed: what they were then."""
+    return {"tokens": "samples"} | config if kind == SRay.kind else config
+
+
 def check_same_shape(path: Path, like: Checkpoint) -> None:
     """Make sure that a file holds weights of the same network and classes, before anything is made as it says.
 
@@ -175,7 +181,8 @@ def check_same_shape(path: Path, like: Checkpoint) -> None:
         with safe_open(path, framework="pt") as stored:
             metadata = dict(stored.metadata() or {})
         label_set = _label_set_from_plain(json.loads(metadata["label_set"]))
-        shape = metadata.get("field", SRay.kind), json.loads(metadata["model_config"])
+        kind = metadata.get("field", SRay.kind)
+        shape = kind, _of_its_time(kind, json.loads(metadata["model_config"]))
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError, SemanticMapperError) as error:
         raise WeightsError(f"{path.name}: not readable as weights of this project ({error})") from error
     if shape != (like.model.kind, json.loads(json.dumps(to_plain(like.model.config)))):

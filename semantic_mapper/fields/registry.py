@@ -32,10 +32,12 @@ KINDS: dict[str, tuple[type[Config], str, str]] = {
 
 # A name for some switches of a kind. The field built is of that kind, and so is its checkpoint: the switches are part
 # of the config that is saved, so nothing but a choice of names depends on this table.
-PRESETS: dict[str, tuple[str, dict[str, bool]]] = {
-    "sray-none": ("sray", {"intra_view_attention": False, "cross_view_attention": False}),
-    "sray-intra": ("sray", {"intra_view_attention": True, "cross_view_attention": False}),
-    "sray-cross": ("sray", {"intra_view_attention": False, "cross_view_attention": True}),
+_PAPER = {"tokens": "samples"}  # its order of attention, blending and compositing, and its ablations
+PRESETS: dict[str, tuple[str, dict[str, Any]]] = {
+    "sray-paper": ("sray", _PAPER | {"intra_view_attention": True, "cross_view_attention": True}),
+    "sray-none": ("sray", _PAPER | {"intra_view_attention": False, "cross_view_attention": False}),
+    "sray-intra": ("sray", _PAPER | {"intra_view_attention": True, "cross_view_attention": False}),
+    "sray-cross": ("sray", _PAPER | {"intra_view_attention": False, "cross_view_attention": True}),
 }
 
 

@@ -2,6 +2,12 @@
 
 Read top to bottom beside section 3 of the paper: ``encode`` gives the F_j, ``contextual_space`` is Eq. 3 to 5,
 ``attend`` Eq. 6 to 10, ``blend_views`` Eq. 11 and 12, ``render_samples`` Eq. 13.
+
+``tokens = "samples"`` is the paper's order: attention among all samples, then blending of the views, then
+compositing. ``tokens = "surface"`` composites first, each view by itself, so that attention and blending work on one
+token a view; the tokens go through the semantic MLP before they are blended, and what is learned beyond that starts
+without effect. So with trained image features, and nothing else trained, it is a vote of its views, weighted by
+what they see.
 """
 
 from __future__ import annotations
@@ -23,7 +29,7 @@ from semantic_mapper.fields.attention import (
     radial_attention,
 )
 from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.fields.contextual import CUES, ContextualSpace, contextual_space
+from semantic_mapper.fields.contextual import CUES, SURFACE_CUES, ContextualSpace, contextual_space, surface_space
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.geometry_net import LEAST_VISIBILITY, DensityNet, GeometryInit
 from semantic_mapper.fields.learned import LearnedField
@@ -62,10 +68,15 @@ class SRay(LearnedField):
         self.density = DensityNet(dim)
         self.radial = MultiHeadAttention(dim, config.heads, published=published)
         self.cross = MultiHeadAttention(dim, config.heads, published=published)
-        self.weights = ViewWeightNet(dim, CUES)
+        self.at_surface = config.tokens == "surface"
+        self.weights = ViewWeightNet(dim, SURFACE_CUES if self.at_surface else CUES)
         self.semantic = nn.Sequential(nn.Linear(dim, 2 * dim), nn.ReLU(), nn.Linear(2 * dim, dim))
         self.classifier = nn.Linear(dim, len(label_set))
         self.label_logit = nn.Parameter(torch.tensor(LABEL_LOGIT))
+        if self.at_surface:
+            self.weights.start_alike()
+            nn.init.zeros_(self.radial.out.weight)
+            nn.init.zeros_(self.cross.out.weight)
 
     def encode(self, views: SourceViews) -> EncodedViews:
         """Encode each view by itself: features F_j and the depth distribution of every pixel.
@@ -139,28 +150,49 @@ class SRay(LearnedField):
             x = x + positional_encoding(x.shape[2], x.shape[3], x)
         keep = 1.0 if self.config.attention_residual else 0.0
         if self.config.intra_view_attention:
-            x = keep * x + radial_attention(x, valid, self.radial)
-        if self.config.cross_view_attention:
+            x = keep * x + radial_attention(self._normalised(x), valid, self.radial)
+        if self.config.cross_view_attention and not self.at_surface:
             x = keep * x + cross_view_attention(x, valid, self.cross)
         return x.transpose(0, 1)
 
-    def blend_views(self, refined: torch.Tensor, space: ContextualSpace) -> tuple[torch.Tensor, torch.Tensor]:
+    def attend_at_surface(self, space: ContextualSpace) -> torch.Tensor:
+        """Eq. 10 among one token a view: (m, R, 1, C)."""
+        if not self.config.cross_view_attention:
+            return space.feature
+        x = space.feature.transpose(0, 1)
+        keep = 1.0 if self.config.attention_residual else 0.0
+        x = keep * x + cross_view_attention(self._normalised(x), space.valid.transpose(0, 1), self.cross)
+        return x.transpose(0, 1)
+
+    def blend_views(
+        self, refined: torch.Tensor, space: ContextualSpace, content: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Semantic ray s (Eq. 11, 12) and colour of each sample: (R, N, C), (R, N, 3).
 
         With ``occlusion`` the weights of Eq. 12 are times the views' visibilities: the bounds hold among views that see
         the sample alike.
+
+        Args:
+            content: (m, R, N, C) what is blended, where that is not what the weights are made of.
         """
-        semantic_score, colour_score = self.weights(refined, space.cues)
+        semantic_score, colour_score = self.weights(self._normalised(refined), space.cues)
         colour_weight = softmax_weights(colour_score, space.valid)
         if self.config.parity == "published":
             semantic_weight = colour_weight
         else:
             semantic_weight = constrained_weights(semantic_score, space.valid, self.config.tau)
-            if self.config.occlusion:
+            if self.config.occlusion or self.at_surface:
                 semantic_weight = semantic_weight * (space.visibility + LEAST_VISIBILITY)
                 semantic_weight = semantic_weight / semantic_weight.sum(0).clamp_min(1e-12)
-        s = torch.einsum("mrn,mrnc->rnc", semantic_weight, refined)
+        if self.at_surface:
+            colour_weight = colour_weight * (space.visibility + LEAST_VISIBILITY)
+            colour_weight = colour_weight / colour_weight.sum(0).clamp_min(1e-12)
+        s = torch.einsum("mrn,mrnc->rnc", semantic_weight, refined if content is None else content)
         return s, torch.einsum("mrn,mrnc->rnc", colour_weight, space.rgb)
+
+    def _normalised(self, x: torch.Tensor) -> torch.Tensor:
+        """Layer norm of tokens at the surface; the paper has none."""
+        return functional.layer_norm(x, x.shape[-1:]) if self.at_surface else x
 
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
         """As every field renders; streaming, without what ``sampling.sample_weight_threshold`` calls faint."""
@@ -181,15 +213,25 @@ class SRay(LearnedField):
         weights = compositing_weights(sigma, interval)
         opacity = weights.sum(dim=1)
         known = space.valid.flatten(2).any(2).any(0)
-        seen, looked_at = self.mask_occluded(space), weights
+        looked_at = weights
+        seen = space if self.at_surface else self.mask_occluded(space)
         if sample_weight_threshold > 0:
             seen = self.without_faint(seen, weights, sample_weight_threshold)
             looked_at = weights * seen.valid.any(0)
             looked_at = looked_at * (opacity / looked_at.sum(1).clamp_min(1e-12))[:, None]
-        s, colour = self.blend_views(self.attend(seen), seen)
-        # The classifier is linear, so logits of blended features equal blended logits: classify once a ray.
-        rendered = composite(looked_at, s + self.semantic(s))
-        logits = functional.linear(rendered, self.classifier.weight) + opacity[:, None] * self.classifier.bias
+        refined = self.attend(seen)
+        if self.at_surface:
+            seen = replace(seen, feature=refined)
+            seen = self.mask_occluded(surface_space(seen, looked_at, rays, sources, occlusion=self.config.occlusion))
+            token = self.attend_at_surface(seen)
+            s, colour = (blended[:, 0] for blended in self.blend_views(token, seen, token + self.semantic(token)))
+            logits = self.classifier(s)
+        else:
+            s, colour = self.blend_views(refined, seen)
+            # The classifier is linear, so logits of blended features equal blended logits: classify once a ray.
+            rendered = composite(looked_at, s + self.semantic(s))
+            colour = composite(looked_at, colour)
+            logits = functional.linear(rendered, self.classifier.weight) + opacity[:, None] * self.classifier.bias
         if self.config.source_labels:
             logits = logits + self.label_logit * composite(weights, self.propagate_labels(space))
         logits = logits * known[:, None]
@@ -198,7 +240,7 @@ class SRay(LearnedField):
             logits=logits,
             depth_m=composite_depth(weights, z),
             opacity=opacity,
-            rgb=composite(looked_at, colour),
+            rgb=colour,
             entropy=-(log_p.exp() * log_p).sum(-1),
             known=known,
         )
@@ -210,5 +252,7 @@ def _check(config: SRayConfig) -> None:
         raise ConfigError(
             f"feature_dim must be a multiple of 4 and of heads ({config.heads}), got {config.feature_dim}"
         )
+    if config.parity == "published" and config.tokens != "samples":
+        raise ConfigError('parity = "published" needs tokens = "samples": the published code has no others')
     if not 0 < config.tau < 1:
         raise ConfigError(f"tau must lie between 0 and 1 (Eq. 12), got {config.tau}")

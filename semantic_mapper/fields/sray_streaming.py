@@ -15,6 +15,7 @@ from torch import nn
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.errors import ConfigError, ShapeError
 from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.contextual import BACKGROUND_M, OWN_RADIUS_M
 from semantic_mapper.fields.geometry_net import GEOMETRY_CHANNELS, LEAST_VISIBILITY, OWN_DENSITY_OFFSET
 from semantic_mapper.fields.projection import MIN_DEPTH_M
 from semantic_mapper.fields.sampling import sample_guided
@@ -113,7 +114,8 @@ class StreamingSRay:
     ) -> FieldRender:
         with torch.inference_mode():
             classifier = self.model.classifier
-            logits = rendered @ classifier.weight.T + opacity[:, None] * classifier.bias
+            sum_of_weights = 1.0 if self.model.at_surface else opacity[:, None]
+            logits = rendered @ classifier.weight.T + sum_of_weights * classifier.bias
             if self.model.config.source_labels:
                 logits = logits + self.model.label_logit * carried
             logits = logits * known[:, None]
@@ -140,6 +142,7 @@ class _SourceMaps(NamedTuple):
 
 class _Settings(NamedTuple):
     heads: int
+    at_surface: bool  # one token a view for the attention across views and for blending
     residual: bool  # attention adds to the features instead of replacing them
     occlusion: bool  # views count by their visibility
     log_ratio: float  # ln(1 / tau) of Eq. 12
@@ -149,6 +152,8 @@ class _Settings(NamedTuple):
     label_doubt: float
     own_density_offset: float
     min_depth_m: float
+    background_m: float
+    own_radius_m: float
 
 
 class _Layer(NamedTuple):
@@ -196,6 +201,7 @@ def _settings(model: SRay) -> _Settings:
     config = model.config
     return _Settings(
         heads=config.heads,
+        at_surface=model.at_surface,
         residual=config.attention_residual,
         occlusion=config.occlusion,
         log_ratio=math.log(1 / config.tau),
@@ -205,6 +211,8 @@ def _settings(model: SRay) -> _Settings:
         label_doubt=DOUBT,
         own_density_offset=OWN_DENSITY_OFFSET,
         min_depth_m=MIN_DEPTH_M,
+        background_m=BACKGROUND_M,
+        own_radius_m=OWN_RADIUS_M,
     )
 
 

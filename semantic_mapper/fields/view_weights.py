@@ -37,6 +37,13 @@ class ViewWeightNet(nn.Module):
         super().__init__()
         self.net = nn.Sequential(nn.Linear(feature_dim + extra, 16), nn.ReLU(), nn.Linear(16, 2))
 
+    def start_alike(self) -> None:
+        """Let all views have the same scores until training says otherwise."""
+        last = self.net[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
     def forward(self, feature: torch.Tensor, extra: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(m, R, N, C), (m, R, N, E) -> semantic and colour score, (m, R, N) each."""
         semantic, colour = self.net(torch.cat((feature, extra), dim=-1)).unbind(-1)

@@ -8,15 +8,22 @@ from semantic_mapper.fields.sray import SRay
 from tests.fields.scene import pose_at, wall_rays, wall_sources
 from tests.fields.tiny_fields import LABELS, POSES, TINY, assert_gradients_are_right, tiny
 
-SWITCHES = {"sray-none": (False, False), "sray-intra": (True, False), "sray-cross": (False, True), "sray": (True, True)}
+SWITCHES = {
+    "sray-none": (False, False),
+    "sray-intra": (True, False),
+    "sray-cross": (False, True),
+    "sray-paper": (True, True),
+}
 
 
 @pytest.mark.parametrize("name", list(SWITCHES))
 def test_a_name_sets_the_attention_switches_and_nothing_else(name: str):
     config = build_field(name, {"tau": 0.1}, LABELS).config
     assert (config.intra_view_attention, config.cross_view_attention) == SWITCHES[name]
-    rest = {f for f in SRayConfig.__struct_fields__ if f not in ("intra_view_attention", "cross_view_attention", "tau")}
-    assert all(getattr(config, f) == getattr(SRayConfig(), f) for f in rest) and config.tau == 0.1
+    switches = ("tokens", "intra_view_attention", "cross_view_attention", "tau")
+    rest = {f for f in SRayConfig.__struct_fields__ if f not in switches}
+    assert all(getattr(config, f) == getattr(SRayConfig(), f) for f in rest)
+    assert config.tau == 0.1 and config.tokens == "samples"
 
 
 def test_the_switches_of_a_name_win_over_those_of_a_config():
@@ -51,7 +58,7 @@ def test_an_ablation_is_saved_as_s_ray_with_its_switches_and_loads_to_the_same_a
 
 
 def test_the_ablations_differ_from_each_other_at_the_same_weights():
-    whole = tiny("sray")
+    whole = tiny("sray-paper")
     rays = wall_rays(pose_at(0.0), step=31)
     seen: list[torch.Tensor] = []
     for name in SWITCHES:

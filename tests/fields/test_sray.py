@@ -182,7 +182,7 @@ def test_mismatched_sources_give_a_shape_error():
 
 
 def test_published_parity_runs_and_differs_from_the_paper():
-    published = small_field(parity="published")
+    published = small_field(parity="published", tokens="samples")
     paper = small_field()
     assert published.cross.head_dim == 4 and paper.cross.head_dim == 8
     encoded = published.encode(wall_sources(POSES))
@@ -198,7 +198,7 @@ def test_published_parity_runs_and_differs_from_the_paper():
 
 
 def test_published_parity_leaves_the_interval_length_out_of_alpha():
-    field = small_field(parity="published")
+    field = small_field(parity="published", tokens="samples")
     encoded = field.encode(wall_sources(POSES))
     rays = wall_rays(pose_at(0.0), step=31)
     z = torch.tensor([[1.98, 2.0, 2.02]]).expand(len(rays.origin), 3)

@@ -16,7 +16,9 @@
 
 enum {
     CUES = 4,        /* hit, visibility, view cosine, logarithm of the depth's spread */
-    ROW_EXTRA = 8,   /* columns of a token beyond its features: cues, colour, one unused */
+    OWN = 4,         /* place of one more, of tokens at the surface: whether the view is the query's own */
+    COLOUR = 5,      /* place of the colour behind the cues */
+    ROW_EXTRA = 8,   /* columns of a token beyond its features: cues, own, colour */
     GEOMETRY = 5,    /* mu_1, s_1, mu_2, s_2, weight of the first: a mixture of two logistics over depth */
     SAMPLE_CUES = 4, /* what DensityNet gets beside mean and variance of the features */
     ROWS = 4,        /* that a matrix product works on at a time */
@@ -39,6 +41,7 @@ typedef struct {
 
 typedef struct {
     int64_t heads;
+    int64_t at_surface;        /* one token a view for the attention across views and for blending */
     int64_t residual;          /* attention adds to the features instead of replacing them */
     int64_t occlusion;         /* views count by their visibility */
     double log_ratio;          /* ln(1 / tau) of Eq. 12 */
@@ -48,6 +51,8 @@ typedef struct {
     double label_doubt;        /* hit probability at which a label that a view carries over counts by half */
     double own_density_offset; /* of the density that the network adds */
     double min_depth;          /* metres before a source camera */
+    double background;         /* metres to what a ray meets that meets nothing */
+    double own_radius;         /* metres from the ray's origin within which a camera is the query's own */
 } Settings;
 
 typedef struct {
@@ -91,8 +96,13 @@ typedef struct {
     int64_t stride;                            /* floats of a token */
     int64_t view_width, density_width, hidden; /* outputs of view_hidden, density_token, semantic_hidden (H) */
 
-    /* Tokens, in the order of the views and then of the samples. */
-    float *tokens;                        /* (T, stride): features, CUES, colour */
+    /* Tokens, in the order of the views and then of the samples; behind them, from token `far` on, one a view at the
+     * background, in no order of samples. */
+    int64_t far;
+    float *tokens;                        /* (T, stride): features, CUES, own, colour */
+    float *normed, *surface;              /* (T, stride), (m, stride) layer norms; one token a view */
+    int64_t *sees_far;                    /* (m,) whether the direction of the ray lies in a view */
+    float *surface_visible, *own_view;    /* (m,) */
     float *hit, *visible;                 /* (T,) */
     float *depth, *half;                  /* (T,) of the sample in the view, and half the sample's interval */
     float *mixture[GEOMETRY];             /* (T,) what the view knows of the surface there */
@@ -136,9 +146,14 @@ static float *take_floats(Arena *arena, int64_t count) { return take(arena, coun
 static int64_t *take_ints(Arena *arena, int64_t count) { return take(arena, count, sizeof(int64_t)); }
 
 static void lay_out(Scratch *s, const Weights *w, Arena *arena) {
-    int64_t C = s->channels, N = round_up(s->samples, LANES), T = round_up(s->views * s->samples, LANES);
+    int64_t C = s->channels, M = round_up(s->views, LANES), N = round_up(max_i(s->samples, s->views), LANES);
+    int64_t T = round_up(s->views * s->samples, LANES) + M;
+    s->far = T - M;
     int64_t D = s->density_width, group = round_up(max_i(s->views, s->samples), LANES);
     s->tokens = take_floats(arena, T * s->stride);
+    s->normed = take_floats(arena, T * s->stride), s->surface = take_floats(arena, M * s->stride);
+    s->sees_far = take_ints(arena, M), s->surface_visible = take_floats(arena, M);
+    s->own_view = take_floats(arena, M);
     s->hit = take_floats(arena, T), s->visible = take_floats(arena, T);
     s->depth = take_floats(arena, T), s->half = take_floats(arena, T);
     for (int i = 0; i < GEOMETRY; i++) s->mixture[i] = take_floats(arena, T);
@@ -352,9 +367,25 @@ static void attend(const float *qkv, const int64_t *index, int64_t count, int64_
     else attend_any(qkv, index, count, heads, inner, s, out);
 }
 
+/* The tokens as the learned parts take them: with a layer norm of their features at the surface. */
+static const float *normalised(Scratch *s, const Settings *set, int64_t count) {
+    const int64_t C = s->channels;
+    if (!set->at_surface) return s->tokens;
+    memcpy(s->normed, s->tokens, (size_t)(count * s->stride) * sizeof(float));
+    for (int64_t t = 0; t < count; t++) {
+        float *row = s->normed + t * s->stride, mean = 0, square = 0;
+        for (int64_t c = 0; c < C; c++) mean += row[c];
+        mean /= (float)C;
+        for (int64_t c = 0; c < C; c++) row[c] -= mean, square += row[c] * row[c];
+        const float rate = 1.0f / sqrtf(square / (float)C + 1e-5f);
+        for (int64_t c = 0; c < C; c++) row[c] *= rate;
+    }
+    return s->normed;
+}
+
 /* Queries, keys and values of all tokens. */
-static void project_tokens(Scratch *s, const F32 *qkv, int64_t count) {
-    product(s->tokens, s->stride, count, qkv, s->qkv);
+static void project_tokens(Scratch *s, const F32 *qkv, const Settings *set, int64_t count) {
+    product(normalised(s, set, count), s->stride, count, qkv, s->qkv);
 }
 
 /* What the heads found becomes, or is added to, the tokens' features. */
@@ -366,7 +397,7 @@ static void merge_heads(Scratch *s, const F32 *out, int64_t count, bool residual
 
 /* Intra-view radial attention (Eq. 9): each view's tokens among themselves. */
 static void attend_along_ray(Scratch *s, const Attention *w, const Settings *set, int64_t count) {
-    project_tokens(s, &w->qkv, count);
+    project_tokens(s, &w->qkv, set, count);
     for (int64_t j = 0; j < s->views; j++)
         attend(s->qkv, s->every + s->view_start[j], s->view_start[j + 1] - s->view_start[j], set->heads, s->channels, s,
                s->mixed);
@@ -375,7 +406,7 @@ static void attend_along_ray(Scratch *s, const Attention *w, const Settings *set
 
 /* Cross-view sparse attention (Eq. 10): each sample's tokens among themselves. */
 static void attend_across_views(Scratch *s, const Attention *w, const Settings *set, int64_t count) {
-    project_tokens(s, &w->qkv, count);
+    project_tokens(s, &w->qkv, set, count);
     for (int64_t k = 0; k < s->samples; k++)
         attend(s->qkv, s->by_sample + k * s->views, s->sample_size[k], set->heads, s->channels, s, s->mixed);
     merge_heads(s, &w->out, count, set->residual);
@@ -399,7 +430,7 @@ INLINE void gather_token(Scratch *s, const SourceMaps *maps, int64_t j, float u,
     weighted_sum(maps->feature.data, C, pixel, w, 4, C, row);
     for (int c = 0; c < 3; c++) {
         const float *rgb = maps->rgb.data + c;
-        row[C + CUES + c] = w[0] * rgb[3 * pixel[0]] + w[1] * rgb[3 * pixel[1]] + w[2] * rgb[3 * pixel[2]] +
+        row[C + COLOUR + c] = w[0] * rgb[3 * pixel[0]] + w[1] * rgb[3 * pixel[1]] + w[2] * rgb[3 * pixel[2]] +
                             w[3] * rgb[3 * pixel[3]];
     }
     const int64_t at = (j * height + nearest(v, height)) * width + nearest(u, width);
@@ -414,8 +445,8 @@ INLINE void gather_token(Scratch *s, const SourceMaps *maps, int64_t j, float u,
 }
 
 /* Probability that a view's ray ends in the sample, and that it gets there at all; see hit_and_visibility. */
-static void find_hits(Scratch *s, int64_t count) {
-    for (int64_t t = 0; t < count; t += LANES) {
+static void find_hits(Scratch *s, int64_t first, int64_t count) {
+    for (int64_t t = first; t < first + count; t += LANES) {
         const Lanes z = load(s->depth + t), half = load(s->half + t), share = load(s->mixture[4] + t);
         const Lanes first = 1.0f / load(s->mixture[1] + t), second = 1.0f / load(s->mixture[3] + t);
         const Lanes front = z - load(s->mixture[0] + t), behind = z - load(s->mixture[2] + t);
@@ -425,10 +456,28 @@ static void find_hits(Scratch *s, int64_t count) {
         store(s->hit + t, far - near);
         store(s->visible + t, 1.0f - near);
     }
-    for (int64_t t = 0; t < count; t++) {
+    for (int64_t t = first; t < first + count; t++) {
         float *cues = s->tokens + t * s->stride + s->channels;
         cues[0] = s->hit[t], cues[1] = s->visible[t];
     }
+}
+
+/* The token of view j at the background. */
+INLINE void look_far(Scratch *s, const SourceMaps *maps, const Settings *set, int64_t j, const float *o,
+                     const float *d, float length) {
+    const float far = (float)set->background, *K = maps->K.data + 4 * j;
+    const float x = o[0] + far * d[0], y = o[1] + far * d[1], depth = o[2] + far * d[2];
+    const float width = (float)maps->feature.shape[2] - 0.5f, height = (float)maps->feature.shape[1] - 0.5f;
+    const float u = K[0] * x / depth + K[2], v = K[1] * y / depth + K[3];
+    s->sees_far[j] = depth > (float)set->min_depth && u > -0.5f && u < width && v > -0.5f && v < height;
+    s->depth[s->far + j] = depth, s->half[s->far + j] = 0;
+    if (!s->sees_far[j]) {
+        for (int i = 0; i < GEOMETRY; i++) s->mixture[i][s->far + j] = 1.0f;
+        return;
+    }
+    gather_token(s, maps, j, u, v, s->far + j);
+    s->tokens[(s->far + j) * s->stride + s->channels + 2] =
+        (x * d[0] + y * d[1] + depth * d[2]) / (sqrtf(x * x + y * y + depth * depth) * length);
 }
 
 /* Reproject the samples of a ray into all views (Eq. 4, 5); returns the number of tokens. */
@@ -446,6 +495,8 @@ static int64_t fill_tokens(Scratch *s, const SourceMaps *maps, const Settings *s
         }
         const float length = sqrtf(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
         s->view_start[j] = count;
+        s->own_view[j] = sqrtf(o[0] * o[0] + o[1] * o[1] + o[2] * o[2]) < (float)set->own_radius ? 1.0f : 0.0f;
+        if (set->at_surface) look_far(s, maps, set, j, o, d, length);
         for (int64_t base = 0; base < s->samples; base += LANES) {
             const Lanes z = load(s->z + base), x = o[0] + z * d[0], y = o[1] + z * d[1], depth = o[2] + z * d[2];
             const Lanes u = K[0] * x / depth + K[2], v = K[1] * y / depth + K[3];
@@ -464,7 +515,8 @@ static int64_t fill_tokens(Scratch *s, const SourceMaps *maps, const Settings *s
         }
     }
     s->view_start[s->views] = count;
-    find_hits(s, count);
+    find_hits(s, 0, count);
+    if (set->at_surface) find_hits(s, s->far, s->views);
     return count;
 }
 
@@ -479,7 +531,7 @@ static void group_by_sample(Scratch *s, int64_t count) {
 
 /* Move the tokens that SRay.mask_occluded and without_faint keep to the front; returns how many they are. */
 static int64_t drop_tokens(Scratch *s, const Settings *set) {
-    const float hidden_below = set->occlusion ? (float)set->hidden_below : 0.0f;
+    const float hidden_below = set->occlusion && !set->at_surface ? (float)set->hidden_below : 0.0f;
     const bool drop_faint = set->sample_weight_threshold > 0;
     int64_t kept = 0, end = 0;
     for (int64_t k = 0; k < s->samples; k++) {
@@ -583,11 +635,62 @@ static void weigh_samples(Scratch *s, const Settings *set, float *opacity, float
     *opacity = sum, *depth = sum > 1e-3f ? depth_sum / max_f(sum, 1e-6f) : 0.0f;
 }
 
+/* ---- One token a view (contextual.surface_space) ---- */
+
+/* Of `from`, `weight` times: its row to a surface token, and what the view sees of it; returns its share in the token. */
+INLINE float add_to_surface(Scratch *s, const Settings *set, int64_t from, float weight, float *token,
+                            float *visible) {
+    const float *row = s->tokens + from * s->stride;
+    const int64_t C = s->channels;
+    const float share = set->occlusion ? weight * (s->visible[from] + (float)set->least_visibility) : weight;
+    for (int64_t c = 0; c < C; c++) token[c] += share * row[c];
+    for (int64_t c = C + 2; c < s->stride; c++) token[c] += share * row[c];
+    token[C] += weight * row[C];
+    *visible += weight * s->visible[from];
+    return share;
+}
+
+/* Composite each view's tokens by itself, the background's with what the samples leave; those of views that see the
+ * surface, where any does, become the tokens. Returns how many they are. */
+static int64_t composite_views(Scratch *s, const Settings *set) {
+    const int64_t C = s->channels;
+    const float hidden_below = set->occlusion ? (float)set->hidden_below : 0.0f;
+    float rest = 1.0f, clearest = 0;
+    for (int64_t k = 0; k < s->samples; k++) rest -= s->looked_at[k];
+    rest = max_f(rest, 0.0f);
+    int64_t count = 0;
+    memset(s->surface, 0, (size_t)(s->views * s->stride) * sizeof(float));
+    for (int64_t j = 0; j < s->views; j++) {
+        float *token = s->surface + count * s->stride, sum = 0, weight = 0, visible = 0;
+        for (int64_t t = s->view_start[j]; t < s->view_start[j + 1]; t++) {
+            const float part = s->looked_at[s->sample_of[t]];
+            sum += add_to_surface(s, set, t, part, token, &visible), weight += part;
+        }
+        if (s->sees_far[j]) sum += add_to_surface(s, set, s->far + j, rest, token, &visible), weight += rest;
+        if (weight <= 0) continue;
+        const float rate = 1.0f / max_f(sum, 1e-12f);
+        for (int64_t c = 0; c < s->stride; c++) token[c] *= c == C ? 1.0f : rate;
+        token[C + 1] = visible, token[C + OWN] = s->own_view[j];
+        s->surface_visible[count++] = set->occlusion ? visible : weight;
+        clearest = max_f(clearest, visible);
+    }
+    int64_t kept = 0;
+    for (int64_t i = 0; i < count; i++) {
+        if (s->surface_visible[i] < hidden_below && hidden_below <= clearest) continue;
+        memcpy(s->tokens + kept * s->stride, s->surface + i * s->stride, (size_t)s->stride * sizeof(float));
+        s->visible[kept++] = s->surface_visible[i];
+    }
+    memset(s->sample_size, 0, (size_t)s->samples * sizeof(int64_t));
+    for (int64_t i = 0; i < kept; i++) s->by_sample[i] = i;
+    s->sample_size[0] = kept;
+    return kept;
+}
+
 /* ---- Blending (Eq. 11, 12) and compositing (Eq. 13) ---- */
 
 /* Of each token its weights in the semantic ray and in the colour, neither yet normalised (Eq. 12). */
 static void score_views(Scratch *s, const Weights *w, const Settings *set, int64_t count) {
-    hidden_layer(s->tokens, s->stride, count, &w->view_hidden, s->view_hidden);
+    hidden_layer(normalised(s, set, count), s->stride, count, &w->view_hidden, s->view_hidden);
     two_outputs(s->view_hidden, count, &w->view_scores, s->semantic_score, s->colour_score);
     for (int64_t k = 0; k < s->samples; k++) {
         const int64_t *tokens = s->by_sample + k * s->views;
@@ -600,9 +703,11 @@ static void score_views(Scratch *s, const Weights *w, const Settings *set, int64
          * out. */
         const Lanes score = load(s->semantic_score + t);
         Lanes weight = exp_below((float)set->log_ratio * (logistic(2.0f * score) - 1.0f));
-        if (set->occlusion) weight *= load(s->visible + t) + (float)set->least_visibility;
+        if (set->occlusion || set->at_surface) weight *= load(s->visible + t) + (float)set->least_visibility;
         store(s->semantic_score + t, weight);
-        store(s->colour_score + t, exp_below(load(s->colour_score + t)));
+        Lanes colour = exp_below(load(s->colour_score + t));
+        if (set->at_surface) colour *= load(s->visible + t) + (float)set->least_visibility;
+        store(s->colour_score + t, colour);
     }
 }
 
@@ -621,12 +726,27 @@ static int64_t blend_views(Scratch *s, float *colour) {
         weighted_sum(s->tokens, s->stride, tokens, s->view_share, views, C, s->s + kept * C);
         for (int64_t i = 0; i < views; i++) {
             const float weight = s->looked_at[k] * s->colour_score[tokens[i]] / colour_sum;
-            const float *rgb = s->tokens + tokens[i] * s->stride + C + CUES;
+            const float *rgb = s->tokens + tokens[i] * s->stride + C + COLOUR;
             for (int c = 0; c < 3; c++) colour[c] += weight * rgb[c];
         }
         s->kept_weight[kept++] = s->looked_at[k];
     }
     return kept;
+}
+
+/* The same of tokens at the surface, which stay apart until they have been through `semantic`; as many as there are. */
+static int64_t weigh_views(Scratch *s, int64_t count, float *colour) {
+    const int64_t C = s->channels;
+    float sum = 0, colour_sum = 0;
+    memset(colour, 0, 3 * sizeof(float));
+    for (int64_t i = 0; i < count; i++) sum += s->semantic_score[i], colour_sum += s->colour_score[i];
+    for (int64_t i = 0; i < count; i++) {
+        const float *row = s->tokens + i * s->stride;
+        memcpy(s->s + i * C, row, (size_t)C * sizeof(float));
+        s->kept_weight[i] = s->semantic_score[i] / sum;
+        for (int c = 0; c < 3; c++) colour[c] += s->colour_score[i] / colour_sum * row[C + COLOUR + c];
+    }
+    return count;
 }
 
 /* Eq. 13 of s + semantic(s): the second layer of `semantic` is linear, so it is applied once, to the composited hidden
@@ -681,9 +801,11 @@ static void render_ray(const RenderArguments *a, Scratch *s, int64_t r) {
         group_by_sample(s, count);
     }
     if (w->radial.qkv.shape[0] > 0) attend_along_ray(s, &w->radial, set, count);
+    if (set->at_surface) count = composite_views(s, set);
     if (w->cross.qkv.shape[0] > 0) attend_across_views(s, &w->cross, set, count);
     score_views(s, w, set, count);
-    const int64_t kept = blend_views(s, a->out.colour.data + 3 * r);
+    float *colour = a->out.colour.data + 3 * r;
+    const int64_t kept = set->at_surface ? weigh_views(s, count, colour) : blend_views(s, colour);
     composite_semantics(s, w, kept, a->out.feature.data + r * C);
 }
 
@@ -705,7 +827,7 @@ KERNEL(render_sray, RenderArguments) {
     if (!memory) return 1;
     arena = (Arena){.next = memory};
     lay_out(&s, &a->weights, &arena);
-    for (int64_t i = 0; i < max_i(round_up(s.views * s.samples, LANES), s.hidden); i++) s.every[i] = i;
+    for (int64_t i = 0; i < max_i(s.far, s.hidden); i++) s.every[i] = i;
     for (int64_t r = start; r < stop; r++) render_ray(a, &s, r);
     free(memory);
     return 0;
