@@ -99,7 +99,7 @@ def surface_space(
     geometry = mean(both("cues")[..., 2:CUES])
     T = sources.T_camera_world
     origin = torch.einsum("mij,rj->mri", T[:, :3, :3], rays.origin) + T[:, None, :3, 3]
-    own: torch.Tensor = torch.linalg.vector_norm(origin, dim=-1) < OWN_RADIUS_M
+    own = origin.square().sum(-1) < OWN_RADIUS_M**2
     cues = torch.cat((torch.stack((hits, visible), dim=-1), geometry, own.to(hits.dtype)[..., None]), dim=-1)
     return ContextualSpace(
         feature=mean(both("feature"))[:, :, None],
