@@ -17,6 +17,7 @@ from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.training.appearance import vary_appearance
 from semantic_mapper.training.losses import Loss, image_loss
 from semantic_mapper.training.rooms import RoomViews
 from semantic_mapper.training.views import jitter_colours, mirrored_view, stack_sources, withhold_depth
@@ -41,6 +42,7 @@ class ImageStepConfig(Config, frozen=True):
     depth_dropout: Fraction = 0.3  # fraction of images without depth after that
     mirrored: Fraction = 0.5  # fraction of images
     colour_jitter: float = 0.25
+    appearance: Fraction = 0.0  # fraction of images with another light, texture and sharpness; see ``appearance``
     balance: Fraction = 0.25  # see ``losses.image_loss``
 
 
@@ -77,7 +79,10 @@ def draw_images(
     withheld = 1.0 if colours_only else 0.0 if config.frozen_colours else config.depth_dropout
     sources = withhold_depth(replace(stacked, channel=None), withheld, generator)
     sources = jitter_colours(to_device(sources, device), config.colour_jitter, generator)
-    return ImageBatch(sources, stacked.channel.to(device))
+    channel = stacked.channel.to(device)
+    if config.appearance > 0:
+        sources = vary_appearance(sources, channel, config.appearance, generator)
+    return ImageBatch(sources, channel)
 
 
 def images_loss(model: LearnedField, batch: ImageBatch, config: ImageStepConfig) -> Loss:

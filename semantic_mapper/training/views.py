@@ -148,7 +148,7 @@ def degrade_view(sources: SourceViews, index: int, generator: torch.Generator) -
     height, width = rgb.shape[-2:]
     rgb = rgb.clamp_min(1e-3) ** uniform(0.7, 1.4) * 2 ** uniform(-2.0, 0.5)
     if (sigma := uniform(-1.0, 2.5) * width / 160) > 0.3:
-        rgb = _blurred(rgb, sigma)
+        rgb = blurred(rgb, sigma)
     rgb = rgb + uniform(0.0, 0.1) * torch.randn(rgb.shape, generator=generator)
     for _ in range(int(torch.randint(0, 4, (1,), generator=generator))):
         h, w = int(uniform(0.1, 0.5) * height), int(uniform(0.1, 0.5) * width)
@@ -163,7 +163,7 @@ def degrade_view(sources: SourceViews, index: int, generator: torch.Generator) -
     return replace(sources, rgb=whole, depth_m=depth_m)
 
 
-def _blurred(rgb: torch.Tensor, sigma: float) -> torch.Tensor:
+def blurred(rgb: torch.Tensor, sigma: float) -> torch.Tensor:
     """(3, H, W) with a Gaussian of ``sigma`` pixels."""
     radius = max(1, round(2.5 * sigma))
     x = torch.arange(-radius, radius + 1, dtype=rgb.dtype)

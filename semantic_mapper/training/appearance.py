@@ -1,0 +1,90 @@
+"""What photographs have and rendered rooms lack: uneven light, textures on everything, dull colours, blur and noise.
+
+For steps on single images, where views need not agree with each other. Geometry and labels stay as they are.
+"""
+
+from __future__ import annotations
+
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch.nn import functional
+
+from semantic_mapper.training.views import blurred
+from semantic_mapper.types import SourceViews
+
+TEXTURED = 0.5  # of the classes in an image
+LOW_FREQUENCIES = 0.1  # of each side of the spectrum: light and colour, not shapes
+
+
+def vary_appearance(
+    views: SourceViews, channel: torch.Tensor, fraction: float, generator: torch.Generator
+) -> SourceViews:
+    """A random ``fraction`` of the images with another light, texture, colour and sharpness.
+
+    Args:
+        channel: (m, H, W) int64 classes, whose surfaces get a texture each; -1 is one of them.
+        generator: Of the CPU, so that draws are the same whatever the device.
+    """
+    chosen = torch.rand(len(views.rgb), generator=generator) < fraction
+    if not bool(chosen.any()):
+        return views
+    rgb = views.rgb.clone()
+    for i in chosen.nonzero()[:, 0].tolist():
+        other = views.rgb[int(torch.randint(len(views.rgb), (1,), generator=generator))]
+        rgb[i] = _vary(views.rgb[i], other, channel[i], generator)
+    return replace(views, rgb=rgb)
+
+
+def _vary(rgb: torch.Tensor, other: torch.Tensor, channel: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    def uniform(low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand(1, generator=generator))
+
+    size = (rgb.shape[1], rgb.shape[2])
+    rgb = mix_amplitudes(rgb, other, uniform(0, 0.5))
+    texture = _texture(size, uniform, generator).to(rgb.device)
+    classes = channel.unique()
+    textured = classes[torch.rand(len(classes), generator=generator).to(classes.device) < TEXTURED]
+    rgb = torch.where(torch.isin(channel, textured), rgb * texture.exp(), rgb)
+    light = _smooth_noise(size, (3, 4), generator).to(rgb.device) * uniform(0, 0.4)
+    rgb = rgb * light.exp()
+    grey = rgb.mean(0, keepdim=True)
+    rgb = grey + (rgb - grey) * uniform(0.3, 1.4)
+    rgb = rgb.mean() + (rgb - rgb.mean()) * uniform(0.7, 1.2)
+    if (sigma := uniform(-0.8, 1.2) * size[1] / 160) > 0.3:
+        rgb = blurred(rgb, sigma)
+    noise = torch.randn(rgb.shape, generator=generator).to(rgb.device)
+    return (rgb + max(uniform(-0.03, 0.06), 0) * noise).clamp(0, 1)
+
+
+def mix_amplitudes(rgb: torch.Tensor, other: torch.Tensor, share: float) -> torch.Tensor:
+    """(3, H, W) with ``share`` of the other image's low-frequency amplitudes, phases kept (Yang and Soatto, FDA, CVPR
+    2020; mixed as in Xu et al., CVPR 2021)."""
+    own, theirs = torch.fft.fft2(rgb), torch.fft.fft2(other)
+    rows = torch.fft.fftfreq(rgb.shape[1], device=rgb.device).abs()[:, None] < LOW_FREQUENCIES / 2
+    columns = torch.fft.fftfreq(rgb.shape[2], device=rgb.device).abs()[None] < LOW_FREQUENCIES / 2
+    weight = share * (rows & columns)
+    amplitude = (1 - weight) * own.abs() + weight * theirs.abs()
+    return torch.fft.ifft2(torch.polar(amplitude, own.angle())).real.clamp(0, 1)
+
+
+def _texture(
+    size: tuple[int, int], uniform: Callable[[float, float], float], generator: torch.Generator
+) -> torch.Tensor:
+    """(1, H, W) logarithm of a reflectance: noise of several scales, stretched along one of the axes."""
+    strength, stretch = uniform(0, 0.35), 2 ** uniform(-2, 2)
+    texture = torch.zeros(1, *size)
+    for octave in range(2, 6):
+        cells = 2**octave
+        grid = (max(2, round(cells * min(stretch, 1))), max(2, round(cells * min(1 / stretch, 1))))
+        texture += _smooth_noise(size, grid, generator) * uniform(0, 1)
+    return strength * texture / texture.std().clamp_min(1e-6)
+
+
+def _smooth_noise(size: tuple[int, int], grid: tuple[int, int], generator: torch.Generator) -> torch.Tensor:
+    """(1, H, W) normal noise of a coarse grid, interpolated."""
+    coarse = torch.randn(1, 1, *grid, generator=generator)
+    return functional.interpolate(coarse, size=size, mode="bicubic", align_corners=False)[0]

@@ -1,0 +1,65 @@
+import msgspec
+import torch
+
+from semantic_mapper.training.appearance import mix_amplitudes, vary_appearance
+from semantic_mapper.training.images import ImageStepConfig, draw_images
+from semantic_mapper.training.rooms import RoomPoolConfig, render_room
+from semantic_mapper.types import SourceViews
+from tests.fields.scene import pose_at, wall_sources
+
+VIEWS = wall_sources([pose_at(0.1 * i) for i in range(4)])
+
+
+def labels(views: SourceViews) -> torch.Tensor:
+    channel = torch.zeros(views.depth_m.shape, dtype=torch.int64)
+    channel[:, :, : channel.shape[2] // 2] = 3
+    return channel
+
+
+def varied(fraction: float, seed: int = 0) -> SourceViews:
+    return vary_appearance(VIEWS, labels(VIEWS), fraction, torch.Generator().manual_seed(seed))
+
+
+def test_only_colours_change_and_they_stay_colours():
+    views = varied(1.0)
+    assert views.depth_m is VIEWS.depth_m and views.K is VIEWS.K and views.T_world_camera is VIEWS.T_world_camera
+    change = (views.rgb - VIEWS.rgb).abs().flatten(1).mean(1)
+    assert (change > 0.01).all() and views.rgb.min() >= 0 and views.rgb.max() <= 1
+    assert torch.isfinite(views.rgb).all()
+
+
+def test_the_same_seed_gives_the_same_images_and_another_one_others():
+    assert torch.equal(varied(1.0).rgb, varied(1.0).rgb)
+    assert not torch.equal(varied(1.0).rgb, varied(1.0, seed=1).rgb)
+
+
+def test_a_fraction_of_the_images_stays_as_it_is():
+    assert varied(0.0) is VIEWS
+    kept = sum(int((varied(0.5, seed).rgb == VIEWS.rgb).flatten(1).all(1).sum()) for seed in range(25))
+    assert 25 < kept < 75
+
+
+def test_amplitudes_of_another_image_bring_its_light_and_keep_the_shapes():
+    shape = VIEWS.rgb[0] * 0.5
+    bright = torch.full_like(shape, 0.9)
+    mixed = mix_amplitudes(shape, bright, 0.5)
+    assert mixed.mean() > shape.mean() + 0.1
+    a, b = shape - shape.mean(), mixed - mixed.mean()
+    assert (a * b).sum() / (a.norm() * b.norm()) > 0.8
+    torch.testing.assert_close(mix_amplitudes(shape, bright, 0.0), shape, atol=1e-5, rtol=0)
+
+
+def test_image_steps_vary_appearance_where_they_are_asked_to():
+    room = render_room(10, RoomPoolConfig(width=48, views=3))
+    plain = ImageStepConfig(images=2, colour_jitter=0.0, mirrored=0.0)
+    drawn = [
+        draw_images([room], replace_appearance(plain, a), torch.Generator().manual_seed(3), torch.device("cpu"))
+        for a in (0.0, 1.0)
+    ]
+    assert torch.equal(drawn[0].channel, drawn[1].channel)
+    assert not torch.equal(drawn[0].views.rgb, drawn[1].views.rgb)
+    assert torch.equal(drawn[0].views.depth_m, drawn[1].views.depth_m)
+
+
+def replace_appearance(config: ImageStepConfig, appearance: float) -> ImageStepConfig:
+    return msgspec.structs.replace(config, appearance=appearance)
