@@ -18,6 +18,7 @@ OWN_DENSITY_OFFSET = 6.0  # at the start the views decide alone: 0.0025 / m of d
 MEASURED_SHIFT = 0.05  # a measured depth may be moved by at most this fraction
 MEASURED_SCALE = 0.01  # initial spread of a measured depth, fraction of z
 PREDICTED_SCALE = 0.25  # initial spread of a predicted depth, fraction of z
+COMMON_FOCAL = 0.69  # focal length in image widths at which a predicted depth is taken as it is
 LEAST_VISIBILITY = 1e-4  # a sample that is hidden from every view that it projects into takes all of them alike
 
 
@@ -34,13 +35,22 @@ class GeometryInit(nn.Module):
         nn.init.normal_(last.weight, std=1e-3)
         nn.init.zeros_(last.bias)
 
-    def forward(self, feature: torch.Tensor, depth_m: torch.Tensor) -> torch.Tensor:
-        """feature (m, C, h, w), depth_m (m, h, w) with 0 = none -> (m, 5, h, w) mixture parameters."""
+    def forward(self, feature: torch.Tensor, depth_m: torch.Tensor, focal: torch.Tensor | None = None) -> torch.Tensor:
+        """Mixture parameters (m, 5, h, w).
+
+        Args:
+            feature: (m, C, h, w).
+            depth_m: (m, h, w), 0 = none.
+            focal: (m,) focal length in image widths, which a predicted depth is proportional to: a thing looks the same
+                through a lens of twice the focal length at twice the distance. None = ``COMMON_FOCAL``.
+        """
         measured = depth_m > 0
         inverse = torch.where(measured, 1 / depth_m.clamp_min(NEAR_M), torch.zeros_like(depth_m))
         raw = self.net(torch.cat((feature, inverse[:, None], measured[:, None].to(feature.dtype)), dim=1))
         shift, spread, behind, spread_behind, fraction, guess = raw.unbind(1)
         predicted = 1 / (1 / FAR_M + (1 / NEAR_M - 1 / FAR_M) * torch.sigmoid(guess - 2.0))
+        if focal is not None:
+            predicted = predicted * (focal / COMMON_FOCAL)[:, None, None]
         mu_1 = torch.where(measured, depth_m * (1 + MEASURED_SHIFT * torch.tanh(shift)), predicted)
         start = torch.where(measured, MEASURED_SCALE, PREDICTED_SCALE)
         s_1 = mu_1 * start * torch.exp(spread.clamp(-3, 3))

@@ -86,7 +86,8 @@ class SRay(LearnedField):
         """
         check_views(views)
         feature = self.encoder(views)
-        geometry = self.geometry_init(feature, depth_at(views, feature.shape[-2], feature.shape[-1]))
+        focal = views.K[:, 0, 0] / views.rgb.shape[-1] if self.config.depth_by_focal else None
+        geometry = self.geometry_init(feature, depth_at(views, feature.shape[-2], feature.shape[-1]), focal)
         encoded = encoded_views(views, feature, geometry)
         if views.channel is None or not self.config.source_labels:
             return encoded

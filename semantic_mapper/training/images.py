@@ -18,7 +18,7 @@ from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.training.appearance import vary_appearance
-from semantic_mapper.training.losses import Loss, image_loss
+from semantic_mapper.training.losses import Loss, guess_loss, image_loss
 from semantic_mapper.training.rooms import RoomViews
 from semantic_mapper.training.views import jitter_colours, mirrored_view, stack_sources, withhold_depth
 from semantic_mapper.types import SourceViews
@@ -44,14 +44,22 @@ class ImageStepConfig(Config, frozen=True):
     colour_jitter: float = 0.25
     appearance: Fraction = 0.0  # fraction of images with another light, texture and sharpness; see ``appearance``
     balance: Fraction = 0.25  # see ``losses.image_loss``
+    depth: float = 0.05  # weight of ``losses.guess_loss``: images without depth learn it, too
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageBatch:
-    """Images of several rooms, on the training device; channel (m, H, W) int64, -1 = ignore."""
+    """Images of several rooms, on the training device.
+
+    Args:
+        views: As the field is given them.
+        channel: (m, H, W) int64, -1 = ignore.
+        depth_m: (m, H, W) as the sensor measured it, also where the field is given none.
+    """
 
     views: SourceViews
     channel: torch.Tensor
+    depth_m: torch.Tensor
 
 
 def draw_images(
@@ -82,7 +90,7 @@ def draw_images(
     channel = stacked.channel.to(device)
     if config.appearance > 0:
         sources = vary_appearance(sources, channel, config.appearance, generator)
-    return ImageBatch(sources, channel)
+    return ImageBatch(sources, channel, stacked.depth_m.to(device))
 
 
 def images_loss(model: LearnedField, batch: ImageBatch, config: ImageStepConfig) -> Loss:
@@ -93,10 +101,14 @@ def images_loss(model: LearnedField, batch: ImageBatch, config: ImageStepConfig)
     """
     encoder = encoder_for_images(model)
     with encoder.batch_statistics():
-        logits = model.source_logits(model.encode(batch.views))
+        encoded = model.encode(batch.views)
+        logits = model.source_logits(encoded)
     assert logits is not None  # or there would be no such encoder
     loss = image_loss(logits, batch.channel, config.balance)
-    return Loss(loss, loss, torch.zeros_like(loss), torch.zeros_like(loss))
+    depth = torch.zeros_like(loss)
+    if config.depth > 0 and encoded.geometry.any():  # a field without geometry holds zeros
+        depth = guess_loss(encoded.geometry, batch.views.depth_m, batch.depth_m)
+    return Loss(loss + config.depth * depth, loss, torch.zeros_like(loss), depth)
 
 
 def encoder_for_images(model: LearnedField) -> ImageEncoder:

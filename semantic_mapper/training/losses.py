@@ -13,6 +13,7 @@ from semantic_mapper.training.views import RayTargets
 from semantic_mapper.types import FieldRender
 
 IGNORE = -1
+GUESS_WIDTH = 0.01  # least relative spread of a guessed depth
 RAREST = 1e-3  # fraction of the pixels below which a class is not weighted up further
 
 
@@ -24,6 +25,7 @@ class LossConfig(Config, frozen=True):
     depth: float = 0.1
     source: float = 0.25  # per-pixel class loss on labelled source views: teaches the shared encoder densely
     balance: float = 0.0  # of that loss, see ``image_loss``
+    source_depth: float = 0.0  # on the depth that the field predicts for source views without any, see ``guess_loss``
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,6 +70,26 @@ def image_loss(logits: torch.Tensor, channel: torch.Tensor, balance: float) -> t
     weight = (fraction.to(logits.dtype) + RAREST) ** -balance
     total = functional.cross_entropy(logits, small, weight, ignore_index=IGNORE, reduction="sum")
     return total / (weight * fraction).sum().clamp_min(1e-6) / labelled.sum().clamp_min(1)
+
+
+def guess_loss(geometry: torch.Tensor, given_m: torch.Tensor, depth_m: torch.Tensor) -> torch.Tensor:
+    """Negative log likelihood of the true depth of views that were given none; 0 where there are none.
+
+    A Laplace distribution of log depth round the field's guess, as wide as the field says: near and far errors count
+    alike, and the width is learned with the guess.
+
+    Args:
+        geometry: (m, G, h, w) of ``EncodedViews``: nearer component first, its depth and its spread in metres.
+        given_m: (m, H, W) depth that the field was given, 0 = none.
+        depth_m: (m, H, W) depth that was measured, 0 = unknown.
+    """
+    size = geometry.shape[-2:]
+    target = functional.interpolate(depth_m[:, None], size=size, mode="nearest-exact")[:, 0]
+    guessed = (target > 0) & ~(given_m > 0).flatten(1).any(1)[:, None, None]
+    width = (geometry[:, 1] / geometry[:, 0]).clamp_min(GUESS_WIDTH)
+    error = (geometry[:, 0].log() - target.clamp_min(1e-3).log()).abs()
+    each = error / width + width.log()
+    return (each * guessed).sum() / guessed.sum().clamp_min(1)
 
 
 def ray_loss(render: FieldRender, targets: RayTargets, config: LossConfig) -> Loss:

@@ -16,7 +16,7 @@ from semantic_mapper.fields.base import MAX_SOURCE_VIEWS, EncodedViews
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.sampling import sample_guided, sample_inverse_depth
-from semantic_mapper.training.losses import IGNORE, Loss, LossConfig, image_loss, mean_loss, ray_loss
+from semantic_mapper.training.losses import IGNORE, Loss, LossConfig, guess_loss, image_loss, mean_loss, ray_loss
 from semantic_mapper.training.views import (
     LabelledView,
     RayTargets,
@@ -98,6 +98,7 @@ class StepBatch:
         rays: R query rays.
         targets: What they should render to.
         z: (R, N) sample depths, ascending, metres.
+        depth_m: (m, H, W) measured depth of the source views, also of those that the field is given none of.
     """
 
     sources: SourceViews
@@ -105,6 +106,7 @@ class StepBatch:
     rays: RayBatch
     targets: RayTargets
     z: torch.Tensor
+    depth_m: torch.Tensor
 
 
 def pick_views(
@@ -198,7 +200,9 @@ def draw_batch(
     stacked = withhold_depth(stacked, 1.0 if blind else config.depth_dropout, generator)
     stacked = jitter_colours(to_device(stacked, device), config.colour_jitter, generator)
     channel = torch.stack([(resident or views)[i].channel for i in sources])
-    return StepBatch(stacked, channel.to(device), to_device(rays, device), to_device(targets, device), z.to(device))
+    depth_m = torch.stack([(resident or views)[i].depth_m for i in sources])
+    drawn = to_device(rays, device), to_device(targets, device), z.to(device)
+    return StepBatch(stacked, channel.to(device), *drawn, depth_m.to(device))
 
 
 def draw_rays(
@@ -240,6 +244,9 @@ def batch_loss(
             if logits is not None:
                 dense = image_loss(logits, batch.channel, config.balance)
                 loss = replace(loss, total=loss.total + config.source * dense)
+        if config.source_depth > 0 and encoded.geometry.any():  # a field without geometry holds zeros
+            guess = guess_loss(encoded.geometry, batch.sources.depth_m, batch.depth_m)
+            loss = replace(loss, total=loss.total + config.source_depth * guess)
         losses.append(loss)
     return mean_loss(losses)
 

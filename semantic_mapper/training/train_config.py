@@ -27,7 +27,7 @@ class TrainStepConfig(StepConfig, frozen=True):
     no_depth: Fraction = 0.25
     no_depth_thinning: AtLeastOne = 4  # 32 samples a ray instead of 8
     mirrored: Fraction = 0.5
-    loss: LossConfig = LossConfig(balance=0.25)
+    loss: LossConfig = LossConfig(balance=0.25, source_depth=0.02)
 
 
 class TrainConfig(Config, frozen=True):

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
-from semantic_mapper.config import EncoderConfig, UNetFieldConfig
+from semantic_mapper.config import EncoderConfig, SRayConfig, UNetFieldConfig
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.peers.unet_field import UNetField
+from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.training.losses import semantic_loss
+from semantic_mapper.training.losses import guess_loss, semantic_loss
 from semantic_mapper.training.step import StepConfig, pick_views_on_path
 from semantic_mapper.training.views import degrade_view, draw_pixels, natural_weights
 from semantic_mapper.types import SourceViews
-from tests.small import tiny_field
+from tests.fields.scene import pose_at, wall_sources
+from tests.small import SMALL_ENCODER, tiny_field
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -116,3 +120,31 @@ def test_what_is_off_draws_nothing(name: str) -> None:
     a, b = generator(3), generator(3)
     assert pick_views_on_path([4], 9, plain, a) == pick_views_on_path([4], 9, plain, b)
     assert torch.equal(torch.rand(1, generator=a), torch.rand(1, generator=b))
+
+
+def test_the_depth_of_views_without_any_is_learned_where_it_was_measured() -> None:
+    geometry = torch.full((2, 5, 4, 6), 2.0)
+    geometry[:, 1] = 0.2
+    geometry.requires_grad_(True)
+    measured = torch.full((2, 8, 12), 3.0)
+    measured[:, :4] = 0
+    given = torch.zeros(2, 8, 12)
+    given[1] = measured[1]
+    loss = guess_loss(geometry, given, measured)
+    loss.backward()
+    assert geometry.grad is not None
+    torch.testing.assert_close(loss.detach(), torch.tensor(1.5).log() / 0.1 + torch.tensor(0.1).log())
+    assert not geometry.grad[1].any() and not geometry.grad[0, :, :2].any()  # it was given, or nobody knows
+    assert (geometry.grad[0, 0, 2:] < 0).all() and (geometry.grad[0, 1, 2:] < 0).all()  # farther, and less sure
+    assert guess_loss(geometry, measured, measured) == 0
+
+
+def test_a_lens_of_twice_the_focal_length_guesses_twice_the_depth() -> None:
+    torch.manual_seed(0)
+    field = SRay(SRayConfig(feature_dim=8, heads=2, encoder=SMALL_ENCODER), ROOMS).eval()
+    views = wall_sources([pose_at(0.0)])
+    views = replace(views, depth_m=torch.zeros_like(views.depth_m))
+    K = views.K.clone()
+    K[:, :2, :2] *= 2
+    near, far = (field.encode(v).geometry[:, 0] for v in (views, replace(views, K=K)))
+    torch.testing.assert_close(far, 2 * near)
