@@ -30,6 +30,7 @@ class ImageStepConfig(Config, frozen=True):
     old_names: ClassVar = {"share": "fraction", "depth_withheld": "depth_dropout"}
 
     fraction: Fraction = 0.5  # of the budget; 0 = rays from the first step on
+    later: Fraction = 0.0  # fraction of the steps after that which are still on images, at the rate of rays
     rooms: AtLeastOne = 8  # a step, of a rank
     images: AtLeastOne = 2  # of each
     learning_rate: Positive = 2e-3

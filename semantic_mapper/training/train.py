@@ -219,7 +219,9 @@ class _Run:
         if (encoder := self.field.image_encoder) is not None and encoder.depth_net is not None:
             frozen = config.images.frozen_colours and progress.depth_grown and fraction < share
             encoder.freeze_colours(frozen)
-        batch = self._draw_images(pool, generator) if fraction < share else self._draw(pool, generator)
+        later = config.images.later
+        on_images = fraction < share or (later > 0 and float(torch.rand(1, generator=generator)) < later)
+        batch = self._draw_images(pool, generator) if on_images else self._draw(pool, generator)
         rate = learning_rate(fraction, share, config)
         encoder_rate = 1.0 if isinstance(batch, ImageBatch) else config.encoder_rate
         set_rates(self.optimiser, rate, encoder_rate, config.backbone_rate)

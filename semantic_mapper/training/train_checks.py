@@ -43,7 +43,7 @@ def check_field(field: LearnedField, config: TrainConfig) -> None:
             f"a field of kind '{field.kind}' holds a single scene in its weights, so it has nothing to learn for other "
             f"rooms; `semantic-mapper benchmark rooms --protocol scratch --kind {field.kind}` fits it room by room"
         )
-    if config.images.fraction > 0:
+    if config.images.fraction > 0 or config.images.later > 0:
         encoder_for_images(field)
     check_parts(field, config.bfloat16)
     if config.encode_together and not _encodes_views_separately(field):

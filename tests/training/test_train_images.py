@@ -233,3 +233,14 @@ def test_half_precision_files_keep_statistics_whole(tmp_path: Path):
     save_checkpoint(Checkpoint(field), tmp_path / "w.safetensors", half=True)
     again = load_checkpoint(tmp_path / "w.safetensors").model
     assert all(float(t.min()) == 3e5 for n, t in again.named_buffers() if n.endswith("running_var"))
+
+
+def test_images_may_go_on_among_the_rays():
+    """Steps on images leave alone what only rays teach; with a share of 1 all later steps are on images."""
+    start = train(small_run(images={"fraction": 0.0, "later": 1.0}, steps=1)).model.state_dict()
+    field = train(small_run(images={"fraction": 0.0, "later": 1.0}, steps=4)).model
+    # Weight decay alone moves what has a gradient; what has none rests.
+    moved = {name.split(".")[0] for name, t in field.state_dict().items() if not torch.equal(t, start[name])}
+    assert "encoder" in moved and "classifier" in moved and not moved & {"density", "weights", "cross", "label_logit"}
+    mixed = train(small_run(images={"fraction": 0.0, "later": 0.5}, steps=12)).model.state_dict()
+    assert any(not torch.equal(mixed[name], start[name]) for name in mixed if name.startswith("density"))
