@@ -56,6 +56,7 @@ class SRay(LearnedField):
     kind = "sray"
     class_rows = ("classifier.weight", "classifier.bias")
     encoding_parts = ("encoder", "geometry_init")
+    image_parts = ("semantic", "classifier")
 
     def __init__(self, config: SRayConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
         super().__init__(config, label_set, sampling)

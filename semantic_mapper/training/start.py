@@ -62,13 +62,21 @@ def take_over_encoder(field: LearnedField, path: Path) -> dict[str, Any]:
     into.load_state_dict(weights.state_dict())
     if grows:
         own.grow_depth()
-    classifier = checkpoint.model.image_classifier()
-    same_classes = checkpoint.model.label_set == field.label_set
-    started = classifier is not None and same_classes and field.start_from_classifier(*classifier)
+    started = checkpoint.model.label_set == field.label_set and _take_over_classifier(field, checkpoint.model)
     _log.info(
         "encoder_taken_over", weights=path.name, depth="grown from colours" if grows else "as it is", classifier=started
     )
     return origin(path, checkpoint.recipe)
+
+
+def _take_over_classifier(field: LearnedField, start: LearnedField) -> bool:
+    """Classify images as ``start`` does; False where the field cannot."""
+    if start.kind == field.kind and field.image_parts:
+        theirs = {name: t for name, t in start.state_dict().items() if name.split(".")[0] in field.image_parts}
+        field.load_state_dict(field.state_dict() | theirs)
+        return True
+    classifier = start.image_classifier()
+    return classifier is not None and field.start_from_classifier(*classifier)
 
 
 def start_from_imagenet(field: LearnedField) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import torch
 from safetensors import safe_open
 from torch.nn import functional
 
-from semantic_mapper.config import SRayConfig
+from semantic_mapper.config import SRayConfig, convert_config, to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.registry import build_field
@@ -22,7 +22,7 @@ from semantic_mapper.training.rooms import RoomPool, RoomPoolConfig, render_room
 from semantic_mapper.training.schedule import cosine_rate
 from semantic_mapper.training.start import take_over_encoder
 from semantic_mapper.training.train import IMAGES_FILE, STATE_FILE, WEIGHTS_FILE, train
-from semantic_mapper.training.views import mirrored_view, query_rays
+from semantic_mapper.training.views import mirrored_view, query_rays, stack_sources
 from tests.small import SMALL_ENCODER
 from tests.training.small_run import POOL, small_run
 
@@ -244,3 +244,19 @@ def test_images_may_go_on_among_the_rays():
     assert "encoder" in moved and "classifier" in moved and not moved & {"density", "weights", "cross", "label_logit"}
     mixed = train(small_run(images={"fraction": 0.0, "later": 0.5}, steps=12)).model.state_dict()
     assert any(not torch.equal(mixed[name], start[name]) for name in mixed if name.startswith("density"))
+
+
+@pytest.mark.parametrize("tokens", ["surface", "samples"])
+def test_a_field_takes_over_how_another_one_of_its_kind_classifies_images(tokens: str, tmp_path: Path):
+    config = convert_config(to_plain(small_run().field) | {"tokens": tokens}, SRayConfig, "field")
+    start = build_field("sray", config, ROOMS).eval()
+    for parameter in start.parameters():
+        parameter.data += 0.1 * torch.randn_like(parameter)
+    save_checkpoint(Checkpoint(start), tmp_path / "start.safetensors")
+    field = build_field("sray", small_run().field, ROOMS).eval()
+    take_over_encoder(field, tmp_path / "start.safetensors")
+    views = stack_sources(ROOM.views[:2])
+    with torch.no_grad():
+        expected, found = (f.source_logits(f.encode(views)) for f in (start, field))
+    assert expected is not None and found is not None
+    torch.testing.assert_close(found, expected)
