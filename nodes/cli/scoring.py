@@ -90,8 +90,11 @@ def score_table(title: str, scores: Mapping[str, Any]) -> Table:
         ("total_accuracy", "total accuracy"),
         ("average_accuracy", "average accuracy"),
         ("coverage", "coverage"),
+        ("ece", "calibration error"),
+        ("open_set_auroc", "AUROC, classes it lacks"),
     ):
-        table.add_row(text, *(_show(m.get(key)) for m in methods.values()))
+        if any(m.get(key) is not None for m in methods.values()):
+            table.add_row(text, *(_show(m.get(key)) for m in methods.values()))
     table.add_section()
     for name in dict.fromkeys(n for m in methods.values() for n in m["per_class"]):
         table.add_row(f"IoU {name}", *(_show(m["per_class"].get(name)) for m in methods.values()))

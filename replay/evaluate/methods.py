@@ -3,28 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
+
+import torch
+from torch.nn import functional
 
 from semantic_mapper.config import MapperConfig, convert_config, to_plain
 from semantic_mapper.errors import FrameError, LabelError
-from semantic_mapper.evaluation.metrics import ConfusionMatrix
+from semantic_mapper.evaluation.metrics import ConfidenceScores, ConfusionMatrix
+from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper, make_field
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.replay.evaluate.truth import TruthMapper
 from semantic_mapper.training.baselines import UNetBaseline, UNetConfig, WarpBaseline
-from semantic_mapper.types import PosedFrame, UInt8
+from semantic_mapper.training.views import stack_sources, view_from_frame
+from semantic_mapper.types import Float32, PosedFrame, UInt8
 
 _log = get_logger(__name__)
 
-Predictor = Callable[[PosedFrame], UInt8]
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Opinion:
+    """What a method says of a frame.
+
+    Args:
+        label: (H, W) uint8 ids; the ignore id = unknown.
+        confidence: (H, W) float32 probability of ``label``; None where the method has none.
+    """
+
+    label: UInt8
+    confidence: Float32 | None = None
+
+
+Predictor = Callable[[PosedFrame], Opinion]
 
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Metrics by method, and how many frames were scored, left out, and refused."""
+    """Metrics by method, and how many frames were scored, left out, and refused.
+
+    Beside the figures of ``SegmentationMetrics`` a method has ``ece``, and ``open_set_auroc`` where some labels are of
+    classes that it cannot name; both None without confidences.
+    """
 
     methods: dict[str, dict[str, Any]]
     scored: int
@@ -33,16 +56,39 @@ class Evaluation:
 
 
 def field_predictors(bundle: Mapper) -> dict[str, Predictor]:
-    """The field as it maps (the frame itself is a source view) and for a novel view (the frame is none), by kind."""
+    """The field as it maps (the frame itself is a source view), for a novel view (the frame is none), and what its
+    encoder says of the frame alone, where it has an opinion of single images."""
     novel = _with_current_view(bundle.pipeline.config, False)
     pipeline = MappingPipeline(
         novel, make_field(bundle.checkpoint.model, novel), bundle.pipeline.label_set, anchors=bundle.checkpoint.anchors
     )
     kind = bundle.checkpoint.model.kind
-    return {
-        kind: lambda frame: bundle.pipeline.step(frame).label,
-        f"{kind}, novel view": lambda frame: pipeline.step(frame).label,
+    found: dict[str, Predictor] = {
+        kind: lambda frame: _mapped(bundle.pipeline, frame),
+        f"{kind}, novel view": lambda frame: _mapped(pipeline, frame),
     }
+    if type(bundle.checkpoint.model).source_logits is not LearnedField.source_logits and kind != "unet":
+        found["own image alone"] = lambda frame: _of_image(bundle, frame)
+    return found
+
+
+def _mapped(pipeline: MappingPipeline, frame: PosedFrame) -> Opinion:
+    update = pipeline.step(frame)
+    return Opinion(update.label, update.confidence)
+
+
+def _of_image(bundle: Mapper, frame: PosedFrame) -> Opinion:
+    """What the field's encoder and classifier make of the image by itself, at the size that the pipeline works at."""
+    model, config = bundle.checkpoint.model, bundle.pipeline.config
+    width = min(config.render.encode_width or frame.intrinsics.width, frame.intrinsics.width)
+    view = view_from_frame(replace(frame, label=None), model.label_set, width)
+    with torch.inference_mode():
+        logits = model.source_logits(model.encode(stack_sources([view])))
+        assert logits is not None  # or the caller would not ask
+        size = (frame.intrinsics.height, frame.intrinsics.width)
+        large = functional.interpolate(logits.float(), size=size, mode="bilinear", align_corners=False)
+        confidence, channel = torch.softmax(large[0], dim=0).max(dim=0)
+    return Opinion(model.label_set.to_ids(channel.numpy()), confidence.numpy())
 
 
 def baseline_predictors(
@@ -56,7 +102,11 @@ def baseline_predictors(
     unet = UNetBaseline(label_set, UNetConfig(seconds=seconds, seed=seed))
     steps = unet.fit(keyframes, on_progress)
     _log.info("unet_fitted", steps=steps, keyframes=len(keyframes))
-    return {"per-image U-Net": unet.predict, "labels carried by depth": WarpBaseline(label_set, keyframes).predict}
+    warp = WarpBaseline(label_set, keyframes)
+    return {
+        "per-image U-Net": lambda frame: Opinion(unet.predict(frame)),
+        "labels carried by depth": lambda frame: Opinion(warp.predict(frame)),
+    }
 
 
 def evaluate_frames(
@@ -70,6 +120,7 @@ def evaluate_frames(
     """Run every predictor over every frame; frames in ``exclude_stamps`` are predicted but not scored."""
     truth_mapper = TruthMapper(stream_labels, label_set)
     confusions = {name: ConfusionMatrix(label_set) for name in predictors}
+    confidences = {name: ConfidenceScores() for name in predictors}
     scored = excluded = refused = 0
     for index, frame in enumerate(frames):
         where = f"frame seq={frame.seq}"
@@ -80,14 +131,24 @@ def evaluate_frames(
             elif frame.label is not None:
                 truth = truth_mapper.to_map_ids(frame.label, where)
                 scored += 1
-                for name, label in predicted.items():
-                    confusions[name].update(truth, label, where)
+                labelled = frame.label != stream_labels.ignore_id
+                strange = labelled & (truth == label_set.ignore_id)
+                for name, opinion in predicted.items():
+                    confusions[name].update(truth, opinion.label, where)
+                    if opinion.confidence is not None:
+                        correct = opinion.label[labelled] == truth[labelled]
+                        confidences[name].update(opinion.confidence[labelled], correct, strange[labelled])
         except (FrameError, LabelError) as error:
             refused += 1
             _log.error("frame_refused", seq=frame.seq, reason=str(error))
         if on_frame is not None:
             on_frame(index + 1)
-    return Evaluation({n: asdict(c.metrics()) for n, c in confusions.items()}, scored, excluded, refused)
+    methods = {
+        name: asdict(matrix.metrics())
+        | {"ece": confidences[name].calibration.ece, "open_set_auroc": confidences[name].open_set_auroc}
+        for name, matrix in confusions.items()
+    }
+    return Evaluation(methods, scored, excluded, refused)
 
 
 def _with_current_view(config: MapperConfig, use: bool) -> MapperConfig:

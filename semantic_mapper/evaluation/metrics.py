@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -289,6 +290,59 @@ def calibration(confidence: Float32 | Float64, correct: NDArray[np.bool_], *, bi
     confidence_sum = np.bincount(index, weights=p, minlength=bins).astype(np.float64)
     right = np.bincount(index, weights=correct.ravel(), minlength=bins).astype(np.float64)
     return calibration_of_bins(count, confidence_sum, right)
+
+
+class ConfidenceScores:
+    """Whether confidence means something, over any number of images: calibration, and what it says of strange things.
+
+    Args:
+        bins: Of confidence; calibration joins them to 15.
+    """
+
+    _BINS = 15
+    _FINE = 100  # fine bins in one of calibration
+
+    def __init__(self) -> None:
+        size = self._BINS * self._FINE
+        self._count, self._strange = np.zeros(size, np.int64), np.zeros(size, np.int64)
+        self._sum, self._right = np.zeros(size), np.zeros(size)
+
+    def update(self, confidence: Float32, correct: NDArray[np.bool_], strange: NDArray[np.bool_]) -> None:
+        """Add an image.
+
+        Args:
+            confidence: (...) in [0, 1], of the predicted class, of pixels that have a truth.
+            correct: (...) bool.
+            strange: (...) bool, where the truth is a class that cannot be predicted: these count for ``open_set_auroc``
+                alone.
+        """
+        p = np.clip(confidence.astype(np.float64).ravel(), 0, 1)
+        size = len(self._count)
+        index = np.clip(np.ceil(p * size).astype(np.int64) - 1, 0, size - 1)
+        known = ~strange.ravel()
+        self._count += np.bincount(index[known], minlength=size)
+        self._sum += np.bincount(index[known], weights=p[known], minlength=size)
+        self._right += np.bincount(index[known], weights=correct.ravel()[known], minlength=size)
+        self._strange += np.bincount(index[~known], minlength=size)
+
+    @property
+    def calibration(self) -> Calibration:
+        """Of the pixels whose class can be predicted."""
+
+        def joined(values: NDArray[Any]) -> NDArray[Any]:
+            return values.reshape(self._BINS, self._FINE).sum(1)
+
+        return calibration_of_bins(joined(self._count), joined(self._sum), joined(self._right))
+
+    @property
+    def open_set_auroc(self) -> float | None:
+        """Probability that a pixel of a class that can be predicted has more confidence than one of another class;
+        0.5 = confidence knows nothing of it; None where there are none of either."""
+        known, strange = int(self._count.sum()), int(self._strange.sum())
+        if not known or not strange:
+            return None
+        below = np.cumsum(self._strange) - self._strange
+        return float((self._count * (below + 0.5 * self._strange)).sum() / known / strange)
 
 
 def calibration_of_bins(count: NDArray[np.int64], confidence_sum: Float64, right: Float64) -> Calibration:

@@ -8,6 +8,7 @@ from sklearn.metrics import confusion_matrix, jaccard_score, recall_score
 
 from semantic_mapper.errors import LabelError, ShapeError
 from semantic_mapper.evaluation.metrics import (
+    ConfidenceScores,
     ConfusionMatrix,
     calibration,
     confusion_of,
@@ -156,3 +157,30 @@ def test_confidences_that_are_not_probabilities_are_refused() -> None:
         with pytest.raises(ShapeError, match="probabilities"):
             calibration(np.array([bad]), np.array([True]))
     assert calibration(np.zeros(0), np.zeros(0, bool)).ece is None
+
+
+def test_confidences_of_several_images_add_up_to_the_calibration_of_all_and_strange_pixels_stay_out():
+    draw = np.random.default_rng(3)
+    confidence = draw.random((4, 500), np.float32)
+    correct = draw.random((4, 500)) < confidence
+    strange = draw.random((4, 500)) < 0.2
+    scores = ConfidenceScores()
+    for row in zip(confidence, correct, strange, strict=True):
+        scores.update(*row)
+    whole = calibration(confidence[~strange], correct[~strange])
+    assert scores.calibration.ece == pytest.approx(whole.ece, abs=1e-9)
+    assert np.array_equal(scores.calibration.count, whole.count)
+
+
+def test_open_set_auroc_is_how_often_a_known_pixel_is_surer_than_a_strange_one():
+    confidence = np.array([0.9, 0.8, 0.4, 0.6, 0.3], np.float32)
+    strange = np.array([False, False, False, True, True])
+    scores = ConfidenceScores()
+    scores.update(confidence, np.ones(5, bool), strange)
+    assert scores.open_set_auroc == pytest.approx(5 / 6)  # 0.4 is below 0.6, all other pairs are in order
+    alike = ConfidenceScores()
+    alike.update(np.full(4, 0.5, np.float32), np.ones(4, bool), np.array([True, False, True, False]))
+    assert alike.open_set_auroc == 0.5
+    nothing = ConfidenceScores()
+    nothing.update(np.full(2, 0.5, np.float32), np.ones(2, bool), np.zeros(2, bool))
+    assert nothing.open_set_auroc is None and nothing.calibration.ece is not None

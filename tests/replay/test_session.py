@@ -20,7 +20,7 @@ from semantic_mapper.mapper import Mapper, make_field
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.summary_table import notes, summary_table
 from semantic_mapper.replay import artifacts
-from semantic_mapper.replay.evaluate.methods import baseline_predictors, evaluate_frames, field_predictors
+from semantic_mapper.replay.evaluate.methods import Opinion, baseline_predictors, evaluate_frames, field_predictors
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.replay.session import SNAPSHOTS, MapSession, open_recording
 from semantic_mapper.replay.stats import LatencyHistogram
@@ -330,7 +330,10 @@ def test_methods_are_scored_on_the_same_frames_and_keyframes_never_count(weights
     predictors = field_predictors(bundle) | baseline_predictors(keyframes, ROOMS, seconds=1.0, seed=0)
     excluded = frozenset(f.stamp_ns for f in keyframes)
     result = evaluate_frames(frames, predictors, ROOMS, ROOMS, excluded)
-    assert set(result.methods) == {"sray", "sray, novel view", "per-image U-Net", "labels carried by depth"}
+    own = {"sray", "sray, novel view", "own image alone"}
+    assert set(result.methods) == own | {"per-image U-Net", "labels carried by depth"}
+    for name, figures in result.methods.items():
+        assert (figures["ece"] is not None) is (name in own) and figures["open_set_auroc"] is None
     assert (result.scored, result.excluded, result.refused) == (4, 2, 0)
     assert len({m["pixels"] for m in result.methods.values()}) == 1
     assert result.methods["labels carried by depth"]["total_accuracy"] > 0.5
@@ -342,7 +345,7 @@ def test_an_unknown_label_costs_one_frame_of_an_evaluation_and_progress_still_en
     label[0, 0] = 77
     frames[1] = replace(frames[1], label=label)
     seen: list[int] = []
-    result = evaluate_frames(frames, {"truth": lambda f: f.label}, ROOMS, ROOMS, frozenset(), seen.append)
+    result = evaluate_frames(frames, {"truth": lambda f: Opinion(f.label)}, ROOMS, ROOMS, frozenset(), seen.append)
     assert (result.scored, result.refused) == (2, 1) and seen == [1, 2, 3]
     assert result.methods["truth"]["miou"] == 1.0
 
@@ -350,7 +353,7 @@ def test_an_unknown_label_costs_one_frame_of_an_evaluation_and_progress_still_en
 def test_carried_labels_reproduce_the_keyframe_itself():
     frame = tiny_frames()[0]
     predictors = baseline_predictors([frame], ROOMS, seconds=0.5, seed=0)
-    same = predictors["labels carried by depth"](frame) == frame.label
+    same = predictors["labels carried by depth"](frame).label == frame.label
     assert same[frame.depth_m > 0].mean() > 0.98
 
 
@@ -361,3 +364,13 @@ def test_other_label_sets_are_scored_on_shared_classes_only(weights):
     session = MapSession(Mapper.load(weights, tiny_config()), stream_labels=stream)
     session.process(replace(frame, label=label))
     assert set(session.confusion.metrics().per_class) == {"wall"}
+
+
+def test_a_log_with_classes_that_the_field_lacks_tells_whether_confidence_knows(weights):
+    stream = make_label_set("mine", ["wall", "spaceship"], ids=[1, 9])
+    frames = [replace(f, label=np.where(f.label == ROOMS.ids[0], 1, 9).astype(np.uint8)) for f in tiny_frames(2)]
+    shy = {"shy": lambda f: Opinion(f.label, np.where(f.label == 1, 0.9, 0.2).astype(np.float32))}
+    figures = evaluate_frames(frames, shy, stream, ROOMS, frozenset()).methods["shy"]
+    assert figures["open_set_auroc"] == 1.0 and figures["ece"] == pytest.approx(0.1, abs=1e-6)
+    own = evaluate_frames(frames, field_predictors(Mapper.load(weights, tiny_config())), stream, ROOMS, frozenset())
+    assert all(0 <= m["open_set_auroc"] <= 1 for m in own.methods.values())
