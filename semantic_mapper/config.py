@@ -62,6 +62,9 @@ class EncoderConfig(Config, frozen=True):
         192,
     )  # of each stage; the first works at half the size of the image
     blocks: Annotated[tuple[Layers, ...], msgspec.Meta(max_length=8)] = (1, 2, 3, 3)  # residual blocks a stage
+    # "efficientnet-lite0": a network that may start from ImageNet weights, between a small stem and a decoder whose widths
+    # ``channels`` are and whose residual blocks at each width ``blocks`` are
+    backbone: Literal["residual", "efficientnet-lite0"] = "residual"
     depth: bool = False  # whether it sees measured depth (as ``fields.surface`` puts it) beside colours
 
 

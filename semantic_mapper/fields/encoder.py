@@ -15,10 +15,12 @@ from torch.nn import functional
 
 from semantic_mapper.config import EncoderConfig
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.efficientnet import WIDTHS, EfficientNetLite0
 from semantic_mapper.fields.surface import SURFACE_CHANNELS, surface_maps
 from semantic_mapper.types import SourceViews
 
 COLOURS = 3
+COLOUR_MEAN, COLOUR_DEVIATION = 0.45, 0.25
 MEASURED_SHARE = 0.05  # of the pixels: with less measured depth a view counts as one without
 
 
@@ -47,10 +49,11 @@ class ResidualBlock(nn.Module):
 class UpBlock(nn.Module):
     """Bring deep features to the width of the skip connection, upsample, add, refine."""
 
-    def __init__(self, c_in: int, c_skip: int, *, refine: bool) -> None:
+    def __init__(self, c_in: int, c_skip: int, *, refine: int) -> None:
         super().__init__()
         self.reduce = nn.Conv2d(c_in, c_skip, 1)
-        self.refine = ResidualBlock(c_skip, c_skip, 1) if refine else nn.Identity()
+        blocks = [ResidualBlock(c_skip, c_skip, 1) for _ in range(refine)]
+        self.refine = blocks[0] if refine == 1 else nn.Sequential(*blocks)
 
     def forward(self, x: torch.Tensor, skip: torch.Tensor) -> torch.Tensor:
         """(B, c_in, h, w), (B, c_skip, H, W) -> (B, c_skip, H, W); H is 2 h or 2 h - 1."""
@@ -75,7 +78,7 @@ class ResidualUNet(nn.Module):
         self.stages = nn.ModuleList(stages)
         # At the finest stage a residual block would cost as much as all of the others, and brings little.
         self.ups = nn.ModuleList(
-            UpBlock(channels[i + 1], channels[i], refine=i > 0) for i in reversed(range(len(blocks) - 1))
+            UpBlock(channels[i + 1], channels[i], refine=int(i > 0)) for i in reversed(range(len(blocks) - 1))
         )
         self.head = nn.Conv2d(channels[0], c_out, 3, 1, 1)
 
@@ -92,8 +95,43 @@ class ResidualUNet(nn.Module):
         return self.head(x)
 
 
+class PretrainedUNet(nn.Module):
+    """The same shapes as ``ResidualUNet``, with EfficientNet-Lite0 in the place of its deeper stages.
+
+    The backbone sees colours alone. A stem of its own sees all inputs, depth among them, at strides 2 and 4, and keeps
+    the fine detail that the backbone's 16 channels there do not. ``channels`` are the widths of the decoder, finest
+    first, ``blocks`` its residual blocks at each.
+    """
+
+    def __init__(self, c_in: int, config: EncoderConfig, c_out: int) -> None:
+        super().__init__()
+        channels = config.channels
+        self.stem = nn.Conv2d(c_in, channels[0], 5, 2, 2)
+        self.fine = ResidualBlock(channels[0], channels[0], 1)
+        self.finer_half = ResidualBlock(channels[0], channels[1], 2)
+        self.backbone = EfficientNetLite0(len(channels))
+        self.laterals = nn.ModuleList(nn.Conv2d(WIDTHS[i], out, 1) for i, out in enumerate(channels))
+        self.ups = nn.ModuleList(
+            UpBlock(channels[i + 1], channels[i], refine=config.blocks[i]) for i in reversed(range(len(channels) - 1))
+        )
+        self.head = nn.Conv2d(channels[0], c_out, 3, 1, 1)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """(B, c_in, H, W) -> (B, c_out, H / 2, W / 2), sizes rounded up."""
+        x = x.contiguous(memory_format=torch.channels_last)
+        maps = self.backbone(x[:, :COLOURS] * COLOUR_DEVIATION + COLOUR_MEAN)
+        skips = [lateral(features) for lateral, features in zip(self.laterals, maps, strict=True)]
+        fine = self.fine(functional.relu(self.stem(x)))
+        skips[0] = skips[0] + fine
+        skips[1] = skips[1] + self.finer_half(fine)
+        x = skips.pop()
+        for up in self.ups:
+            x = up(x, skips.pop())
+        return self.head(x)
+
+
 class ImageEncoder(nn.Module):
-    """Residual U-Nets, shared by all views; each view is encoded by itself.
+    """U-Nets of either kind, shared by all views; each view is encoded by itself.
 
     Where the config asks for depth there are two: one for views with measured depth, which sees what
     ``surface.surface_maps`` makes of it beside the colours, and one for views without, which sees colours alone. Both
@@ -119,8 +157,12 @@ class ImageEncoder(nn.Module):
                 "encoder: channels and blocks need one positive number a stage each, and feature_dim has to be "
                 f"positive; got {list(channels)}, {list(blocks)} and {feature_dim}"
             )
-        self.colour_net = ResidualUNet(COLOURS, config, feature_dim)
-        self.depth_net = ResidualUNet(COLOURS + SURFACE_CHANNELS, config, feature_dim) if config.depth else None
+        pretrained = config.backbone == "efficientnet-lite0"
+        if pretrained and not 2 <= len(channels) <= len(WIDTHS):
+            raise ConfigError(f"encoder: this backbone has 2 to {len(WIDTHS)} stages, got {list(channels)}")
+        unet = PretrainedUNet if pretrained else ResidualUNet
+        self.colour_net = unet(COLOURS, config, feature_dim)
+        self.depth_net = unet(COLOURS + SURFACE_CHANNELS, config, feature_dim) if config.depth else None
         self._of_batch = False
         self._colours_frozen = False
         # Channels-last convolutions take a quarter of the CPU time at these widths (forward and backward).
@@ -129,7 +171,7 @@ class ImageEncoder(nn.Module):
 
     def forward(self, views: SourceViews) -> torch.Tensor:
         """Features (m, C, H / 2, W / 2) of m views; H and W need not be multiples of the deepest stride."""
-        rgb = (views.rgb - 0.45) / 0.25
+        rgb = (views.rgb - COLOUR_MEAN) / COLOUR_DEVIATION
         if self.depth_net is None:
             return self.colour_net(rgb)
         measured = has_depth(views.depth_m)
@@ -188,6 +230,10 @@ class ImageEncoder(nn.Module):
         finally:
             self._of_batch = False
             self.train(mode)
+
+    def backbones(self) -> Iterator[EfficientNetLite0]:
+        """Those of its networks that may start from ImageNet weights."""
+        return (module for module in self.modules() if isinstance(module, EfficientNetLite0))
 
     def _norms(self) -> Iterator[nn.BatchNorm2d]:
         return (module for module in self.modules() if isinstance(module, nn.BatchNorm2d))

@@ -1,4 +1,4 @@
-"""The optimiser of a training run: AdamW with a rate of its own for the image encoder."""
+"""The optimiser of a training run: AdamW with rates of their own for the image encoder and its backbone."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import torch
 
 from semantic_mapper.fields.learned import LearnedField
 
+BACKBONE = "backbone"
 ENCODER = "encoder"
 REST = "rest"
 
@@ -13,20 +14,27 @@ REST = "rest"
 def make_optimiser(field: LearnedField, learning_rate: float, weight_decay: float) -> torch.optim.AdamW:
     """AdamW over all parameters; scales, shifts and biases do not decay."""
     encoder = field.image_encoder
-    in_encoder = set() if encoder is None else {id(p) for p in encoder.parameters()}
+    part_of: dict[int, str] = {}
+    if encoder is not None:
+        part_of |= {id(p): ENCODER for p in encoder.parameters()}
+        part_of |= {id(p): BACKBONE for backbone in encoder.backbones() for p in backbone.parameters()}
     groups = [
         {
-            "params": [p for p in field.parameters() if (id(p) in in_encoder) == inside and (p.ndim > 1) == decays],
+            "params": [p for p in field.parameters() if part_of.get(id(p), REST) == part and (p.ndim > 1) == decays],
             "weight_decay": weight_decay if decays else 0.0,
-            "part": ENCODER if inside else REST,
+            "part": part,
         }
-        for inside in (True, False)
+        for part in (BACKBONE, ENCODER, REST)
         for decays in (True, False)
     ]
     return torch.optim.AdamW([group for group in groups if group["params"]], learning_rate)
 
 
-def set_rates(optimiser: torch.optim.Optimizer, rate: float, encoder_share: float) -> None:
-    """Learning rate of all parameters; the encoder takes ``encoder_share`` of it."""
+def set_rates(
+    optimiser: torch.optim.Optimizer, rate: float, encoder_share: float, backbone_share: float = 1.0
+) -> None:
+    """Learning rate of all parameters; the encoder takes ``encoder_share`` of it, its backbone ``backbone_share`` of
+    that."""
+    shares = {BACKBONE: encoder_share * backbone_share, ENCODER: encoder_share, REST: 1.0}
     for group in optimiser.param_groups:
-        group["lr"] = rate * (encoder_share if group["part"] == ENCODER else 1.0)
+        group["lr"] = rate * shares[group["part"]]

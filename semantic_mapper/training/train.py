@@ -33,7 +33,7 @@ from semantic_mapper.training.ranks import Ranks, joined, ranks_from_environment
 from semantic_mapper.training.recipe import provenance, rooms_before
 from semantic_mapper.training.rooms import RoomPool, RoomViews
 from semantic_mapper.training.schedule import budget_fraction, learning_rate
-from semantic_mapper.training.start import take_over, take_over_encoder
+from semantic_mapper.training.start import start_from_imagenet, take_over, take_over_encoder
 from semantic_mapper.training.step import (
     StepBatch,
     batch_loss,
@@ -150,6 +150,8 @@ class _Run:
         """
         if self.config.start:
             self.progress.origins.append(take_over(self.field, Path(self.config.start)))
+        if self.config.imagenet:
+            self.progress.origins.append(start_from_imagenet(self.field))
         if self.config.encoder_from:
             self.progress.origins.append(take_over_encoder(self.field, Path(self.config.encoder_from)))
 
@@ -219,7 +221,8 @@ class _Run:
             encoder.freeze_colours(frozen)
         batch = self._draw_images(pool, generator) if fraction < share else self._draw(pool, generator)
         rate = learning_rate(fraction, share, config)
-        set_rates(self.optimiser, rate, 1.0 if isinstance(batch, ImageBatch) else config.encoder_rate)
+        encoder_rate = 1.0 if isinstance(batch, ImageBatch) else config.encoder_rate
+        set_rates(self.optimiser, rate, encoder_rate, config.backbone_rate)
         parts: torch.Tensor = self.loss(batch)
         self.optimiser.zero_grad()
         parts[0].backward()

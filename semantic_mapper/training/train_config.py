@@ -39,6 +39,7 @@ class TrainConfig(Config, frozen=True):
     )  # settings of that kind; what is left out keeps its default
     start: str = ""  # weights file to start from, of this very shape; empty = random weights
     encoder_from: str = ""  # weights file of any kind whose image encoder is taken over; empty = random weights
+    imagenet: bool = False  # an encoder with backbone = "efficientnet-lite0" starts from ImageNet weights there
     seconds: float = 1500.0  # wall-clock budget; 0 = only steps count (then a run repeats bit for bit on a CPU)
     steps: int = 0  # step budget; 0 = only seconds count
     rooms_per_step: int = 1  # a rank
@@ -46,6 +47,7 @@ class TrainConfig(Config, frozen=True):
     bfloat16: tuple[str, ...] = ()  # parts of the field ("encoder", ...) that compute in it where it is fast
     learning_rate: float = 1e-3  # of steps on rays; ``images`` has its own
     encoder_rate: float = 0.1  # of the image encoder, as a share of it
+    backbone_rate: float = 0.1  # of a backbone that ImageNet weights started, as a share of the encoder's
     final_learning_rate: float = 5e-5
     weight_decay: float = 0.02
     gradient_clip: float = 10.0
