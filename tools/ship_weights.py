@@ -38,10 +38,17 @@ COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
 def chain(recipe: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """The recipes of all runs that weights come from, their own first, down to those that began with random weights."""
+    """The recipes of all runs that weights come from, their own first, down to those that began with random weights or
+    with those of others."""
     yield recipe
     for origin in recipe.get("origins") or ():
-        yield from chain(origin["recipe"])
+        if not _of_others(origin):
+            yield from chain(origin["recipe"])
+
+
+def _of_others(origin: dict[str, Any]) -> bool:
+    """Whether these are published weights that no run of this project has made."""
+    return origin["recipe"].get("kind") == "imagenet"
 
 
 def check_chain(weights: Path, recipe: dict[str, Any]) -> None:
@@ -155,11 +162,19 @@ def metadata_block(weights: Path) -> str:
         f"`{model.label_set.name}`, {len(model.label_set)} classes; images {checkpoint.width} pixels wide; "
         f"training rooms of suite `{recipe.get('suite')}`.",
         "",
-        "The runs, each from the weights of the one before, the first from random ones:",
+        f"The runs, each from the weights of the one before, the first from {_first_weights(recipe)}:",
         "",
     ]
     parts = [*head, *_run_table(recipe), "", *_figure_table(recipe.get("figures") or ())]
     return "\n".join(parts) + "\n"
+
+
+def _first_weights(recipe: dict[str, Any]) -> str:
+    others = [o for run in chain(recipe) for o in run.get("origins") or () if _of_others(o)]
+    if not others:
+        return "random ones"
+    named = (f"`{o['file']}` ({o['recipe'].get('licence')}, SHA-256 `{o['sha256'][:12]}`)" for o in others)
+    return f"random ones but for the backbone of the image encoder, ImageNet weights {', '.join(named)}"
 
 
 def _run_table(recipe: dict[str, Any]) -> list[str]:
@@ -224,8 +239,10 @@ def _name(run: dict[str, Any]) -> str:
 
 
 def _data(config: dict[str, Any]) -> str:
-    share = config.get("images", {}).get("share", 0.0)
-    return "images" if share == 1 else "rays" if share == 0 else f"images, from {share:.0%} of the steps on rays"
+    images = config.get("images", {})
+    share, later = images.get("fraction", images.get("share", 0.0)), images.get("later", 0.0)
+    rays = f"rays and, {later:.0%} of the steps, images" if later else "rays"
+    return "images" if share == 1 else rays if share == 0 else f"images, from {share:.0%} of the steps on {rays}"
 
 
 def _depth(config: dict[str, Any]) -> str:

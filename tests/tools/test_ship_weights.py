@@ -146,3 +146,15 @@ def test_a_card_without_its_marks_is_refused(tmp_path: Path) -> None:
     page.write_text(f"{END}\n{BEGIN}\n", encoding="utf-8")
     with pytest.raises(ConfigError, match="must hold"):
         renew_card(page, weights(tmp_path))
+
+
+def test_weights_that_others_published_need_no_revision_and_are_named_in_the_card(tmp_path: Path) -> None:
+    published = {"file": "lite0.pth", "sha256": "ab" * 32, "recipe": {"kind": "imagenet", "licence": "Apache-2.0"}}
+    first = run(origins=[published], config={"kind": "sray", "images": {"fraction": 1.0}})
+    later = {"kind": "sray", "start": "w", "images": {"fraction": 0.0, "later": 0.5}}
+    path = weights(tmp_path, run(origins=[origin(first)], config=later))
+    convert(path, tmp_path / "half.safetensors")
+    block = metadata_block(tmp_path / "half.safetensors")
+    assert "ImageNet weights `lite0.pth` (Apache-2.0, SHA-256 `abababababab`)" in block
+    rows = [line for line in block.splitlines() if line.startswith("| `sray`")]
+    assert [row.split(" | ")[1] for row in rows] == ["images", "rays and, 50% of the steps, images"]
