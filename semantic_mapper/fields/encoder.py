@@ -98,17 +98,26 @@ class ResidualUNet(nn.Module):
 class PretrainedUNet(nn.Module):
     """The same shapes as ``ResidualUNet``, with EfficientNet-Lite0 in the place of its deeper stages.
 
-    The backbone sees colours alone. A stem of its own sees all inputs, depth among them, at strides 2 and 4, and keeps
-    the fine detail that the backbone's 16 channels there do not. ``channels`` are the widths of the decoder, finest
-    first, ``blocks`` its residual blocks at each but the coarsest.
+    The backbone sees colours alone. Beside it a slim residual encoder sees all inputs, depth among them: where colours
+    are not those of the training rooms, in photographs, depth is what a view can be known by. ``channels`` are the
+    widths of that encoder and of the decoder, finest first, ``blocks`` the residual blocks of both at each stage; the
+    coarsest stage is the backbone's alone.
     """
 
     def __init__(self, c_in: int, config: EncoderConfig, c_out: int) -> None:
         super().__init__()
         channels = config.channels
         self.stem = nn.Conv2d(c_in, channels[0], 5, 2, 2)
-        self.fine = ResidualBlock(channels[0], channels[0], 1)
-        self.finer_half = ResidualBlock(channels[0], channels[1], 2)
+        widths = (channels[0], *channels[:-1])
+        self.stages = nn.ModuleList(
+            nn.Sequential(
+                *(
+                    ResidualBlock(widths[i] if k == 0 else out, out, 2 if k == 0 and i > 0 else 1)
+                    for k in range(max(config.blocks[i], 1))
+                )
+            )
+            for i, out in enumerate(channels[:-1])
+        )
         self.backbone = EfficientNetLite0(len(channels))
         self.laterals = nn.ModuleList(nn.Conv2d(WIDTHS[i], out, 1) for i, out in enumerate(channels))
         self.ups = nn.ModuleList(
@@ -121,9 +130,10 @@ class PretrainedUNet(nn.Module):
         x = x.contiguous(memory_format=torch.channels_last)
         maps = self.backbone(x[:, :COLOURS] * COLOUR_DEVIATION + COLOUR_MEAN)
         skips = [lateral(features) for lateral, features in zip(self.laterals, maps, strict=True)]
-        fine = self.fine(functional.relu(self.stem(x)))
-        skips[0] = skips[0] + fine
-        skips[1] = skips[1] + self.finer_half(fine)
+        x = functional.relu(self.stem(x))
+        for i, stage in enumerate(self.stages):
+            x = stage(x)
+            skips[i] = skips[i] + x
         x = skips.pop()
         for up in self.ups:
             x = up(x, skips.pop())

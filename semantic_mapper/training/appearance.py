@@ -17,6 +17,7 @@ from semantic_mapper.training.views import blurred
 from semantic_mapper.types import SourceViews
 
 TEXTURED = 0.5  # of the classes in an image
+TINT = 0.3  # sigma of the logarithm of a class's colour
 LOW_FREQUENCIES = 0.1  # of each side of the spectrum: light and colour, not shapes
 
 
@@ -26,7 +27,7 @@ def vary_appearance(
     """A random ``fraction`` of the images with another light, texture, colour and sharpness.
 
     Args:
-        channel: (m, H, W) int64 classes, whose surfaces get a texture each; -1 is one of them.
+        channel: (m, H, W) int64 classes, half of which get a texture and a tint; -1 is one of them.
         generator: Of the CPU, so that draws are the same whatever the device.
     """
     chosen = torch.rand(len(views.rgb), generator=generator) < fraction
@@ -48,11 +49,13 @@ def _vary(rgb: torch.Tensor, other: torch.Tensor, channel: torch.Tensor, generat
     texture = _texture(size, uniform, generator).to(rgb.device)
     classes = channel.unique()
     textured = classes[torch.rand(len(classes), generator=generator).to(classes.device) < TEXTURED]
-    rgb = torch.where(torch.isin(channel, textured), rgb * texture.exp(), rgb)
+    for one in textured.tolist():
+        tint = (TINT * torch.randn(3, 1, 1, generator=generator)).to(rgb.device)
+        rgb = torch.where(channel == one, rgb * (texture + tint).exp(), rgb)
     light = _smooth_noise(size, (3, 4), generator).to(rgb.device) * uniform(0, 0.4)
     rgb = rgb * light.exp()
     grey = rgb.mean(0, keepdim=True)
-    rgb = grey + (rgb - grey) * uniform(0.3, 1.4)
+    rgb = grey + (rgb - grey) * uniform(0.0, 1.4)
     rgb = rgb.mean() + (rgb - rgb.mean()) * uniform(0.7, 1.2)
     if (sigma := uniform(-0.8, 1.2) * size[1] / 160) > 0.3:
         rgb = blurred(rgb, sigma)
