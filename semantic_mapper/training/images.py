@@ -20,7 +20,13 @@ from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.training.appearance import vary_appearance
 from semantic_mapper.training.losses import Loss, guess_loss, image_loss
 from semantic_mapper.training.rooms import RoomViews
-from semantic_mapper.training.views import jitter_colours, mirrored_view, stack_sources, withhold_depth
+from semantic_mapper.training.views import (
+    cropped_view,
+    jitter_colours,
+    mirrored_view,
+    stack_sources,
+    withhold_depth,
+)
 from semantic_mapper.types import SourceViews
 
 
@@ -42,6 +48,7 @@ class ImageStepConfig(Config, frozen=True):
     frozen_colours: bool = True
     depth_dropout: Fraction = 0.3  # fraction of images without depth after that
     mirrored: Fraction = 0.5  # fraction of images
+    cropped: Fraction = 0.0  # fraction of images of which a part is shown, half to all of each side, at full size
     colour_jitter: float = 0.25
     appearance: Fraction = 0.0  # fraction of images with another light, texture and sharpness; see ``appearance``
     balance: Fraction = 0.25  # see ``losses.image_loss``
@@ -82,7 +89,11 @@ def draw_images(
         for place in order:
             view = room.resident[room.labelled[place]]
             mirror = float(torch.rand(1, generator=generator)) < config.mirrored
-            views.append(mirrored_view(view) if mirror else view)
+            view = mirrored_view(view) if mirror else view
+            if config.cropped > 0:
+                crop, size, down, across = torch.rand(4, generator=generator).tolist()
+                view = cropped_view(view, 0.5 + 0.5 * size, down, across) if crop < config.cropped else view
+            views.append(view)
     stacked = stack_sources(views, with_labels=True)
     assert stacked.channel is not None
     withheld = 1.0 if colours_only else 0.0 if config.frozen_colours else config.depth_dropout

@@ -79,6 +79,28 @@ def mirrored_view(view: LabelledView) -> LabelledView:
     )
 
 
+def cropped_view(view: LabelledView, fraction: float, down: float, across: float) -> LabelledView:
+    """A part of the view at the view's own size, as a longer lens sees it.
+
+    Args:
+        fraction: Of each side that is kept, above 0.
+        down, across: Place of the part, from 0 (top, left) to 1.
+    """
+    k = view.intrinsics
+    height, width = max(round(fraction * k.height), 1), max(round(fraction * k.width), 1)
+    top, left = round(down * (k.height - height)), round(across * (k.width - width))
+    part = slice(top, top + height), slice(left, left + width)
+    size = (k.height, k.width)
+    rgb = functional.interpolate(view.rgb[:, *part][None], size=size, mode="bilinear", align_corners=False)[0]
+    depth_m = functional.interpolate(view.depth_m[part][None, None], size=size, mode="nearest-exact")[0, 0]
+    channel = functional.interpolate(view.channel[part][None, None].float(), size=size, mode="nearest-exact")[0, 0]
+    x, y = k.width / width, k.height / height
+    lens = CameraIntrinsics(
+        k.fx * x, k.fy * y, (k.cx - left + 0.5) * x - 0.5, (k.cy - top + 0.5) * y - 0.5, k.width, k.height
+    )
+    return LabelledView(rgb, depth_m, channel.long(), lens, view.T_world_camera)
+
+
 def stack_sources(views: Sequence[LabelledView], *, with_labels: bool = False) -> SourceViews:
     """Views of one resolution as the input of ``SemanticField.encode``, with what is known of their labels if asked."""
     return SourceViews(

@@ -1,9 +1,12 @@
+from dataclasses import replace
+
 import msgspec
 import torch
 
-from semantic_mapper.training.appearance import mix_amplitudes, vary_appearance
+from semantic_mapper.training.appearance import hue_rotation, mix_amplitudes, vary_appearance
 from semantic_mapper.training.images import ImageStepConfig, draw_images
 from semantic_mapper.training.rooms import RoomPoolConfig, render_room
+from semantic_mapper.training.views import cropped_view, query_rays
 from semantic_mapper.types import SourceViews
 from tests.fields.scene import pose_at, wall_sources
 
@@ -63,3 +66,39 @@ def test_image_steps_vary_appearance_where_they_are_asked_to():
 
 def replace_appearance(config: ImageStepConfig, appearance: float) -> ImageStepConfig:
     return msgspec.structs.replace(config, appearance=appearance)
+
+
+def test_some_images_lose_their_colours_where_depth_is_left():
+    def alike(views: SourceViews, seed: int) -> torch.Tensor:
+        """(m,) correlation of each image with what it was."""
+        rgb = vary_appearance(views, labels(views), 1.0, torch.Generator().manual_seed(seed)).rgb.mean(1).flatten(1)
+        pairs = zip(rgb, views.rgb.mean(1).flatten(1), strict=True)
+        return torch.stack([torch.corrcoef(torch.stack(pair))[0, 1].abs() for pair in pairs])
+
+    blind = replace(VIEWS, depth_m=torch.zeros_like(VIEWS.depth_m))
+    lost = [int((alike(views, seed) < 0.05).sum()) for views in (VIEWS, blind) for seed in range(20)]
+    assert 2 <= sum(lost[:20]) <= 20 and sum(lost[20:]) == 0
+
+
+def test_hues_turn_round_the_grey_axis():
+    turn = hue_rotation(2.0)
+    torch.testing.assert_close(turn @ torch.ones(3), torch.ones(3))
+    torch.testing.assert_close(turn @ turn.T, torch.eye(3), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        hue_rotation(2 * torch.pi / 3) @ torch.eye(3), torch.eye(3)[[2, 0, 1]], atol=1e-6, rtol=0
+    )
+
+
+def test_a_cropped_view_sees_its_part_as_a_longer_lens_does():
+    view = render_room(10, RoomPoolConfig(width=48, views=3)).views[0]
+    part = cropped_view(view, 0.5, 1.0, 0.25)
+    assert part.rgb.shape == view.rgb.shape and part.channel.dtype == view.channel.dtype
+    rays, targets = query_rays(part, torch.arange(part.channel.numel()), near_m=0.1, far_m=9.0, prior=None)
+    points = rays.origin + rays.direction * targets.depth_m[:, None]
+    back = (points - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, :3]
+    k = view.intrinsics
+    u = (back[:, 0] / back[:, 2].clamp_min(1e-6) * k.fx + k.cx).round().long().clamp(0, k.width - 1)
+    v = (back[:, 1] / back[:, 2].clamp_min(1e-6) * k.fy + k.cy).round().long().clamp(0, k.height - 1)
+    measured = targets.depth_m > 0
+    assert measured.float().mean() > 0.3
+    assert (view.channel[v, u] == targets.channel)[measured].float().mean() > 0.9
