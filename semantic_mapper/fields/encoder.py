@@ -179,6 +179,7 @@ class ImageEncoder(nn.Module):
         self.depth_net = unet(COLOURS + SURFACE_CHANNELS, config, feature_dim) if config.depth else None
         self._of_batch = False
         self._colours_frozen = False
+        self._backbones_frozen = False
         # Channels-last convolutions take a quarter of the CPU time at these widths (forward and backward).
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         self.train()  # which is where the norms learn that they are constants
@@ -224,6 +225,9 @@ class ImageEncoder(nn.Module):
             norm.train(mode and self._of_batch)
         if self._colours_frozen:
             self.colour_net.eval()
+        if self._backbones_frozen:
+            for backbone in self.backbones():
+                backbone.eval()
         return self
 
     def freeze_colours(self, frozen: bool) -> None:
@@ -231,7 +235,16 @@ class ImageEncoder(nn.Module):
         if frozen != self._colours_frozen:
             self._colours_frozen = frozen
             self.colour_net.requires_grad_(not frozen)
+            if self._backbones_frozen:
+                self.freeze_backbones()
             self.train(self.training)
+
+    def freeze_backbones(self) -> None:
+        """Let pretrained backbones keep their weights and statistics from now on, whatever is trained."""
+        self._backbones_frozen = True
+        for backbone in self.backbones():
+            backbone.requires_grad_(False)
+        self.train(self.training)
 
     @contextmanager
     def batch_statistics(self) -> Generator[None]:

@@ -133,6 +133,9 @@ class _Run:
         self.config, self.folder, self.ranks, self.device = config, folder, ranks, device
         self.field = build_field(config.kind, config.field, ROOMS).to(device)
         check_field(self.field, config)
+        trained = config.imagenet or config.start or config.encoder_from
+        if config.backbone_rate == 0 and trained and self.field.image_encoder is not None:
+            self.field.image_encoder.freeze_backbones()
         self.loss: nn.Module = _StepLoss(self.field, config)
         if ranks.world > 1:  # parts that a config switches off (an attention, say) get no gradient
             self.loss = DistributedDataParallel(self.loss, find_unused_parameters=True)

@@ -173,3 +173,19 @@ def test_blocks_at_the_coarsest_width_are_refused():
 def test_a_number_of_stages_that_it_has_not_is_refused(stages: int):
     with pytest.raises(ConfigError, match="2 to 5 stages"):
         ImageEncoder(EncoderConfig(backbone="efficientnet-lite0", channels=(8,) * stages, blocks=(0,) * stages), 8)
+
+
+def test_a_frozen_backbone_keeps_weights_and_statistics_while_the_rest_learns():
+    encoder = ImageEncoder(SMALL, 8)
+    encoder.freeze_backbones()
+    encoder.freeze_colours(True)
+    encoder.freeze_colours(False)  # which must not wake it
+    before = {name: t.clone() for name, t in encoder.state_dict().items()}
+    optimiser = torch.optim.AdamW(encoder.parameters(), 0.1, weight_decay=0.1)
+    views = wall_sources([pose_at(0.0), pose_at(0.1)])
+    with encoder.batch_statistics():
+        encoder(views).square().sum().backward()
+    optimiser.step()
+    changed = {name for name, t in encoder.state_dict().items() if not torch.equal(t, before[name])}
+    assert not any("backbone" in name for name in changed)
+    assert "depth_net.stem.weight" in changed and "depth_net.stages.0.0.norm1.running_mean" in changed
