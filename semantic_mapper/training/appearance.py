@@ -1,6 +1,7 @@
 """What photographs have and rendered rooms lack: uneven light, textures on everything, other colours, blur and noise.
 
-For steps on single images, where views need not agree with each other. Geometry and labels stay as they are.
+For steps on single images, where views need not agree with each other. Labels stay as they are, and depth where it is
+left: sensors other than the rendered ones lose margins, the distance, and patches.
 
 Without other colours a network learns the colours of the rooms: the first shipped weights lost 13 of 60 points of mIoU
 on a real kitchen where it was shown in grey. So hues turn, some images are grey, and some with depth lose their colours
@@ -26,13 +27,14 @@ TINT = 0.3  # sigma of the logarithm of a class's colour
 TURNED = 0.3  # of the images, by any angle of hue
 GREY = 0.15  # of the images
 COLOURLESS = 0.1  # of the images with depth: one colour, and noise
+LOST = 0.3  # of the images with depth, each of margins, distance and patches
 LOW_FREQUENCIES = 0.1  # of each side of the spectrum: light and colour, not shapes
 
 
 def vary_appearance(
     views: SourceViews, channel: torch.Tensor, fraction: float, generator: torch.Generator
 ) -> SourceViews:
-    """A random ``fraction`` of the images with another light, texture, colour and sharpness.
+    """A random ``fraction`` of the images with another light, texture, colour and sharpness, and gaps in their depth.
 
     Args:
         channel: (m, H, W) int64 classes, half of which get a texture and a tint; -1 is one of them.
@@ -41,14 +43,15 @@ def vary_appearance(
     chosen = torch.rand(len(views.rgb), generator=generator) < fraction
     if not bool(chosen.any()):
         return views
-    rgb = views.rgb.clone()
+    rgb, depth_m = views.rgb.clone(), views.depth_m.clone()
     for i in chosen.nonzero()[:, 0].tolist():
         other = views.rgb[int(torch.randint(len(views.rgb), (1,), generator=generator))]
         rgb[i] = _vary(views.rgb[i], other, channel[i], generator)
         if float(torch.rand(1, generator=generator)) < COLOURLESS and bool(views.depth_m[i].any()):
             plain = torch.rand(3, 1, 1, generator=generator) + 0.1 * torch.randn(rgb[i].shape, generator=generator)
             rgb[i] = plain.clamp(0, 1).to(rgb.device)
-    return replace(views, rgb=rgb)
+        depth_m[i] = _with_gaps(depth_m[i], generator)
+    return replace(views, rgb=rgb, depth_m=depth_m)
 
 
 def _vary(rgb: torch.Tensor, other: torch.Tensor, channel: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
@@ -75,6 +78,23 @@ def _vary(rgb: torch.Tensor, other: torch.Tensor, channel: torch.Tensor, generat
         rgb = blurred(rgb, sigma)
     noise = torch.randn(rgb.shape, generator=generator).to(rgb.device)
     return (rgb + max(uniform(-0.03, 0.06), 0) * noise).clamp(0, 1)
+
+
+def _with_gaps(depth_m: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    """(H, W) without what other sensors do not measure: margins (depth registered to colour), distance, patches."""
+    lost = torch.rand(3, generator=generator) < LOST
+    amount = torch.rand(3, generator=generator)
+    height, width = depth_m.shape
+    keep = torch.ones(height, width, dtype=torch.bool)
+    if lost[0]:
+        margins = (0.1 * torch.rand(2, 2, generator=generator) * torch.tensor([[height], [width]])).long().tolist()
+        keep = torch.zeros_like(keep)
+        keep[margins[0][0] : height - margins[0][1], margins[1][0] : width - margins[1][1]] = True
+    if lost[2]:
+        noise = _smooth_noise((height, width), (8, 11), generator)[0]
+        keep &= noise > torch.quantile(noise, 0.2 * float(amount[2]))
+    kept = depth_m * keep.to(depth_m.device)
+    return kept * (kept < 3.0 + 4.0 * float(amount[1])) if lost[1] else kept
 
 
 def hue_rotation(angle: float) -> torch.Tensor:
