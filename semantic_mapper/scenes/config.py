@@ -25,6 +25,9 @@ class RoomConfig(Config, frozen=True):
     min_height_m: float = 2.35
     max_height_m: float = 3.0
     clutter: float = 1.0  # scales the number of small objects, 0 = none
+    camouflage: Fraction = (
+        0.3  # of the rooms, for each pair of classes of ``materials.CAMOUFLAGE``: one material for both
+    )
     shadow_resolution: int = 96  # pixels a side of each face of a light's shadow cube
 
 

@@ -18,7 +18,6 @@ from semantic_mapper.types import Float64
 
 Color = tuple[float, float, float]
 
-CAMOUFLAGE_SHARE = 0.3  # of the rooms, for each pair
 CAMOUFLAGE = (
     ("door", "cabinet", "wood"),
     ("desk", "table", "wood"),
@@ -130,9 +129,15 @@ class Draw:
 
 
 class Palette:
-    """The materials of one room, by pool."""
+    """The materials of one room, by pool.
 
-    def __init__(self, rng: np.random.Generator, *, held_out: bool = False) -> None:
+    Args:
+        rng: Draws everything.
+        held_out: Colours of a held-out room; see ``Draw``.
+        camouflage: Chance that a pair of ``CAMOUFLAGE`` shares a material.
+    """
+
+    def __init__(self, rng: np.random.Generator, *, held_out: bool = False, camouflage: float = 0.3) -> None:
         self._materials: list[Material] = []
         self._pools: dict[str, list[int]] = {}
         draw = Draw(rng, held_out)
@@ -140,7 +145,7 @@ class Palette:
             self._pools[pool] = [self.add(make(draw)) for _ in range(count)]
         self._shared: dict[str, int] = {}
         for first, second, pool in CAMOUFLAGE:
-            chosen, active = self.pick(rng, pool), rng.uniform() < CAMOUFLAGE_SHARE
+            chosen, active = self.pick(rng, pool), rng.uniform() < camouflage
             if active:
                 chosen = self._shared.get(first, self._shared.get(second, chosen))
                 self._shared[first] = self._shared[second] = chosen

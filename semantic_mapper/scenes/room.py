@@ -26,7 +26,7 @@ def make_room(seed: int, config: RoomConfig = RoomConfig()) -> Scene:
     rng = np.random.default_rng((SUITE_VERSION, seed, _ROOM_STREAM))
     template = config.template or CYCLE[seed % len(CYCLE)]
     size = _room_size(rng, template, config)
-    palette = Palette(rng, held_out=seed not in TRAIN_SEEDS)
+    palette = Palette(rng, held_out=seed not in TRAIN_SEEDS, camouflage=config.camouflage)
     layout = Layout(size, rng, palette, wet=template == "bathroom")
     furnish(layout, template, config.clutter)
     primitives = pack(layout.groups)

@@ -111,6 +111,12 @@ def test_a_programme_can_be_asked_for(template: str) -> None:
     assert make_room(3, config).template == template
 
 
+def test_camouflage_changes_materials_but_not_where_things_stand() -> None:
+    plain, hidden = (make_room(0, RoomConfig(shadow_resolution=8, camouflage=f)) for f in (0.0, 1.0))
+    np.testing.assert_array_equal(plain.primitives.center, hidden.primitives.center)
+    assert (plain.primitives.material != hidden.primitives.material).any()
+
+
 def test_main_furniture_is_nearly_always_there() -> None:
     wanted = {"bedroom": "bed", "living": "sofa", "office": "desk", "kitchen": "counter", "bathroom": "toilet"}
     for template, label in wanted.items():
