@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import islice
 
+import msgspec
 import numpy as np
 
 from semantic_mapper.errors import ConfigError, SemanticMapperError
@@ -24,6 +25,8 @@ _LEG_M = 0.7  # mean way between two way-points
 _SMALL_M3 = 2e-4  # eighth of the volume of a part that is worth being looked at
 _LOOK_BELOW_M = 1.8  # lamps under the ceiling are no targets
 _LOOK_UP_SHARE = 0.2  # of the way-points; without it ceilings are hardly seen
+_CLOSE_M = (0.4, 1.1)  # of a close-up to what it looks at
+_CLOSE_CLEARANCE_M = 0.15
 _FINE = 24  # points of the path between two way-points
 _PROBE = CameraIntrinsics(fx=27.6, fy=27.6, cx=19.5, cy=14.5, width=40, height=30)
 _FLAT: dict[str, float] = dict.fromkeys(
@@ -77,8 +80,12 @@ def clearance(scene: Scene, points: Float64) -> Float64:
 def _best_view(scene: Scene, rng: np.random.Generator, config: CameraPathConfig, last: Float64 | None) -> Float64:
     """(5,) position, yaw, pitch of the best candidate; within reach of ``last`` in a straight line.
 
+    ``config.close_up`` of the views look down at the nearest thing worth it, from near by.
+
     Of the best few, the one wins on whose way from ``last`` the picture stays worth having: no frame of bare wall.
     """
+    if rng.uniform() < config.close_up and len(carried := _carried(scene)):
+        return _close_up(scene, carried, rng, config, last)
     targets = _targets(scene)
     raised = rng.uniform(0.15, 0.4) if rng.uniform() < _LOOK_UP_SHARE else 0.0
     states: list[Float64] = []
@@ -94,6 +101,48 @@ def _best_view(scene: Scene, rng: np.random.Generator, config: CameraPathConfig,
         return states[int(order[0])]
     best = max(order[:_FINALISTS], key=lambda k: scores[k] + _WAY_WEIGHT * _worst_between(scene, last, states[k]))
     return states[int(best)]
+
+
+def _close_up(
+    scene: Scene, targets: Float64, rng: np.random.Generator, config: CameraPathConfig, last: Float64 | None
+) -> Float64:
+    """(5,) position, yaw, pitch of a view from ``_CLOSE_M`` of one of ``targets`` (N >= 1, 3) that can be reached from
+    ``last`` in a straight line; else the place of ``last``, turned to the nearest."""
+    around = targets[rng.integers(len(targets), size=_DRAWS)]
+    if last is not None:  # of three things the nearest to the camera
+        rivals = targets[rng.integers(len(targets), size=(_DRAWS, 3))]
+        nearest = np.linalg.norm(rivals - last[:3], axis=-1).argmin(1)
+        around = rivals[np.arange(_DRAWS), nearest]
+    angle, far, rise = rng.uniform(0, 2 * np.pi, _DRAWS), rng.uniform(*_CLOSE_M, _DRAWS), rng.uniform(0.2, 1.1, _DRAWS)
+    out = far * np.cos(rise)
+    points = around + np.stack((out * np.cos(angle), out * np.sin(angle), far * np.sin(rise)), -1)
+    needed = min(config.clearance_m, _CLOSE_CLEARANCE_M)
+    free = np.flatnonzero((clearance(scene, points) >= needed) & (points[:, 2] < 2.0))
+    if last is not None:
+        reach = (k for k in free if _line_is_free(scene, last[:3], points[k], needed))
+        free = np.array(list(islice(reach, 1)), int)
+    if len(free):
+        position, target = points[free[0]], around[free[0]]
+    elif last is not None:
+        position, target = last[:3], targets[np.linalg.norm(targets - last[:3], axis=1).argmin()]
+    else:
+        return _best_view(scene, rng, msgspec.structs.replace(config, close_up=0.0), None)
+    toward = target + rng.normal(0, 0.12, 3) - position
+    pitch = float(np.arctan2(toward[2], np.hypot(toward[0], toward[1]))) + rng.uniform(-0.1, 0.2)
+    return np.array([*position, float(np.arctan2(toward[1], toward[0])), np.clip(pitch, -1.2, 0.1)])
+
+
+def _carried(scene: Scene) -> Float64:
+    """(N, 3) small things that stand on furniture between knee and eye height, inside the room."""
+    p = scene.primitives
+    low, high = p.bounds()
+    prop = p.label == ROOMS.ids[ROOMS.names.index("otherprop")]
+    inside = ((p.center > 0.05) & (p.center < np.array(scene.size_m) - 0.05)).all(1)
+    things = np.flatnonzero(prop & inside & (low[:, 2] > 0.3) & (low[:, 2] < 1.5) & (p.half.max(1) < 0.25))
+    below = np.flatnonzero(~prop & (p.half[:, :2].min(1) > 0.14))
+    gap = low[things, None, 2] - high[None, below, 2]  # N Q
+    over = (p.center[things, None, :2] > low[None, below, :2]) & (p.center[things, None, :2] < high[None, below, :2])
+    return p.center[things[(over.all(-1) & (np.abs(gap) < 0.03)).any(1)]]
 
 
 def _worst_between(scene: Scene, a: Float64, b: Float64) -> float:
@@ -174,10 +223,11 @@ def _smooth_path(scene: Scene, points: Float64, config: CameraPathConfig) -> Flo
     padded = np.vstack((points[:1], points, points[-1:]))
     legs: list[Float64] = []
     t = np.linspace(0, 1, _FINE, endpoint=False)[:, None]
+    needed = config.clearance_m if config.close_up == 0 else min(config.clearance_m, _CLOSE_CLEARANCE_M)
     for k in range(len(points) - 1):
         a, b, c, d = padded[k : k + 4]
         curve = 0.5 * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3)
-        if clearance(scene, curve[:, :3]).min() < config.clearance_m:
+        if clearance(scene, curve[:, :3]).min() < needed:
             curve[:, :3] = b[:3] + t * (c - b)[:3]
         legs.append(curve)
     return np.vstack((*legs, points[-1:]))

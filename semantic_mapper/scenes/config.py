@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-from semantic_mapper.config import Config
+from semantic_mapper.config import Config, Fraction
 
-SUITE_VERSION = 2  # part of every seed: a change that alters a room raises it
+SUITE_VERSION = 3  # part of every seed: a change that alters a room raises it
 
 TRAIN_SEEDS = range(0, 100_000)
 VALIDATION_SEEDS = range(100_000, 100_020)
@@ -25,6 +25,9 @@ class RoomConfig(Config, frozen=True):
     min_height_m: float = 2.35
     max_height_m: float = 3.0
     clutter: float = 1.0  # scales the number of small objects, 0 = none
+    camouflage: Fraction = (
+        0.3  # of the rooms, for each pair of classes of ``materials.CAMOUFLAGE``: one material for both
+    )
     shadow_resolution: int = 96  # pixels a side of each face of a light's shadow cube
 
 
@@ -38,6 +41,7 @@ class CameraPathConfig(Config, frozen=True):
     tremor_m: float = 0.004
     tremor_deg: float = 0.6
     roll_deg: float = 0.0  # by which the camera is mounted askew
+    close_up: Fraction = 0.0  # of the way-points: 0.4 to 1.1 m from a table, counter or shelf, looking at what is on it
 
 
 class NoiseConfig(Config, frozen=True):
@@ -47,15 +51,16 @@ class NoiseConfig(Config, frozen=True):
     """
 
     depth: DepthSensorName = "oak_d"  # "exact": no error; "none": no depth sensor, frames carry no depth
-    exposure_stops: float = 0.25  # standard deviation of the exposure's drift, in stops
-    white_balance: float = 0.07  # standard deviation of the red and blue gains' drift, natural logarithm
+    exposure_stops: float = 0.4  # standard deviation of the exposure's drift, in stops
+    white_balance: float = 0.12  # standard deviation of the red and blue gains' drift, natural logarithm
     auto_exposure: float = 0.6  # share of the way to an evenly exposed picture that the camera goes by itself
-    look: float = 1.0  # strength of random contrast and saturation; 0 = neutral
+    look: float = 1.0  # strength of random contrast and saturation, 0 = neutral; a few sequences are nearly grey
     shot_noise: float = 0.0005  # variance of linear light per unit of it, at ISO factor 1
     read_noise: float = 0.003  # standard deviation in linear light, at ISO factor 1
     max_vignetting: float = 0.35  # loss of light in the corners, up to
     max_lens_blur_px: float = 0.7  # standard deviation of the lens's blur, up to; for a width of 320
     max_blur_way_m: float = 0.01  # way of the camera while the shutter is open, up to; one radian counts as 0.35 m
+    rough: float = 0.2  # fraction of the sequences that have up to three times the blur and six times the noise
 
 
 class PoseNoiseConfig(Config, frozen=True):

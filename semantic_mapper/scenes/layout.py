@@ -12,6 +12,7 @@ from semantic_mapper.types import Float64
 
 _GAP_M = 0.015  # between two pieces, and between a piece and the wall behind it
 _WALLS = 4
+_THINGS_M2 = 14.0  # small things a square metre of table or counter
 
 
 class Layout:
@@ -131,10 +132,12 @@ class Layout:
             self.groups.append(parts)
 
     def clutter(self, fraction: float, names: tuple[str, ...]) -> None:
-        """Small things on the tops of furniture, ``share`` a fifth of a square metre on average."""
+        """Small things on the tops of furniture: ``fraction`` of about fourteen a square metre; some tops are nearly
+        bare, some crowded."""
         for top, yaw, position in list(self._tops):
             area = max(top.x1 - top.x0, 0.0) * max(top.y1 - top.y0, 0.0)
-            for _ in range(int(self.rng.poisson(fraction * area * 5.0 + 0.3 * fraction))):
+            crowd = fraction * float(self.rng.choice((0.2, 0.8, 1.3, 2.0)))
+            for _ in range(int(self.rng.poisson(crowd * (area * _THINGS_M2 + 0.3)))):
                 small = FURNITURE[names[int(self.rng.integers(len(names)))]].make(self.rng, self.palette)
                 low, high = small.bounds()
                 x0, x1 = top.x0 - low[0] + 0.02, top.x1 - high[0] - 0.02

@@ -18,7 +18,6 @@ from semantic_mapper.types import Float64
 
 Color = tuple[float, float, float]
 
-CAMOUFLAGE_SHARE = 0.3  # of the rooms, for each pair
 CAMOUFLAGE = (
     ("door", "cabinet", "wood"),
     ("desk", "table", "wood"),
@@ -43,6 +42,13 @@ class Pattern(IntEnum):
     PRINT = 6  # blobs in three colours
     SPINES = 7  # upright stripes of random width and hue: rows of books
     PLANKS = 8  # boards with grain, each of its own shade
+    GRAIN = 9  # year rings and knots, along the longest side
+    STONE = 10  # clouds with light and dark speckles
+    BRUSHED = 11  # metal, brushed along the longest side
+    CARPET = 12  # marbled stripes
+    PAGE = 13  # a printed page: text, headlines, pictures; the scale is the height of a line
+    OUTSIDE = 14  # what is seen through a window: sky, trees, houses
+    STAINS = 15  # worn paint: clouds, and streaks that run down
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,9 +129,15 @@ class Draw:
 
 
 class Palette:
-    """The materials of one room, by pool."""
+    """The materials of one room, by pool.
 
-    def __init__(self, rng: np.random.Generator, *, held_out: bool = False) -> None:
+    Args:
+        rng: Draws everything.
+        held_out: Colours of a held-out room; see ``Draw``.
+        camouflage: Chance that a pair of ``CAMOUFLAGE`` shares a material.
+    """
+
+    def __init__(self, rng: np.random.Generator, *, held_out: bool = False, camouflage: float = 0.3) -> None:
         self._materials: list[Material] = []
         self._pools: dict[str, list[int]] = {}
         draw = Draw(rng, held_out)
@@ -133,7 +145,7 @@ class Palette:
             self._pools[pool] = [self.add(make(draw)) for _ in range(count)]
         self._shared: dict[str, int] = {}
         for first, second, pool in CAMOUFLAGE:
-            chosen, active = self.pick(rng, pool), rng.uniform() < CAMOUFLAGE_SHARE
+            chosen, active = self.pick(rng, pool), rng.uniform() < camouflage
             if active:
                 chosen = self._shared.get(first, self._shared.get(second, chosen))
                 self._shared[first] = self._shared[second] = chosen
@@ -180,10 +192,13 @@ def _scaled(color: Color, factor: float) -> Color:
 
 
 def _wood(d: Draw) -> Material:
+    """Fine or strong grain, or glued staves as of a butcher's block."""
     hue, saturation, value = d.wood()
     a = _hsv(hue, saturation, value)
-    b = _hsv(hue, saturation * 1.1, value * d.uniform(0.55, 0.85))
-    return Material(Pattern.WOOD, a, b, d.uniform(0.015, 0.05), d.seed(), gloss=d.uniform(0.0, 0.25))
+    b = _hsv(hue, saturation * 1.15, value * d.uniform(0.4, 0.85))
+    pattern = d.one_of(Pattern.WOOD, Pattern.GRAIN, Pattern.GRAIN, Pattern.GRAIN, Pattern.PLANKS)
+    low, high = {Pattern.GRAIN: (0.008, 0.03), Pattern.PLANKS: (0.03, 0.06)}.get(pattern, (0.015, 0.05))
+    return Material(pattern, a, b, d.uniform(low, high), d.seed(), gloss=d.uniform(0.0, 0.4))
 
 
 def _parquet(d: Draw) -> Material:
@@ -191,6 +206,42 @@ def _parquet(d: Draw) -> Material:
     a = _hsv(hue, saturation, value)
     b = _hsv(hue, saturation * 1.1, value * d.uniform(0.5, 0.8))
     return Material(Pattern.PLANKS, a, b, d.uniform(0.07, 0.18), d.seed(), gloss=d.uniform(0.0, 0.35))
+
+
+def _stone(d: Draw) -> Material:
+    """Granite, terrazzo, laminate: half of them nearly black; the darkest may be polished."""
+    dark = d.uniform(0, 1) < 0.5
+    a = _hsv(d.hue(), d.uniform(0.0, 0.25), d.uniform(0.08, 0.3) if dark else d.uniform(0.4, 0.9))
+    b = _scaled(a, d.uniform(0.25, 0.7) if not dark or d.uniform(0, 1) < 0.5 else d.uniform(1.5, 4.0))
+    shine = d.uniform(0.05, 0.2) if dark and d.uniform(0, 1) < 0.4 else 0.0
+    return Material(Pattern.STONE, a, b, d.uniform(0.02, 0.09), d.seed(), gloss=d.uniform(0.2, 0.9), mirror=shine)
+
+
+def _lacquer(d: Draw) -> Material:
+    """Glossy fronts, most of them in a strong colour."""
+    a = _hsv(d.hue(), d.uniform(0.55, 1.0) if d.uniform(0, 1) < 0.7 else d.uniform(0, 0.1), d.uniform(0.25, 0.9))
+    return Material(Pattern.PLAIN, a, _scaled(a, 0.75), d.uniform(0.1, 0.5), d.seed(), gloss=d.uniform(0.4, 1.2))
+
+
+def _steel(d: Draw) -> Material:
+    value = d.uniform(0.12, 0.35) if d.uniform(0, 1) < 0.5 else d.uniform(0.4, 0.75)
+    a = _hsv(d.uniform(0.0, 1.0), d.uniform(0, 0.08), value)
+    return Material(Pattern.BRUSHED, a, _scaled(a, d.uniform(0.6, 0.85)), 0.03, d.seed(), gloss=d.uniform(0.5, 1.0))
+
+
+def _carpet(d: Draw) -> Material:
+    a = _hsv(d.hue(), d.uniform(0.0, 0.35), d.uniform(0.25, 0.8))
+    b = _hsv(d.hue(), d.uniform(0.0, 0.3), d.uniform(0.1, 0.5))
+    return Material(Pattern.CARPET, a, b, d.uniform(0.02, 0.06), d.seed())
+
+
+def _paper(d: Draw) -> Material:
+    """White sheets with text, and covers in strong colours."""
+    a = _hsv(d.hue(), d.uniform(0, 0.06), d.uniform(0.85, 1.0))
+    b = _hsv(d.hue(), d.uniform(0.0, 0.8), d.uniform(0.05, 0.4))
+    if d.uniform(0, 1) < 0.4:
+        a, b = _hsv(d.hue(), d.uniform(0.4, 1.0), d.uniform(0.2, 0.8)), _hsv(d.hue(), d.uniform(0, 0.3), 0.95)
+    return Material(Pattern.PAGE, a, b, d.uniform(0.006, 0.02), d.seed(), gloss=d.uniform(0.0, 0.4))
 
 
 def _fabric(d: Draw) -> Material:
@@ -209,15 +260,18 @@ def _paint(d: Draw) -> Material:
 
 
 def _wall_paint(d: Draw) -> Material:
-    a = _hsv(d.hue(), d.uniform(0.0, 0.35), d.uniform(0.55, 0.95))
-    pattern = d.one_of(Pattern.PLAIN, Pattern.PLAIN, Pattern.PLAIN, Pattern.STRIPES, Pattern.PRINT)
-    b = _scaled(a, 0.88 if pattern == Pattern.PLAIN else d.uniform(0.7, 0.92))
-    return Material(pattern, a, b, d.uniform(0.08, 0.4), d.seed())
+    """Often nearly white or grey, now and then in a colour or papered."""
+    plain = d.uniform(0, 1) < 0.5
+    a = _hsv(d.hue(), d.uniform(0.0, 0.08) if plain else d.uniform(0.0, 0.45), d.uniform(0.45, 0.97))
+    pattern = d.one_of(Pattern.PLAIN, Pattern.PLAIN, Pattern.STAINS, Pattern.STAINS, Pattern.STRIPES, Pattern.PRINT)
+    b = _scaled(a, d.uniform(0.7, 0.92))
+    return Material(pattern, a, b, d.uniform(0.08, 0.5), d.seed())
 
 
 def _metal(d: Draw) -> Material:
-    a = _hsv(d.uniform(0.5, 0.7), d.uniform(0, 0.1), d.uniform(0.25, 0.85))
-    return Material(Pattern.PLAIN, a, _scaled(a, 0.8), 0.05, d.seed(), gloss=0.6)
+    a = _hsv(d.uniform(0.5, 0.7), d.uniform(0, 0.1), d.uniform(0.2, 0.85))
+    pattern = d.one_of(Pattern.PLAIN, Pattern.BRUSHED)
+    return Material(pattern, a, _scaled(a, 0.75), 0.05, d.seed(), gloss=d.uniform(0.4, 1.0))
 
 
 def _ceramic(d: Draw) -> Material:
@@ -228,15 +282,16 @@ def _ceramic(d: Draw) -> Material:
 def _tile(d: Draw) -> Material:
     a = _hsv(d.hue(), d.uniform(0.0, 0.45), d.uniform(0.4, 0.95))
     b = _scaled(a, d.uniform(0.4, 0.8))
-    pattern = d.one_of(Pattern.TILES, Pattern.TILES, Pattern.CHECKER)
-    return Material(pattern, a, b, d.uniform(0.12, 0.4), d.seed(), gloss=d.uniform(0.1, 0.4))
+    pattern = d.one_of(*[Pattern.TILES] * 5, Pattern.CHECKER)
+    return Material(pattern, a, b, d.uniform(0.03, 0.4), d.seed(), gloss=d.uniform(0.1, 0.4))
 
 
 def _print(d: Draw) -> Material:
     a = _hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
     b = _hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
-    pattern = d.one_of(Pattern.PRINT, Pattern.PRINT, Pattern.STRIPES, Pattern.CHECKER)
-    return Material(pattern, a, b, d.uniform(0.06, 0.25), d.seed())
+    pattern = d.one_of(Pattern.PRINT, Pattern.PAGE, Pattern.OUTSIDE, Pattern.STRIPES, Pattern.CHECKER, Pattern.STONE)
+    low, high = {Pattern.PAGE: (0.012, 0.04), Pattern.OUTSIDE: (0.1, 0.4)}.get(pattern, (0.06, 0.25))
+    return Material(pattern, a, b, d.uniform(low, high), d.seed())
 
 
 def _screen(d: Draw) -> Material:
@@ -257,11 +312,13 @@ def _plant(d: Draw) -> Material:
 
 
 def _daylight(d: Draw) -> Material:
-    """What stands outside a window: bright, or dim as at dusk."""
-    a = _hsv(d.uniform(0.5, 0.65), d.uniform(0.0, 0.4), d.uniform(0.3, 0.95))
-    b = _hsv(d.uniform(0.2, 0.6), d.uniform(0.0, 0.4), d.uniform(0.25, 0.9))
-    lit = d.uniform(0.0, 0.25) if d.uniform(0, 1) < 0.45 else d.uniform(0.25, 0.9)
-    return Material(Pattern.PRINT, a, b, d.uniform(0.2, 0.6), d.seed(), emission=lit, gloss=0.5)
+    """What stands outside a window: so bright that it burns out, bright, or dim as at dusk."""
+    a = _hsv(d.uniform(0.5, 0.65), d.uniform(0.0, 0.5), d.uniform(0.4, 1.0))
+    b = _hsv(d.uniform(0.1, 0.45), d.uniform(0.0, 0.6), d.uniform(0.15, 0.7))
+    kind = d.uniform(0, 1)
+    lit = d.uniform(0.0, 0.25) if kind < 0.35 else d.uniform(0.25, 1.2) if kind < 0.75 else d.uniform(1.5, 4.0)
+    pattern = d.one_of(Pattern.OUTSIDE, Pattern.OUTSIDE, Pattern.OUTSIDE, Pattern.PRINT)
+    return Material(pattern, a, b, d.uniform(0.15, 0.5), d.seed(), emission=lit, gloss=0.5)
 
 
 def _lampshade(d: Draw) -> Material:
@@ -277,8 +334,11 @@ def _dark(d: Draw) -> Material:
 def _object(d: Draw) -> Material:
     a = _hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
     b = _hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
-    pattern = d.one_of(Pattern.PLAIN, Pattern.STRIPES, Pattern.WEAVE)
-    return Material(pattern, a, _scaled(a, 0.8) if pattern == Pattern.PLAIN else b, d.uniform(0.02, 0.08), d.seed())
+    if d.uniform(0, 1) < 0.35:  # white, grey or black
+        a = _hsv(d.hue(), d.uniform(0.0, 0.1), d.uniform(0.03, 0.98))
+    pattern = d.one_of(Pattern.PLAIN, Pattern.PLAIN, Pattern.STRIPES, Pattern.WEAVE, Pattern.PAGE, Pattern.PRINT)
+    second = _scaled(a, 0.75) if pattern == Pattern.PLAIN else b
+    return Material(pattern, a, second, d.uniform(0.01, 0.08), d.seed(), gloss=d.uniform(0.0, 0.8))
 
 
 def _mirror(d: Draw) -> Material:
@@ -289,19 +349,24 @@ def _mirror(d: Draw) -> Material:
 _POOLS: tuple[tuple[str, int, Callable[[Draw], Material]], ...] = (
     ("wood", 3, _wood),
     ("parquet", 1, _parquet),
+    ("stone", 2, _stone),
+    ("lacquer", 1, _lacquer),
+    ("steel", 1, _steel),
+    ("carpet", 1, _carpet),
+    ("paper", 4, _paper),
     ("fabric", 4, _fabric),
     ("paint", 3, _paint),
     ("wallpaint", 2, _wall_paint),
     ("metal", 2, _metal),
     ("ceramic", 1, _ceramic),
     ("tile", 2, _tile),
-    ("print", 4, _print),
+    ("print", 5, _print),
     ("screen", 2, _screen),
     ("books", 3, _books),
     ("plant", 1, _plant),
     ("daylight", 1, _daylight),
     ("lampshade", 1, _lampshade),
     ("dark", 1, _dark),
-    ("object", 6, _object),
+    ("object", 9, _object),
     ("mirror", 1, _mirror),
 )

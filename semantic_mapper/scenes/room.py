@@ -12,6 +12,7 @@ from semantic_mapper.scenes.primitives import Primitives, pack
 from semantic_mapper.scenes.room_templates import CYCLE, ROOM_TEMPLATES, furnish
 from semantic_mapper.scenes.scene import Lights, Scene, extremes, shadow_cubes
 
+_GLARE = 0.35  # fraction of the rooms with one hard, strong light
 _ROOM_STREAM = 0  # number of the random stream; camera paths use others
 
 
@@ -25,7 +26,7 @@ def make_room(seed: int, config: RoomConfig = RoomConfig()) -> Scene:
     rng = np.random.default_rng((SUITE_VERSION, seed, _ROOM_STREAM))
     template = config.template or CYCLE[seed % len(CYCLE)]
     size = _room_size(rng, template, config)
-    palette = Palette(rng, held_out=seed not in TRAIN_SEEDS)
+    palette = Palette(rng, held_out=seed not in TRAIN_SEEDS, camouflage=config.camouflage)
     layout = Layout(size, rng, palette, wet=template == "bathroom")
     furnish(layout, template, config.clutter)
     primitives = pack(layout.groups)
@@ -57,22 +58,29 @@ def _room_size(rng: np.random.Generator, template: str, config: RoomConfig) -> t
 
 
 def _make_lights(rng: np.random.Generator, primitives: Primitives, layout: Layout, shadow_resolution: int) -> Lights:
-    """Two to four of the room's lamps and windows are lit, and the next room's lamp where an opening shows it;
-    strengths add up to an evenly exposed picture."""
+    """Two to four of the room's lamps and windows are lit, and the next room's lamp where an opening shows it.
+
+    Strengths add up to an evenly exposed picture, but in ``_GLARE`` of the rooms one of the lights is so strong and
+    hard that what is near it burns out and corners are dim.
+    """
     size, lamps = layout.size_m, layout.lamps
     order = rng.permutation(len(lamps)) if lamps else np.zeros(0, int)
     chosen = [lamps[i] for i in order[: int(rng.integers(2, 5))]]
     if not chosen:
         chosen = [np.array([size[0] / 2, size[1] / 2, size[2] - 0.3])]
-    shares = rng.uniform(0.5, 1.5, len(chosen))
-    strength = rng.uniform(3.0, 4.5) * (size[0] * size[1] / 16.0) ** 0.5 * shares / shares.sum()
+    shares = rng.uniform(0.3, 1.7, len(chosen))
+    strength = rng.uniform(3.0, 6.0) * (size[0] * size[1] / 16.0) ** 0.5 * shares / shares.sum()
+    softness, dim = rng.uniform(0.35, 1.0, len(chosen)), rng.uniform(0.5, 1.0)
+    if rng.uniform() < _GLARE:
+        strength[0] = strength[0] * rng.uniform(2.0, 5.0) + 1.5
+        softness[0] = 0.2
+        dim = rng.uniform(0.25, 0.6)
     if layout.far_lamp is not None:
         chosen.append(layout.far_lamp)
-        strength = np.append(strength, rng.uniform(0.4, 1.6))
-    warm = rng.uniform(-1.0, 1.0, (len(chosen), 1))
-    tint = 1.0 + warm * np.array([[0.15, 0.0, -0.2]])
+        strength, softness = np.append(strength, rng.uniform(0.2, 3.0)), np.append(softness, 0.7)
+    warm = np.clip(rng.normal(0.0, 0.8, (len(chosen), 1)), -1.8, 1.8)  # of one room, lamps differ in colour
+    tint = 1.0 + warm * np.array([[0.16, 0.02, -0.24]]) + rng.uniform(-0.05, 0.05, (len(chosen), 3))
     position = np.array(chosen)
     cubes = shadow_cubes(primitives, position, shadow_resolution)
-    softness = rng.uniform(0.35, 1.0, len(chosen))
-    ambient = rng.uniform(0.3, 0.5) * (1.0 + rng.uniform(-0.06, 0.06, 3))
+    ambient = 0.42 * dim * (1.0 + rng.uniform(-0.12, 0.12, 3))
     return Lights(position, tint * strength[:, None], cubes, *extremes(cubes), softness, ambient)

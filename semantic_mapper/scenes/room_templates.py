@@ -24,7 +24,7 @@ class Entry:
 _WINDOW = Entry("window", 0.9)
 _WALLS = (
     Entry("window", 0.5), Entry("radiator", 0.4), Entry("picture", 0.75, 4), Entry("wall_shelf", 0.4),
-    Entry("wall_clock", 0.3), Entry("wall_mirror", 0.2), Entry("coat_hooks", 0.2),
+    Entry("notices", 0.35, 2), Entry("wall_clock", 0.3), Entry("wall_mirror", 0.2), Entry("coat_hooks", 0.2),
 )  # fmt: skip
 _LOOSE = (
     Entry("plant", 0.45), Entry("floor_lamp", 0.35), Entry("waste_bin", 0.35), Entry("carton", 0.3, 2),
@@ -78,15 +78,28 @@ CYCLE = (
     "kitchen", "bedroom", "bathroom", "kitchen", "living", "office", "bathroom", "kitchen", "bedroom", "studio",
 )  # fmt: skip
 
-_COMMON = ("cup", "bottle", "bowl", "book_pile", "vase", "small_box", "potted_plant")
+_COMMON = (
+    "cup", "cup", "bottle", "bowl", "book_pile", "vase", "small_box", "potted_plant", "magazines", "magazines",
+    "leaflet", "open_book", "cable",
+)  # fmt: skip
+_KITCHEN = (
+    "kettle", "pan", "pan", "microwave", "dish_rack", "bottle", "cutting_board", "packets", "packets", "coffee_machine",
+    "toaster", "utensils", "tableware", "standing_books",
+)  # fmt: skip
 CLUTTER: dict[str, tuple[str, ...]] = {
-    "bedroom": (*_COMMON, "table_lamp", "table_lamp", "photo_frame", "photo_frame", "book_pile", "laptop"),
-    "living": (*_COMMON, "table_lamp", "photo_frame", "photo_frame", "laptop"),
-    "office": ("cup", "book_pile", "small_box", "potted_plant", "paper_pile", "paper_pile", "laptop", "table_lamp"),
-    "kitchen": (*_COMMON, "cup", "kettle", "pan", "pan", "microwave", "dish_rack", "bottle"),
-    "bathroom": ("soap_set", "soap_set", "bottle", "bottle", "cup", "small_box", "folded_towels", "potted_plant"),
-    "studio": (*_COMMON, "table_lamp", "photo_frame", "pan", "kettle", "laptop"),
-}
+    "bedroom": (*_COMMON, "table_lamp", "table_lamp", "photo_frame", "photo_frame", "laptop", "folded_towels"),
+    "living": (*_COMMON, "table_lamp", "photo_frame", "photo_frame", "laptop", "standing_books", "tableware"),
+    "office": (
+        "cup", "book_pile", "small_box", "potted_plant", "paper_pile", "paper_pile", "laptop", "table_lamp",
+        "magazines", "standing_books", "leaflet", "utensils", "cable", "open_book",
+    ),
+    "kitchen": (*_COMMON, *_KITCHEN),
+    "bathroom": (
+        "soap_set", "soap_set", "bottle", "bottle", "cup", "small_box", "folded_towels", "potted_plant", "utensils",
+        "packets", "cable", "magazines",
+    ),
+    "studio": (*_COMMON, *_KITCHEN, "table_lamp", "photo_frame", "laptop"),
+}  # fmt: skip
 
 
 def furnish(layout: Layout, template: str, clutter: float) -> None:

@@ -13,6 +13,7 @@ from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 _TABLE_SIZE = 4096
 _TABLE_TOP = 4.0  # linear light that the tone table ends at
+_PIXEL_BLUR_PX = 0.45  # standard deviation of what one pixel collects: rays hit points, pixels see areas
 _WELL_EXPOSED = 0.42  # mean linear light that the automatic exposure aims at
 _LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
@@ -37,8 +38,8 @@ def expose(
     follows from its depth; what a moving edge uncovers is not rendered.
     """
     moved = blur_motion(linear, depth_m, intrinsics, shot)
-    sigma = shot.lens_blur_px * intrinsics.width / 320
-    if sigma > 0.15:
+    if shot.lens_blur_px > 0:
+        sigma = float(np.hypot(_PIXEL_BLUR_PX, shot.lens_blur_px * intrinsics.width / 320))
         moved = np.asarray(cv2.GaussianBlur(moved, (0, 0), sigma), np.float32)
     mean = float(moved[::4, ::4].mean(axis=(0, 1)) @ _LUMA)
     auto = float(np.clip(_WELL_EXPOSED / max(mean, 1e-3), 0.4, 3.0)) ** config.auto_exposure

@@ -13,6 +13,8 @@ from semantic_mapper.types import Float64
 
 OPENING_SHARE = 0.4  # of the rooms
 _BEYOND = ("dresser", "bookshelf", "wardrobe", "armchair", "plant", "open_rack", "sideboard")
+_FLOORS = ("parquet", "parquet", "parquet", "wood", "tile", "stone", "fabric", "carpet", "carpet")
+_WALLS = ("wallpaint", "wallpaint", "wallpaint", "tile")
 _CORNER_M = 0.35  # of wall to leave beside an opening
 
 
@@ -58,9 +60,7 @@ def wall_pose(size_m: tuple[float, float, float], wall: int, along: float, away:
 def build_shell(size_m: tuple[float, float, float], rng: np.random.Generator, palette: Palette, *, wet: bool) -> Shell:
     """The shell of a room. ``wet``: a bathroom, with tiles."""
     w, d, h = size_m
-    floors, walls = (("tile",), ("tile", "wallpaint")) if wet else (
-        ("parquet", "parquet", "wood", "tile", "fabric"), ("wallpaint", "wallpaint", "wallpaint", "tile")
-    )  # fmt: skip
+    floors, walls = (("tile",), ("tile", "wallpaint")) if wet else (_FLOORS, _WALLS)
     floor, wall = palette.pick(rng, *floors, role="floor"), palette.pick(rng, *walls)
     ceiling, board = palette.pick(rng, "wallpaint", "paint"), palette.pick(rng, "wood", "paint")
     accent = palette.pick(rng, "wallpaint", "paint", "wood") if rng.uniform() < 0.3 else wall
@@ -122,7 +122,7 @@ def _beyond(
     """What the opening shows, in the frame of its wall: frame and leaf of the door, shell and a piece of the room."""
     width, middle, back = o.right - o.left, (o.left + o.right) / 2, -0.1 - o.deep
     if rng.uniform() < 0.5:
-        floor, wall = palette.pick(rng, "parquet", "tile", "fabric"), palette.pick(rng, "wallpaint", "tile")
+        floor, wall = palette.pick(rng, "parquet", "tile", "carpet"), palette.pick(rng, "wallpaint", "tile")
     pieces: list[Assembly] = []
     for label, material, center, size in (
         ("floor", floor, (middle, back / 2 - 0.05, -0.051), (width + 0.2, o.deep + 0.2, 0.1)),

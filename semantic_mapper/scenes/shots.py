@@ -11,6 +11,7 @@ from semantic_mapper.scenes.config import SUITE_VERSION, NoiseConfig
 from semantic_mapper.types import Float64
 
 _SHOT_STREAM = 2  # number of the random stream; rooms and paths use others
+_GREY = 0.12  # fraction of the sequences that are nearly without colour
 _KEEP = 0.93  # of the drift from one frame to the next
 _TURN_WEIGHT_M = 0.35  # a turn of one radian counts as this much way
 
@@ -42,13 +43,13 @@ def sequence_shots(poses: Float64, seed: int, config: NoiseConfig) -> list[Shot]
     """One ``Shot`` for each of the poses (N, 4, 4): one camera and one look, exposure and white balance that drift,
     and motion towards the next pose. Deterministic in its arguments; shot k does not depend on later ones' number."""
     rng = np.random.default_rng((SUITE_VERSION, seed, _SHOT_STREAM))
-    look = _look(rng, config)
+    look, blur = _look(rng, config)
     state = rng.standard_normal(3)
     shots: list[Shot] = []
     for k, pose in enumerate(poses):
         if k:
             state = _KEEP * state + np.sqrt(1 - _KEEP**2) * rng.standard_normal(3)
-        way = config.max_blur_way_m * rng.uniform() ** 2
+        way = blur * config.max_blur_way_m * rng.uniform() ** 2
         after = poses[k + 1] if k + 1 < len(poses) else pose
         shots.append(Shot(_gain(state, config), *look, T_open_close=motion_between(pose, after, way)))
     return shots
@@ -57,15 +58,21 @@ def sequence_shots(poses: Float64, seed: int, config: NoiseConfig) -> list[Shot]
 def single_shot(seed: int, config: NoiseConfig) -> Shot:
     """A ``Shot`` of a camera at rest, for a view that belongs to no sequence."""
     rng = np.random.default_rng((SUITE_VERSION, seed, _SHOT_STREAM))
-    look = _look(rng, config)
+    look, _ = _look(rng, config)
     return Shot(_gain(rng.standard_normal(3), config), *look, T_open_close=np.eye(4))
 
 
-def _look(rng: np.random.Generator, config: NoiseConfig) -> tuple[float, float, float, float, float]:
-    contrast = 1.0 + config.look * rng.uniform(-0.15, 0.2)
+def _look(rng: np.random.Generator, config: NoiseConfig) -> tuple[tuple[float, float, float, float, float], float]:
+    """Contrast, saturation, ISO factor, vignetting and lens blur of one camera; and the factor of its motion blur."""
+    contrast = 1.0 + config.look * rng.uniform(-0.15, 0.5)
     saturation = 1.0 + config.look * rng.uniform(-0.45, 0.25)
-    iso = float(2.0 ** rng.uniform(-1.0, 1.5))
-    return contrast, saturation, iso, config.max_vignetting * rng.uniform(), config.max_lens_blur_px * rng.uniform()
+    if rng.uniform() < _GREY:
+        saturation = max(0.0, 1.0 - config.look * rng.uniform(0.8, 1.0))
+    iso, blur = float(2.0 ** rng.uniform(-1.0, 1.5)), 1.0
+    if rng.uniform() < config.rough:
+        iso, blur = iso * rng.uniform(1.5, 6.0), rng.uniform(1.0, 3.0)
+    vignetting, lens = config.max_vignetting * rng.uniform(), config.max_lens_blur_px * rng.uniform()
+    return (contrast, saturation, iso, vignetting, lens), blur
 
 
 def _gain(state: Float64, config: NoiseConfig) -> Float64:

@@ -15,13 +15,14 @@ from semantic_mapper.scenes.config import DepthSensorName
 from semantic_mapper.types import CameraIntrinsics
 
 ASPECT = 0.75
+_CLOSE_POINTS = 0.7  # fraction of the way-points of a path of close-ups
 _STREAM = 7  # number of the random stream; rooms, paths, shots and poses use others
 
 
 class CameraDraw(Config, frozen=True):
     """What is drawn once a room.
 
-    A share ``usual`` of the rooms is seen as the benchmark's rooms are, with the lens of an OAK-D held in the hand.
+    A share ``usual`` of the rooms is seen with the benchmark's camera: the lens of an OAK-D held in the hand.
     """
 
     usual: Fraction = 0.4
@@ -34,6 +35,7 @@ class CameraDraw(Config, frozen=True):
     roll_deg: Annotated[float, msgspec.Meta(ge=0, le=45)] = 12.0  # standard deviation of the mounting's
     sensors: tuple[DepthSensorName, ...] = ("oak_d", "oak_d", "oak_d", "d435", "d435", "exact")  # one of them
     odometry: Fraction = 0.5  # of the rooms in which poses drift
+    close_up: Fraction = 0.4  # of the rooms in which most views look down at a table, counter or shelf from near by
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,15 +63,19 @@ def draw_camera(seed: int, width: int, step_m: float, config: CameraDraw) -> Cam
     if not config.sensors:
         raise ConfigError('CameraDraw: sensors is empty; name at least one depth sensor, or "none"')
     rng = np.random.default_rng((_STREAM, seed))
+    close_up = _CLOSE_POINTS if rng.uniform() < config.close_up else 0.0
     if rng.uniform() < config.usual:
-        return Camera(_pinhole(width, config.focal), CameraPathConfig(step_m=step_m), NoiseConfig(), None)
+        path = CameraPathConfig(step_m=step_m, close_up=close_up)
+        return Camera(_pinhole(width, config.focal), path, NoiseConfig(), None)
     focal = float(np.exp(rng.uniform(np.log(config.focal_min), np.log(config.focal_max))))
     low = float(rng.uniform(config.height_min_m, config.height_max_m - config.height_span_m))
     roll = float(np.clip(rng.normal(0, config.roll_deg), -2 * config.roll_deg, 2 * config.roll_deg))
     sensor = config.sensors[int(rng.integers(len(config.sensors)))]
     return Camera(
         _pinhole(width, focal),
-        CameraPathConfig(step_m=step_m, min_height_m=low, max_height_m=low + config.height_span_m, roll_deg=roll),
+        CameraPathConfig(
+            step_m=step_m, min_height_m=low, max_height_m=low + config.height_span_m, roll_deg=roll, close_up=close_up
+        ),
         NoiseConfig(depth=sensor),
         PoseNoiseConfig() if rng.uniform() < config.odometry else None,
     )

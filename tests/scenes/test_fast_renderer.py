@@ -27,7 +27,7 @@ def random_turns(rng: np.random.Generator, count: int) -> Float64:
     return q * np.linalg.det(q)[:, None, None]
 
 
-def random_scene(seed: int, count: int = 14) -> Scene:
+def random_scene(seed: int, count: int = 20) -> Scene:
     rng = np.random.default_rng(seed)
     primitives = Primitives(
         shape=np.arange(count) % 4,
@@ -93,8 +93,8 @@ def test_arrays_of_other_shapes_and_foreign_materials_are_refused() -> None:
     depth, index = cast_pixels(p.shape, p.center, p.half, p.rotation, *camera, 21, 15)
     with pytest.raises(ShapeError, match="index"):
         shade_pixels(depth, index[1:], *kernel_arrays(scene), *camera)
-    foreign = replace(scene, primitives=replace(p, material=np.full(len(p), 9)))
-    with pytest.raises(ShapeError, match="9 materials"):
+    foreign = replace(scene, primitives=replace(p, material=np.full(len(p), len(Pattern))))
+    with pytest.raises(ShapeError, match=f"{len(Pattern)} materials"):
         shade_pixels(depth, index, *kernel_arrays(foreign), *camera)
     cut = replace(scene, lights=replace(scene.lights, shadow_low=scene.lights.shadow_low[:, :, 1:]))
     with pytest.raises(ShapeError, match="low"):

@@ -69,6 +69,13 @@ def test_camouflaged_pairs_share_one_material_in_about_a_third_of_the_rooms() ->
         assert 0.2 < np.mean(shared) < 0.5, (first, second)
 
 
+@pytest.mark.parametrize("fraction", [0.0, 0.8, 1.0])
+def test_a_palette_camouflages_as_many_pairs_as_it_is_asked_to(fraction: float) -> None:
+    palettes = [Palette(np.random.default_rng(seed), camouflage=fraction) for seed in range(100)]
+    shared = [a in p.camouflage and p.camouflage[a] == p.camouflage.get(b) for p in palettes for a, b, _ in CAMOUFLAGE]
+    assert np.mean(shared) == pytest.approx(fraction, abs=0.06)
+
+
 @pytest.mark.parametrize(
     ("pair", "pieces", "labels"),
     [

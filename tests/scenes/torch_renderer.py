@@ -115,7 +115,7 @@ def render_views_torch(
         depth, index = first_hits(tensors, origin, ray)
         depths.append(depth)
         indices.append(index)
-        colors.append(shade_hits(tensors, origin, ray, depth, index))
+        colors.append(shade_hits(tensors, origin, ray, depth, index, intrinsics.fx))
     size = (len(poses), intrinsics.height, intrinsics.width)
     depth = torch.cat(depths).reshape(size).double().cpu().numpy()
     index = torch.cat(indices).reshape(size).int().cpu().numpy()
@@ -191,46 +191,53 @@ def _interval_of_cone(o: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, t
 
 
 def shade_hits(
-    t: _Tensors, origins: torch.Tensor, rays: torch.Tensor, depth: torch.Tensor, index: torch.Tensor
+    t: _Tensors, origins: torch.Tensor, rays: torch.Tensor, depth: torch.Tensor, index: torch.Tensor, fx: float
 ) -> torch.Tensor:
-    """Linear RGB (R, 3) of the hits; black where there is none."""
+    """Linear RGB (R, 3) of the hits; black where there is none. ``fx``: focal length in pixels."""
     out = torch.zeros_like(rays)
     hit = (index >= 0).nonzero()[:, 0]
     view, p = -rays[hit] * depth[hit, None], index[hit]
     world = origins[hit] - view
-    color, normal = _shade_points(t, p, world, view)
+    way = view.norm(dim=-1)
+    color, normal = _shade_points(t, p, world, view, way / fx)
     mirror = t.mirror[t.material[p]]
     shows = (mirror > 0).nonzero()[:, 0]
     if len(shows):
-        seen = _reflected(t, world[shows], view[shows], normal[shows])
+        seen = _reflected(t, world[shows], view[shows], normal[shows], way[shows], fx)
         fraction = mirror[shows, None]
         color[shows] = (1 - fraction) * color[shows] + fraction * seen
     out[hit] = color
     return out
 
 
-def _reflected(t: _Tensors, world: torch.Tensor, view: torch.Tensor, normal: torch.Tensor) -> torch.Tensor:
-    """Light (N, 3) that mirrors at ``world`` (N, 3) send along ``view``."""
+def _reflected(
+    t: _Tensors, world: torch.Tensor, view: torch.Tensor, normal: torch.Tensor, way: torch.Tensor, fx: float
+) -> torch.Tensor:
+    """Light (N, 3) that mirrors at ``world`` (N, 3), ``way`` (N,) from the camera, send along ``view``."""
     toward = torch.nn.functional.normalize(view, dim=-1)
     rays = 2 * (normal * toward).sum(-1, keepdim=True) * normal - toward
     depth, index = first_hits(t, world, rays)
     out = torch.zeros_like(rays)
     hit = (index >= 0).nonzero()[:, 0]
     step = rays[hit] * depth[hit, None]
-    out[hit] = _shade_points(t, index[hit], world[hit] + step, -step)[0]
+    pixel = (way + depth)[hit] / fx
+    out[hit] = _shade_points(t, index[hit], world[hit] + step, -step, pixel)[0]
     return out
 
 
 def _shade_points(
-    t: _Tensors, p: torch.Tensor, world: torch.Tensor, view: torch.Tensor
+    t: _Tensors, p: torch.Tensor, world: torch.Tensor, view: torch.Tensor, pixel: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Linear RGB (N, 3) and normals (N, 3) of the points ``world`` (N, 3) of primitives p (N,), seen along -view."""
+    """Linear RGB (N, 3) and normals (N, 3) of the points ``world`` (N, 3) of primitives p (N,), seen along -view;
+    ``pixel`` (N,) is the width of a pixel there, metres."""
     rotation, half = t.rotation[p], t.half[p]
     local = torch.einsum("rji,rj->ri", rotation, world - t.center[p])
     own, axis = _own_normal(t.shape[p], local, half)
     normal = torch.einsum("rij,rj->ri", rotation, own)
     m = t.material[p]
-    base = albedo(t.pattern[m], t.color_a[m], t.color_b[m], t.scale_m[m], t.seed[m], local, half, axis)
+    facing = (normal * torch.nn.functional.normalize(view, dim=-1)).sum(-1)
+    footprint = pixel / facing.clamp_min(0.1).sqrt()
+    base = albedo(t.pattern[m], t.color_a[m], t.color_b[m], t.scale_m[m], t.seed[m], local, half, axis, footprint)
     light = t.ambient * (0.75 + 0.25 * normal[:, 2:]) * _openness(t, world, normal)[:, None]
     for k in range(len(t.light_position)):
         light = light + _light(t, k, world, normal, view, t.gloss[m])

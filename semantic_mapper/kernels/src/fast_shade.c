@@ -160,13 +160,14 @@ static void mirror_ray(const double *view, const double *normal, double *ray) {
 static void shade_point(const ShadeArguments *a, int64_t p, double *world, double *view, float *out) {
     const Materials *materials = &a->materials;
     double fraction = 1.0; /* of this pixel that the surface at `world` makes up */
+    double way = sqrt(dot(view, view)); /* of the light from there to the camera */
     for (int bounces = 0; bounces < 2 && p >= 0 && p < a->primitives.shape.shape[0]; bounces++) {
         double local[3], normal[3], albedo[3], light[3], ray[3];
         int axis = normal_at(&a->primitives, p, world, local, normal);
         int64_t m = a->material.data[p];
         texture(materials->pattern.data[m], materials->color_a.data + 3 * m, materials->color_b.data + 3 * m,
                 materials->scale.data[m], materials->seed.data[m], local, a->primitives.half.data + 3 * p, axis,
-                albedo);
+                way / a->fx / sqrt(max_d(dot(normal, view) / sqrt(dot(view, view)), 0.1)), albedo);
         lighting(&a->lights, world, normal, view, materials->gloss.data[m], light);
         double mirror = bounces == 0 ? materials->mirror.data[m] : 0.0; /* one in a mirror shows its own color */
         for (int i = 0; i < 3; i++) {
@@ -178,6 +179,7 @@ static void shade_point(const ShadeArguments *a, int64_t p, double *world, doubl
         mirror_ray(view, normal, ray);
         double t = first_hit(&a->primitives, world, ray, &p);
         for (int i = 0; i < 3; i++) world[i] = world[i] + t * ray[i], view[i] = -t * ray[i];
+        way += t;
     }
 }
 

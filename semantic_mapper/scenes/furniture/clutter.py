@@ -93,6 +93,133 @@ def laptop(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
 
 
 @furniture("otherprop", "small")
+def magazines(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """One to four magazines and sheets, fanned out flat."""
+    for k in range(int(rng.integers(1, 5))):
+        size = (rng.uniform(0.15, 0.22), rng.uniform(0.2, 0.3), 0.006)
+        center = (rng.uniform(-0.07, 0.07), rng.uniform(-0.05, 0.05), 0.003 + 0.006 * k)
+        a.box(palette.pick(rng, "paper", "paper", "print"), center, size, yaw=rng.uniform(-0.8, 0.8))
+
+
+@furniture("otherprop", "small")
+def open_book(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """Two pages that rise towards the outside."""
+    w, d, paper = rng.uniform(0.13, 0.2), rng.uniform(0.19, 0.28), palette.pick(rng, "paper")
+    a.box(palette.pick(rng, "object", "dark"), (0, 0, 0.004), (2 * w + 0.02, d + 0.01, 0.008))
+    for x in (-1, 1):
+        a.box(paper, (x * w / 2, 0, 0.013), (w - 0.004, d, 0.018))
+
+
+@furniture("otherprop", "small")
+def standing_books(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A row of upright books, each of its own size, the last one leaning."""
+    x = 0.0
+    for _ in range(int(rng.integers(2, 8))):
+        w, d, h = rng.uniform(0.012, 0.05), rng.uniform(0.12, 0.2), rng.uniform(0.17, 0.29)
+        a.box(palette.pick(rng, "object", "paper", "print", "fabric"), (x + w / 2, 0, h / 2), (w, d, h))
+        x += w + 0.001
+
+
+@furniture("otherprop", "small")
+def leaflet(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A sheet, brochure or open book that stands and leans back."""
+    w, h, lean = rng.uniform(0.12, 0.24), rng.uniform(0.16, 0.3), rng.uniform(0.1, 0.4)
+    thick = rng.uniform(0.006, 0.025)
+    z = (h * float(np.cos(lean)) + thick * float(np.sin(lean))) / 2
+    a.box(palette.pick(rng, "paper", "paper", "print"), (0, 0, z), (w, thick, h), tilt=lean)
+    if rng.uniform() < 0.3:  # the shelf of a stand
+        a.box(palette.pick(rng, "metal", "wood", "dark"), (0, 0.02, 0.01), (w, 0.1, 0.02))
+
+
+@furniture("otherprop", "small")
+def cutting_board(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A board with something on it, or a tray with things."""
+    w, d = rng.uniform(0.26, 0.46), rng.uniform(0.2, 0.32)
+    a.box(palette.pick(rng, "wood", "wood", "object", "metal"), (0, 0, 0.01), (w, d, 0.02))
+    for _ in range(int(rng.integers(0, 4))):
+        x, y, side = rng.uniform(-0.3, 0.3) * w, rng.uniform(-0.25, 0.25) * d, rng.uniform(0.05, 0.11)
+        tall = rng.uniform(0.03, 0.12)
+        add = (a.box, a.cylinder, a.ellipsoid, a.frustum)[int(rng.integers(4))]
+        add(palette.pick(rng, "object", "ceramic", "plant"), (x, y, 0.02 + tall / 2), (side, side, tall))
+
+
+@furniture("otherprop", "small")
+def packets(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """Cereal boxes, cartons, tins and jars in a row."""
+    x = 0.0
+    for _ in range(int(rng.integers(2, 6))):
+        w, d, h = rng.uniform(0.05, 0.16), rng.uniform(0.05, 0.1), rng.uniform(0.08, 0.3)
+        material = palette.pick(rng, "object", "object", "print", "paper", "metal")
+        if rng.uniform() < 0.55:
+            a.box(material, (x + w / 2, 0, h / 2), (w, d, h), yaw=rng.uniform(-0.15, 0.15))
+        else:
+            a.cylinder(material, (x + w / 2, 0, h * 0.4), (w, w, h * 0.8))
+            a.cylinder(palette.pick(rng, "metal", "object"), (x + w / 2, 0, h * 0.82), (w * 0.9, w * 0.9, h * 0.06))
+        x += w + 0.02
+
+
+@furniture("otherprop", "small")
+def coffee_machine(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """Foot, column, head over a pot."""
+    w, d, h = rng.uniform(0.16, 0.26), rng.uniform(0.22, 0.32), rng.uniform(0.26, 0.38)
+    body, pot = palette.pick(rng, "dark", "metal", "lacquer", "paint"), palette.pick(rng, "dark", "ceramic", "metal")
+    a.box(body, (0, 0, 0.02), (w, d, 0.04))
+    a.box(body, (0, -d * 0.3, h / 2), (w, d * 0.4, h))
+    a.box(body, (0, 0, h - 0.045), (w - 0.004, d, 0.09))
+    a.cylinder(pot, (0, d * 0.18, 0.04 + h * 0.22), (w * 0.6, w * 0.6, h * 0.42))
+
+
+@furniture("otherprop", "small")
+def toaster(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A rounded body with two slots."""
+    w, d, h = rng.uniform(0.26, 0.34), rng.uniform(0.16, 0.2), rng.uniform(0.17, 0.21)
+    body, dark = palette.pick(rng, "metal", "steel", "lacquer", "paint"), palette.pick(rng, "dark")
+    a.box(body, (0, 0, h * 0.45), (w, d, h * 0.9))
+    a.cylinder(body, (0, 0, h * 0.86), (d, h * 0.28, w), yaw=np.pi / 2, tilt=np.pi / 2)
+    for y in (-0.03, 0.03):
+        a.box(dark, (0, y, h), (w * 0.75, 0.024, 0.006))
+    a.box(dark, (w / 2 + 0.012, 0, h * 0.6), (0.024, 0.04, 0.02))
+
+
+@furniture("otherprop", "small")
+def cable(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A cable that lies in bends, with a plug or a phone at its end."""
+    material, x, y, angle = palette.pick(rng, "dark", "paint"), 0.0, 0.0, rng.uniform(0, 6.3)
+    for _ in range(int(rng.integers(3, 7))):
+        long = rng.uniform(0.05, 0.12)
+        dx, dy = long * float(np.cos(angle)), long * float(np.sin(angle))
+        a.box(material, (x + dx / 2, y + dy / 2, 0.004), (long + 0.006, 0.008, 0.008), yaw=angle)
+        x, y, angle = x + dx, y + dy, angle + rng.uniform(-1.1, 1.1)
+    a.box(palette.pick(rng, "dark", "screen", "object"), (x, y, 0.006), (0.075, 0.15, 0.012), yaw=angle)
+
+
+@furniture("otherprop", "small")
+def utensils(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A jar with spoons, pens or brushes."""
+    w, h = rng.uniform(0.08, 0.13), rng.uniform(0.1, 0.16)
+    a.cylinder(palette.pick(rng, "object", "ceramic", "metal"), (0, 0, h / 2), (w, w, h))
+    for _ in range(int(rng.integers(2, 6))):
+        x, y, long = rng.uniform(-0.3, 0.3) * w, rng.uniform(-0.3, 0.3) * w, rng.uniform(0.1, 0.2)
+        lean = rng.uniform(-0.25, 0.25)
+        a.box(palette.pick(rng, "wood", "metal", "object"), (x, y, h + long * 0.3), (0.014, 0.01, long), tilt=lean)
+
+
+@furniture("otherprop", "small")
+def tableware(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """A plate with food or cutlery, sometimes a glass beside it."""
+    w, plate = rng.uniform(0.18, 0.27), palette.pick(rng, "ceramic", "ceramic", "object")
+    a.frustum(plate, (0, 0, 0.01), (w, w, 0.02), tilt=np.pi)
+    for _ in range(int(rng.integers(0, 3))):
+        x, y, side = rng.uniform(-0.2, 0.2) * w, rng.uniform(-0.2, 0.2) * w, rng.uniform(0.04, 0.09)
+        a.ellipsoid(palette.pick(rng, "object", "plant", "wood"), (x, y, 0.03), (side, side, 0.05))
+    for x in (-1, 1):
+        a.box(palette.pick(rng, "metal"), (x * (w / 2 + 0.025), 0, 0.003), (0.016, 0.18, 0.006))
+    if rng.uniform() < 0.5:
+        glass = palette.pick(rng, "ceramic", "object", "daylight")
+        a.frustum(glass, (w / 2 + 0.02, w / 2 + 0.02, 0.06), (0.07, 0.07, 0.12), tilt=np.pi)
+
+
+@furniture("otherprop", "small")
 def paper_pile(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     """Sheets, a little askew."""
     for k in range(int(rng.integers(2, 4))):

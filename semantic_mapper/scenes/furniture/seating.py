@@ -145,7 +145,7 @@ def chair(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     """Four legs, seat, slatted or plain back."""
     w, d, seat = rng.uniform(0.4, 0.48), rng.uniform(0.4, 0.48), rng.uniform(0.43, 0.47)
     wood, pad = palette.pick(rng, "wood", "paint", "metal"), palette.pick(rng, "fabric", "wood")
-    height, thick = rng.uniform(0.8, 1.0), rng.uniform(0.03, 0.045)
+    height, thick = rng.uniform(0.8, 1.0), rng.uniform(0.03, 0.06)
     for x in (-1, 1):
         px = x * (w / 2 - thick / 2)
         a.box(wood, (px, d - 0.03, seat / 2 - 0.02), (thick, thick, seat - 0.04))
@@ -153,14 +153,16 @@ def chair(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     a.box(pad, (0, d / 2 + 0.01, seat), (w, d - 0.02, 0.045))
     if rng.uniform() < 0.4:
         a.ellipsoid(pad, (0, d / 2 + 0.01, seat + 0.02), (w * 0.95, d * 0.92, 0.06))
-    style = int(rng.integers(3))
+    style = int(rng.integers(5))
     if style == 0:
         a.cylinder(pad, (0, 0.03, height - 0.06), (0.07, 0.1, w), yaw=np.pi / 2, tilt=np.pi / 2)
     elif style == 1:
         a.box(pad, (0, 0.035, (height + seat) / 2 + 0.08), (w - 2 * thick, 0.025, (height - seat) * 0.6))
     else:
-        for z in np.linspace(seat + 0.14, height - 0.04, 3):
-            a.box(wood, (0, 0.03, float(z)), (w - 2 * thick, 0.02, 0.06))
+        slats, tall = int(rng.integers(2, 6)), rng.uniform(0.03, 0.06)
+        for z in np.linspace(seat + rng.uniform(0.1, 0.2), height - tall / 2, slats):
+            a.box(wood, (0, 0.03, float(z)), (w - 2 * thick, 0.02, tall))
+        a.box(wood, (0, d / 2, seat - 0.05), (w - 2 * thick, d - 0.04, 0.05))
 
 
 @furniture("chair", "centre")

@@ -15,7 +15,7 @@ def wardrobe(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     doors = int(rng.integers(2, 5))
     each, d, h = rng.uniform(0.38, 0.5), rng.uniform(0.52, 0.62), rng.uniform(1.8, 2.2)
     w = doors * each
-    body, front = (palette.pick(rng, "wood", "paint", role="cabinet") for _ in range(2))
+    body, front = (palette.pick(rng, "wood", "paint", "lacquer", role="cabinet") for _ in range(2))
     knob = palette.pick(rng, "metal", "dark")
     sliding = rng.uniform() < 0.25
     if sliding:  # one leaf may be a mirror
@@ -36,7 +36,7 @@ def dresser(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     w, d, h = rng.uniform(0.8, 1.4), rng.uniform(0.4, 0.5), rng.uniform(0.7, 1.0)
     rows, columns = int(rng.integers(2, 5)), int(rng.integers(1, 3))
     body, knob = palette.pick(rng, "wood", "paint", role="cabinet"), palette.pick(rng, "metal", "dark", "wood")
-    front = body if rng.uniform() < 0.6 else palette.pick(rng, "wood", "paint")
+    front = body if rng.uniform() < 0.6 else palette.pick(rng, "wood", "paint", "lacquer")
     a.box(body, (0, d / 2, h / 2 + 0.03), (w, d, h - 0.06))
     a.box(knob, (0, d / 2 - 0.01, 0.03), (w - 0.06, d - 0.06, 0.06))
     a.box(body, (0, d / 2 + 0.01, h + 0.012), (w + 0.04, d + 0.03, 0.03))
@@ -91,6 +91,15 @@ def bookshelf(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
                 books = palette.pick(rng, "books", "books", "books", "object")
                 center = (x + run / 2, 0.02 + deep / 2, floor + tall / 2)
                 a.box(books, center, (run, deep, tall), label="otherprop", item=item)
+            elif rng.uniform() < 0.7:  # a thing instead of books
+                item += 1
+                tall, wide = pitch * rng.uniform(0.3, 0.75), min(run, rng.uniform(0.08, 0.22))
+                thing, center = (
+                    palette.pick(rng, "object", "ceramic", "plant", "metal"),
+                    (x + run / 2, d / 2, floor + tall / 2),
+                )
+                add = (a.box, a.cylinder, a.ellipsoid, a.frustum)[int(rng.integers(4))]
+                add(thing, center, (wide, min(wide, d * 0.8), tall), label="otherprop", item=item)
             x += run + 0.01
     a.tops.append(Top(-w / 2, w / 2, 0, d, 0.091 + shelves * pitch))
 

@@ -31,7 +31,7 @@ def _trestles(a: Assembly, material: int, w: float, d: float, h: float) -> None:
 def dining_table(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     """A rectangular table with four legs."""
     w, d, h = rng.uniform(1.1, 1.8), rng.uniform(0.75, 0.95), rng.uniform(0.72, 0.77)
-    wood = palette.pick(rng, "wood", "wood", "paint", role="table")
+    wood = palette.pick(rng, "wood", "wood", "wood", "paint", "lacquer", "stone", role="table")
     a.box(wood, (0, d / 2, h), (w, d, 0.04))
     if rng.uniform() < 0.3:
         _trestles(a, palette.pick(rng, "wood", "metal"), w, d, h)
@@ -46,7 +46,7 @@ def dining_table(a: Assembly, rng: np.random.Generator, palette: Palette) -> Non
 def round_table(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     """A round or oval top on a column."""
     r, h = rng.uniform(0.8, 1.2), rng.uniform(0.72, 0.77)
-    wood, foot = palette.pick(rng, "wood", "paint", role="table"), palette.pick(rng, "wood", "metal")
+    wood, foot = palette.pick(rng, "wood", "wood", "paint", "stone", role="table"), palette.pick(rng, "wood", "metal")
     wide = r * (1.0 if rng.uniform() < 0.6 else rng.uniform(1.2, 1.5))
     a.cylinder(wood, (0, r / 2, h), (wide, r, 0.04))
     if rng.uniform() < 0.5:

@@ -13,7 +13,7 @@ from semantic_mapper.scenes.primitives import Assembly, Top
 def door(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     """Leaf with panels, frame, handle."""
     w, h = rng.uniform(0.8, 0.95), rng.uniform(1.95, 2.1)
-    leaf, frame = palette.pick(rng, "wood", "paint", role="door"), palette.pick(rng, "wood", "paint")
+    leaf, frame = palette.pick(rng, "wood", "paint", "lacquer", role="door"), palette.pick(rng, "wood", "paint")
     metal = palette.pick(rng, "metal", "dark")
     a.box(leaf, (0, 0.025, h / 2), (w, 0.05, h))
     for x in (-1, 1):
@@ -46,7 +46,7 @@ def window(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
         a.box(frame, ((k + 1) * w / (bars + 1) - w / 2, 0.025, mid), (0.05, 0.046, tall))
     if rng.uniform() < 0.4:
         a.box(frame, (0, 0.025, low + tall * 0.65), (w, 0.044, 0.04))
-    a.box(palette.pick(rng, "paint", "wood", "tile"), (0, 0.09, low - 0.07), (w + 0.2, 0.18, 0.035))
+    a.box(palette.pick(rng, "paint", "wood", "tile", "stone"), (0, 0.09, low - 0.07), (w + 0.2, 0.18, 0.035))
     a.lamps.extend(((-w / 4, 0.35, mid + 0.1), (w / 4, 0.35, mid + 0.1)))
     a.tops.append(Top(-w / 2 + 0.05, w / 2 - 0.05, 0.06, 0.18, low - 0.0525))
     if rng.uniform() < 0.7:
@@ -71,7 +71,7 @@ def picture(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     """A framed print; some are lit, some have a mount."""
     w, tall = rng.uniform(0.35, 1.1), rng.uniform(0.35, 0.9)
     z = rng.uniform(1.45, 1.65)
-    sight = palette.pick(rng, "print", "print", "fabric", "screen", role="picture")
+    sight = palette.pick(rng, "print", "print", "paper", "fabric", "screen", role="picture")
     sight = palette.pick(rng, "screen") if rng.uniform() < 0.2 else sight
     edge = rng.uniform(0.02, 0.06)
     a.box(palette.pick(rng, "wood", "paint", "dark", "metal"), (0, 0.015, z), (w, 0.03, tall))
@@ -79,6 +79,21 @@ def picture(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
         a.box(palette.pick(rng, "paint", "wallpaint"), (0, 0.018, z), (w - 2 * edge, 0.03, tall - 2 * edge))
         edge += 0.05
     a.box(sight, (0, 0.02, z), (w - 2 * edge, 0.034, tall - 2 * edge))
+
+
+@furniture("otherprop", "hang")
+def notices(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
+    """Sheets pinned to the wall, side by side or one above the other, sometimes on a board."""
+    columns, rows = int(rng.integers(1, 5)), int(rng.integers(1, 3))
+    z, pitch = rng.uniform(1.25, 1.6), rng.uniform(0.24, 0.32)
+    if rng.uniform() < 0.3:
+        size = (columns * pitch + 0.05, 0.012, rows * 0.34 + 0.05)
+        a.box(palette.pick(rng, "wood", "fabric", "paint"), (0, 0.006, z), size)
+    for k in range(columns * rows):
+        x, up = (k % columns - (columns - 1) / 2) * pitch, (k // columns - (rows - 1) / 2) * 0.33
+        wide, tall = rng.uniform(0.12, 0.21), rng.uniform(0.15, 0.3)
+        center = (x + rng.uniform(-0.02, 0.02), 0.0145, z + up + rng.uniform(-0.01, 0.01))
+        a.box(palette.pick(rng, "paper", "paper", "print"), center, (wide, 0.005, tall), item=1 + k)
 
 
 @furniture("otherprop", "hang")
@@ -130,9 +145,7 @@ def wall_shelf(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     w, z = rng.uniform(0.6, 1.1), rng.uniform(1.35, 1.7)
     a.box(palette.pick(rng, "wood", "paint"), (0, 0.11, z), (w, 0.22, 0.03))
     run, tall = w * rng.uniform(0.3, 0.6), rng.uniform(0.16, 0.25)
-    a.box(
-        palette.pick(rng, "books"), (-w / 2 + 0.03 + run / 2, 0.1, z + 0.015 + tall / 2), (run, 0.15, tall),
-        label="otherprop", item=1,
-    )  # fmt: skip
+    books, center = palette.pick(rng, "books", "books", "object"), (-w / 2 + 0.03 + run / 2, 0.1, z + 0.015 + tall / 2)
+    a.box(books, center, (run, 0.15, tall), label="otherprop", item=1)
     pot = palette.pick(rng, "object", "ceramic")
     a.cylinder(pot, (w / 2 - 0.12, 0.11, z + 0.075), (0.12, 0.12, 0.12), label="otherprop", item=2)
