@@ -1,7 +1,7 @@
 """Analytic primitives, assemblies of them, and the arrays that the ray casters read.
 
-A primitive is a unit shape (box [-1, 1]^3, cylinder about z, sphere, frustum about z) scaled by its half extents,
-turned and moved.
+A primitive is a unit shape (box [-1, 1]^3, cylinder about z, sphere, frustum about z, pillow) scaled by its half
+extents, turned and moved.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ class Shape(IntEnum):
     CYLINDER = 1
     ELLIPSOID = 2
     FRUSTUM = 3  # a cone cut off: radius 1 at z = -1, 0.6 at z = 1
+    PILLOW = 4  # a superellipsoid x^4 + y^4 + z^4 = 1: a box with soft edges
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,6 +122,10 @@ class Assembly:
     def frustum(self, material: int, center: Vector, size: Vector, **options: object) -> None:
         """``add`` an upright frustum, wide below; ``tilt=np.pi`` turns it over."""
         self.add(Shape.FRUSTUM, material, center, size, **options)  # type: ignore[arg-type]
+
+    def pillow(self, material: int, center: Vector, size: Vector, **options: object) -> None:
+        """``add`` a box with soft edges."""
+        self.add(Shape.PILLOW, material, center, size, **options)  # type: ignore[arg-type]
 
     def bounds(self) -> tuple[Float64, Float64]:
         """Lower and upper corner (3,) of all parts, in the assembly's frame."""

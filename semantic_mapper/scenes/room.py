@@ -58,14 +58,14 @@ def _room_size(rng: np.random.Generator, template: str, config: RoomConfig) -> t
 
 
 def _make_lights(rng: np.random.Generator, primitives: Primitives, layout: Layout, shadow_resolution: int) -> Lights:
-    """Two to four of the room's lamps and windows are lit, and the next room's lamp where an opening shows it.
+    """Two to five of the room's lamps and windows are lit, and the next room's lamp where an opening shows it.
 
     Strengths add up to an evenly exposed picture, but in ``_GLARE`` of the rooms one of the lights is so strong and
     hard that what is near it burns out and corners are dim.
     """
     size, lamps = layout.size_m, layout.lamps
     order = rng.permutation(len(lamps)) if lamps else np.zeros(0, int)
-    chosen = [lamps[i] for i in order[: int(rng.integers(2, 5))]]
+    chosen = [lamps[i] for i in order[: int(rng.integers(2, 6))]]
     if not chosen:
         chosen = [np.array([size[0] / 2, size[1] / 2, size[2] - 0.3])]
     shares = rng.uniform(0.3, 1.7, len(chosen))
