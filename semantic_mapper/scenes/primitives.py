@@ -16,7 +16,8 @@ from semantic_mapper.types import Float64, UInt8
 
 Vector = tuple[float, float, float]
 
-_LABEL_ID = dict(zip(ROOMS.names, ROOMS.ids, strict=True))
+BEING = "being"  # label of people and animals: no class, their pixels are to be ignored
+_LABEL_ID = {**dict(zip(ROOMS.names, ROOMS.ids, strict=True)), BEING: ROOMS.ignore_id}
 
 
 class Shape(IntEnum):
@@ -38,7 +39,7 @@ class Part:
         center: (3,) metres.
         half: (3,) half extents along its own axes.
         rotation: (3, 3) own axes -> assembly axes.
-        label: Class name of ``labels.ROOMS``.
+        label: Class name of ``labels.ROOMS``, or ``BEING``.
         material: Number in the palette.
         item: Separate objects of one assembly (a cushion on a sofa) have numbers of their own.
         casts_shadow: False for what light comes from or through.
@@ -141,7 +142,7 @@ class Primitives:
         shape: (P,) int64 of ``Shape``.
         center, half: (P, 3) float64 metres.
         rotation: (P, 3, 3) float64, own axes -> world.
-        label: (P,) uint8 ids of ``labels.ROOMS``.
+        label: (P,) uint8 ids of ``labels.ROOMS``, or its ignore id.
         instance: (P,) uint16, from 1.
         group: (P,) int64, which piece of furniture it belongs to; 0 to 5 are floor, ceiling and walls.
         material: (P,) int64.
