@@ -28,6 +28,7 @@ class RoomConfig(Config, frozen=True):
     camouflage: Fraction = (
         0.3  # of the rooms, for each pair of classes of ``materials.CAMOUFLAGE``: one material for both
     )
+    people: Fraction = 0.0  # of the rooms with people or animals, whose pixels carry the ignore id; half of them move
     shadow_resolution: int = 96  # pixels a side of each face of a light's shadow cube
 
 

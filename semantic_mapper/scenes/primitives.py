@@ -1,7 +1,7 @@
 """Analytic primitives, assemblies of them, and the arrays that the ray casters read.
 
-A primitive is a unit shape (box [-1, 1]^3, cylinder about z, sphere, frustum about z) scaled by its half extents,
-turned and moved.
+A primitive is a unit shape (box [-1, 1]^3, cylinder about z, sphere, frustum about z, pillow) scaled by its half
+extents, turned and moved.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from semantic_mapper.types import Float64, UInt8
 
 Vector = tuple[float, float, float]
 
-_LABEL_ID = dict(zip(ROOMS.names, ROOMS.ids, strict=True))
+BEING = "being"  # label of people and animals: no class, their pixels are to be ignored
+_LABEL_ID = {**dict(zip(ROOMS.names, ROOMS.ids, strict=True)), BEING: ROOMS.ignore_id}
 
 
 class Shape(IntEnum):
@@ -26,6 +27,7 @@ class Shape(IntEnum):
     CYLINDER = 1
     ELLIPSOID = 2
     FRUSTUM = 3  # a cone cut off: radius 1 at z = -1, 0.6 at z = 1
+    PILLOW = 4  # a superellipsoid x^4 + y^4 + z^4 = 1: a box with soft edges
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +39,7 @@ class Part:
         center: (3,) metres.
         half: (3,) half extents along its own axes.
         rotation: (3, 3) own axes -> assembly axes.
-        label: Class name of ``labels.ROOMS``.
+        label: Class name of ``labels.ROOMS``, or ``BEING``.
         material: Number in the palette.
         item: Separate objects of one assembly (a cushion on a sofa) have numbers of their own.
         casts_shadow: False for what light comes from or through.
@@ -122,6 +124,10 @@ class Assembly:
         """``add`` an upright frustum, wide below; ``tilt=np.pi`` turns it over."""
         self.add(Shape.FRUSTUM, material, center, size, **options)  # type: ignore[arg-type]
 
+    def pillow(self, material: int, center: Vector, size: Vector, **options: object) -> None:
+        """``add`` a box with soft edges."""
+        self.add(Shape.PILLOW, material, center, size, **options)  # type: ignore[arg-type]
+
     def bounds(self) -> tuple[Float64, Float64]:
         """Lower and upper corner (3,) of all parts, in the assembly's frame."""
         lows, highs = zip(*(part_bounds(part) for part in self.parts), strict=True)
@@ -136,7 +142,7 @@ class Primitives:
         shape: (P,) int64 of ``Shape``.
         center, half: (P, 3) float64 metres.
         rotation: (P, 3, 3) float64, own axes -> world.
-        label: (P,) uint8 ids of ``labels.ROOMS``.
+        label: (P,) uint8 ids of ``labels.ROOMS``, or its ignore id.
         instance: (P,) uint16, from 1.
         group: (P,) int64, which piece of furniture it belongs to; 0 to 5 are floor, ceiling and walls.
         material: (P,) int64.

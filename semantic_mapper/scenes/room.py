@@ -8,11 +8,13 @@ from semantic_mapper.errors import ConfigError
 from semantic_mapper.scenes.config import SUITE_VERSION, TRAIN_SEEDS, RoomConfig
 from semantic_mapper.scenes.layout import Layout
 from semantic_mapper.scenes.materials import Palette
+from semantic_mapper.scenes.people import add_beings
 from semantic_mapper.scenes.primitives import Primitives, pack
 from semantic_mapper.scenes.room_templates import CYCLE, ROOM_TEMPLATES, furnish
 from semantic_mapper.scenes.scene import Lights, Scene, extremes, shadow_cubes
 
 _GLARE = 0.35  # fraction of the rooms with one hard, strong light
+_PEOPLE_STREAM = 3
 _ROOM_STREAM = 0  # number of the random stream; camera paths use others
 
 
@@ -29,9 +31,12 @@ def make_room(seed: int, config: RoomConfig = RoomConfig()) -> Scene:
     palette = Palette(rng, held_out=seed not in TRAIN_SEEDS, camouflage=config.camouflage)
     layout = Layout(size, rng, palette, wet=template == "bathroom")
     furnish(layout, template, config.clutter)
+    # A stream of its own: the room is the same with and without people in it.
+    others = np.random.default_rng((SUITE_VERSION, seed, _PEOPLE_STREAM))
+    walks = add_beings(layout, others) if others.uniform() < config.people else ()
     primitives = pack(layout.groups)
     lights = _make_lights(rng, primitives, layout, config.shadow_resolution)
-    return Scene(seed, template, size, primitives, palette.table(), lights)
+    return Scene(seed, template, size, primitives, palette.table(), lights, walks)
 
 
 def _check(seed: int, config: RoomConfig) -> None:
@@ -58,14 +63,14 @@ def _room_size(rng: np.random.Generator, template: str, config: RoomConfig) -> t
 
 
 def _make_lights(rng: np.random.Generator, primitives: Primitives, layout: Layout, shadow_resolution: int) -> Lights:
-    """Two to four of the room's lamps and windows are lit, and the next room's lamp where an opening shows it.
+    """Two to five of the room's lamps and windows are lit, and the next room's lamp where an opening shows it.
 
     Strengths add up to an evenly exposed picture, but in ``_GLARE`` of the rooms one of the lights is so strong and
     hard that what is near it burns out and corners are dim.
     """
     size, lamps = layout.size_m, layout.lamps
     order = rng.permutation(len(lamps)) if lamps else np.zeros(0, int)
-    chosen = [lamps[i] for i in order[: int(rng.integers(2, 5))]]
+    chosen = [lamps[i] for i in order[: int(rng.integers(2, 6))]]
     if not chosen:
         chosen = [np.array([size[0] / 2, size[1] / 2, size[2] - 0.3])]
     shares = rng.uniform(0.3, 1.7, len(chosen))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,6 +11,7 @@ from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.scenes.fast_cast import cast_pixels
 from semantic_mapper.scenes.fast_shade import LightArrays, MaterialArrays, PrimitiveArrays
 from semantic_mapper.scenes.materials import MaterialTable
+from semantic_mapper.scenes.people import Walk
 from semantic_mapper.scenes.primitives import Primitives
 from semantic_mapper.types import Float32, Float64
 
@@ -49,6 +50,7 @@ class Scene:
         primitives: Everything that can be seen, walls included.
         materials: Rows are what ``primitives.material`` counts.
         lights: Point lights and ambient light.
+        walks: What moves from frame to frame.
     """
 
     seed: int
@@ -57,11 +59,22 @@ class Scene:
     primitives: Primitives
     materials: MaterialTable
     lights: Lights
+    walks: tuple[Walk, ...] = ()
 
     @property
     def label_set(self) -> LabelSet:
         """Of the label images."""
         return ROOMS
+
+
+def scene_at(scene: Scene, frame: int) -> Scene:
+    """The scene as it is in one frame of a sequence: people and animals that walk are elsewhere."""
+    if not scene.walks:
+        return scene
+    center = scene.primitives.center.copy()
+    for walk in scene.walks:
+        center[scene.primitives.group == walk.group] += walk.offset(frame)
+    return replace(scene, primitives=replace(scene.primitives, center=center))
 
 
 def kernel_arrays(scene: Scene) -> tuple[PrimitiveArrays, MaterialArrays, LightArrays]:

@@ -10,7 +10,7 @@ from semantic_mapper.scenes.config import CameraPathConfig, NoiseConfig, PoseNoi
 from semantic_mapper.scenes.pose_noise import drifting_poses
 from semantic_mapper.scenes.render import RenderedView, render_view
 from semantic_mapper.scenes.room import make_room
-from semantic_mapper.scenes.scene import Scene
+from semantic_mapper.scenes.scene import Scene, scene_at
 from semantic_mapper.scenes.shots import sequence_shots
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
@@ -61,7 +61,12 @@ def room_views(
     for index, shot in enumerate(shots):
         noise_seed = None if noise is None else seed * 100_003 + index
         view = render_view(
-            scene, intrinsics, poses[index], noise=noise_seed, noise_config=noise or NoiseConfig(), shot=shot
+            scene_at(scene, index),
+            intrinsics,
+            poses[index],
+            noise=noise_seed,
+            noise_config=noise or NoiseConfig(),
+            shot=shot,
         )
         frame = PosedFrame(
             stamp_ns=(index + 1) * FRAME_NS,

@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from semantic_mapper.config import Config
+from semantic_mapper.config import Config, Fraction
 from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
+from semantic_mapper.scenes import TRAIN_SEEDS, RoomConfig, room_frames
 from semantic_mapper.training.cameras import CameraDraw, draw_camera
 from semantic_mapper.training.losses import IGNORE
 from semantic_mapper.training.room_feed import open_feed
@@ -39,6 +39,7 @@ class RoomPoolConfig(Config, frozen=True):
     draws_per_room: int = 6  # a new room replaces the oldest after this many draws
     step_m_min: float = 0.08  # way between two views of a room, drawn between these
     step_m_max: float = 0.35
+    people: Fraction = 0.3  # of the rooms with people or animals in them
     camera: CameraDraw = CameraDraw()
 
     def __post_init__(self) -> None:
@@ -92,7 +93,12 @@ def pack_room(seed: int, config: RoomPoolConfig) -> PackedRoom | str:
     u = float(torch.rand(1, generator=generator))
     step_m = config.step_m_min + u * (config.step_m_max - config.step_m_min)
     camera = draw_camera(seed, config.width, step_m, config.camera)
-    how = {"path": camera.path, "noise": camera.noise, "pose_noise": camera.pose_noise}
+    how = {
+        "room": RoomConfig(people=config.people),
+        "path": camera.path,
+        "noise": camera.noise,
+        "pose_noise": camera.pose_noise,
+    }
     try:
         frames = list(room_frames(seed, config.views, camera.intrinsics, **how))
     except SemanticMapperError as error:

@@ -47,6 +47,20 @@ def test_views_show_furniture_and_no_void(seed: int) -> None:
     assert np.mean(shares) > 0.15
 
 
+@pytest.mark.parametrize("seed", [0, 6, 10])
+def test_close_ups_look_down_at_things_near_by(seed: int) -> None:
+    scene = make_room(seed, FAST)
+    near, far = CameraPathConfig(step_m=0.3, close_up=1.0), CameraPathConfig(step_m=0.3)
+    poses = camera_path(scene, 16, 0, near)
+    assert clearance(scene, poses[:, :3, 3]).min() > 0.15 - 4 * near.tremor_m
+    middle = [
+        np.median([render_view(scene, SMALL, p).exact_depth_m for p in ps])
+        for ps in (poses, camera_path(scene, 16, 0, far))
+    ]
+    assert middle[0] < 0.75 * middle[1]
+    assert poses[:, 2, 2].mean() < -0.2  # the camera's z axis points down
+
+
 def test_cameras_stay_upright() -> None:
     poses = camera_path(make_room(2, FAST), 30, 0)
     assert (poses[:, 2, 1] < -0.5).all()  # the camera's y axis points down in the world

@@ -13,7 +13,7 @@ from semantic_mapper.scenes import Scene, render_view
 from semantic_mapper.scenes.fast_cast import cast_pixels
 from semantic_mapper.scenes.fast_shade import shade_pixels
 from semantic_mapper.scenes.materials import MaterialTable, Pattern
-from semantic_mapper.scenes.primitives import Primitives
+from semantic_mapper.scenes.primitives import Primitives, Shape
 from semantic_mapper.scenes.scene import Lights, extremes, kernel_arrays, shadow_cubes
 from semantic_mapper.types import CameraIntrinsics, Float64
 from tests.scenes.torch_renderer import render_view_torch
@@ -30,7 +30,7 @@ def random_turns(rng: np.random.Generator, count: int) -> Float64:
 def random_scene(seed: int, count: int = 20) -> Scene:
     rng = np.random.default_rng(seed)
     primitives = Primitives(
-        shape=np.arange(count) % 4,
+        shape=np.arange(count) % len(Shape),
         center=rng.uniform((-2, -1.5, 1), (2, 1.5, 4), (count, 3)),
         half=rng.uniform(0.1, 0.9, (count, 3)),
         rotation=random_turns(rng, count),

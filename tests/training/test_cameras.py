@@ -16,7 +16,7 @@ def drawn(count: int, **changes: object) -> list[Camera]:
 
 
 def test_a_share_of_the_rooms_is_seen_as_the_benchmark_sees_them():
-    cameras = drawn(400)
+    cameras = drawn(400, close_up=0.0)
     usual = [c for c in cameras if c.path == CameraPathConfig(step_m=0.1)]
     assert abs(len(usual) / 400 - USUAL) < 0.08
     assert all(c.noise == NoiseConfig() and c.pose_noise is None for c in usual)
@@ -36,13 +36,29 @@ def test_the_others_cover_lenses_heights_tilts_and_sensors():
     assert abs(np.mean([c.pose_noise is not None for c in cameras]) - config.odometry) < 0.08
 
 
+def test_a_share_of_the_rooms_is_seen_from_near_by():
+    cameras = drawn(400)
+    near = [c.path.close_up > 0 for c in cameras]
+    assert abs(np.mean(near) - CameraDraw().close_up) < 0.08
+    focal = [c.intrinsics.fx for c in cameras]
+    assert drawn(400, close_up=0.0)[0].intrinsics.fx == focal[0], "the lens does not depend on it"
+
+
 def test_a_camera_follows_from_the_seed():
     assert drawn(20) == drawn(20)
     assert len({(c.intrinsics.fx, c.path.roll_deg) for c in drawn(20, usual=0.0)}) == 20
 
 
 def test_rooms_are_seen_with_the_drawn_camera():
-    low = {"usual": 0.0, "height_min_m": 0.5, "height_max_m": 0.9, "focal_min": 0.9, "focal_max": 0.9, "roll_deg": 20.0}
+    low = {
+        "usual": 0.0,
+        "close_up": 0.0,
+        "height_min_m": 0.5,
+        "height_max_m": 0.9,
+        "focal_min": 0.9,
+        "focal_max": 0.9,
+        "roll_deg": 20.0,
+    }
     config = convert_config({"width": 48, "views": 3, "camera": low}, RoomPoolConfig, "test config")
     room = render_room(3, config)
     poses = np.stack([v.T_world_camera.numpy() for v in room.views])

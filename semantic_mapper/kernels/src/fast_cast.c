@@ -103,7 +103,8 @@ KERNEL(cast_primitives, CastArguments) {
         case 0: cast_one(a, p, 0); break;
         case 1: cast_one(a, p, 1); break;
         case 2: cast_one(a, p, 2); break;
-        default: cast_one(a, p, 3);
+        case 3: cast_one(a, p, 3); break;
+        default: cast_one(a, p, 4);
         }
     }
     return 0;

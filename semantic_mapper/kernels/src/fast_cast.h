@@ -4,6 +4,8 @@
 #include "kernels.h"
 
 #define NEAR_M 0.02 /* nothing nearer than this is seen */
+#define PILLOW_STEPS 10
+#define PILLOW_ERROR 0.02 /* of x^4 + y^4 + z^4 at a hit */
 
 typedef struct {
     I64 shape;    /* (P,) primitives.Shape */
@@ -70,10 +72,35 @@ static inline double hit_frustum(const double *o, const double *d) {
     return entry(max_d(near, min_d(az, bz)), min_d(far, max_d(az, bz)));
 }
 
+/* x^4 + y^4 + z^4 = 1. Along a ray that sum is convex, so Newton's steps from outside never pass the first crossing; a
+ * ray that is still outside after the last step, or going outwards, misses. */
+static inline double hit_pillow(const double *o, const double *d) {
+    double near = -INFINITY, far = INFINITY;
+    for (int i = 0; i < 3; i++) {
+        double inverse = 1.0 / d[i], a = (-1.0 - o[i]) * inverse, b = (1.0 - o[i]) * inverse;
+        near = max_d(near, min_d(a, b)), far = min_d(far, max_d(a, b));
+    }
+    double t = max_d(near, 0.0), f = 0.0;
+    if (!(t <= far)) return INFINITY;
+    for (int k = 0; k < PILLOW_STEPS; k++) {
+        double slope = 0.0;
+        f = -1.0;
+        for (int i = 0; i < 3; i++) {
+            double x = o[i] + t * d[i], cube = x * x * x;
+            f += cube * x, slope += 4.0 * cube * d[i];
+        }
+        if (k == 0 && f < -PILLOW_ERROR) return INFINITY; /* starts inside */
+        if (!(slope < 0.0)) break;
+        t -= max_d(f, 0.0) / slope;
+    }
+    return fabs(f) <= PILLOW_ERROR && t > NEAR_M ? t : INFINITY;
+}
+
 static inline double hit_shape(int64_t shape, const double *o, const double *d) {
     if (shape == 0) return hit_box(o, d);
     if (shape == 1) return hit_cylinder(o, d);
-    return shape == 2 ? hit_sphere(o, d) : hit_frustum(o, d);
+    if (shape == 2) return hit_sphere(o, d);
+    return shape == 3 ? hit_frustum(o, d) : hit_pillow(o, d);
 }
 
 /* Ray parameter (infinity = miss) of one ray, and the number of the primitive (-1 = miss). */

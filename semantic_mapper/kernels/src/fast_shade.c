@@ -61,6 +61,8 @@ static int own_normal(int64_t shape, const double *local, const double *half, do
         n[2] = qz / half[2];
     else if (shape == 3)
         n[2] = 0.2 * radius / half[2];
+    else if (shape == 4)
+        n[0] *= qx * qx, n[1] *= qy * qy, n[2] = qz * qz * qz / half[2];
     double length = sqrt(dot(n, n));
     for (int i = 0; i < 3; i++) own[i] = n[i] / length;
     if (fabs(own[0]) >= fabs(own[1]) && fabs(own[0]) >= fabs(own[2])) return 0;

@@ -284,7 +284,7 @@ def soap_set(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
 def folded_towels(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     """A pile of folded towels."""
     for k in range(int(rng.integers(2, 5))):
-        a.box(palette.pick(rng, "fabric"), (0, 0, 0.025 + 0.05 * k), (0.3, 0.22, 0.048 if k else 0.05))
+        a.pillow(palette.pick(rng, "fabric"), (0, 0, 0.03 + 0.05 * k), (0.31, 0.23, 0.06))
 
 
 @furniture("picture", "small")
@@ -322,7 +322,7 @@ def bag(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     """A rucksack or handbag on the floor."""
     w, d, h = rng.uniform(0.25, 0.38), rng.uniform(0.14, 0.22), rng.uniform(0.26, 0.42)
     cloth = palette.pick(rng, "fabric", "object", "dark")
-    a.box(cloth, (0, 0.15, h * 0.4), (w, d, h * 0.8))
+    a.pillow(cloth, (0, 0.15, h * 0.42), (w, d, h * 0.84))
     a.ellipsoid(cloth, (0, 0.15, h * 0.8), (w, d, h * 0.4))
     a.box(palette.pick(rng, "fabric", "object"), (0, 0.15 + d / 2 + 0.02, h * 0.32), (w * 0.7, 0.05, h * 0.4))
 

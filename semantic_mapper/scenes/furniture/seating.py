@@ -19,19 +19,25 @@ def bed(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     for x in (-1, 1):
         for y in (0.08, d - 0.08):
             a.box(frame, (x * (w / 2 - 0.06), y, (low - 0.17) / 2), (0.07, 0.07, low - 0.17))
-    a.box(sheet, (0, d / 2 + 0.01, low + 0.07), (w - 0.06, d - 0.08, 0.2))
+    a.pillow(sheet, (0, d / 2 + 0.01, low + 0.07), (w - 0.05, d - 0.07, 0.22))
     cover = d * rng.uniform(0.55, 0.72)
     a.box(duvet, (0, d - cover / 2, low + 0.11), (w - 0.04, cover, 0.16))
     for x in (-1, 1):  # rounded edges
         a.cylinder(duvet, (x * (w / 2 - 0.04), d - cover / 2, low + 0.11), (0.1, 0.16, cover - 0.002), tilt=np.pi / 2)
-    a.ellipsoid(duvet, (0, d - cover / 2, low + 0.18), (w * 0.95, cover * 0.95, 0.12))
+    a.pillow(duvet, (0, d - cover / 2, low + 0.18), (w * 0.98, cover * 0.98, rng.uniform(0.08, 0.2)))
+    if rng.uniform() < 0.4:  # crumpled
+        for _ in range(3):
+            x, y = rng.uniform(-0.3, 0.3) * w, d - cover * rng.uniform(0.2, 0.9)
+            size = (rng.uniform(0.3, 0.5) * w, rng.uniform(0.15, 0.4), rng.uniform(0.06, 0.14))
+            a.ellipsoid(duvet, (x, y, low + 0.24), size, yaw=rng.uniform(-0.6, 0.6))
     if rng.uniform() < 0.35:
         a.box(palette.pick(rng, "fabric"), (0, d - cover * 0.22, low + 0.135), (w + 0.03, cover * 0.4, 0.22))
     _headboard(a, rng, frame, palette.pick(rng, "fabric"), w)
     pillow = palette.pick(rng, "fabric", "print", role="cushion")
     for k in range(1 if w < 1.3 else 2):
         x = 0.0 if w < 1.3 else (k - 0.5) * w * 0.5
-        a.ellipsoid(pillow, (x, 0.3, low + 0.24), (0.6, 0.4, 0.18), label="otherprop", item=1 + k)
+        size = (rng.uniform(0.5, 0.7), rng.uniform(0.36, 0.46), rng.uniform(0.13, 0.22))
+        a.pillow(pillow, (x, 0.3, low + 0.24), size, label="otherprop", item=1 + k, yaw=rng.uniform(-0.08, 0.08))
 
 
 def _headboard(a: Assembly, rng: np.random.Generator, frame: int, cloth: int, w: float) -> None:
@@ -67,11 +73,12 @@ def sofa(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
         elif soft:
             a.ellipsoid(cloth, (x * (w - arm) / 2, depth / 2, 0.04 + tall), (arm * 1.1, depth, 0.14))
         a.box(palette.pick(rng, "wood", "metal"), (x * (w / 2 - 0.08), depth - 0.08, 0.035), (0.06, 0.06, 0.07))
-    each = inner / seats
+    each, plump = inner / seats, rng.uniform() < 0.7
     for k in range(seats):
         x = (k - (seats - 1) / 2) * each
-        a.box(cloth, (x, depth / 2 + 0.11, seat - 0.05), (each - 0.015, depth - 0.2, 0.14))
-        a.box(cloth, (x, 0.27, seat + 0.2), (each - 0.03, 0.14, 0.38), tilt=0.18)
+        cushion = a.pillow if plump else a.box
+        cushion(cloth, (x, depth / 2 + 0.11, seat - 0.05), (each - 0.01, depth - 0.19, 0.2 if plump else 0.14))
+        cushion(cloth, (x, 0.27, seat + 0.2), (each - 0.02, 0.22 if plump else 0.14, 0.42), tilt=0.18)
     if rng.uniform() < 0.2 and seats > 1:  # a chaise
         side = 1 if rng.uniform() < 0.5 else -1
         x = side * (seats - 1) / 2 * each
@@ -83,7 +90,8 @@ def sofa(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     cushion = palette.pick(rng, "print", "fabric", role="cushion")
     for k in range(int(rng.integers(0, seats + 2))):
         x, lean = rng.uniform(-0.4, 0.4) * inner, rng.uniform(0.2, 0.5)
-        a.ellipsoid(cushion, (x, 0.42, seat + 0.19), (0.42, 0.15, 0.38), label="otherprop", item=1 + k, tilt=lean)
+        side = rng.uniform(0.36, 0.48)
+        a.pillow(cushion, (x, 0.42, seat + 0.19), (side, 0.16, side * 0.9), label="otherprop", item=1 + k, tilt=lean)
 
 
 @furniture("sofa", "corner", keep_free_m=0.3)
@@ -94,10 +102,11 @@ def armchair(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
     if rng.uniform() < 0.4:
         _tub_chair(a, cloth, leg, w, d, seat)
         return
-    a.box(cloth, (0, d / 2 + 0.02, seat - 0.1), (w - 0.2, d - 0.08, 0.2))
-    a.box(cloth, (0, 0.12, 0.55), (w, 0.2, rng.uniform(0.7, 0.95)), tilt=0.1)
+    add = a.pillow if rng.uniform() < 0.6 else a.box
+    add(cloth, (0, d / 2 + 0.02, seat - 0.1), (w - 0.2, d - 0.08, 0.24))
+    add(cloth, (0, 0.12, 0.55), (w, 0.22, rng.uniform(0.7, 0.95)), tilt=0.1)
     for x in (-1, 1):
-        a.box(cloth, (x * (w / 2 - 0.06), d / 2 + 0.03, 0.38), (0.12, d - 0.1, 0.44))
+        add(cloth, (x * (w / 2 - 0.07), d / 2 + 0.03, 0.38), (0.15, d - 0.1, 0.46))
         for y in (0.12, d - 0.1):
             a.cylinder(leg, (x * (w / 2 - 0.08), y, 0.09), (0.05, 0.05, 0.18))
 
@@ -123,7 +132,7 @@ def pouf(a: Assembly, rng: np.random.Generator, palette: Palette) -> None:
         a.cylinder(cloth, (0, 0.3, h * 0.45), (w, w, h * 0.9))
         a.ellipsoid(cloth, (0, 0.3, h * 0.9), (w, w, h * 0.2))
     else:
-        a.box(cloth, (0, 0.3, h / 2), (w, w, h))
+        a.pillow(cloth, (0, 0.3, h / 2), (w, w, h))
 
 
 @furniture("chair", "centre")
@@ -177,8 +186,8 @@ def office_chair(a: Assembly, rng: np.random.Generator, palette: Palette) -> Non
         tip = (0.27 * float(np.cos(angle)), 0.3 + 0.27 * float(np.sin(angle)), 0.03)
         a.ellipsoid(metal, tip, (0.06, 0.06, 0.06))
     a.cylinder(metal, (0, 0.3, seat / 2), (0.06, 0.06, seat - 0.08))
-    a.box(cloth, (0, 0.3, seat), (0.48, 0.46, 0.08))
-    a.box(cloth, (0, 0.06, seat + 0.36), (0.44, 0.07, 0.5), tilt=0.1)
+    a.pillow(cloth, (0, 0.3, seat), (0.5, 0.48, 0.1))
+    a.pillow(cloth, (0, 0.06, seat + 0.36), (0.46, 0.09, 0.52), tilt=0.1)
     a.box(metal, (0, 0.04, seat + 0.08), (0.06, 0.04, 0.2))
     if rng.uniform() < 0.6:
         for x in (-0.27, 0.27):

@@ -15,6 +15,15 @@ def _legs(a: Assembly, material: int, w: float, d: float, height: float, thick: 
             a.box(material, (x * (w / 2 - thick), y, height / 2), (thick, thick, height))
 
 
+def _tablecloth(a: Assembly, rng: np.random.Generator, palette: Palette, w: float, d: float, h: float) -> None:
+    """A cloth that hangs over all four edges."""
+    cloth, drop = palette.pick(rng, "fabric"), rng.uniform(0.12, 0.3)
+    a.box(cloth, (0, d / 2, h + 0.0185), (w + 0.012, d + 0.012, 0.003))
+    for side in (-1, 1):
+        a.box(cloth, (side * (w / 2 + 0.006), d / 2, h + 0.02 - drop / 2), (0.008, d + 0.02, drop))
+        a.box(cloth, (0, d / 2 + side * (d / 2 + 0.006), h + 0.02 - drop / 2), (w + 0.004, 0.008, drop))
+
+
 def _trestles(a: Assembly, material: int, w: float, d: float, h: float) -> None:
     """Two pairs of slanting legs joined by a bar."""
     lean, thick = 0.22, 0.05
@@ -33,6 +42,8 @@ def dining_table(a: Assembly, rng: np.random.Generator, palette: Palette) -> Non
     w, d, h = rng.uniform(1.1, 1.8), rng.uniform(0.75, 0.95), rng.uniform(0.72, 0.77)
     wood = palette.pick(rng, "wood", "wood", "wood", "paint", "lacquer", "stone", role="table")
     a.box(wood, (0, d / 2, h), (w, d, 0.04))
+    if rng.uniform() < 0.12:
+        _tablecloth(a, rng, palette, w, d, h)
     if rng.uniform() < 0.3:
         _trestles(a, palette.pick(rng, "wood", "metal"), w, d, h)
         a.tops.append(Top(-w / 2, w / 2, 0, d, h + 0.02))

@@ -1,0 +1,60 @@
+"""People and animals in rooms: ignored by labels, seen by the camera, some of them moving."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.scenes import RoomConfig, Scene, make_room, room_views
+from semantic_mapper.scenes.scene import scene_at
+from semantic_mapper.types import CameraIntrinsics
+
+PEOPLED = RoomConfig(shadow_resolution=8, people=1.0)
+CAMERA = CameraIntrinsics(fx=27.6, fy=27.6, cx=19.5, cy=14.5, width=40, height=30)
+
+
+@pytest.fixture(scope="module")
+def rooms() -> list[Scene]:
+    return [make_room(seed, PEOPLED) for seed in range(12)]
+
+
+def test_rooms_have_nobody_unless_asked_for() -> None:
+    for seed in range(6):
+        scene = make_room(seed, RoomConfig(shadow_resolution=8))
+        assert scene.walks == () and (scene.primitives.label != ROOMS.ignore_id).all()
+
+
+def test_people_stand_inside_a_room_that_is_otherwise_the_same(rooms: list[Scene]) -> None:
+    met = 0
+    for scene in rooms:
+        being = scene.primitives.label == ROOMS.ignore_id
+        plain = make_room(scene.seed, RoomConfig(shadow_resolution=8)).primitives
+        np.testing.assert_array_equal(scene.primitives.center[~being], plain.center)
+        low, high = scene.primitives.bounds()
+        assert (low[being] >= -1e-6).all() and (high[being] <= np.array(scene.size_m) + 1e-6).all()
+        met += bool(being.any())
+    assert met >= 10
+
+
+def test_only_walkers_move_and_by_no_more_than_their_reach(rooms: list[Scene]) -> None:
+    walking = [scene for scene in rooms if scene.walks]
+    assert len(walking) >= 3
+    for scene in walking:
+        moves = np.isin(scene.primitives.group, [walk.group for walk in scene.walks])
+        assert (scene.primitives.label[moves] == ROOMS.ignore_id).all()
+        first, later = scene_at(scene, 0).primitives, scene_at(scene, 3).primitives
+        np.testing.assert_array_equal(first.center[~moves], later.center[~moves])
+        way = np.linalg.norm(first.center[moves] - later.center[moves], axis=1)
+        assert 0 < way.max() <= 1.0
+        assert not scene.primitives.casts_shadow[moves].any()
+
+
+def test_the_camera_sees_them_with_depth_and_without_a_class(rooms: list[Scene]) -> None:
+    seen = 0
+    for scene in rooms:
+        for view in room_views(scene.seed, 4, CAMERA, room=PEOPLED, scene=scene):
+            ignored = view.rendered.label == ROOMS.ignore_id
+            assert (view.rendered.exact_depth_m[ignored] > 0).all()
+            seen += int(ignored.sum())
+    assert seen > 100
