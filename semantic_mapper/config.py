@@ -83,6 +83,7 @@ class SRayConfig(Config, frozen=True):
     cross_view_attention: bool = True  # Eq. 10
     occlusion: bool = True  # views count by how much they see a sample; False = all alike, as in the paper
     source_labels: bool = True  # known labels of source views (finetuning keyframes) are part of their features
+    colour_moments: bool = True  # the density of a sample depends on mean and variance of the views' colours, too
     depth_by_focal: bool = True  # depth predicted from a picture is proportional to the focal length
     attention_residual: bool = True  # M + f(M) instead of f(M) in Eq. 9 and 10; trains faster
     parity: Literal["paper", "published"] = "paper"  # "published": depart from the paper where its code does

@@ -168,7 +168,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
 
 def _of_its_time(kind: str, config: dict[str, Any]) -> dict[str, Any]:
     """The config of a file that was written before some settings existed: what they were then."""
-    return {"tokens": "samples", "depth_by_focal": False} | config if kind == SRay.kind else config
+    then = {"tokens": "samples", "depth_by_focal": False, "colour_moments": False}
+    return then | config if kind == SRay.kind else config
 
 
 def check_same_shape(path: Path, like: Checkpoint) -> None:

@@ -19,6 +19,7 @@ MEASURED_SHIFT = 0.05  # a measured depth may be moved by at most this fraction
 MEASURED_SCALE = 0.01  # initial spread of a measured depth, fraction of z
 PREDICTED_SCALE = 0.25  # initial spread of a predicted depth, fraction of z
 COMMON_FOCAL = 0.69  # focal length in image widths at which a predicted depth is taken as it is
+COLOUR_SCALE = 4.0  # of colours beside features: colours that differ by a quarter have a variance of about 1
 LEAST_VISIBILITY = 1e-4  # a sample that is hidden from every view that it projects into takes all of them alike
 
 
@@ -84,17 +85,20 @@ class DensityNet(nn.Module):
 
     A first estimate comes from the views' hit probabilities: of the views that can see the sample, the share in which
     the view ray ends there is the sample's opacity. The network corrects it by a gain and adds density of its own.
+
+    Args:
+        dim: Values a view and sample, C: features, and colours where views are to agree in these, too.
     """
 
-    def __init__(self, feature_dim: int) -> None:
+    def __init__(self, dim: int) -> None:
         super().__init__()
-        self.token = nn.Sequential(nn.Linear(2 * feature_dim + 4, 32), nn.ReLU(), nn.Linear(32, 16))
+        self.token = nn.Sequential(nn.Linear(2 * dim + 4, 32), nn.ReLU(), nn.Linear(32, 16))
         self.qkv = nn.Linear(16, 48, bias=False)
         self.out = nn.Sequential(nn.Linear(16, 16), nn.ReLU(), nn.Linear(16, 2))
 
     def forward(
         self,
-        feature: torch.Tensor,
+        values: torch.Tensor,
         hit: torch.Tensor,
         visibility: torch.Tensor,
         valid: torch.Tensor,
@@ -103,15 +107,15 @@ class DensityNet(nn.Module):
         """sigma (R, N) in 1 / m; 0 where no view sees the sample.
 
         Args:
-            feature: (m, R, N, C).
+            values: (m, R, N, C).
             hit, visibility, valid: (m, R, N).
             delta: (R, N) interval lengths, metres.
         """
         weight = (visibility + LEAST_VISIBILITY) * valid
         total = weight.sum(0).clamp_min(1e-6)  # (R, N)
         fraction = weight / total
-        mean = torch.einsum("mrn,mrnc->rnc", fraction, feature)
-        var = torch.einsum("mrn,mrnc->rnc", fraction, feature * feature) - mean * mean
+        mean = torch.einsum("mrn,mrnc->rnc", fraction, values)
+        var = torch.einsum("mrn,mrnc->rnc", fraction, values * values) - mean * mean
         seen = (visibility * valid).sum(0)
         opacity = ((hit * valid).sum(0) / seen.clamp_min(1e-3)).clamp(0, 0.999)
         prior = -torch.log1p(-opacity) / delta.clamp_min(1e-4)

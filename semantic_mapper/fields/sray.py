@@ -31,7 +31,7 @@ from semantic_mapper.fields.attention import (
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.contextual import CUES, SURFACE_CUES, ContextualSpace, contextual_space, surface_space
 from semantic_mapper.fields.encoder import ImageEncoder
-from semantic_mapper.fields.geometry_net import LEAST_VISIBILITY, DensityNet, GeometryInit
+from semantic_mapper.fields.geometry_net import COLOUR_SCALE, LEAST_VISIBILITY, DensityNet, GeometryInit
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.source_maps import check_views, depth_at, encoded_views
 from semantic_mapper.fields.view_weights import ViewWeightNet, constrained_weights, softmax_weights
@@ -66,7 +66,7 @@ class SRay(LearnedField):
         self.config: SRayConfig = config
         self.encoder = ImageEncoder(config.encoder, dim)
         self.geometry_init = GeometryInit(dim)
-        self.density = DensityNet(dim)
+        self.density = DensityNet(dim + 3 if config.colour_moments else dim)
         self.radial = MultiHeadAttention(dim, config.heads, published=published)
         self.cross = MultiHeadAttention(dim, config.heads, published=published)
         self.at_surface = config.tokens == "surface"
@@ -93,6 +93,14 @@ class SRay(LearnedField):
         if views.channel is None or not self.config.source_labels:
             return encoded
         return replace(encoded, channel=views.channel.to(torch.int16))
+
+    def find_density(self, space: ContextualSpace) -> torch.Tensor:
+        """sigma (R, N) in 1 / m, from what the views hold at the samples: where features, and with ``colour_moments``
+        colours, agree, there is the surface."""
+        values = space.feature
+        if self.config.colour_moments:
+            values = torch.cat((values, COLOUR_SCALE * space.rgb), dim=-1)
+        return self.density(values, space.hit, space.visibility, space.valid, space.delta)
 
     def propagate_labels(self, space: ContextualSpace) -> torch.Tensor:
         """What views with known labels say of each sample: (R, N, L), each entry and their sum in [0, 1].
@@ -210,7 +218,7 @@ class SRay(LearnedField):
         their ray's weight take no part in it, and the others' semantics and colour stand for theirs.
         """
         space = contextual_space(rays, z, sources)
-        sigma = self.density(space.feature, space.hit, space.visibility, space.valid, space.delta)
+        sigma = self.find_density(space)
         interval = torch.ones_like(space.delta) if self.config.parity == "published" else space.delta
         weights = compositing_weights(sigma, interval)
         opacity = weights.sum(dim=1)

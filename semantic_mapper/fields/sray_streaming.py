@@ -16,7 +16,7 @@ from semantic_mapper.config import SamplingConfig
 from semantic_mapper.errors import ConfigError, ShapeError
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.contextual import BACKGROUND_M, OWN_RADIUS_M
-from semantic_mapper.fields.geometry_net import GEOMETRY_CHANNELS, LEAST_VISIBILITY, OWN_DENSITY_OFFSET
+from semantic_mapper.fields.geometry_net import COLOUR_SCALE, GEOMETRY_CHANNELS, LEAST_VISIBILITY, OWN_DENSITY_OFFSET
 from semantic_mapper.fields.projection import MIN_DEPTH_M
 from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import DOUBT, HIDDEN, SRay
@@ -151,6 +151,7 @@ class _Settings(NamedTuple):
     least_visibility: float
     label_doubt: float
     own_density_offset: float
+    colour_scale: float  # of the colours whose moments the density depends on; 0 = on none
     min_depth_m: float
     background_m: float
     own_radius_m: float
@@ -210,6 +211,7 @@ def _settings(model: SRay) -> _Settings:
         least_visibility=LEAST_VISIBILITY,
         label_doubt=DOUBT,
         own_density_offset=OWN_DENSITY_OFFSET,
+        colour_scale=COLOUR_SCALE if config.colour_moments else 0.0,
         min_depth_m=MIN_DEPTH_M,
         background_m=BACKGROUND_M,
         own_radius_m=OWN_RADIUS_M,

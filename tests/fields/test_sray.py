@@ -204,7 +204,7 @@ def test_published_parity_leaves_the_interval_length_out_of_alpha():
     z = torch.tensor([[1.98, 2.0, 2.02]]).expand(len(rays.origin), 3)
     with torch.no_grad():
         space = contextual_space(rays, z, encoded)
-        sigma = field.density(space.feature, space.hit, space.visibility, space.valid, space.delta)
+        sigma = field.find_density(space)
         render, _ = field.render_samples(rays, z, encoded)
     torch.testing.assert_close(render.opacity, 1 - torch.exp(-sigma.sum(1)))
 

@@ -74,6 +74,7 @@ def assert_equal(fast: FieldRender, reference: FieldRender, atol: float = 2e-5) 
         {"attention_residual": False},
         {"occlusion": False},
         {"source_labels": False},
+        {"colour_moments": False},
         {"tau": 0.9},
         {"intra_view_attention": False, "cross_view_attention": False},
     ],

@@ -58,7 +58,7 @@ def test_untrained_it_is_the_mean_of_what_its_views_say():
     space = contextual_space(rays, z, encoded)
     seen = space.valid.all(2).all(0)
     assert seen.sum() > 10
-    sigma = field.density(space.feature, space.hit, space.visibility, space.valid, space.delta)
+    sigma = field.find_density(space)
     token = surface_space(space, compositing_weights(sigma, space.delta), rays, encoded, occlusion=True)
     share = token.visibility[..., 0] / token.visibility[..., 0].sum(0)
     assert (share[:, seen] - 1 / 3).abs().max() < 0.02
@@ -103,7 +103,7 @@ def test_the_token_of_the_query_s_own_view_says_so():
     rays = wall_rays(POSES[2], step=31)
     z = on_wall(rays)
     space = contextual_space(rays, z, encoded)
-    sigma = field.density(space.feature, space.hit, space.visibility, space.valid, space.delta)
+    sigma = field.find_density(space)
     tokens = surface_space(space, compositing_weights(sigma, space.delta), rays, encoded, occlusion=True)
     assert tokens.feature.shape[2] == 1
     assert tokens.cues[2, ..., -1].min() == 1 and tokens.cues[[0, 1, 3], ..., -1].max() == 0
@@ -151,6 +151,27 @@ def test_a_file_from_before_this_setting_is_of_the_paper_s_form(tmp_path: Path):
         a = field.render(rays, field.encode(wall_sources(POSES))).logits
         b = loaded.render(rays, loaded.encode(wall_sources(POSES))).logits
     assert torch.equal(a, b)
+
+
+def test_density_depends_on_how_much_the_colours_of_the_views_differ():
+    """At a sample where features, depth and visibility say the same."""
+    for moments in (True, False):
+        field = small_field(colour_moments=moments)
+        encoded = field.encode(wall_sources(POSES))
+        tint = torch.tensor([0.4, -0.4, 0.4, -0.4])[:, None, None, None]
+        rays = wall_rays(pose_at(0.0), step=31)
+        alike = contextual_space(rays, on_wall(rays), replace(encoded, rgb=torch.full_like(encoded.rgb, 0.5)))
+        differing = contextual_space(rays, on_wall(rays), replace(encoded, rgb=(0.5 + tint).expand_as(encoded.rgb)))
+        with torch.no_grad():
+            changed = (field.find_density(alike) - field.find_density(differing)).abs().amax()
+        assert (changed > 1e-3) == moments
+
+
+def test_a_file_from_before_colour_moments_has_none(tmp_path: Path):
+    field = small_field(colour_moments=False)
+    path = tmp_path / "old.safetensors"
+    save_checkpoint(Checkpoint(field), path)
+    assert load_checkpoint(_without_setting(path, "colour_moments")).model.config == field.config
 
 
 def _without_setting(path: Path, name: str) -> Path:

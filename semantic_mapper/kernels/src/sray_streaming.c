@@ -20,7 +20,7 @@ enum {
     COLOUR = 5,      /* place of the colour behind the cues */
     ROW_EXTRA = 8,   /* columns of a token beyond its features: cues, own, colour */
     GEOMETRY = 5,    /* mu_1, s_1, mu_2, s_2, weight of the first: a mixture of two logistics over depth */
-    SAMPLE_CUES = 4, /* what DensityNet gets beside mean and variance of the features */
+    SAMPLE_CUES = 4, /* what DensityNet gets beside mean and variance of the features and colours */
     ROWS = 4,        /* that a matrix product works on at a time */
 };
 
@@ -50,6 +50,7 @@ typedef struct {
     double least_visibility;   /* added to each visibility that is a weight */
     double label_doubt;        /* hit probability at which a label that a view carries over counts by half */
     double own_density_offset; /* of the density that the network adds */
+    double colour_scale;       /* of the colours whose moments the density depends on; 0 = on none */
     double min_depth;          /* metres before a source camera */
     double background;         /* metres to what a ray meets that meets nothing */
     double own_radius;         /* metres from the ray's origin within which a camera is the query's own */
@@ -95,6 +96,7 @@ typedef struct {
     int64_t channels, samples, views, classes;
     int64_t stride;                            /* floats of a token */
     int64_t view_width, density_width, hidden; /* outputs of view_hidden, density_token, semantic_hidden (H) */
+    int64_t density_inputs;                    /* of density_hidden */
 
     /* Tokens, in the order of the views and then of the samples; behind them, from token `far` on, one a view at the
      * background, in no order of samples. */
@@ -116,7 +118,7 @@ typedef struct {
     /* Samples. */
     float *z, *delta, *sigma;                 /* (N,) depth, interval length, density */
     float *weight, *looked_at, *clearest;     /* (N,) of compositing; the same without the faint; best visibility */
-    float *density_input, *density_hidden;    /* (N, 2 C + SAMPLE_CUES), (N, the wider of two hidden layers) */
+    float *density_input, *density_hidden;    /* (N, density_inputs), (N, the wider of two hidden layers) */
     float *density_token, *density_qkv;       /* (N, D), (N, 3 D) */
     float *density_mixed;                     /* (N, D) */
     float *gain, *own;                        /* (N,) */
@@ -165,7 +167,7 @@ static void lay_out(Scratch *s, const Weights *w, Arena *arena) {
     s->by_sample = take_ints(arena, s->samples * s->views), s->sample_size = take_ints(arena, s->samples);
     s->z = take_floats(arena, N), s->delta = take_floats(arena, N), s->sigma = take_floats(arena, N);
     s->weight = take_floats(arena, N), s->looked_at = take_floats(arena, N), s->clearest = take_floats(arena, N);
-    s->density_input = take_floats(arena, N * (2 * C + SAMPLE_CUES));
+    s->density_input = take_floats(arena, N * s->density_inputs);
     s->density_hidden = take_floats(arena, N * max_i(w->density_hidden.weight.shape[1],
                                                      w->density_out_hidden.weight.shape[1]));
     s->density_token = take_floats(arena, N * D), s->density_qkv = take_floats(arena, N * 3 * D);
@@ -559,10 +561,26 @@ static int64_t drop_tokens(Scratch *s, const Settings *set) {
 
 /* ---- Density (DensityNet) and compositing weights ---- */
 
-/* Inputs of the network for one sample: mean and variance of the features over the views, and what they see. */
+/* Mean and variance over the views of the colours at a sample; cues and colour fill one vector of a token. */
+_Static_assert(ROW_EXTRA == LANES && COLOUR + 3 == LANES, "the colour ends the vector behind the features");
+static void describe_colour(const Scratch *s, const int64_t *tokens, int64_t views, float scale, float *mean_out,
+                            float *variance_out) {
+    Lanes mean = splat(0), square = splat(0);
+    for (int64_t i = 0; i < views; i++) {
+        const Lanes value = scale * load(s->tokens + tokens[i] * s->stride + s->channels);
+        const Lanes part = splat(s->view_share[i]) * value;
+        mean += part, square += part * value;
+    }
+    const Lanes variance = square - mean * mean;
+    for (int c = 0; c < 3; c++) mean_out[c] = mean[COLOUR + c], variance_out[c] = variance[COLOUR + c];
+}
+
+/* Inputs of the network for one sample: mean and variance of the features, and of the colours, over the views, and what
+ * these see. */
 static void describe_sample(Scratch *s, const Settings *set, int64_t k) {
     const int64_t C = s->channels, views = s->sample_size[k], *tokens = s->by_sample + k * s->views;
-    float *input = s->density_input + k * (2 * C + SAMPLE_CUES), *share = s->view_share;
+    const int64_t values = set->colour_scale > 0 ? C + 3 : C;
+    float *input = s->density_input + k * s->density_inputs, *variance = input + values, *share = s->view_share;
     float sum = 0, visible = 0, hits = 0;
     for (int64_t i = 0; i < views; i++) {
         visible += s->visible[tokens[i]], hits += s->hit[tokens[i]];
@@ -577,7 +595,7 @@ static void describe_sample(Scratch *s, const Settings *set, int64_t k) {
             Lanes value = load(s->tokens + tokens[i] * s->stride + c), part = splat(share[i]) * value;
             mean += part, square += part * value;
         }
-        store(input + c, mean), store(input + C + c, square - mean * mean);
+        store(input + c, mean), store(variance + c, square - mean * mean);
     }
     for (; c < C; c++) {
         float mean = 0, square = 0;
@@ -585,9 +603,10 @@ static void describe_sample(Scratch *s, const Settings *set, int64_t k) {
             const float value = s->tokens[tokens[i] * s->stride + c], part = share[i] * value;
             mean += part, square += part * value;
         }
-        input[c] = mean, input[C + c] = square - mean * mean;
+        input[c] = mean, variance[c] = square - mean * mean;
     }
-    float *cues = input + 2 * C;
+    if (values > C) describe_colour(s, tokens, views, (float)set->colour_scale, input + C, variance + C);
+    float *cues = variance + values;
     cues[0] = min_f(max_f(hits / max_f(visible, 1e-3f), 0.0f), 0.999f); /* opacity */
     cues[1] = visible / (float)views, cues[2] = hits / (float)views, cues[3] = min_f(s->delta[k], 1.0f);
     s->sigma[k] = -log1pf(-cues[0]) / max_f(s->delta[k], 1e-4f);
@@ -597,7 +616,7 @@ static float softplus(float x) { return max_f(x, 0.0f) + log1pf(expf(-fabsf(x)))
 
 /* Density sigma of each sample of the ray from what all views say about it. */
 static void find_density(Scratch *s, const Weights *w, const Settings *set) {
-    const int64_t D = s->density_width, inputs = 2 * s->channels + SAMPLE_CUES;
+    const int64_t D = s->density_width;
     int64_t seen = 0;
     for (int64_t k = 0; k < s->samples; k++) {
         s->sigma[k] = 0;
@@ -605,7 +624,7 @@ static void find_density(Scratch *s, const Weights *w, const Settings *set) {
         describe_sample(s, set, k);
         s->seen[seen++] = k;
     }
-    hidden_layer(s->density_input, inputs, s->samples, &w->density_hidden, s->density_hidden);
+    hidden_layer(s->density_input, s->density_inputs, s->samples, &w->density_hidden, s->density_hidden);
     linear(s->density_hidden, w->density_hidden.weight.shape[1], s->samples, &w->density_token, s->density_token);
     product(s->density_token, D, s->samples, &w->density_qkv, s->density_qkv);
     attend(s->density_qkv, s->seen, seen, 1, D, s, s->density_mixed);
@@ -820,6 +839,7 @@ KERNEL(render_sray, RenderArguments) {
         .view_width = a->weights.view_hidden.weight.shape[1],
         .density_width = a->weights.density_token.weight.shape[1],
         .hidden = a->weights.semantic_hidden.weight.shape[1],
+        .density_inputs = a->weights.density_hidden.weight.shape[0],
     };
     Arena arena = {0};
     lay_out(&s, &a->weights, &arena);
