@@ -84,6 +84,7 @@ class SRay(LearnedField):
             # gradients: on the pixels that it was trained on, the own image is always right.
             self.own_view_factor: torch.Tensor
             self.register_buffer(OWN_VIEW_FACTOR, torch.ones(()))
+            self.register_load_state_dict_pre_hook(_before_own_view_factor)
 
     def encode(self, views: SourceViews) -> EncodedViews:
         """Encode each view by itself: features F_j and the depth distribution of every pixel.
@@ -200,11 +201,6 @@ class SRay(LearnedField):
         s = torch.einsum("mrn,mrnc->rnc", semantic_weight, refined if content is None else content)
         return s, torch.einsum("mrn,mrnc->rnc", colour_weight, space.rgb)
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        if self.at_surface:  # files from before there was one
-            state_dict.setdefault(prefix + OWN_VIEW_FACTOR, torch.ones(()))
-        super()._load_from_state_dict(state_dict, prefix, *args)
-
     def _normalised(self, x: torch.Tensor) -> torch.Tensor:
         """Layer norm of tokens at the surface; the paper has none."""
         return functional.layer_norm(x, x.shape[-1:]) if self.at_surface else x
@@ -260,6 +256,11 @@ class SRay(LearnedField):
             known=known,
         )
         return render, weights
+
+
+def _before_own_view_factor(module: nn.Module, state_dict: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Files from before there was such a factor: the own view is one among others."""
+    state_dict.setdefault(prefix + OWN_VIEW_FACTOR, torch.ones(()))
 
 
 def _check(config: SRayConfig) -> None:
