@@ -136,6 +136,12 @@ class SRay(LearnedField):
             self.classifier.bias.copy_(bias)
         return True
 
+    def weigh_own_view(self, factor: float) -> bool:
+        """Set ``own_view_factor``, where tokens are at the surface."""
+        if self.at_surface:
+            self.own_view_factor.fill_(factor)
+        return self.at_surface
+
     def mask_occluded(self, space: ContextualSpace) -> ContextualSpace:
         """M without the views to which a sample is hidden, where some other view sees it.
 
