@@ -63,6 +63,12 @@ def finetune(
         f"  {recipe['steps']} steps in {recipe['seconds']} s, best at step {recipe['best_step']}: held-out loss "
         f"{recipe['held_out_loss']:.3f}, accuracy {recipe['held_out_accuracy'] * 100:.1f} %"
     )
+    if own := recipe["own_view"]:
+        output.print(
+            f"  on keyframes left out until step {own['step']}: own image alone {own['own_image'] * 100:.1f} %, "
+            f"as one vote among other views {own['as_one_vote'] * 100:.1f} %; it counts {own['factor']:g} times: "
+            f"{own['accuracy'] * 100:.1f} %"
+        )
     if stop:
         stderr_console().print(f"stopped by {stop.name}; the best weights so far are in {out}", style="yellow")
     return stop.exit_code

@@ -74,6 +74,10 @@ class LearnedField(nn.Module, ABC):
         """Classify images as an ``image_classifier`` of another field does; False where a kind cannot."""
         return False
 
+    def weigh_own_view(self, factor: float) -> bool:
+        """Let the query's own image count ``factor`` times as much among the views; False = no choice."""
+        return False
+
     def scene_config(self, views: SourceViews, far_m: float) -> Config:
         """The config that a field of this kind and shape should have to be fitted to the scene that ``views`` show.
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 # torch and safetensors leave parts of their interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import nn
@@ -41,6 +42,7 @@ from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
 LABEL_LOGIT = 8.0  # what full agreement of the labelled views on a class adds to its logit before any training
 HIDDEN = 0.05  # visibility below which a view is left out where another one sees the sample
+OWN_VIEW_FACTOR = "own_view_factor"
 DOUBT = 0.05  # hit probability at which a label that a view carries over counts by half
 
 
@@ -78,6 +80,11 @@ class SRay(LearnedField):
             self.weights.start_alike()
             nn.init.zeros_(self.radial.out.weight)
             nn.init.zeros_(self.cross.out.weight)
+            # Of the own view's blending weight: 1 = one vote among others, large = the own image alone. Not learned by
+            # gradients: on the pixels that it was trained on, the own image is always right.
+            self.own_view_factor: torch.Tensor
+            self.register_buffer(OWN_VIEW_FACTOR, torch.ones(()))
+            self.register_load_state_dict_pre_hook(_before_own_view_factor)
 
     def encode(self, views: SourceViews) -> EncodedViews:
         """Encode each view by itself: features F_j and the depth distribution of every pixel.
@@ -137,6 +144,12 @@ class SRay(LearnedField):
             self.classifier.bias.copy_(bias)
         return True
 
+    def weigh_own_view(self, factor: float) -> bool:
+        """Set ``own_view_factor``, where tokens are at the surface."""
+        if self.at_surface:
+            self.own_view_factor.fill_(factor)
+        return self.at_surface
+
     def mask_occluded(self, space: ContextualSpace) -> ContextualSpace:
         """M without the views to which a sample is hidden, where some other view sees it.
 
@@ -180,7 +193,7 @@ class SRay(LearnedField):
         """Semantic ray s (Eq. 11, 12) and colour of each sample: (R, N, C), (R, N, 3).
 
         With ``occlusion`` the weights of Eq. 12 are times the views' visibilities: the bounds hold among views that see
-        the sample alike.
+        the sample alike. The own view's weight at the surface is times ``own_view_factor``.
 
         Args:
             content: (m, R, N, C) what is blended, where that is not what the weights are made of.
@@ -193,6 +206,8 @@ class SRay(LearnedField):
             semantic_weight = constrained_weights(semantic_score, space.valid, self.config.tau)
             if self.config.occlusion or self.at_surface:
                 semantic_weight = semantic_weight * (space.visibility + LEAST_VISIBILITY)
+                if self.at_surface:
+                    semantic_weight = semantic_weight * torch.where(space.cues[..., CUES] > 0, self.own_view_factor, 1)
                 semantic_weight = semantic_weight / semantic_weight.sum(0).clamp_min(1e-12)
         if self.at_surface:
             colour_weight = colour_weight * (space.visibility + LEAST_VISIBILITY)
@@ -255,6 +270,11 @@ class SRay(LearnedField):
             known=known,
         )
         return render, weights
+
+
+def _before_own_view_factor(module: nn.Module, state_dict: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Files from before there was such a factor: the own view is one among others."""
+    state_dict.setdefault(prefix + OWN_VIEW_FACTOR, torch.ones(()))
 
 
 def _check(config: SRayConfig) -> None:

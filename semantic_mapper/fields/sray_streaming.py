@@ -155,6 +155,7 @@ class _Settings(NamedTuple):
     min_depth_m: float
     background_m: float
     own_radius_m: float
+    own_view_factor: float  # of the own view's weight, of tokens at the surface
 
 
 class _Layer(NamedTuple):
@@ -215,6 +216,7 @@ def _settings(model: SRay) -> _Settings:
         min_depth_m=MIN_DEPTH_M,
         background_m=BACKGROUND_M,
         own_radius_m=OWN_RADIUS_M,
+        own_view_factor=float(model.own_view_factor) if model.at_surface else 1.0,
     )
 
 

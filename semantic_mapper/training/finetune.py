@@ -8,9 +8,9 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
 
 import msgspec
@@ -38,6 +38,7 @@ from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.frozen_encoder import encode_once, resting_loss
+from semantic_mapper.training.images import ImageStepConfig, classifies_images, image_batch, images_loss
 from semantic_mapper.training.linear_probe import fit_class_rows
 from semantic_mapper.training.losses import IGNORE, Loss, semantic_loss
 from semantic_mapper.training.optimiser import make_optimiser, set_rates
@@ -47,18 +48,25 @@ from semantic_mapper.training.step import StepConfig, pick_views, training_loss
 from semantic_mapper.training.uncertainty import with_uncertainty
 from semantic_mapper.training.views import (
     LabelledView,
+    RayTargets,
     draw_pixels,
+    mirrored_view,
     query_rays,
     stack_sources,
     view_from_frame,
 )
-from semantic_mapper.types import PosedFrame
+from semantic_mapper.types import PosedFrame, RayBatch
 
 _log = get_logger(__name__)
 
 HELD_OUT_BLOCK = 16  # pixels a side: single held-out pixels would be known from their neighbours
 HELD_OUT_RAYS = 6144  # over all keyframes: a look must not cost more the more keyframes there are
-HELD_OUT_SOURCES = 8  # that a held-out ray is rendered from: those that see most of its view
+HELD_OUT_SOURCES = 7  # that a held-out ray is rendered from, beside its own image: those that see most of its view
+IMAGES = 4  # of a step on single images
+MIRRORED = 0.5  # of them
+RESERVED = 4  # one in so many keyframes chooses among the factors, and is not learned from until then
+FACTOR_RAYS = 2048  # of all of them
+OWN_VIEW_FACTORS = (1.0, 4.0, 16.0, 1e3)  # of which one is chosen: from one vote among others to the own image alone
 
 
 class FinetuneConfig(Config, frozen=True):
@@ -92,6 +100,9 @@ class FinetuneConfig(Config, frozen=True):
     linear_probe_steps: NotNegative = 40  # steps of the classifier alone, on features as they are, before the first ray
     frozen_encoder_fraction: Fraction = (
         0.0  # of the budget, at its start, in which the image encoder rests, so that steps cost less
+    )
+    image_fraction: Fraction = (
+        0.75  # of the budget behind that: steps on single images, where a kind classifies these; the rest is on rays
     )
     seed: NotNegative = 0
     device: DeviceName = "auto"
@@ -202,7 +213,7 @@ def finetune(
     device = choose_device(config.device, 0)
     model.to(device)
     with encoder_in_bfloat16(model, device) if config.bfloat16 else nullcontext():
-        best, steps = _run(model, scene, config, clock, generator, on_progress, stopped)
+        best, steps, own_view = _run(model, scene, config, clock, generator, on_progress, stopped)
     model.load_state_dict(best.state)
     recipe: dict[str, Any] = {
         "kind": "finetune",
@@ -213,6 +224,7 @@ def finetune(
         "seconds": round(clock.elapsed_s, 1),
         "held_out_loss": best.loss,
         "held_out_accuracy": best.accuracy,
+        "own_view": own_view,
         "train_stamps_ns": sorted({int(f.stamp_ns) for f in labelled} | {int(s) for s in seen_stamps_ns}),
     }
     anchors = tuple(anchor_from_frame(f, config.width) for f in labelled)
@@ -227,7 +239,7 @@ def _run(
     generator: torch.Generator,
     on_progress: Callable[[FinetuneProgress], None] | None,
     stopped: Callable[[], object],
-) -> tuple[_Best, int]:
+) -> tuple[_Best, int, dict[str, float]]:
     optimiser = make_optimiser(model, config.learning_rate, config.weight_decay)
     alive, norms = _prepare_norms(model, scene.train)
     patience = 0 if alive else config.patience  # random weights get worse before they get better
@@ -239,6 +251,8 @@ def _run(
 
     with clock.looking():
         best = _Best(*look(), 0, copy.deepcopy(model.state_dict()))
+    images_from, images_until = config.frozen_encoder_fraction, _end_of_images(model, config)
+    reserved, own_view = _reserve(model, scene, config), dict[str, float]()
     step, evaluated, stale = 0, 0, 0
     best, encoded = (best, None) if alive else _linear_probe(model, scene, config, best)
     latest = (best.loss, best.accuracy)
@@ -249,9 +263,17 @@ def _run(
     while (fraction := clock.used(step)) < 1 and (patience == 0 or stale < patience) and not stopped():
         rate = cosine_rate(fraction, config.learning_rate, config.final_learning_rate)
         set_rates(optimiser, rate, config.encoder_rate)
+        if reserved and fraction >= 0.5 * (images_from + images_until):
+            if alive:
+                _settle_norms(model, scene.train)
+            own_view, reserved = _fit_own_view(model, scene, config, reserved) | {"step": step}, ()
         with norms():
-            kept = encoded if fraction < config.frozen_encoder_fraction else None
-            loss = _draw_loss(model, scene, kept, config.step, generator)
+            if images_from <= fraction < images_until:
+                learned = [i for i in scene.queries if i not in reserved]
+                loss = _draw_image_loss(model, [scene.train[i] for i in learned], config.step, generator)
+            else:
+                kept = encoded if fraction < images_from else None
+                loss = _draw_loss(model, scene, kept, config.step, generator)
         step += 1
         if loss is None:
             continue
@@ -276,7 +298,9 @@ def _run(
         latest = look()
         if latest[0] < best.loss or not math.isfinite(best.loss):
             best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
-    return best, step
+    if best.step <= own_view.get("step", 0):  # the weights that are kept are from before the choice
+        own_view = {}
+    return best, step, own_view
 
 
 def _draw_loss(
@@ -291,6 +315,27 @@ def _draw_loss(
     if encoded is not None:
         return resting_loss(model, encoded, scene.train, query, sources, config, generator)
     return training_loss(model, scene.train, query, sources, config, generator)
+
+
+def _end_of_images(model: LearnedField, config: FinetuneConfig) -> float:
+    """Fraction of the budget until which steps are on images; 0 where a kind says nothing of them, or the encoder is to
+    stay what it is."""
+    if config.encoder_rate == 0 or not classifies_images(model):
+        return 0.0
+    return config.frozen_encoder_fraction + (1 - config.frozen_encoder_fraction) * config.image_fraction
+
+
+def _draw_image_loss(
+    model: LearnedField, views: Sequence[LabelledView], config: StepConfig, generator: torch.Generator
+) -> Loss:
+    """Loss of a step on single images: what the field makes of each by itself."""
+    views = [views[i] for i in torch.randperm(len(views), generator=generator).tolist()[:IMAGES]]
+    views = [mirrored_view(v) if float(torch.rand(1, generator=generator)) < MIRRORED else v for v in views]
+    # All without depth or none: norms take their statistics from images of one kind.
+    colours_only = float(torch.rand(1, generator=generator)) < config.depth_dropout
+    given = ImageStepConfig(colour_jitter=config.colour_jitter)
+    device = next(model.parameters()).device
+    return images_loss(model, image_batch(views, given, generator, device, colours_only=colours_only), given)
 
 
 def _linear_probe(
@@ -355,41 +400,106 @@ def _split(view: LabelledView, share: float, generator: torch.Generator) -> tupl
 
 
 def _evaluate(model: LearnedField, scene: _Scene, config: FinetuneConfig) -> tuple[float, float]:
-    """Class loss and accuracy of held-out rays, each view rendered from the others that see most of it; with their
-    training labels, if the config makes them known."""
+    """Class loss and accuracy of held-out rays, rendered as a mapper would: from the view's own image, and from the
+    others that see most of it, with their training labels if the config makes them known."""
     generator = torch.Generator().manual_seed(config.seed)
-    sampling = config.step.sampling
-    device = next(model.parameters()).device
     rays_a_view = min(config.held_out_rays, max(1, HELD_OUT_RAYS // len(scene.queries)))
-    losses: list[float] = []
-    right, counted = 0, 0
     model.eval()
     with torch.inference_mode():
-        sources = stack_sources(scene.train, with_labels=config.step.known_labels)
-        encoded = model.encode(to_device(sources, device))
-        for i, view in enumerate(scene.held_out):
-            flat = draw_pixels(view.channel, rays_a_view, 0.5, generator, len(model.label_set))
-            if len(flat) == 0:
-                continue
-            prior = view.depth_m.flatten()[flat]
-            rays, targets = query_rays(view, flat, near_m=sampling.near_m, far_m=sampling.far_m, prior=prior)
-            chosen = encoded.select(_looking_on(scene, i, own=model.needs_own_view).to(device))
-            rays, z, targets = (
-                to_device(rays, device),
-                sample_guided(rays, sampling).to(device),
-                to_device(targets, device),
-            )
-            render, _ = model.render_samples(rays, z, chosen)
-            losses.append(float(semantic_loss(render.logits, targets.channel)))
-            right += int(((render.logits.argmax(1) == targets.channel) & render.known).sum())
-            counted += len(flat)
+        views = dict(enumerate(scene.held_out))
+        found = _score(model, list(_rays_of(model, scene, views, config, rays_a_view, generator)))
     model.train()
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _ViewRays:
+    """Rays of one view: what they should render to, their sample depths, and the views to render them from."""
+
+    rays: RayBatch
+    targets: RayTargets
+    z: torch.Tensor
+    sources: EncodedViews
+
+
+def _rays_of(
+    model: LearnedField,
+    scene: _Scene,
+    views: Mapping[int, LabelledView],
+    config: FinetuneConfig,
+    rays_a_view: int,
+    generator: torch.Generator,
+) -> Iterator[_ViewRays]:
+    """Rays of views that have labels, each with its own image as the last of its sources.
+
+    Args:
+        views: By their number in the scene; their labels are the targets.
+    """
+    sampling = config.step.sampling
+    device = next(model.parameters()).device
+    sources = stack_sources(scene.train, with_labels=config.step.known_labels)
+    encoded = model.encode(to_device(sources, device))
+    for i, view in views.items():
+        flat = draw_pixels(view.channel, rays_a_view, 0.5, generator, len(model.label_set))
+        if len(flat) == 0:
+            continue
+        prior = view.depth_m.flatten()[flat]
+        rays, targets = query_rays(view, flat, near_m=sampling.near_m, far_m=sampling.far_m, prior=prior)
+        others = [] if model.needs_own_view else _looking_on(scene, i)
+        chosen = encoded.select(torch.tensor([*others, i], device=device))
+        known = chosen.channel.clone()
+        known[-1] = IGNORE  # a mapper's current frame has no labels
+        z = sample_guided(rays, sampling).to(device)
+        yield _ViewRays(to_device(rays, device), to_device(targets, device), z, replace(chosen, channel=known))
+
+
+def _reserve(model: LearnedField, scene: _Scene, config: FinetuneConfig) -> Sequence[int]:
+    """Views that steps on images leave out until the own view's weight is chosen: one in ``RESERVED`` of those with
+    labels. None where nothing is to be chosen, or nothing would be left to learn from."""
+    no_images = _end_of_images(model, config) <= config.frozen_encoder_fraction
+    if no_images or len(scene.queries) < RESERVED or not model.weigh_own_view(1.0):
+        return ()
+    return scene.queries[::RESERVED]
+
+
+def _fit_own_view(
+    model: LearnedField, scene: _Scene, config: FinetuneConfig, reserved: Sequence[int]
+) -> dict[str, float]:
+    """Choose how much the own image counts beside the other views: what gives the best accuracy in the views that the
+    encoder has not seen yet. Held-out blocks cannot say it: what surrounds them was trained on.
+
+    Returns:
+        The choice, and the accuracies in those views: with it, with a vote among others, and of the own image alone.
+    """
+    generator = torch.Generator().manual_seed(config.seed)
+    model.eval()
+    with torch.inference_mode():
+        views = {i: scene.train[i] for i in reserved}
+        rays = list(_rays_of(model, scene, views, config, FACTOR_RAYS // len(reserved), generator))
+        alone = _score(model, [replace(part, sources=part.sources.select(torch.tensor([-1]))) for part in rays])
+        scores: dict[float, tuple[float, float]] = {}
+        for factor in OWN_VIEW_FACTORS:
+            model.weigh_own_view(factor)
+            scores[factor] = _score(model, rays)
+        best = max(scores, key=lambda factor: scores[factor][1])  # the smallest of equal ones
+        model.weigh_own_view(best)
+    model.train()
+    return {"factor": best, "accuracy": scores[best][1], "as_one_vote": scores[1.0][1], "own_image": alone[1]}
+
+
+def _score(model: LearnedField, parts: Sequence[_ViewRays]) -> tuple[float, float]:
+    """Mean loss of the views, infinite without any, and accuracy of their rays."""
+    losses: list[float] = []
+    right, counted = 0, 0
+    for part in parts:
+        render, _ = model.render_samples(part.rays, part.z, part.sources)
+        losses.append(float(semantic_loss(render.logits, part.targets.channel)))
+        right += int(((render.logits.argmax(1) == part.targets.channel) & render.known).sum())
+        counted += len(part.z)
     return float(np.mean(losses)) if losses else float("inf"), right / max(counted, 1)
 
 
-def _looking_on(scene: _Scene, view: int, *, own: bool) -> torch.Tensor:
-    """Indices (k,) of the views that see most of a view, without it; or of it alone."""
-    if own:
-        return torch.tensor([view])
+def _looking_on(scene: _Scene, view: int) -> list[int]:
+    """Numbers of the other views that see most of a view."""
     order = scene.overlap[view].argsort(descending=True, stable=True)
-    return order[order != view][:HELD_OUT_SOURCES]
+    return order[order != view][:HELD_OUT_SOURCES].tolist()

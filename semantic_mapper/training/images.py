@@ -21,6 +21,7 @@ from semantic_mapper.training.appearance import vary_appearance
 from semantic_mapper.training.losses import Loss, guess_loss, image_loss
 from semantic_mapper.training.rooms import RoomViews
 from semantic_mapper.training.views import (
+    LabelledView,
     cropped_view,
     jitter_colours,
     mirrored_view,
@@ -94,6 +95,22 @@ def draw_images(
                 crop, size, down, across = torch.rand(4, generator=generator).tolist()
                 view = cropped_view(view, 0.5 + 0.5 * size, down, across) if crop < config.cropped else view
             views.append(view)
+    return image_batch(views, config, generator, device, colours_only=colours_only)
+
+
+def image_batch(
+    views: Sequence[LabelledView],
+    config: ImageStepConfig,
+    generator: torch.Generator,
+    device: torch.device,
+    *,
+    colours_only: bool,
+) -> ImageBatch:
+    """These views as a step is given them, appearance and depth varied as ``config`` says.
+
+    Args:
+        colours_only: None of them with depth.
+    """
     stacked = stack_sources(views, with_labels=True)
     assert stacked.channel is not None
     withheld = 1.0 if colours_only else 0.0 if config.frozen_colours else config.depth_dropout
@@ -130,11 +147,16 @@ def encoder_for_images(model: LearnedField) -> ImageEncoder:
         ConfigError: a kind of field that says nothing of an image by itself.
     """
     encoder = model.image_encoder
-    # The class is asked: the field itself would need views to encode, and there are none yet where a run is checked.
-    if encoder is None or type(model).source_logits is LearnedField.source_logits:
+    if encoder is None or not classifies_images(model):
         raise ConfigError(
             f"a field of kind '{model.kind}' does not classify single images, so it can only learn from rays: set "
             "share = 0 under [images] in the file that --config names (recipes/cpu-rays.toml does), and take over an "
             "image encoder that has learned already with --encoder"
         )
     return encoder
+
+
+def classifies_images(model: LearnedField) -> bool:
+    """Whether a field of this kind says anything of single images."""
+    # The class is asked: the field itself would need views to encode, and there are none yet where a run is checked.
+    return type(model).source_logits is not LearnedField.source_logits

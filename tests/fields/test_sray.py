@@ -190,9 +190,9 @@ def test_published_parity_runs_and_differs_from_the_paper():
     z = torch.tensor([[1.9, 2.0, 2.1]]).expand(len(rays.origin), 3)
     thin, _ = published.render_samples(rays, z, encoded)
     assert torch.isfinite(thin.logits).all()
-    for name, tensor in paper.state_dict().items():
-        if published.state_dict()[name].shape == tensor.shape:
-            tensor.copy_(published.state_dict()[name])
+    for name, theirs in published.state_dict().items():
+        if paper.state_dict()[name].shape == theirs.shape:
+            paper.state_dict()[name].copy_(theirs)
     other, _ = paper.render_samples(rays, z, encoded)
     assert not torch.allclose(thin.opacity, other.opacity, atol=0.01)  # alpha without the interval's length
 

@@ -90,6 +90,21 @@ def test_it_renders_what_the_reference_renders(changes: dict[str, Any], guided: 
     assert_equal(*render_both(field, labelled(wall_sources([*POSES, *BEHIND])), rays, z), atol)
 
 
+@pytest.mark.parametrize("factor", [0.25, 8.0, 1e3])
+def test_the_own_view_counts_as_much_more(factor: float):
+    field = random_field()
+    views = labelled(wall_sources([*POSES, *BEHIND]))
+    for pose in (POSES[1], pose_at(0.2, 0.3)):  # of a source view, and of none
+        rays = wall_rays(pose, step=3)
+        z = sample_guided(rays, SamplingConfig())
+        field.own_view_factor.fill_(1.0)
+        plain = render_both(field, views, rays, z)[0].logits
+        field.own_view_factor.fill_(factor)
+        fast, reference = render_both(field, views, rays, z)
+        assert_equal(fast, reference)
+        assert torch.equal(fast.logits, plain) == (pose is not POSES[1])
+
+
 @pytest.mark.parametrize(
     ("feature_dim", "heads"),
     [(4, 1), (4, 2), (12, 3), (16, 1), (20, 4), (24, 3), (28, 1), (32, 2), (32, 4), (32, 8), (36, 2), (64, 8)],

@@ -109,6 +109,38 @@ def test_the_token_of_the_query_s_own_view_says_so():
     assert tokens.cues[2, ..., -1].min() == 1 and tokens.cues[[0, 1, 3], ..., -1].max() == 0
 
 
+def test_the_factor_of_the_own_view_leads_from_the_vote_to_the_own_image_alone():
+    field = small_field()
+    encoded = constant_features(field.encode(wall_sources(POSES[:3])), [1.0, -2.0, 0.5])
+    rays = wall_rays(POSES[1], step=31)
+    said = field.source_logits(encoded)
+    assert said is not None
+    others, own = said[[0, 2], :, 5, 5].mean(0), said[1, :, 5, 5]
+    seen = contextual_space(rays, on_wall(rays), encoded).valid.all(2).all(0)
+    assert seen.sum() > 10
+    for factor, share in ((1.0, 1 / 3), (4.0, 4 / 6), (1e6, 1.0)):
+        field.own_view_factor.fill_(factor)
+        logits = field.render_samples(rays, on_wall(rays), encoded)[0].logits[seen]
+        wanted = (share * own + (1 - share) * others).expand_as(logits)
+        # The views do not see the wall quite alike, so that their votes are not quite 1 / 3 each.
+        assert (logits - wanted).abs().max() < (1e-4 if share == 1 else 0.05) * (others - own).abs().max()
+
+
+def test_a_file_keeps_the_factor_of_the_own_view_and_one_without_has_1(tmp_path: Path):
+    field = small_field()
+    field.own_view_factor.fill_(4.0)
+    path = tmp_path / "new.safetensors"
+    save_checkpoint(Checkpoint(field), path, half=True)
+    new = load_checkpoint(path).model
+    assert isinstance(new, SRay) and new.own_view_factor == 4
+    with safe_open(path, framework="pt") as stored:
+        metadata = dict(stored.metadata() or {})
+    tensors = {name: t for name, t in load_file(path).items() if "own_view_factor" not in name}
+    save_file(tensors, path, metadata)
+    old = load_checkpoint(path).model
+    assert isinstance(old, SRay) and old.own_view_factor == 1
+
+
 def test_a_view_whose_sight_is_blocked_has_no_token():
     field = small_field()
     views = wall_sources(POSES)

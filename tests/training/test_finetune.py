@@ -14,6 +14,7 @@ from semantic_mapper.fields.registry import build_field
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.finetune import FinetuneConfig, finetune
+from semantic_mapper.training.losses import image_loss
 from semantic_mapper.training.select import Candidate, candidate_from_frame, choose_keyframes
 from semantic_mapper.training.uncertainty import LEAST, with_uncertainty
 from semantic_mapper.training.views import stack_sources, view_from_frame
@@ -36,7 +37,14 @@ def test_finetuning_improves_held_out_rays_and_says_what_it_did():
 
 def start_loss(start):
     """Held-out loss of the weights that a finetuning starts from: no learning, one look."""
-    still = config(steps=1, linear_probe_steps=0, learning_rate=0.0, final_learning_rate=0.0, weight_decay=0.0)
+    still = config(
+        steps=1,
+        linear_probe_steps=0,
+        learning_rate=0.0,
+        final_learning_rate=0.0,
+        weight_decay=0.0,
+        image_fraction=0.0,
+    )
     return finetune(tiny_frames(3), ROOMS, start, still).recipe["held_out_loss"]
 
 
@@ -103,12 +111,12 @@ def running_means(model: torch.nn.Module) -> dict[str, torch.Tensor]:
 
 def test_norms_live_in_a_field_of_which_nothing_is_trained_and_rest_in_any_other():
     start = calibrated_field()
-    rested = running_means(finetune(tiny_frames(2), ROOMS, start, config(steps=3)).model)
+    rested = running_means(finetune(tiny_frames(2), ROOMS, start, config(steps=3, image_fraction=0.0)).model)
     assert rested and all(torch.equal(rested[name], t) for name, t in running_means(start).items())
 
     frames = tiny_frames(2)
     lived = finetune(
-        frames, ROOMS, tiny_field(), config(steps=3, held_out_fraction=0.0)
+        frames, ROOMS, tiny_field(), config(steps=3, held_out_fraction=0.0, bfloat16=False)
     ).model  # the last weights are kept
     means = running_means(lived)
     calibrate(lived.encoder, stack_sources([view_from_frame(f, ROOMS, 96) for f in frames]))
@@ -173,6 +181,82 @@ def test_an_encoder_that_has_learned_nothing_yet_does_not_rest():
         config_ = config(steps=3, frozen_encoder_fraction=1.0, held_out_fraction=0.0)  # the last weights are kept
         fitted = dict(finetune(tiny_frames(3), ROOMS, start, config_).model.named_parameters())
         assert all(torch.equal(fitted[n], p) for n, p in start.named_parameters() if n.startswith("encoder.")) == rests
+
+
+def test_steps_on_images_teach_the_own_image_and_adapt_the_norms():
+    frames, start = tiny_frames(4), calibrated_field()
+    kept = config(steps=30, held_out_fraction=0.0, image_fraction=1.0)  # the last weights are kept
+    fitted = finetune(frames, ROOMS, start, kept).model
+    views = stack_sources([view_from_frame(f, ROOMS, 96) for f in frames])
+    channel = torch.stack([view_from_frame(f, ROOMS, 96).channel for f in frames])
+    losses = []
+    for field in (start, fitted):
+        with torch.inference_mode():
+            logits = field.eval().source_logits(field.encode(views))
+        assert logits is not None
+        losses.append(float(image_loss(logits, channel, 0.0)))
+    assert losses[1] < 0.7 * losses[0]
+    assert any(not torch.equal(running_means(fitted)[n], t) for n, t in running_means(start).items())
+
+
+def test_steps_on_images_are_the_first_ones_behind_a_resting_encoder(monkeypatch: pytest.MonkeyPatch):
+    made: list[str] = []
+
+    def noted(name, draw):
+        def step(*given):
+            made.append(name)
+            return draw(*given)
+
+        return step
+
+    for name in ("_draw_loss", "_draw_image_loss"):
+        monkeypatch.setattr(finetuning, name, noted(name, getattr(finetuning, name)))
+    rest = {"frozen_encoder_fraction": 0.2, "image_fraction": 0.45, "patience": 0}
+    finetune(tiny_frames(3), ROOMS, calibrated_field(), config(steps=10, **rest))
+    assert made == ["_draw_loss"] * 2 + ["_draw_image_loss"] * 4 + ["_draw_loss"] * 4
+    made.clear()
+    finetune(tiny_frames(3), ROOMS, calibrated_field(), config(steps=3, encoder_rate=0.0))
+    assert made == ["_draw_loss"] * 3, "an encoder that is to stay what it is learns no images"
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_the_own_image_counts_as_much_as_views_that_were_left_out_say(reliable: bool, monkeypatch: pytest.MonkeyPatch):
+    """Of those views, either the own image alone makes sense or the others do; what does not is sure of itself."""
+    rays_of, generator = finetuning._rays_of, torch.Generator().manual_seed(0)
+
+    def told(*given):
+        for part in rays_of(*given):
+            feature = part.sources.feature
+            noise = 9 * torch.randn(feature.shape, generator=generator)
+            own = torch.arange(len(feature)) == len(feature) - 1
+            feature = torch.where((own == reliable)[:, None, None, None], feature, noise)
+            unlabelled = torch.full_like(part.sources.channel, -1)
+            yield dataclasses.replace(
+                part, sources=dataclasses.replace(part.sources, feature=feature, channel=unlabelled)
+            )
+
+    monkeypatch.setattr(finetuning, "_rays_of", told)
+    still = {"learning_rate": 0.0, "final_learning_rate": 0.0, "weight_decay": 0.0}
+    last = {"steps": 4, "held_out_fraction": 0.0}  # the last weights are kept
+    result = finetune(tiny_frames(4), ROOMS, calibrated_field(), config(**last, **still))
+    chosen = result.recipe["own_view"]
+    assert (chosen["factor"] > 1) == reliable
+    assert (chosen["own_image"] > chosen["as_one_vote"]) == reliable
+
+
+def test_views_that_choose_the_own_image_s_weight_are_learned_from_only_then(monkeypatch: pytest.MonkeyPatch):
+    left_out: list[int] = []
+    draw = finetuning._draw_image_loss
+
+    def noted(model, views, *given):
+        left_out.append(8 - len(views))
+        return draw(model, views, *given)
+
+    monkeypatch.setattr(finetuning, "_draw_image_loss", noted)
+    finetune(tiny_frames(8), ROOMS, calibrated_field(), config(steps=8, image_fraction=1.0, patience=0))
+    assert left_out == [2] * 4 + [0] * 4
+    kept = finetune(tiny_frames(3), ROOMS, calibrated_field(), config(steps=2, image_fraction=1.0)).recipe
+    assert kept["own_view"] == {}, "too few to leave one out"
 
 
 def test_doubt_is_what_the_images_alone_give_to_other_classes_than_the_right_one():
@@ -258,19 +342,23 @@ class FakeTime:
         self.now = 100.0
         self.looks = 0
         monkeypatch.setattr(finetuning.time, "monotonic", lambda: self.now)
-        evaluate, draw = finetuning._evaluate, finetuning._draw_loss
+        evaluate = finetuning._evaluate
 
         def look(*given):
             self.now += 2.0
             self.looks += 1
             return evaluate(*given)
 
-        def step(*given):
-            self.now += 1.0
-            return draw(*given)
+        def timed(draw):
+            def step(*given):
+                self.now += 1.0
+                return draw(*given)
+
+            return step
 
         monkeypatch.setattr(finetuning, "_evaluate", look)
-        monkeypatch.setattr(finetuning, "_draw_loss", step)
+        for draw in ("_draw_loss", "_draw_image_loss"):
+            monkeypatch.setattr(finetuning, draw, timed(getattr(finetuning, draw)))
 
 
 def test_a_time_budget_holds_all_of_it_the_last_look_included(monkeypatch: pytest.MonkeyPatch):

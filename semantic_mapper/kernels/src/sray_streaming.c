@@ -54,6 +54,7 @@ typedef struct {
     double min_depth;          /* metres before a source camera */
     double background;         /* metres to what a ray meets that meets nothing */
     double own_radius;         /* metres from the ray's origin within which a camera is the query's own */
+    double own_view_factor;    /* of the own view's weight, of tokens at the surface */
 } Settings;
 
 typedef struct {
@@ -754,10 +755,12 @@ static int64_t blend_views(Scratch *s, float *colour) {
 }
 
 /* The same of tokens at the surface, which stay apart until they have been through `semantic`; as many as there are. */
-static int64_t weigh_views(Scratch *s, int64_t count, float *colour) {
+static int64_t weigh_views(Scratch *s, const Settings *set, int64_t count, float *colour) {
     const int64_t C = s->channels;
     float sum = 0, colour_sum = 0;
     memset(colour, 0, 3 * sizeof(float));
+    for (int64_t i = 0; i < count; i++)
+        if (s->tokens[i * s->stride + C + OWN] > 0) s->semantic_score[i] *= (float)set->own_view_factor;
     for (int64_t i = 0; i < count; i++) sum += s->semantic_score[i], colour_sum += s->colour_score[i];
     for (int64_t i = 0; i < count; i++) {
         const float *row = s->tokens + i * s->stride;
@@ -824,7 +827,7 @@ static void render_ray(const RenderArguments *a, Scratch *s, int64_t r) {
     if (w->cross.qkv.shape[0] > 0) attend_across_views(s, &w->cross, set, count);
     score_views(s, w, set, count);
     float *colour = a->out.colour.data + 3 * r;
-    const int64_t kept = set->at_surface ? weigh_views(s, count, colour) : blend_views(s, colour);
+    const int64_t kept = set->at_surface ? weigh_views(s, set, count, colour) : blend_views(s, colour);
     composite_semantics(s, w, kept, a->out.feature.data + r * C);
 }
 
