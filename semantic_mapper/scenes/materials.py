@@ -8,7 +8,7 @@ rooms: a door with exactly the cabinet's wood.
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -156,20 +156,24 @@ class Palette:
 
     def table(self) -> MaterialTable:
         """All materials as arrays."""
-        items = self._materials
-        return MaterialTable(
-            pattern=np.array([int(m.pattern) for m in items], np.int64),
-            color_a=np.array([m.color_a for m in items], np.float64),
-            color_b=np.array([m.color_b for m in items], np.float64),
-            scale_m=np.array([m.scale_m for m in items], np.float64),
-            seed=np.array([m.seed for m in items], np.int64),
-            emission=np.array([m.emission for m in items], np.float64),
-            gloss=np.array([m.gloss for m in items], np.float64),
-            mirror=np.array([m.mirror for m in items], np.float64),
-        )
+        return material_table(self._materials)
 
 
-def _hsv(hue: float, saturation: float, value: float) -> Color:
+def material_table(items: Sequence[Material]) -> MaterialTable:
+    """Materials as arrays; a primitive's ``material`` counts them."""
+    return MaterialTable(
+        pattern=np.array([int(m.pattern) for m in items], np.int64),
+        color_a=np.array([m.color_a for m in items], np.float64),
+        color_b=np.array([m.color_b for m in items], np.float64),
+        scale_m=np.array([m.scale_m for m in items], np.float64),
+        seed=np.array([m.seed for m in items], np.int64),
+        emission=np.array([m.emission for m in items], np.float64),
+        gloss=np.array([m.gloss for m in items], np.float64),
+        mirror=np.array([m.mirror for m in items], np.float64),
+    )
+
+
+def display_hsv(hue: float, saturation: float, value: float) -> Color:
     """Display HSV -> linear RGB."""
     r, g, b = colorsys.hsv_to_rgb(hue % 1.0, min(max(saturation, 0.0), 1.0), min(max(value, 0.0), 1.0))
     return r**2.2, g**2.2, b**2.2
@@ -181,22 +185,22 @@ def _scaled(color: Color, factor: float) -> Color:
 
 def _wood(d: Draw) -> Material:
     hue, saturation, value = d.wood()
-    a = _hsv(hue, saturation, value)
-    b = _hsv(hue, saturation * 1.1, value * d.uniform(0.55, 0.85))
+    a = display_hsv(hue, saturation, value)
+    b = display_hsv(hue, saturation * 1.1, value * d.uniform(0.55, 0.85))
     return Material(Pattern.WOOD, a, b, d.uniform(0.015, 0.05), d.seed(), gloss=d.uniform(0.0, 0.25))
 
 
 def _parquet(d: Draw) -> Material:
     hue, saturation, value = d.wood()
-    a = _hsv(hue, saturation, value)
-    b = _hsv(hue, saturation * 1.1, value * d.uniform(0.5, 0.8))
+    a = display_hsv(hue, saturation, value)
+    b = display_hsv(hue, saturation * 1.1, value * d.uniform(0.5, 0.8))
     return Material(Pattern.PLANKS, a, b, d.uniform(0.07, 0.18), d.seed(), gloss=d.uniform(0.0, 0.35))
 
 
 def _fabric(d: Draw) -> Material:
     hue, saturation, value = d.hue(), d.uniform(0.0, 0.7), d.uniform(0.2, 0.9)
-    a = _hsv(hue, saturation, value)
-    b = _hsv(hue + float(d.rng.normal(0, 0.04)), saturation * 0.8, value * d.uniform(0.4, 0.9))
+    a = display_hsv(hue, saturation, value)
+    b = display_hsv(hue + float(d.rng.normal(0, 0.04)), saturation * 0.8, value * d.uniform(0.4, 0.9))
     pattern = d.one_of(Pattern.WEAVE, Pattern.WEAVE, Pattern.STRIPES, Pattern.CHECKER, Pattern.PRINT)
     scale = d.uniform(0.008, 0.02) if pattern == Pattern.WEAVE else d.uniform(0.04, 0.15)
     return Material(pattern, a, b, scale, d.seed())
@@ -204,37 +208,37 @@ def _fabric(d: Draw) -> Material:
 
 def _paint(d: Draw) -> Material:
     white = d.uniform(0, 1) < 0.4
-    a = _hsv(d.hue(), d.uniform(0, 0.08) if white else d.uniform(0.1, 0.6), d.uniform(0.55, 0.97))
+    a = display_hsv(d.hue(), d.uniform(0, 0.08) if white else d.uniform(0.1, 0.6), d.uniform(0.55, 0.97))
     return Material(Pattern.PLAIN, a, _scaled(a, 0.85), d.uniform(0.1, 0.5), d.seed(), gloss=d.uniform(0, 0.3))
 
 
 def _wall_paint(d: Draw) -> Material:
-    a = _hsv(d.hue(), d.uniform(0.0, 0.35), d.uniform(0.55, 0.95))
+    a = display_hsv(d.hue(), d.uniform(0.0, 0.35), d.uniform(0.55, 0.95))
     pattern = d.one_of(Pattern.PLAIN, Pattern.PLAIN, Pattern.PLAIN, Pattern.STRIPES, Pattern.PRINT)
     b = _scaled(a, 0.88 if pattern == Pattern.PLAIN else d.uniform(0.7, 0.92))
     return Material(pattern, a, b, d.uniform(0.08, 0.4), d.seed())
 
 
 def _metal(d: Draw) -> Material:
-    a = _hsv(d.uniform(0.5, 0.7), d.uniform(0, 0.1), d.uniform(0.25, 0.85))
+    a = display_hsv(d.uniform(0.5, 0.7), d.uniform(0, 0.1), d.uniform(0.25, 0.85))
     return Material(Pattern.PLAIN, a, _scaled(a, 0.8), 0.05, d.seed(), gloss=0.6)
 
 
 def _ceramic(d: Draw) -> Material:
-    a = _hsv(d.hue(), float(d.rng.choice([0.02, 0.05, 0.25])), d.uniform(0.75, 0.97))
+    a = display_hsv(d.hue(), float(d.rng.choice([0.02, 0.05, 0.25])), d.uniform(0.75, 0.97))
     return Material(Pattern.PLAIN, a, _scaled(a, 0.93), 0.2, d.seed(), gloss=0.5)
 
 
 def _tile(d: Draw) -> Material:
-    a = _hsv(d.hue(), d.uniform(0.0, 0.45), d.uniform(0.4, 0.95))
+    a = display_hsv(d.hue(), d.uniform(0.0, 0.45), d.uniform(0.4, 0.95))
     b = _scaled(a, d.uniform(0.4, 0.8))
     pattern = d.one_of(Pattern.TILES, Pattern.TILES, Pattern.CHECKER)
     return Material(pattern, a, b, d.uniform(0.12, 0.4), d.seed(), gloss=d.uniform(0.1, 0.4))
 
 
 def _print(d: Draw) -> Material:
-    a = _hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
-    b = _hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
+    a = display_hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
+    b = display_hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
     pattern = d.one_of(Pattern.PRINT, Pattern.PRINT, Pattern.STRIPES, Pattern.CHECKER)
     return Material(pattern, a, b, d.uniform(0.06, 0.25), d.seed())
 
@@ -246,43 +250,43 @@ def _screen(d: Draw) -> Material:
 
 
 def _books(d: Draw) -> Material:
-    a = _hsv(d.hue(), d.uniform(0.2, 0.8), d.uniform(0.3, 0.9))
-    b = _hsv(d.hue(), d.uniform(0.2, 0.8), d.uniform(0.3, 0.9))
+    a = display_hsv(d.hue(), d.uniform(0.2, 0.8), d.uniform(0.3, 0.9))
+    b = display_hsv(d.hue(), d.uniform(0.2, 0.8), d.uniform(0.3, 0.9))
     return Material(Pattern.SPINES, a, b, d.uniform(0.025, 0.05), d.seed())
 
 
 def _plant(d: Draw) -> Material:
-    a = _hsv(d.uniform(0.22, 0.4), d.uniform(0.4, 0.8), d.uniform(0.3, 0.7))
+    a = display_hsv(d.uniform(0.22, 0.4), d.uniform(0.4, 0.8), d.uniform(0.3, 0.7))
     return Material(Pattern.PRINT, a, _scaled(a, 0.35), d.uniform(0.03, 0.06), d.seed())
 
 
 def _daylight(d: Draw) -> Material:
     """What stands outside a window: bright, or dim as at dusk."""
-    a = _hsv(d.uniform(0.5, 0.65), d.uniform(0.0, 0.4), d.uniform(0.3, 0.95))
-    b = _hsv(d.uniform(0.2, 0.6), d.uniform(0.0, 0.4), d.uniform(0.25, 0.9))
+    a = display_hsv(d.uniform(0.5, 0.65), d.uniform(0.0, 0.4), d.uniform(0.3, 0.95))
+    b = display_hsv(d.uniform(0.2, 0.6), d.uniform(0.0, 0.4), d.uniform(0.25, 0.9))
     lit = d.uniform(0.0, 0.25) if d.uniform(0, 1) < 0.45 else d.uniform(0.25, 0.9)
     return Material(Pattern.PRINT, a, b, d.uniform(0.2, 0.6), d.seed(), emission=lit, gloss=0.5)
 
 
 def _lampshade(d: Draw) -> Material:
-    a = _hsv(d.uniform(0.05, 0.17), d.uniform(0.0, 0.4), d.uniform(0.8, 1.0))
+    a = display_hsv(d.uniform(0.05, 0.17), d.uniform(0.0, 0.4), d.uniform(0.8, 1.0))
     return Material(Pattern.WEAVE, a, _scaled(a, 0.9), 0.02, d.seed(), emission=d.uniform(0.0, 0.8))
 
 
 def _dark(d: Draw) -> Material:
-    a = _hsv(d.hue(), d.uniform(0, 0.2), d.uniform(0.05, 0.25))
+    a = display_hsv(d.hue(), d.uniform(0, 0.2), d.uniform(0.05, 0.25))
     return Material(Pattern.PLAIN, a, _scaled(a, 0.6), 0.2, d.seed(), gloss=0.6)
 
 
 def _object(d: Draw) -> Material:
-    a = _hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
-    b = _hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
+    a = display_hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
+    b = display_hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
     pattern = d.one_of(Pattern.PLAIN, Pattern.STRIPES, Pattern.WEAVE)
     return Material(pattern, a, _scaled(a, 0.8) if pattern == Pattern.PLAIN else b, d.uniform(0.02, 0.08), d.seed())
 
 
 def _mirror(d: Draw) -> Material:
-    a = _hsv(d.uniform(0.4, 0.6), 0.05, 0.6)
+    a = display_hsv(d.uniform(0.4, 0.6), 0.05, 0.6)
     return Material(Pattern.PLAIN, a, a, 0.5, d.seed(), gloss=0.3, mirror=d.uniform(0.75, 0.92))
 
 
