@@ -62,7 +62,13 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
         frames = (frame for _, frame in zip(range(total), log, strict=False))
         with frame_progress("score", total) as bar:
             found = evaluate_frames(
-                frames, predictors, stream_labels, bundle.checkpoint.label_set, stamps, on_frame=bar.set
+                frames,
+                predictors,
+                stream_labels,
+                bundle.checkpoint.label_set,
+                stamps,
+                on_frame=bar.set,
+                voxel_map=bundle.pipeline.voxel_map,
             )
         return {**asdict(found), "damaged": len(log.errors), "weights": bundle.weights_path.name}
 

@@ -17,7 +17,8 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper, make_field
 from semantic_mapper.mapping.pipeline import MappingPipeline
-from semantic_mapper.replay.evaluate.truth import TruthMapper
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.training.baselines import UNetBaseline, UNetConfig, WarpBaseline
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import Float32, PosedFrame, UInt8
@@ -37,6 +38,8 @@ class Opinion:
     label: UInt8
     confidence: Float32 | None = None
 
+
+MAP = "points of the map"  # the method whose figures are those of the fused map
 
 Predictor = Callable[[PosedFrame], Opinion]
 
@@ -116,8 +119,14 @@ def evaluate_frames(
     label_set: LabelSet,
     exclude_stamps: frozenset[int],
     on_frame: Callable[[int], None] | None = None,
+    voxel_map: VoxelMap | None = None,
 ) -> Evaluation:
-    """Run every predictor over every frame; frames in ``exclude_stamps`` are predicted but not scored."""
+    """Run every predictor over every frame; frames in ``exclude_stamps`` are predicted but not scored.
+
+    ``voxel_map``, where it is given and one of the predictors fills it, is scored in the end as the method ``MAP``: its
+    points against the majority of the labels of the frames with depth that see them.
+    """
+    surface = SurfaceTruth(stream_labels)
     truth_mapper = TruthMapper(stream_labels, label_set)
     confusions = {name: ConfusionMatrix(label_set) for name in predictors}
     confidences = {name: ConfidenceScores() for name in predictors}
@@ -131,6 +140,8 @@ def evaluate_frames(
             elif frame.label is not None:
                 truth = truth_mapper.to_map_ids(frame.label, where)
                 scored += 1
+                if voxel_map is not None:
+                    surface.add(frame)
                 labelled = frame.label != stream_labels.ignore_id
                 strange = labelled & (truth == label_set.ignore_id)
                 for name, opinion in predicted.items():
@@ -143,6 +154,16 @@ def evaluate_frames(
             _log.error("frame_refused", seq=frame.seq, reason=str(error))
         if on_frame is not None:
             on_frame(index + 1)
+    if voxel_map is not None:
+        points = voxel_map.points()
+        labels = surface.labels_at(points.xyz)
+        labelled = labels != stream_labels.ignore_id
+        if labelled.any():
+            truth, answer = truth_mapper.to_map_ids(labels, MAP), points.label
+            confusions[MAP], confidences[MAP] = ConfusionMatrix(label_set), ConfidenceScores()
+            confusions[MAP].update(truth, answer, MAP)
+            strange, voted = truth == label_set.ignore_id, labelled & (answer != label_set.ignore_id)
+            confidences[MAP].update(points.confidence[voted], (answer == truth)[voted], strange[voted])
     methods = {
         name: asdict(matrix.metrics())
         | {"ece": confidences[name].calibration.ece, "open_set_auroc": confidences[name].open_set_auroc}

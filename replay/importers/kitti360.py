@@ -1,12 +1,15 @@
-"""KITTI-360: one drive, its two rectified perspective cameras, without depth.
+"""KITTI-360: one drive, its two rectified perspective cameras, and the depth that its laser scanner gives them.
 
 The layout is that of https://www.cvlibs.net/datasets/kitti-360/documentation.php ("Folder Structure", "Calibration",
 "Camera Poses"): under the root, ``calibration/perspective.txt`` (``P_rect_0x`` 3x4, ``S_rect_0x`` width height),
 ``data_2d_raw/DRIVE/image_0x/data_rect/NNNNNNNNNN.png`` and ``image_0x/timestamps.txt`` (a row a frame),
 ``data_poses/DRIVE/cam0_to_world.txt`` (frame number and the 16 numbers of ``T_world_camera`` of the rectified left
 camera; not every frame has one), and, for drives that are labelled,
-``data_2d_semantics/train/DRIVE/image_0x/semantic/NNNNNNNNNN.png`` (uint8 ids). DRIVE is ``2013_05_28_drive_0000_sync``
-and the like; give the root where it holds one, else ``data_2d_raw/DRIVE`` itself.
+``data_2d_semantics/train/DRIVE/image_0x/semantic/NNNNNNNNNN.png`` (uint8 ids). Depth comes from
+``data_3d_raw/DRIVE/velodyne_points/data/NNNNNNNNNN.bin`` (float32 x y z reflectance a point, in the scanner's axes),
+where it is there, by way of ``calibration/calib_cam_to_velo.txt`` (3x4, unrectified left camera -> scanner) and
+``R_rect_00``. The scanner reaches 2 degrees above the horizon; its scans are not corrected for the car's motion.
+DRIVE is ``2013_05_28_drive_0000_sync`` and the like; give the root where it holds one, else ``data_2d_raw/DRIVE``.
 
 Class ids, names and colours are those of ``kitti360scripts/helpers/labels.py`` in
 https://github.com/autonomousvision/kitti360Scripts, but for its category "void", which is read as unknown.
@@ -21,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from semantic_mapper.errors import FrameError, ImportSourceError, LabelError
+from semantic_mapper.geometry import check_pose, invert_pose, transform
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.replay.importers.base import (
     BadFrameError,
@@ -31,12 +35,13 @@ from semantic_mapper.replay.importers.base import (
     check_frame_pose,
     image_size_must_be,
     numbered_files,
+    read_bytes,
     read_lines,
     read_plane,
     read_rgb,
 )
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame, UInt8
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 
 CAMERAS = ("image_00", "image_01")
 NOMINAL_HZ = 10.0  # of drives whose timestamps.txt is not there
@@ -48,6 +53,8 @@ _CLASSES = (  # from id 7 on
     "gate be9999|stop 96785a|smallpole 999999|lamp 004040|trash bin 0080c0|vending machine 804000|box 404080"
 ).split("|")
 _FIRST_ID = 7
+BEAM_STEP_RAD = (np.radians(0.18), np.radians(0.43))  # between two beams of the scanner (HDL-64E) across and upwards
+MIN_SCAN_M = 0.5
 _VOID = (*range(1, _FIRST_ID), 42, 43, 44, 255)  # ego vehicle, static, ..., unknown object, and license plate (-1)
 
 
@@ -72,8 +79,6 @@ class Kitti360Recording:
     """
 
     def __init__(self, folder: Path, options: ImportOptions) -> None:
-        self.notices = ["the data set has no depth images: frames come without depth"]
-        self.depth_scale = DepthScale(1000.0, convention="the data set has no depth images")
         root, drive = find_drive(folder)
         self._drive_folder = root / "data_2d_raw" / drive
         self._semantics = root / "data_2d_semantics" / "train" / drive
@@ -88,6 +93,12 @@ class Kitti360Recording:
         values = _read_calibration(calibration)
         for name in self._cameras:
             self._intrinsics[name], self._T_cam0_camera[name] = rectified_camera(values, name[-2:], calibration)
+        self._scans = root / "data_3d_raw" / drive / "velodyne_points" / "data"
+        self._T_cam0_scanner = _scanner_pose(root / "calibration", values) if self._scans.is_dir() else None
+        self.notices: list[str] = []
+        if self._T_cam0_scanner is None:
+            self.notices.append(f"no laser scans: {self._scans} is missing; frames come without depth")
+        self.depth_scale = DepthScale(1000.0, convention="depth comes from laser scans, in metres")
         self._poses_file = root / "data_poses" / drive / "cam0_to_world.txt"
         self._poses = self._read_poses()
         self._stamps = self._read_stamps(options.frame_hz)
@@ -131,7 +142,7 @@ class Kitti360Recording:
             seq=index,
             camera_id=camera,
             rgb=rgb,
-            depth_m=None,
+            depth_m=self._depth(index, camera),
             label=label,
             intrinsics=intrinsics,
             T_world_camera=pose,
@@ -143,6 +154,14 @@ class Kitti360Recording:
             raise BadFrameError(self._poses_file, f"has no pose for image {index}; the drive has poses where it moved")
         line, pose = self._poses[index]
         return check_frame_pose(pose, self._poses_file, line) @ self._T_cam0_camera[camera]
+
+    def _depth(self, index: int, camera: str) -> Float32 | None:
+        """Depth image (H, W) of the scan of a frame; None without scans, and of a frame that has none."""
+        file = self._scans / f"{index:010d}.bin"
+        if self._T_cam0_scanner is None or not file.exists():
+            return None
+        T_camera_scanner = invert_pose(self._T_cam0_camera[camera]) @ self._T_cam0_scanner
+        return depth_of_scan(read_scan(file), T_camera_scanner, self._intrinsics[camera])
 
     def _stamp(self, index: int, camera: str) -> int:
         stamps = self._stamps.get(camera)
@@ -238,6 +257,69 @@ def read_semantics(file: Path, size: tuple[int, int]) -> UInt8:
     except LabelError as error:
         raise BadFrameError(file, str(error)) from error
     return ids
+
+
+def read_scan(file: Path) -> Float64:
+    """Points (N, 3) of a scan, metres, in the scanner's axes.
+
+    Raises:
+        BadFrameError: it cannot be read, or does not hold four numbers a point.
+    """
+    try:
+        data = read_bytes(file)
+    except OSError as error:
+        raise BadFrameError(file, f"the scan cannot be read ({error.strerror or error})") from error
+    if len(data) % 16:
+        raise BadFrameError(file, f"a scan has 16 bytes a point, this one {len(data)} bytes; download it again")
+    return np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3].astype(np.float64)
+
+
+def depth_of_scan(points: Float64, T_camera_scanner: Float64, intrinsics: CameraIntrinsics) -> Float32:
+    """Depth image (H, W) of a scan, 0 where no beam went.
+
+    A point fills the pixels between its beam and the next ones, the nearest point wins: so what the camera does not see
+    but the scanner on the roof does is hidden by what stands before it.
+
+    Args:
+        points: (N, 3) in the scanner's axes.
+        T_camera_scanner: (4, 4).
+        intrinsics: Of the camera.
+    """
+    k = intrinsics
+    p = transform(T_camera_scanner, points)
+    p = p[np.isfinite(p).all(axis=1) & (p[:, 2] > MIN_SCAN_M)]
+    uv = np.rint(p[:, :2] / p[:, 2:] * (k.fx, k.fy) + (k.cx, k.cy))
+    half_u, half_v = (int(np.ceil((f * step - 1) / 2)) for f, step in zip((k.fx, k.fy), BEAM_STEP_RAD, strict=True))
+    margin = np.array((half_u, half_v))
+    inside = ((uv >= -margin) & (uv < np.array((k.width, k.height)) + margin)).all(axis=1)
+    (u, v), z = (uv[inside] + margin).astype(np.int64).T, p[inside, 2].astype(np.float32)
+    depth = np.full((k.height + 4 * half_v, k.width + 4 * half_u), np.inf, np.float32)
+    for dv in range(2 * half_v + 1):
+        for du in range(2 * half_u + 1):
+            np.minimum.at(depth, (v + dv, u + du), z)
+    depth = depth[2 * half_v : 2 * half_v + k.height, 2 * half_u : 2 * half_u + k.width]
+    return np.where(np.isfinite(depth), depth, 0).astype(np.float32)
+
+
+def _scanner_pose(calibration: Path, values: dict[str, list[float]]) -> Float64:
+    """T_cam0_scanner (4, 4): the scanner in the rectified left camera.
+
+    Raises:
+        ImportSourceError: files or lines are missing, or of another form.
+    """
+    file = calibration / "calib_cam_to_velo.txt"
+    words = [word for _, text in read_lines(file) for word in text.split()]
+    rectification = values.get("R_rect_00", [])
+    if len(rectification) != 9:
+        raise ImportSourceError(f"{calibration / 'perspective.txt'}: needs 'R_rect_00:' with 9 numbers to use scans")
+    try:
+        T_scanner_camera = np.vstack((np.array([float(w) for w in words]).reshape(3, 4), (0, 0, 0, 1)))
+        check_pose(T_scanner_camera, "calib_cam_to_velo.txt")
+    except (ValueError, FrameError) as error:
+        raise ImportSourceError(f"{file}: expected the 12 numbers of a rigid 3x4 matrix ({error})") from error
+    T_cam0_raw = np.eye(4)
+    T_cam0_raw[:3, :3] = np.array(rectification).reshape(3, 3)
+    return T_cam0_raw @ invert_pose(T_scanner_camera)
 
 
 def _read_calibration(file: Path) -> dict[str, list[float]]:

@@ -74,6 +74,9 @@ def surface_space(
 ) -> ContextualSpace:
     """M with one token a view (N = 1): its samples composited, what lies infinitely far behind them included.
 
+    The query's own view sees all of its ray, wherever that ends: its samples land on one pixel. So it outweighs the
+    others where no depth is known and their visibilities are guesses.
+
     Args:
         space: Of N samples a ray.
         weights: (R, N) compositing weights; what they leave of 1 belongs to the background.
@@ -87,7 +90,11 @@ def surface_space(
     def both(name: str) -> torch.Tensor:
         return torch.cat((getattr(space, name), getattr(far, name)), dim=2)
 
-    valid, visibility, hit = both("valid"), both("visibility"), both("hit")
+    T = sources.T_camera_world
+    origin = torch.einsum("mij,rj->mri", T[:, :3, :3], rays.origin) + T[:, None, :3, 3]
+    own = origin.square().sum(-1) < OWN_RADIUS_M**2  # (m, R)
+    valid, hit = both("valid"), both("hit")
+    visibility = torch.where(own[..., None], valid.to(hit.dtype), both("visibility"))
     seen = weight * valid  # (m, R, N + 1)
     share = seen * (visibility + LEAST_VISIBILITY) if occlusion else seen
     share = share / share.sum(2, keepdim=True).clamp_min(1e-12)
@@ -97,9 +104,6 @@ def surface_space(
 
     visible, hits = (seen * visibility).sum(2), (seen * hit).sum(2)
     geometry = mean(both("cues")[..., 2:CUES])
-    T = sources.T_camera_world
-    origin = torch.einsum("mij,rj->mri", T[:, :3, :3], rays.origin) + T[:, None, :3, 3]
-    own = origin.square().sum(-1) < OWN_RADIUS_M**2
     cues = torch.cat((torch.stack((hits, visible), dim=-1), geometry, own.to(hits.dtype)[..., None]), dim=-1)
     return ContextualSpace(
         feature=mean(both("feature"))[:, :, None],

@@ -8,7 +8,7 @@ rooms: a door with exactly the cabinet's wood.
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -168,20 +168,24 @@ class Palette:
 
     def table(self) -> MaterialTable:
         """All materials as arrays."""
-        items = self._materials
-        return MaterialTable(
-            pattern=np.array([int(m.pattern) for m in items], np.int64),
-            color_a=np.array([m.color_a for m in items], np.float64),
-            color_b=np.array([m.color_b for m in items], np.float64),
-            scale_m=np.array([m.scale_m for m in items], np.float64),
-            seed=np.array([m.seed for m in items], np.int64),
-            emission=np.array([m.emission for m in items], np.float64),
-            gloss=np.array([m.gloss for m in items], np.float64),
-            mirror=np.array([m.mirror for m in items], np.float64),
-        )
+        return material_table(self._materials)
 
 
-def _hsv(hue: float, saturation: float, value: float) -> Color:
+def material_table(items: Sequence[Material]) -> MaterialTable:
+    """Materials as arrays; a primitive's ``material`` counts them."""
+    return MaterialTable(
+        pattern=np.array([int(m.pattern) for m in items], np.int64),
+        color_a=np.array([m.color_a for m in items], np.float64),
+        color_b=np.array([m.color_b for m in items], np.float64),
+        scale_m=np.array([m.scale_m for m in items], np.float64),
+        seed=np.array([m.seed for m in items], np.int64),
+        emission=np.array([m.emission for m in items], np.float64),
+        gloss=np.array([m.gloss for m in items], np.float64),
+        mirror=np.array([m.mirror for m in items], np.float64),
+    )
+
+
+def display_hsv(hue: float, saturation: float, value: float) -> Color:
     """Display HSV -> linear RGB."""
     r, g, b = colorsys.hsv_to_rgb(hue % 1.0, min(max(saturation, 0.0), 1.0), min(max(value, 0.0), 1.0))
     return r**2.2, g**2.2, b**2.2
@@ -194,8 +198,8 @@ def _scaled(color: Color, factor: float) -> Color:
 def _wood(d: Draw) -> Material:
     """Fine or strong grain, or glued staves as of a butcher's block."""
     hue, saturation, value = d.wood()
-    a = _hsv(hue, saturation, value)
-    b = _hsv(hue, saturation * 1.15, value * d.uniform(0.4, 0.85))
+    a = display_hsv(hue, saturation, value)
+    b = display_hsv(hue, saturation * 1.15, value * d.uniform(0.4, 0.85))
     pattern = d.one_of(Pattern.WOOD, Pattern.GRAIN, Pattern.GRAIN, Pattern.GRAIN, Pattern.PLANKS)
     low, high = {Pattern.GRAIN: (0.008, 0.03), Pattern.PLANKS: (0.03, 0.06)}.get(pattern, (0.015, 0.05))
     return Material(pattern, a, b, d.uniform(low, high), d.seed(), gloss=d.uniform(0.0, 0.4))
@@ -203,15 +207,15 @@ def _wood(d: Draw) -> Material:
 
 def _parquet(d: Draw) -> Material:
     hue, saturation, value = d.wood()
-    a = _hsv(hue, saturation, value)
-    b = _hsv(hue, saturation * 1.1, value * d.uniform(0.5, 0.8))
+    a = display_hsv(hue, saturation, value)
+    b = display_hsv(hue, saturation * 1.1, value * d.uniform(0.5, 0.8))
     return Material(Pattern.PLANKS, a, b, d.uniform(0.07, 0.18), d.seed(), gloss=d.uniform(0.0, 0.35))
 
 
 def _stone(d: Draw) -> Material:
     """Granite, terrazzo, laminate: half of them nearly black; the darkest may be polished."""
     dark = d.uniform(0, 1) < 0.5
-    a = _hsv(d.hue(), d.uniform(0.0, 0.25), d.uniform(0.08, 0.3) if dark else d.uniform(0.4, 0.9))
+    a = display_hsv(d.hue(), d.uniform(0.0, 0.25), d.uniform(0.08, 0.3) if dark else d.uniform(0.4, 0.9))
     b = _scaled(a, d.uniform(0.25, 0.7) if not dark or d.uniform(0, 1) < 0.5 else d.uniform(1.5, 4.0))
     shine = d.uniform(0.05, 0.2) if dark and d.uniform(0, 1) < 0.4 else 0.0
     return Material(Pattern.STONE, a, b, d.uniform(0.02, 0.09), d.seed(), gloss=d.uniform(0.2, 0.9), mirror=shine)
@@ -219,35 +223,38 @@ def _stone(d: Draw) -> Material:
 
 def _lacquer(d: Draw) -> Material:
     """Glossy fronts, most of them in a strong colour."""
-    a = _hsv(d.hue(), d.uniform(0.55, 1.0) if d.uniform(0, 1) < 0.7 else d.uniform(0, 0.1), d.uniform(0.25, 0.9))
+    a = display_hsv(d.hue(), d.uniform(0.55, 1.0) if d.uniform(0, 1) < 0.7 else d.uniform(0, 0.1), d.uniform(0.25, 0.9))
     return Material(Pattern.PLAIN, a, _scaled(a, 0.75), d.uniform(0.1, 0.5), d.seed(), gloss=d.uniform(0.4, 1.2))
 
 
 def _steel(d: Draw) -> Material:
     value = d.uniform(0.12, 0.35) if d.uniform(0, 1) < 0.5 else d.uniform(0.4, 0.75)
-    a = _hsv(d.uniform(0.0, 1.0), d.uniform(0, 0.08), value)
+    a = display_hsv(d.uniform(0.0, 1.0), d.uniform(0, 0.08), value)
     return Material(Pattern.BRUSHED, a, _scaled(a, d.uniform(0.6, 0.85)), 0.03, d.seed(), gloss=d.uniform(0.5, 1.0))
 
 
 def _carpet(d: Draw) -> Material:
-    a = _hsv(d.hue(), d.uniform(0.0, 0.35), d.uniform(0.25, 0.8))
-    b = _hsv(d.hue(), d.uniform(0.0, 0.3), d.uniform(0.1, 0.5))
+    a = display_hsv(d.hue(), d.uniform(0.0, 0.35), d.uniform(0.25, 0.8))
+    b = display_hsv(d.hue(), d.uniform(0.0, 0.3), d.uniform(0.1, 0.5))
     return Material(Pattern.CARPET, a, b, d.uniform(0.02, 0.06), d.seed())
 
 
 def _paper(d: Draw) -> Material:
     """White sheets with text, and covers in strong colours."""
-    a = _hsv(d.hue(), d.uniform(0, 0.06), d.uniform(0.85, 1.0))
-    b = _hsv(d.hue(), d.uniform(0.0, 0.8), d.uniform(0.05, 0.4))
+    a = display_hsv(d.hue(), d.uniform(0, 0.06), d.uniform(0.85, 1.0))
+    b = display_hsv(d.hue(), d.uniform(0.0, 0.8), d.uniform(0.05, 0.4))
     if d.uniform(0, 1) < 0.4:
-        a, b = _hsv(d.hue(), d.uniform(0.4, 1.0), d.uniform(0.2, 0.8)), _hsv(d.hue(), d.uniform(0, 0.3), 0.95)
+        a, b = (
+            display_hsv(d.hue(), d.uniform(0.4, 1.0), d.uniform(0.2, 0.8)),
+            display_hsv(d.hue(), d.uniform(0, 0.3), 0.95),
+        )
     return Material(Pattern.PAGE, a, b, d.uniform(0.006, 0.02), d.seed(), gloss=d.uniform(0.0, 0.4))
 
 
 def _fabric(d: Draw) -> Material:
     hue, saturation, value = d.hue(), d.uniform(0.0, 0.7), d.uniform(0.2, 0.9)
-    a = _hsv(hue, saturation, value)
-    b = _hsv(hue + float(d.rng.normal(0, 0.04)), saturation * 0.8, value * d.uniform(0.4, 0.9))
+    a = display_hsv(hue, saturation, value)
+    b = display_hsv(hue + float(d.rng.normal(0, 0.04)), saturation * 0.8, value * d.uniform(0.4, 0.9))
     pattern = d.one_of(Pattern.WEAVE, Pattern.WEAVE, Pattern.STRIPES, Pattern.CHECKER, Pattern.PRINT)
     scale = d.uniform(0.008, 0.02) if pattern == Pattern.WEAVE else d.uniform(0.04, 0.15)
     return Material(pattern, a, b, scale, d.seed())
@@ -255,40 +262,40 @@ def _fabric(d: Draw) -> Material:
 
 def _paint(d: Draw) -> Material:
     white = d.uniform(0, 1) < 0.4
-    a = _hsv(d.hue(), d.uniform(0, 0.08) if white else d.uniform(0.1, 0.6), d.uniform(0.55, 0.97))
+    a = display_hsv(d.hue(), d.uniform(0, 0.08) if white else d.uniform(0.1, 0.6), d.uniform(0.55, 0.97))
     return Material(Pattern.PLAIN, a, _scaled(a, 0.85), d.uniform(0.1, 0.5), d.seed(), gloss=d.uniform(0, 0.3))
 
 
 def _wall_paint(d: Draw) -> Material:
     """Often nearly white or grey, now and then in a colour or papered."""
     plain = d.uniform(0, 1) < 0.5
-    a = _hsv(d.hue(), d.uniform(0.0, 0.08) if plain else d.uniform(0.0, 0.45), d.uniform(0.45, 0.97))
+    a = display_hsv(d.hue(), d.uniform(0.0, 0.08) if plain else d.uniform(0.0, 0.45), d.uniform(0.45, 0.97))
     pattern = d.one_of(Pattern.PLAIN, Pattern.PLAIN, Pattern.STAINS, Pattern.STAINS, Pattern.STRIPES, Pattern.PRINT)
     b = _scaled(a, d.uniform(0.7, 0.92))
     return Material(pattern, a, b, d.uniform(0.08, 0.5), d.seed())
 
 
 def _metal(d: Draw) -> Material:
-    a = _hsv(d.uniform(0.5, 0.7), d.uniform(0, 0.1), d.uniform(0.2, 0.85))
+    a = display_hsv(d.uniform(0.5, 0.7), d.uniform(0, 0.1), d.uniform(0.2, 0.85))
     pattern = d.one_of(Pattern.PLAIN, Pattern.BRUSHED)
     return Material(pattern, a, _scaled(a, 0.75), 0.05, d.seed(), gloss=d.uniform(0.4, 1.0))
 
 
 def _ceramic(d: Draw) -> Material:
-    a = _hsv(d.hue(), float(d.rng.choice([0.02, 0.05, 0.25])), d.uniform(0.75, 0.97))
+    a = display_hsv(d.hue(), float(d.rng.choice([0.02, 0.05, 0.25])), d.uniform(0.75, 0.97))
     return Material(Pattern.PLAIN, a, _scaled(a, 0.93), 0.2, d.seed(), gloss=0.5)
 
 
 def _tile(d: Draw) -> Material:
-    a = _hsv(d.hue(), d.uniform(0.0, 0.45), d.uniform(0.4, 0.95))
+    a = display_hsv(d.hue(), d.uniform(0.0, 0.45), d.uniform(0.4, 0.95))
     b = _scaled(a, d.uniform(0.4, 0.8))
     pattern = d.one_of(*[Pattern.TILES] * 5, Pattern.CHECKER)
     return Material(pattern, a, b, d.uniform(0.03, 0.4), d.seed(), gloss=d.uniform(0.1, 0.4))
 
 
 def _print(d: Draw) -> Material:
-    a = _hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
-    b = _hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
+    a = display_hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
+    b = display_hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
     pattern = d.one_of(Pattern.PRINT, Pattern.PAGE, Pattern.OUTSIDE, Pattern.STRIPES, Pattern.CHECKER, Pattern.STONE)
     low, high = {Pattern.PAGE: (0.012, 0.04), Pattern.OUTSIDE: (0.1, 0.4)}.get(pattern, (0.06, 0.25))
     return Material(pattern, a, b, d.uniform(low, high), d.seed())
@@ -301,20 +308,20 @@ def _screen(d: Draw) -> Material:
 
 
 def _books(d: Draw) -> Material:
-    a = _hsv(d.hue(), d.uniform(0.2, 0.8), d.uniform(0.3, 0.9))
-    b = _hsv(d.hue(), d.uniform(0.2, 0.8), d.uniform(0.3, 0.9))
+    a = display_hsv(d.hue(), d.uniform(0.2, 0.8), d.uniform(0.3, 0.9))
+    b = display_hsv(d.hue(), d.uniform(0.2, 0.8), d.uniform(0.3, 0.9))
     return Material(Pattern.SPINES, a, b, d.uniform(0.025, 0.05), d.seed())
 
 
 def _plant(d: Draw) -> Material:
-    a = _hsv(d.uniform(0.22, 0.4), d.uniform(0.4, 0.8), d.uniform(0.3, 0.7))
+    a = display_hsv(d.uniform(0.22, 0.4), d.uniform(0.4, 0.8), d.uniform(0.3, 0.7))
     return Material(Pattern.PRINT, a, _scaled(a, 0.35), d.uniform(0.03, 0.06), d.seed())
 
 
 def _daylight(d: Draw) -> Material:
     """What stands outside a window: so bright that it burns out, bright, or dim as at dusk."""
-    a = _hsv(d.uniform(0.5, 0.65), d.uniform(0.0, 0.5), d.uniform(0.4, 1.0))
-    b = _hsv(d.uniform(0.1, 0.45), d.uniform(0.0, 0.6), d.uniform(0.15, 0.7))
+    a = display_hsv(d.uniform(0.5, 0.65), d.uniform(0.0, 0.5), d.uniform(0.4, 1.0))
+    b = display_hsv(d.uniform(0.1, 0.45), d.uniform(0.0, 0.6), d.uniform(0.15, 0.7))
     kind = d.uniform(0, 1)
     lit = d.uniform(0.0, 0.25) if kind < 0.35 else d.uniform(0.25, 1.2) if kind < 0.75 else d.uniform(1.5, 4.0)
     pattern = d.one_of(Pattern.OUTSIDE, Pattern.OUTSIDE, Pattern.OUTSIDE, Pattern.PRINT)
@@ -322,27 +329,27 @@ def _daylight(d: Draw) -> Material:
 
 
 def _lampshade(d: Draw) -> Material:
-    a = _hsv(d.uniform(0.05, 0.17), d.uniform(0.0, 0.4), d.uniform(0.8, 1.0))
+    a = display_hsv(d.uniform(0.05, 0.17), d.uniform(0.0, 0.4), d.uniform(0.8, 1.0))
     return Material(Pattern.WEAVE, a, _scaled(a, 0.9), 0.02, d.seed(), emission=d.uniform(0.0, 0.8))
 
 
 def _dark(d: Draw) -> Material:
-    a = _hsv(d.hue(), d.uniform(0, 0.2), d.uniform(0.05, 0.25))
+    a = display_hsv(d.hue(), d.uniform(0, 0.2), d.uniform(0.05, 0.25))
     return Material(Pattern.PLAIN, a, _scaled(a, 0.6), 0.2, d.seed(), gloss=0.6)
 
 
 def _object(d: Draw) -> Material:
-    a = _hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
-    b = _hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
+    a = display_hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
+    b = display_hsv(d.hue(), d.uniform(0.1, 0.9), d.uniform(0.2, 0.95))
     if d.uniform(0, 1) < 0.35:  # white, grey or black
-        a = _hsv(d.hue(), d.uniform(0.0, 0.1), d.uniform(0.03, 0.98))
+        a = display_hsv(d.hue(), d.uniform(0.0, 0.1), d.uniform(0.03, 0.98))
     pattern = d.one_of(Pattern.PLAIN, Pattern.PLAIN, Pattern.STRIPES, Pattern.WEAVE, Pattern.PAGE, Pattern.PRINT)
     second = _scaled(a, 0.75) if pattern == Pattern.PLAIN else b
     return Material(pattern, a, second, d.uniform(0.01, 0.08), d.seed(), gloss=d.uniform(0.0, 0.8))
 
 
 def _mirror(d: Draw) -> Material:
-    a = _hsv(d.uniform(0.4, 0.6), 0.05, 0.6)
+    a = display_hsv(d.uniform(0.4, 0.6), 0.05, 0.6)
     return Material(Pattern.PLAIN, a, a, 0.5, d.seed(), gloss=0.3, mirror=d.uniform(0.75, 0.92))
 
 

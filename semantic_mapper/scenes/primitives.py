@@ -11,13 +11,12 @@ from enum import IntEnum
 
 import numpy as np
 
-from semantic_mapper.labels import ROOMS
+from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.types import Float64, UInt8
 
 Vector = tuple[float, float, float]
 
 BEING = "being"  # label of people and animals: no class, their pixels are to be ignored
-_LABEL_ID = {**dict(zip(ROOMS.names, ROOMS.ids, strict=True)), BEING: ROOMS.ignore_id}
 
 
 class Shape(IntEnum):
@@ -39,7 +38,7 @@ class Part:
         center: (3,) metres.
         half: (3,) half extents along its own axes.
         rotation: (3, 3) own axes -> assembly axes.
-        label: Class name of ``labels.ROOMS``, or ``BEING``.
+        label: Class name of the scene's label set, or ``BEING``.
         material: Number in the palette.
         item: Separate objects of one assembly (a cushion on a sofa) have numbers of their own.
         casts_shadow: False for what light comes from or through.
@@ -142,7 +141,7 @@ class Primitives:
         shape: (P,) int64 of ``Shape``.
         center, half: (P, 3) float64 metres.
         rotation: (P, 3, 3) float64, own axes -> world.
-        label: (P,) uint8 ids of ``labels.ROOMS``, or its ignore id.
+        label: (P,) uint8 ids of the scene's label set, or its ignore id.
         instance: (P,) uint16, from 1.
         group: (P,) int64, which piece of furniture it belongs to; 0 to 5 are floor, ceiling and walls.
         material: (P,) int64.
@@ -204,8 +203,14 @@ def place_parts(assembly: Assembly, yaw: float, position: Float64) -> list[Part]
     ]
 
 
-def pack(groups: list[list[Part]]) -> Primitives:
-    """Parts in world coordinates -> arrays; each (group, item) becomes one instance, numbered from 1."""
+def pack(groups: list[list[Part]], label_set: LabelSet = ROOMS) -> Primitives:
+    """Parts in world coordinates -> arrays; each (group, item) becomes one instance, numbered from 1.
+
+    Args:
+        groups: Parts of each assembly; their labels are names of ``label_set``, or ``BEING``.
+        label_set: Gives the ids.
+    """
+    label_id = {**dict(zip(label_set.names, label_set.ids, strict=True)), BEING: label_set.ignore_id}
     instances: dict[tuple[int, int], int] = {}
     flat: list[Part] = []
     numbers: list[int] = []
@@ -220,7 +225,7 @@ def pack(groups: list[list[Part]]) -> Primitives:
         center=np.array([p.center for p in flat], np.float64),
         half=np.array([p.half for p in flat], np.float64),
         rotation=np.array([p.rotation for p in flat], np.float64),
-        label=np.array([_LABEL_ID[p.label] for p in flat], np.uint8),
+        label=np.array([label_id[p.label] for p in flat], np.uint8),
         instance=np.array(numbers, np.uint16),
         group=np.array(owners, np.int64),
         material=np.array([p.material for p in flat], np.int64),

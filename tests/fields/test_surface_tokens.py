@@ -219,3 +219,23 @@ def _without_setting(path: Path, name: str) -> Path:
 def test_the_published_code_s_departures_need_the_paper_s_form():
     with pytest.raises(ConfigError, match="published"):
         small_field(parity="published", tokens="surface")
+
+
+@pytest.mark.parametrize("streaming", [False, True])
+def test_where_no_view_knows_the_depth_the_query_s_own_view_decides(streaming: bool):
+    """The upper half of a street: no scanner reaches it, so what the views believe of its depth is a guess."""
+    field = small_field()
+    encoded = constant_features(field.encode(wall_sources(POSES)), [1.0, -2.0, 3.0, 0.5])
+    near = torch.full_like(encoded.geometry[:, 0], 0.2 * WALL_M)  # all samples are hidden from all views
+    geometry = torch.stack((near, near * 0.02, near, near * 0.02, torch.ones_like(near)), dim=1)
+    encoded = replace(encoded, geometry=geometry)
+    rays = wall_rays(POSES[2], step=31)
+    with torch.no_grad():
+        render = (
+            StreamingSRay(field).render_samples(rays, on_wall(rays), encoded)
+            if streaming
+            else field.render_samples(rays, on_wall(rays), encoded)[0]
+        )
+        said = field.source_logits(encoded)
+    assert said is not None
+    torch.testing.assert_close(render.logits, said[2, :, 0, 0].expand_as(render.logits), atol=1e-2, rtol=1e-2)

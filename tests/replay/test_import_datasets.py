@@ -11,8 +11,9 @@ import pytest
 
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.replay.importers import ImportOptions, detect_format, import_recording
-from semantic_mapper.replay.importers.kitti360 import LABELS
+from semantic_mapper.replay.importers.kitti360 import LABELS, depth_of_scan
 from semantic_mapper.replay.log.format import LogReader
+from semantic_mapper.types import CameraIntrinsics
 from tests.replay import recordings as rec
 
 DRIVE = "2013_05_28_drive_0000_sync"
@@ -135,6 +136,51 @@ def test_a_kitti360_drive_is_imported_with_both_cameras(tmp_path: Path) -> None:
             assert np.array_equal(f.T_world_camera[:3, :3], left[:3, :3])
             np.testing.assert_allclose(f.T_world_camera[:3, 3], left[:3, :3] @ shift + left[:3, 3], atol=1e-6)
         assert log.info.label_set == LABELS
+
+
+def add_scans(root: Path, points: np.ndarray, numbers: tuple[int, ...] = (250,)) -> Path:
+    """A scan of ``points`` (N, 3), in the scanner's axes: ahead, left, up; it stands 0.5 m above the camera."""
+    scans = root / "data_3d_raw" / DRIVE / "velodyne_points" / "data"
+    scans.mkdir(parents=True)
+    for i in numbers:
+        np.concatenate((points, np.ones((len(points), 1))), axis=1).astype("<f4").tofile(scans / f"{i:010d}.bin")
+    (root / "calibration" / "calib_cam_to_velo.txt").write_text("0 0 1 0 -1 0 0 0 0 -1 0 -0.5\n")
+    return scans
+
+
+def test_laser_scans_give_depth_to_both_cameras(tmp_path: Path) -> None:
+    root = make_kitti360(tmp_path / "KITTI-360")
+    add_scans(root, np.array([[4.0, 0.0, -0.5], [-4.0, 0, 0], [np.nan, 0, 0]]))  # the second lies behind the camera
+    report = import_recording(root, tmp_path / "log.mcap")
+    assert (report.frames, report.with_depth) == (4, 2) and not any("depth" in n for n in report.notices)
+    with LogReader(tmp_path / "log.mcap") as log:
+        left, right, later, _ = log
+    for frame, shift_m in ((left, 0.0), (right, 0.594184)):
+        assert frame.depth_m is not None
+        k = frame.intrinsics
+        row, column = np.nonzero(frame.depth_m)
+        assert len(row) == 1 and frame.depth_m[row, column] == pytest.approx(4.0, abs=0.05)
+        assert abs(column[0] - (k.cx - k.fx * shift_m / 4)) < 1.5 and abs(row[0] - k.cy) < 1.5
+    assert later.depth_m is None
+
+
+def test_a_scan_fills_the_pixels_between_its_beams() -> None:
+    camera = CameraIntrinsics(552.6, 552.6, 100.0, 50.0, 200, 100)
+    depth = depth_of_scan(np.array([[0.0, 0.0, 5.0], [0.0, 0.0, 9.0]]), np.eye(4), camera)
+    row, column = np.nonzero(depth)
+    assert (row.min(), row.max(), column.min(), column.max()) == (48, 52, 99, 101) and (depth[row, column] == 5).all()
+    assert not depth_of_scan(np.zeros((0, 3)), np.eye(4), camera).any()
+
+
+def test_what_is_wrong_with_laser_scans_is_told(tmp_path: Path) -> None:
+    root = make_kitti360(tmp_path / "KITTI-360")
+    scans = add_scans(root, np.array([[4.0, 0.0, 0.0]]), (250, 252))
+    (scans / "0000000250.bin").write_bytes(b"123")
+    report = import_recording(root, tmp_path / "log.mcap")
+    assert "16 bytes a point" in report.skipped[0].reason and report.with_depth == 2
+    (root / "calibration" / "calib_cam_to_velo.txt").write_text("1 2 3\n")
+    with pytest.raises(ImportSourceError, match=r"calib_cam_to_velo\.txt: expected the 12 numbers"):
+        import_recording(root, tmp_path / "x.mcap")
 
 
 def test_the_label_table_is_the_published_one() -> None:

@@ -20,10 +20,11 @@ from semantic_mapper.mapper import Mapper, make_field
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.summary_table import notes, summary_table
 from semantic_mapper.replay import artifacts
-from semantic_mapper.replay.evaluate.methods import Opinion, baseline_predictors, evaluate_frames, field_predictors
+from semantic_mapper.replay.evaluate.methods import MAP, Opinion, baseline_predictors, evaluate_frames, field_predictors
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.replay.session import SNAPSHOTS, MapSession, open_recording
 from semantic_mapper.replay.stats import LatencyHistogram
+from semantic_mapper.types import PosedFrame
 from tests.small import SMALL_ENCODER, tiny_config, tiny_field, tiny_frames
 
 
@@ -374,3 +375,25 @@ def test_a_log_with_classes_that_the_field_lacks_tells_whether_confidence_knows(
     assert figures["open_set_auroc"] == 1.0 and figures["ece"] == pytest.approx(0.1, abs=1e-6)
     own = evaluate_frames(frames, field_predictors(Mapper.load(weights, tiny_config())), stream, ROOMS, frozenset())
     assert all(0 <= m["open_set_auroc"] <= 1 for m in own.methods.values())
+
+
+def test_the_map_is_scored_at_its_points_beside_the_frames():
+    stream = make_label_set("mine", ["wall", "spaceship"], ids=[1, 9])
+    frames = [replace(f, label=np.where(f.label == ROOMS.ids[0], 1, 9).astype(np.uint8)) for f in tiny_frames(3)]
+    voxel_map = VoxelMap(tiny_config().voxel_map, ROOMS)
+
+    def fuse(frame: PosedFrame) -> Opinion:
+        """Walls for sure; spaceships are taken for floor, without conviction."""
+        wall = frame.label == 1
+        probabilities = np.full((*wall.shape, len(ROOMS)), 0.01, np.float32)
+        probabilities[..., 0], probabilities[..., 1] = np.where(wall, 0.8, 0.2), np.where(wall, 0.01, 0.41)
+        voxel_map.integrate(frame, frame.depth_m, probabilities / probabilities.sum(-1, keepdims=True))
+        return Opinion(frame.label)
+
+    held_back = frozenset((frames[2].stamp_ns,))
+    result = evaluate_frames(frames, {"fused": fuse}, stream, ROOMS, held_back, voxel_map=voxel_map)
+    figures = result.methods[MAP]
+    assert set(figures["per_class"]) == {"wall"} and figures["total_accuracy"] > 0.95
+    assert figures["open_set_auroc"] > 0.95 and 0.05 < figures["ece"] < 0.25
+    assert 0 < figures["pixels"] < len(voxel_map.points().xyz)
+    assert MAP not in evaluate_frames(frames, {"fused": fuse}, stream, ROOMS, frozenset()).methods

@@ -657,16 +657,18 @@ static void weigh_samples(Scratch *s, const Settings *set, float *opacity, float
 
 /* ---- One token a view (contextual.surface_space) ---- */
 
-/* Of `from`, `weight` times: its row to a surface token, and what the view sees of it; returns its share in the token. */
-INLINE float add_to_surface(Scratch *s, const Settings *set, int64_t from, float weight, float *token,
+/* Of view j's token `from`, `weight` times: its row to a surface token, and what the view sees of it, which is all where
+ * the view is the query's own; returns its share in the token. */
+INLINE float add_to_surface(Scratch *s, const Settings *set, int64_t j, int64_t from, float weight, float *token,
                             float *visible) {
     const float *row = s->tokens + from * s->stride;
     const int64_t C = s->channels;
-    const float share = set->occlusion ? weight * (s->visible[from] + (float)set->least_visibility) : weight;
+    const float seen = s->own_view[j] > 0 ? 1.0f : s->visible[from];
+    const float share = set->occlusion ? weight * (seen + (float)set->least_visibility) : weight;
     for (int64_t c = 0; c < C; c++) token[c] += share * row[c];
     for (int64_t c = C + 2; c < s->stride; c++) token[c] += share * row[c];
     token[C] += weight * row[C];
-    *visible += weight * s->visible[from];
+    *visible += weight * seen;
     return share;
 }
 
@@ -684,9 +686,9 @@ static int64_t composite_views(Scratch *s, const Settings *set) {
         float *token = s->surface + count * s->stride, sum = 0, weight = 0, visible = 0;
         for (int64_t t = s->view_start[j]; t < s->view_start[j + 1]; t++) {
             const float part = s->looked_at[s->sample_of[t]];
-            sum += add_to_surface(s, set, t, part, token, &visible), weight += part;
+            sum += add_to_surface(s, set, j, t, part, token, &visible), weight += part;
         }
-        if (s->sees_far[j]) sum += add_to_surface(s, set, s->far + j, rest, token, &visible), weight += rest;
+        if (s->sees_far[j]) sum += add_to_surface(s, set, j, s->far + j, rest, token, &visible), weight += rest;
         if (weight <= 0) continue;
         const float rate = 1.0f / max_f(sum, 1e-12f);
         for (int64_t c = 0; c < s->stride; c++) token[c] *= c == C ? 1.0f : rate;

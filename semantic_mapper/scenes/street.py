@@ -1,0 +1,472 @@
+"""A street under an open sky: what a car's camera and laser scanner see of it, with classes of KITTI-360.
+
+The primitives and their casting are those of the rooms; the light is the sun's, with one shadow map, and the sky's. The
+street runs along x. It stands far from the origin of its world, as recorded drives do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from semantic_mapper.geometry import expect_shape, invert_pose, transform
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.scenes.camera import pose_of
+from semantic_mapper.scenes.config import NoiseConfig
+from semantic_mapper.scenes.fast_cast import cast_pixels
+from semantic_mapper.scenes.fast_shade import LightArrays, MaterialArrays, PrimitiveArrays, shade_pixels
+from semantic_mapper.scenes.materials import Color, Material, Pattern, display_hsv, material_table
+from semantic_mapper.scenes.primitives import Assembly, Part, Primitives, Shape, pack, place_parts
+from semantic_mapper.scenes.sensor_color import expose
+from semantic_mapper.scenes.shots import Shot
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
+
+ORIGIN_M = np.array([830.0, 3700.0, 115.0])  # where the street begins: on the road, in its middle
+BEYOND_M = 120.0  # of street that goes on behind the last frame
+STEP_M = 0.8  # of the car from frame to frame
+CAMERA_M = 1.55  # height above the road
+SCANNER_M = np.array([-0.8, 0.0, 1.73])  # place of the scanner beside the foot of the camera: back, left, up
+RINGS_DEG = np.linspace(2.0, -24.8, 64)  # elevation of the scanner's beams
+AZIMUTH_DEG = 0.18
+MAX_RANGE_M = 45.0
+RANGE_SIGMA_M = 0.02
+GLASS_RETURN = 0.3  # probability that a beam comes back from a window
+
+_ROAD, _LANE = 4.0, 2.2  # half the width of the road; width of the strip on which cars park
+_KERB_M = 0.13
+_SHADOW_SIZE, _SUN_M = 3000, 4000.0  # pixels a side of the shadow map; distance of the sun's camera
+_SHADOW_BIAS_M = 0.25
+_SKY_SHADE = 0.45  # light of the sky, as a fraction of the sun's
+_HAZE_M = 700.0
+_GRID = 4  # pixels of the scanner's depth image in one step of its azimuth
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Street:
+    """One street.
+
+    Args:
+        seed: That it was made from.
+        length_m: From x = 0, where the first frame is taken; all coordinates are relative to ``ORIGIN_M``.
+        primitives: Everything that can be seen; labels are ids of ``label_set``.
+        label_set: Has at least the classes of ``CLASSES``.
+        materials: As the shading reads them; a primitive's material counts them.
+        sun: (3,) unit vector towards it.
+        sky: Linear RGB at the horizon and at the zenith.
+        clouds: (S, S) float32 in [0, 1], cover of the sky; tiles.
+        shadow: (``_SHADOW_SIZE``, ``_SHADOW_SIZE``) float32 depth of the first surface as the sun's camera sees it.
+        T_world_sun: (4, 4) pose of that camera.
+        sun_focal: Its focal length, pixels.
+    """
+
+    seed: int
+    length_m: float
+    primitives: Primitives
+    label_set: LabelSet
+    materials: MaterialArrays
+    sun: Float64
+    sky: tuple[Color, Color]
+    clouds: Float32
+    shadow: Float32
+    T_world_sun: Float64
+    sun_focal: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StreetView:
+    """One frame: rgb (H, W, 3) uint8, label (H, W) uint8 ids, exact_depth_m (H, W) float32, 0 = sky."""
+
+    rgb: UInt8
+    label: UInt8
+    exact_depth_m: Float32
+
+
+CLASSES = (
+    "road", "sidewalk", "parking", "terrain", "building", "wall", "fence", "vegetation", "car", "sky", "pole",
+    "traffic sign", "smallpole", "lamp", "trash bin",
+)  # fmt: skip
+
+
+class _Builder:
+    """Collects materials and parts; coordinates are relative to ``ORIGIN_M``."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.default_rng((seed, 360))
+        self.materials: list[Material] = []
+        self.groups: list[list[Part]] = []
+        self.grey = [self.material(Pattern.PLAIN, (0.6, 0.03, v), scale_m=0.4) for v in (0.42, 0.62, 0.9)]
+        self.glass = [self.material(Pattern.PLAIN, (0.58, 0.2, v), gloss=0.6, scale_m=1.5) for v in (0.15, 0.3)]
+        self.wood = [self.material(Pattern.WOOD, (0.08, s, v), scale_m=0.08) for s, v in ((0.4, 0.5), (0.15, 0.85))]
+        leaves = ((0.27, 0.6, 0.45), (0.22, 0.5, 0.5), (0.3, 0.45, 0.35))
+        self.leaves = [self.material(Pattern.PRINT, hsv, scale_m=0.3, dim=0.3) for hsv in leaves]
+
+    def between(self, low: float, high: float) -> float:
+        """A random number."""
+        return float(self.rng.uniform(low, high))
+
+    def pick(self, items: list[int]) -> int:
+        """A random one."""
+        return items[int(self.rng.integers(len(items)))]
+
+    def material(self, pattern: Pattern, hsv: Color, *, scale_m: float, dim: float = 0.8, gloss: float = 0.0) -> int:
+        """A new material whose second colour is ``dim`` times the first; returns its number."""
+        a = display_hsv(*hsv)
+        b = (a[0] * dim, a[1] * dim, a[2] * dim)
+        self.materials.append(Material(pattern, a, b, scale_m, int(self.rng.integers(1 << 30)), gloss=gloss))
+        return len(self.materials) - 1
+
+    def place(self, assembly: Assembly, x: float, y: float, *, z: float = 0.0, yaw: float = 0.0) -> None:
+        """Put an assembly down."""
+        self.groups.append(place_parts(assembly, yaw, ORIGIN_M + np.array([x, y, z])))
+
+
+def make_street(seed: int, length_m: float, label_set: LabelSet) -> Street:
+    """Build a street; everything follows from the arguments.
+
+    Args:
+        seed: Of everything that is drawn.
+        length_m: Way of the car; the street goes on for ``BEYOND_M``.
+        label_set: Whose ids labels are; has the names ``CLASSES``.
+    """
+    b = _Builder(seed)
+    end = length_m + BEYOND_M
+    _ground(b, end)
+    for side in (1.0, -1.0):  # left with a strip for parking, right without
+        verge = _ROAD + (_LANE if side > 0 else 0.0)
+        _sidewalk(b, side, verge, end)
+        _plots(b, side, verge + 2.4, end)
+        _furniture(b, side, verge + 0.5, end)
+        _cars(b, side, verge, end)
+    far = Assembly("vegetation")
+    for k in range(24):  # a wood closes the street off
+        far.ellipsoid(b.pick(b.leaves), (0, (k - 12) * 9.0, b.between(2, 5)), (14, 16, b.between(12, 22)))
+    b.place(far, end + 60, 0)
+    primitives = pack(b.groups, label_set)
+    table = material_table(b.materials)
+    azimuth, elevation = b.between(0, 2 * np.pi), np.radians(b.between(30, 55))
+    sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+    horizon = display_hsv(0.57, b.between(0.05, 0.2), 0.97)
+    zenith = display_hsv(0.6, b.between(0.3, 0.6), b.between(0.75, 0.95))
+    middle = ORIGIN_M + np.array([end / 2, 0.0, 0.0])
+    T_world_sun = pose_of(middle + sun * _SUN_M, azimuth + np.pi, -elevation)
+    focal = _SHADOW_SIZE / 2 * _SUN_M / (end / 2 + 40.0)
+    shadow = _cast(primitives, T_world_sun, focal, (_SHADOW_SIZE, _SHADOW_SIZE))[0].astype(np.float32)
+    return Street(
+        seed, length_m, primitives, label_set,
+        MaterialArrays(
+            table.pattern, table.color_a, table.color_b, table.scale_m, table.seed, table.emission, table.gloss,
+            table.mirror,
+        ),
+        sun, (horizon, zenith), _clouds(b.rng), shadow, T_world_sun, focal,
+    )  # fmt: skip
+
+
+def drive(street: Street, count: int) -> Float64:
+    """Poses T_world_camera (count, 4, 4), ``STEP_M`` apart, in the right lane, with the small sway of a car."""
+    rng = np.random.default_rng((street.seed, 361))
+    phase = rng.uniform(0, 2 * np.pi, 3)
+    x = np.arange(count) * STEP_M
+    y = -1.6 + 0.25 * np.sin(x / 17 + phase[0])
+    yaw = 0.25 / 17 * np.cos(x / 17 + phase[0]) + np.radians(0.3) * np.sin(x / 6 + phase[1])
+    pitch = np.radians(0.35) * np.sin(x / 3.1 + phase[2])
+    place = ORIGIN_M + np.stack((x, y, np.full(count, CAMERA_M)), axis=1)
+    return np.array([pose_of(place[k], yaw[k], pitch[k]) for k in range(count)])
+
+
+def render_street(
+    street: Street, intrinsics: CameraIntrinsics, T_world_camera: Float64, shot: Shot, config: NoiseConfig, seed: int
+) -> StreetView:
+    """What the camera sees.
+
+    Args:
+        street: From ``make_street``.
+        intrinsics: Pinhole without distortion.
+        T_world_camera: (4, 4).
+        shot: Exposure and motion of this frame.
+        config, seed: Noise of the colour camera.
+    """
+    i = intrinsics
+    depth, index = cast_pixels(
+        *_shapes(street.primitives), *_axes(T_world_camera), i.fx, i.fy, i.cx, i.cy, i.width, i.height
+    )
+    u, v = np.meshgrid(np.arange(i.width), np.arange(i.height))
+    ray = np.stack(((u - i.cx) / i.fx, (v - i.cy) / i.fy, np.ones(u.shape)), axis=-1) @ T_world_camera[:3, :3].T
+    hit = index >= 0
+    linear = _sky_light(street, ray)
+    linear[hit] = _surface_light(street, intrinsics, T_world_camera, depth, index, ray)[hit]
+    exact = np.where(hit, depth, 0.0).astype(np.float32)
+    rgb = expose(linear, exact, intrinsics, shot, config, np.random.default_rng((street.seed, seed, 362)))
+    sky = dict(zip(street.label_set.names, street.label_set.ids, strict=True))["sky"]
+    label = np.append(street.primitives.label, np.uint8(sky))[index]  # index -1 is the appended entry
+    return StreetView(rgb, label, exact)
+
+
+def scan_street(street: Street, T_world_scanner: Float64, seed: int) -> Float32:
+    """Points (N, 4) that the laser scanner measures ahead of it: x ahead, y left, z up in metres, and reflectance.
+
+    Only what lies within 52 degrees of straight ahead, which is more than the camera sees.
+
+    Args:
+        street: From ``make_street``.
+        T_world_scanner: (4, 4), axes as those of the points.
+        seed: Of the noise.
+    """
+    rng = np.random.default_rng((street.seed, seed, 363))
+    T_world_ahead = T_world_scanner.copy()  # camera axes
+    T_world_ahead[:3, :3] = T_world_scanner[:3, :3] @ np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    focal = _GRID / np.radians(AZIMUTH_DEG)
+    azimuth = np.radians(np.arange(-52, 52, AZIMUTH_DEG))
+    a, e = (grid.ravel() for grid in np.meshgrid(azimuth, np.radians(RINGS_DEG)))
+    width, height = 2 * int(np.tan(np.radians(53)) * focal), 2 * int(np.tan(np.radians(38)) * focal)
+    u, v = np.tan(a), np.tan(e) / np.cos(a)  # left and up, on the plane ahead
+    depth, index = _cast(street.primitives, T_world_ahead, focal, (height, width))
+    row = np.rint(height / 2 - 0.5 - v * focal).astype(int)
+    column = np.rint(width / 2 - 0.5 - u * focal).astype(int)
+    z, hit = depth[row, column], index[row, column]
+    way = z * np.sqrt(1 + u * u + v * v)
+    found = (hit >= 0) & (way < MAX_RANGE_M)
+    glossy = street.materials.gloss[street.primitives.material[hit]] > 0.5
+    found &= ~glossy | (rng.random(len(z)) < GLASS_RETURN)
+    z, u, v, way = z[found], u[found], v[found], way[found]
+    points = np.stack((z, z * u, z * v), axis=1) * (1 + rng.normal(0, RANGE_SIGMA_M, len(z)) / way)[:, None]
+    reflectance = street.materials.color_a[street.primitives.material[hit[found]]].mean(axis=1)
+    return np.concatenate((points, reflectance[:, None]), axis=1).astype(np.float32)
+
+
+def _ground(b: _Builder, end: float) -> None:
+    asphalt = b.material(Pattern.PLAIN, (0.6, 0.04, b.between(0.38, 0.5)), scale_m=0.5, dim=0.75)
+    paving = b.material(Pattern.TILES, (0.08, 0.08, 0.6), scale_m=0.2, dim=0.6)
+    grass = b.material(Pattern.PRINT, (0.25, 0.5, 0.5), scale_m=0.4, dim=0.6)
+    long, middle = end + 160.0, end / 2 + 40.0
+    road = Assembly("road")
+    road.box(asphalt, (0, 0, -0.1), (long, 2 * _ROAD, 0.2))
+    for k in range(int(end / 6) + 3):
+        road.box(b.grey[2], (-middle + 6.0 * k, 0, 0.003), (2.5, 0.12, 0.006))
+    b.place(road, middle, 0)
+    lane = Assembly("parking")
+    lane.box(paving, (0, _ROAD + _LANE / 2, -0.09), (long, _LANE, 0.2))
+    b.place(lane, middle, 0)
+    terrain = Assembly("terrain")
+    terrain.box(grass, (0, 0, -0.3), (long + 600, 900, 0.5))
+    b.place(terrain, middle, 0)
+
+
+def _sidewalk(b: _Builder, side: float, verge: float, end: float) -> None:
+    paving = b.material(Pattern.TILES, (0.07, 0.05, b.between(0.55, 0.75)), scale_m=0.4, dim=0.7)
+    walk = Assembly("sidewalk")
+    walk.box(paving, (0, side * (verge + 1.2), 0), (end + 160, 2.4, 2 * _KERB_M))
+    walk.box(b.grey[1], (0, side * (verge + 0.08), 0.005), (end + 160, 0.16, 2 * _KERB_M))
+    b.place(walk, end / 2 + 40, 0)
+
+
+def _plots(b: _Builder, side: float, front: float, end: float) -> None:
+    """Houses with gardens, or a green between them; a fence, wall or hedge in front."""
+    x = -20.0
+    while x < end:
+        width, setback = b.between(11, 19), b.between(2.0, 7.0)
+        middle = x + width / 2
+        if b.rng.uniform() < 0.82:
+            _house(b, middle, side, front + setback, width - b.between(1.0, 5.0))
+        else:
+            for _ in range(3):
+                _tree(b, middle + b.between(-5, 5), side * (front + b.between(3, 12)))
+        border = Assembly(("fence", "wall", "vegetation", "terrain")[int(b.rng.choice(4, p=(0.3, 0.2, 0.25, 0.25)))])
+        height = b.between(0.8, 1.6)
+        if border.label == "fence":
+            board = b.pick(b.wood)
+            for k in range(int(width / 0.5)):
+                border.box(board, (-width / 2 + 0.5 * k, 0, height / 2), (0.34, 0.04, height))
+            border.box(board, (0, 0.03, height * 0.7), (width, 0.04, 0.1))
+        elif border.label == "wall":
+            brick = b.material(Pattern.TILES, (0.03, b.between(0.1, 0.5), 0.6), scale_m=0.25, dim=0.7)
+            border.box(brick, (0, 0, height / 2), (width - 1.5, 0.25, height))
+        elif border.label == "vegetation":
+            border.box(b.pick(b.leaves), (0, 0, height / 2), (width - 1, 0.7, height))
+        if border.parts:
+            b.place(border, middle, side * (front + 0.3))
+        if b.rng.uniform() < 0.5:
+            _tree(b, middle + b.between(-6, 6), side * (front + b.between(0.8, max(setback - 0.5, 1.0))))
+        x += width
+
+
+def _house(b: _Builder, x: float, side: float, front: float, width: float) -> None:
+    storeys = int(b.rng.integers(1, 4))
+    height, deep = 0.6 + 2.8 * storeys, b.between(8, 11)
+    pattern = (Pattern.PLAIN, Pattern.PLAIN, Pattern.TILES)[int(b.rng.integers(3))]
+    hsv = (b.between(0.0, 0.17), b.between(0.03, 0.45), b.between(0.6, 0.95))
+    wall = b.material(pattern, hsv, scale_m=0.3 if pattern == Pattern.TILES else 1.0, dim=0.85)
+    roof = b.material(Pattern.STRIPES, (b.between(0.0, 0.06), b.between(0.2, 0.6), b.between(0.3, 0.55)), scale_m=0.3)
+    house = Assembly("building")  # y = 0 is its front, the house lies at y > 0
+    house.box(wall, (0, deep / 2, height / 2), (width, deep, height))
+    pane = b.pick(b.glass)
+    door = int(b.rng.integers(max(int(width / 2.6), 1)))
+    for storey in range(storeys):
+        for k in range(max(int(width / 2.6), 1)):
+            at = -width / 2 + 1.4 + 2.6 * k
+            if storey == 0 and k == door:
+                house.box(b.pick(b.wood), (at, -0.02, 1.15), (1.0, 0.08, 2.1))
+                continue
+            z = 1.9 + 2.8 * storey
+            house.box(b.grey[2], (at, -0.01, z), (1.35, 0.08, 1.55))
+            house.box(pane, (at, -0.03, z), (1.15, 0.08, 1.35))
+    slope = np.radians(b.between(25, 45))
+    reach = deep / 2 / np.cos(slope) + 0.5
+    for turn in (1.0, -1.0):  # two slabs lean on each other; the ridge runs along the street
+        y, z = deep / 2 - turn * reach / 2 * np.cos(slope), height + reach / 2 * np.sin(slope) - 0.3
+        house.box(roof, (0, y, z), (width + 0.4, reach, 0.18), tilt=turn * slope)
+    gable = deep / 2 * np.tan(slope) * 0.55
+    house.box(wall, (0, deep / 2, height + gable / 2), (width - 0.3, deep * 0.45, gable))
+    if b.rng.uniform() < 0.6:
+        house.box(
+            b.grey[0], (b.between(-width / 3, width / 3), deep / 2, height + reach * np.sin(slope)), (0.6, 0.6, 2.0)
+        )
+    b.place(house, x, side * front, yaw=0.0 if side > 0 else np.pi)
+
+
+def _tree(b: _Builder, x: float, y: float) -> None:
+    tree = Assembly("vegetation")
+    trunk, crown = b.between(1.8, 3.0), b.between(2.5, 5.0)
+    tree.cylinder(b.wood[0], (0, 0, trunk / 2), (0.3, 0.3, trunk))
+    leaf = b.pick(b.leaves)
+    for _ in range(6):
+        place = (b.between(-0.9, 0.9), b.between(-0.9, 0.9), trunk + b.between(0.2, 0.8) * crown)
+        tree.ellipsoid(leaf, place, (crown * 0.6, crown * 0.6, crown * b.between(0.45, 0.7)))
+    b.place(tree, x, y)
+
+
+def _furniture(b: _Builder, side: float, y: float, end: float) -> None:
+    """Lamp posts, signs, bins and small trees along the kerb."""
+    x = b.between(-10, 0)
+    while x < end:
+        kind = int(b.rng.choice(4, p=(0.35, 0.25, 0.15, 0.25)))
+        thing = Assembly("pole")
+        if kind == 0:
+            high = b.between(4.5, 6.5)
+            thing.cylinder(b.grey[0], (0, 0, high / 2), (0.14, 0.14, high))
+            thing.box(b.grey[0], (0, -0.5, high), (0.08, 1.1, 0.08))
+            thing.box(b.grey[2], (0, -1.0, high), (0.2, 0.5, 0.12), label="lamp")
+        elif kind == 1:
+            paint = b.material(Pattern.PRINT, (b.between(0, 1), 0.8, 0.8), scale_m=0.2)
+            thing.cylinder(b.grey[0], (0, 0, 1.2), (0.07, 0.07, 2.4), label="smallpole")
+            thing.box(paint, (-0.05, 0, 2.5), (0.03, 0.65, 0.65), label="traffic sign")
+        elif kind == 2:
+            for k in range(int(b.rng.integers(1, 4))):
+                bin_paint = b.material(Pattern.PLAIN, (b.between(0.2, 0.6), 0.4, 0.35), scale_m=0.3)
+                thing.box(bin_paint, (0.7 * k, 0, 0.55), (0.58, 0.7, 1.1), label="trash bin")
+        if kind == 3:
+            _tree(b, x, side * (y + 0.2))
+        else:
+            b.place(thing, x, side * y, z=_KERB_M, yaw=0.0 if side > 0 else np.pi)
+        x += b.between(6, 15)
+
+
+def _cars(b: _Builder, side: float, verge: float, end: float) -> None:
+    x = b.between(4, 12)
+    while x < end:
+        car = Assembly("car")
+        hue, grey = b.between(0, 1), b.rng.uniform() < 0.6
+        paint = b.material(
+            Pattern.PLAIN, (hue, 0.04 if grey else 0.7, b.between(0.12, 0.95)), scale_m=1.0, gloss=0.4, dim=0.95
+        )
+        tyre = b.grey[0]
+        long, high = b.between(3.8, 4.8), b.between(1.4, 1.7)
+        car.box(paint, (0, 0, 0.56), (long, 1.75, 0.62))
+        car.ellipsoid(paint, (long * 0.42, 0, 0.6), (long * 0.3, 1.72, 0.6))
+        car.box(b.glass[0], (-0.2, 0, (0.85 + high) / 2), (long * 0.48, 1.5, high - 0.85))
+        car.box(paint, (-0.25, 0, high), (long * 0.36, 1.48, 0.08))
+        car.box(b.glass[0], (long * 0.22, 0, (0.8 + high) / 2 - 0.05), (long * 0.16, 1.45, (high - 0.8) * 0.6))
+        for end_x in (-0.32, 0.32):
+            for across in (-0.8, 0.8):
+                car.add(Shape.CYLINDER, tyre, (end_x * long, across, 0.31), (0.62, 0.62, 0.22), tilt=np.pi / 2)
+        y = side * (verge - _LANE / 2) if side > 0 else side * (_ROAD - 1.0)
+        b.place(car, x, y + b.between(-0.1, 0.1), yaw=0.0 if b.rng.uniform() < 0.7 else np.pi)
+        x += b.between(5.5, 9) if side > 0 and b.rng.uniform() < 0.7 else b.between(14, 40)
+
+
+def _shapes(p: Primitives) -> tuple[np.ndarray, Float64, Float64, Float64]:
+    return p.shape, p.center, p.half, p.rotation
+
+
+def _axes(T_world_camera: Float64) -> tuple[Float64, Float64]:
+    return T_world_camera[:3, 3].copy(), T_world_camera[:3, :3].copy()
+
+
+def _cast(
+    primitives: Primitives, T_world_camera: Float64, focal: float, size: tuple[int, int]
+) -> tuple[Float64, np.ndarray]:
+    """Depth (H, W), inf = miss, and primitive (H, W), of a pinhole camera with its centre in the middle."""
+    height, width = size
+    middle = (width / 2 - 0.5, height / 2 - 0.5)
+    return cast_pixels(*_shapes(primitives), *_axes(T_world_camera), focal, focal, *middle, width, height)
+
+
+def _clouds(rng: np.random.Generator) -> Float32:
+    """(256, 256) cover of the sky, which goes on over its edges."""
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(256), np.fft.fftfreq(256)))
+    spectrum = np.fft.fft2(rng.standard_normal((256, 256))) / np.maximum(frequency, 1 / 256) ** 1.7
+    clouds = np.fft.ifft2(spectrum).real
+    clouds = (clouds - clouds.mean()) / clouds.std()
+    return np.clip(0.5 * clouds + rng.uniform(-0.4, 0.5), 0, 1).astype(np.float32)
+
+
+def _sky_light(street: Street, ray: Float64) -> Float32:
+    """Linear RGB (H, W, 3) of the sky along rays (H, W, 3)."""
+    up = np.clip(ray[..., 2] / np.linalg.norm(ray, axis=-1), 0.0, 1.0)
+    blend = np.clip(up * 2.2, 0, 1)[..., None] ** 0.7
+    light = (1 - blend) * np.array(street.sky[0]) + blend * np.array(street.sky[1])
+    size = len(street.clouds)
+    plane = ray[..., :2] / np.maximum(ray[..., 2:], 0.05) * 60  # clouds hang in a plane
+    row, column = (np.floor(plane).astype(int) % size).transpose(2, 0, 1)
+    cover = street.clouds[row, column][..., None] * np.clip(up * 6, 0, 1)[..., None]
+    return ((1 - cover) * light + cover * 0.95).astype(np.float32) * np.float32(1.15)
+
+
+def _surface_light(
+    street: Street, i: CameraIntrinsics, T_world_camera: Float64, depth: Float64, index: np.ndarray, ray: Float64
+) -> Float32:
+    """Linear RGB (H, W, 3) of what was hit: sun with shadows, sky, haze."""
+    p = street.primitives
+    flat = LightArrays(
+        np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 6, 1, 1), np.float32), np.zeros(0), np.ones(3),
+        np.full(3, 1e6), np.zeros((0, 6, 1, 1), np.float32), np.zeros((0, 6, 1, 1), np.float32),
+    )  # fmt: skip
+    primitives = PrimitiveArrays(p.shape, p.center, p.half, p.rotation, p.material)
+    lit = shade_pixels(depth, index, primitives, street.materials, flat, *_axes(T_world_camera), i.fx, i.fy, i.cx, i.cy)
+    distance = np.where(np.isfinite(depth), depth, 0.0)
+    world = T_world_camera[:3, 3] + distance[..., None] * ray
+    normal = _normals(p, index, world)
+    albedo = lit / (0.75 + 0.25 * normal[..., 2:])  # that is how ``shade_pixels`` lights what has no lamp
+    facing = np.clip(normal @ street.sun, 0, 1)[..., None] * _sunlit(street, world)[..., None]
+    light = _SKY_SHADE * (0.7 + 0.3 * normal[..., 2:]) * np.array([0.9, 0.97, 1.1]) + facing
+    haze = np.exp(-distance / _HAZE_M)[..., None]
+    return (haze * albedo * light + (1 - haze) * np.array(street.sky[0])).astype(np.float32)
+
+
+def _sunlit(street: Street, world: Float64) -> Float64:
+    """(H, W) 1 where the sun reaches, 0 in shadow; points outside the shadow map are lit."""
+    q = transform(invert_pose(street.T_world_sun), world.reshape(-1, 3))
+    middle = _SHADOW_SIZE / 2 - 0.5
+    uv = np.rint(q[:, :2] / q[:, 2:] * street.sun_focal + middle).astype(int)
+    inside = np.asarray(((uv >= 0) & (uv < _SHADOW_SIZE)).all(axis=1))
+    column, row = np.where(inside[:, None], uv, 0).T
+    shaded = inside & (street.shadow[row, column] <= q[:, 2] - _SHADOW_BIAS_M)
+    return (1.0 - shaded.astype(np.float64)).reshape(world.shape[:2])
+
+
+def _normals(p: Primitives, index: np.ndarray, world: Float64) -> Float64:
+    """Unit normals (H, W, 3) of the primitives ``index`` (H, W) at points (H, W, 3); any where nothing was hit."""
+    expect_shape(world, f"{index.shape[0]} {index.shape[1]} 3", "world")
+    rotation, half = p.rotation[index], p.half[index]
+    q = np.einsum("hwij,hwi->hwj", rotation, world - p.center[index]) / half
+    shape = p.shape[index][..., None]
+    face = np.abs(q) >= np.abs(q).max(axis=-1, keepdims=True)
+    flat = np.where(face, np.sign(q), 0.0)
+    lid = (np.abs(q[..., 2:]) > 0.999) & (shape != Shape.ELLIPSOID)
+    round_ = q / half
+    round_[..., 2] = np.where(shape[..., 0] == Shape.ELLIPSOID, round_[..., 2], 0.0)
+    top = np.zeros_like(q)
+    top[..., 2] = np.sign(q[..., 2])
+    own = np.where(shape == Shape.BOX, flat, np.where(lid, top, round_))
+    own /= np.maximum(np.linalg.norm(own, axis=-1, keepdims=True), 1e-9)
+    return np.einsum("hwij,hwj->hwi", rotation, own)
