@@ -116,14 +116,18 @@ def test_the_factor_of_the_own_view_leads_from_the_vote_to_the_own_image_alone()
     said = field.source_logits(encoded)
     assert said is not None
     others, own = said[[0, 2], :, 5, 5].mean(0), said[1, :, 5, 5]
-    seen = contextual_space(rays, on_wall(rays), encoded).valid.all(2).all(0)
+    space = contextual_space(rays, on_wall(rays), encoded)
+    seen = space.valid.all(2).all(0)
     assert seen.sum() > 10
-    for factor, share in ((1.0, 1 / 3), (4.0, 4 / 6), (1e6, 1.0)):
+    weights = compositing_weights(field.find_density(space), space.delta)
+    visibility = surface_space(space, weights, rays, encoded, occlusion=True).visibility[:, seen, 0]
+    for factor in (1.0, 4.0, 1e6):
         field.own_view_factor.fill_(factor)
         logits = field.render_samples(rays, on_wall(rays), encoded)[0].logits[seen]
-        wanted = (share * own + (1 - share) * others).expand_as(logits)
-        # The views do not see the wall quite alike, so that their votes are not quite 1 / 3 each.
-        assert (logits - wanted).abs().max() < (1e-4 if share == 1 else 0.05) * (others - own).abs().max()
+        share = factor * visibility[1] / (visibility[0] + factor * visibility[1] + visibility[2])
+        wanted = share[:, None] * own + (1 - share[:, None]) * others
+        # The other two do not see the wall quite alike, and are said to here.
+        assert (logits - wanted).abs().max() < (1e-4 if factor > 1e5 else 0.05) * (others - own).abs().max()
 
 
 def test_a_file_keeps_the_factor_of_the_own_view_and_one_without_has_1(tmp_path: Path):
