@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from semantic_mapper.benchmark.config import TierConfig
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.fields.base import SemanticField
+from semantic_mapper.fields.depth_prior import depth_prior
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.render import render_image
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_streaming import StreamingSRay, compiled_covers
-from semantic_mapper.imaging import fill_holes, resize_depth
+from semantic_mapper.imaging import resize_depth, resize_rgb
 from semantic_mapper.labels import IGNORE_CHANNEL, ROOMS, LabelSet
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import FieldRender, Float32, PosedFrame, UInt8
@@ -60,7 +61,7 @@ def predict_view(field: LearnedField, sources: Sequence[PosedFrame], query: Pose
     renderer = _renderer(field, sampling, device)
     with torch.inference_mode():
         encoded = renderer.encode(to_device(stack_sources(views, with_labels=labelled), device))
-    prior = fill_holes(resize_depth(query, query.intrinsics))
+    prior = depth_prior(resize_depth(query, query.intrinsics), resize_rgb(query, query.intrinsics))
     chunk = tier.rays_per_chunk
     render = render_image(renderer, encoded, query.intrinsics, query.T_world_camera, prior, sampling, chunk)
     return _as_prediction(render, field.label_set, (query.intrinsics.height, query.intrinsics.width))

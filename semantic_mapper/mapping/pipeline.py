@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from semantic_mapper.config import MapperConfig, with_quality
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.base import EncodedViews, SemanticField, check_classes, stack_views
+from semantic_mapper.fields.depth_prior import depth_prior
 from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
 from semantic_mapper.imaging import FrameViews, fill_holes, resize_label, working_intrinsics
 from semantic_mapper.labels import LabelSet
@@ -368,14 +369,14 @@ class MappingPipeline:
         return (renderer or self._renderer).render(stack_views(views), intrinsics, frame.T_world_camera, prior, rgb)
 
     def _depth_prior(self, resized: FrameViews, intrinsics: CameraIntrinsics) -> Float32:
-        """Where the surface is expected: the sensor's depth with its holes filled, else the map's own ray cast."""
+        """Where the surface is expected: the sensor's depth (``depth_prior``), else the map's own ray cast."""
         frame = resized.frame
         depth = resized.depth(intrinsics)
-        if frame.depth_m is None:
-            if self.voxel_map.block_count == 0:
-                return depth
-            depth = self.voxel_map.ray_cast(frame.T_world_camera, intrinsics).depth_m
-        return fill_holes(depth)
+        if frame.depth_m is not None:
+            return depth_prior(depth, resized.rgb(intrinsics))
+        if self.voxel_map.block_count == 0:
+            return depth
+        return fill_holes(self.voxel_map.ray_cast(frame.T_world_camera, intrinsics).depth_m)
 
     def _lift(
         self, resized: FrameViews, view: RenderedView, voxel_map: VoxelMap

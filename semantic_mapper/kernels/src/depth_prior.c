@@ -1,0 +1,63 @@
+/* Depth borders drawn to the edges of the image: see fields/depth_prior.py. */
+#include <math.h>
+
+#include "kernels.h"
+
+typedef struct {
+    F32 filled, measured; /* (H, W) depth without holes; as measured, 0 = none */
+    U8 rgb;               /* (H, W, 3) */
+    F32 out;              /* (H, W) */
+    int64_t reach;        /* pixels to either side */
+    double step, step_m;  /* two surfaces are farther apart than step * z + step_m */
+    double colour_rate;   /* a neighbour counts by exp(-rate * squared distance of the colours) */
+    double advantage;     /* how much more the other surface must count for a pixel to go over to it */
+} DrawArguments;
+
+typedef struct {
+    int64_t left, right, top, bottom;
+} Window;
+
+/* Depth at a pixel whose window holds surfaces at `low` and at `high`. */
+static float choose_surface(const DrawArguments *a, const Window *w, int64_t pixel, float low, float high) {
+    const int64_t width = a->filled.shape[1];
+    const float own = a->filled.data[pixel], middle = 0.5f * (low + high);
+    const uint8_t *colour = a->rgb.data + 3 * pixel;
+    double count[2] = {0, 0}, sum[2] = {0, 0};
+    for (int64_t y = w->top; y < w->bottom; y++)
+        for (int64_t x = w->left; x < w->right; x++) {
+            const int64_t other = y * width + x;
+            const float z = a->measured.data[other];
+            if (other == pixel || !(z > 0)) continue;
+            double distance = 0;
+            for (int c = 0; c < 3; c++) {
+                const double difference = (double)a->rgb.data[3 * other + c] - (double)colour[c];
+                distance += difference * difference;
+            }
+            const double weight = exp(-a->colour_rate * distance);
+            const int side = z > middle;
+            count[side] += weight, sum[side] += weight * (double)z;
+        }
+    const int here = own > middle, there = 1 - here;
+    const bool goes_over = count[there] > a->advantage * count[here] + 1e-3;
+    return goes_over ? (float)(sum[there] / count[there]) : own;
+}
+
+KERNEL(draw_borders_to_edges, DrawArguments) {
+    const int64_t height = a->filled.shape[0], width = a->filled.shape[1];
+    for (int64_t j = start; j < stop; j++)
+        for (int64_t i = 0; i < width; i++) {
+            const int64_t pixel = j * width + i;
+            const Window w = {max_i(i - a->reach, 0), min_i(i + a->reach + 1, width), max_i(j - a->reach, 0),
+                              min_i(j + a->reach + 1, height)};
+            const float own = a->filled.data[pixel];
+            float low = own, high = own;
+            for (int64_t y = w.top; y < w.bottom; y++)
+                for (int64_t x = w.left; x < w.right; x++) {
+                    const float z = a->filled.data[y * width + x];
+                    low = min_f(low, z), high = max_f(high, z);
+                }
+            const bool two = (double)(high - low) > a->step * (double)own + a->step_m;
+            a->out.data[pixel] = two ? choose_surface(a, &w, pixel, low, high) : own;
+        }
+    return 0;
+}

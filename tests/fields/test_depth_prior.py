@@ -1,0 +1,75 @@
+"""Depth priors: holes are filled, and borders of depth lie where the image has its edges."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from semantic_mapper.errors import ShapeError
+from semantic_mapper.fields.depth_prior import depth_prior
+from semantic_mapper.imaging import fill_holes
+
+NEAR_M, FAR_M, EDGE = 1.0, 2.0, 12
+
+
+def post_before_wall() -> tuple[np.ndarray, np.ndarray]:
+    """Depth and image of a post, left of column ``EDGE``, before a wall; all measured, border on the edge."""
+    depth_m = np.full((20, 24), FAR_M, np.float32)
+    depth_m[:, :EDGE] = NEAR_M
+    rgb = np.full((20, 24, 3), 200, np.uint8)
+    rgb[:, :EDGE] = 80
+    noise = np.random.default_rng(0).integers(-6, 7, rgb.shape)
+    return depth_m, (rgb.astype(int) + noise).astype(np.uint8)
+
+
+def test_a_near_surface_that_the_sensor_widens_ends_at_the_edge_of_the_image():
+    truth, rgb = post_before_wall()
+    depth_m = truth.copy()
+    depth_m[:, EDGE : EDGE + 2] = NEAR_M
+    np.testing.assert_allclose(depth_prior(depth_m, rgb), truth, atol=1e-6)
+
+
+def test_a_hole_takes_the_surface_that_it_looks_like():
+    """Not the nearest one, as most of a shadow beside a near surface would."""
+    truth, rgb = post_before_wall()
+    depth_m = truth.copy()
+    depth_m[:, EDGE : EDGE + 3] = 0
+    assert (fill_holes(depth_m) != truth).any()
+    np.testing.assert_allclose(depth_prior(depth_m, rgb), truth, atol=1e-6)
+
+
+def test_without_an_edge_in_the_image_the_sensor_has_its_way():
+    truth, rgb = post_before_wall()
+    np.testing.assert_array_equal(depth_prior(truth, np.full_like(rgb, 120)), truth)
+
+
+def test_a_wall_that_is_slanted_by_less_than_the_guided_interval_is_one_surface():
+    depth_m = np.tile(np.linspace(1.0, 1.1, 24, dtype=np.float32), (20, 1))
+    _, rgb = post_before_wall()
+    np.testing.assert_array_equal(depth_prior(depth_m, rgb), depth_m)
+
+
+def test_without_depth_there_is_no_prior():
+    _, rgb = post_before_wall()
+    assert not depth_prior(np.zeros(rgb.shape[:2], np.float32), rgb).any()
+
+
+def test_the_same_bits_on_any_number_of_threads():
+    rng = np.random.default_rng(1)
+    depth_m = rng.choice(np.array([0, 1, 2, 4], np.float32), (40, 60))
+    rgb = rng.integers(0, 256, (40, 60, 3)).astype(np.uint8)
+    count = torch.get_num_threads()
+    try:
+        found: list[bytes] = []
+        for threads in (1, 2, 5):
+            torch.set_num_threads(threads)
+            found.append(depth_prior(depth_m, rgb).tobytes())
+    finally:
+        torch.set_num_threads(count)
+    assert len(set(found)) == 1
+
+
+def test_an_image_of_another_size_is_refused():
+    with pytest.raises(ShapeError, match="rgb"):
+        depth_prior(np.ones((4, 6), np.float32), np.zeros((4, 5, 3), np.uint8))
