@@ -22,13 +22,13 @@ from semantic_mapper.config import (
 )
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import MAX_SOURCE_VIEWS
-from semantic_mapper.scenes import SUITE_VERSION, TEST_SEEDS, VALIDATION_SEEDS, CameraPathConfig
+from semantic_mapper.scenes import SUITE_VERSION, TEST_SEEDS, VALIDATION_SEEDS, CameraPathConfig, RoomConfig
 from semantic_mapper.scenes.config import DepthSensorName
 from semantic_mapper.training.finetune import FinetuneConfig
 from semantic_mapper.training.step import StepConfig
 from semantic_mapper.types import CameraIntrinsics
 
-RECORD_VERSION = 6  # raised by a change of what a record means or how views are rendered: older ones are made again
+RECORD_VERSION = 7  # raised by a change of what a record means or how views are rendered: older ones are made again
 
 FOCAL_PER_WIDTH = 882.5 / 1280  # an OAK-D at 1280 pixels
 MAP_WIDTH = 320
@@ -77,6 +77,7 @@ class SequenceConfig(Config, frozen=True):
     step_m: Positive = 0.08  # way (a turn of 1 rad counts as 0.35 m) between frames
     query_pairs: AtLeastOne = 2  # spread evenly over the sequence
     pair_gap: AtLeastOne = 4  # the second view of a pair is this many frames on
+    camouflage: Fraction = RoomConfig().camouflage  # chance that a pair of classes shares one material
     camera: CameraConfig = CameraConfig()
 
 

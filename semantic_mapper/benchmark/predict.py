@@ -18,7 +18,7 @@ from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.render import render_image
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_streaming import StreamingSRay, compiled_covers
-from semantic_mapper.imaging import resize_depth, resize_rgb
+from semantic_mapper.imaging import fill_holes, resize_depth, resize_rgb
 from semantic_mapper.labels import IGNORE_CHANNEL, ROOMS, LabelSet
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import FieldRender, Float32, PosedFrame, UInt8
@@ -50,8 +50,9 @@ def predict_view(field: LearnedField, sources: Sequence[PosedFrame], query: Pose
     Args:
         field: In evaluation mode, on the device to render on. Its ``sampling`` is set as the tier says.
         sources: What the field may see: depth and labels (ids of the field's label set) only where they are given.
-        query: Gives pose, camera and, as the prior of guided sampling, its sensor depth with holes filled; a query
-            without depth is rendered with the tier's blind samples.
+        query: Gives pose, camera and, as the prior of guided sampling, its sensor depth with holes filled; its image
+            has a say in that only where it is one of ``sources``. A query without depth is rendered with the tier's
+            blind samples.
         tier: Samples and chunk size.
     """
     device = next(field.parameters()).device
@@ -61,7 +62,9 @@ def predict_view(field: LearnedField, sources: Sequence[PosedFrame], query: Pose
     renderer = _renderer(field, sampling, device)
     with torch.inference_mode():
         encoded = renderer.encode(to_device(stack_sources(views, with_labels=labelled), device))
-    prior = depth_prior(resize_depth(query, query.intrinsics), resize_rgb(query, query.intrinsics))
+    depth_m = resize_depth(query, query.intrinsics)
+    shown = any(frame is query for frame in sources)
+    prior = depth_prior(depth_m, resize_rgb(query, query.intrinsics)) if shown else fill_holes(depth_m)
     chunk = tier.rays_per_chunk
     render = render_image(renderer, encoded, query.intrinsics, query.T_world_camera, prior, sampling, chunk)
     return _as_prediction(render, field.label_set, (query.intrinsics.height, query.intrinsics.width))

@@ -8,7 +8,15 @@ import numpy as np
 
 from semantic_mapper.benchmark.config import SuiteConfig, camera_of_width
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, RenderedView, make_room, render_view, room_frames
+from semantic_mapper.scenes import (
+    CameraPathConfig,
+    NoiseConfig,
+    RenderedView,
+    RoomConfig,
+    make_room,
+    render_view,
+    room_frames,
+)
 from semantic_mapper.scenes.scene import Scene
 from semantic_mapper.scenes.shots import motion_between, sequence_shots
 from semantic_mapper.types import Float64, PosedFrame
@@ -66,8 +74,9 @@ def make_benchmark_room(seed: int, suite: SuiteConfig) -> BenchmarkRoom:
         roll_deg=asked.roll_deg,
     )
     noise = NoiseConfig(depth=asked.sensor)
-    frames = tuple(room_frames(seed, suite.sequence.frames, camera, path=path, noise=noise))
-    scene = make_room(seed)
+    furnished = RoomConfig(camouflage=suite.sequence.camouflage)
+    frames = tuple(room_frames(seed, suite.sequence.frames, camera, room=furnished, path=path, noise=noise))
+    scene = make_room(seed, furnished)
     pairs = query_pairs(suite)
     queries = [number for pair in pairs for number in pair]
     if suite.current == "hard":

@@ -14,8 +14,11 @@ from semantic_mapper.imaging import fill_holes
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.types import Float32, UInt8
 
-REACH = 5  # pixels to either side that are looked at
-SURFACE_STEP, SURFACE_STEP_M = 0.04, 0.08  # two surfaces are farther apart: the guided interval, fraction of z + metres
+REACH = 1 / 32  # of the image's width is looked at to either side: sensors err by their own pixels, not by ours
+SURFACE_STEP, SURFACE_STEP_M = (
+    0.04,
+    0.08,
+)  # a leap from one surface to another: the guided interval, fraction of z + metres
 COLOUR_SIGMA = 12.0  # 8-bit steps
 ADVANTAGE = 1.5  # times as much must the other surface count for a pixel to go over to it
 
@@ -40,7 +43,7 @@ def depth_prior(depth_m: Float32, rgb: UInt8) -> Float32:
         np.ascontiguousarray(depth_m, np.float32),
         np.ascontiguousarray(rgb),
         out,
-        REACH,
+        max(round(REACH * sizes["W"]), 1),
         SURFACE_STEP,
         SURFACE_STEP_M,
         1 / (2 * COLOUR_SIGMA**2),

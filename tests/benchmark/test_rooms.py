@@ -111,3 +111,13 @@ def test_hard_query_images_are_what_they_are_called_and_all_else_is_clean(seed: 
 
 def roughness(rgb: np.ndarray) -> float:
     return float(np.abs(np.diff(rgb.astype(np.float32), axis=1)).mean())
+
+
+def test_camouflage_repaints_rooms_and_moves_nothing() -> None:
+    sequence = {"frames": 14, "query_pairs": 1, "pair_gap": 2}
+    rooms = [make_benchmark_room(ROOM, tiny_suite(sequence={**sequence, "camouflage": c})) for c in (0.0, 1.0)]
+    (query,) = {room.queries[0] for room in rooms}
+    plain, painted = (room.truth[query] for room in rooms)
+    np.testing.assert_array_equal(plain.label, painted.label)
+    np.testing.assert_array_equal(plain.depth_m, painted.depth_m)
+    assert (rooms[0].frames[query].rgb != rooms[1].frames[query].rgb).any()

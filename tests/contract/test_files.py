@@ -343,8 +343,9 @@ def test_corrections_of_then_move_the_map(tmp_path: Path) -> None:
 def test_a_stored_run_of_then_is_what_the_plugin_gets(tmp_path: Path) -> None:
     replays = api.LogReplays(FOLDER, lambda name: tmp_path / name)
     made = replays("room.mcap", weights="small.safetensors", config=STORED_SETTINGS, max_frames=STORED_FRAMES)
-    made.assert_like("stored")
+    # Rays at depth borders are sampled elsewhere since priors follow the image's edges (docs/decisions/0020).
+    made.assert_like("stored", labels=0.02, confidence=0.03, class_iou=0.03)
     assert made.mapped == STORED_FRAMES and made.refused == []
     fewer = replays("room.mcap", weights="small.safetensors", config=STORED_SETTINGS, max_frames=STORED_FRAMES - 1)
     with pytest.raises(AssertionError, match="is not as"):
-        fewer.assert_like("stored")
+        fewer.assert_like("stored", labels=0.02, confidence=0.03, class_iou=0.03)

@@ -10,14 +10,14 @@ from semantic_mapper.errors import ShapeError
 from semantic_mapper.fields.depth_prior import depth_prior
 from semantic_mapper.imaging import fill_holes
 
-NEAR_M, FAR_M, EDGE = 1.0, 2.0, 12
+NEAR_M, FAR_M, EDGE, WIDTH = 1.0, 2.0, 80, 160
 
 
 def post_before_wall() -> tuple[np.ndarray, np.ndarray]:
     """Depth and image of a post, left of column ``EDGE``, before a wall; all measured, border on the edge."""
-    depth_m = np.full((20, 24), FAR_M, np.float32)
+    depth_m = np.full((20, WIDTH), FAR_M, np.float32)
     depth_m[:, :EDGE] = NEAR_M
-    rgb = np.full((20, 24, 3), 200, np.uint8)
+    rgb = np.full((20, WIDTH, 3), 200, np.uint8)
     rgb[:, :EDGE] = 80
     noise = np.random.default_rng(0).integers(-6, 7, rgb.shape)
     return depth_m, (rgb.astype(int) + noise).astype(np.uint8)
@@ -44,8 +44,8 @@ def test_without_an_edge_in_the_image_the_sensor_has_its_way():
     np.testing.assert_array_equal(depth_prior(truth, np.full_like(rgb, 120)), truth)
 
 
-def test_a_wall_that_is_slanted_by_less_than_the_guided_interval_is_one_surface():
-    depth_m = np.tile(np.linspace(1.0, 1.1, 24, dtype=np.float32), (20, 1))
+def test_a_surface_at_a_grazing_angle_is_one_surface_whatever_its_texture():
+    depth_m = np.tile(np.geomspace(0.5, 5.0, WIDTH, dtype=np.float32), (20, 1))
     _, rgb = post_before_wall()
     np.testing.assert_array_equal(depth_prior(depth_m, rgb), depth_m)
 

@@ -42,6 +42,22 @@ static float choose_surface(const DrawArguments *a, const Window *w, int64_t pix
     return goes_over ? (float)(sum[there] / count[there]) : own;
 }
 
+static bool apart(const DrawArguments *a, float one, float other) {
+    return (double)fabsf(one - other) > a->step * (double)min_f(one, other) + a->step_m;
+}
+
+/* Whether depth leaps from one pixel to the next somewhere in the window: on a slanted surface it climbs. */
+static bool has_leap(const DrawArguments *a, const Window *w) {
+    const int64_t width = a->filled.shape[1];
+    for (int64_t y = w->top; y < w->bottom; y++)
+        for (int64_t x = w->left; x < w->right; x++) {
+            const float *z = a->filled.data + y * width + x;
+            if (x + 1 < w->right && apart(a, z[0], z[1])) return true;
+            if (y + 1 < w->bottom && apart(a, z[0], z[width])) return true;
+        }
+    return false;
+}
+
 KERNEL(draw_borders_to_edges, DrawArguments) {
     const int64_t height = a->filled.shape[0], width = a->filled.shape[1];
     for (int64_t j = start; j < stop; j++)
@@ -56,7 +72,7 @@ KERNEL(draw_borders_to_edges, DrawArguments) {
                     const float z = a->filled.data[y * width + x];
                     low = min_f(low, z), high = max_f(high, z);
                 }
-            const bool two = (double)(high - low) > a->step * (double)own + a->step_m;
+            const bool two = apart(a, low, high) && has_leap(a, &w);
             a->out.data[pixel] = two ? choose_surface(a, &w, pixel, low, high) : own;
         }
     return 0;
