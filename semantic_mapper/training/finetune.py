@@ -242,6 +242,8 @@ def _run(
 ) -> tuple[_Best, int, dict[str, float]]:
     optimiser = make_optimiser(model, config.learning_rate, config.weight_decay)
     alive, norms = _prepare_norms(model, scene.train)
+    if model.image_encoder is not None and not alive:
+        model.image_encoder.freeze_backbones()  # a few keyframes are no match for a million photographs
     patience = 0 if alive else config.patience  # random weights get worse before they get better
 
     def look() -> tuple[float, float]:
