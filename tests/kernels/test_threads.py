@@ -185,4 +185,6 @@ print(before, idle_cpu_s())
 def test_torchs_threads_stop_spinning_where_torch_was_imported_first(script: Path) -> None:
     cores = len(os.sched_getaffinity(0))
     before, after = map(float, output(start(script, SPIN, OMP_NUM_THREADS=str(cores))))
+    if before < 2e-4:
+        pytest.skip("torch's threads do not spin here, whatever the package does")
     assert after < before / 2, f"CPU time while idle after an operation: {before} s before, {after} s after"

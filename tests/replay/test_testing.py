@@ -67,15 +67,15 @@ def test_the_map_is_that_of_the_command_line(room: ReplayedMap, root: Path, tmp_
 
 def test_questions_are_answered_as_the_queries_answer_them(room: ReplayedMap) -> None:
     points = room.voxel_map.points()
-    answers = at(room.snapshot, points.xyz[::500])
+    answers = at(room.snapshot, points.xyz[::50])
     names = dict(zip(ROOMS.ids, ROOMS.names, strict=True))
-    said = [room.class_at(p) for p in points.xyz[::500]]
+    said = [room.class_at(p) for p in points.xyz[::50]]
     assert said == [names.get(int(i)) for i in answers.label] and len(set(said)) > 1
     assert room.class_at((90.0, 0.0, 0.0)) is None
     wall = room.nearest("wall", (0.0, 0.0, 1.0))
     if wall is not None:
         assert room.class_at(wall.xyz) == "wall"
-    around = points.xyz[::500] + np.random.default_rng(0).normal(0, 0.2, (len(points.xyz[::500]), 3))
+    around = points.xyz[::50] + np.random.default_rng(0).normal(0, 0.2, (len(points.xyz[::50]), 3))
     states = occupancy(room.snapshot, around)
     assert [room.is_free(p) for p in around] == [s == State.FREE for s in states] and len(set(states)) == 3
     with pytest.raises(LabelError, match="spaceship"):
