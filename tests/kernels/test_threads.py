@@ -119,7 +119,8 @@ def script(tmp_path: Path) -> Path:
 
 
 def start(script: Path, code: str, **environment: str) -> subprocess.Popen[str]:
-    script.write_text(code, encoding="utf-8")
+    if not script.exists() or script.read_text(encoding="utf-8") != code:  # another process may be about to read it
+        script.write_text(code, encoding="utf-8")
     inherited = {k: v for k, v in os.environ.items() if not k.startswith("OMP_")}
     return subprocess.Popen(
         [sys.executable, str(script)],
