@@ -250,10 +250,13 @@ def test_top_shows_a_running_launch(watched: Running) -> None:
     pid = wait_for_start(watched, "eye", 0)
     os.kill(pid, signal.SIGKILL)
     pid = wait_for_start(watched, "eye", 1)
-    done = run("top", sockets, "--once", "--json")
-    assert done.returncode == 0, done.stderr
-    shown = json.loads(done.stdout)
-    eye = shown["nodes"]["eye"]
+    for _ in range(20):  # the new process first has to publish
+        done = run("top", sockets, "--once", "--json")
+        assert done.returncode == 0, done.stderr
+        shown = json.loads(done.stdout)
+        eye = shown["nodes"]["eye"]
+        if eye["counters"].get("published"):
+            break
     assert (eye["pid"], eye["restarts"]) == (pid, 1) and eye["memory_mb"] > 5
     assert eye["counters"]["published"] > 0 and eye["rates_hz"]["published"] > 0 and eye["ages_s"]["frame"] >= 0
     assert "killed by SIGKILL" in eye["degraded"][0] and 0 <= eye["ages_s"]["beat"] < eye["ages_s"]["start"]
