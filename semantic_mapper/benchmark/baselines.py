@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from semantic_mapper.benchmark.predict import Prediction
+from semantic_mapper.fields.depth_prior import depth_prior
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.geometry import invert_pose, transform, unproject
@@ -78,7 +79,10 @@ def baseline_predictions(
     size = truth.shape
     own = functional.interpolate(log_p[-1:], size=size, mode="bilinear", align_corners=False)
     own = torch.log_softmax(own[0].permute(1, 2, 0).reshape(-1, own.shape[1]), dim=-1).numpy()
-    given_m = prediction.depth_m if current.depth_m is None else fill_holes(current.depth_m)
+    if current.depth_m is None:
+        given_m = prediction.depth_m
+    else:  # the very depth prior that the field has, or its lead would be the prior's
+        given_m = depth_prior(current.depth_m, current.rgb) if own_image else fill_holes(current.depth_m)
     everywhere = np.ones(own.shape[0], bool)
     found = {"own": _as_prediction(own, everywhere, field.label_set, size)}
     votes: dict[str, tuple[Float32, NDArray[np.bool_]]] = {}

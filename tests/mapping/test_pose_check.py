@@ -46,7 +46,7 @@ def room() -> tuple[PosedFrame, ...]:
 
 
 def walk() -> tuple[PosedFrame, ...]:
-    """Long enough that its second half looks at what the first one saw, from nearly everywhere."""
+    """One in which each of these faults shows. In many other rooms some do not: see docs/howto.md."""
     return tiny_frames(60, seed=15)
 
 
