@@ -1,4 +1,4 @@
-"""Steps of a finetuning in which the image encoder is frozen: features are computed once, a step costs its rays only."""
+"""Steps of a finetuning with a frozen image encoder: features are computed once, a step costs its rays only."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """One round of learning beside a mapper: finetune on the keyframes so far, and judge by those that were held out.
 
-The image encoder is frozen, so that whatever a mapper has encoded of its own keyframes stays valid, and new weights can be
-put in the place of old ones at once.
+The image encoder is frozen, so that whatever a mapper has encoded of its own keyframes stays valid, and new weights
+can be put in the place of old ones at once.
 """
 
 from __future__ import annotations
