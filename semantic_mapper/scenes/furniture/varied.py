@@ -88,9 +88,7 @@ def open_cupboard(a: Assembly, rng: np.random.Generator, palette: Palette) -> No
     panelled = rng.uniform() < 0.4
     for k in range(columns):
         hinge, x = (1 if k % 2 else -1), (k - (columns - 1) / 2) * each
-        if rng.uniform() < 0.15:
-            continue  # no door at all
-        swing = rng.uniform(0.3, 1.9) if rng.uniform() < 0.5 else 0.0
+        swing = rng.uniform(0.3, 1.9) if rng.uniform() < 0.4 else 0.0  # without any door it would be a bookshelf
         _leaf(a, front, x, d + 0.002, 0.05, h - 0.01, each - 0.01, 0.02, hinge, swing)
         if swing:
             continue
