@@ -93,9 +93,9 @@ class FinetuneConfig(Config, frozen=True):
     )
     held_out_rays: AtLeastOne = 512  # a keyframe, but no more than 6,144 in all
     evaluations: AtLeastOne = 10  # over the whole budget
-    patience: NotNegative = (
-        4  # evaluations without a better loss before it stops early; 0 = the whole budget, come what may
-    )
+    # Evaluations without a better loss before it stops early; 0 = the whole budget, come what may. Those during steps
+    # on images do not count: what these teach does not show in rays until the rate has fallen.
+    patience: NotNegative = 4
     bfloat16: bool = True  # the image encoder computes in it where that is fast (GPUs, CPUs with AMX)
     linear_probe_steps: NotNegative = 40  # steps of the classifier alone, on features as they are, before the first ray
     frozen_encoder_fraction: Fraction = (
@@ -290,7 +290,7 @@ def _run(
             with clock.looking():
                 latest = look()
             improved = latest[0] < best.loss or not math.isfinite(best.loss)
-            stale = 0 if improved else stale + 1
+            stale = 0 if improved or fraction < images_until else stale + 1
             if improved:
                 best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
             scene.train = with_uncertainty(model, scene.train) if doubts else scene.train
