@@ -181,7 +181,7 @@ class MappingPipeline:
         view = self._render(resized, [*sources, *own], self.config.render.scale, renderer)
         low = scale_intrinsics(frame.intrinsics, view.known.shape[1], view.known.shape[0])
         seen = self.voxel_map.ray_cast(frame.T_world_camera, low)
-        sure = view.known & (seen.confidence >= SURE)
+        sure = view.known & (seen.confidence >= SURE) & (seen.label != self.label_set.ignore_id)
         same = self.label_set.to_ids(view.probabilities.argmax(axis=2)) == seen.label
         return int((same & sure).sum()), int(sure.sum())
 
