@@ -167,6 +167,8 @@ class KeyframeConfig(Config, frozen=True):
     )
     source_views: Annotated[int, msgspec.Meta(ge=1, le=16)] = 8  # m of the paper
     use_current_view: bool = True  # the frame being mapped is itself a source view of its rendering
+    # Weight of what its image says by itself in its class probabilities, against the rendered view.
+    own_image_weight: Fraction = 0.0
 
 
 class VoxelMapConfig(Config, frozen=True):
