@@ -107,6 +107,7 @@ def score_table(title: str, scores: Mapping[str, Any]) -> Table:
         ("coverage", "coverage"),
         ("ece", "calibration error"),
         ("open_set_auroc", "AUROC, classes it lacks"),
+        ("open_set_unknown", "unknown, of classes it lacks"),
     ):
         if any(m.get(key) is not None for m in methods.values()):
             table.add_row(text, *(_show(m.get(key)) for m in methods.values()))
