@@ -36,7 +36,10 @@ class UNetConfig(Config, frozen=True):
 
 
 class UNetBaseline:
-    """A per-image U-Net: S-Ray's own image encoder with a classifier on top, and nothing that looks across views."""
+    """A per-image U-Net from random weights: a residual encoder of colours with a classifier on top.
+
+    What the encoder of the finetuned field says of single images, in the same seconds, is the row "own image alone".
+    """
 
     def __init__(self, label_set: LabelSet, config: UNetConfig) -> None:
         torch.manual_seed(config.seed)

@@ -60,6 +60,7 @@ from semantic_mapper.types import PosedFrame, RayBatch
 _log = get_logger(__name__)
 
 HELD_OUT_BLOCK = 16  # pixels a side: single held-out pixels would be known from their neighbours
+FEW_STEPS = 10  # fewer are worth a warning: a slow machine, or a small budget
 HELD_OUT_RAYS = 6144  # over all keyframes: a look must not cost more the more keyframes there are
 HELD_OUT_SOURCES = 7  # that a held-out ray is rendered from, beside its own image: those that see most of its view
 IMAGES = 4  # of a step on single images
@@ -296,6 +297,10 @@ def _run(
             scene.train = with_uncertainty(model, scene.train) if doubts else scene.train
         if on_progress is not None:
             on_progress(FinetuneProgress(step, min(fraction, 1.0), float(loss.total.detach()), *latest, improved))
+    if step < FEW_STEPS and not stopped():
+        _log.warning(
+            "few_steps", steps=step, reason="the budget was used up before anything could be learned; raise it"
+        )
     if stopped() and step > 0:  # what was learned since the last look
         latest = look()
         if latest[0] < best.loss or not math.isfinite(best.loss):
