@@ -41,7 +41,7 @@ def encoder(tmp_path: Path) -> str:
 
 
 def test_kinds_that_do_not_classify_images_are_told_which_setting_to_change(tmp_path: Path):
-    with pytest.raises(ConfigError, match=r"kind 'mvsnerf' .* share = 0 under \[images\] .* --encoder"):
+    with pytest.raises(ConfigError, match=r"kind 'mvsnerf' .* fraction = 0 under \[images\] .* --encoder"):
         train(small_run(kind="mvsnerf", field={}), tmp_path)
 
 
