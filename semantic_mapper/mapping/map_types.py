@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.types import Float32, UInt8
+from semantic_mapper.types import Bool, Float32, UInt8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -19,12 +19,14 @@ class MapPoints:
         rgb: (N, 3) uint8.
         label: (N,) uint8 class ids, the label set's ignore id where nothing voted.
         confidence: (N,) float32 probability of ``label``, 0 where nothing voted.
+        measured: (N,) bool, False where no sensor measured the surface: its depth was computed; None = unknown.
     """
 
     xyz: Float32
     rgb: UInt8
     label: UInt8
     confidence: Float32
+    measured: Bool | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +39,7 @@ class MapMesh:
         rgb: (V, 3) uint8.
         label: (V,) uint8 class ids, the ignore id where nothing voted.
         confidence: (V,) float32, 0 where nothing voted.
+        measured: (V,) bool, False where no sensor measured the surface: its depth was computed; None = unknown.
     """
 
     vertices: Float32
@@ -44,6 +47,7 @@ class MapMesh:
     rgb: UInt8
     label: UInt8
     confidence: Float32
+    measured: Bool | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,9 +59,11 @@ class MapView:
         rgb: (H, W, 3) uint8.
         label: (H, W) uint8 class ids, the ignore id at misses and where nothing voted.
         confidence: (H, W) float32, 0 where ``label`` is the ignore id.
+        measured: (H, W) bool, False where no sensor measured the surface: its depth was computed; None = unknown.
     """
 
     depth_m: Float32
     rgb: UInt8
     label: UInt8
     confidence: Float32
+    measured: Bool | None = None

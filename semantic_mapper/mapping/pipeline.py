@@ -231,7 +231,8 @@ class MappingPipeline:
             depth, rows, trust = self._lift(resized, view, self.voxel_map)
         table = view.probabilities.reshape(-1, len(self.label_set))
         with self._stage("fuse"):
-            touched = self.voxel_map.integrate(frame, depth, table, rows=rows, trust=trust)
+            measured = frame.depth_m is not None
+            touched = self.voxel_map.integrate(frame, depth, table, rows=rows, trust=trust, measured=measured)
         if self.corrector.records:
             with self._stage("history"):
                 self.corrector.record(FusedFrame(frame, view.probabilities, view.known, view.depth_m))
@@ -404,7 +405,8 @@ class MappingPipeline:
         view = RenderedView(fused.probabilities, fused.known, fused.rendered_depth_m, 0, 0)
         depth, rows, trust = self._lift(FrameViews(fused.frame), view, voxel_map)
         table = view.probabilities.reshape(-1, len(self.label_set))
-        voxel_map.integrate(fused.frame, depth, table, rows=rows, trust=trust)
+        measured = fused.frame.depth_m is not None
+        voxel_map.integrate(fused.frame, depth, table, rows=rows, trust=trust, measured=measured)
 
     def _make_keyframe(self, resized: FrameViews, encoded: EncodedViews, *, labelled: bool = False) -> Keyframe:
         frame = resized.frame
