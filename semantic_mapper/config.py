@@ -167,6 +167,8 @@ class KeyframeConfig(Config, frozen=True):
     )
     source_views: Annotated[int, msgspec.Meta(ge=1, le=16)] = 8  # m of the paper
     use_current_view: bool = True  # the frame being mapped is itself a source view of its rendering
+    # Weight of what its image says by itself in its class probabilities, against the rendered view.
+    own_image_weight: Fraction = 0.0
 
 
 class VoxelMapConfig(Config, frozen=True):
@@ -183,6 +185,7 @@ class VoxelMapConfig(Config, frozen=True):
     memory_mb: NotNegative = 0  # for voxels; what was used longest ago goes to disk; 0 = no limit
     vote_discount: Fraction = 0.75  # rho: how much a repeated view of a voxel repeats what earlier views said
     vote_band_voxels: Positive = 2.0  # only voxels this near the surface take class votes
+    unknown_below: Fraction = 0.0  # labels of less confidence read as unknown; 0 = none do
     evidence: Literal["float32", "int16"] = "float32"  # "int16": half the memory for classes (``evidence.py``)
 
 

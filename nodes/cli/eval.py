@@ -147,6 +147,8 @@ def _evaluate_targets(
         found["logs"][str(log)] = scores = score_log(ScoreRequest(log, *options))
         tables[str(log)] = score_table(log.name, scores)
         output.print(tables[str(log)])
+        for note in scores["notes"]:
+            output.print(note)
     path = json_file or (folders[0] / "eval.json" if folders else targets[0].with_suffix(".eval.json"))
     write_json(path, found)
     write_eval_report(page := path.with_suffix(".html"), found["replays"], folders, tables, found)

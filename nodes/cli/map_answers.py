@@ -93,7 +93,8 @@ def answer_table(found: dict[str, Any], width: int) -> Table:
     table = Table(title=found["map"], title_justify="left", show_header=False)
     for key, value in found.items():
         if key not in ("map", "question", "classes"):
-            table.add_row(key.replace("_", " "), _text(value))
+            unnamed = key == "class" and value is None and found["surface_distance_m"] is not None
+            table.add_row(key.replace("_", " "), "unknown" if unnamed else _text(value))
     if "classes" in found:
         table.add_section()
         for name, count in sorted(found["classes"].items(), key=lambda item: -item[1]):

@@ -256,7 +256,7 @@ def write_eval_report(
     for log, table in logs.items():
         methods = found["logs"][log]["methods"]
         sections += [
-            Section(Path(log).name, tables=[table]),
+            Section(Path(log).name, found["logs"][log]["notes"], tables=[table]),
             *_classes({n: m["per_class"] for n, m in methods.items()}),
         ]
     if found.get("surface"):

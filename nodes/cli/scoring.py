@@ -15,6 +15,7 @@ from semantic_mapper.nodes.cli.console import frame_progress
 from semantic_mapper.nodes.cli.run_replay import mapper_config
 from semantic_mapper.nodes.cli.summary_table import percent
 from semantic_mapper.replay.evaluate.methods import baseline_predictors, evaluate_frames, field_predictors
+from semantic_mapper.replay.evaluate.shortfall import explain_shortfall
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.types import PosedFrame
 
@@ -36,7 +37,8 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
     """Run the methods over a log.
 
     Returns:
-        ``methods`` (metrics by name), ``scored``, ``excluded``, ``refused``, ``damaged``, ``weights``.
+        ``methods`` (metrics by name), ``scored``, ``excluded``, ``refused``, ``damaged``, ``weights``, and ``notes``:
+        why the field is below its own image alone or the U-Net, where it is.
 
     Raises:
         LogError, LabelError, WeightsError: nothing can be scored.
@@ -70,7 +72,14 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
                 on_frame=bar.set,
                 voxel_map=bundle.pipeline.voxel_map,
             )
-        return {**asdict(found), "damaged": len(log.errors), "weights": bundle.weights_path.name}
+        model, recipe = bundle.checkpoint.model, bundle.checkpoint.recipe
+        shortfall = explain_shortfall(model.kind, found.methods, recipe)
+        return {
+            **asdict(found),
+            "damaged": len(log.errors),
+            "weights": bundle.weights_path.name,
+            "notes": list(shortfall),
+        }
 
 
 def _frames_at(log: Log, stamps: frozenset[int]) -> list[PosedFrame]:
@@ -98,6 +107,7 @@ def score_table(title: str, scores: Mapping[str, Any]) -> Table:
         ("coverage", "coverage"),
         ("ece", "calibration error"),
         ("open_set_auroc", "AUROC, classes it lacks"),
+        ("open_set_unknown", "unknown, of classes it lacks"),
     ):
         if any(m.get(key) is not None for m in methods.values()):
             table.add_row(text, *(_show(m.get(key)) for m in methods.values()))

@@ -113,6 +113,7 @@ _ROWS: Sequence[tuple[str, str, Any]] = (
     ("voxel size", "map.voxel_size_m", lambda v: f"{v * 100:g} cm"),
     ("blocks", "map.blocks", str),
     ("surface points", "map", lambda m: f"{m['surface_points']}{' (nearly empty)' if m.get('nearly_empty') else ''}"),
+    ("unknown surface", "map.unknown", percent),
     ("map memory", "map.memory_mb", lambda v: f"{v} MB"),
     ("mIoU", "metrics.miou", percent),
     ("total accuracy", "metrics.total_accuracy", percent),

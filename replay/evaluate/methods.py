@@ -49,7 +49,8 @@ class Evaluation:
     """Metrics by method, and how many frames were scored, left out, and refused.
 
     Beside the figures of ``SegmentationMetrics`` a method has ``ece``, and ``open_set_auroc`` where some labels are of
-    classes that it cannot name; both None without confidences.
+    classes that it cannot name; both None without confidences. The map also has ``open_set_unknown``: the fraction of
+    its voted points of such classes that it calls unknown (``voxel_map.unknown_below``), None without such points.
     """
 
     methods: dict[str, dict[str, Any]]
@@ -154,6 +155,7 @@ def evaluate_frames(
             _log.error("frame_refused", seq=frame.seq, reason=str(error))
         if on_frame is not None:
             on_frame(index + 1)
+    rejected: float | None = None
     if voxel_map is not None:
         points = voxel_map.points()
         labels = surface.labels_at(points.xyz)
@@ -162,13 +164,17 @@ def evaluate_frames(
             truth, answer = truth_mapper.to_map_ids(labels, MAP), points.label
             confusions[MAP], confidences[MAP] = ConfusionMatrix(label_set), ConfidenceScores()
             confusions[MAP].update(truth, answer, MAP)
-            strange, voted = truth == label_set.ignore_id, labelled & (answer != label_set.ignore_id)
+            strange, voted = truth == label_set.ignore_id, labelled & (points.confidence > 0)
+            found = answer[strange & voted] == label_set.ignore_id
+            rejected = float(found.mean()) if len(found) else None
             confidences[MAP].update(points.confidence[voted], (answer == truth)[voted], strange[voted])
-    methods = {
+    methods: dict[str, dict[str, Any]] = {
         name: asdict(matrix.metrics())
         | {"ece": confidences[name].calibration.ece, "open_set_auroc": confidences[name].open_set_auroc}
         for name, matrix in confusions.items()
     }
+    if MAP in methods:
+        methods[MAP]["open_set_unknown"] = rejected
     return Evaluation(methods, scored, excluded, refused)
 
 

@@ -24,7 +24,7 @@ from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, Scene, make_room, render_view, room_frames
+from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, RoomConfig, Scene, make_room, render_view, room_frames
 from semantic_mapper.types import Float32, Float64, UInt8
 
 NEAR_M = 0.05  # a map point this near to the true surface speaks for it
@@ -66,9 +66,10 @@ def map_room(seed: int, weights: Path, digest: str, suite: SuiteConfig) -> MapRe
     pipeline = Mapper.load(weights, suite.mapper).pipeline
     camera = camera_of_width(MAP_WIDTH)
     path = CameraPathConfig(step_m=suite.sequence.step_m)
-    scene = make_room(seed)
+    furnished = RoomConfig(camouflage=suite.sequence.camouflage)
+    scene = make_room(seed, furnished)
     views: list[_View] = []
-    for frame in room_frames(seed, suite.map_frames, camera, path=path, noise=NoiseConfig()):
+    for frame in room_frames(seed, suite.map_frames, camera, room=furnished, path=path, noise=NoiseConfig()):
         label = in_rooms(pipeline.step(as_given(frame, depth=suite.depth)).label, pipeline.label_set)
         assert frame.label is not None
         views.append(_View(frame.T_world_camera, frame.label, label))

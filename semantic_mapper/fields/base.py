@@ -101,6 +101,15 @@ class Sampled(Protocol):
     sampling: SamplingConfig
 
 
+@runtime_checkable
+class ImageClassifier(Protocol):
+    """A field that may also say what an encoded image shows by itself."""
+
+    def source_logits(self, sources: EncodedViews) -> torch.Tensor | None:
+        """Logits (m, L, h, w) of m encoded images; None where the field has no such opinion."""
+        ...
+
+
 def check_classes(field: SemanticField, label_set: LabelSet) -> None:
     """Refuse a field for a map of other classes.
 

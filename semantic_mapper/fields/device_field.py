@@ -61,6 +61,11 @@ class DeviceField:
         with torch.inference_mode():
             return self.model.encode(to_device(views, self.device))
 
+    def source_logits(self, sources: EncodedViews) -> torch.Tensor | None:
+        """Logits (m, L, h, w) of the encoded images by themselves, on the device; None where the kind has none."""
+        with torch.inference_mode():
+            return self.model.source_logits(sources)
+
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
         """Render rays of the device from views that ``encode`` has encoded; not differentiable."""
         with torch.inference_mode():

@@ -215,8 +215,11 @@ class ImageEncoder(nn.Module):
 
     @property
     def uncalibrated(self) -> bool:
-        """Whether its norms have never seen an image: constants of a fresh network mean nothing."""
-        return any(int(norm.num_batches_tracked or 0) == 0 for norm in self._norms())
+        """Whether its norms have never seen an image: constants of a fresh network mean nothing.
+
+        Norms of a pretrained backbone that was frozen from the start have counted no batch, but have statistics.
+        """
+        return any(_is_fresh(norm) for norm in self._norms())
 
     def train(self, mode: bool = True) -> Self:
         """Training mode for all but the norms, whose statistics only change inside ``batch_statistics``."""
@@ -264,6 +267,13 @@ class ImageEncoder(nn.Module):
 
     def _norms(self) -> Iterator[nn.BatchNorm2d]:
         return (module for module in self.modules() if isinstance(module, nn.BatchNorm2d))
+
+
+def _is_fresh(norm: nn.BatchNorm2d) -> bool:
+    """Whether a norm is as it was built: it has counted no batch, and was given no statistics."""
+    assert norm.running_mean is not None and norm.running_var is not None  # all norms here track their statistics
+    counted = int(norm.num_batches_tracked or 0)
+    return counted == 0 and not bool(norm.running_mean.any()) and bool((norm.running_var == 1).all())
 
 
 def has_depth(depth_m: torch.Tensor) -> torch.Tensor:

@@ -70,6 +70,11 @@ class StreamingSRay:
                 encoded.channel,
             )
 
+    def source_logits(self, sources: EncodedViews) -> torch.Tensor:
+        """Logits (m, L, h, w) of the encoded images by themselves."""
+        with torch.inference_mode():
+            return self.model.source_logits(sources)
+
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
         """Render rays with guided samples; not differentiable."""
         return self.render_samples(

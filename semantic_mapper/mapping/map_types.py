@@ -17,8 +17,9 @@ class MapPoints:
     Args:
         xyz: (N, 3) float32 metres in the world.
         rgb: (N, 3) uint8.
-        label: (N,) uint8 class ids, the label set's ignore id where nothing voted.
-        confidence: (N,) float32 probability of ``label``, 0 where nothing voted.
+        label: (N,) uint8 class ids, the label set's ignore id where nothing voted or the map is too unsure
+            (``voxel_map.unknown_below``).
+        confidence: (N,) float32 probability of the likeliest class, 0 where nothing voted.
         measured: (N,) bool, False where no sensor measured the surface: its depth was computed; None = unknown.
     """
 
@@ -37,7 +38,7 @@ class MapMesh:
         vertices: (V, 3) float32 metres in the world.
         faces: (F, 3) int32 vertex indices.
         rgb: (V, 3) uint8.
-        label: (V,) uint8 class ids, the ignore id where nothing voted.
+        label: (V,) uint8 class ids, the ignore id where unknown; see ``MapPoints``.
         confidence: (V,) float32, 0 where nothing voted.
         measured: (V,) bool, False where no sensor measured the surface: its depth was computed; None = unknown.
     """
@@ -57,8 +58,8 @@ class MapView:
     Args:
         depth_m: (H, W) float32 z-depth, 0 where the ray meets no surface.
         rgb: (H, W, 3) uint8.
-        label: (H, W) uint8 class ids, the ignore id at misses and where nothing voted.
-        confidence: (H, W) float32, 0 where ``label`` is the ignore id.
+        label: (H, W) uint8 class ids, the ignore id at misses and where unknown; see ``MapPoints``.
+        confidence: (H, W) float32, 0 at misses and where nothing voted.
         measured: (H, W) bool, False where no sensor measured the surface: its depth was computed; None = unknown.
     """
 

@@ -28,6 +28,7 @@ from semantic_mapper.mapping.fusion.depth_trust import depth_trust
 from semantic_mapper.mapping.fusion.vote_fusion import add_votes
 from semantic_mapper.mapping.keyframes import EncodedSize, Keyframe, KeyframeStore
 from semantic_mapper.mapping.pose_check import PoseCheck
+from semantic_mapper.mapping.views.own_image import add_own_image
 from semantic_mapper.mapping.views.upsample import upsample
 from semantic_mapper.mapping.views.view_renderer import RenderedView, ViewRenderer
 from semantic_mapper.mapping.views.virtual_views import ViewpointChooser, VirtualLook
@@ -76,6 +77,7 @@ class MappingPipeline:
         self._viewpoints = ViewpointChooser(config.virtual, config.seed)
         self._steps = 0
         self._renderer = ViewRenderer(field, config.render, config.sampling)
+        self._own_image_weight = config.keyframes.own_image_weight if config.keyframes.use_current_view else 0.0
         self.corrector = MapCorrector(config.history, self.voxel_map, self.keyframes, self._fuse_again)
         self._intrinsics: dict[str, CameraIntrinsics] = {}
         self._odd_sizes: dict[str, tuple[tuple[int, int], int]] = {}
@@ -181,7 +183,7 @@ class MappingPipeline:
         view = self._render(resized, [*sources, *own], self.config.render.scale, renderer)
         low = scale_intrinsics(frame.intrinsics, view.known.shape[1], view.known.shape[0])
         seen = self.voxel_map.ray_cast(frame.T_world_camera, low)
-        sure = view.known & (seen.confidence >= SURE)
+        sure = view.known & (seen.confidence >= SURE) & (seen.label != self.label_set.ignore_id)
         same = self.label_set.to_ids(view.probabilities.argmax(axis=2)) == seen.label
         return int((same & sure).sum()), int(sure.sum())
 
@@ -227,6 +229,7 @@ class MappingPipeline:
         with self._stage("render"):
             own = [current] if self.config.keyframes.use_current_view else []
             view = self._render(resized, [*(k.encoded for k in sources), *own], self.config.render.scale)
+            view = add_own_image(view, self.field, current, self._own_image_weight)
         with self._stage("lift"):
             depth, rows, trust = self._lift(resized, view, self.voxel_map)
         table = view.probabilities.reshape(-1, len(self.label_set))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError, FrameError, MapError
 from semantic_mapper.geometry import check_pose
-from semantic_mapper.labels import IGNORE_CHANNEL, LabelSet
+from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.files.extract import join_meshes, open3d_grid, surface_voxels, triangle_mesh
 from semantic_mapper.mapping.files.map_file import open_map
 from semantic_mapper.mapping.files.map_manifest import MapManifest
@@ -280,7 +280,7 @@ class VoxelMap:
         """A copy of the whole map as an ``open3d.t.geometry.VoxelBlockGrid``, for what Open3D does with one.
 
         Its attributes are tsdf, weight and color (float32, as Open3D's own ``integrate`` leaves them), label (uint8 id,
-        the ignore id where nothing voted), and evidence and votes as they are stored.
+        the ignore id where unknown), and evidence and votes as they are stored.
 
         Raises:
             MapError: the map is empty.
@@ -291,8 +291,7 @@ class VoxelMap:
         if not len(keys):
             raise MapError("an empty map has no blocks to hand to Open3D; map a frame first")
         flat = {name: values.reshape(len(keys), -1, *values.shape[4:]) for name, values in state.items()}
-        channel = np.where(np.asarray(flat["votes"], np.float32) > 0, flat["evidence"].argmax(axis=2), IGNORE_CHANNEL)
-        return open3d_grid(keys, self.config.voxel_size_m, **flat, label=self.label_set.to_ids(channel))
+        return open3d_grid(keys, self.config.voxel_size_m, **flat, label=self.changes(0, min_weight=1e-9).label)
 
     def ray_cast(self, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> MapView:
         """The map as a camera would see it, up to ``depth_max_m`` away.
@@ -402,13 +401,14 @@ class VoxelMap:
 
     def _choose_changes(self, since: int, limit: int, min_weight: float) -> ChosenBlocks:
         _check_min_weight(min_weight)
-        decision = (self.label_set, self.config.vote_discount, min_weight)
+        decision = (self.label_set, self.config.vote_discount, self.config.unknown_below, min_weight)
         return choose_blocks(self._grid, (since, self.version, self.epoch), limit, decision)
 
     def _read(
         self, grid: BlockGrid, voxels: Float64
     ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Float32, BoolImage]:
-        return read_points(voxels, grid.index, grid.buffers(), self.label_set, self.config.vote_discount)
+        decision = (self.label_set, self.config.vote_discount, self.config.unknown_below)
+        return read_points(voxels, grid.index, grid.buffers(), *decision)
 
 
 def _check_min_weight(min_weight: float) -> None:

@@ -24,8 +24,8 @@ class PointAnswers:
     """What is at N points.
 
     Args:
-        label: (N,) uint8 class ids of the nearest surface; the ignore id where none is near, or nothing voted there.
-        confidence: (N,) float32 probability of ``label``, 0 at the ignore id.
+        label: (N,) uint8 class ids of the nearest surface; the ignore id where none is near or it is unknown.
+        confidence: (N,) float32 probability of the likeliest class, 0 where none is near or nothing voted.
         distance_m: (N,) float32 to that surface, infinite where none is near.
         state: (N,) uint8 ``State`` of the voxel that the point itself lies in.
     """

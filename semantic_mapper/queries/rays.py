@@ -25,8 +25,8 @@ class RayHits:
 
     Args:
         distance_m: (N,) float32 along the ray, 0 where it meets no surface.
-        label: (N,) uint8 class ids, the ignore id at misses and where nothing voted.
-        confidence: (N,) float32, 0 where ``label`` is the ignore id.
+        label: (N,) uint8 class ids, the ignore id at misses and where unknown.
+        confidence: (N,) float32 probability of the likeliest class, 0 at misses and where nothing voted.
         rgb: (N, 3) uint8.
     """
 
@@ -104,7 +104,6 @@ def _cast(snapshot: MapSnapshot, origin: Float64, direction: Float64, max_m: flo
         max_m,
         snapshot.index,
         snapshot.voxels,
-        snapshot.label_set.ignore_id,
         distance,
         slot,
         voxel,
@@ -115,10 +114,10 @@ def _cast(snapshot: MapSnapshot, origin: Float64, direction: Float64, max_m: flo
 
 def nearest_corners(points: Float64, snapshot: MapSnapshot) -> tuple[Int64, Int64]:
     """Slot (-1 = none) and voxel (N,) of the observed voxel nearest to points (N, 3), units of voxels, among the eight
-    round each; of those with a class if any has one."""
+    round each; of those with votes if any has some."""
     points = np.ascontiguousarray(points)
     slot, voxel = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
-    find_nearest_corners(points, snapshot.index, snapshot.voxels, snapshot.label_set.ignore_id, slot, voxel)
+    find_nearest_corners(points, snapshot.index, snapshot.voxels, slot, voxel)
     return slot, voxel
 
 
@@ -130,7 +129,6 @@ def march_rays(
     max_m: float,
     index: BlockIndex,
     voxels: BlockVoxels,
-    ignore_id: int,
     distance: Float32,
     slots: Int64,
     chosen: Int64,
@@ -143,15 +141,12 @@ def march_rays(
         voxels_per_step: Length of one step of the quantised TSDF.
         max_m: Where rays end, in units of the distance.
         index, voxels: Of the snapshot.
-        ignore_id: Of its label set.
         distance, slots, chosen: (N,) written.
     """
     ...
 
 
 @kernel
-def find_nearest_corners(
-    points: Float64, index: BlockIndex, voxels: BlockVoxels, ignore_id: int, slots: Int64, chosen: Int64
-) -> None:
+def find_nearest_corners(points: Float64, index: BlockIndex, voxels: BlockVoxels, slots: Int64, chosen: Int64) -> None:
     """Write slots and voxels (N,); see ``nearest_corners``."""
     ...

@@ -21,8 +21,8 @@ class BlockVoxels(NamedTuple):
     Args:
         tsdf: (S, 512) int8 signed distance over truncation, times 127.
         weight: (S, 512) uint8, 1 where observed.
-        label: (S, 512) uint8 class ids, the ignore id where nothing voted.
-        confidence: (S, 512) uint8 probability of ``label``, times 255.
+        label: (S, 512) uint8 class ids, the ignore id where nothing voted or the map is too unsure.
+        confidence: (S, 512) uint8 probability of the likeliest class, times 255; 0 where nothing voted.
         rgb: (S, 512, 3) uint8.
         classes: (S, 4) uint64, a bit for each class id that a surface voxel of the block may have.
     """

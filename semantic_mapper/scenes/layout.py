@@ -6,12 +6,13 @@ import numpy as np
 
 from semantic_mapper.scenes.furniture import FURNITURE
 from semantic_mapper.scenes.materials import Palette
-from semantic_mapper.scenes.primitives import Assembly, Part, Top, part_bounds, place_parts, rotation_z
+from semantic_mapper.scenes.primitives import Assembly, Part, Top, part_bounds, place_parts, rotation_z, scaled
 from semantic_mapper.scenes.shell import build_shell, wall_pose
 from semantic_mapper.types import Float64
 
 _GAP_M = 0.015  # between two pieces, and between a piece and the wall behind it
 _WALLS = 4
+_SIZES = (0.8, 1.2)  # of the pieces of varied rooms, in terms of those of others
 _THINGS_M2 = 14.0  # small things a square metre of table or counter
 
 
@@ -23,25 +24,43 @@ class Layout:
         rng: Draws everything.
         palette: The room's materials.
         wet: A bathroom, with tiles.
+        variety: Draws what only varied rooms have; None: not one of them.
     """
 
     def __init__(
-        self, size_m: tuple[float, float, float], rng: np.random.Generator, palette: Palette, *, wet: bool = False
+        self,
+        size_m: tuple[float, float, float],
+        rng: np.random.Generator,
+        palette: Palette,
+        *,
+        wet: bool = False,
+        variety: np.random.Generator | None = None,
     ) -> None:
         self.size_m = size_m
         self.rng = rng
         self.palette = palette
+        self.variety = variety
+        self._sizes: dict[str, float] = {}  # by which each kind of piece is larger, in a varied room
         self.groups: list[list[Part]] = []
         self.lamps: list[Float64] = []
         self._tops: list[tuple[Top, float, Float64]] = []  # with yaw and position of the piece they belong to
         self._low, self._high = np.zeros((0, 3)), np.zeros((0, 3))  # of all parts that stand
         self._free_low, self._free_high = np.zeros((0, 3)), np.zeros((0, 3))  # zones to keep free
-        shell = build_shell(size_m, rng, palette, wet=wet)
+        shell = build_shell(size_m, rng, palette, wet=wet, variety=variety)
         self.groups.extend(shell.groups)
         self.far_lamp = shell.lamp
         self.has_opening = shell.free is not None
         if shell.free is not None:
             self._free_low, self._free_high = shell.free[0][None], shell.free[1][None]
+
+    def make(self, name: str, rng: np.random.Generator | None = None) -> Assembly:
+        """A specimen of a piece, drawn by ``rng`` or else the room's; in a varied room, each kind has its own size."""
+        piece = FURNITURE[name].make(self.rng if rng is None else rng, self.palette)
+        if self.variety is None:
+            return piece
+        if name not in self._sizes:
+            self._sizes[name] = float(np.exp(self.variety.uniform(*np.log(_SIZES))))
+        return scaled(piece, self._sizes[name])
 
     def put(self, assembly: Assembly, yaw: float, position: Float64, *, in_keep_free: bool = False) -> bool:
         """Stand ``assembly`` at ``position`` (3,) if nothing is in the way; ``in_keep_free``: it may stand where space
@@ -108,6 +127,15 @@ class Layout:
                 return yaw, position
         return None
 
+    def in_corner(self, assembly: Assembly) -> bool:
+        """With its left end in one of the room's corners, its back to the wall."""
+        low, _ = assembly.bounds()
+        for wall in self.rng.permutation(_WALLS):
+            yaw, position = wall_pose(self.size_m, int(wall), float(0.03 - low[0]), float(0.03 - low[1]))
+            if self.put(assembly, yaw, position):
+                return True
+        return False
+
     def in_centre(self, assembly: Assembly, *, tries: int = 30, margin_m: float = 0.3) -> tuple[float, Float64] | None:
         """Free in the room, along its axes; returns the pose it got, or None."""
         low, high = assembly.bounds()
@@ -138,7 +166,7 @@ class Layout:
             area = max(top.x1 - top.x0, 0.0) * max(top.y1 - top.y0, 0.0)
             crowd = fraction * float(self.rng.choice((0.2, 0.8, 1.3, 2.0)))
             for _ in range(int(self.rng.poisson(crowd * (area * _THINGS_M2 + 0.3)))):
-                small = FURNITURE[names[int(self.rng.integers(len(names)))]].make(self.rng, self.palette)
+                small = self.make(names[int(self.rng.integers(len(names)))])
                 low, high = small.bounds()
                 x0, x1 = top.x0 - low[0] + 0.02, top.x1 - high[0] - 0.02
                 y0, y1 = top.y0 - low[1] + 0.02, top.y1 - high[1] - 0.02

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 
 import numpy as np
@@ -183,6 +183,12 @@ def material_table(items: Sequence[Material]) -> MaterialTable:
         gloss=np.array([m.gloss for m in items], np.float64),
         mirror=np.array([m.mirror for m in items], np.float64),
     )
+
+
+def joined_tables(first: MaterialTable, second: MaterialTable) -> MaterialTable:
+    """One table; the numbers of ``second`` go on after those of ``first``."""
+    pairs = ((f.name, getattr(first, f.name), getattr(second, f.name)) for f in fields(MaterialTable))
+    return MaterialTable(**{name: np.concatenate((a, b)) for name, a, b in pairs})
 
 
 def display_hsv(hue: float, saturation: float, value: float) -> Color:

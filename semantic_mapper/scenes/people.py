@@ -65,8 +65,12 @@ def _person(rng: np.random.Generator, palette: Palette, *, casts_shadow: bool) -
     """Upright, facing y; the arms hang, or are bent as at work."""
     a, h = Assembly(BEING), rng.uniform(1.5, 1.9) / 1.75
     wide, bend = rng.uniform(0.36, 0.5), rng.uniform(0.0, 1.5)
-    skin, hair = palette.add(_skin(rng)), palette.add(_hair(rng))
-    shirt, trousers, shoe = palette.add(_cloth(rng)), palette.add(_cloth(rng)), palette.pick(rng, "dark", "object")
+    skin, hair = palette.add(skin_material(rng)), palette.add(_hair(rng))
+    shirt, trousers, shoe = (
+        palette.add(cloth_material(rng)),
+        palette.add(cloth_material(rng)),
+        palette.pick(rng, "dark", "object"),
+    )
     legs = trousers if rng.uniform() < 0.85 else skin
 
     def add(shape: Shape, material: int, center: tuple[float, float, float], size: tuple[float, float, float]) -> None:
@@ -108,7 +112,8 @@ def _animal(rng: np.random.Generator, palette: Palette, *, casts_shadow: bool) -
     return a
 
 
-def _skin(rng: np.random.Generator) -> Material:
+def skin_material(rng: np.random.Generator) -> Material:
+    """Skin of any tone."""
     color = np.array([0.75, 0.5, 0.38]) * rng.uniform(0.1, 1.0) * rng.uniform(0.85, 1.15, 3)
     return _plain(rng, color, Pattern.PLAIN, 0.1)
 
@@ -118,7 +123,8 @@ def _hair(rng: np.random.Generator) -> Material:
     return _plain(rng, color, Pattern.BRUSHED, 0.02)
 
 
-def _cloth(rng: np.random.Generator) -> Material:
+def cloth_material(rng: np.random.Generator) -> Material:
+    """Cloth of any colour: plain, woven, striped or checked."""
     pattern = (Pattern.PLAIN, Pattern.WEAVE, Pattern.STRIPES, Pattern.CHECKER)[int(rng.integers(4))]
     grey = rng.uniform(0.01, 0.7) * np.ones(3)
     color = grey if rng.uniform() < 0.5 else rng.uniform(0.01, 0.8, 3)

@@ -6,7 +6,7 @@ extents, turned and moved.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
@@ -177,6 +177,14 @@ def rotation_x(angle: float) -> Float64:
     """(3, 3) right-handed rotation about x."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def scaled(assembly: Assembly, factor: float) -> Assembly:
+    """The same piece ``factor`` times as large; the space before it stays as it is."""
+    parts = [replace(p, center=p.center * factor, half=p.half * factor) for p in assembly.parts]
+    tops = [Top(*(factor * value for value in (t.x0, t.x1, t.y0, t.y1, t.z))) for t in assembly.tops]
+    lamps = [(factor * x, factor * y, factor * z) for x, y, z in assembly.lamps]
+    return replace(assembly, parts=parts, tops=tops, lamps=lamps)
 
 
 def part_bounds(part: Part) -> tuple[Float64, Float64]:

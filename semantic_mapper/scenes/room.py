@@ -15,6 +15,7 @@ from semantic_mapper.scenes.scene import Lights, Scene, extremes, shadow_cubes
 
 _GLARE = 0.35  # fraction of the rooms with one hard, strong light
 _PEOPLE_STREAM = 3
+_VARIETY_STREAM = 4
 _ROOM_STREAM = 0  # number of the random stream; camera paths use others
 
 
@@ -29,7 +30,9 @@ def make_room(seed: int, config: RoomConfig = RoomConfig()) -> Scene:
     template = config.template or CYCLE[seed % len(CYCLE)]
     size = _room_size(rng, template, config)
     palette = Palette(rng, held_out=seed not in TRAIN_SEEDS, camouflage=config.camouflage)
-    layout = Layout(size, rng, palette, wet=template == "bathroom")
+    variety = np.random.default_rng((SUITE_VERSION, seed, _VARIETY_STREAM))
+    varied = variety.uniform() < config.variety
+    layout = Layout(size, rng, palette, wet=template == "bathroom", variety=variety if varied else None)
     furnish(layout, template, config.clutter)
     # A stream of its own: the room is the same with and without people in it.
     others = np.random.default_rng((SUITE_VERSION, seed, _PEOPLE_STREAM))

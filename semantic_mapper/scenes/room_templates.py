@@ -101,18 +101,39 @@ CLUTTER: dict[str, tuple[str, ...]] = {
     "studio": (*_COMMON, *_KITCHEN, "table_lamp", "photo_frame", "laptop"),
 }  # fmt: skip
 
+_BOARD = ("tray", "mixing_bowl", "board", "board", "jug")
+
+# What varied rooms hold before all else, and on their tables beside what others do (``RoomConfig.variety``).
+VARIED: dict[str, tuple[Entry, ...]] = {
+    "bedroom": (Entry("open_cupboard", 0.6), Entry("any_table", 0.2)),
+    "living": (Entry("any_table", 0.6), Entry("open_cupboard", 0.5)),
+    "office": (Entry("any_table", 0.6), Entry("open_cupboard", 0.5)),
+    "kitchen": (
+        Entry("corner_counter", 0.6), Entry("any_refrigerator", 0.9), Entry("any_table", 0.9),
+        Entry("open_cupboard", 0.4),
+    ),
+    "bathroom": (Entry("open_cupboard", 0.4),),
+    "studio": (Entry("any_refrigerator", 0.6), Entry("any_table", 0.6), Entry("open_cupboard", 0.4)),
+}  # fmt: skip
+VARIED_CLUTTER: dict[str, tuple[str, ...]] = {
+    "bedroom": ("tray", "jug"), "living": _BOARD, "office": ("tray",), "kitchen": (*_BOARD, *_BOARD),
+    "bathroom": ("jug", "tray"), "studio": _BOARD,
+}  # fmt: skip
+
 
 def furnish(layout: Layout, template: str, clutter: float) -> None:
     """Fill ``layout`` after ``ROOM_TEMPLATES[template]``."""
     if not layout.has_opening or layout.rng.uniform() < 0.4:
         _place(layout, "door")
-    for entry in ROOM_TEMPLATES[template]:
+    more = () if layout.variety is None else VARIED[template]
+    for entry in (*more, *ROOM_TEMPLATES[template]):
         for _ in range(entry.most):
             if layout.rng.uniform() < entry.chance:
                 _place(layout, entry.name)
     _ceiling_lamps(layout)
     if clutter > 0:
-        layout.clutter(clutter, CLUTTER[template])
+        names = CLUTTER[template] if layout.variety is None else (*CLUTTER[template], *VARIED_CLUTTER[template])
+        layout.clutter(clutter, names)
 
 
 def _ceiling_lamps(layout: Layout) -> None:
@@ -121,7 +142,7 @@ def _ceiling_lamps(layout: Layout) -> None:
     look = int(layout.rng.integers(1 << 30))
     two = max(w, d) > 4.2 and layout.rng.uniform() < 0.5
     for share in (0.28, 0.72) if two else (0.5,):
-        lamp = FURNITURE["ceiling_lamp"].make(np.random.default_rng(look), layout.palette)
+        lamp = layout.make("ceiling_lamp", np.random.default_rng(look))
         x, y = (w * share, d / 2) if w >= d else (w / 2, d * share)
         layout.put(lamp, 0.0 if w >= d else np.pi / 2, np.array([x, y, h - 0.001]))
 
@@ -131,8 +152,10 @@ def _place(layout: Layout, name: str) -> None:
         _SETS[name](layout)
         return
     kind = FURNITURE[name]
-    assembly = kind.make(layout.rng, layout.palette)
-    if kind.place == "centre":
+    assembly = layout.make(name)
+    if name == "corner_counter":
+        layout.in_corner(assembly)
+    elif kind.place == "centre":
         layout.in_centre(assembly)
     else:
         layout.at_wall(assembly, corner=kind.place == "corner", flush=kind.place == "hang")
@@ -141,7 +164,7 @@ def _place(layout: Layout, name: str) -> None:
 def _main_piece(layout: Layout, name: str) -> tuple[Assembly, float, np.ndarray] | None:
     """Stand a piece at a wall, trying specimens of several sizes; the piece with its yaw and position, or None."""
     for _ in range(4):
-        piece = FURNITURE[name].make(layout.rng, layout.palette)
+        piece = layout.make(name)
         pose = layout.at_wall(piece, corner=False, flush=False, tries=40)
         if pose is not None:
             return piece, *pose
@@ -157,13 +180,13 @@ def _bed_set(layout: Layout) -> None:
     bed, yaw, position = found
     low, high = bed.bounds()
     for side in (-1, 1):
-        stand = FURNITURE["nightstand"].make(rng, layout.palette)
+        stand = layout.make("nightstand")
         own_low, own_high = stand.bounds()
         reach = high[0] + 0.06 - own_low[0] if side > 0 else low[0] - 0.06 - own_high[0]
         if rng.uniform() < 0.75:
             layout.put(stand, yaw, position + rotation_z(yaw) @ np.array([reach, 0.0, 0.0]))
     if rng.uniform() < 0.5:
-        rug = FURNITURE["rug"].make(rng, layout.palette)
+        rug = layout.make("rug")
         layout.on_floor_unchecked(rug, yaw, position + rotation_z(yaw) @ np.array([0.0, 1.2, 0.0]))
 
 
@@ -176,10 +199,10 @@ def _sofa_set(layout: Layout) -> None:
     sofa, yaw, position = found
     front = float(sofa.bounds()[1][1])
     if rng.uniform() < 0.6:
-        rug = FURNITURE["rug"].make(rng, layout.palette)
+        rug = layout.make("rug")
         layout.on_floor_unchecked(rug, yaw, position + rotation_z(yaw) @ np.array([0.0, front - 0.2, 0.0]))
     if rng.uniform() < 0.85:
-        table = FURNITURE["coffee_table"].make(rng, layout.palette)
+        table = layout.make("coffee_table")
         own = np.array([rng.uniform(-0.1, 0.1), front + rng.uniform(0.3, 0.45), 0.0])
         layout.put(table, yaw, position + rotation_z(yaw) @ own, in_keep_free=True)
 
@@ -191,9 +214,7 @@ def _desk_set(layout: Layout) -> None:
     if found is None:
         return
     desk, yaw, position = found
-    chair = FURNITURE[("office_chair", "office_chair", "chair", "shell_chair")[int(rng.integers(4))]].make(
-        rng, layout.palette
-    )
+    chair = layout.make(("office_chair", "office_chair", "chair", "shell_chair")[int(rng.integers(4))])
     depth = float(desk.bounds()[1][1])
     own = np.array([rng.uniform(-0.12, 0.12), depth + rng.uniform(0.5, 0.75), 0.0])
     turn = yaw + np.pi + rng.uniform(-0.35, 0.35)
@@ -204,7 +225,7 @@ def _dining_set(layout: Layout) -> None:
     """A table with chairs of one kind round it."""
     rng = layout.rng
     round_top = rng.uniform() < 0.35
-    table = FURNITURE["round_table" if round_top else "dining_table"].make(rng, layout.palette)
+    table = layout.make("round_table" if round_top else "dining_table")
     pose = layout.in_centre(table, tries=60, margin_m=0.55)
     if pose is None:
         return
@@ -221,7 +242,7 @@ def _dining_set(layout: Layout) -> None:
     for x, y, facing in seats:
         if rng.uniform() < 0.7:
             # One generator seed for all: the chairs of a set are alike.
-            chair = FURNITURE[kind].make(np.random.default_rng(look), layout.palette)
+            chair = layout.make(kind, np.random.default_rng(look))
             _draw_up(layout, chair, yaw, position, x, y, facing)
 
 
@@ -240,7 +261,7 @@ def _draw_up(
 
 def _mat(layout: Layout) -> None:
     """A mat on the bathroom floor."""
-    rug = FURNITURE["rug"].make(layout.rng, layout.palette)
+    rug = layout.make("rug")
     w, d, _ = layout.size_m
     layout.on_floor_unchecked(rug, 0.0, np.array([w * layout.rng.uniform(0.4, 0.6), d * 0.3, 0.0]))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from semantic_mapper.scenes.arms import draw_arms, hold_arms
 from semantic_mapper.scenes.camera import camera_path
 from semantic_mapper.scenes.config import CameraPathConfig, NoiseConfig, PoseNoiseConfig, RoomConfig
 from semantic_mapper.scenes.pose_noise import drifting_poses
@@ -58,10 +59,12 @@ def room_views(
     poses = camera_path(scene, count, seed, path)
     frame_poses = poses if pose_noise is None else drifting_poses(poses, seed, pose_noise)
     shots = [None] * count if noise is None else sequence_shots(poses, seed, noise)
+    arms = draw_arms(seed, room.variety)
     for index, shot in enumerate(shots):
+        present = scene_at(scene, index)
         noise_seed = None if noise is None else seed * 100_003 + index
         view = render_view(
-            scene_at(scene, index),
+            present if arms is None else hold_arms(present, arms, poses[index]),
             intrinsics,
             poses[index],
             noise=noise_seed,

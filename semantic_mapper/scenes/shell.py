@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -46,6 +46,7 @@ class _Opening:
     deep: float
     has_leaf: bool
     hinge: int = field(default=1)
+    swing: float = np.pi / 2  # of the leaf, into the next room; negative: into this one
 
 
 def wall_pose(size_m: tuple[float, float, float], wall: int, along: float, away: float = 0.0) -> tuple[float, Float64]:
@@ -57,14 +58,22 @@ def wall_pose(size_m: tuple[float, float, float], wall: int, along: float, away:
     return yaw, np.append(corner + turn @ np.array([along, away]), 0.0)
 
 
-def build_shell(size_m: tuple[float, float, float], rng: np.random.Generator, palette: Palette, *, wet: bool) -> Shell:
-    """The shell of a room. ``wet``: a bathroom, with tiles."""
+def build_shell(
+    size_m: tuple[float, float, float],
+    rng: np.random.Generator,
+    palette: Palette,
+    *,
+    wet: bool,
+    variety: np.random.Generator | None = None,
+) -> Shell:
+    """The shell of a room. ``wet``: a bathroom, with tiles. ``variety`` draws the doors of a varied room, which stand
+    open by any angle, to either side."""
     w, d, h = size_m
     floors, walls = (("tile",), ("tile", "wallpaint")) if wet else (_FLOORS, _WALLS)
     floor, wall = palette.pick(rng, *floors, role="floor"), palette.pick(rng, *walls)
     ceiling, board = palette.pick(rng, "wallpaint", "paint"), palette.pick(rng, "wood", "paint")
     accent = palette.pick(rng, "wallpaint", "paint", "wood") if rng.uniform() < 0.3 else wall
-    opening = _draw_opening(size_m, rng)
+    opening = _draw_opening(size_m, rng) if variety is None else _draw_door(size_m, variety)
     groups: list[list[Part]] = []
     for label, material, z in (("floor", floor, -0.05), ("ceiling", ceiling, h + 0.05)):
         slab = Assembly(label)
@@ -100,6 +109,17 @@ def _draw_opening(size_m: tuple[float, float, float], rng: np.random.Generator) 
         wall, x0, x0 + width, height, x0 - rng.uniform(0.3, 1.3), x0 + width + rng.uniform(0.3, 1.3),
         rng.uniform(1.4, 2.6), has_leaf, 1 if rng.uniform() < 0.5 else -1,
     )  # fmt: skip
+
+
+def _draw_door(size_m: tuple[float, float, float], rng: np.random.Generator) -> _Opening:
+    """An opening that more rooms have, and that more often has a leaf."""
+    opening = _draw_opening(size_m, rng)
+    if opening.wall < 0:
+        opening = _draw_opening(size_m, rng)
+    if not opening.has_leaf:
+        return opening
+    swing = rng.uniform(0.15, 1.9) if rng.uniform() < 0.5 else -rng.uniform(0.15, np.pi / 2)
+    return replace(opening, swing=float(swing))
 
 
 def _wall(length: float, h: float, material: int, board: int, opening: _Opening | None) -> Assembly:
@@ -158,8 +178,32 @@ def _door_frame(o: _Opening, rng: np.random.Generator, palette: Palette) -> Asse
     frame.box(wood, ((o.x0 + o.x1) / 2, -0.05, o.height - 0.02), (width - 0.08, 0.128, 0.04))
     if o.has_leaf:
         leaf, metal = palette.pick(rng, "wood", "paint", role="door"), palette.pick(rng, "metal", "dark")
-        x = o.x1 - 0.065 if o.hinge > 0 else o.x0 + 0.065
-        frame.box(leaf, (x, -0.12 - width / 2, o.height / 2), (0.045, width - 0.06, o.height - 0.05), item=1)
-        inner = x - o.hinge * 0.05
-        frame.box(metal, (inner, -0.12 - width + 0.12, 1.03), (0.03, 0.12, 0.03), item=1)
+        if o.swing == np.pi / 2:
+            x = o.x1 - 0.065 if o.hinge > 0 else o.x0 + 0.065
+            frame.box(leaf, (x, -0.12 - width / 2, o.height / 2), (0.045, width - 0.06, o.height - 0.05), item=1)
+            inner = x - o.hinge * 0.05
+            frame.box(metal, (inner, -0.12 - width + 0.12, 1.03), (0.03, 0.12, 0.03), item=1)
+        else:
+            _swung_leaf(frame, o, leaf, metal)
     return frame
+
+
+def _swung_leaf(frame: Assembly, o: _Opening, leaf: int, metal: int) -> None:
+    """The leaf at ``o.swing``, with two panels and a handle on each side."""
+    away = 1.0 if o.swing < 0 else -1.0  # along y, to where it opens
+    width = o.x1 - o.x0 - 0.1
+    hinge = np.array([o.x1 - 0.05 if o.hinge > 0 else o.x0 + 0.05, away * 0.04 - 0.05])
+    angle = abs(o.swing)
+    along = np.array([-o.hinge * np.cos(angle), away * np.sin(angle)])  # from the hinge to the lock
+    across = np.array([-along[1], along[0]])
+    yaw = float(np.arctan2(along[1], along[0]))
+
+    def add(material: int, way: float, z: float, size: tuple[float, float, float], off: float = 0.0) -> None:
+        x, y = hinge + along * way + across * off
+        frame.box(material, (float(x), float(y), z), size, yaw=yaw, item=1)
+
+    add(leaf, width / 2, o.height / 2, (width, 0.04, o.height - 0.05))
+    for z, tall in ((0.27, 0.32), (0.72, 0.4)):
+        add(leaf, width / 2, z * o.height, (width * 0.66, 0.054, tall * o.height))
+    for side in (-1, 1):
+        add(metal, width - 0.1, 1.03, (0.12, 0.03, 0.03), side * 0.05)

@@ -37,7 +37,7 @@ from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
-from semantic_mapper.training.frozen_encoder import encode_once, resting_loss
+from semantic_mapper.training.frozen_encoder import encode_once, frozen_encoder_loss
 from semantic_mapper.training.images import ImageStepConfig, classifies_images, image_batch, images_loss
 from semantic_mapper.training.linear_probe import fit_class_rows
 from semantic_mapper.training.losses import IGNORE, Loss, semantic_loss
@@ -93,13 +93,13 @@ class FinetuneConfig(Config, frozen=True):
     )
     held_out_rays: AtLeastOne = 512  # a keyframe, but no more than 6,144 in all
     evaluations: AtLeastOne = 10  # over the whole budget
-    patience: NotNegative = (
-        4  # evaluations without a better loss before it stops early; 0 = the whole budget, come what may
-    )
+    # Evaluations without a better loss before it stops early; 0 = the whole budget, come what may. Those during steps
+    # on images do not count: what these teach does not show in rays until the rate has fallen.
+    patience: NotNegative = 4
     bfloat16: bool = True  # the image encoder computes in it where that is fast (GPUs, CPUs with AMX)
     linear_probe_steps: NotNegative = 40  # steps of the classifier alone, on features as they are, before the first ray
     frozen_encoder_fraction: Fraction = (
-        0.0  # of the budget, at its start, in which the image encoder rests, so that steps cost less
+        0.0  # of the budget, at its start, in which the image encoder is frozen, so that steps cost less
     )
     image_fraction: Fraction = (
         0.75  # of the budget behind that: steps on single images, where a kind classifies these; the rest is on rays
@@ -290,7 +290,7 @@ def _run(
             with clock.looking():
                 latest = look()
             improved = latest[0] < best.loss or not math.isfinite(best.loss)
-            stale = 0 if improved else stale + 1
+            stale = 0 if improved or fraction < images_until else stale + 1
             if improved:
                 best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
             scene.train = with_uncertainty(model, scene.train) if doubts else scene.train
@@ -315,7 +315,7 @@ def _draw_loss(
     """Loss of a step, from kept features where there are some; None where the query has no labelled pixel."""
     query, sources = pick_views(scene.queries, scene.overlap, config, generator)
     if encoded is not None:
-        return resting_loss(model, encoded, scene.train, query, sources, config, generator)
+        return frozen_encoder_loss(model, encoded, scene.train, query, sources, config, generator)
     return training_loss(model, scene.train, query, sources, config, generator)
 
 
@@ -349,7 +349,7 @@ def _linear_probe(
     """Fit the class rows alone, undone where held-out rays say that it did no good.
 
     Returns:
-        The better state, and the views as they are encoded now, for an encoder that rests; None without either.
+        The better state, and the views as they are encoded now, for a frozen encoder; None without either.
     """
     # Kept features leave a kind that classifies while it encodes nothing to learn.
     if model.needs_own_view or (config.linear_probe_steps == 0 and config.frozen_encoder_fraction == 0):

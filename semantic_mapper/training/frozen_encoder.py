@@ -1,4 +1,4 @@
-"""Steps of a finetuning in which the image encoder rests: features are computed once, a step costs its rays only."""
+"""Steps of a finetuning with a frozen image encoder: features are computed once, a step costs its rays only."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def encode_once(model: LearnedField, views: Sequence[LabelledView], *, with_labe
         return model.encode(to_device(stack_sources(views, with_labels=with_labels), device))
 
 
-def resting_loss(
+def frozen_encoder_loss(
     model: LearnedField,
     encoded: EncodedViews,
     views: Sequence[LabelledView],

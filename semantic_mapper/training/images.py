@@ -150,8 +150,8 @@ def encoder_for_images(model: LearnedField) -> ImageEncoder:
     if encoder is None or not classifies_images(model):
         raise ConfigError(
             f"a field of kind '{model.kind}' does not classify single images, so it can only learn from rays: set "
-            "share = 0 under [images] in the file that --config names (recipes/cpu-rays.toml does), and take over an "
-            "image encoder that has learned already with --encoder"
+            "fraction = 0 under [images] in the file that --config names (recipes/cpu-rays.toml does), and take over "
+            "a trained image encoder with --encoder"
         )
     return encoder
 

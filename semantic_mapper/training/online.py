@@ -1,7 +1,7 @@
 """One round of learning beside a mapper: finetune on the keyframes so far, and judge by those that were held out.
 
-The image encoder rests, so that whatever a mapper has encoded of its own keyframes stays valid, and new weights can be
-put in the place of old ones at once.
+The image encoder is frozen, so that whatever a mapper has encoded of its own keyframes stays valid, and new weights
+can be put in the place of old ones at once.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def learn(
     encoder = current.model.image_encoder
     if not encode_alike(current.model, current.model) or encoder is None or encoder.uncalibrated:
         raise WeightsError(
-            f"these weights (kind '{current.model.kind}') cannot be finetuned with an encoder that rests: start from "
+            f"these weights (kind '{current.model.kind}') cannot be finetuned with a frozen encoder: start from "
             "trained S-Ray weights"
         )
     seen = current.train_stamps_ns | {f.stamp_ns for f in held_out}  # judged by: not to be scored on either

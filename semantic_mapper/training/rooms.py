@@ -40,6 +40,7 @@ class RoomPoolConfig(Config, frozen=True):
     step_m_min: float = 0.08  # way between two views of a room, drawn between these
     step_m_max: float = 0.35
     people: Fraction = 0.3  # of the rooms with people or animals in them
+    variety: Fraction = 0.0  # of the rooms that hold what benchmark rooms lack; see ``RoomConfig.variety``
     camera: CameraDraw = CameraDraw()
 
     def __post_init__(self) -> None:
@@ -94,7 +95,7 @@ def pack_room(seed: int, config: RoomPoolConfig) -> PackedRoom | str:
     step_m = config.step_m_min + u * (config.step_m_max - config.step_m_min)
     camera = draw_camera(seed, config.width, step_m, config.camera)
     how = {
-        "room": RoomConfig(people=config.people),
+        "room": RoomConfig(people=config.people, variety=config.variety),
         "path": camera.path,
         "noise": camera.noise,
         "pose_noise": camera.pose_noise,

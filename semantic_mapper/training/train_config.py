@@ -47,7 +47,7 @@ class TrainConfig(Config, frozen=True):
     bfloat16: tuple[str, ...] = ()  # parts of the field ("encoder", ...) that compute in it where it is fast
     learning_rate: float = 1e-3  # of steps on rays; ``images`` has its own
     encoder_rate: float = 0.1  # of the image encoder, as a share of it
-    # Of a backbone that ImageNet weights started, as a share of the encoder's; 0 = it rests: what learns from rooms
+    # Of a backbone that ImageNet weights started, as a fraction of the encoder's; 0 = frozen: what learns from rooms
     # forgets photographs.
     backbone_rate: float = 0.0
     final_learning_rate: float = 5e-5

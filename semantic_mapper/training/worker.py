@@ -14,8 +14,9 @@ if TYPE_CHECKING:
 
 
 def prepare_worker() -> None:
-    """One thread of computation, deaf to Ctrl-C (the parent ends it), gone when the parent is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """One thread of computation, deaf to signals that stop a whole group (the parent ends it), gone with the parent."""
+    for stop in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(stop, signal.SIG_IGN)
     os.environ["OMP_NUM_THREADS"] = "1"
     parent = multiprocessing.parent_process()
     if parent is not None:

@@ -53,6 +53,19 @@ def test_statistics_change_inside_batch_statistics_and_nowhere_else():
     assert not any(m.training for m in field.modules() if isinstance(m, torch.nn.BatchNorm2d))
 
 
+def test_a_backbone_with_statistics_of_its_own_is_calibrated_though_it_has_counted_no_batch():
+    field = encoder(EncoderConfig(channels=(8, 8), blocks=(1, 0), backbone="efficientnet-lite0"))
+    for backbone in field.backbones():
+        for module in backbone.modules():
+            if isinstance(module, torch.nn.BatchNorm2d):
+                assert module.running_mean is not None
+                module.running_mean.fill_(0.1)  # as published weights bring it, their count is not among them
+    field.freeze_backbones()
+    assert field.uncalibrated, "the other norms are fresh"
+    calibrate(field, views(2))
+    assert not field.uncalibrated
+
+
 def test_calibration_makes_a_fresh_encoder_normalise_and_changes_no_weight():
     field = encoder().eval()
     weights = {name: p.clone() for name, p in field.named_parameters()}

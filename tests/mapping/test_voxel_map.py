@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from semantic_mapper.errors import ConfigError, FrameError, MapError, PoseError,
 from semantic_mapper.geometry import look_at
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.rays import ray_cast
 from semantic_mapper.types import CameraIntrinsics
 from tests.mapping.rendered_views import INTRINSICS, LABELS, around, frame, plane_depth, small_map, sphere_depth, sure
 
@@ -131,6 +134,33 @@ def test_repeated_views_are_discounted() -> None:
     n_eff = 20 / (1 + 0.5 * 19)
     expected = 1 / (1 + 2 * (0.15 / 0.7) ** n_eff)
     np.testing.assert_allclose(points.confidence[middle], expected, atol=0.005)
+
+
+def test_what_the_map_is_unsure_of_is_unknown_wherever_it_is_read(tmp_path: Path) -> None:
+    """Left half of the view p = 0.5, right half p = 0.9; threshold between the two."""
+    probabilities = np.concatenate((sure(2, 0.5)[:, :80], sure(1, 0.9)[:, 80:]), axis=1)
+    plain, strict = small_map(), small_map(unknown_below=0.7)
+    for voxel_map in (plain, strict):
+        voxel_map.integrate(frame(), np.full((120, 160), 1.0, np.float32), probabilities, None)
+    assert same(plain.block_state(), strict.block_state()), "the evidence is the same, only its reading is not"
+    strict.save(tmp_path / "map.npz")
+    strict = VoxelMap.load(tmp_path / "map.npz")
+    at_voxels = [MapMirror.of(voxel_map).snapshot() for voxel_map in (plain, strict)]
+    readings = [
+        (plain.points(), strict.points()),
+        (plain.mesh(), strict.mesh()),
+        (plain.ray_cast(np.eye(4), INTRINSICS), strict.ray_cast(np.eye(4), INTRINSICS)),
+        (plain.changes(0), strict.changes(0)),
+        (ray_cast(at_voxels[0], np.eye(4), INTRINSICS), ray_cast(at_voxels[1], np.eye(4), INTRINSICS)),
+    ]
+    for free, reading in readings:
+        np.testing.assert_array_equal(reading.confidence, free.confidence)
+        unsure = reading.confidence < (0.7 if reading.confidence.dtype == np.float32 else round(0.7 * 255))
+        assert (free.label[unsure & (free.confidence > 0)] != LABELS.ignore_id).sum() > 50
+        np.testing.assert_array_equal(reading.label, np.where(unsure, LABELS.ignore_id, free.label))
+        assert set(np.unique(reading.label)) == {LABELS.ignore_id, 9}
+    seen = strict.to_open3d().attribute("label").numpy()
+    assert set(np.unique(seen).tolist()) == {LABELS.ignore_id, 9}
 
 
 def test_far_and_grazing_looks_count_less() -> None:

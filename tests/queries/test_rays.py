@@ -93,7 +93,7 @@ def test_hits_in_random_blocks_lie_on_a_zero_of_the_interpolated_field(seed: int
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_nearest_corner_with_a_class_speaks_for_a_point(seed: int) -> None:
+def test_the_nearest_corner_with_votes_speaks_for_a_point(seed: int) -> None:
     snapshot, rng = random_map(seed), np.random.default_rng(seed)
     _, observed, first = dense(snapshot)
     row_of = {tuple(key): row for row, key in enumerate(snapshot.keys.tolist())}
@@ -108,8 +108,8 @@ def test_the_nearest_corner_with_a_class_speaks_for_a_point(seed: int) -> None:
                 continue
             x, y, z = at % 8
             mine = snapshot.slots[row_of[tuple((at // 8).tolist())]], 64 * z + 8 * y + x
-            has_class = snapshot.voxels.label[mine] != 0
-            candidates.append((has_class, float(np.prod(1 - np.abs(p - at))), mine))
+            has_votes = snapshot.voxels.confidence[mine] > 0
+            candidates.append((has_votes, float(np.prod(1 - np.abs(p - at))), mine))
         best = max((c[:2] for c in candidates), default=None)
         if best is None:
             assert slot == -1

@@ -59,6 +59,8 @@ def test_a_session_leaves_summary_map_points_and_picture(tmp_path, weights):
     assert summary["labels"]["1"] == "wall" and summary["weights"]["file"] == "w.safetensors"
     points = VoxelMap.load(tmp_path / "out/map.npz").points()
     assert len(points.xyz) == summary["map"]["surface_points"]
+    unknown = (points.label == session.pipeline.label_set.ignore_id).mean()
+    assert summary["map"]["unknown"] == pytest.approx(unknown, abs=1e-4)
     ply = (tmp_path / "out/map.ply").read_bytes()
     header = ply.split(b"end_header")[0].decode()
     assert "property uchar label" in header and "property float confidence" in header
@@ -380,7 +382,7 @@ def test_a_log_with_classes_that_the_field_lacks_tells_whether_confidence_knows(
 def test_the_map_is_scored_at_its_points_beside_the_frames():
     stream = make_label_set("mine", ["wall", "spaceship"], ids=[1, 9])
     frames = [replace(f, label=np.where(f.label == ROOMS.ids[0], 1, 9).astype(np.uint8)) for f in tiny_frames(3)]
-    voxel_map = VoxelMap(tiny_config().voxel_map, ROOMS)
+    voxel_map = VoxelMap(tiny_config(voxel_map={"voxel_size_m": 0.05, "unknown_below": 0.65}).voxel_map, ROOMS)
 
     def fuse(frame: PosedFrame) -> Opinion:
         """Walls for sure; spaceships are taken for floor, without conviction."""
@@ -395,5 +397,6 @@ def test_the_map_is_scored_at_its_points_beside_the_frames():
     figures = result.methods[MAP]
     assert set(figures["per_class"]) == {"wall"} and figures["total_accuracy"] > 0.95
     assert figures["open_set_auroc"] > 0.95 and 0.05 < figures["ece"] < 0.25
+    assert 0.9 < figures["open_set_unknown"] < 1.0, "all but what mixes with walls at the border"
     assert 0 < figures["pixels"] < len(voxel_map.points().xyz)
     assert MAP not in evaluate_frames(frames, {"fused": fuse}, stream, ROOMS, frozenset()).methods

@@ -76,11 +76,12 @@ def test_without_patience_a_budget_is_spent_to_its_end():
     hopeless = {"learning_rate": 30.0, "final_learning_rate": 30.0, "gradient_clip": 1e6, "evaluations": 10}
     start, fresh = calibrated_field(), tiny_field()
 
-    def steps(field: SRay, patience: int) -> int:
-        recipe = finetune(tiny_frames(3), ROOMS, field, config(steps=20, patience=patience, **hopeless)).recipe
-        return recipe["steps"]
+    def steps(field: SRay, patience: int, images: float = 0.0) -> int:
+        given = config(steps=20, patience=patience, image_fraction=images, **hopeless)
+        return finetune(tiny_frames(3), ROOMS, field, given).recipe["steps"]
 
-    assert steps(start, 2) < 20
+    assert steps(start, 2) < 15
+    assert 15 < steps(start, 2, 0.75) < 20, "looks during steps on images do not count"
     assert steps(start, 0) == 20
     assert steps(fresh, 2) == 20, "random weights get worse before they get better"
 

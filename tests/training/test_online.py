@@ -199,5 +199,5 @@ def test_too_few_keyframes_and_an_encoder_that_learns_are_refused() -> None:
     with pytest.raises(ConfigError, match="frozen_encoder_fraction must be 1"):
         convert_config({"finetune": {"frozen_encoder_fraction": 0.5}}, OnlineConfig, "test")
     for model in (build_field("unet", {}, ROOMS), tiny_field()):
-        with pytest.raises(WeightsError, match="cannot be finetuned with an encoder that rests"):
+        with pytest.raises(WeightsError, match="cannot be finetuned with a frozen encoder"):
             learn(pool_of(FRAMES).split(), Checkpoint(model, (), {}), CONFIG)

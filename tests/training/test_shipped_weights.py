@@ -33,6 +33,10 @@ def scores(field: LearnedField, width: int) -> Scores:
     return validate(field.eval(), rooms, config, TrainStepConfig(), ALONE)
 
 
+def test_they_are_no_fresh_network_to_a_finetuning(shipped: Checkpoint):
+    assert shipped.model.image_encoder is not None and not shipped.model.image_encoder.uncalibrated
+
+
 @pytest.mark.slow
 def test_they_know_rooms_that_they_have_never_seen_with_depth_and_without(shipped: Checkpoint):
     able = scores(shipped.model, shipped.width)

@@ -12,7 +12,8 @@ typedef struct {
     int64_t itemsize;                 /* of their evidence */
     I64 rows;                         /* (B,) of the result */
     U8 ids;                           /* (L + 1,) of the classes, and the ignore id */
-    double vote_discount, min_weight; /* voxels with less weight count as not observed */
+    double vote_discount, unknown_below;
+    double min_weight;    /* voxels with less weight count as not observed */
     I8 tsdf;                          /* (R, 512) */
     U8 label, confidence;             /* (R, 512) */
     U8 rgb;                           /* (R, 512, 3) */
@@ -50,8 +51,8 @@ KERNEL(compact_blocks, CompactArguments) {
             if (in_mask(block.voted, voxel)) {
                 if (observed) {
                     double confidence;
-                    int64_t best =
-                        decide(block.evidence, a->itemsize, classes, *block.votes, a->vote_discount, &confidence);
+                    int64_t best = decide(block.evidence, a->itemsize, classes, *block.votes, a->vote_discount,
+                                          a->unknown_below, &confidence);
                     a->label.data[at] = best < 0 ? ignore_id : a->ids.data[best];
                     a->confidence.data[at] = to_byte(confidence * CONFIDENCE_STEPS);
                 }

@@ -8,7 +8,7 @@ typedef struct {
     double voxel_size;                /* metres */
     double truncation_voxels;
     double z_max; /* metres */
-    double vote_discount;
+    double vote_discount, unknown_below;
     BlockIndex index;
     GridBuffers buffers;
     F32 depth;      /* (H, W) metres */
@@ -34,9 +34,8 @@ KERNEL(cast_view_rows, CastViewArguments) {
             if (z <= 0) continue;
             point_at(origin, d, z, p);
             int64_t at = v * a->depth.shape[1] + u;
-            a->channel.data[at] =
-                read_point(p, &a->index, &a->buffers, a->vote_discount, a->rgb.data + 3 * at, &confidence,
-                           a->measured.data + at);
+            a->channel.data[at] = read_point(p, &a->index, &a->buffers, a->vote_discount, a->unknown_below,
+                                             a->rgb.data + 3 * at, &confidence, a->measured.data + at);
             a->depth.data[at] = (float)z;
             a->confidence.data[at] = (float)confidence;
         }

@@ -2,9 +2,8 @@
 #include "ray_casting.h"
 #include "snapshot.h"
 
-/* Slot (-1 = none) and voxel of the observed corner nearest to a point; of those with a class if any has one. */
-static int64_t nearest_corner(const double *p, const BlockIndex *index, const BlockVoxels *voxels, int64_t ignore_id,
-                              int64_t *chosen) {
+/* Slot (-1 = none) and voxel of the observed corner nearest to a point; of those with votes if any has some. */
+static int64_t nearest_corner(const double *p, const BlockIndex *index, const BlockVoxels *voxels, int64_t *chosen) {
     int64_t x0 = floor_int(p[0]), y0 = floor_int(p[1]), z0 = floor_int(p[2]), best_slot = -1;
     double best = -1.0;
     bool best_voted = false;
@@ -14,7 +13,7 @@ static int64_t nearest_corner(const double *p, const BlockIndex *index, const Bl
         int64_t slot = find_block(index, key_of_voxel(x, y, z)), voxel = voxel_in_block(x, y, z);
         if (slot < 0 || !voxels->weight.data[slot * BLOCK_VOXELS + voxel]) continue;
         double fraction = (1 - fabs(p[0] - (double)x)) * (1 - fabs(p[1] - (double)y)) * (1 - fabs(p[2] - (double)z));
-        bool voted = voxels->label.data[slot * BLOCK_VOXELS + voxel] != ignore_id;
+        bool voted = voxels->confidence.data[slot * BLOCK_VOXELS + voxel] > 0;
         if ((voted && !best_voted) || (voted == best_voted && fraction > best))
             best = fraction, best_slot = slot, *chosen = voxel, best_voted = voted;
     }
@@ -28,7 +27,6 @@ typedef struct {
     double max_m;
     BlockIndex index;
     BlockVoxels voxels;
-    int64_t ignore_id;
     F32 distance; /* (N,) out: 0 = miss */
     I64 slots;    /* (N,) out: -1 = none */
     I64 chosen;   /* (N,) out: voxel of the block */
@@ -43,7 +41,7 @@ KERNEL(march_rays, MarchArguments) {
         if (!(d > 0)) continue;
         point_at(origin, direction, d, p);
         a->distance.data[n] = (float)d;
-        a->slots.data[n] = nearest_corner(p, &a->index, &a->voxels, a->ignore_id, a->chosen.data + n);
+        a->slots.data[n] = nearest_corner(p, &a->index, &a->voxels, a->chosen.data + n);
     }
     return 0;
 }
@@ -52,14 +50,12 @@ typedef struct {
     F64 points; /* (N, 3) units of voxels */
     BlockIndex index;
     BlockVoxels voxels;
-    int64_t ignore_id;
     I64 slots;  /* (N,) out: -1 = none */
     I64 chosen; /* (N,) out: voxel of the block */
 } CornerArguments;
 
 KERNEL(find_nearest_corners, CornerArguments) {
     for (int64_t n = 0; n < a->points.shape[0]; n++)
-        a->slots.data[n] =
-            nearest_corner(a->points.data + 3 * n, &a->index, &a->voxels, a->ignore_id, a->chosen.data + n);
+        a->slots.data[n] = nearest_corner(a->points.data + 3 * n, &a->index, &a->voxels, a->chosen.data + n);
     return 0;
 }

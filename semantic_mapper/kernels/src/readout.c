@@ -5,7 +5,7 @@ typedef struct {
     F64 points; /* (N, 3) in voxels */
     BlockIndex index;
     GridBuffers buffers;
-    double vote_discount;
+    double vote_discount, unknown_below;
     U8 rgb;         /* (N, 3) */
     I64 channel;    /* (N,) */
     F32 confidence; /* (N,) */
@@ -16,7 +16,7 @@ KERNEL(read_map_points, ReadPointsArguments) {
     for (int64_t i = start; i < stop; i++) {
         double confidence;
         a->channel.data[i] = read_point(a->points.data + 3 * i, &a->index, &a->buffers, a->vote_discount,
-                                        a->rgb.data + 3 * i, &confidence, a->measured.data + i);
+                                        a->unknown_below, a->rgb.data + 3 * i, &confidence, a->measured.data + i);
         a->confidence.data[i] = (float)confidence;
     }
     return 0;
@@ -24,11 +24,11 @@ KERNEL(read_map_points, ReadPointsArguments) {
 
 typedef struct {
     AnyArray evidence; /* (L,) float32, float64 or int16 */
-    double votes, vote_discount;
+    double votes, vote_discount, unknown_below;
     F64 confidence; /* (1,) */
 } DecideArguments;
 
 KERNEL(decide_voxel, DecideArguments) {
     return decide(a->evidence.data, a->evidence.itemsize, a->evidence.shape[0], a->votes, a->vote_discount,
-                  a->confidence.data);
+                  a->unknown_below, a->confidence.data);
 }

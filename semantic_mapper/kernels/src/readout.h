@@ -92,9 +92,10 @@ static inline double evidence_difference(const void *evidence, int64_t itemsize,
     return evidence_at(evidence, itemsize, a) - evidence_at(evidence, itemsize, b);
 }
 
-/* Channel and confidence of one voxel's evidence (L,), of any type; -1 and 0 without votes. */
+/* Channel and confidence of one voxel's evidence (L,), of any type; -1 and 0 without votes. Below `unknown_below` the
+ * channel is -1, too, and the confidence that of the likeliest class. */
 static inline int64_t decide(const void *evidence, int64_t itemsize, int64_t classes, double votes,
-                             double vote_discount, double *confidence) {
+                             double vote_discount, double unknown_below, double *confidence) {
     *confidence = 0.0;
     if (votes <= 0) return -1;
     double worth = votes > 1 ? 1.0 / (1.0 + vote_discount * (votes - 1.0)) : 1.0 / votes; /* n_eff / n */
@@ -107,17 +108,18 @@ static inline int64_t decide(const void *evidence, int64_t itemsize, int64_t cla
     }
     for (int64_t c = 0; c < classes; c++) total += exp(evidence_difference(evidence, itemsize, c, best) * worth);
     *confidence = 1.0 / total;
-    return best;
+    return *confidence < unknown_below ? -1 : best;
 }
 
 /* Channel and confidence of a point; writes its color to `rgb` (3,) and whether all around it was measured. At most
  * MAX_CLASSES classes. */
 static inline int64_t read_point(const double *p, const BlockIndex *index, const GridBuffers *buffers,
-                                 double vote_discount, uint8_t *rgb, double *confidence, uint8_t *measured) {
+                                 double vote_discount, double unknown_below, uint8_t *rgb, double *confidence,
+                                 uint8_t *measured) {
     double color[3], evidence[MAX_CLASSES];
     float least_weight;
     double votes = gather(p, index, buffers, color, evidence, &least_weight);
     *measured = least_weight >= MEASURED && least_weight < INFINITY;
     for (int c = 0; c < 3; c++) rgb[c] = to_byte(color[c]);
-    return decide(evidence, sizeof(double), buffers->evidence.shape[2], votes, vote_discount, confidence);
+    return decide(evidence, sizeof(double), buffers->evidence.shape[2], votes, vote_discount, unknown_below, confidence);
 }

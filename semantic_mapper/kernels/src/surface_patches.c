@@ -22,7 +22,7 @@ KERNEL(sum_surface_patches, SumPatchesArguments) {
             double votes = buffers->votes.data[at], confidence;
             if (votes < a->max_votes) {
                 decide((const char *)buffers->evidence.data + at * classes * itemsize, itemsize, classes, votes,
-                       a->vote_discount, &confidence);
+                       a->vote_discount, 0.0, &confidence);
                 a->need.data[n] += (1.0 - confidence) / (1.0 + votes);
             }
             for (int axis = 0; axis < 3; axis++)

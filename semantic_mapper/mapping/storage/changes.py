@@ -38,8 +38,8 @@ class BlockChanges:
         epoch: Of the map. Where it is another than before, blocks of before are gone: those of the new epoch come all.
         keys: (B, 3) int32 block coordinates in lexicographic order.
         tsdf: (B, 512) int8 signed distance over truncation, times 127; -128 where not observed.
-        label: (B, 512) uint8 class ids, the ignore id where nothing voted or nothing was observed.
-        confidence: (B, 512) uint8 probability of ``label``, times 255; 0 at the ignore id.
+        label: (B, 512) uint8 class ids, the ignore id where nothing voted, or the map is too unsure.
+        confidence: (B, 512) uint8 probability of the likeliest class, times 255; 0 where nothing voted.
         rgb: (B, 512, 3) uint8.
     """
 
@@ -66,7 +66,7 @@ class ChosenBlocks(NamedTuple):
         packed: (B,) sorted keys of existing blocks.
         since, version, newest, epoch: Of the result.
         label_set: For the ids.
-        vote_discount: rho, see ``readout``.
+        vote_discount, unknown_below: See ``readout``.
         min_weight: Voxels with fewer measurements count as not observed; > 0.
     """
 
@@ -77,6 +77,7 @@ class ChosenBlocks(NamedTuple):
     epoch: int
     label_set: LabelSet
     vote_discount: float
+    unknown_below: float
     min_weight: float
 
 
@@ -124,7 +125,7 @@ def oldest_first(versions: NDArray[np.int64], limit: int, newest: int) -> tuple[
 
 
 def choose_blocks(
-    grid: BlockGrid, versions: tuple[int, int, int], limit: int, decision: tuple[LabelSet, float, float]
+    grid: BlockGrid, versions: tuple[int, int, int], limit: int, decision: tuple[LabelSet, float, float, float]
 ) -> ChosenBlocks:
     """Which blocks have changed after a version, and how they are to be reported.
 
@@ -132,7 +133,7 @@ def choose_blocks(
         grid: The map's storage.
         versions: ``since``, and the map's version and epoch.
         limit: See ``VoxelMap.changes``.
-        decision: The last three of ``ChosenBlocks``.
+        decision: The last four of ``ChosenBlocks``.
 
     Raises:
         MapError: ``since`` is not a version of the map, or a negative ``limit``.
@@ -187,6 +188,7 @@ def _compact_into(out: BlockChanges, rows: NDArray[np.int64], blocks: PackedBloc
         np.ascontiguousarray(rows),
         ids,
         chosen.vote_discount,
+        chosen.unknown_below,
         chosen.min_weight,
         out.tsdf,
         out.label,
@@ -204,6 +206,7 @@ def _compact_blocks(
     rows: Int64,
     ids: UInt8,
     vote_discount: float,
+    unknown_below: float,
     min_weight: float,
     tsdf: NDArray[np.int8],
     label: UInt8,
@@ -217,7 +220,7 @@ def _compact_blocks(
         evidence_itemsize: 4 (float32) or 2 (int16).
         rows: (B,) of the output.
         ids: (L + 1,) of the classes, and the ignore id.
-        vote_discount, min_weight: See ``ChosenBlocks``.
+        vote_discount, unknown_below, min_weight: See ``ChosenBlocks``.
         tsdf, label, confidence, rgb: As in ``BlockChanges``.
     """
     ...

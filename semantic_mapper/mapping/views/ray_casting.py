@@ -48,7 +48,7 @@ def cast_view(
     after the other. (Where even what one pixel may see does not fit, its ray meets the nearest of that.)
 
     Returns:
-        depth (H, W) float32 metres (0 = miss), rgb (H, W, 3) uint8, channel (H, W) int64 (-1 = no votes),
+        depth (H, W) float32 metres (0 = miss), rgb (H, W, 3) uint8, channel (H, W) int64 (-1 = unknown),
         confidence (H, W) float32, measured (H, W) bool.
     """
     size = (intrinsics.height, intrinsics.width)
@@ -66,6 +66,7 @@ def cast_view(
             config.truncation_voxels,
             config.depth_max_m,
             config.vote_discount,
+            config.unknown_below,
             grid.index,
             grid.buffers(),
             depth,
@@ -109,6 +110,7 @@ def _cast_view_rows(
     truncation_voxels: float,
     depth_max_m: float,
     vote_discount: float,
+    unknown_below: float,
     index: BlockIndex,
     buffers: GridBuffers,
     depth: Float32,

@@ -1,6 +1,16 @@
 """Builders of furniture; importing this package fills ``FURNITURE``."""
 
-from semantic_mapper.scenes.furniture import bathroom, clutter, kitchen, seating, small, storage, surfaces, wall_mounted
+from semantic_mapper.scenes.furniture import (
+    bathroom,
+    clutter,
+    kitchen,
+    seating,
+    small,
+    storage,
+    surfaces,
+    varied,
+    wall_mounted,
+)
 from semantic_mapper.scenes.furniture.registry import FURNITURE, Furniture, furniture
 
 __all__ = [
@@ -14,5 +24,6 @@ __all__ = [
     "small",
     "storage",
     "surfaces",
+    "varied",
     "wall_mounted",
 ]

@@ -149,7 +149,7 @@ def test_voxels_are_rounded_as_plain_numpy_rounds_them(evidence: str, rng: np.ra
     tsdf, label, confidence = np.empty((3, 512), np.int8), np.empty((3, 512), np.uint8), np.empty((3, 512), np.uint8)
     rgb, itemsize = np.empty((3, 512, 3), np.uint8), packed.evidence.itemsize
     changes_module._compact_blocks(
-        packed.data, packed.ends, itemsize, rows, ids, 0.3, 2.0, tsdf, label, confidence, rgb
+        packed.data, packed.ends, itemsize, rows, ids, 0.3, 0.4, 2.0, tsdf, label, confidence, rgb
     )
     for row, block in zip(rows, order, strict=True):
         seen, value = values.weight[block] >= 2.0, values.tsdf[block].astype(float)
@@ -161,5 +161,5 @@ def test_voxels_are_rounded_as_plain_numpy_rounds_them(evidence: str, rng: np.ra
         for voxel in range(512):
             best, p = -1, 0.0
             if seen[voxel]:
-                best, p = decide(values.evidence[block, voxel], float(values.votes[block, voxel]), 0.3)
+                best, p = decide(values.evidence[block, voxel], float(values.votes[block, voxel]), 0.3, 0.4)
             assert (label[row, voxel], confidence[row, voxel]) == (ids[best], int(p * 255 + 0.5))

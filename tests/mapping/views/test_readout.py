@@ -25,6 +25,12 @@ def test_no_votes_no_decision() -> None:
     assert decide(np.zeros(4), 0.0, 0.5) == (-1, 0.0)
 
 
+def test_below_the_threshold_the_class_is_unknown_and_the_confidence_stays() -> None:
+    evidence = np.log(np.array([0.3, 0.6, 0.1]))
+    assert decide(evidence, 1.0, 0.75, 0.55) == (1, pytest.approx(0.6))
+    assert decide(evidence, 1.0, 0.75, 0.65) == (-1, pytest.approx(0.6))
+
+
 @pytest.mark.parametrize("weight", [1e-3, 0.2, 1.0])
 def test_a_single_vote_means_what_the_field_said_however_little_it_is_trusted(weight: float) -> None:
     p = np.array([0.1, 0.85, 0.05])
@@ -48,7 +54,7 @@ def test_points_are_read_as_plain_numpy_reads_them(evidence: str, rng: np.random
     )
     points = rng.uniform(-12, 18, (400, 3))
     points[::5] = np.round(points[::5])  # at voxels: the others count nothing
-    rgb, label, confidence = read_points(points, index, buffers, labels, rho)
+    rgb, label, confidence = read_points(points, index, buffers, labels, rho, 0.0)
     for n, p in enumerate(points):
         around = [(f, at) for f, at in corners(buffers, p) if f >= 1e-3]
         seen = [(f, at) for f, at in around if buffers.weight[at] > 0]
@@ -75,6 +81,6 @@ def test_points_beyond_all_numbers_do_no_harm_and_unknown_ones_are_unknown(rng: 
     index, buffers = random_grid(rng)
     labels = make_label_set("four", ("a", "b", "c", "d"), ignore_id=0)
     wild = np.array([[np.nan] * 3, [np.inf, 0, 0], [1e300, -1e300, 0], [-1e19] * 3, [1e9] * 3])
-    assert np.isin(read_points(wild, index, buffers, labels, 0.5)[1], (0, *labels.ids)).all()
+    assert np.isin(read_points(wild, index, buffers, labels, 0.5, 0.0)[1], (0, *labels.ids)).all()
     for points in (np.full((2, 3), 300.0), wild[:0]):
-        assert not any(values.any() for values in read_points(points, index, buffers, labels, 0.5))
+        assert not any(values.any() for values in read_points(points, index, buffers, labels, 0.5, 0.0))

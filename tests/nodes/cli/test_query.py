@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from semantic_mapper.errors import TransportError
+from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.cli.query import Asked, Question, ask_file, ask_mapper
 from tests.nodes.mapper.test_query_service import a_folder, answering
 from tests.nodes.support import eventually, run, run_here
@@ -56,6 +58,19 @@ def test_at_points_below_zero_too(map_file: Path) -> None:
     assert found["state"] == "occupied" and "table" in shown
     found, _ = ask(map_file, "at", "-1e1", "-2", ".5")
     assert (found["class"], found["state"], found["surface_distance_m"]) == (None, "unknown", None)
+
+
+def test_at_a_surface_that_the_map_is_unsure_of(map_file: Path, tmp_path: Path) -> None:
+    strict = VoxelMap(replace(whole_map().config, unknown_below=1.0), whole_map().label_set)
+    strict.merged(whole_map(), np.eye(4)).save(tmp_path / "map.npz")
+    point = BOX + np.array([0.0, 0.0, HALF[2]])
+    found, shown = ask(tmp_path / "map.npz", "at", *point)
+    sure, _ = ask(map_file, "at", *point)
+    assert found["class"] is None and found["surface_distance_m"] is not None and "unknown" in shown
+    assert found["confidence"] == sure["confidence"]
+    info, _ = ask(tmp_path / "map.npz", "info")
+    assert info["without_class"] == info["surface_voxels"] > 1000
+    assert ask(tmp_path / "map.npz", "nearest", "table", *point)[0]["found"] is False
 
 
 def test_nearest(map_file: Path) -> None:

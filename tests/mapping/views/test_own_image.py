@@ -1,0 +1,69 @@
+"""What the own image adds to a rendered view."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapping.pipeline import MappingPipeline
+from semantic_mapper.mapping.views.own_image import add_own_image
+from semantic_mapper.mapping.views.view_renderer import RenderedView
+from tests.small import tiny_config, tiny_field, tiny_frames
+
+
+class Says:
+    """A field with a given opinion (1, L, h, w) of images."""
+
+    def __init__(self, logits: torch.Tensor | None) -> None:
+        self.logits = logits
+
+    def source_logits(self, sources):
+        return self.logits
+
+
+def rendered(probabilities: np.ndarray, known: np.ndarray) -> RenderedView:
+    return RenderedView(probabilities.astype(np.float32), known, np.ones(known.shape, np.float32), 1, 1)
+
+
+def test_both_opinions_are_joined_as_their_geometric_mean_where_the_view_is_known(rng: np.random.Generator) -> None:
+    view_p, own_p = rng.dirichlet(np.ones(4), (3, 5)), rng.dirichlet(np.ones(4), (3, 5))
+    known = rng.random((3, 5)) < 0.7
+    field = Says(torch.from_numpy(np.log(own_p)).permute(2, 0, 1)[None])
+    found = add_own_image(rendered(view_p, known), field, None, 0.3)  # type: ignore[arg-type]
+    expected = np.maximum(own_p, 1e-4) ** 0.3 * np.maximum(view_p, 1e-4) ** 0.7
+    expected /= expected.sum(axis=2, keepdims=True)
+    np.testing.assert_allclose(found.probabilities[known], expected[known], atol=1e-5)
+    np.testing.assert_array_equal(found.probabilities[~known], view_p.astype(np.float32)[~known])
+    assert found.probabilities.dtype == np.float32
+
+
+@pytest.mark.parametrize("field", [Says(None), object()])
+def test_a_field_without_an_opinion_of_images_leaves_the_view(field: object) -> None:
+    view = rendered(np.full((2, 2, 4), 0.25), np.ones((2, 2), bool))
+    assert add_own_image(view, field, None, 0.5) is view  # type: ignore[arg-type]
+
+
+def test_an_opinion_of_another_size_is_resized() -> None:
+    own = torch.zeros(1, 2, 4, 8)
+    own[:, 0, :, :4] = own[:, 1, :, 4:] = 5.0
+    view = rendered(np.full((2, 4, 2), 0.5), np.ones((2, 4), bool))
+    found = add_own_image(view, Says(own), None, 1.0).probabilities.argmax(axis=2)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(found, [[0, 0, 1, 1]] * 2)
+
+
+def test_the_map_takes_it_in_unless_the_frame_is_no_source_or_its_weight_is_nothing() -> None:
+    frames = tiny_frames(2)
+
+    def map_of(**keyframes: object):
+        pipeline = MappingPipeline(tiny_config(keyframes=keyframes), StreamingSRay(tiny_field()), ROOMS)
+        for frame in frames:
+            pipeline.step(frame)
+        return pipeline.voxel_map.block_state()["evidence"]
+
+    with_own, without = map_of(own_image_weight=0.5), map_of()
+    assert np.abs(with_own - without).max() > 0.01
+    novel = [map_of(use_current_view=False, own_image_weight=weight) for weight in (0.0, 0.5)]
+    np.testing.assert_array_equal(*novel)
