@@ -235,6 +235,22 @@ class RenderConfig(Config, frozen=True):
             raise ValueError('bfloat16 is for device = "cuda"')
 
 
+class DepthFromMotionConfig(Config, frozen=True):
+    """How depth is computed from posed pictures, where no sensor measures it."""
+
+    width: Annotated[int, msgspec.Meta(ge=32, le=1280)] = 160  # pixels that are matched; more cost time, not error
+    planes: Annotated[int, msgspec.Meta(ge=16, le=256, multiple_of=16)] = 64  # depths tried, uniform in inverse depth
+    near_m: Metres = 0.4
+    far_m: Metres = 8.0
+    sources: Annotated[int, msgspec.Meta(ge=1, le=16)] = 4  # other frames that each is matched with
+    # A frame waits for this many later ones, which see it from the other side: more accurate. 0 = live.
+    delay_frames: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0
+
+    def __post_init__(self) -> None:
+        if not self.near_m < self.far_m:
+            raise ValueError(f"near_m = {self.near_m} must be less than far_m = {self.far_m}")
+
+
 Quality = Literal["custom", "fast", "balanced", "reference"]
 QUALITIES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # of ``sampling`` and of ``render``
     "fast": (
