@@ -104,11 +104,9 @@ def _depth_line(session: MapSession) -> str:
     source = _depth_source(session)
     if source["source"] == "sensor":
         return ""
-    if source["source"] == "rendered":
-        return "; depth: rendered by the field (no depth sensor)"
-    return (
-        f"; depth: rendered by the field for {100 * source['rendered_fraction']:.0f} % of the frames (no sensor depth)"
-    )
+    ways = {"computed_fraction": "computed from the pictures", "rendered_fraction": "rendered by the field"}
+    parts = [f"{how} for {100 * source[key]:.0f} % of the frames" for key, how in ways.items() if source[key]]
+    return f"; depth: {', '.join(parts)} (no sensor depth)"
 
 
 def nearly_empty(session: MapSession, points: int) -> str | None:
@@ -222,11 +220,17 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
 
 
 def _depth_source(session: MapSession) -> dict[str, Any]:
-    """Where the geometry comes from; frames without sensor depth have theirs rendered by the field."""
+    """Where the geometry comes from: the sensor, the pictures of a moving camera, or renders of the field."""
     mapped = session.published - session.dropped - len(session.refusals)
-    fraction = session.without_depth / mapped if mapped else 0.0
-    source = "sensor" if not session.without_depth else "rendered" if fraction == 1 else "mixed"
-    return {"source": source, "rendered_fraction": round(fraction, 4)}
+    rendered, computed = (n / mapped if mapped else 0.0 for n in (session.without_depth, session.computed_depth))
+    names = {"sensor": rendered + computed < 1, "rendered": rendered > 0, "computed": computed > 0}
+    sources = [name for name, used in names.items() if used]
+    return {
+        "source": sources[0] if len(sources) == 1 else "mixed" if sources else "sensor",
+        "rendered_fraction": round(rendered, 4),
+        "computed_fraction": round(computed, 4),
+        "too_little_motion": session.too_little_motion,
+    }
 
 
 def _metrics(session: MapSession, points: MapPoints) -> dict[str, Any]:

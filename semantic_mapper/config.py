@@ -251,6 +251,18 @@ class DepthFromMotionConfig(Config, frozen=True):
             raise ValueError(f"near_m = {self.near_m} must be less than far_m = {self.far_m}")
 
 
+DepthSource = Literal["auto", "sensor", "computed", "off"]
+
+
+class DepthConfig(Config, frozen=True):
+    """Where the depth of frames comes from."""
+
+    # "auto": the sensor's, and computed from the pictures where a frame has none; "computed": always from the pictures;
+    # "sensor": the sensor's, and rendered by the field where a frame has none; "off": always rendered by the field
+    source: DepthSource = "auto"
+    from_motion: DepthFromMotionConfig = DepthFromMotionConfig()
+
+
 Quality = Literal["custom", "fast", "balanced", "reference"]
 QUALITIES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # of ``sampling`` and of ``render``
     "fast": (
@@ -269,6 +281,7 @@ class MapperConfig(Config, frozen=True):
     """Everything ``MappingPipeline`` needs. The defaults are those of the "balanced" quality."""
 
     sampling: SamplingConfig = SamplingConfig(guided=4, sample_weight_threshold=0.02)
+    depth: DepthConfig = DepthConfig()
     keyframes: KeyframeConfig = KeyframeConfig()
     voxel_map: VoxelMapConfig = VoxelMapConfig()
     history: HistoryConfig = HistoryConfig()

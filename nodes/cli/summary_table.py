@@ -51,6 +51,11 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
         lines.append(f"warning: {summary['map']['nearly_empty']}")
     if dig(summary, "pose_check.warning"):
         lines.append(f"warning: {summary['pose_check']['warning']}")
+    if fraction := dig(summary, "depth.computed_fraction"):
+        lines.append(
+            f"depth: computed from the pictures for {percent(fraction)} of the frames, which have no sensor depth; "
+            "expect a surface some centimetres off, and holes in plain walls"
+        )
     if fraction := dig(summary, "depth.rendered_fraction"):
         lines.append(
             f"depth: rendered by the field for {percent(fraction)} of the frames, which have no sensor depth; geometry "
@@ -92,10 +97,16 @@ def _pose_figure(check: Mapping[str, Any], key: str) -> str:
     return "not checked" if value is None else percent(value)
 
 
+def _depth_source(depth: Mapping[str, Any]) -> str:
+    fractions = (percent(depth.get(f"{how}_fraction", 0.0)) for how in ("computed", "rendered"))
+    return _DEPTH_SOURCES[depth["source"]].format(*fractions)
+
+
 _DEPTH_SOURCES = {
     "sensor": "sensor",
     "rendered": "rendered by the field (no depth sensor)",
-    "mixed": "rendered by the field for {} of the frames",
+    "computed": "computed from the pictures (no depth sensor)",
+    "mixed": "computed for {} of the frames, rendered by the field for {}",
 }
 _ROWS: Sequence[tuple[str, str, Any]] = (
     ("log", "source", str),
@@ -105,7 +116,7 @@ _ROWS: Sequence[tuple[str, str, Any]] = (
     ("frames dropped", "frames.dropped", str),
     ("frames refused", "frames.refused", str),
     ("frames scored", "frames.scored", str),
-    ("depth", "depth", lambda d: _DEPTH_SOURCES[d["source"]].format(percent(d["rendered_fraction"]))),
+    ("depth", "depth", _depth_source),
     ("depth disagreement", "pose_check", lambda c: _pose_figure(c, "depth_disagreement")),
     ("contradicting pairs", "pose_check", lambda c: _pose_figure(c, "contradicting_pairs")),
     ("latency p50", "latency_ms.p50", _ms),

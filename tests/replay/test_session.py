@@ -24,7 +24,7 @@ from semantic_mapper.replay.evaluate.methods import MAP, Opinion, baseline_predi
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.replay.session import SNAPSHOTS, MapSession, open_recording
 from semantic_mapper.replay.stats import LatencyHistogram
-from semantic_mapper.types import PosedFrame
+from semantic_mapper.types import MapUpdate, PosedFrame
 from tests.small import SMALL_ENCODER, tiny_config, tiny_field, tiny_frames
 
 
@@ -203,7 +203,8 @@ def test_scores_are_those_of_the_rendered_labels(weights):
     session = MapSession(Mapper.load(weights, tiny_config()), stream_labels=ROOMS)
     right = counted = 0
     for frame in frames:
-        update = session.process(frame)
+        (update,) = session.process(frame)
+        assert isinstance(update, MapUpdate)
         if frame.stamp_ns != frames[1].stamp_ns:
             labelled = frame.label != ROOMS.ignore_id
             right += int((update.label == frame.label)[labelled].sum())
