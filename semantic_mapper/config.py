@@ -189,6 +189,17 @@ class VoxelMapConfig(Config, frozen=True):
     evidence: Literal["float32", "int16"] = "float32"  # "int16": half the memory for classes (``evidence.py``)
 
 
+class PoseRefinerConfig(Config, frozen=True):
+    """How given poses are made to fit the pictures; see ``bundle/refiner.py``."""
+
+    # One sigma of given poses against each other over metres of path, where frames tell none (``pose_sigma`` 0) ...
+    sigma_m: Positive = 0.03
+    sigma_deg: Positive = 2.0  # ... and of their rotations
+    window: Annotated[int, msgspec.Meta(ge=3, le=100)] = 10  # keyframes that are adjusted together
+    corners: Annotated[int, msgspec.Meta(ge=50, le=5000)] = 300  # followed in an image
+    width: Annotated[int, msgspec.Meta(ge=64, le=4096)] = 640  # of the images that they are followed in, at most
+
+
 class HistoryConfig(Config, frozen=True):
     """Fused frames kept on disk, so that the map can follow corrected poses (loop closures)."""
 

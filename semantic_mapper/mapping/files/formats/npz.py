@@ -23,7 +23,7 @@ def write_npz(path: Path, points: MapPoints, label_set: LabelSet) -> None:
     Raises:
         MapError: the file cannot be written.
     """
-    computed = points.measured is not None and not points.measured.all()
+    measured = {} if points.measured is None or points.measured.all() else {"measured": points.measured}
     with atomic_write(path, raises=MapError) as file:
         np.savez_compressed(
             file,
@@ -31,10 +31,11 @@ def write_npz(path: Path, points: MapPoints, label_set: LabelSet) -> None:
             rgb=points.rgb,
             label=points.label,
             confidence=points.confidence,
-            **({"measured": points.measured} if computed else {}),
             label_ids=np.array(label_set.ids, np.uint8),
             label_names=np.array(label_set.names, np.str_),
             label_colors=np.array(label_set.colors, np.uint8).reshape(-1, 3),
             ignore_id=np.uint8(label_set.ignore_id),
             label_set=np.str_(label_set.name),
+            allow_pickle=False,
+            **measured,
         )
