@@ -224,12 +224,15 @@ def _depth_source(session: MapSession) -> dict[str, Any]:
     mapped = session.published - session.dropped - len(session.refusals)
     rendered, computed = (n / mapped if mapped else 0.0 for n in (session.without_depth, session.computed_depth))
     names = {"sensor": rendered + computed < 1, "rendered": rendered > 0, "computed": computed > 0}
+    given_px, refined_px = (_rounded(px, 2) for px in session.pipeline.pose_disagreement_px or (None, None))
     sources = [name for name, used in names.items() if used]
     return {
         "source": sources[0] if len(sources) == 1 else "mixed" if sources else "sensor",
         "rendered_fraction": round(rendered, 4),
         "computed_fraction": round(computed, 4),
         "too_little_motion": session.too_little_motion,
+        "given_poses_off_px": given_px,
+        "refined_poses_off_px": refined_px,
     }
 
 

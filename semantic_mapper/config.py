@@ -272,6 +272,10 @@ class DepthConfig(Config, frozen=True):
     # "sensor": the sensor's, and rendered by the field where a frame has none; "off": always rendered by the field
     source: DepthSource = "auto"
     from_motion: DepthFromMotionConfig = DepthFromMotionConfig()
+    # Whether given poses are made to fit the pictures where depth is computed from these; without, poses that are some
+    # pixels off give depth that is far off.
+    refine_poses: bool = True
+    poses: PoseRefinerConfig = PoseRefinerConfig()
 
 
 Quality = Literal["custom", "fast", "balanced", "reference"]

@@ -117,6 +117,12 @@ class MappingPipeline:
         """The frames that still wait in ``prepare``, oldest first."""
         return self._frame_depth.finish()
 
+    @property
+    def pose_disagreement_px(self) -> tuple[float, float] | None:
+        """Median distance in pixels of corners from where given poses have them, and where refined poses do, of the
+        last frames whose depth was computed; None where there were none."""
+        return self._frame_depth.disagreement.medians
+
     def correct_poses(self, poses: CorrectedPoses, *, until_ns: int | None = None) -> CorrectionStatus:
         """Begin to move the map with corrected poses of frames that it was fused from, as a loop closure gives them.
 
