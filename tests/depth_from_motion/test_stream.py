@@ -148,3 +148,17 @@ def test_a_spread_needs_a_depth_of_its_size() -> None:
         replace(frame, depth_sigma_m=truth)
     with pytest.raises(FrameError, match="depth_sigma_m must be float32"):
         replace(frame, depth_m=truth, depth_sigma_m=truth[:3])
+
+
+def test_the_spread_is_larger_where_the_picture_says_nothing() -> None:
+    plain = np.zeros(CAMERA.height * CAMERA.width, np.bool_).reshape(CAMERA.height, CAMERA.width)
+    stream = DepthFromMotion(CONFIG)
+    for k in range(6):
+        frame, _ = plane_frame(0.08 * k, seq=k)
+        rgb = frame.rgb.copy()
+        rgb[:, :24] = 90
+        (done,) = stream.push(replace(frame, rgb=rgb))
+    plain[:, :18] = True
+    assert done.depth_m is not None and done.depth_sigma_m is not None
+    spread = done.depth_sigma_m / done.depth_m
+    assert np.median(spread[plain]) > 2 * np.median(spread[:, 32:])
