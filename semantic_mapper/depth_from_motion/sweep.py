@@ -18,7 +18,8 @@ EDGE_GRAY = 16.0  # a difference of gray by which P2 halves
 # Of a plane that no source sees. A pixel that matches nowhere costs some 20 by chance, and near planes leave the
 # picture of a source first: a higher cost would push plain surfaces away.
 UNSEEN_COST = 14
-HINT_COST = 12.0  # of a plane far from the hint
+# Of a plane far from the hint. More helps a right hint, but a wrong one then outweighs what the pictures show.
+HINT_COST = 3.0
 PATH_GROUPS = 3  # paths to the sides, down and up
 
 Int16 = NDArray[np.int16]

@@ -162,3 +162,15 @@ def test_the_spread_is_larger_where_the_picture_says_nothing() -> None:
     assert done.depth_m is not None and done.depth_sigma_m is not None
     spread = done.depth_sigma_m / done.depth_m
     assert np.median(spread[plain]) > 2 * np.median(spread[:, 32:])
+
+
+def test_a_wrong_hint_does_not_outweigh_the_picture() -> None:
+    frames = walk(6)
+
+    def hint(frame: PosedFrame, intrinsics: CameraIntrinsics) -> DepthEstimate:
+        wrong = 1.5 * frames[frame.seq][1]
+        return DepthEstimate(wrong, 0.03 * wrong)
+
+    stream = DepthFromMotion(CONFIG)
+    done = [ready for frame, _ in frames for ready in stream.push(frame, hint)]
+    assert relative_error(done[-1], frames[-1][1]) < 0.03
