@@ -8,7 +8,8 @@ import numpy as np
 
 from semantic_mapper.config import DepthFromMotionConfig
 from semantic_mapper.depth_from_motion.agreement import find_agreement
-from semantic_mapper.depth_from_motion.spread import estimate_spread
+from semantic_mapper.depth_from_motion.smooth import smooth_planes
+from semantic_mapper.depth_from_motion.spread import spread_of_match, spread_of_surface
 from semantic_mapper.depth_from_motion.sweep import inverse_depths, sweep_and_match
 from semantic_mapper.depth_from_motion.views import DepthEstimate, PreparedView
 from semantic_mapper.geometry import expect_shape
@@ -22,6 +23,8 @@ def estimate_depth(
     neighbours: Sequence[PreparedView] = (),
 ) -> DepthEstimate:
     """Depth and spread (h, w) of ``reference``, by plane sweep and semi-global matching.
+
+    What is not sure is filled from what is, along the surfaces that the image shows.
 
     Args:
         sources: Views with some way between, see ``choose_sources``; without any there is no depth.
@@ -39,11 +42,15 @@ def estimate_depth(
         return no_depth(size)
     inverse_depth = inverse_depths(config.planes, config.near_m, config.far_m)
     swept = sweep_and_match(reference, sources, inverse_depth, hint)
-    step = inverse_depth[1] - inverse_depth[0]
-    depth = (1 / (inverse_depth[0] + swept.plane * step)).astype(np.float32)
+    first, step = float(inverse_depth[0]), float(inverse_depth[1] - inverse_depth[0])
+    depth = (1 / (first + swept.plane * step)).astype(np.float32)
     agreement = find_agreement(reference, depth, neighbours)
-    sigma = estimate_spread(swept, agreement, float(step), len(sources))
-    return DepthEstimate(agreement.mean_m, sigma)
+    plane = ((1 / agreement.mean_m - first) / step).astype(np.float32)
+    matched = spread_of_match(swept, agreement)
+    surface = np.clip(smooth_planes(plane, matched, reference.rgb), 0, config.planes - 1)
+    depth = (1 / (first + surface * step)).astype(np.float32)
+    sigma = spread_of_surface(plane, surface, matched, agreement, depth)
+    return DepthEstimate(depth, (depth**2 * step * sigma).astype(np.float32))
 
 
 def no_depth(size: tuple[int, int]) -> DepthEstimate:

@@ -15,9 +15,11 @@ from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int32, Int
 
 SMALL_STEP, LARGE_STEP = 8, 80  # P1 and P2; costs are sums of two numbers of different bits of 24
 EDGE_GRAY = 16.0  # a difference of gray by which P2 halves
-ONE_VIEW_COST = 8  # of a plane that a single source sees
-UNSEEN_COST = 36  # of a plane that no source sees; pixels that match no better than by chance cost some 16 to 20
-HINT_COST = 12.0  # of a plane far from the hint
+# Of a plane that no source sees. A pixel that matches nowhere costs some 20 by chance, and near planes leave the
+# picture of a source first: a higher cost would push plain surfaces away.
+UNSEEN_COST = 14
+# Of a plane far from the hint. More helps a right hint, but a wrong one then outweighs what the pictures show.
+HINT_COST = 3.0
 PATH_GROUPS = 3  # paths to the sides, down and up
 
 Int16 = NDArray[np.int16]
@@ -77,7 +79,6 @@ def sweep_and_match(
         rate,
         cost,
         seen,
-        ONE_VIEW_COST,
         UNSEEN_COST,
         HINT_COST,
     )
@@ -155,11 +156,10 @@ def sweep_planes(
     hint_rate: Float32,
     cost: UInt8,
     seen: UInt8,
-    one_view: int,
     unseen: int,
     hint_cost: float,
 ) -> None:
-    """Sum of the two lowest costs over the sources, at each plane of each pixel, plus what the hint costs.
+    """Cost of each plane of each pixel: of its two best sources, twice that of a single one, plus what the hint costs.
 
     Args:
         count: h, rows.
@@ -169,7 +169,7 @@ def sweep_planes(
         inverse_depth: (D,).
         hint, hint_rate: (h, w) plane, < 0 = none, and 1 / planes by which it may be off.
         cost, seen: (h, w, D) and (h, w) uint8, written.
-        one_view: Added where one source alone sees a plane; unseen: cost where none does.
+        unseen: Cost where no source sees a plane.
         hint_cost: Of a plane far from the hint.
     """
     ...

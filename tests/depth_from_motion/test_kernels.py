@@ -10,11 +10,11 @@ import torch
 
 from semantic_mapper.depth_from_motion.agreement import TOLERANCE, find_agreement
 from semantic_mapper.depth_from_motion.enlarge import enlarge_estimate
+from semantic_mapper.depth_from_motion.smooth import relax_membrane, smooth_planes
 from semantic_mapper.depth_from_motion.sweep import (
     EDGE_GRAY,
     HINT_COST,
     LARGE_STEP,
-    ONE_VIEW_COST,
     SMALL_STEP,
     UNSEEN_COST,
     inverse_depths,
@@ -64,7 +64,7 @@ def plain_cost(reference: PreparedView, sources: list[PreparedView], hint: Depth
         seen.append(inside)
     lowest = np.sort(found, axis=0)
     count = np.sum(seen, axis=0)
-    cost = np.where(count == 1, 2 * lowest[0] + ONE_VIEW_COST, UNSEEN_COST)
+    cost = np.where(count == 1, 2 * lowest[0], UNSEEN_COST)
     if len(sources) > 1:
         cost = np.where(count > 1, lowest[0] + lowest[1], cost)
     if hint is not None:
@@ -169,6 +169,31 @@ def test_neighbours_agree_where_their_depth_is_that_of_the_same_surface() -> Non
 
 def _with_estimate(view: PreparedView, estimate: DepthEstimate) -> PreparedView:
     return replace(view, estimate=estimate)
+
+
+def test_a_membrane_is_the_least_squares_surface() -> None:
+    rng = np.random.default_rng(2)
+    data, weight, right, below = (rng.uniform(0.1, 2, (7, 9)).astype(np.float32) for _ in range(4))
+    out = np.zeros_like(data)
+    relax_membrane(data, weight, right, below, out, 300, 1.5)
+    number = np.arange(data.size).reshape(data.shape)
+    left = np.diag(weight.ravel().astype(float))
+    for tie, one, other in ((right[:, :-1], number[:, :-1], number[:, 1:]), (below[:-1], number[:-1], number[1:])):
+        for t, a, b in zip(tie.ravel(), one.ravel(), other.ravel(), strict=True):
+            left[[a, b], [a, b]] += t
+            left[[a, b], [b, a]] -= t
+    expected = np.linalg.solve(left, (weight * data).ravel())
+    np.testing.assert_allclose(out.ravel(), expected, atol=1e-5)
+
+
+def test_what_is_not_sure_takes_the_plane_around_it_and_edges_of_the_image_part_surfaces() -> None:
+    x = np.arange(32, dtype=np.float32)[None].repeat(24, 0)
+    truth = np.where(x < 16, 10 + 0.2 * x, 40.0).astype(np.float32)
+    rgb = np.where(x < 16, 60, 200).astype(np.uint8)[..., None].repeat(3, 2)
+    plane, sigma = truth.copy(), np.full_like(truth, 0.2)
+    plane[6:18, 4:12], sigma[6:18, 4:12] = 55, 30
+    smooth = smooth_planes(plane, sigma, rgb)
+    assert np.abs(smooth - truth).max() < 0.3
 
 
 def test_an_enlarged_plane_is_a_plane() -> None:

@@ -148,3 +148,29 @@ def test_a_spread_needs_a_depth_of_its_size() -> None:
         replace(frame, depth_sigma_m=truth)
     with pytest.raises(FrameError, match="depth_sigma_m must be float32"):
         replace(frame, depth_m=truth, depth_sigma_m=truth[:3])
+
+
+def test_the_spread_is_larger_where_the_picture_says_nothing() -> None:
+    plain = np.zeros(CAMERA.height * CAMERA.width, np.bool_).reshape(CAMERA.height, CAMERA.width)
+    stream = DepthFromMotion(CONFIG)
+    for k in range(6):
+        frame, _ = plane_frame(0.08 * k, seq=k)
+        rgb = frame.rgb.copy()
+        rgb[:, :24] = 90
+        (done,) = stream.push(replace(frame, rgb=rgb))
+    plain[:, :18] = True
+    assert done.depth_m is not None and done.depth_sigma_m is not None
+    spread = done.depth_sigma_m / done.depth_m
+    assert np.median(spread[plain]) > 2 * np.median(spread[:, 32:])
+
+
+def test_a_wrong_hint_does_not_outweigh_the_picture() -> None:
+    frames = walk(6)
+
+    def hint(frame: PosedFrame, intrinsics: CameraIntrinsics) -> DepthEstimate:
+        wrong = 1.5 * frames[frame.seq][1]
+        return DepthEstimate(wrong, 0.03 * wrong)
+
+    stream = DepthFromMotion(CONFIG)
+    done = [ready for frame, _ in frames for ready in stream.push(frame, hint)]
+    assert relative_error(done[-1], frames[-1][1]) < 0.03

@@ -43,7 +43,7 @@ typedef struct {
     F32 hint_rate;      /* (h, w) 1 / planes by which the hint may be off */
     U8 cost;            /* (h, w, D) */
     U8 seen;            /* (h, w) the most sources that see one plane of a pixel */
-    int64_t one_view, unseen; /* added where a single source sees a point; cost where none does */
+    int64_t unseen;     /* cost where no source sees a plane */
     double hint_cost;   /* of a plane far from the hint */
 } SweepArguments;
 
@@ -89,7 +89,7 @@ static void match_source(const SweepArguments *a, int64_t n, float x, float y, i
     }
 }
 
-/* Sum of the two lowest costs over the sources, plus what the hint says. */
+/* Sum of the costs of the two sources that match best, twice that of a single one; plus what the hint says. */
 KERNEL(sweep_planes, SweepArguments) {
     const int64_t height = a->cost.shape[0], width = a->cost.shape[1], planes = a->cost.shape[2];
     const int64_t sources = a->source_size.shape[0];
@@ -107,7 +107,7 @@ KERNEL(sweep_planes, SweepArguments) {
             int32_t most = 0;
             for (int64_t d = 0; d < planes; d++) {
                 const int32_t n = views[d];
-                int32_t value = n > 1 ? first[d] + second[d] : n ? 2 * first[d] + (int32_t)a->one_view : (int32_t)a->unseen;
+                int32_t value = n > 1 ? first[d] + second[d] : n ? 2 * first[d] : (int32_t)a->unseen;
                 if (hint >= 0) {
                     const float off = ((float)d - hint) * rate;
                     value += (int32_t)(far * min_f(off * off, 1.0f));
@@ -314,18 +314,18 @@ typedef struct {
     U8 rgb;                   /* (H, W, 3) */
     F32 out_depth, out_sigma; /* (H, W) */
     double same;              /* fraction of the depth by which pixels of one surface differ at most */
-    double colour_rate;       /* a coarse pixel counts by exp(-rate * squared distance of the colours) */
+    double colour_rate;       /* a coarse pixel counts by about exp(-rate * squared distance of the colours) */
 } EnlargeArguments;
 
 /* Depth of a full pixel: of the coarse pixels round it, those of the surface that looks most like it, averaged. */
 static void enlarge_pixel(const EnlargeArguments *a, int64_t v, int64_t u, float y, float x) {
     const int64_t height = a->depth.shape[0], width = a->depth.shape[1], at = v * a->out_depth.shape[1] + u;
-    const int64_t j0 = (int64_t)floorf(y), i0 = (int64_t)floorf(x);
+    const int64_t j0 = (int64_t)(y + 0.5f), i0 = (int64_t)(x + 0.5f);
     const uint8_t *colour = a->rgb.data + 3 * at;
-    float z[16], sigma[16], weight[16], best = 0;
+    float z[9], sigma[9], weight[9], best = 0;
     int count = 0, chosen = 0;
-    for (int64_t j = max_i(j0 - 1, 0); j < min_i(j0 + 3, height); j++)
-        for (int64_t i = max_i(i0 - 1, 0); i < min_i(i0 + 3, width); i++) {
+    for (int64_t j = max_i(j0 - 1, 0); j < min_i(j0 + 2, height); j++)
+        for (int64_t i = max_i(i0 - 1, 0); i < min_i(i0 + 2, width); i++) {
             const int64_t from = j * width + i;
             if (!(a->depth.data[from] > 0)) continue;
             const uint8_t *other = a->coarse_rgb.data + 3 * from;
@@ -333,8 +333,8 @@ static void enlarge_pixel(const EnlargeArguments *a, int64_t v, int64_t u, float
             for (int c = 0; c < 3; c++) distance += (float)((other[c] - colour[c]) * (other[c] - colour[c]));
             const float dy = y - (float)j, dx = x - (float)i;
             z[count] = a->depth.data[from], sigma[count] = a->sigma.data[from];
-            weight[count] = expf(-(float)a->colour_rate * distance - 0.7f * (dy * dy + dx * dx)) + 1e-9f;
-            count++;
+            const float near = 1.0f / (1.0f + 0.25f * ((float)a->colour_rate * distance + 0.7f * (dy * dy + dx * dx)));
+            weight[count++] = near * near * near * near; /* about exp of the negative sum */
         }
     if (!count) return; /* none stays 0 */
     for (int k = 0; k < count; k++) {
@@ -374,5 +374,32 @@ KERNEL(enlarge_depth, EnlargeArguments) {
                                                  at[3] * sigma[below + beside];
         }
     }
+    return 0;
+}
+
+typedef struct {
+    F32 data, weight; /* (h, w) values, and how much each counts */
+    F32 right, below; /* (h, w) how much a pixel is tied to the one to the right, and below; last ones 0 */
+    F32 out;          /* (h, w) first guess, then the solution */
+    int64_t iterations;
+    double relaxation; /* 1 to 2 */
+} MembraneArguments;
+
+/* Minimum of sum weight (out - data)^2 + sum tie (difference of neighbours)^2, by red-black over-relaxation. */
+KERNEL(relax_membrane, MembraneArguments) {
+    const int64_t height = a->out.shape[0], width = a->out.shape[1];
+    const float *right = a->right.data, *below = a->below.data, omega = (float)a->relaxation;
+    float *out = a->out.data;
+    for (int64_t turn = 0; turn < 2 * a->iterations; turn++)
+        for (int64_t y = 0; y < height; y++)
+            for (int64_t x = (y + turn) & 1; x < width; x += 2) {
+                const int64_t at = y * width + x;
+                float sum = a->weight.data[at] * a->data.data[at], total = a->weight.data[at] + 1e-12f;
+                if (x > 0) sum += right[at - 1] * out[at - 1], total += right[at - 1];
+                if (x + 1 < width) sum += right[at] * out[at + 1], total += right[at];
+                if (y > 0) sum += below[at - width] * out[at - width], total += below[at - width];
+                if (y + 1 < height) sum += below[at] * out[at + width], total += below[at];
+                out[at] += omega * (sum / total - out[at]);
+            }
     return 0;
 }
