@@ -581,7 +581,7 @@ class _Bag:
         """Make of whatever a damaged bag leads to an error that says what to do."""
         try:
             yield
-        except (SemanticMapperError, StopIteration, GeneratorExit):
+        except (SemanticMapperError, StopIteration, MemoryError):
             raise
         except Exception as error:  # storage, compression and messages each raise their own
             raise ImportSourceError(
