@@ -11,7 +11,7 @@ from semantic_mapper.config import Config, Positive
 
 SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # of transport/topics.py, which loads what the launcher has no need of
 # Of drivers/registry.py and drivers/poses/config.py, for the same reason.
-CAMERA_KINDS = ("v4l2", "opencv", "oak")
+CAMERA_KINDS = ("v4l2", "opencv", "stereo", "oak", "realsense")
 POSE_KINDS = ("device", "fixed", "topic", "board", "rgbd")
 TRACKING_KINDS = ("oak",)  # cameras that can tell their own pose
 ENDPOINT_PATTERN = r"^([a-z]+://.+|)\Z"
@@ -39,7 +39,7 @@ def check_tracking(camera_kind: str, pose_kind: object) -> None:
 class LiveCamera(Config, frozen=True):
     """A camera that is connected, or a video."""
 
-    kind: Text  # of drivers/registry.py: v4l2, opencv, oak
+    kind: Text  # of drivers/registry.py: v4l2, opencv, stereo, oak, realsense
     poses: Text | dict[str, Any]  # who knows where the camera is: TOML file, or the same as a table; see drivers/poses
     config: str | dict[str, Any] = msgspec.field(
         default_factory=dict

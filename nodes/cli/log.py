@@ -19,10 +19,10 @@ LISTED = 10  # skipped files and damages that are shown one by one
 
 @verb
 def import_(
-    source: Annotated[Path, typer.Argument(metavar="SRC", help="Folder of the recording.")],
+    source: Annotated[Path, typer.Argument(metavar="SRC", help="Folder of the recording, or ROS bag.")],
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Log to write (.mcap).")],
     format: Annotated[  # noqa: A002 - the name of the option
-        Literal["folder", "tum", "scannet", "replica", "kitti360"] | None,
+        Literal["folder", "tum", "scannet", "replica", "kitti360", "rosbag"] | None,
         typer.Option(help="Found out when not given."),
     ] = None,
     max_frames: Annotated[int, typer.Option(min=0, help="Stop after this many; 0 = all.")] = 0,
@@ -32,14 +32,25 @@ def import_(
     rotate: Annotated[
         Literal["0", "90", "180", "270"], typer.Option(help="Turn every image clockwise by this many degrees.")
     ] = "0",
+    topic: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ROLE=NAME",
+            help="ROS bags: topic of the image, depth (none: without), info or pose; several times. Found by type.",
+        ),
+    ] = None,
+    world: Annotated[str, typer.Option(help="ROS bags: frame of tf that poses are in; map, world or odom.")] = "",
+    body: Annotated[str, typer.Option(help="ROS bags: frame whose pose the topic of poses tells.")] = "",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a log that is there.")] = False,
 ) -> None:
-    """Make a log of a recording: sequence folder, TUM RGB-D, exported ScanNet, Replica (Semantic-NeRF), KITTI-360.
+    """Make a log of a recording: sequence folder, TUM RGB-D, ScanNet, Replica (Semantic-NeRF), KITTI-360, ROS bag.
 
     Frames that cannot be used are left out, each with its file and the reason. --rotate is for cameras that are mounted
-    on their side: the weights know upright rooms. Poses and intrinsics turn with the images.
+    on their side: the weights know upright rooms. Poses and intrinsics turn with the images. Of a ROS bag (1 or 2),
+    poses come from tf or from odometry, and one camera is imported.
 
     Example: semantic-mapper import path/to/redkitchen kitchen.mcap
+    Example: semantic-mapper import robot.bag robot.mcap --topic image=/front/color/image_raw
     Example: semantic-mapper import path/to/adt flat.mcap --rotate 90 --rename recipes/classes/adt-to-rooms.toml
     """
     output = Output.guarded()
@@ -56,7 +67,13 @@ def import_(
                 bar.start(total)
             bar.set(done)
 
-        options = ImportOptions(max_frames=max_frames or None, quarters=int(rotate) // 90)
+        options = ImportOptions(
+            max_frames=max_frames or None,
+            quarters=int(rotate) // 90,
+            topics=_topics_by_role(topic or []),
+            world=world,
+            body=body,
+        )
         report = import_recording(
             source, log, format, on_progress, options=options, renames=renames, overwrite=overwrite
         )
@@ -72,6 +89,14 @@ def import_(
         output.print(f"  {what}: frame {skipped.frame}: {skipped.file}: {skipped.reason}")
     if len(report.skipped) > LISTED:
         output.print(f"  and {len(report.skipped) - LISTED} more")
+
+
+def _topics_by_role(texts: list[str]) -> dict[str, str]:
+    pairs = [text.partition("=") for text in texts]
+    for role, equals, name in pairs:
+        if not equals or not name:
+            raise typer.BadParameter(f"--topic {role}: write ROLE=NAME, such as image=/camera/color/image_raw")
+    return {role: name for role, _, name in pairs}
 
 
 def _depth_line(report: ImportReport) -> str:

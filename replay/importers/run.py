@@ -23,6 +23,8 @@ from semantic_mapper.replay.importers.base import (
 from semantic_mapper.replay.importers.folder import FolderRecording
 from semantic_mapper.replay.importers.kitti360 import Kitti360Recording
 from semantic_mapper.replay.importers.replica import ReplicaRecording
+from semantic_mapper.replay.importers.rosbag import STORAGE as BAG_STORAGE
+from semantic_mapper.replay.importers.rosbag import RosbagRecording, is_bag_folder, is_ros_mcap
 from semantic_mapper.replay.importers.scannet import ScanNetRecording
 from semantic_mapper.replay.importers.tum import TumRecording
 from semantic_mapper.replay.log.atomic_log import atomic_log
@@ -38,6 +40,7 @@ FORMATS: dict[str, Callable[[Path, ImportOptions], Recording]] = {
     "scannet": ScanNetRecording,
     "replica": ReplicaRecording,
     "kitti360": Kitti360Recording,
+    "rosbag": RosbagRecording,
 }
 
 # What a folder of each format has, and no other.
@@ -51,14 +54,11 @@ _MARKS = {
 
 LISTED = 5  # recordings that an error names
 _SEE = "replay/importers/ says what each format consists of"
-_CONVERT = "bags are not read: export its images, depth and poses as a TUM RGB-D folder, and import that"
 _VIDEO = (
     "is a video, which has no poses: `semantic-mapper up launch/video.toml` maps it with poses from a board or a socket"
 )
 _PACKED = "is packed; unpack it, and name the folder that comes out"
 _FILES = {
-    ".bag": f"is a ROS 1 bag, and {_CONVERT}",
-    ".db3": f"is a ROS 2 bag, and {_CONVERT}",
     **dict.fromkeys((".mp4", ".avi", ".mkv", ".mov", ".webm"), _VIDEO),
     **dict.fromkeys((".zip", ".tgz", ".gz", ".tar", ".7z"), _PACKED),
 }
@@ -67,13 +67,15 @@ _DEFAULTS = ImportOptions()
 
 
 def detect_format(src: Path) -> str:
-    """Format of a recording by the files in its folder.
+    """Format of a recording by its file, or by the files in its folder.
 
     Raises:
-        ImportSourceError: no such folder, or none of the formats.
+        ImportSourceError: no such file or folder, or none of the formats.
     """
     if not src.exists():
-        raise ImportSourceError(f"{src}: no such folder")
+        raise ImportSourceError(f"{src}: no such file or folder")
+    if _is_bag(src):
+        return "rosbag"
     if src.is_file():
         raise ImportSourceError(f"{src}: {_what_file(src)}")
     for name in _MARKS:
@@ -82,6 +84,13 @@ def detect_format(src: Path) -> str:
     if src.resolve().parent.name == "data_2d_raw":
         return "kitti360"
     raise ImportSourceError(f"{src}: {_what_folder(src)}")
+
+
+def _is_bag(src: Path) -> bool:
+    """Whether it is a bag of ROS: a file or, of ROS 2, a folder."""
+    if src.is_dir():
+        return is_bag_folder(src)
+    return src.suffix in (".bag", ".db3") or (src.suffix in BAG_STORAGE and is_ros_mcap(src))
 
 
 def _lacks(src: Path, name: str) -> list[str]:
@@ -95,12 +104,12 @@ def _what_folder(src: Path) -> str:
     if sequences:
         return f"is a scene of Replica; name one sequence: {', '.join(map(str, sequences))}"
     below = [
-        folder for folder in sorted(src.iterdir()) if folder.is_dir() and any(not _lacks(folder, n) for n in _MARKS)
+        path
+        for path in sorted(src.iterdir())
+        if _is_bag(path) or (path.is_dir() and any(not _lacks(path, n) for n in _MARKS))
     ]
     if below:
         return f"holds recordings; name one of them: {', '.join(map(str, below[:LISTED]))}"
-    if (src / "metadata.yaml").exists() and any((*src.glob("*.db3"), *src.glob("*.mcap"))):
-        return f"is a ROS 2 bag, and {_CONVERT}"
     name = min(_MARKS, key=lambda n: len(_lacks(src, n)))
     if len(_lacks(src, name)) < len(_MARKS[name]):
         return f"is nearest to a recording of format '{name}', but lacks {', '.join(_lacks(src, name))}; {_SEE}"
@@ -135,14 +144,14 @@ def import_recording(
     codec: CodecOptions | None = None,
     overwrite: bool = False,
 ) -> ImportReport:
-    """Write the recording in folder ``src`` to the log ``dst``, which is there only once the import is complete.
+    """Write the recording ``src`` (folder or ROS bag) to the log ``dst``, which is there once the import is complete.
 
     A frame that cannot be used is left out and reported; a bad label image costs the frame its label only.
 
     Args:
-        src: Folder of the recording.
+        src: Folder of the recording, or its file.
         dst: Log to write.
-        format_name: "folder", "tum", "scannet", "replica" or "kitti360"; None = found out.
+        format_name: "folder", "tum", "scannet", "replica", "kitti360" or "rosbag"; None = found out.
         on_progress: Called with (frames looked at, frames in all).
         options: How to read.
         renames: New names of classes by their present ones; classes of one name become one class.
@@ -159,8 +168,8 @@ def import_recording(
     name = format_name or detect_format(src)
     if name not in FORMATS:
         raise ImportSourceError(f"no format '{name}'; there are {', '.join(FORMATS)}")
-    if not src.is_dir():
-        raise ImportSourceError(f"{src}: no such folder")
+    if not src.is_dir() and not (name == "rosbag" and src.is_file()):
+        raise ImportSourceError(f"{src}: no such {'file or folder' if name == 'rosbag' else 'folder'}")
     recording = FORMATS[name](src, options)
     total = len(recording) if options.max_frames is None else min(len(recording), options.max_frames)
     info, changed = _changes(src, recording.info, options, renames or {})
