@@ -19,13 +19,13 @@ from typing import Any
 from unittest.mock import patch
 
 import msgspec
-import semantic_mapper.drivers.realsense.config
 import typer.main
 from typer.testing import CliRunner
 
 import semantic_mapper.drivers.oak.config
 import semantic_mapper.drivers.opencv.config
 import semantic_mapper.drivers.poses.config
+import semantic_mapper.drivers.realsense.config
 import semantic_mapper.drivers.stereo.config
 import semantic_mapper.drivers.v4l2.config
 from semantic_mapper.benchmark.config import SuiteConfig
