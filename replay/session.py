@@ -74,6 +74,8 @@ class MapSession:
         self.corrected_poses = 0  # given; the map has moved with them
         self.learned: dict[str, Any] | None = None  # what became of weights that were offered meanwhile
         self.unfinished_correction = ""  # what the map has not moved with, and why
+        self.left_out = 0  # by the import that has made the log
+        self.scale_known = True  # else lengths are not metres
         self.without_depth = 0  # their geometry was rendered, not measured
         # Frames that were not mapped, those that were but whose label image cannot be used, and stretches of a log in
         # which no frame can be made out:

@@ -34,6 +34,7 @@ class ImportOptions:
         max_frames: Stop after this many frames; None = all.
         quarters: Turn every image clockwise by this many quarters of a full turn: for a camera mounted on its side.
         match_s: TUM: largest time between a colour image, its depth image and its pose.
+        scale: Metres per unit of poses whose unit is their own (transforms, colmap); None = not known.
     """
 
     camera_id: str = "camera"
@@ -41,6 +42,7 @@ class ImportOptions:
     max_frames: int | None = None
     quarters: int = 0
     match_s: float = 0.02
+    scale: float | None = None
 
 
 MAX_FILE_BYTES = 1 << 28  # of one image, or one list of poses

@@ -253,7 +253,7 @@ def test_formats_are_told_apart(folder: Path, tum: Path, scannet: Path, tmp_path
         ("half", "nearest to a recording of format 'folder', but lacks intrinsics.json"),
         ("bag", "is a ROS 2 bag"),
         ("day.bag", "is a ROS 1 bag"),
-        ("film.MP4", "is a video, which has no poses"),
+        ("film.MP4", "is a film, which has no poses"),
         ("day.zip", "is packed; unpack it"),
         ("no", "no such folder"),
         ("log.mcap", "nor a log of semantic-mapper"),
