@@ -8,19 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from semantic_mapper.drivers.calibration import save_calibration
 from semantic_mapper.errors import ConfigError, ImportSourceError
 from semantic_mapper.evaluation.trajectory import align_similar
 from semantic_mapper.geometry import transform
-from semantic_mapper.nodes.cli.main import app
 from semantic_mapper.replay.log.reader import LogReader
 from semantic_mapper.replay.sfm.film_note import read_left_out
 from semantic_mapper.replay.sfm.reconstruct import FilmOptions, FilmReport, import_film
 from semantic_mapper.replay.sfm.refusals import FilmError
 from semantic_mapper.replay.sfm.scale import Mark, MarkedDistance, ScaleHint
 from semantic_mapper.types import Float64
+from tests.nodes.support import run
 
 from . import films
 
@@ -186,8 +185,9 @@ def test_two_scenes_are_refused_with_their_times(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_verb_makes_a_map_and_prints_the_report_last(tmp_path: Path, walked: tuple[Path, Float64]) -> None:
     out = tmp_path / "out"
-    ran = CliRunner().invoke(app, ["map", str(walked[0]), "--out", str(out), "--voxel-size", "0.05"])
-    assert ran.exit_code == 0, ran.output
+    done = run("map", walked[0], "--out", out, "--voxel-size", "0.05")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.rstrip().splitlines()[-1] == str(out / "report.html")
     summary = json.loads((out / "summary.json").read_text())
     assert summary["scale"] == "unknown" and summary["frames"]["left_out"] + summary["frames"]["published"] == COUNT
     assert {"room.mcap", "room.html", "report.html", "map.ply", "map.npz"} <= {file.name for file in out.iterdir()}
