@@ -73,6 +73,24 @@ def film_options(
     return FilmOptions(calibration, focal_prior or None, hint, quarters)
 
 
+def recording_scale(options: FilmOptions) -> float | None:
+    """Metres per unit, of a recording that has poses.
+
+    Raises:
+        ConfigError: options were given that are for films alone.
+    """
+    hint = options.scale
+    if any(
+        value is not None
+        for value in (options.calibration, options.focal_prior_px, hint.distance, hint.board, hint.camera_height_m)
+    ):
+        raise ConfigError(
+            "the recording has poses and intrinsics of its own; --calibration, --focal-prior, --distance, --square-mm, "
+            "--board and --camera-height are for films"
+        )
+    return hint.factor
+
+
 def is_film(source: Path) -> bool:
     """Whether poses have to be found: of a film, or of a folder of pictures that is no recording of a known format."""
     from semantic_mapper.replay.importers import is_recording

@@ -20,6 +20,7 @@ from semantic_mapper.nodes.cli.film import (
     import_film_log,
     is_film,
     print_film,
+    recording_scale,
 )
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
 from semantic_mapper.plain_text import counted
@@ -79,13 +80,11 @@ def import_(
     renames = load_config(rename, RenameConfig).classes if rename is not None else None
 
     log.parent.mkdir(parents=True, exist_ok=True)
+    film = film_options(calibration, focal_prior, scale, distance, square_mm, board, camera_height, int(rotate) // 90)
     if format is None and is_film(source):
         if renames is not None or max_frames:
             raise typer.BadParameter("a film has no classes to rename, and is read to its end")
-        options = film_options(
-            calibration, focal_prior, scale, distance, square_mm, board, camera_height, int(rotate) // 90
-        )
-        found, page = import_film_log(source, log, options, overwrite=overwrite)
+        found, page = import_film_log(source, log, film, overwrite=overwrite)
         print_film(output, found, log)
         output.print(f"  {page}  (report)")
         return
@@ -96,7 +95,7 @@ def import_(
                 bar.start(total)
             bar.set(done)
 
-        options = ImportOptions(max_frames=max_frames or None, quarters=int(rotate) // 90, scale=scale or None)
+        options = ImportOptions(max_frames=max_frames or None, quarters=int(rotate) // 90, scale=recording_scale(film))
         report = import_recording(
             source, log, format, on_progress, options=options, renames=renames, overwrite=overwrite
         )

@@ -53,7 +53,7 @@ def map_(
     Example: semantic-mapper map film.mp4 --out runs/film --calibration camera.toml --camera-height 1.5
     """
     output = Output.guarded()
-    from semantic_mapper.nodes.cli.film import film_options, import_film_log, is_film, print_film
+    from semantic_mapper.nodes.cli.film import film_options, import_film_log, is_film, print_film, recording_scale
     from semantic_mapper.nodes.cli.outputs import hold_folder
     from semantic_mapper.nodes.cli.report import REPORT_NAME
     from semantic_mapper.nodes.cli.run_replay import ReplayRequest, mapper_config, replay_log
@@ -72,7 +72,7 @@ def map_(
             output.print(f"  {page}  (report on the film)")
         else:
             with frame_progress("import", None) as bar:
-                plain = ImportOptions(quarters=int(rotate) // 90)
+                plain = ImportOptions(quarters=int(rotate) // 90, scale=recording_scale(options))
                 import_recording(source, log, on_progress=lambda done, _: bar.set(done), options=plain, overwrite=True)
     with StopRequest() as stop:
         with frame_progress("replay", None) as bar:

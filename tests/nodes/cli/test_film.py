@@ -81,6 +81,12 @@ def test_the_report_says_what_was_left_out_and_that_lengths_are_no_metres(tmp_pa
     assert "2.50 m" in page and "1.40 m" in page
 
 
+def test_options_of_films_are_refused_for_recordings(tmp_path: Path) -> None:
+    folder = rec.make_folder(tmp_path / "kitchen")
+    done = run("import", folder, tmp_path / "a.mcap", "--camera-height", "1.4")
+    assert done.returncode == 1 and "are for films" in done.stderr
+
+
 def test_a_log_keeps_how_many_frames_of_its_film_it_lacks() -> None:
     note = FilmNote(10, {"blurred": 4, "moved too little": 3}, 4, 3, 0.6, 800.0)
     assert read_left_out({"film.json": note.attachment()}) == 7
