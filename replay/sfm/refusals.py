@@ -116,7 +116,7 @@ def refuse_outcome(film: object, outcome: Outcome, times_s: Sequence[float], spa
             f"--focal-prior where the lens is unusual, or {_HOW}",
         )
     if len(spans[0]) < LEAST_MODEL * picks:
-        if len(spans) == 1 and flat_fraction(outcome.pairs) >= 0.5:
+        if flat_fraction(outcome.pairs) >= 0.5:  # what models it gives are noise
             raise turning(film)
         listed = "; ".join(
             f"{times_s[min(span)]:.1f} to {times_s[max(span)]:.1f} s ({len(span)} of {picks} views)"

@@ -58,6 +58,7 @@ def test_a_film_that_hangs_together_passes() -> None:
         (outcome(3), [], "no-matches", "do not match each other: 3 of 19"),
         (outcome(19, flat=0.99), [], "turning", "turns on the spot"),
         (outcome(19, flat=0.99), [range(4)], "turning", "turns on the spot"),
+        (outcome(19, flat=0.99), [range(5), range(8, 12)], "turning", "turns on the spot"),
         (outcome(19), [], "no-matches", "from two sides"),
         (outcome(19), [range(9), range(11, 19)], "several-scenes", r"0.0 to 4.0 s \(9 of 20 views\); 5.5 to 9.0 s"),
     ],
