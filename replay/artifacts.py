@@ -22,6 +22,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.formats.ply import write_ply
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.plots import write_picture
+from semantic_mapper.transport.messages import SCALE_UNKNOWN
 from semantic_mapper.types import Float64
 
 if TYPE_CHECKING:  # session imports this module
@@ -167,10 +168,12 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "scored": session.scored,
             "without_depth": session.without_depth,
             "excluded_from_scores": session.excluded,
+            "left_out": session.left_out,
         },
         "latency_ms": {**_percentiles(session.step_ms), "first": _rounded(session.step_ms.first)},
         "stages_ms": {name: _percentiles(times) for name, times in session.stage_ms.items()},
         "depth": _depth_source(session),
+        "scale": "metres" if session.scale_known else SCALE_UNKNOWN,
         "pose_check": {
             "keyframes_compared": pipeline.pose_check.compared,
             "depth_disagreement": _rounded(pipeline.pose_check.recent, 4),

@@ -75,6 +75,8 @@ class MapSession:
         self.corrected_poses = 0  # given; the map has moved with them
         self.learned: dict[str, Any] | None = None  # what became of weights that were offered meanwhile
         self.unfinished_correction = ""  # what the map has not moved with, and why
+        self.left_out = 0  # by the import that has made the log
+        self.scale_known = True  # else lengths are not metres
         self.without_depth = 0  # their geometry was rendered, not measured
         self.computed_depth = 0  # their geometry was computed from the pictures
         self.too_little_motion = 0  # of these, those whose camera had not moved enough to compute any

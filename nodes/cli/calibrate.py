@@ -68,7 +68,7 @@ def calibrate(
     output = Output.guarded()
     from semantic_mapper.nodes.calibration.report import report, report_json, write_files, write_stereo
 
-    settings = _settings(config, square_mm)
+    settings = board_settings(config, square_mm)
     if board is not None:
         _draw_board(output, settings, board, json)
         if not sources:
@@ -91,8 +91,12 @@ def calibrate(
         output.print(str(path))
 
 
-def _settings(path: Path | None, square_mm: float) -> Any:
-    """Raises: ConfigError: the file, or a board that cannot be."""
+def board_settings(path: Path | None, square_mm: float) -> Any:
+    """Board and settings of a file (None = defaults), with squares of so many millimetres (0 = as it says).
+
+    Raises:
+        ConfigError: the file, or a board that cannot be.
+    """
     import msgspec
 
     from semantic_mapper.config import load_config

@@ -29,6 +29,7 @@ from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.corrected_poses import correct_session, keeping_frames, read_corrections
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.session import MapSession, open_recording
+from semantic_mapper.replay.sfm.film_note import read_left_out
 from semantic_mapper.types import PosedFrame
 
 REPLAY_DELAY_FRAMES = 6  # that a frame waits for where its depth is computed: nobody waits for the map of a log
@@ -98,6 +99,7 @@ def replay_log(
             source=log.info.source,
             rerun=open_recording(request.rerun, bundle.pipeline),
         )
+        session.scale_known, session.left_out = log.info.scale_known, read_left_out(log.attachments())
         for error in log.errors:  # stretches of the file in which no frame can be made out
             session.note_damage(str(error))
         total = min(len(log), request.max_frames or len(log))

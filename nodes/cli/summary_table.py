@@ -61,6 +61,13 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
             f"depth: rendered by the field for {percent(fraction)} of the frames, which have no sensor depth; geometry "
             "is less exact than with a depth sensor"
         )
+    if summary.get("scale") == "unknown":
+        lines.append(
+            "scale: unknown; lengths of this map are not metres. Import the film with --scale, --distance, --square-mm "
+            "or --camera-height"
+        )
+    if frames.get("left_out"):
+        lines.append(f"{counted(frames['left_out'], 'frame')} of the film left out by the import; its report says why")
     if frames.get("excluded_from_scores"):
         lines.append(
             f"{counted(frames['excluded_from_scores'], 'frame')} left out of the scores: weights were finetuned on them"
@@ -115,6 +122,8 @@ _ROWS: Sequence[tuple[str, str, Any]] = (
     ("frames fused", "frames.fused", str),
     ("frames dropped", "frames.dropped", str),
     ("frames refused", "frames.refused", str),
+    ("frames left out of the log", "frames", lambda f: str(f.get("left_out") or "-")),
+    ("scale", "scale", str),
     ("frames scored", "frames.scored", str),
     ("depth", "depth", _depth_source),
     ("depth disagreement", "pose_check", lambda c: _pose_figure(c, "depth_disagreement")),

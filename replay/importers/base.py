@@ -38,6 +38,7 @@ class ImportOptions:
         topics: ROS bags: topics by role ("image", "depth", "info", "pose"), where several fit; depth "none" = without.
         world: ROS bags: frame of tf in which poses are; empty = map, world or odom.
         body: ROS bags: frame whose pose the topic of poses tells; empty = as its messages say.
+        scale: Metres per unit of poses whose unit is their own (transforms, colmap); None = not known.
     """
 
     camera_id: str = "camera"
@@ -48,6 +49,7 @@ class ImportOptions:
     topics: Mapping[str, str] = field(default_factory=dict[str, str])
     world: str = ""
     body: str = ""
+    scale: float | None = None
 
 
 MAX_FILE_BYTES = 1 << 28  # of one image, or one list of poses

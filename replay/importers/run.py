@@ -20,16 +20,21 @@ from semantic_mapper.replay.importers.base import (
     Recording,
     Skipped,
 )
+from semantic_mapper.replay.importers.colmap import open_colmap
 from semantic_mapper.replay.importers.folder import FolderRecording
 from semantic_mapper.replay.importers.kitti360 import Kitti360Recording
+from semantic_mapper.replay.importers.polycam import open_polycam
+from semantic_mapper.replay.importers.record3d import open_record3d
 from semantic_mapper.replay.importers.replica import ReplicaRecording
 from semantic_mapper.replay.importers.rosbag import STORAGE as BAG_STORAGE
 from semantic_mapper.replay.importers.rosbag import RosbagRecording, is_bag_folder, is_ros_mcap
 from semantic_mapper.replay.importers.scannet import ScanNetRecording
+from semantic_mapper.replay.importers.transforms import open_transforms
 from semantic_mapper.replay.importers.tum import TumRecording
 from semantic_mapper.replay.log.atomic_log import atomic_log
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.sequence import SUFFIX as LOG_SUFFIX
+from semantic_mapper.replay.sfm.colmap_model import find_model
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
@@ -41,6 +46,10 @@ FORMATS: dict[str, Callable[[Path, ImportOptions], Recording]] = {
     "replica": ReplicaRecording,
     "kitti360": Kitti360Recording,
     "rosbag": RosbagRecording,
+    "polycam": open_polycam,
+    "record3d": open_record3d,
+    "transforms": open_transforms,
+    "colmap": open_colmap,
 }
 
 # What a folder of each format has, and no other.
@@ -50,13 +59,14 @@ _MARKS = {
     "scannet": ("color", "depth", "pose"),
     "replica": ("rgb", "depth", "traj_w_c.txt"),
     "kitti360": ("calibration/perspective.txt", "data_2d_raw", "data_poses"),
+    "polycam": ("keyframes/images", "keyframes/cameras"),
+    "record3d": ("rgb", "metadata.json"),
+    "transforms": ("transforms.json",),
 }
 
 LISTED = 5  # recordings that an error names
 _SEE = "replay/importers/ says what each format consists of"
-_VIDEO = (
-    "is a video, which has no poses: `semantic-mapper up launch/video.toml` maps it with poses from a board or a socket"
-)
+_VIDEO = "is a film, which has no poses: `semantic-mapper import` and `semantic-mapper map` find them"
 _PACKED = "is packed; unpack it, and name the folder that comes out"
 _FILES = {
     **dict.fromkeys((".mp4", ".avi", ".mkv", ".mov", ".webm"), _VIDEO),
@@ -81,6 +91,8 @@ def detect_format(src: Path) -> str:
     for name in _MARKS:
         if not _lacks(src, name):
             return name
+    if find_model(src) is not None:
+        return "colmap"
     if src.resolve().parent.name == "data_2d_raw":
         return "kitti360"
     raise ImportSourceError(f"{src}: {_what_folder(src)}")
@@ -91,6 +103,15 @@ def _is_bag(src: Path) -> bool:
     if src.is_dir():
         return is_bag_folder(src)
     return src.suffix in (".bag", ".db3") or (src.suffix in BAG_STORAGE and is_ros_mcap(src))
+
+
+def is_recording(src: Path) -> bool:
+    """Whether a folder is, or holds, a recording of one of the formats."""
+    try:
+        detect_format(src)
+    except ImportSourceError:
+        return any(not _lacks(folder, n) for folder in src.iterdir() if folder.is_dir() for n in _MARKS)
+    return True
 
 
 def _lacks(src: Path, name: str) -> list[str]:
@@ -151,7 +172,7 @@ def import_recording(
     Args:
         src: Folder of the recording, or its file.
         dst: Log to write.
-        format_name: "folder", "tum", "scannet", "replica", "kitti360" or "rosbag"; None = found out.
+        format_name: One of ``FORMATS``; None = found out.
         on_progress: Called with (frames looked at, frames in all).
         options: How to read.
         renames: New names of classes by their present ones; classes of one name become one class.

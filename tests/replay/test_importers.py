@@ -251,7 +251,7 @@ def test_formats_are_told_apart(folder: Path, tum: Path, scannet: Path, tmp_path
         ("nothing", "no recording of a known format"),
         (".", "holds recordings; name one of them: .*bag, .*day.bag, .*desk, .*kitchen, .*scene0000_00"),
         ("half", "nearest to a recording of format 'folder', but lacks intrinsics.json"),
-        ("film.MP4", "is a video, which has no poses"),
+        ("film.MP4", "is a film, which has no poses"),
         ("day.zip", "is packed; unpack it"),
         ("no", "no such file or folder"),
         ("log.mcap", "nor a log of semantic-mapper"),
