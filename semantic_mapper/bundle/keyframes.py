@@ -143,10 +143,12 @@ class KeyframeMap:
         if not sights:
             return None
         rows, columns, pixels = zip(*sights, strict=True)
+        held = np.arange(len(keyframes)) < len(old)
+        held[0] |= not any(np.isfinite(k.prior_sigmas[0]) for k in keyframes)  # something must hold the others
         problem = BundleProblem(
             self.intrinsics,
             np.array([k.T_world_camera for k in keyframes]),
-            np.arange(len(keyframes)) < len(old),
+            held,
             np.array([k.prior for k in keyframes]),
             np.array([k.prior_sigmas for k in keyframes]),
             np.array([self.points[i] for i in ids]),
