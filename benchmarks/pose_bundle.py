@@ -124,7 +124,10 @@ def refine(walk: Walk, config: PoseRefinerConfig) -> dict[str, Any]:
     given = np.array([f.T_world_camera for f in walk.frames])
     every = max(1, len(live) // 30)
     rows: dict[str, Any] = {}
-    for name, poses in (("given", given), ("as they come", np.array(live)), ("corrected", np.array([*final.values()]))):
+    paths = {"given": given, "as they come": np.array(live), "corrected": np.array([*final.values()])}
+    if not np.array_equal(given, walk.truth):
+        paths["true"] = walk.truth  # what is left is the error of following corners
+    for name, poses in paths.items():
         rows[name] = {
             "flow_2_px": flow_error_px(walk.frames, poses, 2, every),
             "flow_5_px": flow_error_px(walk.frames, poses, 5, every),
