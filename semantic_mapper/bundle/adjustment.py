@@ -89,10 +89,15 @@ def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
     for seen, row, column in zip(problem.pixels, problem.keyframe.tolist(), problem.point.tolist(), strict=True):
         graph.add(factor(seen, pixel, X(row), L(column), lens, False, False))
     settings = gtsam.LevenbergMarquardtParams()
-    settings.setMaxIterations(iterations)
-    settings.setRelativeErrorTol(_TOLERANCE)
     try:
-        found = gtsam.LevenbergMarquardtOptimizer(graph, start, settings).optimize()
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, settings)
+        cost = optimizer.error()
+        for _ in range(iterations):  # ``optimize`` would keep Python's other threads waiting until its end
+            optimizer.iterate()
+            before, cost = cost, optimizer.error()
+            if before - cost <= _TOLERANCE * before:
+                break
+        found = optimizer.values()
     except RuntimeError as error:  # what GTSAM raises where sights leave a direction open
         _log.warning("bundle_left_out", reason=str(error).strip()[:200])
         found = start
