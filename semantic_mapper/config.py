@@ -193,8 +193,8 @@ class PoseRefinerConfig(Config, frozen=True):
     """How given poses are made to fit the pictures; see ``bundle/refiner.py``."""
 
     # One sigma of given poses against each other over metres of path, where frames tell none (``pose_sigma`` 0) ...
-    sigma_m: Positive = 0.03
-    sigma_deg: Positive = 2.0  # ... and of their rotations
+    sigma_m: Positive = 0.05
+    sigma_deg: Positive = 5.0  # ... and of their rotations
     window: Annotated[int, msgspec.Meta(ge=3, le=100)] = 10  # keyframes that are adjusted together
     corners: Annotated[int, msgspec.Meta(ge=50, le=5000)] = 300  # followed in an image
     width: Annotated[int, msgspec.Meta(ge=64, le=4096)] = 640  # of the images that they are followed in, at most

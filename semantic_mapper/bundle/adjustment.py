@@ -8,7 +8,10 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, X
 
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import Bool, CameraIntrinsics, Float64, Int64
+
+_log = get_logger(__name__)
 
 _PIXEL_SIGMA = 0.7  # of a corner that is followed
 _HUBER_SIGMAS = 1.5  # errors beyond count less
@@ -86,9 +89,18 @@ def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
     for seen, row, column in zip(problem.pixels, problem.keyframe.tolist(), problem.point.tolist(), strict=True):
         graph.add(factor(seen, pixel, X(row), L(column), lens, False, False))
     settings = gtsam.LevenbergMarquardtParams()
-    settings.setMaxIterations(iterations)
-    settings.setRelativeErrorTol(_TOLERANCE)
-    found = gtsam.LevenbergMarquardtOptimizer(graph, start, settings).optimize()
+    try:
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, settings)
+        cost = optimizer.error()
+        for _ in range(iterations):  # ``optimize`` would keep Python's other threads waiting until its end
+            optimizer.iterate()
+            before, cost = cost, optimizer.error()
+            if before - cost <= _TOLERANCE * before:
+                break
+        found = optimizer.values()
+    except RuntimeError as error:  # what GTSAM raises where sights leave a direction open
+        _log.warning("bundle_left_out", reason=str(error).strip()[:200])
+        found = start
     poses = np.array([found.atPose3(X(row)).matrix() for row in range(len(problem.poses))])
     poses[problem.held] = problem.poses[problem.held]
     points = np.array([found.atPoint3(L(row)) for row in range(len(problem.points))]).reshape(-1, 3)

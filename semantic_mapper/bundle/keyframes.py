@@ -10,12 +10,15 @@ import numpy as np
 from semantic_mapper.bundle.adjustment import BundleProblem, BundleResult, reprojection_errors
 from semantic_mapper.bundle.tracks import Tracks
 from semantic_mapper.geometry import camera_matrix, invert_pose, project, transform
-from semantic_mapper.types import Bool, CameraIntrinsics, Float64, Int64, UInt8
+from semantic_mapper.types import Bool, CameraIntrinsics, Float64, Int64
 
 _LEAST_PARALLAX = np.radians(1.0)  # between the rays that a point is found from
 _MAX_ERROR_PX = 3.0  # a sight that is further off is of something else
 _SHARED_LEAST = 10  # points that an old keyframe must share with the window to hold it
 _PNP_PX = 3.0
+_FLOW = 0.04  # of the image's width that corners move by to the next keyframe
+_LEFT = 0.6  # of the last keyframe's corners: fewer, and there is another keyframe
+_LEAST_CORNERS = 20
 
 
 @dataclass(slots=True, eq=False)
@@ -24,7 +27,6 @@ class Keyframe:
 
     Args:
         number: Counts keyframes from 0.
-        image: For finding its corners again.
         tracks: What it sees.
         T_world_camera: (4, 4), the best that is known.
         prior: (4, 4) as given; anything where ``prior_sigmas`` are infinite.
@@ -32,7 +34,6 @@ class Keyframe:
     """
 
     number: int
-    image: UInt8
     tracks: Tracks
     T_world_camera: Float64
     prior: Float64
@@ -93,6 +94,23 @@ class KeyframeMap:
         off[rows] = False
         return invert_pose(T_camera_world), tracks.ids[mask][off]
 
+    def wants_keyframe(self, tracks: Tracks) -> bool:
+        """Whether a frame that sees these corners should become the next keyframe."""
+        if not self.keyframes:
+            return True
+        before = self.keyframes[-1].tracks
+        shared = np.isin(before.ids, tracks.ids).sum()
+        return shared < max(_LEFT * len(before.ids), _LEAST_CORNERS) or self.flow(tracks) > _FLOW
+
+    def flow(self, tracks: Tracks) -> float:
+        """Median motion of corners since the last keyframe, as a fraction of the image's width; NaN where few stay."""
+        before = self.keyframes[-1].tracks
+        shared = before.ids[np.isin(before.ids, tracks.ids)]
+        if len(shared) < _LEAST_CORNERS:
+            return np.nan
+        moved = tracks.pixels[tracks.rows(shared)] - before.pixels[before.rows(shared)]
+        return float(np.median(np.linalg.norm(moved, axis=1))) / self.intrinsics.width
+
     def predict(self, tracks: Tracks, T_world_before: Float64, T_world_camera: Float64) -> Float64:
         """Where the tracks of the image before are expected (N, 2): by their points, or by the rotation alone."""
         K = camera_matrix(self.intrinsics)
@@ -125,10 +143,12 @@ class KeyframeMap:
         if not sights:
             return None
         rows, columns, pixels = zip(*sights, strict=True)
+        held = np.arange(len(keyframes)) < len(old)
+        held[0] |= not any(np.isfinite(k.prior_sigmas[0]) for k in keyframes)  # something must hold the others
         problem = BundleProblem(
             self.intrinsics,
             np.array([k.T_world_camera for k in keyframes]),
-            np.arange(len(keyframes)) < len(old),
+            held,
             np.array([k.prior for k in keyframes]),
             np.array([k.prior_sigmas for k in keyframes]),
             np.array([self.points[i] for i in ids]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from semantic_mapper.bundle.adjustment import BundleProblem, BundleResult, adjust_bundle, reprojection_errors
 from semantic_mapper.bundle.keyframes import Keyframe, KeyframeMap
+from semantic_mapper.bundle.picture_checks import PictureChecker
 from semantic_mapper.bundle.tracks import Tracker, Tracks, prepare_image
 from semantic_mapper.config import PoseRefinerConfig
 from semantic_mapper.errors import FrameError
@@ -16,8 +18,6 @@ from semantic_mapper.geometry import invert_pose, rotation_vector, scale_intrins
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
 _LEAST_POINTS = 20  # that must agree on a frame's pose
-_KEYFRAME_FLOW = 0.04  # of the image's width that corners move by to the next keyframe
-_KEYFRAME_LEFT = 0.6  # of the last keyframe's corners: fewer, and there is another keyframe
 _MAX_SIGMAS = 4.0  # a pose that is further from the given one is not believed
 _ITERATIONS = 8
 _CORRECTED_M, _CORRECTED_RAD = 1e-3, 5e-4  # smaller changes are not told
@@ -73,8 +73,19 @@ class PoseRefiner:
         self._given = np.eye(4)  # of the frame before
         self._refined = np.eye(4)
         self._count = 0
+        self._checks = PictureChecker()
         self._worker = ThreadPoolExecutor(1, "pose bundle") if background else None
         self._pending: tuple[BundleProblem, list[Keyframe], list[int], Future[BundleResult]] | None = None
+
+    @property
+    def counters(self) -> Counter[str]:
+        """Frames by what is wrong with their pictures, or between them and their poses; see ``PictureChecker``."""
+        return self._checks.counters
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The same of the last frame, a sentence for each."""
+        return self._checks.warnings
 
     def push(self, frame: PosedFrame) -> RefinedPose:
         """Refine the next frame's pose.
@@ -89,14 +100,15 @@ class PoseRefiner:
         guess = _rigid(self._refined @ invert_pose(self._given) @ given) if self._count else given
         expected = points.predict(self._tracker.tracks, self._refined, guess)
         tracks = self._tracker.advance(image, expected)
-        pose, refined = self._locate(points, tracks, guess, given, self._sigmas(frame))
+        pose, refined = self._locate(points, tracks, guess, self._sigmas(frame))
         given_px, error_px = self._disagreement(points, tracks, given, pose)
+        self._check(frame, points, tracks, given, given_px)
         self._given, self._refined = given, pose
         self._count += 1
-        if self._is_keyframe(points, tracks):
+        if points.wants_keyframe(tracks):
             tracks = self._tracker.replenish()
             number = points.keyframes[-1].number + 1 if points.keyframes else 0
-            points.add(Keyframe(number, image, tracks, pose, given, self._sigmas(frame)))
+            points.add(Keyframe(number, tracks, pose, given, self._sigmas(frame)))
             self._adjust(points)
         last = points.keyframes[-1]
         relative = invert_pose(last.T_world_camera) @ self._refined
@@ -148,13 +160,13 @@ class PoseRefiner:
         return frame.pose_sigma or self._config.sigma_m, np.radians(self._config.sigma_deg)
 
     def _locate(
-        self, points: KeyframeMap, tracks: Tracks, guess: Float64, given: Float64, sigmas: tuple[float, float]
+        self, points: KeyframeMap, tracks: Tracks, guess: Float64, sigmas: tuple[float, float]
     ) -> tuple[Float64, bool]:
         found = points.locate(tracks, guess, _LEAST_POINTS)
         if found is None:
             return guess, False
         pose, wrong = found
-        off = invert_pose(given) @ pose
+        off = invert_pose(guess) @ pose  # against the given motion since the frame before
         metres, radians = sigmas
         if np.hypot(np.linalg.norm(off[:3, 3]) / metres, np.linalg.norm(rotation_vector(off)) / radians) > _MAX_SIGMAS:
             return guess, False
@@ -170,15 +182,11 @@ class PoseRefiner:
         if found is not None:
             frame.T_keyframe_camera, frame.tracks = invert_pose(frame.keyframe.T_world_camera) @ found[0], None
 
-    def _is_keyframe(self, points: KeyframeMap, tracks: Tracks) -> bool:
-        if not points.keyframes:
-            return True
-        before = points.keyframes[-1].tracks
-        shared = np.isin(before.ids, tracks.ids)
-        if shared.sum() < max(_KEYFRAME_LEFT * len(before.ids), _LEAST_POINTS):
-            return True
-        moved = tracks.pixels[tracks.rows(before.ids[shared])] - before.pixels[shared]
-        return float(np.median(np.linalg.norm(moved, axis=1))) > _KEYFRAME_FLOW * points.intrinsics.width
+    def _check(self, frame: PosedFrame, points: KeyframeMap, tracks: Tracks, given: Float64, given_px: float) -> None:
+        self._checks.look(frame.rgb)
+        if points.keyframes:
+            moved = invert_pose(points.keyframes[-1].prior) @ given
+            self._checks.compare(moved, points.flow(tracks), given_px / frame.intrinsics.width)
 
     def _adjust(self, points: KeyframeMap) -> None:
         """Bundle now, or in the worker where that is free."""

@@ -77,6 +77,7 @@ class Tracker:
         self._count = count
         self._next_id = 0
         self._last: UInt8 | None = None
+        self._before: UInt8 | None = None
         self.tracks = NO_TRACKS
 
     def advance(self, image: UInt8, guess: Float64 | None = None) -> Tracks:
@@ -91,20 +92,24 @@ class Tracker:
             pixels, good = follow(self._last, image, self.tracks.pixels, guess)
             good &= _on_epipolar_lines(self.tracks.pixels, pixels, good)
             self.tracks = Tracks(self.tracks.ids[good], pixels[good])
-        self._last = image
+        self._before, self._last = self._last, image
         return self.tracks
+
+    def fresh(self) -> Tracker:
+        """One that follows nothing yet, and gives numbers that this one has not given."""
+        other = Tracker(self._count)
+        other._next_id = self._next_id
+        return other
+
+    def retry(self, image: UInt8, tracks: Tracks, guess: Float64) -> Tracks:
+        """``advance`` of the last image again, from another guess."""
+        self._last, self.tracks = self._before, tracks
+        return self.advance(image, guess)
 
     def drop(self, ids: Int64) -> None:
         """Follow these corners no longer."""
         keep = ~np.isin(self.tracks.ids, ids)
         self.tracks = Tracks(self.tracks.ids[keep], self.tracks.pixels[keep])
-
-    def adopt(self, ids: Int64, pixels: Float64) -> None:
-        """Follow corners again that were lost, in the image of the last ``advance``."""
-        new = ~np.isin(ids, self.tracks.ids)
-        joined = np.concatenate((self.tracks.ids, ids[new]))
-        order = np.argsort(joined)
-        self.tracks = Tracks(joined[order], np.concatenate((self.tracks.pixels, pixels[new]))[order])
 
     def replenish(self) -> Tracks:
         """Find new corners in the image of the last ``advance``, away from those that are followed."""
@@ -131,7 +136,7 @@ def _on_epipolar_lines(before: Float64, after: Float64, good: np.ndarray) -> np.
     fits = np.ones(len(before), bool)
     if good.sum() >= _EPIPOLAR_LEAST:
         cv2.setRNGSeed(1)
-        _, inliers = cv2.findFundamentalMat(before[good], after[good], cv2.USAC_DEFAULT, _EPIPOLAR_PX, 0.999, 500)
+        _, inliers = cv2.findFundamentalMat(before[good], after[good], cv2.FM_RANSAC, _EPIPOLAR_PX, 0.99, 300)
         if inliers is not None and inliers.sum() >= 0.4 * good.sum():
             fits[good] = inliers.ravel() > 0
     return fits

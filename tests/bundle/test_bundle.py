@@ -15,21 +15,11 @@ from semantic_mapper.config import PoseRefinerConfig
 from semantic_mapper.errors import FrameError
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
 from semantic_mapper.geometry import invert_pose, project, transform, unproject
-from semantic_mapper.scenes import TRAIN_SEEDS, CameraPathConfig, room_frames
-from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
+from semantic_mapper.types import Float64, PosedFrame
 
-INTRINSICS = CameraIntrinsics(220.0, 220.0, 159.5, 119.5, 320, 240)
+from .rooms import INTRINSICS, truth, walk
+
 CONFIG = PoseRefinerConfig(sigma_m=0.02, corners=200)
-
-
-@cache
-def walk() -> tuple[PosedFrame, ...]:
-    """Frames through a furnished room, and where they truly are."""
-    return tuple(room_frames(TRAIN_SEEDS[7], 24, INTRINSICS, path=CameraPathConfig(step_m=0.05)))
-
-
-def truth() -> Float64:
-    return np.array([f.T_world_camera for f in walk()])
 
 
 @cache
