@@ -74,7 +74,7 @@ def import_(
     camera_height: HeightOption = 0.0,
 ) -> None:
     """Make a log of a recording: sequence folder, TUM RGB-D, exported ScanNet, Replica (Semantic-NeRF), KITTI-360, ROS
-    bag, Polycam raw data, Record3D (EXR + RGB), transforms.json (nerfstudio, instant-ngp), COLMAP model with its images.
+    bag, Polycam raw data, Record3D (EXR + RGB), transforms.json (nerfstudio, instant-ngp), COLMAP model with images.
 
     Of a film or a folder of pictures without poses these are found (structure from motion), and a report is written
     beside the log (LOG with .html). Without one of --scale, --distance, --square-mm, --camera-height the lengths of its

@@ -6,11 +6,11 @@
 #define BLOCK_SIDE 8
 #define BLOCK_VOXELS 512
 #define MAX_CLASSES 256   /* class ids are bytes */
-#define LARGEST_STEP 0.95 /* Weights of mapping/fusion/depth_trust.py: from the first on a surface was measured, up to the second computed. */
+#define LARGEST_STEP 0.95 /* of the TSDF: two neighbours that differ by more straddle a depth edge, not a surface */
+
+/* Weights of mapping/fusion/depth_trust.py: from the first on a surface was measured, up to the second computed. */
 #define MEASURED 1.0f
 #define COMPUTED_CAP (31.0f / 32.0f)
-
-/* of the TSDF: two neighbours that differ by more straddle a depth edge, not a surface */
 
 typedef struct {
     I32 keys;          /* (capacity, 3) block coordinates */
