@@ -114,18 +114,31 @@ def nearly_empty(session: MapSession, points: int) -> str | None:
     """Why a map has hardly any surface for the space that its frames measured, and what to do; None where it has.
 
     Args:
-        session: With at least one frame mapped, else None is returned.
+        session: With at least one frame that had depth to map, else None is returned.
         points: Surface points of the map.
     """
     blocks = session.pipeline.voxel_map.block_count
-    if not session.fused or points >= MIN_POINTS_A_BLOCK * blocks:
+    mapped = max(session.fused, session.computed_depth)  # a camera that stands still fuses nothing
+    if not mapped or (points and points >= MIN_POINTS_A_BLOCK * blocks):
         return None
-    found = f"the map is nearly empty: {points:,} surface points in {blocks:,} blocks, of {session.fused} frames"
-    if 2 * session.without_depth >= session.fused:
+    found = f"the map is nearly empty: {points:,} surface points in {blocks:,} blocks, of {mapped} frames"
+    if 2 * session.without_depth >= mapped:
         return (
             f"{found}; {session.without_depth} of them have no sensor depth, and depth that the field renders does not "
             "agree well enough from frame to frame to make a surface: record with a depth camera, or import depth "
-            "images, too; without depth, finetune the weights on this scene and move slowly, with views that overlap"
+            'images, too; or have it computed from the pictures (depth.source = "auto")'
+        )
+    if 2 * session.computed_depth >= mapped and 2 * session.too_little_motion >= session.computed_depth:
+        return (
+            f"{found}; for {session.too_little_motion} of them the camera had not moved enough to compute depth from "
+            "the pictures: move it sideways, a few centimetres a frame, with views that overlap; turning alone or "
+            "standing still shows no depth"
+        )
+    if 2 * session.computed_depth >= mapped:
+        return (
+            f"{found}; depth computed from their pictures does not agree from frame to frame: it needs poses that are "
+            "exact (T_world_camera, metres, stamped with the time of capture), rectified, sharp images "
+            "and surfaces with texture; move sideways, with views that overlap"
         )
     return (
         f"{found}; their depth does not agree from frame to frame: check depth_scale, the intrinsics and the poses "
@@ -136,7 +149,8 @@ def nearly_empty(session: MapSession, points: int) -> str | None:
 def _empty_line(session: MapSession, points: MapPoints) -> str:
     if nearly_empty(session, len(points.xyz)) is None:
         return ""
-    why = "no depth" if 2 * session.without_depth >= session.fused else "depth disagrees"
+    without = session.without_depth + session.too_little_motion
+    why = "no depth" if 2 * without >= session.fused else "depth disagrees"
     return f"MAP NEARLY EMPTY ({why}; see summary.json); "
 
 

@@ -105,15 +105,17 @@ def _pose_figure(check: Mapping[str, Any], key: str) -> str:
 
 
 def _depth_source(depth: Mapping[str, Any]) -> str:
-    fractions = (percent(depth.get(f"{how}_fraction", 0.0)) for how in ("computed", "rendered"))
-    return _DEPTH_SOURCES[depth["source"]].format(*fractions)
+    if depth["source"] != "mixed":
+        return _DEPTH_SOURCES[depth["source"]]
+    fractions = {"computed from the pictures": "computed_fraction", "rendered by the field": "rendered_fraction"}
+    parts = [f"{how} for {percent(depth[key])}" for how, key in fractions.items() if depth.get(key)]
+    return f"{', '.join(parts)} of the frames"
 
 
 _DEPTH_SOURCES = {
     "sensor": "sensor",
     "rendered": "rendered by the field (no depth sensor)",
     "computed": "computed from the pictures (no depth sensor)",
-    "mixed": "computed for {} of the frames, rendered by the field for {}",
 }
 _ROWS: Sequence[tuple[str, str, Any]] = (
     ("log", "source", str),
