@@ -174,7 +174,7 @@ def test_npz_needs_no_pickle_and_is_the_same_each_time(tmp_path: Path) -> None:
         assert (int(read["ignore_id"]), str(read["label_set"])) == (0, "three")
 
 
-SOME_COMPUTED = np.array([True, False, True, True])
+SOME_COMPUTED = np.array([True, False, False, True])
 
 
 @pytest.mark.parametrize("measured", [None, np.ones(4, np.bool_)])
@@ -199,7 +199,7 @@ def test_points_and_meshes_say_what_was_measured_where_something_was_computed(tm
     write_ply_mesh(tmp_path / "mesh.ply", replace(MESH, measured=SOME_COMPUTED), LABELS)
     for name in ("points.ply", "mesh.ply"):
         point = load_open3d().t.io.read_point_cloud(str(tmp_path / name)).point
-        assert point["measured"].numpy().ravel().tolist() == [1, 0, 1, 1]
+        assert point["measured"].numpy().ravel().tolist() == [1, 0, 0, 1]
         assert (point.positions.numpy() == POINTS.xyz).all() and (point["label"].numpy().ravel() == POINTS.label).all()
     kept = sure_points(replace(POINTS, measured=SOME_COMPUTED), 0.75)
     assert kept.measured is not None and kept.measured.tolist() == [True, False]
