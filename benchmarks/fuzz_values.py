@@ -31,7 +31,7 @@ from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.memory import give_back_freed_memory
 from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport import codec
-from semantic_mapper.types import CameraIntrinsics, PosedFrame
+from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
 MAX_STEP_S = 2.0
 MAX_GROWTH_MB = 500
@@ -329,8 +329,8 @@ def _send(session: MapSession, parts: list[bytes]) -> tuple[str, dict[str, float
     except CodecError:
         return "refused by the codec", {}
     blocks, fused = session.pipeline.voxel_map.block_count, session.pipeline.voxel_map.frames
-    update = session.process(frame)
-    if update is not None:
+    (update,) = session.process(frame)
+    if isinstance(update, MapUpdate):
         return "mapped", update.stage_ms
     after = session.pipeline.voxel_map
     assert (after.block_count, after.frames) == (blocks, fused), "a frame was refused, but the map has changed"

@@ -20,7 +20,7 @@ from semantic_mapper.config import AtLeastOne, Config, Positive, convert_config,
 from semantic_mapper.errors import CameraError, ConfigError, FrameError, PoseError
 from semantic_mapper.files import write_bytes
 from semantic_mapper.geometry import camera_matrix, check_pose
-from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]  # a pose, row by row
@@ -165,6 +165,12 @@ class Rectifier:
             raise ConfigError(
                 f"the lens distortion {measured.distortion} leaves no usable image: {error}; calibrate the camera again"
             ) from error
+
+    def nearest(self, depth_m: Float32) -> Float32:
+        """Depth (H, W) in the pixels of the lens -> in those of the rectified image, each from the nearest pixel."""
+        if self._maps is None:
+            return depth_m
+        return np.asarray(cv2.remap(depth_m, *self._maps, cv2.INTER_NEAREST), np.float32)
 
     def __call__(self, bgr: UInt8) -> UInt8:
         """(H, W, 3) BGR as OpenCV captures it -> rectified RGB of the same size."""

@@ -12,7 +12,7 @@ from semantic_mapper.drivers.poses.config import PoseConfig, tells_of_rig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.types import Float64
 
-OTHER_FILES = ("oak",)  # kinds whose `calibration` is a file of another form
+OTHER_FILES = ("oak", "stereo")  # kinds whose `calibration` is a file of another form
 
 
 @dataclass(frozen=True, slots=True, eq=False)

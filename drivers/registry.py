@@ -17,7 +17,7 @@ from semantic_mapper.config import convert_config
 from semantic_mapper.drivers.base import Camera
 from semantic_mapper.errors import ConfigError, DependencyError, SemanticMapperError
 
-KINDS = ("v4l2", "opencv", "oak")
+KINDS = ("v4l2", "opencv", "stereo", "oak", "realsense")
 
 
 @dataclass(frozen=True, slots=True)

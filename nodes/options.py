@@ -11,8 +11,8 @@ from semantic_mapper.config import Config, Positive
 
 SOURCE_PATTERN = r"^[A-Za-z0-9_.:-]{1,64}\Z"  # of transport/topics.py, which loads what the launcher has no need of
 # Of drivers/registry.py and drivers/poses/config.py, for the same reason.
-CAMERA_KINDS = ("v4l2", "opencv", "oak")
-POSE_KINDS = ("device", "fixed", "topic", "board", "rgbd")
+CAMERA_KINDS = ("v4l2", "opencv", "stereo", "oak", "realsense")
+POSE_KINDS = ("device", "fixed", "topic", "board", "rgbd", "visual")
 TRACKING_KINDS = ("oak",)  # cameras that can tell their own pose
 ENDPOINT_PATTERN = r"^([a-z]+://.+|)\Z"
 
@@ -32,14 +32,15 @@ def check_tracking(camera_kind: str, pose_kind: object) -> None:
         raise ValueError(
             f'poses = {{ kind = "device" }}: cameras of kind "{camera_kind}" do not track themselves, and no frame '
             f'would have a pose (only {", ".join(TRACKING_KINDS)} does); use kind = "topic" (odometry from a socket), '
-            '"board" (a printed board), "rgbd" (odometry from depth) or "fixed" (it never moves)'
+            '"board" (a printed board), "rgbd" (odometry from depth), "visual" (from pictures) or "fixed" (it never '
+            "moves)"
         )
 
 
 class LiveCamera(Config, frozen=True):
     """A camera that is connected, or a video."""
 
-    kind: Text  # of drivers/registry.py: v4l2, opencv, oak
+    kind: Text  # of drivers/registry.py: v4l2, opencv, stereo, oak, realsense
     poses: Text | dict[str, Any]  # who knows where the camera is: TOML file, or the same as a table; see drivers/poses
     config: str | dict[str, Any] = msgspec.field(
         default_factory=dict

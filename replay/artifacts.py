@@ -22,6 +22,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.formats.ply import write_ply
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.plots import write_picture
+from semantic_mapper.transport.messages import SCALE_UNKNOWN
 from semantic_mapper.types import Float64
 
 if TYPE_CHECKING:  # session imports this module
@@ -104,29 +105,40 @@ def _depth_line(session: MapSession) -> str:
     source = _depth_source(session)
     if source["source"] == "sensor":
         return ""
-    if source["source"] == "rendered":
-        return "; depth: rendered by the field (no depth sensor)"
-    return (
-        f"; depth: rendered by the field for {100 * source['rendered_fraction']:.0f} % of the frames (no sensor depth)"
-    )
+    ways = {"computed_fraction": "computed from the pictures", "rendered_fraction": "rendered by the field"}
+    parts = [f"{how} for {100 * source[key]:.0f} % of the frames" for key, how in ways.items() if source[key]]
+    return f"; depth: {', '.join(parts)} (no sensor depth)"
 
 
 def nearly_empty(session: MapSession, points: int) -> str | None:
     """Why a map has hardly any surface for the space that its frames measured, and what to do; None where it has.
 
     Args:
-        session: With at least one frame mapped, else None is returned.
+        session: With at least one frame that had depth to map, else None is returned.
         points: Surface points of the map.
     """
     blocks = session.pipeline.voxel_map.block_count
-    if not session.fused or points >= MIN_POINTS_A_BLOCK * blocks:
+    mapped = max(session.fused, session.computed_depth)  # a camera that stands still fuses nothing
+    if not mapped or (points and points >= MIN_POINTS_A_BLOCK * blocks):
         return None
-    found = f"the map is nearly empty: {points:,} surface points in {blocks:,} blocks, of {session.fused} frames"
-    if 2 * session.without_depth >= session.fused:
+    found = f"the map is nearly empty: {points:,} surface points in {blocks:,} blocks, of {mapped} frames"
+    if 2 * session.without_depth >= mapped:
         return (
             f"{found}; {session.without_depth} of them have no sensor depth, and depth that the field renders does not "
             "agree well enough from frame to frame to make a surface: record with a depth camera, or import depth "
-            "images, too; without depth, finetune the weights on this scene and move slowly, with views that overlap"
+            'images, too; or have it computed from the pictures (depth.source = "auto")'
+        )
+    if 2 * session.computed_depth >= mapped and 2 * session.too_little_motion >= session.computed_depth:
+        return (
+            f"{found}; for {session.too_little_motion} of them the camera had not moved enough to compute depth from "
+            "the pictures: move it sideways, a few centimetres a frame, with views that overlap; turning alone or "
+            "standing still shows no depth"
+        )
+    if 2 * session.computed_depth >= mapped:
+        return (
+            f"{found}; depth computed from their pictures does not agree from frame to frame: it needs poses that are "
+            "exact (T_world_camera, metres, stamped with the time of capture), rectified, sharp images "
+            "and surfaces with texture; move sideways, with views that overlap"
         )
     return (
         f"{found}; their depth does not agree from frame to frame: check depth_scale, the intrinsics and the poses "
@@ -137,7 +149,8 @@ def nearly_empty(session: MapSession, points: int) -> str | None:
 def _empty_line(session: MapSession, points: MapPoints) -> str:
     if nearly_empty(session, len(points.xyz)) is None:
         return ""
-    why = "no depth" if 2 * session.without_depth >= session.fused else "depth disagrees"
+    without = session.without_depth + session.too_little_motion
+    why = "no depth" if 2 * without >= session.fused else "depth disagrees"
     return f"MAP NEARLY EMPTY ({why}; see summary.json); "
 
 
@@ -169,10 +182,12 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "scored": session.scored,
             "without_depth": session.without_depth,
             "excluded_from_scores": session.excluded,
+            "left_out": session.left_out,
         },
         "latency_ms": {**_percentiles(session.step_ms), "first": _rounded(session.step_ms.first)},
         "stages_ms": {name: _percentiles(times) for name, times in session.stage_ms.items()},
         "depth": _depth_source(session),
+        "scale": "metres" if session.scale_known else SCALE_UNKNOWN,
         "pose_check": {
             "keyframes_compared": pipeline.pose_check.compared,
             "depth_disagreement": _rounded(pipeline.pose_check.recent, 4),
@@ -222,11 +237,20 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
 
 
 def _depth_source(session: MapSession) -> dict[str, Any]:
-    """Where the geometry comes from; frames without sensor depth have theirs rendered by the field."""
+    """Where the geometry comes from: the sensor, the pictures of a moving camera, or renders of the field."""
     mapped = session.published - session.dropped - len(session.refusals)
-    fraction = session.without_depth / mapped if mapped else 0.0
-    source = "sensor" if not session.without_depth else "rendered" if fraction == 1 else "mixed"
-    return {"source": source, "rendered_fraction": round(fraction, 4)}
+    rendered, computed = (n / mapped if mapped else 0.0 for n in (session.without_depth, session.computed_depth))
+    names = {"sensor": rendered + computed < 1, "rendered": rendered > 0, "computed": computed > 0}
+    given_px, refined_px = (_rounded(px, 2) for px in session.pipeline.pose_disagreement_px or (None, None))
+    sources = [name for name, used in names.items() if used]
+    return {
+        "source": sources[0] if len(sources) == 1 else "mixed" if sources else "sensor",
+        "rendered_fraction": round(rendered, 4),
+        "computed_fraction": round(computed, 4),
+        "too_little_motion": session.too_little_motion,
+        "given_poses_off_px": given_px,
+        "refined_poses_off_px": refined_px,
+    }
 
 
 def _metrics(session: MapSession, points: MapPoints) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from semantic_mapper.errors import FrameError, LabelError
+from semantic_mapper.errors import FrameError, LabelError, SemanticMapperError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, ImageMeans, confusion_of
 from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.labels import LabelSet
@@ -39,6 +39,7 @@ class Refusal:
     seq: int
     stamp_ns: int
     reason: str
+    camera_id: str = ""
 
 
 class MapSession:
@@ -74,7 +75,11 @@ class MapSession:
         self.corrected_poses = 0  # given; the map has moved with them
         self.learned: dict[str, Any] | None = None  # what became of weights that were offered meanwhile
         self.unfinished_correction = ""  # what the map has not moved with, and why
+        self.left_out = 0  # by the import that has made the log
+        self.scale_known = True  # else lengths are not metres
         self.without_depth = 0  # their geometry was rendered, not measured
+        self.computed_depth = 0  # their geometry was computed from the pictures
+        self.too_little_motion = 0  # of these, those whose camera had not moved enough to compute any
         # Frames that were not mapped, those that were but whose label image cannot be used, and stretches of a log in
         # which no frame can be made out:
         self.refusals, self.label_refusals = BoundedLog[Refusal](MAX_LISTED), BoundedLog[Refusal](MAX_LISTED)
@@ -89,17 +94,39 @@ class MapSession:
         self._snapshot_stride = 1
         self._rerun = rerun
 
-    def process(self, frame: PosedFrame) -> MapUpdate | None:
-        """Map one frame; None where it was refused (counted and logged, the map unchanged)."""
+    def process(self, frame: PosedFrame) -> list[MapUpdate | Refusal]:
+        """Take one frame and map what is ready: the frame itself, unless its depth waits for later ones.
+
+        Returns:
+            What became of each: the update, or why it was refused (counted and logged, the map unchanged).
+        """
         self.published += 1
+        began = time.perf_counter()
+        try:
+            ready = self.pipeline.prepare(frame)
+        except FrameError as error:
+            return [self._refuse(frame, error)]
+        depth_ms = (time.perf_counter() - began) * 1e3
+        return [self._map(item, depth_ms / len(ready)) for item in ready]
+
+    def process_rest(self) -> list[MapUpdate | Refusal]:
+        """Map the frames that still wait for later ones, which do not come any more."""
+        return [self._map(item, 0.0) for item in self.pipeline.prepare_rest()]
+
+    def _refuse(self, frame: PosedFrame, error: FrameError) -> Refusal:
+        self.refusals.append(refusal := Refusal(frame.seq, frame.stamp_ns, str(error), frame.camera_id))
+        _log.error("frame_refused", seq=frame.seq, camera=frame.camera_id, reason=str(error))
+        return refusal
+
+    def _map(self, frame: PosedFrame, depth_ms: float) -> MapUpdate | Refusal:
         began = time.perf_counter()
         try:
             update = self.pipeline.step(frame)
         except FrameError as error:
-            self.refusals.append(Refusal(frame.seq, frame.stamp_ns, str(error)))
-            _log.error("frame_refused", seq=frame.seq, camera=frame.camera_id, reason=str(error))
-            return None
-        self.step_ms.add((time.perf_counter() - began) * 1e3)
+            return self._refuse(frame, error)
+        self.step_ms.add((time.perf_counter() - began) * 1e3 + depth_ms)
+        if frame.depth_sigma_m is not None:
+            update.stage_ms["depth"] = depth_ms
         for name, value in update.stage_ms.items():
             self.stage_ms.setdefault(name, LatencyHistogram()).add(value)
         self.fused += int(update.fused)
@@ -125,6 +152,11 @@ class MapSession:
             if not self.without_depth:
                 _log.warning("geometry_is_rendered", seq=frame.seq, reason="the frame has no depth")
             self.without_depth += 1
+        elif frame.depth_sigma_m is not None:
+            if not self.computed_depth:
+                _log.warning("depth_is_computed", seq=frame.seq, reason="the frame has no sensor depth")
+            self.computed_depth += 1
+            self.too_little_motion += not frame.depth_m.any()
 
     def refuse(self, seq: int, stamp_ns: int, reason: str) -> None:
         """Count a frame that was damaged before it could be processed."""
@@ -156,7 +188,12 @@ class MapSession:
         self.dropped += count
 
     def finish(self, out: Path) -> dict[str, Any]:
-        """Write ``summary.json``, ``map.ply``, ``map.npz`` and ``overview.png`` to ``out``; returns the summary."""
+        """Map what still waits, and write ``summary.json``, ``map.ply``, ``map.npz`` and ``overview.png`` to ``out``;
+        returns the summary."""
+        try:
+            self.process_rest()
+        except SemanticMapperError as error:  # the map is full, for one: what is in it is worth keeping
+            _log.error("last_frames_not_mapped", reason=str(error))
         return write_artifacts(self, out, self._rerun)
 
     def _score(self, frame: PosedFrame, update: MapUpdate) -> PosedFrame:

@@ -189,6 +189,17 @@ class VoxelMapConfig(Config, frozen=True):
     evidence: Literal["float32", "int16"] = "float32"  # "int16": half the memory for classes (``evidence.py``)
 
 
+class PoseRefinerConfig(Config, frozen=True):
+    """How given poses are made to fit the pictures; see ``bundle/refiner.py``."""
+
+    # One sigma of given poses against each other over metres of path, where frames tell none (``pose_sigma`` 0) ...
+    sigma_m: Positive = 0.05
+    sigma_deg: Positive = 5.0  # ... and of their rotations
+    window: Annotated[int, msgspec.Meta(ge=3, le=100)] = 10  # keyframes that are adjusted together
+    corners: Annotated[int, msgspec.Meta(ge=50, le=5000)] = 300  # followed in an image
+    width: Annotated[int, msgspec.Meta(ge=64, le=4096)] = 640  # of the images that they are followed in, at most
+
+
 class HistoryConfig(Config, frozen=True):
     """Fused frames kept on disk, so that the map can follow corrected poses (loop closures)."""
 
@@ -235,6 +246,38 @@ class RenderConfig(Config, frozen=True):
             raise ValueError('bfloat16 is for device = "cuda"')
 
 
+class DepthFromMotionConfig(Config, frozen=True):
+    """How depth is computed from posed pictures, where no sensor measures it."""
+
+    width: Annotated[int, msgspec.Meta(ge=32, le=1280)] = 160  # pixels that are matched; more cost time, not error
+    planes: Annotated[int, msgspec.Meta(ge=16, le=256, multiple_of=16)] = 64  # depths tried, uniform in inverse depth
+    near_m: Metres = 0.4
+    far_m: Metres = 8.0
+    sources: Annotated[int, msgspec.Meta(ge=1, le=16)] = 4  # other frames that each is matched with
+    # A frame waits for this many later ones, which see it from the other side: more accurate. 0 = live.
+    delay_frames: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0
+
+    def __post_init__(self) -> None:
+        if not self.near_m < self.far_m:
+            raise ValueError(f"near_m = {self.near_m} must be less than far_m = {self.far_m}")
+
+
+DepthSource = Literal["auto", "sensor", "computed", "off"]
+
+
+class DepthConfig(Config, frozen=True):
+    """Where the depth of frames comes from."""
+
+    # "auto": the sensor's, and computed from the pictures where a frame has none; "computed": always from the pictures;
+    # "sensor": the sensor's, and rendered by the field where a frame has none; "off": always rendered by the field
+    source: DepthSource = "auto"
+    from_motion: DepthFromMotionConfig = DepthFromMotionConfig()
+    # Whether given poses are made to fit the pictures where depth is computed from these; without, poses that are some
+    # pixels off give depth that is far off.
+    refine_poses: bool = True
+    poses: PoseRefinerConfig = PoseRefinerConfig()
+
+
 Quality = Literal["custom", "fast", "balanced", "reference"]
 QUALITIES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # of ``sampling`` and of ``render``
     "fast": (
@@ -253,6 +296,7 @@ class MapperConfig(Config, frozen=True):
     """Everything ``MappingPipeline`` needs. The defaults are those of the "balanced" quality."""
 
     sampling: SamplingConfig = SamplingConfig(guided=4, sample_weight_threshold=0.02)
+    depth: DepthConfig = DepthConfig()
     keyframes: KeyframeConfig = KeyframeConfig()
     voxel_map: VoxelMapConfig = VoxelMapConfig()
     history: HistoryConfig = HistoryConfig()

@@ -124,6 +124,8 @@ class PosedFrame:
         T_world_camera: (4, 4) float64.
         pose_source: Where the pose comes from ("log", "odometry", ...).
         pose_sigma: One-sigma position uncertainty in metres; 0 = not known.
+        depth_sigma_m: (H, W) float32 one-sigma spread of ``depth_m`` in metres, where it was computed from pictures;
+            None where a sensor measured it. Not part of messages and logs.
 
     Raises:
         FrameError: a shape or dtype is off, or a number out of its range. ``geometry.check_pose`` checks the pose.
@@ -139,6 +141,7 @@ class PosedFrame:
     T_world_camera: Float64
     pose_source: str = "log"
     pose_sigma: float = 0.0
+    depth_sigma_m: Float32 | None = None
 
     def __post_init__(self) -> None:
         size = (self.intrinsics.height, self.intrinsics.width)
@@ -149,6 +152,13 @@ class PosedFrame:
         _expect(self, "T_world_camera", self.T_world_camera, (4, 4), np.float64)
         if self.depth_m is not None:
             _expect(self, "depth_m", self.depth_m, size, np.float32)
+        if self.depth_sigma_m is not None:
+            if self.depth_m is None:
+                raise FrameError(
+                    f"frame seq={self.seq} of camera '{self.camera_id}': depth_sigma_m is the spread of depth_m, "
+                    "which is missing; give both or neither"
+                )
+            _expect(self, "depth_sigma_m", self.depth_sigma_m, size, np.float32)
         if self.label is not None:
             _expect(self, "label", self.label, size, np.uint8)
 

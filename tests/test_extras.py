@@ -10,7 +10,7 @@ import pytest
 
 HIDDEN = """
 import sys
-for name in ("rerun", "rerun_cli", "tensorboard"):
+for name in ("rerun", "rerun_cli", "tensorboard", "pycolmap"):
     sys.modules[name] = None
 """
 
@@ -28,6 +28,18 @@ for name in ("rerun", "rerun_cli", "tensorboard"):
                 print(error)
             """,
             "pip install 'semantic-mapper[viewer]'",
+        ),
+        (
+            """
+            from pathlib import Path
+            from semantic_mapper.errors import SemanticMapperError
+            from semantic_mapper.replay.sfm.reconstruct import FilmOptions, import_film
+            try:
+                import_film(Path("film.mp4"), Path("film.mcap"), FilmOptions(), print)
+            except SemanticMapperError as error:
+                print(error)
+            """,
+            "pip install 'semantic-mapper[sfm]'",
         ),
     ],
 )

@@ -1,1 +1,1 @@
-"""Where a camera was when it took an image: the device itself, a fixed place, a topic, a board, or RGB-D odometry."""
+"""Where a camera was: told by itself, a topic, a board, its own depth or pictures; or it never moves."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 import numpy as np
 
-from semantic_mapper.config import AtLeastOne, AtLeastZero, Config, Fraction, NotNegative, Positive
+from semantic_mapper.config import AtLeastOne, AtLeastZero, Config, Fraction, NotNegative, PoseRefinerConfig, Positive
 from semantic_mapper.drivers.calibration import Matrix
 from semantic_mapper.types import Float64
 
@@ -117,12 +117,31 @@ class OdometryPoses(Config, frozen=True):
     drift: Fraction = 0.05  # of the way: what ``sigma`` grows by with the chain of keyframes
 
 
-PoseConfig = DevicePoses | FixedPose | TopicPoses | BoardPoses | OdometryPoses
+class VisualPoses(Config, frozen=True):
+    """Visual odometry of a single camera; the world begins where it or its ``scale`` does."""
+
+    kind: Literal["visual"] = "visual"
+    # Where the scale comes from: a table of "topic" (the robot's odometry, however coarse) or "board" (a printed one,
+    # seen at the beginning). The world is the one of these poses then.
+    scale: dict[str, Any] = msgspec.field(default_factory=dict)
+    distance_m: AtLeastZero = 0.0  # in its place: from the camera to what is in the middle of its first picture
+    T_world_start: Matrix = IDENTITY  # T_world_camera of the first picture, where there is no ``scale``
+    tracking: PoseRefinerConfig = PoseRefinerConfig()
+    drift: Fraction = 0.03  # of the way: what ``sigma`` grows by
+
+    def __post_init__(self) -> None:
+        if self.scale and self.scale.get("kind") not in ("topic", "board"):
+            raise ValueError('scale: kind must be "topic" or "board"')
+        if self.scale and self.distance_m:
+            raise ValueError("give scale or distance_m")
+
+
+PoseConfig = DevicePoses | FixedPose | TopicPoses | BoardPoses | OdometryPoses | VisualPoses
 
 
 def begins_world(config: PoseConfig) -> bool:
     """Whether the world of the poses begins with the process: that of another process is another one."""
-    return isinstance(config, DevicePoses | OdometryPoses)
+    return isinstance(config, DevicePoses | OdometryPoses | VisualPoses)
 
 
 def tells_of_rig(config: PoseConfig) -> bool:
@@ -136,12 +155,13 @@ def tells_of_rig(config: PoseConfig) -> bool:
             return False
 
 
-KINDS: dict[str, type[DevicePoses] | type[FixedPose] | type[TopicPoses] | type[BoardPoses] | type[OdometryPoses]] = {
+KINDS: dict[str, type[PoseConfig]] = {
     "device": DevicePoses,
     "fixed": FixedPose,
     "topic": TopicPoses,
     "board": BoardPoses,
     "rgbd": OdometryPoses,
+    "visual": VisualPoses,
 }
 
 

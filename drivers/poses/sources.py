@@ -17,6 +17,7 @@ from semantic_mapper.drivers.poses.config import (
     OdometryPoses,
     PoseConfig,
     TopicPoses,
+    VisualPoses,
 )
 from semantic_mapper.drivers.poses.posed_camera import DiagnosticPoseSource
 from semantic_mapper.errors import ConfigError
@@ -26,7 +27,7 @@ def open_poses(config: Mapping[str, Any], where: str = "poses") -> DiagnosticPos
     """A pose source as a launch file tells of it, ready to be entered.
 
     Args:
-        config: ``kind`` ("device", "fixed", "topic", "board", "rgbd") and its settings, see ``config.py``.
+        config: ``kind`` ("device", "fixed", "topic", "board", "rgbd", "visual") and its settings, see ``config.py``.
         where: Names the file or section in errors.
 
     Raises:
@@ -46,6 +47,8 @@ def read_pose_config(config: Mapping[str, Any], where: str = "poses") -> PoseCon
     checked = convert_config(dict(config), KINDS[kind], where)
     for name, rows in _matrices(checked).items():
         rigid_matrix(rows, f"{where}: {name}")
+    if isinstance(checked, VisualPoses) and checked.scale:
+        read_pose_config(checked.scale, f"{where}: scale")
     return checked
 
 
@@ -72,6 +75,10 @@ def make_poses(config: PoseConfig) -> DiagnosticPoseSource:
             from semantic_mapper.drivers.poses.odometry import OdometryPoseSource
 
             return OdometryPoseSource(config)
+        case VisualPoses():
+            from semantic_mapper.drivers.poses.visual import VisualPoseSource
+
+            return VisualPoseSource(config, open_poses(config.scale, "poses: scale") if config.scale else None)
 
 
 def _matrices(config: PoseConfig) -> dict[str, Matrix]:
@@ -85,7 +92,7 @@ def _matrices(config: PoseConfig) -> dict[str, Matrix]:
             return {"T_base_camera": config.T_base_camera, **mounts} | rig
         case BoardPoses():
             return {"T_world_board": config.T_world_board}
-        case OdometryPoses():
+        case OdometryPoses() | VisualPoses():
             return {"T_world_start": config.T_world_start}
         case DevicePoses():
             return {}

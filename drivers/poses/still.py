@@ -11,8 +11,8 @@ from semantic_mapper.errors import CameraError
 
 WAYS_OUT = (
     'give it a pose from outside (kind = "topic": the robot\'s own odometry), a printed board that it sees (kind = '
-    '"board"), a place where it stands still (kind = "fixed"), or use a camera with depth (kind = "rgbd") or one that '
-    'tracks itself (kind = "device")'
+    '"board"), a place where it stands still (kind = "fixed"), its own pictures (kind = '
+    '"visual"), or use a camera with depth (kind = "rgbd") or one that tracks itself (kind = "device")'
 )
 
 

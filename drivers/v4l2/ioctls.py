@@ -31,6 +31,7 @@ LOWEST, HIGHEST = -(2**31), 2**31 - 1  # value of a control
 _CAP_VIDEO_CAPTURE = 0x00000001
 _CAP_DEVICE_CAPS = 0x80000000
 _BUF_TYPE_VIDEO_CAPTURE = 1
+_FRAMESIZE_DISCRETE = 1
 _CTRL_FLAG_DISABLED = 0x0001
 _CTRL_FLAG_NEXT = 0x80000000
 _FOURCC_BIG_ENDIAN = 1 << 31
@@ -61,6 +62,18 @@ class _Format(ctypes.Structure):
     )
 
 
+class _FrameSize(ctypes.Structure):
+    """Of a discrete size the union begins with width and height."""
+
+    _fields_ = (
+        ("index", ctypes.c_uint32),
+        ("pixelformat", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("size", ctypes.c_uint32 * 6),
+        ("reserved", ctypes.c_uint32 * 2),
+    )
+
+
 class _QueryControl(ctypes.Structure):
     _fields_ = (
         ("id", ctypes.c_uint32),
@@ -86,6 +99,7 @@ def _number(direction: int, number: int, kind: type[ctypes.Structure]) -> int:
 _READ, _WRITE = 2, 1
 QUERYCAP = _number(_READ, 0, _Capability)
 ENUM_FMT = _number(_READ | _WRITE, 2, _Format)
+ENUM_FRAMESIZES = _number(_READ | _WRITE, 74, _FrameSize)
 G_CTRL = _number(_READ | _WRITE, 27, _ControlValue)
 S_CTRL = _number(_READ | _WRITE, 28, _ControlValue)
 QUERYCTRL = _number(_READ | _WRITE, 36, _QueryControl)
@@ -144,13 +158,33 @@ def list_formats(fd: int) -> tuple[str, ...]:
     Raises:
         OSError: it does not answer.
     """
-    found: list[str] = []
+    return tuple(fourcc_text(code) for code in _format_codes(fd))
+
+
+def list_sizes(fd: int) -> tuple[tuple[int, int], ...]:
+    """Width and height of each image size that it offers, the largest first; none of a device that scales freely.
+
+    Raises:
+        OSError: it does not answer.
+    """
+    found: set[tuple[int, int]] = set()
+    for code in _format_codes(fd):
+        for index in range(_MAX_ROWS):
+            told = _FrameSize(index=index, pixelformat=code)
+            if not _ask(fd, ENUM_FRAMESIZES, told) or told.type != _FRAMESIZE_DISCRETE:
+                break
+            found.add((told.size[0], told.size[1]))
+    return tuple(sorted(found, reverse=True))
+
+
+def _format_codes(fd: int) -> list[int]:
+    found: list[int] = []
     for index in range(_MAX_ROWS):
         told = _Format(index=index, type=_BUF_TYPE_VIDEO_CAPTURE)
         if not _ask(fd, ENUM_FMT, told):
             break
-        found.append(fourcc_text(told.pixelformat))
-    return tuple(found)
+        found.append(told.pixelformat)
+    return found
 
 
 def list_controls(fd: int) -> dict[str, Control]:

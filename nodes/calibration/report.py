@@ -22,9 +22,11 @@ from semantic_mapper.drivers.calibrating.solve import Calibration
 from semantic_mapper.drivers.calibrating.views import ViewGatherer
 from semantic_mapper.drivers.calibration import save_calibration
 from semantic_mapper.drivers.poses.config import BoardPoses
+from semantic_mapper.drivers.stereo.calibration import StereoCalibration, save_stereo
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.files import write_bytes
-from semantic_mapper.geometry import rotation_vector
+from semantic_mapper.geometry import invert_pose, rotation_vector
+from semantic_mapper.nodes.calibration.sources import SIDES
 
 
 class CalibrationSettings(Config, frozen=True):
@@ -41,15 +43,8 @@ def write_files(out: Path, found: Calibration, settings: CalibrationSettings) ->
         ConfigError: a file cannot be written; it is as it was.
     """
     written: list[Path] = []
-    b = settings.board
     for name, camera in found.cameras.items():
-        about: dict[str, str | float] = {
-            "made_by": f"semantic-mapper {__version__} calibrate",
-            "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
-            "board": f"{b.pattern} {b.columns}x{b.rows}, {1000 * b.square_m:g} mm",
-            "views": len(camera.views),
-            "rms_px": round(camera.rms_px, 4),
-        }
+        about = _about(settings) | {"views": len(camera.views), "rms_px": round(camera.rms_px, 4)}
         about |= {f"sigma_{key}": float(f"{sigma:.3g}") for key, sigma in camera.sigmas.items()}
         mount = None
         if found.rig is not None:
@@ -64,6 +59,54 @@ def write_files(out: Path, found: Calibration, settings: CalibrationSettings) ->
         write_whole(picture, cv2.imencode(".png", np.ascontiguousarray(drawn[..., ::-1]))[1].tobytes())
         written += [out / f"{name}.toml", picture]
     return written
+
+
+def write_stereo(out: Path, name: str, found: Calibration, settings: CalibrationSettings) -> list[Path]:
+    """One TOML file of both cameras of a pair, and a picture of each; returns their paths.
+
+    The half in which the left camera's image is comes of where the two cameras sit.
+
+    Args:
+        out: Folder.
+        name: Of the pair.
+        found: Cameras left and right, named by the half of the image, with their rig.
+        settings: Of the calibration.
+
+    Raises:
+        ConfigError: a file cannot be written; it is as it was.
+    """
+    assert found.rig is not None
+    left, right = (found.cameras[side] for side in SIDES)
+    T_right_left = invert_pose(found.rig.T_rig_camera[SIDES[1]])
+    swapped = bool(T_right_left[0, 3] > 0)
+    if swapped:
+        left, right, T_right_left = right, left, invert_pose(T_right_left)
+    about = _about(settings) | {
+        "views": min(len(left.views), len(right.views)),
+        "moments": found.rig.instants[SIDES[1]],
+        "rms_px": round(found.rig.rms_px, 4),
+        "baseline_mm": round(1000 * float(np.linalg.norm(T_right_left[:3, 3])), 3),
+        "sigma_baseline_mm": float(f"{1000 * found.rig.position_sigma_m[SIDES[1]]:.3g}"),
+    }
+    file = out / f"{name}.toml"
+    with _explained(file):
+        save_stereo(file, StereoCalibration(left.intrinsics, right.intrinsics, T_right_left, swapped), about)
+    written = [file]
+    for side, camera in zip(SIDES, (left, right), strict=True):
+        picture = out / f"{name}-{side}.png"
+        drawn = draw_calibration(f"{name} {side}", camera, settings.calibration)
+        write_whole(picture, cv2.imencode(".png", np.ascontiguousarray(drawn[..., ::-1]))[1].tobytes())
+        written.append(picture)
+    return written
+
+
+def _about(settings: CalibrationSettings) -> dict[str, str | float]:
+    b = settings.board
+    return {
+        "made_by": f"semantic-mapper {__version__} calibrate",
+        "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "board": f"{b.pattern} {b.columns}x{b.rows}, {1000 * b.square_m:g} mm",
+    }
 
 
 def write_whole(path: Path, data: bytes) -> None:

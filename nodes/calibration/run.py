@@ -99,7 +99,7 @@ class Gathering:
             if time.monotonic() - last_sent < TELL_S:
                 continue
             last_sent = time.monotonic()
-            lacks = self.lacks(rig=rig) if len(self.cameras) == len(sources) else ["waiting for images"]
+            lacks = self.lacks(rig=rig) if len(self.cameras) >= len(sources) else ["waiting for images"]
             kept = {name: len(views.kept) for name, views in list(self.cameras.items())}
             _log.info("views", **kept, lacking="; ".join(lacks) or "nothing")
             if not lacks:

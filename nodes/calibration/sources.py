@@ -16,9 +16,15 @@ from semantic_mapper.nodes.options import SOURCE_PATTERN
 if TYPE_CHECKING:
     from semantic_mapper.drivers.base import Camera, CameraImage
 
+SIDES = ("left", "right")  # of a stereo pair, as its cameras are called
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-_ADDRESSES = {"v4l2": "device", "opencv": "source", "oak": "device"}  # key of the driver's config
-_KEEPS_INTRINSICS = ("oak",)  # rectifies with what its maker has measured
+_ADDRESSES = {
+    "v4l2": "device",
+    "opencv": "source",
+    "oak": "device",
+    "realsense": "device",
+}  # key of the driver's config
+_KEEPS_INTRINSICS = ("oak", "realsense")  # rectifies with what its maker has measured
 
 _log = structlog.get_logger(__name__)
 
@@ -70,6 +76,25 @@ def parse_sources(texts: Sequence[str], size: str) -> list[Source]:
     return found
 
 
+def parse_stereo(texts: Sequence[str], size: str) -> tuple[str, Source]:
+    """The source of a stereo pair that gives both images side by side, as ``[NAME=]PLACE``: its name, and its halves
+    as two cameras, left and right.
+
+    Args:
+        texts: Of the command line.
+        size: "WIDTHxHEIGHT" of both together, to ask of V4L2 cameras; empty = as they are.
+
+    Raises:
+        ConfigError: more than one, or not a place.
+        CameraError, DependencyError: a camera that cannot be opened.
+    """
+    if len(texts) != 1:
+        raise ConfigError("--stereo calibrates one device that gives both images side by side; name one")
+    name, _ = _split(texts[0], alone=True)
+    (source,) = parse_sources(texts, size)
+    return ("stereo" if name == "camera" else name), _Halves(source)
+
+
 def _split(text: str, *, alone: bool) -> tuple[str, str]:
     name, equals, place = text.partition("=")
     if not equals or "/" in name or ":" in name:
@@ -86,7 +111,7 @@ def _camera_source(name: str, place: str, size: str) -> Source:
     kind, colon, address = place.partition(":")
     if colon and kind in _ADDRESSES:
         config: dict[str, Any] = {_ADDRESSES[kind]: address}
-        if kind != "oak":
+        if kind not in _KEEPS_INTRINSICS:
             config["uncalibrated"] = True
         if size and kind == "v4l2":
             config["width"], config["height"] = _read_size(size)
@@ -163,6 +188,29 @@ class _Camera:
 
     def stop(self) -> None:
         self.camera.stop()
+
+
+class _Halves:
+    """The images of a device that gives two side by side, as those of two cameras."""
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self.live = source.live
+        self.stream = source.stream
+        self.known = False
+
+    def images(self) -> Iterator[tuple[str, CameraImage]]:
+        from semantic_mapper.drivers.base import CameraImage
+        from semantic_mapper.drivers.calibration import guess_intrinsics
+        from semantic_mapper.drivers.stereo.camera import halves
+
+        for name, image in self._source.images():
+            for side, rgb in zip(SIDES, halves(image.rgb), strict=True):
+                plain = guess_intrinsics(rgb.shape[1], rgb.shape[0])
+                yield name, CameraImage(image.stamp_ns, image.seq, side, rgb, None, plain)
+
+    def stop(self) -> None:
+        self._source.stop()
 
 
 @dataclass(slots=True)

@@ -27,7 +27,8 @@ def calibrate(
         list[str] | None,
         typer.Argument(
             metavar="[NAME=]PLACE...",
-            help="Camera (v4l2:DEVICE, oak:ID, opencv:URL), video, log (.mcap), folder of pictures; of a rig several.",
+            help="Camera (v4l2:DEVICE, oak:ID, realsense:ID, opencv:URL), video, log (.mcap), folder of pictures; of a "
+            "rig several.",
         ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", help="Folder for NAME.toml and NAME.png.")] = Path("calibration"),
@@ -45,6 +46,9 @@ def calibrate(
     known: Annotated[
         bool, typer.Option("--known", help="Keep the intrinsics that the source tells; find the rig alone.")
     ] = False,
+    stereo: Annotated[
+        bool, typer.Option("--stereo", help="The source gives two images side by side: one file for the pair.")
+    ] = False,
     rig: Annotated[bool, typer.Option("--rig/--no-rig", help="Of several cameras, also find where they sit.")] = True,
     seconds: Annotated[float, typer.Option(help="How long to look through live cameras, at most.")] = 180.0,
     json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
@@ -58,12 +62,13 @@ def calibrate(
 
     Example: semantic-mapper calibrate --board board.png
     Example: semantic-mapper calibrate v4l2:/dev/video0 --size 1280x720 --square-mm 39.6 --out calibration
+    Example: semantic-mapper calibrate --stereo v4l2:/dev/video0 --size 2560x720 --square-mm 39.6
     Example: semantic-mapper calibrate left=pictures/left right=pictures/right
     """
     output = Output.guarded()
-    from semantic_mapper.nodes.calibration.report import report, report_json, write_files
+    from semantic_mapper.nodes.calibration.report import report, report_json, write_files, write_stereo
 
-    settings = _settings(config, square_mm)
+    settings = board_settings(config, square_mm)
     if board is not None:
         _draw_board(output, settings, board, json)
         if not sources:
@@ -71,8 +76,12 @@ def calibrate(
     if not sources:
         raise typer.BadParameter("name a camera, video, log or folder; or --board FILE.png to print a board")
     with _folder_for_results(out):
-        found, gathered = _calibrate(sources, settings, size, known=known, rig=rig, seconds=seconds)
-        files = write_files(out, found, settings)
+        if stereo:
+            name, found, gathered = _calibrate_stereo(sources, settings, size, seconds)
+            files = write_stereo(out, name, found, settings)
+        else:
+            found, gathered = _calibrate(sources, settings, size, known=known, rig=rig, seconds=seconds)
+            files = write_files(out, found, settings)
     if json:
         output.json(report_json(found, gathered.cameras, files))
         return
@@ -82,8 +91,12 @@ def calibrate(
         output.print(str(path))
 
 
-def _settings(path: Path | None, square_mm: float) -> Any:
-    """Raises: ConfigError: the file, or a board that cannot be."""
+def board_settings(path: Path | None, square_mm: float) -> Any:
+    """Board and settings of a file (None = defaults), with squares of so many millimetres (0 = as it says).
+
+    Raises:
+        ConfigError: the file, or a board that cannot be.
+    """
     import msgspec
 
     from semantic_mapper.config import load_config
@@ -155,3 +168,17 @@ def _calibrate(
         names = ", ".join(keep) or "none"
         raise ConfigError(f"{names}: calibrated by its maker already; name several cameras to find where they sit")
     return solve(gathered.cameras, keep, settings.calibration, rig=rig), gathered
+
+
+def _calibrate_stereo(
+    sources: list[str], settings: Any, size: str, seconds: float
+) -> tuple[str, Calibration, Gathering]:
+    from semantic_mapper.drivers.calibrating.solve import solve
+    from semantic_mapper.nodes.calibration.run import Gathering
+    from semantic_mapper.nodes.calibration.sources import parse_stereo
+
+    name, source = parse_stereo(sources, size)
+    gathered = Gathering(settings.board, settings.calibration)
+    with StopRequest() as stop:
+        gathered.run([source], stop, seconds, rig=True)
+    return name, solve(gathered.cameras, (), settings.calibration, rig=True), gathered

@@ -13,7 +13,9 @@ from semantic_mapper.nodes.cli.verb import verb
 
 @verb
 def cameras(
-    kind: Annotated[list[str] | None, typer.Option(help="Only this kind (v4l2, oak); may be repeated.")] = None,
+    kind: Annotated[
+        list[str] | None, typer.Option(help="Only this kind (v4l2, stereo, oak, realsense); may be repeated.")
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
 ) -> None:
     """List the cameras that are connected, with the address that a launch file or a config names them by.

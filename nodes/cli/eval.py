@@ -163,5 +163,6 @@ def surface_line(figures: dict[str, Any]) -> str:
     labels = "" if figures["mesh_miou"] is None else f", mIoU at its vertices {figures['mesh_miou'] * 100:.1f} %"
     return (
         f"surface {figures['median_m'] * 1000:.1f} mm (median) from the mesh, "
-        f"{figures['complete'] * 100:.1f} % of the mesh within 5 cm of the map{labels}"
+        f"{figures['complete'] * 100:.1f} % of the mesh within 5 cm of the map, "
+        f"{figures['complete_10cm'] * 100:.1f} % within 10 cm{labels}"
     )

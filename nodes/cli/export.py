@@ -29,7 +29,10 @@ def export(
     color: Annotated[
         Literal["rgb", "class", "confidence"] | None, typer.Option(help="Of points and meshes.  [default: rgb]")
     ] = None,
-    min_weight: Annotated[float, typer.Option(help="Leave voxels with fewer depth measurements out.")] = 1.0,
+    min_weight: Annotated[
+        float | None,
+        typer.Option(help="Leave out voxels that fewer measurements have seen; 1 leaves out computed depth."),
+    ] = None,
     min_confidence: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Leave surface with a less sure label out.")
     ] = 0.0,
@@ -60,19 +63,21 @@ def export(
     """
     output = Output.guarded()
     from semantic_mapper.errors import ConfigError
+    from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
     from semantic_mapper.nodes.cli.export_log import export_recording
     from semantic_mapper.nodes.cli.saved_maps import is_log
     from semantic_mapper.replay.exporters.map_files import ExportRequest, format_of, parse_up
 
     if is_log(source):
         given = {"--color": color, "--height": height, "--resolution": resolution, "--floor": floor}
-        given |= {"--up": up != "auto", "--min-weight": min_weight != 1.0, "--min-confidence": min_confidence > 0}
+        given |= {"--up": up != "auto", "--min-weight": min_weight is not None, "--min-confidence": min_confidence > 0}
         map_options = [name for name, value in given.items() if value]
         return export_recording(output, source, out, format, camera, max_frames, map_options)
     if camera or max_frames:
         raise ConfigError("--camera and --max-frames are for logs; a map has no frames")
     kind = format_of(out, format)
-    request = ExportRequest(kind, min_weight, min_confidence, color, parse_up(up), height, resolution, floor)
+    least = SURFACE_WEIGHT if min_weight is None else min_weight
+    request = ExportRequest(kind, least, min_confidence, color, parse_up(up), height, resolution, floor)
     return _export_map(output, source, out, request)
 
 

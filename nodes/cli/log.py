@@ -8,6 +8,20 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from semantic_mapper.nodes.cli.console import Output, frame_progress
+from semantic_mapper.nodes.cli.film import (
+    BoardOption,
+    CalibrationOption,
+    DistanceOption,
+    FocalPriorOption,
+    HeightOption,
+    ScaleOption,
+    SquareOption,
+    film_options,
+    import_film_log,
+    is_film,
+    print_film,
+    recording_scale,
+)
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
 from semantic_mapper.plain_text import counted
 
@@ -19,10 +33,19 @@ LISTED = 10  # skipped files and damages that are shown one by one
 
 @verb
 def import_(
-    source: Annotated[Path, typer.Argument(metavar="SRC", help="Folder of the recording.")],
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SRC",
+            help="Folder of the recording, or ROS bag; or film, or folder of pictures, without poses.",
+        ),
+    ],
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Log to write (.mcap).")],
     format: Annotated[  # noqa: A002 - the name of the option
-        Literal["folder", "tum", "scannet", "replica", "kitti360"] | None,
+        Literal[
+            "folder", "tum", "scannet", "replica", "kitti360", "rosbag", "polycam", "record3d", "transforms", "colmap"
+        ]
+        | None,
         typer.Option(help="Found out when not given."),
     ] = None,
     max_frames: Annotated[int, typer.Option(min=0, help="Stop after this many; 0 = all.")] = 0,
@@ -32,14 +55,38 @@ def import_(
     rotate: Annotated[
         Literal["0", "90", "180", "270"], typer.Option(help="Turn every image clockwise by this many degrees.")
     ] = "0",
+    topic: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ROLE=NAME",
+            help="ROS bags: topic of the image, depth (none: without), info or pose; several times. Found by type.",
+        ),
+    ] = None,
+    world: Annotated[str, typer.Option(help="ROS bags: frame of tf that poses are in; map, world or odom.")] = "",
+    body: Annotated[str, typer.Option(help="ROS bags: frame whose pose the topic of poses tells.")] = "",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a log that is there.")] = False,
+    calibration: CalibrationOption = None,
+    focal_prior: FocalPriorOption = 0.0,
+    scale: ScaleOption = 0.0,
+    distance: DistanceOption = "",
+    square_mm: SquareOption = 0.0,
+    board: BoardOption = None,
+    camera_height: HeightOption = 0.0,
 ) -> None:
-    """Make a log of a recording: sequence folder, TUM RGB-D, exported ScanNet, Replica (Semantic-NeRF), KITTI-360.
+    """Make a log of a recording: sequence folder, TUM RGB-D, exported ScanNet, Replica (Semantic-NeRF), KITTI-360, ROS
+    bag, Polycam raw data, Record3D (EXR + RGB), transforms.json (nerfstudio, instant-ngp), COLMAP model with images.
+
+    Of a film or a folder of pictures without poses these are found (structure from motion), and a report is written
+    beside the log (LOG with .html). Without one of --scale, --distance, --square-mm, --camera-height the lengths of its
+    map are not metres.
 
     Frames that cannot be used are left out, each with its file and the reason. --rotate is for cameras that are mounted
-    on their side: the weights know upright rooms. Poses and intrinsics turn with the images.
+    on their side: the weights know upright rooms. Poses and intrinsics turn with the images. Of a ROS bag (1 or 2),
+    poses come from tf or from odometry, and one camera is imported.
 
     Example: semantic-mapper import path/to/redkitchen kitchen.mcap
+    Example: semantic-mapper import robot.bag robot.mcap --topic image=/front/color/image_raw
+    Example: semantic-mapper import film.mp4 film.mcap --calibration camera.toml --camera-height 1.5
     Example: semantic-mapper import path/to/adt flat.mcap --rotate 90 --rename recipes/classes/adt-to-rooms.toml
     """
     output = Output.guarded()
@@ -49,6 +96,14 @@ def import_(
     renames = load_config(rename, RenameConfig).classes if rename is not None else None
 
     log.parent.mkdir(parents=True, exist_ok=True)
+    film = film_options(calibration, focal_prior, scale, distance, square_mm, board, camera_height, int(rotate) // 90)
+    if format is None and is_film(source):
+        if renames is not None or max_frames:
+            raise typer.BadParameter("a film has no classes to rename, and is read to its end")
+        found, page = import_film_log(source, log, film, overwrite=overwrite)
+        print_film(output, found, log)
+        output.print(f"  {page}  (report)")
+        return
     with frame_progress("import", None) as bar:
 
         def on_progress(done: int, total: int) -> None:
@@ -56,7 +111,14 @@ def import_(
                 bar.start(total)
             bar.set(done)
 
-        options = ImportOptions(max_frames=max_frames or None, quarters=int(rotate) // 90)
+        options = ImportOptions(
+            max_frames=max_frames or None,
+            quarters=int(rotate) // 90,
+            topics=_topics_by_role(topic or []),
+            world=world,
+            body=body,
+            scale=recording_scale(film),
+        )
         report = import_recording(
             source, log, format, on_progress, options=options, renames=renames, overwrite=overwrite
         )
@@ -72,6 +134,14 @@ def import_(
         output.print(f"  {what}: frame {skipped.frame}: {skipped.file}: {skipped.reason}")
     if len(report.skipped) > LISTED:
         output.print(f"  and {len(report.skipped) - LISTED} more")
+
+
+def _topics_by_role(texts: list[str]) -> dict[str, str]:
+    pairs = [text.partition("=") for text in texts]
+    for role, equals, name in pairs:
+        if not equals or not name:
+            raise typer.BadParameter(f"--topic {role}: write ROLE=NAME, such as image=/camera/color/image_raw")
+    return {role: name for role, _, name in pairs}
 
 
 def _depth_line(report: ImportReport) -> str:

@@ -22,6 +22,7 @@ from semantic_mapper.nodes.cli import keys as cli_keys
 from semantic_mapper.nodes.cli import label as cli_label
 from semantic_mapper.nodes.cli import launch as cli_launch
 from semantic_mapper.nodes.cli import log as cli_log
+from semantic_mapper.nodes.cli import map as cli_map
 from semantic_mapper.nodes.cli import query as cli_query
 from semantic_mapper.nodes.cli import record as cli_record
 from semantic_mapper.nodes.cli import replay as cli_replay
@@ -42,6 +43,7 @@ app = typer.Typer(
 
 for _function in (
     cli_demo.demo,
+    cli_map.map_,
     cli_replay.replay,
     cli_compare.compare,
     cli_up.up,

@@ -23,6 +23,14 @@ QualityOption = Annotated[
     Literal["fast", "balanced", "reference"] | None,
     typer.Option("--quality", help="Rays and samples: fewer, some or all; without it as --config says."),
 ]
+DepthOption = Annotated[
+    Literal["auto", "sensor", "computed", "off"] | None,
+    typer.Option(
+        "--depth",
+        help="auto: the sensor's, and computed from the pictures where a frame has none; sensor or off: rendered by "
+        "the field where it has none, or always; without it as --config says.",
+    ),
+]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with settings of the mapper.")]
 
 
@@ -46,6 +54,7 @@ def replay(
     rerun: Annotated[Path | None, typer.Option(help="Also write a Rerun recording (.rrd).")] = None,
     config: ConfigOption = None,
     quality: QualityOption = None,
+    depth: DepthOption = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of everything that is drawn at random.")] = None,
     corrections: Annotated[
         Path | None,
@@ -60,10 +69,10 @@ def replay(
     Example: semantic-mapper replay kitchen.mcap --out runs/kitchen --weights kitchen.safetensors
     """
     output = Output.guarded()
-    from semantic_mapper.nodes.cli.run_replay import ReplayRequest, mapper_config, replay_log
+    from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, ReplayRequest, mapper_config, replay_log
     from semantic_mapper.nodes.cli.summary_table import notes, result_lines, summary_table
 
-    settings = mapper_config(config, voxel_size, seed, quality)
+    settings = mapper_config(config, voxel_size, seed, quality, depth, REPLAY_DELAY_FRAMES)
     request = ReplayRequest(
         log[0], out, weights, settings, max_frames, eval_exclude, rerun, corrections, tuple(log[1:])
     )

@@ -261,10 +261,15 @@ def write_eval_report(
         ]
     if found.get("surface"):
         rows = [
-            (name, f"{f['median_m'] * 1000:.1f} mm", f"{f['complete'] * 100:.1f} %")
+            (
+                name,
+                f"{f['median_m'] * 1000:.1f} mm",
+                f"{f['complete'] * 100:.1f} %",
+                f"{f['complete_10cm'] * 100:.1f} %",
+            )
             for name, f in found["surface"].items()
         ]
-        heads = ("map", "median distance from the mesh", "of the mesh within 5 cm")
+        heads = ("map", "median distance from the mesh", "of the mesh within 5 cm", "within 10 cm")
         sections.append(Section("Surface", tables=[table_of(heads, rows)]))
     sections.append(Section(folded={"All figures": json.dumps(found, indent=1)}))
     write_page(path, f"Evaluation of {', '.join([*summaries, *(Path(log).name for log in logs)])}", sections)

@@ -10,7 +10,15 @@ from typing import Any
 import msgspec
 import structlog
 
-from semantic_mapper.config import MapperConfig, Quality, check_quality, convert_config, read_toml, rename_settings
+from semantic_mapper.config import (
+    DepthSource,
+    MapperConfig,
+    Quality,
+    check_quality,
+    convert_config,
+    read_toml,
+    rename_settings,
+)
 from semantic_mapper.errors import LogError, SemanticMapperError
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.mapper import Mapper
@@ -21,7 +29,10 @@ from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.corrected_poses import correct_session, keeping_frames, read_corrections
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.session import MapSession, open_recording
+from semantic_mapper.replay.sfm.film_note import read_left_out
 from semantic_mapper.types import PosedFrame
+
+REPLAY_DELAY_FRAMES = 6  # that a frame waits for where its depth is computed: nobody waits for the map of a log
 
 _log = structlog.get_logger(__name__)
 
@@ -88,6 +99,7 @@ def replay_log(
             source=log.info.source,
             rerun=open_recording(request.rerun, bundle.pipeline),
         )
+        session.scale_known, session.left_out = log.info.scale_known, read_left_out(log.attachments())
         for error in log.errors:  # stretches of the file in which no frame can be made out
             session.note_damage(str(error))
         total = min(len(log), request.max_frames or len(log))
@@ -123,9 +135,19 @@ def _map_frames(session: MapSession, log: Log, total: int, stop: StopRequest, on
 
 
 def mapper_config(
-    path: Path | None, voxel_size_m: float | None, seed: int | None = None, quality: Quality | None = None
+    path: Path | None,
+    voxel_size_m: float | None,
+    seed: int | None = None,
+    quality: Quality | None = None,
+    depth: DepthSource | None = None,
+    delay_frames: int = 0,
 ) -> MapperConfig:
     """The mapper's config from a TOML file (None = defaults) with what the command line says on top.
+
+    Args:
+        path: The file.
+        voxel_size_m, seed, quality, depth: What the command line says, None = nothing.
+        delay_frames: How many later frames one may wait for whose depth is computed, where the file does not say it.
 
     Raises:
         ConfigError: see ``load_config`` and ``check_quality``.
@@ -136,6 +158,11 @@ def mapper_config(
     if voxel_size_m is not None:
         voxel_map = msgspec.structs.replace(config.voxel_map, voxel_size_m=voxel_size_m)
         config = msgspec.structs.replace(config, voxel_map=voxel_map)
+    if "delay_frames" not in data.get("depth", {}).get("from_motion", {}):
+        from_motion = msgspec.structs.replace(config.depth.from_motion, delay_frames=delay_frames)
+        config = msgspec.structs.replace(config, depth=msgspec.structs.replace(config.depth, from_motion=from_motion))
+    if depth is not None:
+        config = msgspec.structs.replace(config, depth=msgspec.structs.replace(config.depth, source=depth))
     given = {"seed": seed, "quality": quality}
     return msgspec.structs.replace(config, **{name: value for name, value in given.items() if value is not None})
 

@@ -51,11 +51,23 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
         lines.append(f"warning: {summary['map']['nearly_empty']}")
     if dig(summary, "pose_check.warning"):
         lines.append(f"warning: {summary['pose_check']['warning']}")
+    if fraction := dig(summary, "depth.computed_fraction"):
+        lines.append(
+            f"depth: computed from the pictures for {percent(fraction)} of the frames, which have no sensor depth; "
+            "expect a surface some centimetres off, and holes in plain walls"
+        )
     if fraction := dig(summary, "depth.rendered_fraction"):
         lines.append(
             f"depth: rendered by the field for {percent(fraction)} of the frames, which have no sensor depth; geometry "
             "is less exact than with a depth sensor"
         )
+    if summary.get("scale") == "unknown":
+        lines.append(
+            "scale: unknown; lengths of this map are not metres. Import the film with --scale, --distance, --square-mm "
+            "or --camera-height"
+        )
+    if frames.get("left_out"):
+        lines.append(f"{counted(frames['left_out'], 'frame')} of the film left out by the import; its report says why")
     if frames.get("excluded_from_scores"):
         lines.append(
             f"{counted(frames['excluded_from_scores'], 'frame')} left out of the scores: weights were finetuned on them"
@@ -92,10 +104,18 @@ def _pose_figure(check: Mapping[str, Any], key: str) -> str:
     return "not checked" if value is None else percent(value)
 
 
+def _depth_source(depth: Mapping[str, Any]) -> str:
+    if depth["source"] != "mixed":
+        return _DEPTH_SOURCES[depth["source"]]
+    fractions = {"computed from the pictures": "computed_fraction", "rendered by the field": "rendered_fraction"}
+    parts = [f"{how} for {percent(depth[key])}" for how, key in fractions.items() if depth.get(key)]
+    return f"{', '.join(parts)} of the frames"
+
+
 _DEPTH_SOURCES = {
     "sensor": "sensor",
     "rendered": "rendered by the field (no depth sensor)",
-    "mixed": "rendered by the field for {} of the frames",
+    "computed": "computed from the pictures (no depth sensor)",
 }
 _ROWS: Sequence[tuple[str, str, Any]] = (
     ("log", "source", str),
@@ -104,8 +124,10 @@ _ROWS: Sequence[tuple[str, str, Any]] = (
     ("frames fused", "frames.fused", str),
     ("frames dropped", "frames.dropped", str),
     ("frames refused", "frames.refused", str),
+    ("frames left out of the log", "frames", lambda f: str(f.get("left_out") or "-")),
+    ("scale", "scale", str),
     ("frames scored", "frames.scored", str),
-    ("depth", "depth", lambda d: _DEPTH_SOURCES[d["source"]].format(percent(d["rendered_fraction"]))),
+    ("depth", "depth", _depth_source),
     ("depth disagreement", "pose_check", lambda c: _pose_figure(c, "depth_disagreement")),
     ("contradicting pairs", "pose_check", lambda c: _pose_figure(c, "contradicting_pairs")),
     ("latency p50", "latency_ms.p50", _ms),

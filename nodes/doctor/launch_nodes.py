@@ -68,7 +68,8 @@ def _connected(live: LiveCamera) -> str:
 
     device = str(table_of(live.config, "camera.config")[0].get("device", ""))
     # Files and streams are named, not found; a device file has several names; an IP address may lie behind a router.
-    if live.kind == "opencv" or Path(device).is_char_device() or device.count(".") == 3:
+    named = live.kind == "opencv" or (live.kind == "stereo" and device and not device.startswith("/dev/"))
+    if named or Path(device).is_char_device() or device.count(".") == 3:
         return f"{live.kind} {device}".rstrip()
     found, unknown = find_cameras((live.kind,))
     if live.kind in unknown:

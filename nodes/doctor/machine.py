@@ -38,7 +38,7 @@ def examine(launch: Path | None = None, settings: Sequence[str] = ()) -> list[Ch
     checks: list[Check] = []
     own = (_python, _libc, _packages, _libusb, _open3d, _torch, _weights, _sockets, _curve, _machine, _disk)
     robot = doctor_robot
-    others = (robot.room, robot.cameras, robot.oak, robot.clocks, robot.ports, robot.left_sockets)
+    others = (robot.room, robot.cameras, robot.oak, robot.realsense, robot.clocks, robot.ports, robot.left_sockets)
     for check in (*own, *others, doctor_launch.own_keys):
         checks.extend(check())
     if launch is not None:

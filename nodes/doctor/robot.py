@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import grp
+import importlib.util
 import os
 import resource
 import shutil
@@ -21,6 +22,8 @@ DEV = Path("/dev")
 UDEV_FOLDERS = (Path("/etc/udev/rules.d"), Path("/usr/lib/udev/rules.d"), Path("/lib/udev/rules.d"))
 OAK_VENDOR = "03e7"  # USB id of what an OAK is before and after its start
 OAK_RULE = f'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{OAK_VENDOR}", MODE="0666"'
+REALSENSE_VENDOR = "8086"
+REALSENSE_RULE = f'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{REALSENSE_VENDOR}", MODE="0666"'
 # Of the launch files: poses, questions, status, updates, the remote viewer; of `view`: its page and its data.
 PORTS = (5560, 5561, 5562, 5563, 5570, WEB_PORT, DATA_PORT)
 LEAST_FILES = 1024
@@ -51,16 +54,27 @@ def cameras() -> Iterator[Check]:
 
 def oak() -> Iterator[Check]:
     """DepthAI's udev rule, without which an OAK on USB may be opened by root alone."""
-    if os.geteuid() == 0:
-        yield Check("OAK on USB", "ok", "this user may open all of USB")
+    yield _usb_rule("OAK", OAK_VENDOR, OAK_RULE, "80-movidius.rules")
+
+
+def realsense() -> Iterator[Check]:
+    """Whether the RealSense SDK is installed, and its udev rule."""
+    if importlib.util.find_spec("pyrealsense2") is None:
+        yield Check("RealSense", "ok", "not installed; pip install 'semantic-mapper[realsense]' where there is one")
         return
-    mend = f"echo '{OAK_RULE}' | sudo tee /etc/udev/rules.d/80-movidius.rules; sudo udevadm control --reload-rules"
+    yield _usb_rule("RealSense", REALSENSE_VENDOR, REALSENSE_RULE, "99-realsense.rules")
+
+
+def _usb_rule(name: str, vendor: str, rule: str, file: str) -> Check:
+    """Whether this user may open USB devices of a vendor."""
+    if os.geteuid() == 0:
+        return Check(f"{name} on USB", "ok", "this user may open all of USB")
     for folder in UDEV_FOLDERS:
         for path in sorted(folder.glob("*.rules")) if folder.is_dir() else ():
-            if OAK_VENDOR in _text(path):
-                yield Check("OAK on USB", "ok", str(path))
-                return
-    yield Check("OAK on USB", "note", "no udev rule: only root may open one", f"{mend}; then plug it in again")
+            if f'idVendor}}=="{vendor}"' in _text(path):
+                return Check(f"{name} on USB", "ok", str(path))
+    mend = f"echo '{rule}' | sudo tee /etc/udev/rules.d/{file}; sudo udevadm control --reload-rules"
+    return Check(f"{name} on USB", "note", "no udev rule: only root may open one", f"{mend}; then plug it in again")
 
 
 def clocks() -> Iterator[Check]:

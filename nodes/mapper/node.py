@@ -257,6 +257,7 @@ class _Mapper:
     def _map(self, frame: PosedFrame) -> None:
         from semantic_mapper.transport.codec import encode
         from semantic_mapper.transport.messages import FrameRefused
+        from semantic_mapper.types import MapUpdate
 
         if self._session is None:
             self._early += 1
@@ -264,15 +265,15 @@ class _Mapper:
             return
         self._gaps.note(frame.camera_id, frame.seq)
         self._streams.note_frame(frame.camera_id)
-        update = self._session.process(frame)
+        results = self._session.process(frame)
         self._capture_age_s = (time.monotonic_ns() - frame.stamp_ns) / 1e9
-        if update is None:
-            reason = self._session.refusals.last.reason
-            refused = FrameRefused(frame.stamp_ns, frame.seq, frame.camera_id, reason)
-            self._publisher.publish(encode(refused))
-        else:
-            self._step_us += round(1e3 * sum(update.stage_ms.values()))
-            self._publisher.publish(encode(update))
+        for result in results:
+            if isinstance(result, MapUpdate):
+                self._step_us += round(1e3 * sum(result.stage_ms.values()))
+                self._publisher.publish(encode(result))
+            else:
+                refused = FrameRefused(result.stamp_ns, result.seq, result.camera_id, result.reason)
+                self._publisher.publish(encode(refused))
 
     def _end(self, end: EndOfStream) -> bool:
         """One stream has ended; True where all have."""

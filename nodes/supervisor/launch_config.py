@@ -225,8 +225,9 @@ def _check_camera_kinds(camera: Any, where: str) -> None:
         raise ConfigError(
             f"{where}: `camera.poses` is {'missing' if poses is None else 'empty'}: a camera alone does not know "
             'where it is. Write [node.options.camera.poses] with kind = "topic" (odometry from a socket), "board" (a '
-            'printed board), "rgbd" (odometry from depth), "device" (it tracks itself, OAK) or "fixed" (it never '
-            'moves); for example poses = { kind = "topic", endpoint = "tcp://127.0.0.1:5560" }'
+            'printed board), "rgbd" (odometry from depth), "visual" (from its pictures alone), "device" (it tracks '
+            'itself, OAK) or "fixed" (it never moves); for example '
+            'poses = { kind = "topic", endpoint = "tcp://127.0.0.1:5560" }'
         )
     if isinstance(poses, dict) and poses.get("kind") not in POSE_KINDS:
         if "kind" not in poses:

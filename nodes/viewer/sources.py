@@ -82,7 +82,8 @@ class _MapShow:
 def thinned(points: MapPoints, ages: Float32) -> tuple[MapPoints, Float32]:
     """Every n-th point and its age, so that there are at most ``MAX_POINTS``."""
     step = max(1, -(-len(points.xyz) // MAX_POINTS))
-    few = MapPoints(points.xyz[::step], points.rgb[::step], points.label[::step], points.confidence[::step])
+    measured = None if points.measured is None else points.measured[::step]
+    few = MapPoints(points.xyz[::step], points.rgb[::step], points.label[::step], points.confidence[::step], measured)
     return few, ages[::step]
 
 

@@ -18,6 +18,7 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float32
 
 NEAR_M = 0.05  # a mesh vertex with a map point this near counts as mapped
+ROUGHLY_M = 0.10  # and as roughly mapped
 
 
 def compare_with_mesh(folder: Path, mesh: Path) -> dict[str, Any]:
@@ -30,8 +31,8 @@ def compare_with_mesh(folder: Path, mesh: Path) -> dict[str, Any]:
 
     Returns:
         ``median_m``, ``p95_m``: distance of map points to the mesh; ``on_mesh``: map points within 5 cm, of all
-        (a map may hold more than the mesh); ``complete``: fraction of vertices with a map point within 5 cm;
-        ``mesh_miou``: labels at the vertices, null without labels.
+        (a map may hold more than the mesh); ``complete``, ``complete_10cm``: fraction of vertices with a map point
+        within 5 cm and within 10 cm; ``mesh_miou``: labels at the vertices, null without labels.
 
     Raises:
         MapError: a file is missing or does not hold what it should.
@@ -53,6 +54,7 @@ def compare_with_mesh(folder: Path, mesh: Path) -> dict[str, Any]:
         "p95_m": round(float(np.percentile(distance, 95)), 4),
         "on_mesh": round(float((distance < NEAR_M).mean()), 4),
         "complete": round(float((nearest < NEAR_M).mean()), 4),
+        "complete_10cm": round(float((nearest < ROUGHLY_M).mean()), 4),
         "mesh_miou": None,
     }
     if label is not None:

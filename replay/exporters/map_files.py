@@ -17,6 +17,7 @@ from semantic_mapper.mapping.files.formats.npz import write_npz
 from semantic_mapper.mapping.files.formats.obj import write_obj
 from semantic_mapper.mapping.files.formats.ply import write_ply, write_ply_mesh
 from semantic_mapper.mapping.files.up_axis import find_up
+from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
 from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, occupancy_grid
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -52,7 +53,7 @@ class ExportRequest:
 
     Args:
         format: Of the file.
-        min_weight: Voxels with fewer depth measurements are left out.
+        min_weight: Voxels of less weight are left out; 1 = only measured surface.
         min_confidence: Surface whose label is less sure is left out; 0 keeps what nothing voted for, too.
         color: Points and meshes: what the colours show; the camera's by default.
         up: GLB and grid: (3,) unit vector, up in the world; found by ``find_up`` by default, or refused.
@@ -62,7 +63,7 @@ class ExportRequest:
     """
 
     format: Format
-    min_weight: float = 1.0
+    min_weight: float = SURFACE_WEIGHT
     min_confidence: float = 0.0
     color: ColorBy | None = None
     up: Float64 | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from semantic_mapper.replay.importers.base import DepthScale, ImportOptions, ImportReport, RenameConfig, Skipped
-from semantic_mapper.replay.importers.run import FORMATS, detect_format, import_recording
+from semantic_mapper.replay.importers.run import FORMATS, detect_format, import_recording, is_recording
 
 __all__ = [
     "FORMATS",
@@ -14,4 +14,5 @@ __all__ = [
     "Skipped",
     "detect_format",
     "import_recording",
+    "is_recording",
 ]

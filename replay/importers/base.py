@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol, cast
 
@@ -33,7 +34,11 @@ class ImportOptions:
             scannet 30).
         max_frames: Stop after this many frames; None = all.
         quarters: Turn every image clockwise by this many quarters of a full turn: for a camera mounted on its side.
-        match_s: TUM: largest time between a colour image, its depth image and its pose.
+        match_s: TUM and ROS bags: largest time between a colour image, its depth image and its pose.
+        topics: ROS bags: topics by role ("image", "depth", "info", "pose"), where several fit; depth "none" = without.
+        world: ROS bags: frame of tf in which poses are; empty = map, world or odom.
+        body: ROS bags: frame whose pose the topic of poses tells; empty = as its messages say.
+        scale: Metres per unit of poses whose unit is their own (transforms, colmap); None = not known.
     """
 
     camera_id: str = "camera"
@@ -41,6 +46,10 @@ class ImportOptions:
     max_frames: int | None = None
     quarters: int = 0
     match_s: float = 0.02
+    topics: Mapping[str, str] = field(default_factory=dict[str, str])
+    world: str = ""
+    body: str = ""
+    scale: float | None = None
 
 
 MAX_FILE_BYTES = 1 << 28  # of one image, or one list of poses

@@ -20,14 +20,21 @@ from semantic_mapper.replay.importers.base import (
     Recording,
     Skipped,
 )
+from semantic_mapper.replay.importers.colmap import open_colmap
 from semantic_mapper.replay.importers.folder import FolderRecording
 from semantic_mapper.replay.importers.kitti360 import Kitti360Recording
+from semantic_mapper.replay.importers.polycam import open_polycam
+from semantic_mapper.replay.importers.record3d import open_record3d
 from semantic_mapper.replay.importers.replica import ReplicaRecording
+from semantic_mapper.replay.importers.rosbag import STORAGE as BAG_STORAGE
+from semantic_mapper.replay.importers.rosbag import RosbagRecording, is_bag_folder, is_ros_mcap
 from semantic_mapper.replay.importers.scannet import ScanNetRecording
+from semantic_mapper.replay.importers.transforms import open_transforms
 from semantic_mapper.replay.importers.tum import TumRecording
 from semantic_mapper.replay.log.atomic_log import atomic_log
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.replay.log.sequence import SUFFIX as LOG_SUFFIX
+from semantic_mapper.replay.sfm.colmap_model import find_model
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
@@ -38,6 +45,11 @@ FORMATS: dict[str, Callable[[Path, ImportOptions], Recording]] = {
     "scannet": ScanNetRecording,
     "replica": ReplicaRecording,
     "kitti360": Kitti360Recording,
+    "rosbag": RosbagRecording,
+    "polycam": open_polycam,
+    "record3d": open_record3d,
+    "transforms": open_transforms,
+    "colmap": open_colmap,
 }
 
 # What a folder of each format has, and no other.
@@ -47,18 +59,16 @@ _MARKS = {
     "scannet": ("color", "depth", "pose"),
     "replica": ("rgb", "depth", "traj_w_c.txt"),
     "kitti360": ("calibration/perspective.txt", "data_2d_raw", "data_poses"),
+    "polycam": ("keyframes/images", "keyframes/cameras"),
+    "record3d": ("rgb", "metadata.json"),
+    "transforms": ("transforms.json",),
 }
 
 LISTED = 5  # recordings that an error names
 _SEE = "replay/importers/ says what each format consists of"
-_CONVERT = "bags are not read: export its images, depth and poses as a TUM RGB-D folder, and import that"
-_VIDEO = (
-    "is a video, which has no poses: `semantic-mapper up launch/video.toml` maps it with poses from a board or a socket"
-)
+_VIDEO = "is a film, which has no poses: `semantic-mapper import` and `semantic-mapper map` find them"
 _PACKED = "is packed; unpack it, and name the folder that comes out"
 _FILES = {
-    ".bag": f"is a ROS 1 bag, and {_CONVERT}",
-    ".db3": f"is a ROS 2 bag, and {_CONVERT}",
     **dict.fromkeys((".mp4", ".avi", ".mkv", ".mov", ".webm"), _VIDEO),
     **dict.fromkeys((".zip", ".tgz", ".gz", ".tar", ".7z"), _PACKED),
 }
@@ -67,21 +77,41 @@ _DEFAULTS = ImportOptions()
 
 
 def detect_format(src: Path) -> str:
-    """Format of a recording by the files in its folder.
+    """Format of a recording by its file, or by the files in its folder.
 
     Raises:
-        ImportSourceError: no such folder, or none of the formats.
+        ImportSourceError: no such file or folder, or none of the formats.
     """
     if not src.exists():
-        raise ImportSourceError(f"{src}: no such folder")
+        raise ImportSourceError(f"{src}: no such file or folder")
+    if _is_bag(src):
+        return "rosbag"
     if src.is_file():
         raise ImportSourceError(f"{src}: {_what_file(src)}")
     for name in _MARKS:
         if not _lacks(src, name):
             return name
+    if find_model(src) is not None:
+        return "colmap"
     if src.resolve().parent.name == "data_2d_raw":
         return "kitti360"
     raise ImportSourceError(f"{src}: {_what_folder(src)}")
+
+
+def _is_bag(src: Path) -> bool:
+    """Whether it is a bag of ROS: a file or, of ROS 2, a folder."""
+    if src.is_dir():
+        return is_bag_folder(src)
+    return src.suffix in (".bag", ".db3") or (src.suffix in BAG_STORAGE and is_ros_mcap(src))
+
+
+def is_recording(src: Path) -> bool:
+    """Whether a folder is, or holds, a recording of one of the formats."""
+    try:
+        detect_format(src)
+    except ImportSourceError:
+        return any(not _lacks(folder, n) for folder in src.iterdir() if folder.is_dir() for n in _MARKS)
+    return True
 
 
 def _lacks(src: Path, name: str) -> list[str]:
@@ -95,12 +125,12 @@ def _what_folder(src: Path) -> str:
     if sequences:
         return f"is a scene of Replica; name one sequence: {', '.join(map(str, sequences))}"
     below = [
-        folder for folder in sorted(src.iterdir()) if folder.is_dir() and any(not _lacks(folder, n) for n in _MARKS)
+        path
+        for path in sorted(src.iterdir())
+        if _is_bag(path) or (path.is_dir() and any(not _lacks(path, n) for n in _MARKS))
     ]
     if below:
         return f"holds recordings; name one of them: {', '.join(map(str, below[:LISTED]))}"
-    if (src / "metadata.yaml").exists() and any((*src.glob("*.db3"), *src.glob("*.mcap"))):
-        return f"is a ROS 2 bag, and {_CONVERT}"
     name = min(_MARKS, key=lambda n: len(_lacks(src, n)))
     if len(_lacks(src, name)) < len(_MARKS[name]):
         return f"is nearest to a recording of format '{name}', but lacks {', '.join(_lacks(src, name))}; {_SEE}"
@@ -135,14 +165,14 @@ def import_recording(
     codec: CodecOptions | None = None,
     overwrite: bool = False,
 ) -> ImportReport:
-    """Write the recording in folder ``src`` to the log ``dst``, which is there only once the import is complete.
+    """Write the recording ``src`` (folder or ROS bag) to the log ``dst``, which is there once the import is complete.
 
     A frame that cannot be used is left out and reported; a bad label image costs the frame its label only.
 
     Args:
-        src: Folder of the recording.
+        src: Folder of the recording, or its file.
         dst: Log to write.
-        format_name: "folder", "tum", "scannet", "replica" or "kitti360"; None = found out.
+        format_name: One of ``FORMATS``; None = found out.
         on_progress: Called with (frames looked at, frames in all).
         options: How to read.
         renames: New names of classes by their present ones; classes of one name become one class.
@@ -159,8 +189,8 @@ def import_recording(
     name = format_name or detect_format(src)
     if name not in FORMATS:
         raise ImportSourceError(f"no format '{name}'; there are {', '.join(FORMATS)}")
-    if not src.is_dir():
-        raise ImportSourceError(f"{src}: no such folder")
+    if not src.is_dir() and not (name == "rosbag" and src.is_file()):
+        raise ImportSourceError(f"{src}: no such {'file or folder' if name == 'rosbag' else 'folder'}")
     recording = FORMATS[name](src, options)
     total = len(recording) if options.max_frames is None else min(len(recording), options.max_frames)
     info, changed = _changes(src, recording.info, options, renames or {})

@@ -46,6 +46,25 @@ def align_rigid(a: Float64, b: Float64) -> Float64:
     return T_b_a
 
 
+def align_similar(a: Float64, b: Float64) -> tuple[Float64, float]:
+    """The similarity that takes points a (N, 3) nearest to points b (N, 3) in least squares: ``T_b_a @ (scale * a)``.
+
+    Umeyama's closed form; for paths whose scale is unknown.
+
+    Raises:
+        ShapeError: other shapes, fewer than 3 points, or points a that are all one.
+    """
+    rigid = align_rigid(a, b)
+    level_a, level_b = a - a.mean(axis=0), b - b.mean(axis=0)
+    size = float((level_a**2).sum())
+    if not size > 0:
+        raise ShapeError("alignment with scale needs points that are not all one")
+    scale = float(((level_a @ rigid[:3, :3].T) * level_b).sum()) / size
+    T_b_a = rigid.copy()
+    T_b_a[:3, 3] = b.mean(axis=0) - scale * rigid[:3, :3] @ a.mean(axis=0)
+    return T_b_a, scale
+
+
 def absolute_trajectory_error(estimated: Float64, truth: Float64) -> TrajectoryError:
     """Distances between positions after the estimated path has been aligned to the true one, without scale.
 

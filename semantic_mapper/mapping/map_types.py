@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.types import Float32, UInt8
+from semantic_mapper.types import Bool, Float32, UInt8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,12 +20,14 @@ class MapPoints:
         label: (N,) uint8 class ids, the label set's ignore id where nothing voted or the map is too unsure
             (``voxel_map.unknown_below``).
         confidence: (N,) float32 probability of the likeliest class, 0 where nothing voted.
+        measured: (N,) bool, False where no sensor measured the surface: its depth was computed; None = unknown.
     """
 
     xyz: Float32
     rgb: UInt8
     label: UInt8
     confidence: Float32
+    measured: Bool | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +40,7 @@ class MapMesh:
         rgb: (V, 3) uint8.
         label: (V,) uint8 class ids, the ignore id where unknown; see ``MapPoints``.
         confidence: (V,) float32, 0 where nothing voted.
+        measured: (V,) bool, False where no sensor measured the surface: its depth was computed; None = unknown.
     """
 
     vertices: Float32
@@ -45,6 +48,7 @@ class MapMesh:
     rgb: UInt8
     label: UInt8
     confidence: Float32
+    measured: Bool | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,9 +60,11 @@ class MapView:
         rgb: (H, W, 3) uint8.
         label: (H, W) uint8 class ids, the ignore id at misses and where unknown; see ``MapPoints``.
         confidence: (H, W) float32, 0 at misses and where nothing voted.
+        measured: (H, W) bool, False where no sensor measured the surface: its depth was computed; None = unknown.
     """
 
     depth_m: Float32
     rgb: UInt8
     label: UInt8
     confidence: Float32
+    measured: Bool | None = None

@@ -27,7 +27,7 @@ def load_open3d() -> Any:
     Raises:
         DependencyError: naming the library that is missing and how to get it.
     """
-    notes = _preload_libusb() + preload_folder(Path(sys.prefix) / "syslibs")
+    notes = preload_libusb() + preload_folder(Path(sys.prefix) / "syslibs")
     try:
         open3d = importlib.import_module("open3d")
     except (ImportError, OSError, MemoryError) as error:
@@ -68,7 +68,8 @@ def _load_global(path: Path) -> str:
     return ""
 
 
-def _preload_libusb() -> list[str]:
+def preload_libusb() -> list[str]:
+    """Load the wheel's ``libusb-1.0`` into the process; one line for why it could not be, empty where it was."""
     try:
         libusb_package = importlib.import_module("libusb_package")
     except ImportError as error:

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from semantic_mapper.config import MapperConfig, with_quality
-from semantic_mapper.errors import FrameError
+from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.fields.base import EncodedViews, SemanticField, check_classes, stack_views
 from semantic_mapper.fields.depth_prior import depth_prior
 from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
@@ -24,6 +24,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.correction.corrected_map import CorrectedPoses, CorrectionStatus, MapCorrector
 from semantic_mapper.mapping.correction.history import FusedFrame
+from semantic_mapper.mapping.frame_depth import FrameDepth, computed_trust
 from semantic_mapper.mapping.fusion.depth_trust import depth_trust
 from semantic_mapper.mapping.fusion.vote_fusion import add_votes
 from semantic_mapper.mapping.keyframes import EncodedSize, Keyframe, KeyframeStore
@@ -33,7 +34,7 @@ from semantic_mapper.mapping.views.upsample import upsample
 from semantic_mapper.mapping.views.view_renderer import RenderedView, ViewRenderer
 from semantic_mapper.mapping.views.virtual_views import ViewpointChooser, VirtualLook
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.types import CameraIntrinsics, Float32, MapUpdate, PosedFrame, SourceViews, UInt8
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, MapUpdate, PosedFrame, SourceViews, UInt8
 
 _log = get_logger(__name__)
 
@@ -73,6 +74,7 @@ class MappingPipeline:
         self.label_set = label_set
         self.voxel_map = VoxelMap(config.voxel_map, label_set)
         self.keyframes = KeyframeStore(config.keyframes)
+        self._frame_depth = FrameDepth(config.depth, self._cast_for_hint)
         self.pose_check = PoseCheck(config.voxel_map.depth_max_m)
         self._viewpoints = ViewpointChooser(config.virtual, config.seed)
         self._steps = 0
@@ -89,12 +91,37 @@ class MappingPipeline:
     def step(self, frame: PosedFrame) -> MapUpdate:
         """Render the semantics of one frame, fuse it, and maybe keep it as a source view.
 
+        A frame whose depth is to be computed gets it from those before it; see ``prepare``.
+
         Raises:
             FrameError, PoseError: the frame cannot be used. The map is unchanged and the next frame is welcome.
+            ConfigError: ``depth.from_motion.delay_frames`` is not 0, and the frame does not come from ``prepare``.
         """
+        (frame,) = self.prepare(frame) if self._delay_frames == 0 else (self._prepared(frame),)
         self.corrector.make_room()
         with self.corrector.turn:
             return self._map_frame(self.corrector.place(frame))
+
+    def prepare(self, frame: PosedFrame) -> list[PosedFrame]:
+        """Give a frame the depth that ``config.depth`` asks for; what is ready for ``step``, oldest first.
+
+        One frame each, unless ``depth.from_motion.delay_frames`` lets frames wait for later ones.
+
+        Raises:
+            PoseError: the pose is not a rigid transform.
+        """
+        check_pose(frame.T_world_camera, f"frame seq={frame.seq} of camera '{frame.camera_id}'")
+        return self._frame_depth.push(frame)
+
+    def prepare_rest(self) -> list[PosedFrame]:
+        """The frames that still wait in ``prepare``, oldest first."""
+        return self._frame_depth.finish()
+
+    @property
+    def pose_disagreement_px(self) -> tuple[float, float] | None:
+        """Median distance in pixels of corners from where given poses have them, and where refined poses do, of the
+        last frames whose depth was computed; None where there were none."""
+        return self._frame_depth.disagreement.medians
 
     def correct_poses(self, poses: CorrectedPoses, *, until_ns: int | None = None) -> CorrectionStatus:
         """Begin to move the map with corrected poses of frames that it was fused from, as a loop closure gives them.
@@ -234,7 +261,8 @@ class MappingPipeline:
             depth, rows, trust = self._lift(resized, view, self.voxel_map)
         table = view.probabilities.reshape(-1, len(self.label_set))
         with self._stage("fuse"):
-            touched = self.voxel_map.integrate(frame, depth, table, rows=rows, trust=trust)
+            measured = is_measured(frame)
+            touched = self.voxel_map.integrate(frame, depth, table, rows=rows, trust=trust, measured=measured)
         if self.corrector.records:
             with self._stage("history"):
                 self.corrector.record(FusedFrame(frame, view.probabilities, view.known, view.depth_m))
@@ -242,7 +270,8 @@ class MappingPipeline:
             is_keyframe = self.keyframes.wants(frame.T_world_camera, current.size)
             if is_keyframe:
                 keyframe = self._make_keyframe(resized, current)
-                self.pose_check.add(keyframe, sources, self.keyframes.keyframes)
+                if is_measured(frame):  # computed depth follows from the poses and cannot contradict them
+                    self.pose_check.add(keyframe, sources, self.keyframes.keyframes)
                 self.keyframes.add(keyframe)
         self._intrinsics[frame.camera_id] = frame.intrinsics
         self._odd_sizes.pop(frame.camera_id, None)
@@ -273,6 +302,24 @@ class MappingPipeline:
             samples=view.samples,
             stage_ms=self._stage_ms,
         )
+
+    @property
+    def _delay_frames(self) -> int:
+        depth = self.config.depth
+        return depth.from_motion.delay_frames if depth.source in ("auto", "computed") else 0
+
+    def _prepared(self, frame: PosedFrame) -> PosedFrame:
+        if frame.depth_sigma_m is None and (frame.depth_m is None or self.config.depth.source == "computed"):
+            raise ConfigError("depth.from_motion.delay_frames lets frames wait: give step what prepare returns")
+        return frame
+
+    def _cast_for_hint(self, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> tuple[Float32, Bool]:
+        if self.voxel_map.block_count == 0:
+            empty = np.zeros((intrinsics.height, intrinsics.width), np.float32)
+            return empty, empty > 0
+        view = self.voxel_map.ray_cast(T_world_camera, intrinsics)
+        assert view.measured is not None
+        return view.depth_m, view.measured
 
     def _check(self, frame: PosedFrame) -> None:
         where = f"frame seq={frame.seq} of camera '{frame.camera_id}'"
@@ -325,6 +372,8 @@ class MappingPipeline:
         frame = resized.frame
         intrinsics = working_intrinsics(frame.intrinsics, self.config.render.encode_width or frame.intrinsics.width)
         rgb, depth = resized.rgb(intrinsics), resized.depth(intrinsics)
+        if frame.depth_sigma_m is not None:  # the image encoder learned from sensors: computed depth misleads it
+            depth = np.zeros_like(depth)
         views = SourceViews(
             rgb=torch.from_numpy(rgb).permute(2, 0, 1).float().div(255)[None],
             depth_m=torch.from_numpy(depth)[None],
@@ -369,7 +418,9 @@ class MappingPipeline:
         intrinsics = scale_intrinsics(frame.intrinsics, width, height)
         prior = self._depth_prior(resized, intrinsics)
         rgb = resized.rgb(intrinsics)
-        return (renderer or self._renderer).render(stack_views(views), intrinsics, frame.T_world_camera, prior, rgb)
+        return (renderer or self._renderer).render(
+            stack_views(views), intrinsics, frame.T_world_camera, prior, rgb, computed=frame.depth_sigma_m is not None
+        )
 
     def _depth_prior(self, resized: FrameViews, intrinsics: CameraIntrinsics) -> Float32:
         """Where the surface is expected: the sensor's depth (``depth_prior``), else the map's own ray cast."""
@@ -396,6 +447,8 @@ class MappingPipeline:
             depth = np.asarray(cv2.resize(view.depth_m, size, interpolation=cv2.INTER_LINEAR), np.float32)
         else:
             depth, trust = resized.depth(frame.intrinsics), None
+            if frame.depth_sigma_m is not None:
+                trust = computed_trust(depth, frame.depth_sigma_m)
         return depth, upsample(view.probabilities, view.known, rgb_low, depth_low, frame.rgb, depth), trust
 
     def _at_rows(self, table: Float32, rows: NDArray[np.int32]) -> tuple[UInt8, Float32]:
@@ -407,7 +460,8 @@ class MappingPipeline:
         view = RenderedView(fused.probabilities, fused.known, fused.rendered_depth_m, 0, 0)
         depth, rows, trust = self._lift(FrameViews(fused.frame), view, voxel_map)
         table = view.probabilities.reshape(-1, len(self.label_set))
-        voxel_map.integrate(fused.frame, depth, table, rows=rows, trust=trust)
+        measured = is_measured(fused.frame)
+        voxel_map.integrate(fused.frame, depth, table, rows=rows, trust=trust, measured=measured)
 
     def _make_keyframe(self, resized: FrameViews, encoded: EncodedViews, *, labelled: bool = False) -> Keyframe:
         frame = resized.frame
@@ -416,3 +470,8 @@ class MappingPipeline:
         return Keyframe(
             frame.seq, frame.stamp_ns, frame.T_world_camera, intrinsics, depth, encoded, labelled, frame.camera_id
         )
+
+
+def is_measured(frame: PosedFrame) -> bool:
+    """Whether a sensor measured the depth of a frame."""
+    return frame.depth_m is not None and frame.depth_sigma_m is None

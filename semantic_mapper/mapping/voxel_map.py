@@ -22,6 +22,7 @@ from semantic_mapper.mapping.files.map_manifest import MapManifest
 from semantic_mapper.mapping.files.map_saving import MapSaving
 from semantic_mapper.mapping.files.merge import add_blocks, check_fit, copy_blocks, voxel_transform
 from semantic_mapper.mapping.fusion.allocation import blocks_in_band, frame_budget, make_camera
+from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
 from semantic_mapper.mapping.fusion.frame_votes import check_depth, frame_votes, probability_table, trusted_depth
 from semantic_mapper.mapping.fusion.fuse import fuse_blocks, make_limits
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView
@@ -45,7 +46,7 @@ _KERNEL_LOCK = threading.RLock()
 
 BoolImage = NDArray[np.bool_]
 BLOCKS_A_VERSION = 256  # of a map that takes over another one
-POINT_FIELDS = ("xyz", "rgb", "label", "confidence")
+POINT_FIELDS = ("xyz", "rgb", "label", "confidence", "measured")
 
 
 class VoxelMap:
@@ -112,7 +113,7 @@ class VoxelMap:
         with _KERNEL_LOCK:
             return self._grid.changed_since(version)
 
-    def changes(self, since: int, limit: int = 0, min_weight: float = 1.0) -> BlockChanges:
+    def changes(self, since: int, limit: int = 0, min_weight: float = SURFACE_WEIGHT) -> BlockChanges:
         """The blocks changed after ``version`` was ``since``, in compact form.
 
         Args:
@@ -120,7 +121,7 @@ class VoxelMap:
             limit: At most this many blocks, those that have been waiting longest, but never less than one whole version
                 (a frame; a loaded map is one version); 0 = all. A caller that goes on asking with the version they got
                 comes to the present map.
-            min_weight: Voxels with fewer depth measurements count as not observed; > 0.
+            min_weight: Voxels of less weight count as not observed; > 0. 1 = only what was measured.
 
         Raises:
             MapError: ``since`` is not a version of this map, or a bad ``limit`` or ``min_weight``.
@@ -128,7 +129,7 @@ class VoxelMap:
         with _KERNEL_LOCK:
             return read_changes(self._grid, self._choose_changes(since, limit, min_weight))
 
-    def copy_changes(self, since: int, limit: int = 0, min_weight: float = 1.0) -> CopiedChanges:
+    def copy_changes(self, since: int, limit: int = 0, min_weight: float = SURFACE_WEIGHT) -> CopiedChanges:
         """As ``changes``, but only copied here: another thread makes them compact, which is most of the work."""
         with _KERNEL_LOCK:
             return copy_changes(self._grid, self._choose_changes(since, limit, min_weight))
@@ -147,6 +148,7 @@ class VoxelMap:
         *,
         rows: NDArray[np.int32] | None = None,
         trust: Float32 | None = None,
+        measured: bool = True,
     ) -> int:
         """Fuse one frame.
 
@@ -157,7 +159,8 @@ class VoxelMap:
             known: (H, W) bool, where ``probabilities`` mean something; None = everywhere.
             rows: (H, W) int32, where several pixels share their probabilities: these are (K, L) then, and this says
                 which row is a pixel's, -1 = unknown. ``known`` is None then.
-            trust: (H, W) float32 0..1, weight of each depth and its vote; None = 1, as of what was measured.
+            trust: (H, W) float32 0..1, how much of its full weight each depth and its vote count; None = 1.
+            measured: Whether a sensor measured the depth; what was computed weighs less (``depth_trust``).
 
         Returns:
             Blocks touched, 0 where the depth image holds no measurement.
@@ -199,6 +202,7 @@ class VoxelMap:
                     weights,
                     votes,
                     self.frames,
+                    measured=measured,
                 )
             self.frames += 1
             self.last_stamp_ns = frame.stamp_ns
@@ -242,11 +246,11 @@ class VoxelMap:
             self.version = self._grid.mark_all_changed(self.version + 1, BLOCKS_A_VERSION)
             self.epoch += 1
 
-    def points(self, min_weight: float = 1.0) -> MapPoints:
+    def points(self, min_weight: float = SURFACE_WEIGHT) -> MapPoints:
         """Points of the surface, at most three a voxel, in a fixed order.
 
         Args:
-            min_weight: Voxels with fewer depth measurements are left out; > 0.
+            min_weight: Voxels of less weight are left out; > 0. 1 = only what was measured.
         """
         _check_min_weight(min_weight)
         parts: list[MapPoints] = []
@@ -257,7 +261,7 @@ class VoxelMap:
                 parts.append(MapPoints(xyz, *self._read(grid, voxels)))
         return MapPoints(*(np.concatenate([getattr(part, name) for part in parts]) for name in POINT_FIELDS))
 
-    def mesh(self, min_weight: float = 1.0) -> MapMesh:
+    def mesh(self, min_weight: float = SURFACE_WEIGHT) -> MapMesh:
         """Triangle mesh of the surface by marching cubes, in a fixed order; see ``points``.
 
         Raises:
@@ -302,8 +306,8 @@ class VoxelMap:
         check_pose(T_world_camera, "ray_cast")
         camera = make_camera(intrinsics, T_world_camera)
         with _KERNEL_LOCK:
-            depth_m, rgb, channel, confidence = cast_view(self._grid, camera, intrinsics, self.config)
-        return MapView(depth_m, rgb, self.label_set.to_ids(channel), confidence)
+            depth_m, rgb, channel, confidence, measured = cast_view(self._grid, camera, intrinsics, self.config)
+        return MapView(depth_m, rgb, self.label_set.to_ids(channel), confidence, measured)
 
     def block_state(self, keys: NDArray[np.int32] | None = None) -> dict[str, NDArray[np.generic]]:
         """A copy of everything, or of some existing blocks (B, 3), for comparisons bit by bit; it pages nothing in.
@@ -400,7 +404,9 @@ class VoxelMap:
         decision = (self.label_set, self.config.vote_discount, self.config.unknown_below, min_weight)
         return choose_blocks(self._grid, (since, self.version, self.epoch), limit, decision)
 
-    def _read(self, grid: BlockGrid, voxels: Float64) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Float32]:
+    def _read(
+        self, grid: BlockGrid, voxels: Float64
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Float32, BoolImage]:
         decision = (self.label_set, self.config.vote_discount, self.config.unknown_below)
         return read_points(voxels, grid.index, grid.buffers(), *decision)
 

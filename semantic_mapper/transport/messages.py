@@ -37,6 +37,8 @@ MAX_DAMAGES = 50  # damaged places of a recording that its end tells of
 MAX_KEYFRAME_BYTES = 8 * MAX_KEYFRAME_PIXELS + 2 * MAX_HEADER_BYTES  # raw colour, float32 depth, labels: all of it
 MAX_WEIGHTS_BYTES = 1 << 26  # of a weights file on the wire: five times the shipped one
 _SENTENCE = 4096  # letters; longer ones are cut
+# Metadata of a stream whose lengths are not metres, as poses from pictures alone give them; without it they are.
+SCALE_KEY, SCALE_UNKNOWN = "scale", "unknown"
 
 
 class StreamInfo(Wire, frozen=True):
@@ -57,6 +59,11 @@ class StreamInfo(Wire, frozen=True):
     frame_count: Count | None = None
     frame_hz: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
     metadata: Annotated[Mapping[Word, Sentence], Meta(max_length=64)] = msgspec.field(default_factory=dict)
+
+    @property
+    def scale_known(self) -> bool:
+        """Whether lengths are metres."""
+        return self.metadata.get(SCALE_KEY) != SCALE_UNKNOWN
 
 
 class Status(Wire, frozen=True):

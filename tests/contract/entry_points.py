@@ -25,6 +25,8 @@ from typer.testing import CliRunner
 import semantic_mapper.drivers.oak.config
 import semantic_mapper.drivers.opencv.config
 import semantic_mapper.drivers.poses.config
+import semantic_mapper.drivers.realsense.config
+import semantic_mapper.drivers.stereo.config
 import semantic_mapper.drivers.v4l2.config
 from semantic_mapper.benchmark.config import SuiteConfig
 from semantic_mapper.config import MapperConfig, SRayConfig, convert_config, load_config
@@ -222,6 +224,8 @@ SETTINGS: dict[str, tuple[type[msgspec.Struct], dict[str, Any]]] = {
     "launch.finetuner": (FinetunerOptions, {}),
     "camera.v4l2": (semantic_mapper.drivers.v4l2.config.Config, {}),
     "camera.opencv": (semantic_mapper.drivers.opencv.config.Config, {"source": "a.mp4"}),
+    "camera.stereo": (semantic_mapper.drivers.stereo.config.Config, {}),
+    "camera.realsense": (semantic_mapper.drivers.realsense.config.Config, {}),
     "camera.oak": (semantic_mapper.drivers.oak.config.Config, {}),
     **{f"poses.{kind}": (struct, {}) for kind, struct in semantic_mapper.drivers.poses.config.KINDS.items()},
     "poses.checks": (semantic_mapper.drivers.poses.config.PoseChecks, {}),

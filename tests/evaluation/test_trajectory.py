@@ -8,6 +8,7 @@ from semantic_mapper.errors import ShapeError
 from semantic_mapper.evaluation.trajectory import (
     absolute_trajectory_error,
     align_rigid,
+    align_similar,
     relative_pose_error,
     rotation_angle,
 )
@@ -46,6 +47,14 @@ def test_alignment_is_the_best_there_is(rng: np.random.Generator) -> None:
     assert np.allclose(best[:3, :3] @ best[:3, :3].T, np.eye(3)) and np.linalg.det(best[:3, :3]) > 0
     for _ in range(300):
         assert cost(best @ rigid(tuple(rng.normal(0, 0.02, 3)), tuple(rng.normal(0, 0.02, 3)))) >= cost(best)
+
+
+def test_alignment_with_scale_finds_the_similarity_and_refuses_a_single_place(rng: np.random.Generator) -> None:
+    a, T = rng.normal(size=(30, 3)), rigid((0.3, -2.0, 1.1), (5, -3, 2))
+    found, scale = align_similar(a, 2.5 * a @ T[:3, :3].T + T[:3, 3])
+    assert scale == pytest.approx(2.5) and np.allclose(found, T)
+    with pytest.raises(ShapeError, match="not all one"):
+        align_similar(np.ones((5, 3)), a[:5])
 
 
 def test_alignment_does_not_mirror() -> None:

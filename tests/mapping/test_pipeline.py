@@ -201,7 +201,7 @@ def test_a_first_frame_with_a_bad_pose_does_not_fix_the_camera_size():
 
 def test_frames_without_depth_are_rendered_and_fused_from_what_the_field_sees():
     # Untrained weights guess the depth of a view without depth at random, so only views with depth are sources here.
-    pipeline = make_pipeline(keyframes={"use_current_view": False, "translation_m": 0.02})
+    pipeline = make_pipeline(keyframes={"use_current_view": False, "translation_m": 0.02}, depth={"source": "sensor"})
     frames = tiny_frames()
     for frame in frames[:3]:
         pipeline.step(frame)

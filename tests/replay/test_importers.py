@@ -249,19 +249,18 @@ def test_formats_are_told_apart(folder: Path, tum: Path, scannet: Path, tmp_path
     (tmp_path / "log.mcap").touch()
     for src, complaint in (
         ("nothing", "no recording of a known format"),
-        (".", "holds recordings; name one of them: .*desk, .*kitchen, .*scene0000_00"),
+        (".", "holds recordings; name one of them: .*bag, .*day.bag, .*desk, .*kitchen, .*scene0000_00"),
         ("half", "nearest to a recording of format 'folder', but lacks intrinsics.json"),
-        ("bag", "is a ROS 2 bag"),
-        ("day.bag", "is a ROS 1 bag"),
-        ("film.MP4", "is a video, which has no poses"),
+        ("film.MP4", "is a film, which has no poses"),
         ("day.zip", "is packed; unpack it"),
-        ("no", "no such folder"),
+        ("no", "no such file or folder"),
         ("log.mcap", "nor a log of semantic-mapper"),
     ):
         with pytest.raises(ImportSourceError, match=complaint):
             detect_format(tmp_path / src)
-    with pytest.raises(ImportSourceError, match="no format 'rosbag'"):
-        import_recording(folder, tmp_path / "x.mcap", "rosbag")
+    assert [detect_format(tmp_path / src) for src in ("bag", "day.bag")] == ["rosbag", "rosbag"]
+    with pytest.raises(ImportSourceError, match="no format 'film'"):
+        import_recording(folder, tmp_path / "x.mcap", "film")
 
 
 def test_a_tum_sequence_gets_matched_depth_and_interpolated_poses(tum: Path) -> None:

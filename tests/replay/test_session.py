@@ -24,7 +24,7 @@ from semantic_mapper.replay.evaluate.methods import MAP, Opinion, baseline_predi
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.replay.session import SNAPSHOTS, MapSession, open_recording
 from semantic_mapper.replay.stats import LatencyHistogram
-from semantic_mapper.types import PosedFrame
+from semantic_mapper.types import MapUpdate, PosedFrame
 from tests.small import SMALL_ENCODER, tiny_config, tiny_field, tiny_frames
 
 
@@ -37,8 +37,8 @@ def weights(tmp_path):
     return tmp_path / "w.safetensors"
 
 
-def run(weights, frames, rerun=None, **options):
-    bundle = Mapper.load(weights, tiny_config())
+def run(weights, frames, rerun=None, depth="auto", **options):
+    bundle = Mapper.load(weights, tiny_config(depth={"source": depth}))
     recording = open_recording(rerun, bundle.pipeline)
     session = MapSession(bundle, stream_labels=ROOMS, source="test", rerun=recording, **options)
     for frame in frames:
@@ -92,18 +92,46 @@ def test_the_first_frame_which_may_compile_kernels_does_not_count_in_the_percent
 
 
 @pytest.mark.parametrize(
-    ("measured", "row", "line"),
+    ("depth", "measured", "source", "row", "line"),
     [
-        (6, "sensor", ""),
-        (3, "rendered by the field for 50.0 % of the frames", "for 50 % of the frames"),
-        (0, "rendered by the field (no depth sensor)", "rendered by the field (no depth sensor)"),
+        ("sensor", 6, "sensor", "sensor", ""),
+        (
+            "sensor",
+            3,
+            "mixed",
+            "rendered by the field for 50.0 % of the frames",
+            "rendered by the field for 50 % of the frames",
+        ),
+        (
+            "sensor",
+            0,
+            "rendered",
+            "rendered by the field (no depth sensor)",
+            "rendered by the field for 100 % of the frames",
+        ),
+        ("auto", 6, "sensor", "sensor", ""),
+        (
+            "auto",
+            3,
+            "mixed",
+            "computed from the pictures for 50.0 % of the frames",
+            "computed from the pictures for 50 % of the frames",
+        ),
+        (
+            "auto",
+            0,
+            "computed",
+            "computed from the pictures (no depth sensor)",
+            "computed from the pictures for 100 % of the frames",
+        ),
     ],
 )
 def test_summary_table_notes_and_picture_say_where_depth_comes_from(
-    tmp_path, weights, monkeypatch, measured, row, line
+    tmp_path, weights, monkeypatch, depth, measured, source, row, line
 ):
     frames = tiny_frames()
-    session = run(weights, [*frames[:measured], *(replace(f, depth_m=None) for f in frames[measured:])])
+    given = [*frames[:measured], *(replace(f, depth_m=None) for f in frames[measured:])]
+    session = run(weights, given, depth=depth)
     drawn = []
 
     def draw(strips, *_, subtitle, **__):
@@ -112,18 +140,22 @@ def test_summary_table_notes_and_picture_say_where_depth_comes_from(
 
     monkeypatch.setattr(artifacts, "draw_overview", draw)
     summary = session.finish(tmp_path / "out")
-    assert summary["frames"]["without_depth"] == 6 - measured
-    assert summary["depth"] == {
-        "source": {6: "sensor", 3: "mixed", 0: "rendered"}[measured],
-        "rendered_fraction": 1 - measured / 6,
-    }
+    without = 1 - measured / 6
+    computed = depth == "auto"
+    assert summary["frames"]["without_depth"] == (0 if computed else 6 - measured)
+    said = summary["depth"]
+    assert said["source"] == source
+    assert (said["rendered_fraction"], said["computed_fraction"]) == ((0, without) if computed else (without, 0))
+    assert computed or said["too_little_motion"] == 0
     table = summary_table({"run": summary})
     cells = dict(zip(*(column.cells for column in table.columns), strict=True))
     assert cells["depth"] == row
-    assert any("rendered by the field" in note for note in notes(summary)) == (measured < 6)
+    how = "computed from the pictures" if computed else "rendered by the field"
+    assert any(how in note for note in notes(summary)) == (measured < 6)
     ((strips, subtitle),) = drawn
-    assert line in subtitle and ("rendered" in subtitle) == bool(line)
-    assert [strip.depth_rendered for strip in strips] == [frames[0].depth_m is None or measured == 0, measured < 6]
+    assert line in subtitle and (how in subtitle) == bool(line)
+    last = measured < 6 and not computed
+    assert [strip.depth_rendered for strip in strips] == [last and measured == 0, last]
 
 
 def _draw_nothing_but_tell(subtitles: list[str]):
@@ -139,11 +171,14 @@ def test_a_nearly_empty_map_is_plainly_said_so_with_the_reason(tmp_path, weights
     monkeypatch.setattr(artifacts, "draw_overview", _draw_nothing_but_tell(drawn))
     monkeypatch.setattr(artifacts, "MIN_POINTS_A_BLOCK", 1000)
     frames = tiny_frames()
-    for name, given, why in (
-        ("blind", [replace(f, depth_m=None) for f in frames], "have no sensor depth"),
-        ("measured", frames, "check depth_scale, the intrinsics and the poses"),
+    without = [replace(f, depth_m=None) for f in frames]
+    for name, depth, given, why in (
+        ("rendered", "sensor", without, "have no sensor depth, and depth that the field renders"),
+        ("still", "auto", [replace(f, T_world_camera=frames[0].T_world_camera) for f in without], "move it sideways"),
+        ("computed", "auto", without, "poses that are exact"),
+        ("measured", "auto", frames, "check depth_scale, the intrinsics and the poses"),
     ):
-        summary = run(weights, given).finish(tmp_path / name)
+        summary = run(weights, given, depth=depth).finish(tmp_path / name)
         said = summary["map"]["nearly_empty"]
         assert said.startswith("the map is nearly empty: ") and why in said
         assert f"warning: {said}" in notes(summary)
@@ -203,7 +238,8 @@ def test_scores_are_those_of_the_rendered_labels(weights):
     session = MapSession(Mapper.load(weights, tiny_config()), stream_labels=ROOMS)
     right = counted = 0
     for frame in frames:
-        update = session.process(frame)
+        (update,) = session.process(frame)
+        assert isinstance(update, MapUpdate)
         if frame.stamp_ns != frames[1].stamp_ns:
             labelled = frame.label != ROOMS.ignore_id
             right += int((update.label == frame.label)[labelled].sum())

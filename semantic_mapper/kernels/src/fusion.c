@@ -93,10 +93,11 @@ typedef struct {
     FusionLimits limits;
     F32 depth; /* (H, W) metres */
     U8 rgb;    /* (H, W, 3) */
-    F32 trust; /* (H, W) weight of each depth, or (0, 0): 1 */
+    F32 trust; /* (H, W) fraction of `look` that each depth weighs, or (0, 0): 1 */
     Votes votes;
     F32 dither; /* see evidence.h */
     int64_t moment;
+    double look, weight_cap; /* what one depth weighs, and what all of its kind together may */
 } FuseArguments;
 
 static void fuse_block(const FuseArguments *a, int64_t block, const VoxelOffsets *offsets) {
@@ -104,6 +105,7 @@ static void fuse_block(const FuseArguments *a, int64_t block, const VoxelOffsets
     const int32_t *key = buffers->keys.data + 3 * block;
     float truncation = (float)a->limits.truncation, band = (float)a->limits.vote_band;
     float cap = (float)a->limits.max_weight;
+    float look = (float)a->look, weight_cap = (float)a->weight_cap;
     bool weighted = a->trust.shape[0] > 0;
     int64_t classes = a->votes.log_p.shape[1];
     uint64_t seed = dither_seed(key, a->moment);
@@ -113,11 +115,13 @@ static void fuse_block(const FuseArguments *a, int64_t block, const VoxelOffsets
     for (int64_t k = 0; k < count; k++) {
         int64_t voxel = found.voxel[k], pixel = found.pixel[k], at = block * BLOCK_VOXELS + voxel;
         float *tsdf = buffers->tsdf.data + at, *color = buffers->color.data + 3 * at;
-        float old = buffers->weight.data[at], new = weighted ? a->trust.data[pixel] : 1.0f;
-        float fraction = 1.0f / (old + new);
-        *tsdf = (old * *tsdf + new * min_f(found.distance[k] / truncation, 1.0f)) * fraction;
-        for (int c = 0; c < 3; c++) color[c] = (old * color[c] + new * a->rgb.data[3 * pixel + c]) * fraction;
-        buffers->weight.data[at] = min_f(old + new, cap);
+        float old = buffers->weight.data[at], new = weighted ? look * a->trust.data[pixel] : look;
+        if (look == MEASURED || old < MEASURED) { /* what is computed leaves alone what was measured */
+            float fraction = 1.0f / (old + new);
+            *tsdf = (old * *tsdf + new * min_f(found.distance[k] / truncation, 1.0f)) * fraction;
+            for (int c = 0; c < 3; c++) color[c] = (old * color[c] + new * a->rgb.data[3 * pixel + c]) * fraction;
+            buffers->weight.data[at] = min_f(old + new, weight_cap);
+        }
         float weight = a->votes.weights.data[pixel];
         if (weight > 0 && fabsf(found.distance[k]) <= band)
             add_vote(buffers, at, a->votes.log_p.data + a->votes.rows.data[pixel] * classes, weight, cap,

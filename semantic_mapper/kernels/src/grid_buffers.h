@@ -8,6 +8,10 @@
 #define MAX_CLASSES 256   /* class ids are bytes */
 #define LARGEST_STEP 0.95 /* of the TSDF: two neighbours that differ by more straddle a depth edge, not a surface */
 
+/* Weights of mapping/fusion/depth_trust.py: from the first on a surface was measured, up to the second computed. */
+#define MEASURED 1.0f
+#define COMPUTED_CAP (31.0f / 32.0f)
+
 typedef struct {
     I32 keys;          /* (capacity, 3) block coordinates */
     F32 tsdf;          /* (capacity, 512) signed distance over truncation, -1 to 1 */

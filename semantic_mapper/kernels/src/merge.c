@@ -128,13 +128,14 @@ static void add_voxel(const GridBuffers *buffers, int64_t at, const BlockValues 
     double mine = buffers->weight.data[at], theirs = added->weight.data[from];
     if (theirs > 0) {
         double weight = mine + theirs;
+        double most = mine < MEASURED && theirs < MEASURED ? COMPUTED_CAP : cap;
         buffers->tsdf.data[at] =
             (float)((mine * buffers->tsdf.data[at] + theirs * added->tsdf.data[from]) / weight);
         for (int c = 0; c < 3; c++) {
             float *color = buffers->color.data + 3 * at + c;
             *color = (float)((mine * *color + theirs * added->color.data[3 * from + c]) / weight);
         }
-        buffers->weight.data[at] = (float)min_d(weight, cap);
+        buffers->weight.data[at] = (float)min_d(weight, most);
     }
     double old = buffers->votes.data[at], votes = old + (double)added->votes.data[from];
     if (!(added->votes.data[from] > 0)) return;

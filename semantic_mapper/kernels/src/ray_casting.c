@@ -15,6 +15,7 @@ typedef struct {
     U8 rgb;         /* (H, W, 3) */
     I64 channel;    /* (H, W) */
     F32 confidence; /* (H, W) */
+    U8 measured;    /* (H, W) */
 } CastViewArguments;
 
 KERNEL(cast_view_rows, CastViewArguments) {
@@ -34,7 +35,7 @@ KERNEL(cast_view_rows, CastViewArguments) {
             point_at(origin, d, z, p);
             int64_t at = v * a->depth.shape[1] + u;
             a->channel.data[at] = read_point(p, &a->index, &a->buffers, a->vote_discount, a->unknown_below,
-                                             a->rgb.data + 3 * at, &confidence);
+                                             a->rgb.data + 3 * at, &confidence, a->measured.data + at);
             a->depth.data[at] = (float)z;
             a->confidence.data[at] = (float)confidence;
         }

@@ -45,13 +45,15 @@ ALWAYS_INLINE double sample_tsdf(const double *p, const BlockIndex *index, const
     return fraction_sum > 0 ? total / fraction_sum : NOT_OBSERVED;
 }
 
-/* Interpolates color (3,) and evidence (L,) at a point; returns the interpolated votes. */
+/* Interpolates color (3,) and evidence (L,) at a point, and finds the least weight around it; returns the interpolated
+ * votes. */
 static inline double gather(const double *p, const BlockIndex *index, const GridBuffers *buffers, double *color,
-                            double *evidence) {
+                            double *evidence, float *least_weight) {
     int64_t classes = buffers->evidence.shape[2], itemsize = buffers->evidence.itemsize;
     int64_t x0 = floor_int(p[0]), y0 = floor_int(p[1]), z0 = floor_int(p[2]);
     double fx = p[0] - (double)x0, fy = p[1] - (double)y0, fz = p[2] - (double)z0;
     double color_sum = 0.0, vote_sum = 0.0, votes = 0.0;
+    *least_weight = INFINITY;
     for (int c = 0; c < 3; c++) color[c] = 0.0;
     for (int64_t c = 0; c < classes; c++) evidence[c] = 0.0;
     for (int corner = 0; corner < 8; corner++) {
@@ -63,6 +65,7 @@ static inline double gather(const double *p, const BlockIndex *index, const Grid
         int64_t at = block * BLOCK_VOXELS + voxel_in_block(x, y, z);
         if (buffers->weight.data[at] > 0) {
             color_sum += fraction;
+            *least_weight = min_f(*least_weight, buffers->weight.data[at]);
             for (int c = 0; c < 3; c++) color[c] += fraction * (double)buffers->color.data[3 * at + c];
         }
         float voxel_votes = buffers->votes.data[at];
@@ -108,11 +111,15 @@ static inline int64_t decide(const void *evidence, int64_t itemsize, int64_t cla
     return *confidence < unknown_below ? -1 : best;
 }
 
-/* Channel and confidence of a point; writes its color to `rgb` (3,). At most MAX_CLASSES classes. */
+/* Channel and confidence of a point; writes its color to `rgb` (3,) and whether all around it was measured. At most
+ * MAX_CLASSES classes. */
 static inline int64_t read_point(const double *p, const BlockIndex *index, const GridBuffers *buffers,
-                                 double vote_discount, double unknown_below, uint8_t *rgb, double *confidence) {
+                                 double vote_discount, double unknown_below, uint8_t *rgb, double *confidence,
+                                 uint8_t *measured) {
     double color[3], evidence[MAX_CLASSES];
-    double votes = gather(p, index, buffers, color, evidence);
+    float least_weight;
+    double votes = gather(p, index, buffers, color, evidence, &least_weight);
+    *measured = least_weight >= MEASURED && least_weight < INFINITY;
     for (int c = 0; c < 3; c++) rgb[c] = to_byte(color[c]);
     return decide(evidence, sizeof(double), buffers->evidence.shape[2], votes, vote_discount, unknown_below, confidence);
 }

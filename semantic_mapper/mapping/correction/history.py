@@ -108,7 +108,7 @@ class FrameHistory:
             self._database.execute("PRAGMA journal_mode = OFF")
             self._database.execute(
                 "CREATE TABLE frames (number INTEGER PRIMARY KEY, crc INTEGER, "
-                "color BLOB, depth BLOB, probabilities BLOB, known BLOB)"
+                "color BLOB, depth BLOB, probabilities BLOB, known BLOB, sigma BLOB)"
             )
         except sqlite3.Error as error:
             raise MapError(
@@ -164,7 +164,7 @@ class FrameHistory:
                 self._database.execute("DELETE FROM frames WHERE number >= ? AND number < ?", (self._erased, until))
                 self._erased = until
                 self._database.execute(
-                    "INSERT INTO frames VALUES (?, ?, ?, ?, ?, ?)", (number, _checksum(blobs), *blobs)
+                    "INSERT INTO frames VALUES (?, ?, ?, ?, ?, ?, ?)", (number, _checksum(blobs), *blobs)
                 )
         except sqlite3.Error as error:
             raise MapError(
@@ -199,7 +199,8 @@ class FrameHistory:
         try:
             with self._lock:
                 row = self._database.execute(
-                    "SELECT crc, color, depth, probabilities, known FROM frames WHERE number = ?", (entry.number,)
+                    "SELECT crc, color, depth, probabilities, known, sigma FROM frames WHERE number = ?",
+                    (entry.number,),
                 ).fetchone()
         except sqlite3.Error as error:
             raise MapError(f"{where} cannot be read: {error}") from error
@@ -236,11 +237,12 @@ def _pack(fused: FusedFrame) -> tuple[bytes, ...]:
         pack_floats(fused.rendered_depth_m) if depth is None else pack_depth(depth),
         pack_floats(fused.probabilities),
         pack_mask(fused.known),
+        b"" if fused.frame.depth_sigma_m is None else pack_floats(fused.frame.depth_sigma_m),
     )
 
 
 def _unpack(entry: FrameEntry, T_world_camera: Float64, blobs: tuple[bytes, ...]) -> FusedFrame:
-    color, depth, probabilities, known = blobs
+    color, depth, probabilities, known, sigma = blobs
     height, width = entry.intrinsics.height, entry.intrinsics.width
     coarse = entry.shape[:2]
     return FusedFrame(
@@ -253,6 +255,7 @@ def _unpack(entry: FrameEntry, T_world_camera: Float64, blobs: tuple[bytes, ...]
             label=None,
             intrinsics=entry.intrinsics,
             T_world_camera=T_world_camera,
+            depth_sigma_m=unpack_floats(sigma, (height, width)) if sigma else None,
         ),
         probabilities=unpack_floats(probabilities, entry.shape),
         known=unpack_mask(known, *coarse),

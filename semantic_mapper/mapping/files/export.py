@@ -19,7 +19,8 @@ SurfaceT = TypeVar("SurfaceT", MapPoints, MapMesh)
 def sure_points(points: MapPoints, min_confidence: float) -> MapPoints:
     """The points whose label is at least so sure; all of them for 0."""
     keep = points.confidence >= min_confidence
-    return MapPoints(points.xyz[keep], points.rgb[keep], points.label[keep], points.confidence[keep])
+    measured = None if points.measured is None else points.measured[keep]
+    return MapPoints(points.xyz[keep], points.rgb[keep], points.label[keep], points.confidence[keep], measured)
 
 
 def sure_faces(mesh: MapMesh, min_confidence: float) -> MapMesh:
@@ -29,7 +30,8 @@ def sure_faces(mesh: MapMesh, min_confidence: float) -> MapMesh:
     faces = mesh.faces[(mesh.confidence >= min_confidence)[mesh.faces].all(axis=1)]
     used, corners = np.unique(faces, return_inverse=True)
     faces = corners.reshape(-1, 3).astype(np.int32)
-    return MapMesh(mesh.vertices[used], faces, mesh.rgb[used], mesh.label[used], mesh.confidence[used])
+    measured = None if mesh.measured is None else mesh.measured[used]
+    return MapMesh(mesh.vertices[used], faces, mesh.rgb[used], mesh.label[used], mesh.confidence[used], measured)
 
 
 def colored(surface: SurfaceT, label_set: LabelSet, by: ColorBy) -> SurfaceT:

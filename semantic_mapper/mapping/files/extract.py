@@ -127,10 +127,8 @@ def join_meshes(parts: Sequence[MapMesh]) -> MapMesh:
     vertices, first, inverse = np.unique(corners, axis=0, return_index=True, return_inverse=True)
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)])
     faces = _in_order(inverse.reshape(-1)[faces])
-    rgb, label, confidence = (
-        np.concatenate([getattr(part, name) for part in parts])[first] for name in ("rgb", "label", "confidence")
-    )
-    return MapMesh(vertices, faces, rgb, label, confidence)
+    read = ("rgb", "label", "confidence", "measured")
+    return MapMesh(vertices, faces, *(np.concatenate([getattr(part, name) for part in parts])[first] for name in read))
 
 
 def _weld(triangles: Float32) -> tuple[Float32, NDArray[np.int32]]:

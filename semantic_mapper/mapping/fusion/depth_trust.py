@@ -1,9 +1,14 @@
-"""How far a rendered depth may be believed: a measurement it is not.
+"""How far depth may be believed that no sensor measured.
+
+Depth of a sensor weighs ``MEASURED`` in the TSDF. Computed depth (from the pictures, or rendered by a field) weighs at
+most ``COMPUTED_LOOK``, and all of it together at most ``COMPUTED_CAP``: so one measurement outweighs it, and the weight
+of a voxel says whether its surface was measured (from ``MEASURED`` on) or computed. Computed depth never changes what
+was measured.
 
 A field's depth of a view is a mean along each ray. Where its samples disagree, at edges and where it guesses, it leaves
-the smooth surface of its neighbours; and where the map has a surface, it has to lie near that. So a pixel's weight in
-the TSDF is at most ``MOST_TRUST`` of a measurement, falls with both differences, and is nothing where little would be
-left. Beyond the map a field mostly guesses: what it says there weighs so little that many looks have to agree.
+the smooth surface of its neighbours; and where the map has a surface, it has to lie near that. So its trust falls with
+both differences, and is nothing where little would be left. Beyond the map a field mostly guesses: what it says there
+weighs so little that many looks have to agree.
 """
 
 from __future__ import annotations
@@ -12,9 +17,13 @@ import numpy as np
 
 from semantic_mapper.types import Float32
 
-MOST_TRUST = 0.5  # of a measurement's weight
-GUESS_TRUST = 0.05  # where the map has no surface yet
-LEAST_TRUST = 0.025  # below, nothing is fused
+MEASURED = 1.0
+COMPUTED_LOOK = 1 / 32
+COMPUTED_CAP = 31 / 32
+SURFACE_WEIGHT = 2 * COMPUTED_LOOK  # from which on a voxel is part of the surface: two looks have to agree
+MOST_TRUST = 1.0  # of a rendered depth
+GUESS_TRUST = 0.1  # where the map has no surface yet
+LEAST_TRUST = 0.05  # below, nothing is fused
 ROUGHNESS = 0.003  # fraction of z by which a pixel may leave the line between its neighbours: trust falls to 1 / e
 
 

@@ -18,6 +18,7 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.fusion.allocation import Camera
+from semantic_mapper.mapping.fusion.depth_trust import COMPUTED_CAP, COMPUTED_LOOK, MEASURED
 from semantic_mapper.mapping.fusion.evidence import DITHER
 from semantic_mapper.mapping.storage.grid_buffers import GridBuffers
 from semantic_mapper.types import Bool, Float32, Int32, Int64, UInt8
@@ -125,6 +126,8 @@ def fuse_blocks(
     trust: Float32,
     votes: Votes,
     moment: int,
+    *,
+    measured: bool = True,
 ) -> None:
     """Fuse one frame into blocks, in place.
 
@@ -135,11 +138,13 @@ def fuse_blocks(
         limits: Of the map.
         depth: (H, W) float32 metres.
         rgb: (H, W, 3) uint8.
-        trust: (H, W) float32 weight of each depth, or (0, 0) where all are measured: 1.
+        trust: (H, W) float32 fraction of its full weight that each depth counts, or (0, 0): 1.
         votes: Of the frame.
         moment: A number that changes from frame to frame; see ``evidence``.
+        measured: Whether a sensor measured the depth; see ``depth_trust``.
     """
-    args = (indices, buffers, camera, limits, depth, rgb, trust, votes, DITHER, moment)
+    look, cap = (MEASURED, limits.max_weight) if measured else (COMPUTED_LOOK, COMPUTED_CAP)
+    args = (indices, buffers, camera, limits, depth, rgb, trust, votes, DITHER, moment, look, cap)
     _fuse_frame_into_blocks(len(indices), *args)
 
 
@@ -188,4 +193,6 @@ def _fuse_frame_into_blocks(
     votes: Votes,
     dither: Float32,
     moment: int,
+    look: float,
+    weight_cap: float,
 ) -> None: ...

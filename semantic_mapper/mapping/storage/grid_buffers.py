@@ -24,7 +24,7 @@ class GridBuffers(NamedTuple):
     Args:
         keys: (capacity, 3) int32 block coordinates.
         tsdf: (capacity, 512) float32, signed distance over truncation in [-1, 1].
-        weight: (capacity, 512) float32, number of depth measurements (capped).
+        weight: (capacity, 512) float32, number of depth measurements (capped); below 1 the depth was computed.
         color: (capacity, 512, 3) float32 in 0..255.
         evidence: (capacity, 512, L), sum (float32) or mean (int16) of log probabilities by weight; see ``evidence``.
         votes: (capacity, 512) float32, sum of vote weights.

@@ -19,7 +19,7 @@ from semantic_mapper.mapping.fusion.allocation import Camera, blocks_in_view, vi
 from semantic_mapper.mapping.storage.block_grid import BlockGrid
 from semantic_mapper.mapping.storage.block_index import BlockIndex, unpack_keys
 from semantic_mapper.mapping.storage.grid_buffers import GridBuffers
-from semantic_mapper.types import CameraIntrinsics, Float32, Int64, UInt8
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Int64, UInt8
 
 
 class Window(NamedTuple):
@@ -41,7 +41,7 @@ class Window(NamedTuple):
 
 def cast_view(
     grid: BlockGrid, camera: Camera, intrinsics: CameraIntrinsics, config: VoxelMapConfig
-) -> tuple[Float32, UInt8, NDArray[np.int64], Float32]:
+) -> tuple[Float32, UInt8, NDArray[np.int64], Float32, Bool]:
     """See the map through a camera, up to ``depth_max_m`` away.
 
     What it may see and is on disk comes back into memory; where there is no room for all of it, for a part of the image
@@ -49,11 +49,12 @@ def cast_view(
 
     Returns:
         depth (H, W) float32 metres (0 = miss), rgb (H, W, 3) uint8, channel (H, W) int64 (-1 = unknown),
-        confidence (H, W) float32.
+        confidence (H, W) float32, measured (H, W) bool.
     """
     size = (intrinsics.height, intrinsics.width)
     depth, confidence = np.zeros(size, np.float32), np.zeros(size, np.float32)
     rgb, channel = np.zeros((*size, 3), np.uint8), np.full(size, -1, np.int64)
+    measured = np.zeros(size, np.bool_)
     for window, seen in _windows(grid, camera, intrinsics, config):
         if len(seen):
             grid.page_in(seen)
@@ -72,8 +73,9 @@ def cast_view(
             rgb,
             channel,
             confidence,
+            measured,
         )
-    return depth, rgb, channel, confidence
+    return depth, rgb, channel, confidence, measured
 
 
 def _windows(
@@ -115,6 +117,7 @@ def _cast_view_rows(
     rgb: UInt8,
     channel: Int64,
     confidence: Float32,
+    measured: Bool,
 ) -> None:
     """Fill the rows of a window of what ``cast_view`` returns."""
     ...

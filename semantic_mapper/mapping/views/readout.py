@@ -20,7 +20,7 @@ from semantic_mapper.kernels import kernel, parallel_kernel
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.storage.block_index import BlockIndex
 from semantic_mapper.mapping.storage.grid_buffers import GridBuffers
-from semantic_mapper.types import Float32, Float64, Int64, UInt8
+from semantic_mapper.types import Bool, Float32, Float64, Int64, UInt8
 
 
 def read_points(
@@ -30,8 +30,8 @@ def read_points(
     label_set: LabelSet,
     vote_discount: float,
     unknown_below: float,
-) -> tuple[UInt8, UInt8, Float32]:
-    """Colour, label and confidence at points.
+) -> tuple[UInt8, UInt8, Float32, Bool]:
+    """Colour, label and confidence at points, and whether their surface was measured.
 
     Args:
         voxels: (N, 3) float64 world points in units of voxels.
@@ -41,13 +41,15 @@ def read_points(
         unknown_below: Confidence below which a label is the ignore id.
 
     Returns:
-        rgb (N, 3) uint8, label (N,) uint8 ids (ignore id = unknown), confidence (N,) float32 (0 = no votes).
+        rgb (N, 3) uint8, label (N,) uint8 ids (ignore id = unknown), confidence (N,) float32 (0 = no votes), measured
+        (N,) bool, False where depth of a voxel around was computed or there is none.
     """
     rgb, channel = np.zeros((len(voxels), 3), np.uint8), np.full(len(voxels), -1, np.int64)
-    confidence = np.zeros(len(voxels), np.float32)
+    confidence, measured = np.zeros(len(voxels), np.float32), np.zeros(len(voxels), np.bool_)
     points = np.ascontiguousarray(voxels)
-    _read_map_points(len(points), points, index, buffers, vote_discount, unknown_below, rgb, channel, confidence)
-    return rgb, label_set.to_ids(channel), confidence
+    decision = (vote_discount, unknown_below)
+    _read_map_points(len(points), points, index, buffers, *decision, rgb, channel, confidence, measured)
+    return rgb, label_set.to_ids(channel), confidence, measured
 
 
 def decide(evidence: NDArray[Any], votes: float, vote_discount: float, unknown_below: float = 0.0) -> tuple[int, float]:
@@ -83,6 +85,7 @@ def _read_map_points(
     rgb: UInt8,
     channel: Int64,
     confidence: Float32,
+    measured: Bool,
 ) -> None:
-    """Fill rgb (N, 3), channel (N,), -1 = unknown, and confidence (N,) of points (N, 3)."""
+    """Fill rgb (N, 3), channel (N,), -1 = unknown, confidence (N,) and measured (N,) of points (N, 3)."""
     ...

@@ -17,6 +17,9 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.rate_controller import RateController
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
+COMPUTED_GUIDED = 8  # samples round a depth prior that was computed
+COMPUTED_SIGMA = 0.05  # half width of their interval, as a fraction of depth
+
 _log = get_logger(__name__)
 
 
@@ -71,7 +74,14 @@ class ViewRenderer:
             self._rate_controller.note(render_ms, other_ms, *self._last)
 
     def render(
-        self, sources: EncodedViews, intrinsics: CameraIntrinsics, T_world_camera: Float64, prior_m: Float32, rgb: UInt8
+        self,
+        sources: EncodedViews,
+        intrinsics: CameraIntrinsics,
+        T_world_camera: Float64,
+        prior_m: Float32,
+        rgb: UInt8,
+        *,
+        computed: bool = False,
     ) -> RenderedView:
         """Render one view.
 
@@ -81,6 +91,7 @@ class ViewRenderer:
             T_world_camera: (4, 4).
             prior_m: (h, w) float32 depth prior, 0 = none.
             rgb: (h, w, 3) uint8 colours of the view.
+            computed: Whether the prior was computed from pictures: it may be farther off than a sensor's.
         """
         fraction, sampling = self._config.ray_fraction, self._sampling
         if self._rate_controller is not None:
@@ -89,6 +100,12 @@ class ViewRenderer:
         if blind:
             sampling = msgspec.structs.replace(
                 sampling, guided=max(self._config.samples_without_depth, sampling.guided)
+            )
+        elif computed:
+            sampling = msgspec.structs.replace(
+                sampling,
+                guided=max(COMPUTED_GUIDED, sampling.guided),
+                guided_sigma=max(COMPUTED_SIGMA, sampling.guided_sigma),
             )
         samples = 0
         if isinstance(self._field, Sampled) and sampling.mode == "streaming":

@@ -37,7 +37,7 @@ def test_a_section_of_a_launch_file_becomes_a_pose_source(text: str, kind: type)
 
 
 def test_every_kind_has_its_name() -> None:
-    assert set(KINDS) == {"device", "fixed", "topic", "board", "rgbd"}
+    assert set(KINDS) == {"device", "fixed", "topic", "board", "rgbd", "visual"}
     for name, kind in KINDS.items():
         assert name in str(kind.__annotations__["kind"])
 
@@ -45,7 +45,7 @@ def test_every_kind_has_its_name() -> None:
 @pytest.mark.parametrize(
     ("config", "reason"),
     [
-        ({}, "kind must be one of device, fixed, topic, board, rgbd, got None"),
+        ({}, "kind must be one of device, fixed, topic, board, rgbd, visual, got None"),
         ({"kind": "bord"}, "did you mean 'board'"),
         ({"kind": "topic"}, "endpoint"),
         ({"kind": "board", "column": 3}, "did you mean `columns`"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -164,12 +165,44 @@ def test_npz_needs_no_pickle_and_is_the_same_each_time(tmp_path: Path) -> None:
         write_npz(tmp_path / name, POINTS, LABELS)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     with np.load(tmp_path / "a.npz", allow_pickle=False) as read:
-        for name in POINTS.__slots__:
+        columns = [name for name in POINTS.__slots__ if name != "measured"]
+        for name in columns:
             np.testing.assert_array_equal(read[name], getattr(POINTS, name))
             assert read[name].dtype == getattr(POINTS, name).dtype
         assert read["label_names"].tolist() == ["table", "cup", "wall"] and read["label_ids"].tolist() == [5, 9, 2]
         assert [tuple(c) for c in read["label_colors"]] == list(LABELS.colors)
         assert (int(read["ignore_id"]), str(read["label_set"])) == (0, "three")
+
+
+SOME_COMPUTED = np.array([True, False, False, True])
+
+
+@pytest.mark.parametrize("measured", [None, np.ones(4, np.bool_)])
+def test_points_and_meshes_say_nothing_of_measuring_where_nothing_was_computed(
+    tmp_path: Path, measured: np.ndarray | None
+) -> None:
+    write_npz(tmp_path / "map.npz", replace(POINTS, measured=measured), LABELS)
+    with np.load(tmp_path / "map.npz", allow_pickle=False) as read:
+        assert "measured" not in read.files
+    write_ply(tmp_path / "map.ply", replace(POINTS, measured=measured), LABELS)
+    write_ply(tmp_path / "plain.ply", POINTS, LABELS)
+    assert (tmp_path / "map.ply").read_bytes() == (tmp_path / "plain.ply").read_bytes()
+    write_ply_mesh(tmp_path / "mesh.ply", replace(MESH, measured=measured), LABELS)
+    assert b"measured" not in (tmp_path / "mesh.ply").read_bytes()
+
+
+def test_points_and_meshes_say_what_was_measured_where_something_was_computed(tmp_path: Path) -> None:
+    write_npz(tmp_path / "map.npz", replace(POINTS, measured=SOME_COMPUTED), LABELS)
+    with np.load(tmp_path / "map.npz", allow_pickle=False) as read:
+        assert read["measured"].dtype == np.bool_ and (read["measured"] == SOME_COMPUTED).all()
+    write_ply(tmp_path / "points.ply", replace(POINTS, measured=SOME_COMPUTED), LABELS)
+    write_ply_mesh(tmp_path / "mesh.ply", replace(MESH, measured=SOME_COMPUTED), LABELS)
+    for name in ("points.ply", "mesh.ply"):
+        point = load_open3d().t.io.read_point_cloud(str(tmp_path / name)).point
+        assert point["measured"].numpy().ravel().tolist() == [1, 0, 0, 1]
+        assert (point.positions.numpy() == POINTS.xyz).all() and (point["label"].numpy().ravel() == POINTS.label).all()
+    kept = sure_points(replace(POINTS, measured=SOME_COMPUTED), 0.75)
+    assert kept.measured is not None and kept.measured.tolist() == [True, False]
 
 
 def test_colours_and_confidence_choose_what_is_seen() -> None:

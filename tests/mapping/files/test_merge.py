@@ -12,6 +12,7 @@ from semantic_mapper.geometry import invert_pose, look_at
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.mapping.files import merge
 from semantic_mapper.mapping.files.merge import count_empty
+from semantic_mapper.mapping.fusion.depth_trust import COMPUTED_CAP, MEASURED
 from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.storage.block_store import BlockValues
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -256,7 +257,10 @@ def test_added_voxels_are_those_of_plain_numpy(evidence: str, rng: np.random.Gen
     mine, theirs = before.weight[blocks].astype(float), added.weight.astype(float)
     new = theirs > 0
     weight = np.where(new, mine + theirs, 1.0)
-    np.testing.assert_allclose(buffers.weight[blocks], np.where(new, np.minimum(weight, cap), mine), rtol=1e-6)
+    computed = (mine < MEASURED) & (theirs < MEASURED)  # two computed surfaces do not make a measured one
+    assert (computed & new & (weight > COMPUTED_CAP)).any() and (~computed & (weight > cap)).any()
+    most = np.minimum(weight, np.where(computed, COMPUTED_CAP, cap))
+    np.testing.assert_allclose(buffers.weight[blocks], np.where(new, most, mine), rtol=1e-6)
     for name in ("tsdf", "color"):
         a, b, tail = getattr(before, name)[blocks], getattr(added, name), (..., None) if name == "color" else (...,)
         mean = np.where(new[tail], (mine[tail] * a + theirs[tail] * b) / weight[tail], a)

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import ShapeError
-from semantic_mapper.mapping.fusion.depth_trust import GUESS_TRUST, MOST_TRUST, depth_trust
+from semantic_mapper.mapping.fusion.depth_trust import (
+    COMPUTED_CAP,
+    COMPUTED_LOOK,
+    GUESS_TRUST,
+    MEASURED,
+    MOST_TRUST,
+    SURFACE_WEIGHT,
+    depth_trust,
+)
 from tests.mapping.rendered_views import INTRINSICS, frame, plane_depth, small_map, sure
 
 TRUNCATION_M = 0.08
@@ -25,7 +33,35 @@ def test_a_smooth_surface_where_the_map_has_one_is_trusted_most_and_beyond_it_li
     inner = (slice(2, -2), slice(2, -2))
     np.testing.assert_allclose(trust[inner][:, 90:], MOST_TRUST, rtol=0.02)
     np.testing.assert_allclose(trust[inner][:, :70], GUESS_TRUST, rtol=0.02)
-    assert MOST_TRUST < 1
+
+
+def test_any_number_of_computed_looks_weighs_less_than_one_measurement() -> None:
+    depth = slanted()
+    voxel_map = small_map()
+    for seq in range(40):
+        voxel_map.integrate(frame(seq=seq), depth, None, trust=np.full_like(depth, MOST_TRUST), measured=False)
+        if seq < 2:
+            assert voxel_map.block_state()["weight"].max() == (seq + 1) * COMPUTED_LOOK
+            assert bool(len(voxel_map.points().xyz)) == ((seq + 1) * COMPUTED_LOOK >= SURFACE_WEIGHT)
+    assert voxel_map.block_state()["weight"].max() == COMPUTED_CAP < MEASURED
+    assert not voxel_map.points().measured.any()
+
+
+def test_one_measurement_outweighs_all_that_was_computed_and_is_then_left_alone() -> None:
+    near, far = plane_depth(POSE, (0.0, 0.0, 1.0), 1.0), plane_depth(POSE, (0.0, 0.0, 1.0), 1.04)
+    voxel_map = small_map()
+    for seq in range(40):
+        voxel_map.integrate(frame(seq=seq), near, None, measured=False)
+    voxel_map.integrate(frame(seq=40), far, None)
+    points = voxel_map.points()
+    assert points.measured.mean() > 0.9 and np.median(points.xyz[:, 2]) > 1.02
+    before = voxel_map.block_state()
+    voxel_map.integrate(frame(seq=41, rgb=200), near, None, measured=False)
+    after = voxel_map.block_state()
+    old = before["weight"] >= MEASURED
+    assert old.any()
+    for name in ("tsdf", "weight", "color"):
+        assert before[name][old].tobytes() == after[name][old].tobytes(), name
 
 
 def test_trust_falls_with_distance_from_the_map_to_nothing() -> None:

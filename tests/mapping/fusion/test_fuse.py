@@ -11,6 +11,7 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.geometry import look_at
 from semantic_mapper.mapping.fusion import vote_fusion
 from semantic_mapper.mapping.fusion.allocation import Camera, make_camera
+from semantic_mapper.mapping.fusion.depth_trust import COMPUTED_CAP, COMPUTED_LOOK, MEASURED
 from semantic_mapper.mapping.fusion.evidence import DITHER, PROBABILITY_FLOOR
 from semantic_mapper.mapping.fusion.fuse import Votes, fuse_blocks, make_limits, make_votes, no_votes
 from semantic_mapper.mapping.storage.grid_buffers import GridBuffers
@@ -109,29 +110,45 @@ def copy(buffers: GridBuffers) -> GridBuffers:
 
 @pytest.mark.parametrize("evidence", ["float32", "int16"])
 @pytest.mark.parametrize("trusted", [False, True])
-def test_a_fused_frame_is_that_of_plain_numpy(evidence: str, trusted: bool, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("measured", [False, True])
+def test_a_fused_frame_is_that_of_plain_numpy(
+    evidence: str, trusted: bool, measured: bool, rng: np.random.Generator
+) -> None:
     _, buffers = random_grid(rng, evidence)
     buffers.weight[:] = np.minimum(buffers.weight, 5)
+    few = rng.random(buffers.weight.shape) < 0.5  # looks of computed depth, up to their cap
+    buffers.weight[few & (buffers.weight > 0)] = (
+        rng.integers(1, 32, buffers.weight.shape)[few & (buffers.weight > 0)] / 32
+    )
     before, blocks = copy(buffers), np.array([7, 0, 3, 4, 8], np.int32)
     depth, rgb = some_depth(rng), rng.integers(0, 256, (*SIZE, 3), np.uint8)
     votes = some_votes(rng, depth)
     trust = rng.uniform(0.1, 1, SIZE).astype(np.float32) if trusted else np.empty((0, 0), np.float32)
-    fuse_blocks(blocks, buffers, CAMERA, LIMITS, depth, rgb, trust, votes, 17)
+    fuse_blocks(blocks, buffers, CAMERA, LIMITS, depth, rgb, trust, votes, 17, measured=measured)
     expected, sums = copy(before), sums_of(before).astype(np.float64)
     seen = seen_voxels(before.keys[blocks], depth, LIMITS.truncation)
     seen = seen._replace(at=(blocks[seen.at[0]], seen.at[1]))
     assert len(seen.distance) > 500
-    old, new = before.weight[seen.at], trust[seen.pixel] if trusted else np.float32(1)
-    signed = np.minimum(seen.distance / LIMITS.truncation, 1)
-    expected.tsdf[seen.at] = (old * before.tsdf[seen.at] + new * signed) / (old + new)
-    mixed = old[:, None] * before.color[seen.at] + np.reshape(new, (-1, 1)) * rgb[seen.pixel]
-    expected.color[seen.at] = mixed / np.reshape(old + new, (-1, 1))
-    expected.weight[seen.at] = np.minimum(old + new, LIMITS.max_weight)
+    look, cap = (MEASURED, LIMITS.max_weight) if measured else (COMPUTED_LOOK, COMPUTED_CAP)
+    free = np.ones(len(seen.distance), np.bool_) if measured else before.weight[seen.at] < MEASURED
+    assert free.sum() > 200 and (measured or (~free).sum() > 200)
+    at, pixel = tuple(a[free] for a in seen.at), tuple(a[free] for a in seen.pixel)
+    old, new = before.weight[at], np.float32(look) * (trust[pixel] if trusted else np.float32(1))
+    signed = np.minimum(seen.distance[free] / LIMITS.truncation, 1)
+    expected.tsdf[at] = (old * before.tsdf[at] + new * signed) / (old + new)
+    mixed = old[:, None] * before.color[at] + np.reshape(new, (-1, 1)) * rgb[pixel]
+    expected.color[at] = mixed / np.reshape(old + new, (-1, 1))
+    expected.weight[at] = np.minimum(old + new, cap)
+    assert (expected.weight[at] == cap).any()
     chosen = (votes.weights[seen.pixel] > 0) & (np.abs(seen.distance) <= LIMITS.vote_band)
     assert chosen.sum() > 200
     vote(sums, expected.votes, seen, votes, chosen)
     for name in ("tsdf", "weight", "color", "votes"):
         np.testing.assert_allclose(getattr(buffers, name), getattr(expected, name), rtol=2e-5, atol=2e-5, err_msg=name)
+    kept = np.ones(before.weight.shape, np.bool_)
+    kept[at] = False
+    for name in ("tsdf", "weight", "color"):
+        assert getattr(buffers, name)[kept].tobytes() == getattr(before, name)[kept].tobytes(), name
     # A mean in int16 is within a step of the exact one.
     step = 1.01 * buffers.votes.max() / 3500 if evidence == "int16" else 1e-4
     np.testing.assert_allclose(sums_of(buffers), sums, rtol=1e-5, atol=step)

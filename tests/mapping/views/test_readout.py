@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.labels import make_label_set
+from semantic_mapper.mapping.fusion.depth_trust import MEASURED
 from semantic_mapper.mapping.views.readout import decide, read_points
 from tests.mapping.grids import corners, random_grid, sums_of
 
@@ -54,10 +55,12 @@ def test_points_are_read_as_plain_numpy_reads_them(evidence: str, rng: np.random
     )
     points = rng.uniform(-12, 18, (400, 3))
     points[::5] = np.round(points[::5])  # at voxels: the others count nothing
-    rgb, label, confidence = read_points(points, index, buffers, labels, rho, 0.0)
+    rgb, label, confidence, measured = read_points(points, index, buffers, labels, rho, 0.0)
+    assert 20 < measured.sum() < len(points) - 20
     for n, p in enumerate(points):
         around = [(f, at) for f, at in corners(buffers, p) if f >= 1e-3]
         seen = [(f, at) for f, at in around if buffers.weight[at] > 0]
+        assert measured[n] == (bool(seen) and min(buffers.weight[at] for _, at in seen) >= MEASURED)
         color = sum((f * buffers.color[at].astype(float) for f, at in seen), np.zeros(3)) / (
             sum(f for f, _ in seen) or 1
         )

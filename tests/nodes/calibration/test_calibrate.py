@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import threading
 from collections.abc import Iterator
@@ -16,7 +17,10 @@ from semantic_mapper.drivers.calibrating.config import CalibrationConfig
 from semantic_mapper.drivers.calibrating.solve import solve
 from semantic_mapper.drivers.calibrating.views import BoardView, ViewGatherer
 from semantic_mapper.drivers.calibration import load_calibration, load_mount
+from semantic_mapper.drivers.stereo.calibration import load_stereo
+from semantic_mapper.drivers.stereo.depth import StereoDepth
 from semantic_mapper.errors import CameraError, ConfigError
+from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.nodes.calibration.report import CalibrationSettings, report, report_json, write_files
 from semantic_mapper.nodes.calibration.run import Gathering
 from semantic_mapper.nodes.calibration.sources import parse_sources
@@ -24,7 +28,7 @@ from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
-from tests.drivers.calibrating.boards import BOARD, LENS, shown
+from tests.drivers.calibrating.boards import BOARD, LENS, picture, shown
 from tests.nodes.support import error_line, run, run_here
 from tests.replay.log.test_recording import files_at_most
 
@@ -172,10 +176,54 @@ def test_results_that_do_not_fit_on_the_disk_leave_those_that_were_there(
     assert {file.name for file in tmp_path.iterdir()} <= {"camera.toml", "camera.png"}
 
 
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_pair_that_gives_its_images_side_by_side_becomes_one_file(tmp_path: Path, swapped: bool) -> None:
+    lens = dataclasses.replace(LENS, fx=430.0, fy=428.0, cx=318.0, cy=241.0)
+    T_right_left = np.eye(4)
+    T_right_left[:3, :3] = cv2.Rodrigues(np.radians((0.5, 1.2, -0.4)))[0]
+    T_right_left[:3, 3] = (-0.06, 0.001, 0.002)
+    folder = tmp_path / "pair"
+    folder.mkdir()
+    for seq, (T_left_board, image) in enumerate(shown()):
+        both = [image.rgb, picture(T_right_left @ T_left_board, lens)]
+        cv2.imwrite(str(folder / f"{seq:02d}.png"), np.hstack(both[::-1] if swapped else both))
+    (tmp_path / "board.toml").write_text(BOARD_FILE)
+    code, said = run_here(
+        "calibrate", "--stereo", folder, "--config", tmp_path / "board.toml", "--out", tmp_path / "made"
+    )
+    assert code == 0, said
+    assert {file.name for file in (tmp_path / "made").iterdir()} == {
+        "stereo.toml",
+        "stereo-left.png",
+        "stereo-right.png",
+    }
+    pair = load_stereo(tmp_path / "made" / "stereo.toml")
+    assert pair.swapped is swapped
+    assert abs(pair.left.fx / LENS.fx - 1) < 0.005 and abs(pair.right.fx / lens.fx - 1) < 0.005
+    assert np.abs(pair.T_right_left[:3, 3] - T_right_left[:3, 3]).max() < 0.001
+    apart = pair.T_right_left[:3, :3].T @ T_right_left[:3, :3]
+    assert np.degrees(np.linalg.norm(cv2.Rodrigues(apart)[0])) < 0.2
+    # What counts: how far away a point is that both see, three times as far as the board was shown.
+    point = np.array(((0.2, -0.1, 1.2),))
+    rays = []
+    for truth, known, T in ((LENS, pair.left, np.eye(4)), (lens, pair.right, T_right_left)):
+        turn, shift = cv2.Rodrigues(T[:3, :3])[0], T[:3, 3]
+        seen, _ = cv2.projectPoints(point, turn, shift, camera_matrix(truth), np.array(truth.distortion))
+        rays.append(cv2.undistortPoints(seen, camera_matrix(known), np.array(known.distortion)).reshape(2, 1))
+    found = cv2.triangulatePoints(np.eye(4)[:3], pair.T_right_left[:3], *rays)
+    assert found[2, 0] / found[3, 0] == pytest.approx(1.2, rel=0.03)
+    assert StereoDepth(pair, 640, 0.4, 8.0).baseline_m == pytest.approx(0.06, abs=0.001)
+
+
+def test_a_pair_is_one_device(pictures: Path, tmp_path: Path) -> None:
+    code, said = run_here("calibrate", "--stereo", pictures, pictures, "--out", tmp_path / "made")
+    assert code == 1 and "--stereo calibrates one device" in said and not (tmp_path / "made").exists()
+
+
 def test_what_is_no_source_is_told(pictures: Path, tmp_path: Path) -> None:
     for text, says in (
         ("nowhere.mp4", "neither a folder"),
-        ("v4l3:/dev/video0", "v4l2, opencv, oak"),
+        ("v4l3:/dev/video0", "v4l2, opencv, oak, realsense"),
         ("a b=x", "cannot be the name"),
     ):
         with pytest.raises(ConfigError, match=says):

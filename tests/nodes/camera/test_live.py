@@ -433,3 +433,22 @@ def test_the_launch_file_for_an_oak_is_filled_in_and_fits_driver_and_poses(name:
     config = convert_config(options.camera.config, load_driver("oak").Config, "test")
     assert (config.device, config.fps, config.odometry) == ("169.254.1.222", 20.0, True)  # type: ignore[attr-defined]
     assert read_pose_config(options.camera.poses).kind == "device"
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "expected"),
+    [
+        ("realsense", ["device=0123", "fps=15"], {"device": "0123", "fps": 15, "preset": "high_accuracy"}),
+        ("stereo", ["device=/dev/video1", "calibration=pair.toml"], {"calibration": "pair.toml", "width": 640}),
+    ],
+)
+def test_the_launch_file_for_a_depth_camera_is_filled_in_and_fits_driver_and_poses(
+    kind: str, settings: list[str], expected: dict[str, object]
+) -> None:
+    launch = load_launch(V4L2_LAUNCH.with_name(f"{kind}.toml"), settings, Path("somewhere"))
+    options = launch.options["camera"]
+    assert isinstance(options, CameraOptions) and options.camera is not None and options.camera.kind == kind
+    assert isinstance(options.camera.config, dict) and isinstance(options.camera.poses, dict)
+    config = convert_config(options.camera.config, load_driver(kind).Config, "test")
+    assert {key: getattr(config, key) for key in expected} == expected
+    assert read_pose_config(options.camera.poses).kind == "rgbd"

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import resource
 import socket
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -34,16 +36,37 @@ def test_devices_that_may_not_be_opened_are_bad_and_the_group_is_named(
     assert shut.state == "bad" and str(device) in shut.found and "usermod -aG video" in shut.mend
 
 
-def test_the_rule_for_an_oak_is_looked_for_and_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("examine", "vendor", "rule", "file"),
+    [
+        (doctor_robot.oak, "03e7", doctor_robot.OAK_RULE, "80-movidius.rules"),
+        (doctor_robot.realsense, "8086", doctor_robot.REALSENSE_RULE, "99-realsense.rules"),
+    ],
+)
+def test_the_rule_for_a_depth_camera_is_looked_for_and_given(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    examine: Callable[[], Iterator[Check]],
+    vendor: str,
+    rule: str,
+    file: str,
+) -> None:
     monkeypatch.setattr(doctor_robot, "UDEV_FOLDERS", (tmp_path / "none", tmp_path))
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: True)
     (tmp_path / "10-gone.rules").symlink_to(tmp_path / "nowhere")
     (tmp_path / "20-folder.rules").mkdir()
-    missing = only(doctor_robot.oak())
-    assert missing.state == "note" and 'ATTRS{idVendor}=="03e7"' in missing.mend
-    (tmp_path / "80-movidius.rules").write_text(doctor_robot.OAK_RULE + "\n")
-    found = only(doctor_robot.oak())
-    assert found.state == "ok" and found.found.endswith("80-movidius.rules")
+    missing = only(examine())
+    assert missing.state == "note" and f'ATTRS{{idVendor}}=="{vendor}"' in missing.mend
+    (tmp_path / file).write_text(rule + "\n")
+    found = only(examine())
+    assert found.state == "ok" and found.found.endswith(file)
+
+
+def test_the_extra_for_a_realsense_is_named_and_not_missed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    told = only(doctor_robot.realsense())
+    assert told.state == "ok" and "pip install 'semantic-mapper[realsense]'" in told.found
 
 
 def test_a_clock_that_is_set_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

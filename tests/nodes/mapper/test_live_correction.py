@@ -35,7 +35,7 @@ from semantic_mapper.transport import query_messages as messages
 from semantic_mapper.transport.codec import encode, encode_frame, encode_request
 from semantic_mapper.transport.messages import EndOfStream, Status, StreamInfo
 from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
-from semantic_mapper.types import Float64, PosedFrame
+from semantic_mapper.types import Float64, MapUpdate, PosedFrame
 from tests.mapping.correction.test_corrected_map import drifted, true_poses
 from tests.nodes.mapper.test_query_service import Stranger, a_folder
 from tests.nodes.support import CONFIG, eventually, run
@@ -358,6 +358,7 @@ def test_a_correction_that_fails_leaves_the_mapper_running_and_is_told(bundle_of
     correction = LiveCorrection(session.pipeline)
     correction.carry_on(session, mapped=False)
     assert not correction.running and "the disk is full" in correction.degraded[0]
-    assert session.process(dataclasses.replace(frames[3], stamp_ns=10**12, seq=9)) is not None
+    (result,) = session.process(dataclasses.replace(frames[3], stamp_ns=10**12, seq=9))
+    assert isinstance(result, MapUpdate)
     correction.finish(session, lambda: False, lambda: None)
     assert "the disk is full" in session.unfinished_correction

@@ -186,7 +186,7 @@ def test_launch_files_for_cameras_are_as_the_docs_say() -> None:
         assert "{now}" in str(file.set["out"]), path.name
         for node in file.node:
             assert not node.standby, f"{path.name}: {node.name}"
-    assert live == 6
+    assert live == 9
 
 
 def test_settings_are_filled_in_with_their_own_type(tmp_path: Path) -> None:

@@ -49,10 +49,16 @@ def test_a_wall_3_cm_off_is_measured_as_such(wall_folder):
     assert abs(compare_with_mesh(wall_folder, wall_folder / "mesh.npz")["median_m"] - 0.03) < 0.003
 
 
+def test_a_wall_7_cm_off_is_complete_within_10_cm_alone(wall_folder):
+    write_wall(wall_folder / "mesh.npz", WALL_M + 0.07)
+    found = compare_with_mesh(wall_folder, wall_folder / "mesh.npz")
+    assert (found["complete"], found["complete_10cm"]) == (0.0, 1.0)
+
+
 def test_what_was_never_seen_is_not_complete_and_wrong_labels_score_zero(wall_folder):
     write_wall(wall_folder / "mesh.npz", WALL_M, half=2.0, label=ROOMS.ids[1])
     found = compare_with_mesh(wall_folder, wall_folder / "mesh.npz")
-    assert found["complete"] < 0.5 and found["mesh_miou"] == 0.0
+    assert found["complete"] < found["complete_10cm"] < 0.5 and found["mesh_miou"] == 0.0
 
 
 def test_a_file_that_is_no_mesh_is_named(wall_folder):

@@ -2,6 +2,8 @@
 
 ``comment label 3 chair`` says what the id 3 of the property ``label`` means. Names are ASCII, with Python's escapes for
 what is not, backslashes included: ``name.encode().decode("unicode_escape")`` gives the name back.
+
+Where depth was computed somewhere, there is a property ``measured``: 0 there, 1 where a sensor measured the surface.
 """
 
 from __future__ import annotations
@@ -15,20 +17,19 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.files import atomic_write
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints
-from semantic_mapper.types import Float32, UInt8
+from semantic_mapper.types import Float32
 
-_VERTEX = np.dtype(
-    [
-        ("x", "<f4"),
-        ("y", "<f4"),
-        ("z", "<f4"),
-        ("red", "u1"),
-        ("green", "u1"),
-        ("blue", "u1"),
-        ("label", "u1"),
-        ("confidence", "<f4"),
-    ]
-)
+_VERTEX = [
+    ("x", "<f4"),
+    ("y", "<f4"),
+    ("z", "<f4"),
+    ("red", "u1"),
+    ("green", "u1"),
+    ("blue", "u1"),
+    ("label", "u1"),
+    ("confidence", "<f4"),
+]
+_MEASURED = ("measured", "u1")
 MAX_NAME = 200  # characters of a class name in a comment
 _FACE = np.dtype([("count", "u1"), ("corners", "<i4", (3,))])
 _TYPES = {"<f4": "float", "|u1": "uchar"}
@@ -40,7 +41,7 @@ def write_ply(path: Path, points: MapPoints, label_set: LabelSet) -> None:
     Raises:
         MapError: the file cannot be written.
     """
-    vertices = _vertices(points.xyz, points.rgb, points.label, points.confidence)
+    vertices = _vertices(points.xyz, points)
     _write(path, vertices, np.empty(0, _FACE), label_set, mesh=False)
 
 
@@ -52,17 +53,20 @@ def write_ply_mesh(path: Path, mesh: MapMesh, label_set: LabelSet) -> None:
     """
     faces = np.empty(len(mesh.faces), _FACE)
     faces["count"], faces["corners"] = 3, mesh.faces
-    _write(path, _vertices(mesh.vertices, mesh.rgb, mesh.label, mesh.confidence), faces, label_set, mesh=True)
+    _write(path, _vertices(mesh.vertices, mesh), faces, label_set, mesh=True)
 
 
-def _vertices(xyz: Float32, rgb: UInt8, label: UInt8, confidence: Float32) -> NDArray[np.void]:
-    vertices = np.empty(len(xyz), _VERTEX)
+def _vertices(xyz: Float32, surface: MapPoints | MapMesh) -> NDArray[np.void]:
+    computed = surface.measured is not None and not surface.measured.all()
+    vertices = np.empty(len(xyz), np.dtype([*_VERTEX, _MEASURED] if computed else _VERTEX))
     for column, name in enumerate(("x", "y", "z")):
         vertices[name] = xyz[:, column]
     for column, name in enumerate(("red", "green", "blue")):
-        vertices[name] = rgb[:, column]
-    vertices["label"] = label
-    vertices["confidence"] = confidence
+        vertices[name] = surface.rgb[:, column]
+    vertices["label"] = surface.label
+    vertices["confidence"] = surface.confidence
+    if computed:
+        vertices[_MEASURED[0]] = surface.measured
     return vertices
 
 
@@ -71,7 +75,7 @@ def _write(path: Path, vertices: NDArray[np.void], faces: NDArray[np.void], labe
     lines += [f"comment label {i} {_escaped(n)}" for i, n in zip(label_set.ids, label_set.names, strict=True)]
     lines.append(f"comment label {label_set.ignore_id} unknown")
     lines.append(f"element vertex {len(vertices)}")
-    lines += [f"property {_TYPES[_VERTEX[name].str]} {name}" for name in _VERTEX.names or ()]
+    lines += [f"property {_TYPES[vertices.dtype[name].str]} {name}" for name in vertices.dtype.names or ()]
     if mesh:
         lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
     lines.append("end_header")

@@ -1,0 +1,84 @@
+"""Which RealSense cameras are connected, and why one cannot be had."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from semantic_mapper.drivers.realsense.library import load_realsense
+from semantic_mapper.drivers.registry import FoundCamera
+from semantic_mapper.errors import CameraError
+
+USB_VENDOR = "8086"
+UDEV_RULE = f'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{USB_VENDOR}", MODE="0666"'
+_SEARCH_STEP_S = 0.2
+_MEND = (
+    "check its cable (a USB 3 port, `lsusb` shows it as Intel or RealSense); without permission it does not show "
+    f"either: echo '{UDEV_RULE}' | sudo tee /etc/udev/rules.d/99-realsense.rules && sudo udevadm control "
+    "--reload-rules && sudo udevadm trigger, then plug it in again"
+)
+
+
+def list_devices() -> list[FoundCamera]:
+    """RealSense cameras of this machine.
+
+    Raises:
+        DependencyError: the SDK cannot be loaded.
+        CameraError: it cannot search.
+    """
+    rs = load_realsense()
+    found: list[FoundCamera] = []
+    for device in connected():
+        usb, firmware = (
+            about(device, what) for what in (rs.camera_info.usb_type_descriptor, rs.camera_info.firmware_version)
+        )
+        notes = [f"USB {usb}"] * bool(usb) + [f"firmware {firmware}"] * bool(firmware)
+        serial = about(device, rs.camera_info.serial_number)
+        found.append(FoundCamera("realsense", about(device, rs.camera_info.name), serial, ", ".join(notes)))
+    return found
+
+
+def find_device(serial: str, search_s: float) -> Any:
+    """Look for one device until it is there.
+
+    Args:
+        serial: Number; empty for the only one that is connected.
+        search_s: How long to look.
+
+    Returns:
+        The SDK's ``device``.
+
+    Raises:
+        CameraError: there is none, or several where one should be; and how to mend it.
+    """
+    rs = load_realsense()
+    deadline = time.monotonic() + search_s
+    while True:
+        devices = {about(device, rs.camera_info.serial_number): device for device in connected()}
+        fitting = [device for number, device in devices.items() if serial in ("", number)]
+        if len(fitting) == 1:
+            return fitting[0]
+        if len(fitting) > 1:
+            raise CameraError(f"several RealSense cameras are connected: {', '.join(devices)}; say which by `device`")
+        if time.monotonic() > deadline:
+            what = f"the RealSense '{serial}' is not connected" if serial else "no RealSense camera is connected"
+            there = f" (there is {', '.join(devices)})" if devices else ""
+            raise CameraError(f"{what}{there}: {_MEND}")
+        time.sleep(_SEARCH_STEP_S)
+
+
+def connected() -> list[Any]:
+    """The SDK's ``device`` of each camera.
+
+    Raises:
+        CameraError: the SDK cannot search.
+    """
+    try:
+        return list(load_realsense().context().query_devices())
+    except RuntimeError as error:
+        raise CameraError(f"the RealSense SDK cannot search for cameras: {error}") from error
+
+
+def about(device: Any, what: Any) -> str:
+    """What a device says of itself (``camera_info``); empty where it says nothing."""
+    return str(device.get_info(what)) if device.supports(what) else ""

@@ -1,0 +1,149 @@
+"""A stereo pair as a ``Camera``: the device's images cut in halves, rectified, and matched."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+
+from semantic_mapper.drivers.base import Camera, CameraImage
+from semantic_mapper.drivers.registry import open_camera
+from semantic_mapper.drivers.stereo.calibration import load_stereo
+from semantic_mapper.drivers.stereo.config import Config
+from semantic_mapper.drivers.stereo.depth import StereoDepth
+from semantic_mapper.drivers.v4l2 import paths
+from semantic_mapper.errors import CameraError
+from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.types import UInt8
+
+_OURS = ("device", "calibration", "uncalibrated", "width", "height")  # of the device's driver, set here
+
+
+class StereoCamera:
+    """The left camera of a pair, with depth.
+
+    Args:
+        config: Of the pair.
+        camera_id: Name in the images.
+
+    Raises:
+        CameraError: no device or no calibration is named.
+        ConfigError: the calibration cannot be read or cannot be worked with, or a setting of the device is unknown.
+    """
+
+    def __init__(self, config: Config, camera_id: str) -> None:
+        if not config.device:
+            raise CameraError(
+                f"camera '{camera_id}': no device is named; `semantic-mapper cameras --kind stereo` lists what may be "
+                'one; give its address as device = "/dev/v4l/by-id/..."'
+            )
+        if not config.calibration:
+            raise CameraError(
+                f"stereo pair at {config.device}: has no calibration; make one with `semantic-mapper calibrate "
+                '--stereo`, and name it with calibration = "FILE"'
+            )
+        taken = sorted(set(config.source) & set(_OURS))
+        if taken:
+            raise CameraError(
+                f"stereo pair at {config.device}: `{taken[0]}` cannot be a key of `source`: it is set here"
+            )
+        pair = load_stereo(Path(config.calibration))
+        self._depth = StereoDepth(pair, config.width, config.min_depth_m, config.max_depth_m)
+        self._size = (2 * pair.left.width, pair.left.height)
+        self._swapped = pair.swapped
+        self._camera_id = camera_id
+        kind, settings = source_of(config.device, *self._size)
+        # Its own rectification is off: that of one lens would be wrong for both.
+        settings |= {**config.source, "uncalibrated": True}
+        self._source: Camera = open_camera(kind, settings, camera_id, f"stereo pair at {config.device}")
+        self._info: StreamInfo | None = None
+
+    @property
+    def info(self) -> StreamInfo:
+        """As of ``Camera``."""
+        if self._info is None:
+            raise CameraError(f"camera '{self._camera_id}' is not open yet")
+        return self._info
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """As of ``Camera``."""
+        return tuple(text for text in self._source.warnings if not text.startswith("not calibrated"))
+
+    @property
+    def can_wait(self) -> bool:
+        """As of ``Camera``."""
+        return self._source.can_wait
+
+    @property
+    def last_poll_time(self) -> float:
+        """As of ``Camera``."""
+        return self._source.last_poll_time
+
+    def __enter__(self) -> Self:
+        """Open the device.
+
+        Raises:
+            CameraError: it is not there, or its images have another size than both of the calibration side by side.
+        """
+        self._source.__enter__()
+        told = self._source.info
+        (given,) = told.cameras.values()
+        if (given.width, given.height) != self._size:
+            self._source.__exit__(None, None, None)
+            raise CameraError(
+                f"{told.source}: gives images of {given.width}x{given.height}, and the pair was calibrated at "
+                f"{self._size[0] // 2}x{self._size[1]}, side by side {self._size[0]}x{self._size[1]}; calibrate for a "
+                "size that it offers"
+            )
+        self._info = msgspec.structs.replace(
+            told,
+            source=f"stereo {told.source}",
+            cameras={self._camera_id: self._depth.intrinsics},
+            metadata={
+                **told.metadata,
+                "driver": "stereo",
+                "baseline_m": f"{self._depth.baseline_m:.4f}",
+                "disparities": str(self._depth.disparities),
+            },
+        )
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._source.__exit__(kind, error, trace)
+
+    def __iter__(self) -> Iterator[CameraImage]:
+        """Left images with their depth; otherwise as the device's driver gives them."""
+        for image in self._source:
+            left, right = self._depth.rectify(*halves(image.rgb, swapped=self._swapped))
+            depth_m = self._depth.depth(left, right)
+            yield replace(image, rgb=left, depth_m=depth_m, intrinsics=self._depth.intrinsics)
+
+    def stop(self) -> None:
+        """As of ``Camera``."""
+        self._source.stop()
+
+
+def halves(rgb: UInt8, *, swapped: bool = False) -> tuple[UInt8, UInt8]:
+    """(H, 2 W, 3) -> the left and the right camera's images, (H, W, 3) each."""
+    middle = rgb.shape[1] // 2
+    first, second = rgb[:, :middle], rgb[:, middle : 2 * middle]
+    return (second, first) if swapped else (first, second)
+
+
+def source_of(device: str, width: int = 0, height: int = 0) -> tuple[str, dict[str, Any]]:
+    """Kind and settings of the driver that reads a device.
+
+    Args:
+        device: A V4L2 device, a video file, or a URL.
+        width, height: To ask of it; 0 = as it is.
+    """
+    if Path(device).is_relative_to(paths.DEVICES):
+        return "v4l2", {"device": device, "width": width, "height": height}
+    return "opencv", {"source": device}

@@ -1,0 +1,85 @@
+"""``semantic-mapper map``: a film or a recording becomes a map, in one step."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
+from semantic_mapper.nodes.cli.film import (
+    BoardOption,
+    CalibrationOption,
+    DistanceOption,
+    FocalPriorOption,
+    HeightOption,
+    ScaleOption,
+    SquareOption,
+)
+from semantic_mapper.nodes.cli.replay import ConfigOption, OutOption, QualityOption, VoxelSizeOption, WeightsOption
+from semantic_mapper.nodes.cli.verb import verb
+from semantic_mapper.nodes.process import StopRequest
+
+
+@verb
+def map_(
+    source: Annotated[
+        Path, typer.Argument(metavar="FILM", help="Film, folder of pictures, or a recording that `import` takes.")
+    ],
+    out: OutOption,
+    calibration: CalibrationOption = None,
+    focal_prior: FocalPriorOption = 0.0,
+    scale: ScaleOption = 0.0,
+    distance: DistanceOption = "",
+    square_mm: SquareOption = 0.0,
+    board: BoardOption = None,
+    camera_height: HeightOption = 0.0,
+    rotate: Annotated[
+        Literal["0", "90", "180", "270"], typer.Option(help="Turn every image clockwise by this many degrees.")
+    ] = "0",
+    weights: WeightsOption = None,
+    voxel_size: VoxelSizeOption = None,
+    config: ConfigOption = None,
+    quality: QualityOption = None,
+) -> int:
+    """Make a map of a film: finds where the camera was (`import`), then maps the frames (`replay`).
+
+    The folder gets the log (NAME.mcap), the report on the film (NAME.html), and what `replay` writes. Walk slowly,
+    sideways, in good light; a camera that turns on the spot shows no depth. A film tells no metres: give one of
+    --scale, --distance, --square-mm, --camera-height. The last line is the path of the report.
+
+    Example: semantic-mapper map film.mp4 --out runs/film
+    Example: semantic-mapper map film.mp4 --out runs/film --calibration camera.toml --camera-height 1.5
+    """
+    output = Output.guarded()
+    from semantic_mapper.nodes.cli.film import film_options, import_film_log, is_film, print_film, recording_scale
+    from semantic_mapper.nodes.cli.outputs import hold_folder
+    from semantic_mapper.nodes.cli.report import REPORT_NAME
+    from semantic_mapper.nodes.cli.run_replay import ReplayRequest, mapper_config, replay_log
+    from semantic_mapper.nodes.cli.summary_table import notes, result_lines, summary_table
+    from semantic_mapper.replay.importers import ImportOptions, import_recording
+
+    settings = mapper_config(config, voxel_size, None, quality)
+    options = film_options(
+        calibration, focal_prior, scale, distance, square_mm, board, camera_height, int(rotate) // 90
+    )
+    log = out / f"{source.resolve().stem}.mcap"
+    with hold_folder(out):
+        if is_film(source):
+            report, page = import_film_log(source, log, options, overwrite=True)
+            print_film(output, report, log)
+            output.print(f"  {page}  (report on the film)")
+        else:
+            with frame_progress("import", None) as bar:
+                plain = ImportOptions(quarters=int(rotate) // 90, scale=recording_scale(options))
+                import_recording(source, log, on_progress=lambda done, _: bar.set(done), options=plain, overwrite=True)
+    with StopRequest() as stop:
+        with frame_progress("replay", None) as bar:
+            summary = replay_log(ReplayRequest(log, out, weights, settings), stop, bar.start, bar.set)
+        output.print(summary_table({out.name: summary}))
+        for line in (*notes(summary), *result_lines(out), str(out / REPORT_NAME)):
+            output.print(line)
+        if stop:
+            stderr_console().print(f"stopped by {stop.name}; the map so far is in {out}", style="yellow")
+        return stop.exit_code

@@ -1,0 +1,167 @@
+"""What importers of posed picture collections share: OpenGL axes, lenses that are undone, depth of another size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from semantic_mapper.drivers.calibration import Rectifier
+from semantic_mapper.errors import ConfigError, ImportSourceError
+from semantic_mapper.geometry import scale_intrinsics
+from semantic_mapper.replay.importers.base import (
+    BadFrameError,
+    DepthScale,
+    ImportOptions,
+    LoadedFrame,
+    check_frame_pose,
+    read_plane,
+    read_rgb,
+)
+from semantic_mapper.transport.compression import depth_from_uint16
+from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
+
+DEFAULT_HZ = 2.0  # at which pictures without times count as taken
+T_Z_UP_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # of ARKit's worlds
+GL_AXES = np.diag((1.0, -1.0, -1.0, 1.0))  # T_gl_cv: OpenGL's cameras look along -z, with y up
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedPicture:
+    """One picture of a collection.
+
+    Args:
+        file: The picture.
+        intrinsics: With distortion, as the collection gives them.
+        T_world_camera: (4, 4), OpenCV's axes.
+        depth_file: 16-bit PNG, of any size with the same view; None = no depth.
+        stamp_ns: None = not known.
+        confidence_file: 8-bit PNG of the depth image's size, whose 0 means that the depth is not to be trusted.
+    """
+
+    file: Path
+    intrinsics: CameraIntrinsics
+    T_world_camera: Float64
+    depth_file: Path | None = None
+    stamp_ns: int | None = None
+    confidence_file: Path | None = None
+
+
+class PosedPictures:
+    """A collection as a ``Recording``.
+
+    Args:
+        source: What it is, for people.
+        pictures: In their order.
+        options: See ``ImportOptions``; ``scale`` makes metres of a collection's own unit.
+        depth_scale: Of its depth images.
+        metric: Whether its lengths are metres.
+
+    Raises:
+        ImportSourceError: it holds no picture.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        folder: Path,
+        pictures: Sequence[PosedPicture],
+        options: ImportOptions,
+        *,
+        depth_scale: DepthScale,
+        metric: bool,
+    ) -> None:
+        if not pictures:
+            raise ImportSourceError(f"{folder}: holds no posed picture")
+        self._pictures = pictures
+        self._options = options
+        self._hz = options.frame_hz or DEFAULT_HZ
+        self._factor = options.scale or 1.0
+        self._rectifiers: dict[CameraIntrinsics, Rectifier] = {}
+        self.depth_scale = depth_scale
+        self.notices: list[str] = []
+        metric = metric or options.scale is not None
+        if not metric:
+            self.notices.append(
+                "the scale is unknown: lengths of the log are not metres; give --scale, metres per unit of the poses"
+            )
+        first = self._rectifier(pictures[0].intrinsics, pictures[0].file)
+        self.info = StreamInfo(
+            source=f"{source} {folder.resolve().name}",
+            cameras={options.camera_id: first.intrinsics},
+            frame_count=len(pictures),
+            frame_hz=self._hz,
+            metadata={} if metric else {SCALE_KEY: SCALE_UNKNOWN},
+        )
+
+    def __len__(self) -> int:
+        return len(self._pictures)
+
+    def load(self, number: int) -> LoadedFrame:
+        """Read one frame.
+
+        Raises:
+            BadFrameError: it cannot be used.
+        """
+        picture = self._pictures[number]
+        rgb, encoded = read_rgb(picture.file)
+        height, width = rgb.shape[:2]
+        given = picture.intrinsics
+        if (given.width, given.height) != (width, height):
+            # The sides of resized pictures are rounded; anything else is another view.
+            if abs(given.width * height - given.height * width) > max(given.width, given.height, width, height):
+                raise BadFrameError(
+                    picture.file, f"the picture is {width}x{height}, its camera {given.width}x{given.height}"
+                )
+            given = scale_intrinsics(given, width, height)
+        rectifier = self._rectifier(given, picture.file)
+        changed = bool(given.distortion)
+        pose = picture.T_world_camera.copy()
+        pose[:3, 3] *= self._factor
+        frame = PosedFrame(
+            stamp_ns=round(number * 1e9 / self._hz) if picture.stamp_ns is None else picture.stamp_ns,
+            seq=number,
+            camera_id=self._options.camera_id,
+            rgb=rectifier(np.ascontiguousarray(rgb[..., ::-1])) if changed else rgb,
+            depth_m=None if changed else self._depth(picture, (height, width)),
+            label=None,
+            intrinsics=rectifier.intrinsics,
+            T_world_camera=check_frame_pose(pose, picture.file),
+        )
+        return LoadedFrame(frame, None if changed else encoded)
+
+    def _depth(self, picture: PosedPicture, size: tuple[int, int]) -> Float32 | None:
+        """Depth image (H, W) in metres, brought to the size of the picture; None where there is none."""
+        if picture.depth_file is None or not picture.depth_file.exists():
+            return None
+        units = read_plane(picture.depth_file, "uint16", None, "depth").astype(np.uint16, copy=False)
+        if picture.confidence_file is not None and picture.confidence_file.exists():
+            confidence = read_plane(picture.confidence_file, "uint8", (units.shape[0], units.shape[1]), "confidence")
+            units = np.where(confidence > 0, units, 0).astype(np.uint16)
+        if units.shape != size:
+            units = np.asarray(cv2.resize(units, size[::-1], interpolation=cv2.INTER_NEAREST), np.uint16)
+        return depth_from_uint16(units, self.depth_scale.units_per_m)
+
+    def _rectifier(self, intrinsics: CameraIntrinsics, file: Path) -> Rectifier:
+        if intrinsics not in self._rectifiers:
+            try:
+                self._rectifiers[intrinsics] = Rectifier(intrinsics)
+            except ConfigError as error:
+                raise BadFrameError(file, str(error)) from error
+        return self._rectifiers[intrinsics]
+
+
+def inside(folder: Path, name: str) -> Path:
+    """A file that a collection names.
+
+    Raises:
+        ImportSourceError: it lies outside of the folder.
+    """
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise ImportSourceError(f"{folder}: names '{name}', which lies outside of it")
+    return path

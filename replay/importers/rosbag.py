@@ -1,0 +1,630 @@
+"""ROS bags of version 1 (``.bag``) and 2 (folder, ``.mcap`` or ``.db3``), read without ROS.
+
+A frame is a colour image with the depth image nearest in time and its pose. Poses come from tf, from the world (map,
+world or odom) to the frame that the image names, interpolated between the neighbours of each transform; or from a
+topic of odometry or poses, whose body tf then links to the camera. Topics are found by the type of their messages.
+
+Depth that is not registered to colour is registered here, by the two cameras' intrinsics and tf. Lens distortion is
+removed where the camera's calibration tells of it and its images are not rectified already.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from semantic_mapper.drivers.calibration import Rectifier
+from semantic_mapper.errors import CodecError, ConfigError, DependencyError, ImportSourceError, SemanticMapperError
+from semantic_mapper.geometry import transform, unproject
+from semantic_mapper.plain_text import visible
+from semantic_mapper.replay.importers import ros_images
+from semantic_mapper.replay.importers.base import (
+    BadFrameError,
+    DepthScale,
+    ImportOptions,
+    LoadedFrame,
+    check_frame_pose,
+    image_size_must_be,
+)
+from semantic_mapper.replay.importers.ros_transforms import (
+    WORLDS,
+    Track,
+    TransformTree,
+    frame_name,
+    pose_row,
+    stamp_of,
+)
+from semantic_mapper.replay.importers.tum import match_nearest
+from semantic_mapper.transport.codec import EncodedImage
+from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
+
+ROLES = ("image", "depth", "info", "pose")
+STORAGE = (".mcap", ".db3")  # of ROS 2
+DEPTH_SCALE = DepthScale(ros_images.UNITS_PER_M, convention="ROS's millimetres (16UC1) or metres (32FC1)")
+LISTED = 12  # topics that an error names
+
+_RAW, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_INFO = "sensor_msgs/msg/CameraInfo"
+_TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+# What gives the pose of a frame that it names, and what gives one without saying whose.
+_NAMED_POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped")
+_POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+_SAME_PLACE = 1e-6  # of a transform's entries; cameras that are closer are one
+_TRANSPORTS = ("/compressedDepth", "/compressed")
+_MEND = (
+    "`ros2 bag reindex`, `mcap recover` or `rosbag reindex` mends a bag whose recorder was killed; one that was copied "
+    "in part has to be copied again"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Topic:
+    """A topic of images.
+
+    Args:
+        name: Of the topic; ``encoding`` and ``frame``: of its first message.
+        raw: ``sensor_msgs/Image``, not compressed.
+    """
+
+    name: str
+    raw: bool
+    encoding: str
+    frame: str
+
+    @property
+    def base(self) -> str:
+        """Name without the transport."""
+        for transport in _TRANSPORTS:
+            if not self.raw and self.name.endswith(transport):
+                return self.name.removesuffix(transport)
+        return self.name
+
+    def __str__(self) -> str:
+        return f"{self.name} ({visible(self.encoding)})"
+
+
+class RosbagRecording:
+    """A bag, opened; one frame for each image of one camera.
+
+    Args:
+        src: ``.bag``, ``.mcap`` or ``.db3`` file, or folder of ROS 2.
+        options: See ``ImportOptions``.
+
+    Raises:
+        ImportSourceError: damaged, no image, several cameras where none is named, no calibration, or no poses.
+        DependencyError: the package ``rosbags`` is not installed.
+    """
+
+    def __init__(self, src: Path, options: ImportOptions) -> None:
+        self.notices: list[str] = []
+        self.depth_scale = DEPTH_SCALE
+        self._options = options
+        unknown = sorted(set(options.topics) - set(ROLES))
+        if unknown:
+            raise ImportSourceError(f"no topic has the role '{unknown[0]}'; the roles are {', '.join(ROLES)}")
+        self._bag = _Bag(src)
+        color, depth = self._find_images()
+        infos = {color.name: self._info_topic(color, options.topics.get("info", ""))}
+        if depth is not None and self._has_info(depth):
+            infos[depth.name] = self._info_topic(depth, "")
+        self._tree = TransformTree()
+        self._stamps: dict[str, list[tuple[int, int]]] = {t.name: [] for t in (color, depth) if t is not None}
+        calibrations, poses = self._read_all(set(infos.values()))
+        self._color, self._color_topic = self._stamps[color.name], color
+        self._measured = self._intrinsics(color, calibrations[infos[color.name]])
+        self._rectify = _rectifier(src, self._measured)
+        depth_info = None if depth is None or depth.name not in infos else calibrations[infos[depth.name]]
+        self._depth_topic = depth
+        self._depth = self._stamps[depth.name] if depth is not None else []
+        self._T_color_depth: Float64 | None = None
+        self._depth_intrinsics = self._measured
+        if depth is not None:
+            self._link_depth(depth, None if depth_info is None else self._intrinsics(depth, depth_info))
+        pose_topic = self._pose_topic()
+        self._pose_at, told = self._pose_source(pose_topic, poses.get(pose_topic, []))
+        self.notices.append(told)
+        if self._tree.refused:
+            self.notices.append(f"{self._tree.refused} transforms of tf are left out: they hold NaN or no rotation")
+        within_ns = round(options.match_s * 1e9)
+        stamps, depth_stamps = (
+            np.array([stamp for stamp, _ in series], np.int64) for series in (self._color, self._depth)
+        )
+        self._order = np.argsort(stamps, kind="stable")
+        depth_order = np.argsort(depth_stamps, kind="stable")
+        matches = match_nearest(stamps[self._order], depth_stamps[depth_order], within_ns)
+        self._depth_of = [int(depth_order[i]) if i >= 0 else -1 for i in matches]
+        self.info = StreamInfo(
+            source=f"rosbag {src.resolve().stem}",
+            cameras={options.camera_id: self._rectify.intrinsics},
+            frame_count=len(self._color),
+            frame_hz=_rate(stamps),
+        )
+
+    def __len__(self) -> int:
+        return len(self._color)
+
+    def load(self, number: int) -> LoadedFrame:
+        """Read one frame.
+
+        Raises:
+            BadFrameError: it cannot be used.
+        """
+        index = int(self._order[number])
+        stamp_ns = self._color[index][0]
+        where = Path(self._color_topic.name)
+        if not 0 <= stamp_ns < MAX_STAMP_NS:
+            raise BadFrameError(where, f"its stamp, {stamp_ns} ns, is none")
+        if number and self._color[int(self._order[number - 1])][0] == stamp_ns:
+            raise BadFrameError(where, f"a second image of {stamp_ns / 1e9:.6f} s")
+        pose = self._pose_at(stamp_ns)
+        if pose is None:
+            raise BadFrameError(where, f"there is no pose round its time {stamp_ns / 1e9:.6f} s")
+        try:
+            rgb, encoded = self._rgb(index)
+        except CodecError as error:
+            raise BadFrameError(where, f"image of {stamp_ns / 1e9:.6f} s: {error}") from error
+        return LoadedFrame(
+            PosedFrame(
+                stamp_ns=stamp_ns,
+                seq=number,
+                camera_id=self._options.camera_id,
+                rgb=rgb,
+                depth_m=self._depth_m(self._depth_of[number]),
+                label=None,
+                intrinsics=self._rectify.intrinsics,
+                T_world_camera=check_frame_pose(pose, where),
+            ),
+            encoded,
+        )
+
+    def _rgb(self, index: int) -> tuple[UInt8, EncodedImage | None]:
+        message = self._bag.message(self._color_topic.name, self._color, index)
+        encoded = None
+        if self._color_topic.raw:
+            rgb = ros_images.color_image(message)
+        else:
+            rgb, encoded = ros_images.compressed_color_image(message)
+        image_size_must_be(rgb, self._measured, Path(self._color_topic.name))
+        if any(self._measured.distortion):
+            return self._rectify(np.ascontiguousarray(rgb[..., ::-1])), None
+        return rgb, encoded
+
+    def _depth_m(self, index: int) -> Float32 | None:
+        topic = self._depth_topic
+        if index < 0 or topic is None:
+            return None
+        where = Path(topic.name)
+        try:
+            message = self._bag.message(topic.name, self._depth, index)
+            read = ros_images.depth_image if topic.raw else ros_images.compressed_depth_image
+            depth_m = read(message)
+        except CodecError as error:
+            raise BadFrameError(where, str(error)) from error
+        k = self._depth_intrinsics
+        if depth_m.shape != (k.height, k.width):
+            raise BadFrameError(
+                where,
+                f"the depth image is {depth_m.shape[1]}x{depth_m.shape[0]}, its calibration says {k.width}x{k.height}",
+            )
+        if self._T_color_depth is not None:
+            return register_depth(depth_m, k, self._T_color_depth, self._rectify.intrinsics)
+        return self._rectify.nearest(depth_m)
+
+    def _find_images(self) -> tuple[_Topic, _Topic | None]:
+        """The topics of colour and of depth.
+
+        Raises:
+            ImportSourceError: none or several fit, or a named one does not.
+        """
+        topics = self._bag.image_topics()
+        depths = [t for t in topics if ros_images.is_depth(t.name, t.encoding)]
+        colors = [t for t in topics if t not in depths]
+        wanted = self._options.topics
+        if "image" in wanted:
+            color = self._named("image", colors)
+        else:
+            fitting = _without_doubles(colors)
+            colorful = [t for t in fitting if not ros_images.is_grey(t.encoding)]
+            color = self._only("image", colorful or fitting)
+            left = [str(t) for t in fitting if t != color]
+            if left:
+                self.notices.append(f"images are those of {color.name}; there are also {', '.join(left[:LISTED])}")
+        if wanted.get("depth") == "none":
+            return color, None
+        if "depth" in wanted:
+            return color, self._named("depth", depths)
+        fitting = _without_doubles(depths)
+        registered = [t for t in fitting if t.frame == color.frame]
+        if not fitting:
+            self.notices.append("no topic has depth images: frames come without depth")
+            return color, None
+        return color, self._only("depth", registered or fitting)
+
+    def _named(self, role: str, fitting: list[_Topic]) -> _Topic:
+        name = self._options.topics[role]
+        for topic in fitting:
+            if topic.name == name:
+                return topic
+        there = ", ".join(map(str, fitting[:LISTED])) or "none"
+        raise ImportSourceError(f"{self._bag.src}: no topic '{name}' of images for {role}; there are {there}")
+
+    def _only(self, role: str, fitting: list[_Topic]) -> _Topic:
+        if len(fitting) == 1:
+            return fitting[0]
+        if not fitting:
+            raise ImportSourceError(f"{self._bag.src}: no topic has images; there are {self._bag.listing()}")
+        raise ImportSourceError(
+            f"{self._bag.src}: several topics fit the {role}: {', '.join(map(str, fitting[:LISTED]))}; name one: "
+            f"--topic {role}={fitting[0].name}"
+        )
+
+    def _has_info(self, topic: _Topic) -> bool:
+        return _info_name(topic) in self._bag.topics(_INFO)
+
+    def _info_topic(self, topic: _Topic, wanted: str) -> str:
+        infos = self._bag.topics(_INFO)
+        name = wanted or _info_name(topic)
+        if name in infos:
+            return name
+        if not wanted and len(infos) == 1:
+            self.notices.append(f"the calibration of {topic.name} is that of {infos[0]}, the only one")
+            return infos[0]
+        there = f"there are {', '.join(infos[:LISTED])}: name one with --topic info=NAME" if infos else "there is none"
+        raise ImportSourceError(
+            f"{self._bag.src}: no camera_info at {name}, without which the focal length of {topic.name} is not known; "
+            f"{there}"
+        )
+
+    def _pose_topic(self) -> str:
+        """The topic that poses come from; empty = tf.
+
+        Raises:
+            ImportSourceError: the named one is not there, or several fit.
+        """
+        found = self._bag.topics(*_NAMED_POSES, *_POSES)
+        name = self._options.topics.get("pose", "")
+        if name and name not in found:
+            there = ", ".join(found[:LISTED]) or "none"
+            raise ImportSourceError(f"{self._bag.src}: no topic '{name}' of poses; there are {there}")
+        in_world = set(WORLDS) & set(self._tree.way_up(self._color_topic.frame))
+        if name or self._options.world or in_world:
+            return name
+        if len(found) > 1:
+            raise ImportSourceError(
+                f"{self._bag.src}: several topics tell poses: {', '.join(found[:LISTED])}; name one: "
+                f"--topic pose={found[0]}"
+            )
+        if not found and not self._bag.topics(*_TF):
+            raise ImportSourceError(
+                f"{self._bag.src}: has no poses: neither tf nor a topic of "
+                f"{', '.join(t.replace('/msg/', '/') for t in (*_NAMED_POSES, *_POSES))}; it has {self._bag.listing()}"
+            )
+        return found[0] if found else ""
+
+    def _read_all(self, infos: set[str]) -> tuple[dict[str, list[Any]], dict[str, list[Any]]]:
+        """One pass over the bag: stamps of images and transforms; returns calibrations and poses by topic."""
+        calibrations: dict[str, list[Any]] = {name: [] for name in infos}
+        poses: dict[str, list[Any]] = {name: [] for name in self._bag.topics(*_NAMED_POSES, *_POSES)}
+        transforms = self._bag.topics(*_TF)
+        unstamped = 0
+        for name, received_ns, message in self._bag.messages({*self._stamps, *infos, *transforms, *poses}):
+            if name in self._stamps:
+                stamp_ns = stamp_of(message.header)
+                unstamped += not stamp_ns
+                self._stamps[name].append((stamp_ns or received_ns, received_ns))
+            elif name in calibrations:
+                calibrations[name].append(message)
+            elif name in transforms:
+                self._tree.add(message.transforms, fixed=name.endswith("tf_static"))
+            else:
+                poses[name].append(message)
+        self._tree.close()
+        if unstamped:
+            self.notices.append(f"{unstamped} images have no stamp: the time at which they were recorded stands for it")
+        for name, messages in calibrations.items():
+            if not messages:
+                raise ImportSourceError(f"{self._bag.src}: {name} has no message")
+        return calibrations, poses
+
+    def _intrinsics(self, topic: _Topic, infos: list[Any]) -> CameraIntrinsics:
+        """Raises: ImportSourceError: they change, or cannot be used."""
+        rectified = "rect" in topic.base.rsplit("/", 1)[-1]
+        try:
+            found = [self._bag.intrinsics(info, rectified=rectified) for info in infos]
+        except ImportSourceError as error:
+            raise ImportSourceError(f"{self._bag.src}: {topic.name}: {error}") from error
+        if len(set(found)) > 1:
+            raise ImportSourceError(
+                f"{self._bag.src}: the calibration of {topic.name} changes ({found[0]}, then {found[-1]}): the lens "
+                "has zoomed or the size was switched; cut the bag where it does"
+            )
+        return found[0]
+
+    def _link_depth(self, depth: _Topic, own: CameraIntrinsics | None) -> None:
+        """How depth comes to the pixels of colour.
+
+        Raises:
+            ImportSourceError: it is of another camera, and nobody says where that one sits.
+        """
+        color = self._color_topic
+        linked = depth.frame != color.frame and self._tree.reaches(color.frame, depth.frame)
+        T = self._tree.lookup(color.frame, depth.frame, self._color[0][0], MAX_STAMP_NS) if linked else np.eye(4)
+        if own is None:
+            self.notices.append(f"{depth.name} has no calibration: it is taken as registered to {color.name}")
+            return
+        if own == self._measured and (T is None or np.allclose(T, np.eye(4), atol=_SAME_PLACE)):
+            return
+        if any(own.distortion):
+            raise ImportSourceError(
+                f"{self._bag.src}: {depth.name} has lens distortion of its own; record depth that is registered to "
+                "colour, or import without it: --topic depth=none"
+            )
+        if T is None or (depth.frame != color.frame and not linked):
+            raise ImportSourceError(
+                f"{self._bag.src}: {depth.name} is of another camera ({depth.frame}) than {color.name} ({color.frame})"
+                ", and tf does not link the two; record tf_static or registered depth, or import without it: "
+                "--topic depth=none"
+            )
+        self._T_color_depth, self._depth_intrinsics = T, own
+        self.notices.append(f"{depth.name} is registered to {color.name} here, by tf and the intrinsics of both")
+
+    def _pose_source(self, topic: str, messages: list[Any]) -> tuple[Callable[[int], Float64 | None], str]:
+        """What tells the pose of a time, and a sentence on it.
+
+        Raises:
+            ImportSourceError: nothing does.
+        """
+        within_ns = round(self._options.match_s * 1e9)
+        camera, tree = self._color_topic.frame, self._tree
+        if not topic:
+            world = self._world(camera)
+            return (
+                lambda stamp_ns: tree.lookup(world, camera, stamp_ns, within_ns),
+                f"poses are those of {camera} in {world}, from tf",
+            )
+        body, track = self._track(topic, messages)
+        if body != camera and not tree.reaches(body, camera):
+            raise ImportSourceError(
+                f"{self._bag.src}: {topic} tells where '{body}' is, but tf does not say where the camera '{camera}' "
+                f"sits on it; record tf_static, or say with --body {camera} that the poses are the camera's"
+            )
+
+        def pose_at(stamp_ns: int) -> Float64 | None:
+            T_world_body = track.at(stamp_ns, within_ns)
+            T_body_camera = tree.lookup(body, camera, stamp_ns, within_ns)
+            return None if T_world_body is None or T_body_camera is None else T_world_body @ T_body_camera
+
+        return pose_at, f"poses are those of {camera}, from {topic} of {body}"
+
+    def _track(self, topic: str, messages: list[Any]) -> tuple[str, Track]:
+        """Whose poses a topic tells, and the poses."""
+        named = topic in self._bag.topics(*_NAMED_POSES)
+        body = frame_name(self._options.body or (messages[0].child_frame_id if named and messages else ""))
+        if messages and not body:
+            raise ImportSourceError(
+                f"{self._bag.src}: {topic} does not say whose poses it tells; name the frame with --body, such as "
+                f"--body {self._color_topic.frame} where they are the camera's"
+            )
+        read = self._bag.pose_reader(topic)
+        rows = {stamp_of(message.header): pose_row(*read(message)) for message in messages}
+        good = {stamp: row for stamp, row in rows.items() if row is not None}
+        if not good:
+            raise ImportSourceError(f"{self._bag.src}: {topic} holds no pose")
+        if len(good) < len(rows):
+            self.notices.append(f"{len(rows) - len(good)} poses of {topic} are left out: they hold NaN or no rotation")
+        return body, Track(list(good), list(good.values()))
+
+    def _world(self, camera: str) -> str:
+        """The frame of tf in which poses are."""
+        way = self._tree.way_up(camera)
+        wanted = frame_name(self._options.world)
+        if wanted:
+            if wanted in way:
+                return wanted
+            raise ImportSourceError(f"{self._bag.src}: tf has no way from {camera} to {wanted}: {_on(way)}")
+        for world in WORLDS:
+            if world in way:
+                return world
+        if len(way) == 1:
+            raise ImportSourceError(
+                f"{self._bag.src}: tf does not know the frame '{camera}' of {self._color_topic.name}; record tf and "
+                "tf_static, or name a topic of poses: --topic pose=NAME --body " + (camera or "FRAME")
+            )
+        raise ImportSourceError(
+            f"{self._bag.src}: tf has no frame {', '.join(WORLDS)} above the camera: {_on(way)}; name the world: "
+            f"--world {way[-1]}, or a topic of poses: --topic pose=NAME"
+        )
+
+
+def register_depth(depth_m: Float32, own: CameraIntrinsics, T_color_depth: Float64, color: CameraIntrinsics) -> Float32:
+    """Depth of one camera in the pixels of another: (H, W) of ``color``, the nearest surface, 0 where none falls.
+
+    Args:
+        depth_m: (h, w) in metres, 0 = no measurement.
+        own: Intrinsics of the depth camera, without distortion.
+        T_color_depth: (4, 4) from the depth camera to the colour camera.
+        color: Intrinsics of the colour camera, without distortion.
+    """
+    points = transform(T_color_depth, unproject(depth_m, own).reshape(-1, 3)[depth_m.ravel() > 0])
+    points = points[points[:, 2] > 0]
+    u = np.rint(color.fx * points[:, 0] / points[:, 2] + color.cx)
+    v = np.rint(color.fy * points[:, 1] / points[:, 2] + color.cy)
+    inside = (u >= 0) & (u < color.width) & (v >= 0) & (v < color.height)
+    pixels = v[inside].astype(np.int64) * color.width + u[inside].astype(np.int64)
+    nearest = np.full(color.height * color.width, np.inf, np.float32)
+    np.minimum.at(nearest, pixels, points[inside, 2].astype(np.float32))
+    nearest[np.isinf(nearest)] = 0
+    return nearest.reshape(color.height, color.width)
+
+
+def is_ros_mcap(path: Path) -> bool:
+    """Whether an MCAP file says of itself that it is a bag of ROS 2."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(29)  # magic, op code, length of the record, length of the profile, profile
+    except OSError:
+        return False
+    return head[:9] == b"\x89MCAP0\r\n\x01" and head[17:25] == b"\x04\x00\x00\x00ros2"
+
+
+def is_bag_folder(folder: Path) -> bool:
+    """Whether a folder is a bag of ROS 2, complete or without its metadata."""
+    files = _storage_files(folder)
+    return bool(files) and (
+        (folder / "metadata.yaml").exists() or all(f.suffix == ".db3" or is_ros_mcap(f) for f in files)
+    )
+
+
+class _Bag:
+    """A bag that is open, by the names of its topics.
+
+    Raises:
+        ImportSourceError: it cannot be read.
+        DependencyError: the package is missing.
+    """
+
+    def __init__(self, src: Path) -> None:
+        self.src = src
+        highlevel, typesys = _load_rosbags()
+        paths = [src] if src.is_file() or (src / "metadata.yaml").exists() else _storage_files(src)
+        with self._explained():
+            # Bags of ROS 2 before Iron hold no definitions of their messages; those read here have not changed since.
+            self._reader = highlevel.AnyReader(
+                paths, default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+            )
+            self._reader.open()
+        self._is_ros2: bool = self._reader.is2
+        self._streams: dict[str, tuple[int, Iterator[tuple[Any, int, bytes]]]] = {}  # next index, and its messages
+
+    def topics(self, *types: str) -> list[str]:
+        """Names of topics of these types that have messages."""
+        return sorted({c.topic for c in self._reader.connections if c.msgtype in types and c.msgcount})
+
+    def listing(self) -> str:
+        """All topics, for people."""
+        names = sorted({f"{c.topic} ({c.msgtype.replace('/msg/', '/')})" for c in self._reader.connections})
+        more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+        return visible(", ".join(names[:LISTED])) + more if names else "no topic at all"
+
+    def image_topics(self) -> list[_Topic]:
+        """Topics of images that have messages, by their first."""
+        found: list[_Topic] = []
+        for kind, field in ((_RAW, "encoding"), (_COMPRESSED, "format")):
+            for name in self.topics(kind):
+                _, _, message = next(self.messages({name}), ("", 0, None))
+                if message is not None:
+                    encoding = str(getattr(message, field))
+                    found.append(_Topic(name, kind == _RAW, encoding, frame_name(message.header.frame_id)))
+        return found
+
+    def messages(self, names: set[str]) -> Iterator[tuple[str, int, Any]]:
+        """Topic, time of recording, and message, in the order of recording."""
+        with self._explained():
+            for connection, received_ns, data in self._reader.messages(connections=self._connections(names)):
+                yield connection.topic, received_ns, self._reader.deserialize(data, connection.msgtype)
+
+    def message(self, name: str, series: list[tuple[int, int]], index: int) -> Any:
+        """One message of a topic; quick where they are asked for in order.
+
+        Args:
+            name: Of the topic.
+            series: Stamp and time of recording of all its messages, in the order of recording.
+            index: In ``series``.
+
+        Raises:
+            CodecError: it cannot be read.
+        """
+        position, stream = self._streams.get(name, (-1, iter(())))
+        try:
+            if not 0 <= position <= index:
+                received_ns = series[index][1]
+                position = next(i for i, (_, at_ns) in enumerate(series) if at_ns >= received_ns)
+                stream = iter(self._reader.messages(connections=self._connections({name}), start=received_ns))
+            with self._explained():
+                connection, _, data = next(stream)
+                while position < index:
+                    connection, _, data = next(stream)
+                    position += 1
+                self._streams[name] = (position + 1, stream)
+                return self._reader.deserialize(data, connection.msgtype)
+        except (ImportSourceError, StopIteration) as error:
+            self._streams.pop(name, None)
+            raise CodecError(f"cannot be read: {error}") from error
+
+    def intrinsics(self, info: Any, *, rectified: bool) -> CameraIntrinsics:
+        """See ``ros_images.intrinsics``."""
+        K, D, P = (info.k, info.d, info.p) if self._is_ros2 else (info.K, info.D, info.P)
+        return ros_images.intrinsics(info, P if rectified else K, D, rectified=rectified)
+
+    def pose_reader(self, topic: str) -> Callable[[Any], tuple[Any, Any]]:
+        """What takes position and rotation out of a message of a topic of poses."""
+        kinds: Mapping[str, Callable[[Any], tuple[Any, Any]]] = {
+            "nav_msgs/msg/Odometry": lambda m: (m.pose.pose.position, m.pose.pose.orientation),
+            "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: (m.pose.pose.position, m.pose.pose.orientation),
+            "geometry_msgs/msg/PoseStamped": lambda m: (m.pose.position, m.pose.orientation),
+            "geometry_msgs/msg/TransformStamped": lambda m: (m.transform.translation, m.transform.rotation),
+        }
+        return kinds[self._connections({topic})[0].msgtype]
+
+    def _connections(self, names: set[str]) -> list[Any]:
+        return [c for c in self._reader.connections if c.topic in names]
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Make of whatever a damaged bag leads to an error that says what to do."""
+        try:
+            yield
+        except (SemanticMapperError, StopIteration, MemoryError):
+            raise
+        except Exception as error:  # storage, compression and messages each raise their own
+            raise ImportSourceError(
+                f"{self.src}: this ROS bag cannot be read: {visible(str(error)) or type(error).__name__}; {_MEND}"
+            ) from error
+
+
+def _load_rosbags() -> tuple[Any, Any]:
+    try:
+        return importlib.import_module("rosbags.highlevel"), importlib.import_module("rosbags.typesys")
+    except ImportError as error:
+        raise DependencyError(
+            f"ROS bags cannot be read: {error}. Run `make setup`, or install it yourself: pip install 'rosbags>=0.11.9'"
+        ) from error
+
+
+def _storage_files(folder: Path) -> list[Path]:
+    return sorted(f for f in folder.iterdir() if f.suffix in STORAGE) if folder.is_dir() else []
+
+
+def _without_doubles(topics: list[_Topic]) -> list[_Topic]:
+    """Of each camera one transport: raw images where there are some."""
+    by_base = {t.base: t for t in sorted(topics, key=lambda t: t.raw)}
+    return [t for t in topics if t in by_base.values()]
+
+
+def _info_name(topic: _Topic) -> str:
+    return f"{topic.base.rsplit('/', 1)[0]}/camera_info"
+
+
+def _on(way: list[str]) -> str:
+    return " on ".join(f"'{frame}'" for frame in way)
+
+
+def _rectifier(src: Path, measured: CameraIntrinsics) -> Rectifier:
+    try:
+        return Rectifier(measured)
+    except ConfigError as error:
+        raise ImportSourceError(f"{src}: {error}") from error
+
+
+def _rate(stamps: Any) -> float:
+    """Images a second, 0 where it cannot be told."""
+    if len(stamps) < 2 or stamps.max() == stamps.min():
+        return 0.0
+    return round(1e9 * (len(stamps) - 1) / float(stamps.max() - stamps.min()), 3)

@@ -1,0 +1,274 @@
+"""COLMAP's models, text and binary: cameras, images with their poses, and points.
+
+The layout is that of https://colmap.github.io/format.html ("Output Format"). COLMAP's pixels begin at the corner of the
+image (the first pixel's centre is at 0.5); here centres are integers, so 0.5 is taken off. Its poses are world to
+camera, and its camera axes are OpenCV's.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from semantic_mapper.errors import FrameError, ImportSourceError
+from semantic_mapper.files import read_regular
+from semantic_mapper.geometry import invert_pose, pose_matrix
+from semantic_mapper.types import CameraIntrinsics, Float64, Int64
+
+MAX_BYTES = 1 << 31  # of one file of a model
+# Camera models by their number: name, and how many parameters. What is not here has no pinhole image.
+MODELS: dict[int, tuple[str, int]] = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+}
+_NAMES = ("cameras", "images", "points3D")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColmapImage:
+    """One registered image.
+
+    Args:
+        name: As the model has it, a path below the folder of images.
+        camera_id: Of its camera.
+        T_world_camera: (4, 4).
+        xy: (N, 2) its features in pixels.
+        point_ids: (N,) of their points; -1 = none.
+    """
+
+    name: str
+    camera_id: int
+    T_world_camera: Float64
+    xy: Float64
+    point_ids: Int64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColmapModel:
+    """A model.
+
+    Args:
+        cameras: By their ids; with distortion as OpenCV has it.
+        images: In the order of their names.
+        points: (3,) of each point by its id.
+        errors_px: Mean reprojection error of each point, by its id.
+    """
+
+    cameras: dict[int, CameraIntrinsics]
+    images: tuple[ColmapImage, ...]
+    points: dict[int, Float64]
+    errors_px: dict[int, float]
+
+
+def find_model(folder: Path) -> Path | None:
+    """The folder of a model: this one, or ``sparse/0``, ``sparse`` or ``colmap/sparse/0`` below it; None = none."""
+    for place in (folder, folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0"):
+        if any(all((place / f"{name}.{kind}").exists() for name in _NAMES[:2]) for kind in ("bin", "txt")):
+            return place
+    return None
+
+
+def read_model(folder: Path) -> ColmapModel:
+    """Read the model in a folder; binary files come before text.
+
+    Raises:
+        ImportSourceError: a file is missing, cut off, or holds something else; a camera that is no pinhole camera with
+            a lens of OpenCV's model.
+    """
+    binary = all((folder / f"{name}.bin").exists() for name in _NAMES[:2])
+    kind = "bin" if binary else "txt"
+    files = [folder / f"{name}.{kind}" for name in _NAMES]
+    for file in files[:2]:
+        if not file.exists():
+            raise ImportSourceError(f"{file}: missing; a model has cameras, images and points3D, .bin or .txt")
+    cameras = dict(_cameras_bin(files[0]) if binary else _cameras_txt(files[0]))
+    images = sorted(_images_bin(files[1]) if binary else _images_txt(files[1]), key=lambda image: image.name)
+    rows = () if not files[2].exists() else _points_bin(files[2]) if binary else _points_txt(files[2])
+    points, errors = {}, {}
+    for number, xyz, error in rows:
+        points[number], errors[number] = xyz, error
+    for image in images:
+        if image.camera_id not in cameras:
+            raise ImportSourceError(f"{files[1]}: image '{image.name}' has camera {image.camera_id}, which is missing")
+    return ColmapModel(cameras, tuple(images), points, errors)
+
+
+def intrinsics_of(model: str, width: int, height: int, params: list[float], where: str) -> CameraIntrinsics:
+    """A camera of COLMAP's as OpenCV's model.
+
+    Raises:
+        ImportSourceError: a fisheye or another lens that OpenCV's pinhole model does not have, or impossible values.
+    """
+    wanted = dict(MODELS.values()).get(model)
+    if wanted is None or wanted != len(params):
+        raise ImportSourceError(f"{where}: camera model '{model}' with {len(params)} parameters is not known")
+    if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+        fx, fy, cx, cy, *lens = (params[0], *params)
+    else:
+        fx, fy, cx, cy, *lens = params
+    if model in ("SIMPLE_RADIAL", "RADIAL"):
+        lens = [*lens, *[0.0] * (4 - len(lens))]
+    elif model == "FULL_OPENCV":
+        lens = [*lens]  # k1 k2 p1 p2 k3 k4 k5 k6, as OpenCV orders them
+    elif model not in ("SIMPLE_PINHOLE", "PINHOLE", "OPENCV"):
+        raise ImportSourceError(
+            f"{where}: the lens model '{model}' is not read; undistort the images (`colmap image_undistorter`) and "
+            "import the model that comes out"
+        )
+    try:
+        return CameraIntrinsics(fx, fy, cx - 0.5, cy - 0.5, width, height, tuple(lens) if any(lens) else ())
+    except FrameError as error:
+        raise ImportSourceError(f"{where}: {error}") from error
+
+
+class _Bytes:
+    """Numbers of a binary file, in order."""
+
+    def __init__(self, file: Path) -> None:
+        try:
+            self._data, self._at, self.file = read_regular(file, MAX_BYTES), 0, file
+        except OSError as error:
+            raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
+
+    def numbers(self, form: str) -> tuple[float, ...]:
+        """Numbers as ``struct`` has them, little endian.
+
+        Raises:
+            ImportSourceError: the file ends before.
+        """
+        size = struct.calcsize("<" + form)
+        if self._at + size > len(self._data):
+            raise self._cut()
+        self._at += size
+        return struct.unpack_from("<" + form, self._data, self._at - size)
+
+    def count(self) -> int:
+        """A number of things that follow."""
+        return int(self.numbers("Q")[0])
+
+    def array(self, dtype: np.dtype, count: int) -> np.ndarray:
+        """Records."""
+        size = dtype.itemsize * count
+        if count < 0 or self._at + size > len(self._data):
+            raise self._cut()
+        self._at += size
+        return np.frombuffer(self._data, dtype, count, self._at - size)
+
+    def text(self) -> str:
+        """Up to a zero byte."""
+        end = self._data.find(b"\0", self._at)
+        if end < 0:
+            raise self._cut()
+        found, self._at = self._data[self._at : end], end + 1
+        return found.decode("utf-8", "replace")
+
+    def _cut(self) -> ImportSourceError:
+        return ImportSourceError(f"{self.file}: is cut off, or no file of a COLMAP model; export the model again")
+
+
+_FEATURE = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
+_TRACK = np.dtype([("image", "<i4"), ("feature", "<i4")])
+
+
+def _cameras_bin(file: Path) -> Iterator[tuple[int, CameraIntrinsics]]:
+    data = _Bytes(file)
+    for _ in range(data.count()):
+        number, model, width, height = (int(n) for n in data.numbers("iiQQ"))
+        if model not in MODELS:
+            raise ImportSourceError(f"{file}: camera {number} has model {model}, which is not known")
+        name, count = MODELS[model]
+        params = list(data.numbers(f"{count}d"))
+        yield number, intrinsics_of(name, width, height, params, f"{file}, camera {number}")
+
+
+def _images_bin(file: Path) -> Iterator[ColmapImage]:
+    data = _Bytes(file)
+    for _ in range(data.count()):
+        _, *pose, camera = data.numbers("i7di")
+        name = data.text()
+        rows = data.array(_FEATURE, data.count())
+        xy = np.stack((rows["x"], rows["y"]), axis=1) - 0.5
+        yield _image(name, int(camera), pose, xy, rows["point"].astype(np.int64), f"{file}, image '{name}'")
+
+
+def _points_bin(file: Path) -> Iterator[tuple[int, Float64, float]]:
+    data = _Bytes(file)
+    for _ in range(data.count()):
+        number, x, y, z, _, _, _, error = data.numbers("Qddd3Bd")
+        data.array(_TRACK, data.count())
+        yield int(number), np.array((x, y, z)), float(error)
+
+
+def _cameras_txt(file: Path) -> Iterator[tuple[int, CameraIntrinsics]]:
+    for line, words in _lines(file):
+        try:
+            number, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
+            params = [float(word) for word in words[4:]]
+        except (ValueError, IndexError) as error:
+            raise _bad_line(file, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", error) from error
+        yield number, intrinsics_of(model, width, height, params, f"{file}, line {line}")
+
+
+def _images_txt(file: Path) -> Iterator[ColmapImage]:
+    """Two lines an image; the second one, its features, may be empty."""
+    rows = iter(_lines(file, empty=True))
+    for line, words in rows:
+        if not words:
+            continue
+        try:
+            pose, camera, name = [float(word) for word in words[1:8]], int(words[8]), " ".join(words[9:])
+            if len(pose) != 7 or not name:
+                raise ValueError("too few values")
+        except (ValueError, IndexError) as error:
+            form = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+            raise _bad_line(file, line, form, error) from error
+        line, words = next(rows, (line + 1, []))
+        try:
+            features = np.array([float(word) for word in words]).reshape(-1, 3)
+        except ValueError as error:
+            raise _bad_line(file, line, "X Y POINT3D_ID ...", error) from error
+        points = features[:, 2].astype(np.int64)
+        yield _image(name, camera, pose, features[:, :2] - 0.5, points, f"{file}, image '{name}'")
+
+
+def _points_txt(file: Path) -> Iterator[tuple[int, Float64, float]]:
+    for line, words in _lines(file):
+        try:
+            yield int(words[0]), np.array([float(word) for word in words[1:4]]).reshape(3), float(words[7])
+        except (ValueError, IndexError) as error:
+            raise _bad_line(file, line, "POINT3D_ID X Y Z R G B ERROR TRACK[]", error) from error
+
+
+def _image(name: str, camera: int, pose: list[float], xy: Float64, points: Int64, where: str) -> ColmapImage:
+    w, x, y, z, *t = pose
+    if not np.isfinite(pose).all() or not abs(np.linalg.norm((w, x, y, z)) - 1) < 0.1:
+        raise ImportSourceError(f"{where}: its pose is no unit quaternion QW QX QY QZ and position TX TY TZ")
+    T_camera_world = pose_matrix(np.array(t), np.array((x, y, z, w)))
+    return ColmapImage(name, camera, invert_pose(T_camera_world), xy, points)
+
+
+def _lines(file: Path, *, empty: bool = False) -> Iterator[tuple[int, list[str]]]:
+    try:
+        lines = read_regular(file, MAX_BYTES).decode("utf-8", "replace").splitlines()
+    except OSError as error:
+        raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
+    for number, line in enumerate(lines, 1):
+        if not line.startswith("#") and (empty or line.strip()):
+            yield number, line.split()
+
+
+def _bad_line(file: Path, line: int, form: str, error: Exception) -> ImportSourceError:
+    return ImportSourceError(f"{file}, line {line}: expected {form} ({error})")

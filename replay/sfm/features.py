@@ -1,0 +1,85 @@
+"""Features of the picked frames, and which of those frames show the same place again."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from semantic_mapper.types import Float32, Float64, UInt8
+
+MOST_FEATURES = 2500
+_CONTRAST = 0.02  # half of OpenCV's default: walls of rooms have little
+WORDS, TRAIN_ROWS, ROUNDS = 32, 20_000, 8  # of the vocabulary that the film's own features make
+LOOPS_A_FRAME = 3
+MIN_SIMILARITY = 0.15  # of two frames that may show the same place; of two any frames it is about 0
+
+
+class FeatureFinder:
+    """Finds SIFT features."""
+
+    def __init__(self) -> None:
+        self._sift = cv2.SIFT.create(nfeatures=MOST_FEATURES, contrastThreshold=_CONTRAST)
+
+    def find(self, bgr: UInt8) -> tuple[Float32, UInt8]:
+        """Pixels (N, 2) float32, centres of pixels being integers, and descriptors (N, 128) uint8 (square roots)."""
+        keypoints, found = self._sift.detectAndCompute(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), None)
+        if found is None or not len(keypoints):
+            return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8)
+        xy = np.array([k.pt for k in keypoints], np.float32)[:MOST_FEATURES]
+        rows = np.asarray(found, np.float32)[:MOST_FEATURES]
+        rooted = np.sqrt(rows / np.maximum(rows.sum(axis=1, keepdims=True), 1e-9))
+        return xy, np.clip(np.round(512 * rooted), 0, 255).astype(np.uint8)
+
+
+def loop_pairs(descriptors: list[UInt8], window: int, seed: int) -> list[tuple[int, int]]:
+    """Pairs (i, j), i < j, of frames further than ``window`` apart that look alike.
+
+    Frames are compared by the sums of their descriptors' residuals to a few words (VLAD), learned from all of them.
+
+    Args:
+        descriptors: Of each frame (N, 128) uint8; N may be 0.
+        window: Frames nearer than this in the sequence are matched anyway.
+        seed: Of the words.
+    """
+    filled = [rows for rows in descriptors if len(rows)]
+    if len(filled) <= window or sum(map(len, filled)) < 10 * WORDS:
+        return []
+    rng = np.random.default_rng(seed)
+    each = max(1, TRAIN_ROWS // len(filled))
+    sample = [rows[rng.permutation(len(rows))[:each]] for rows in filled]
+    words = _learn_words(np.concatenate(sample).astype(np.float64), rng)
+    signatures = np.stack([_signature(rows.astype(np.float64), words) for rows in descriptors])
+    signatures -= signatures.mean(axis=0)
+    signatures /= np.maximum(np.linalg.norm(signatures, axis=1, keepdims=True), 1e-9)
+    alike = signatures @ signatures.T
+    gap = np.abs(np.subtract.outer(np.arange(len(alike)), np.arange(len(alike))))
+    alike[gap <= window] = -1
+    pairs: set[tuple[int, int]] = set()
+    for i, row in enumerate(alike):
+        best = np.argsort(-row, kind="stable")[:LOOPS_A_FRAME]
+        pairs |= {(min(i, int(j)), max(i, int(j))) for j in best if row[j] > MIN_SIMILARITY}
+    return sorted(pairs)
+
+
+def _learn_words(rows: Float64, rng: np.random.Generator) -> Float64:
+    words = rows[rng.permutation(len(rows))[:WORDS]]
+    for _ in range(ROUNDS):
+        nearest = _nearest(rows, words)
+        counts = np.bincount(nearest, minlength=WORDS)
+        sums = np.zeros_like(words)
+        np.add.at(sums, nearest, rows)
+        words = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], words)
+    return words
+
+
+def _signature(rows: Float64, words: Float64) -> Float64:
+    sums = np.zeros_like(words)
+    if len(rows):
+        nearest = _nearest(rows, words)
+        np.add.at(sums, nearest, rows - words[nearest])
+    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
+    return sums.ravel() / max(float(np.linalg.norm(sums)), 1e-9)
+
+
+def _nearest(rows: Float64, words: Float64) -> np.ndarray:
+    return np.argmin((words**2).sum(axis=1) - 2 * rows @ words.T, axis=1)

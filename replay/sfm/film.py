@@ -1,0 +1,171 @@
+"""The frames of a film, or the pictures of a folder, in their order, with times."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from semantic_mapper.errors import ImportSourceError
+from semantic_mapper.types import UInt8
+
+FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
+MAX_SIDE_PX = 1280  # larger frames are made smaller: a map needs no more, and memory stays bounded
+PICTURE_HZ = 2.0  # at which the pictures of a folder count as taken
+DEFAULT_HZ = 30.0  # of a film that tells neither times nor a rate
+_TURNS = (None, cv2.ROTATE_90_CLOCKWISE, cv2.ROTATE_180, cv2.ROTATE_90_COUNTERCLOCKWISE)
+_FOCAL_35MM, _DIAGONAL_35MM = 0xA405, 43.27  # EXIF: FocalLengthIn35mmFilm; the diagonal of its picture in mm
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilmFrame:
+    """One decoded frame.
+
+    Args:
+        index: Counts from 0 over all frames of the film, good and bad.
+        stamp_ns: Time within the film, nanoseconds; rises.
+        bgr: (H, W, 3), upright as the film's rotation mark says, at most ``MAX_SIDE_PX`` wide and high.
+    """
+
+    index: int
+    stamp_ns: int
+    bgr: UInt8
+
+
+class Film:
+    """A film or a folder of pictures; may be read several times, always with the same result.
+
+    Args:
+        path: Film file, or folder of pictures, which are read by the numbers in their names.
+        quarters: Turn every frame clockwise by this many quarters, beside what the film's own rotation mark says.
+
+    Attributes:
+        width, height: Of the frames as they are given, in pixels.
+        full_width, full_height: Before they were made smaller.
+        count: About how many there are; films may tell a wrong number.
+        focal_px: Focal length by the picture's EXIF data, for the given size; None where nothing tells it.
+        odd_pictures: Of a folder: pictures that cannot be read or have another size, with the reason.
+
+    Raises:
+        ImportSourceError: missing, no film that OpenCV can decode, or no pictures.
+    """
+
+    def __init__(self, path: Path, quarters: int = 0) -> None:
+        self.path = path
+        self.odd_pictures: dict[Path, str] = {}
+        self.focal_px: float | None = None
+        self._turn = _TURNS[quarters % 4]
+        self._pictures = pictures_of(path) if path.is_dir() else []
+        if path.is_dir() and not self._pictures:
+            raise ImportSourceError(f"{path}: no pictures in it ({', '.join(PICTURE_SUFFIXES)})")
+        if not path.exists():
+            raise ImportSourceError(f"{path}: no such film or folder of pictures")
+        first, self.count, self.hz = self._look() if not self._pictures else self._look_at_pictures()
+        full = first if self._turn is None else np.asarray(cv2.rotate(first, self._turn), np.uint8)
+        self.full_height, self.full_width = full.shape[:2]
+        self._ratio = min(1.0, MAX_SIDE_PX / max(full.shape[:2]))
+        self.width, self.height = (max(1, round(side * self._ratio)) for side in (self.full_width, self.full_height))
+        if self.focal_px is not None:
+            self.focal_px *= self._ratio
+
+    def __iter__(self) -> Iterator[FilmFrame]:
+        """All frames from the first one; pictures that cannot be used are left out (``odd_pictures``)."""
+        return self._iterate_pictures() if self._pictures else self._iterate_film()
+
+    def _iterate_film(self) -> Iterator[FilmFrame]:
+        capture = self._open()
+        try:
+            index, last_ns = 0, -1
+            while True:
+                good, bgr = capture.read()
+                if not good or bgr is None:
+                    return
+                stamp_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+                if stamp_ns <= last_ns:  # containers without times
+                    stamp_ns = last_ns + round(1e9 / self.hz)
+                last_ns = stamp_ns
+                yield FilmFrame(index, stamp_ns, self._as_given(np.asarray(bgr, np.uint8)))
+                index += 1
+        finally:
+            capture.release()
+
+    def _iterate_pictures(self) -> Iterator[FilmFrame]:
+        for index, file in enumerate(self._pictures):
+            bgr = cv2.imread(str(file), cv2.IMREAD_COLOR)  # turns it as its EXIF data says
+            if bgr is None:
+                self.odd_pictures[file] = "is damaged, or no picture that OpenCV can read"
+                continue
+            given = np.asarray(bgr, np.uint8)
+            turned = given if self._turn is None else np.asarray(cv2.rotate(given, self._turn), np.uint8)
+            if turned.shape[:2] != (self.full_height, self.full_width):
+                self.odd_pictures[file] = (
+                    f"is {turned.shape[1]}x{turned.shape[0]}, the first picture {self.full_width}x{self.full_height}"
+                )
+                continue
+            yield FilmFrame(index, round(index * 1e9 / PICTURE_HZ), self._as_given(given))
+
+    def _as_given(self, bgr: UInt8) -> UInt8:
+        if self._turn is not None:
+            bgr = np.asarray(cv2.rotate(bgr, self._turn), np.uint8)
+        if bgr.shape[:2] == (self.height, self.width):
+            return bgr
+        return np.asarray(cv2.resize(bgr, (self.width, self.height), interpolation=cv2.INTER_AREA), np.uint8)
+
+    def _open(self) -> cv2.VideoCapture:
+        capture = cv2.VideoCapture(str(self.path))
+        if not capture.isOpened():
+            capture.release()
+            raise ImportSourceError(
+                f"{self.path}: is no film that OpenCV can decode; is it complete? convert it to H.264 in an mp4 file"
+            )
+        return capture
+
+    def _look(self) -> tuple[UInt8, int, float]:
+        capture = self._open()
+        try:
+            good, bgr = capture.read()
+            if not good or bgr is None:
+                raise ImportSourceError(f"{self.path}: holds no frame that can be decoded; copy or convert it again")
+            hz = capture.get(cv2.CAP_PROP_FPS)
+            count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+            return np.asarray(bgr, np.uint8), max(count, 1), hz if 0.01 < hz < 1000 else DEFAULT_HZ
+        finally:
+            capture.release()
+
+    def _look_at_pictures(self) -> tuple[UInt8, int, float]:
+        for file in self._pictures:
+            bgr = cv2.imread(str(file), cv2.IMREAD_COLOR)
+            if bgr is not None:
+                self.focal_px = focal_of_exif(file, max(bgr.shape[:2]), min(bgr.shape[:2]))
+                return np.asarray(bgr, np.uint8), len(self._pictures), PICTURE_HZ
+        raise ImportSourceError(f"{self.path}: none of its {len(self._pictures)} pictures can be read")
+
+
+def pictures_of(folder: Path) -> list[Path]:
+    """Pictures of a folder by the numbers in their names, as people order them: 9 comes before 10."""
+    files = [file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES and file.is_file()]
+    return sorted(files, key=lambda file: [int(w) if w.isdigit() else w for w in re.split(r"(\d+)", file.name)])
+
+
+def focal_of_exif(file: Path, longer_px: int, shorter_px: int) -> float | None:
+    """Focal length in pixels by the EXIF data of a picture; None where it does not tell one.
+
+    Args:
+        file: JPEG or another format with EXIF data.
+        longer_px, shorter_px: Sides of the picture.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(file) as image:
+            focal_mm = image.getexif().get_ifd(0x8769).get(_FOCAL_35MM, 0)
+    except (OSError, ValueError, SyntaxError):
+        return None
+    if not isinstance(focal_mm, int | float) or not 5 <= focal_mm <= 1000:
+        return None
+    return float(focal_mm) * float(np.hypot(longer_px, shorter_px)) / _DIAGONAL_35MM

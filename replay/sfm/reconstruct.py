@@ -1,0 +1,656 @@
+"""A film becomes a log: frames chosen, poses found, scale and up found, and what lies between filled in."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+
+from semantic_mapper.drivers.calibration import Rectifier, load_calibration
+from semantic_mapper.errors import ConfigError, DependencyError, FrameError, ImportSourceError
+from semantic_mapper.evaluation.upright import camera_up
+from semantic_mapper.geometry import camera_matrix, scale_intrinsics
+from semantic_mapper.image_rotation import rotate_intrinsics
+from semantic_mapper.log_events import get_logger
+from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.log.atomic_log import atomic_log
+from semantic_mapper.replay.sfm import colmap_process as colmap
+from semantic_mapper.replay.sfm.between import Anchor, follow_pose
+from semantic_mapper.replay.sfm.colmap_model import ColmapModel, read_model
+from semantic_mapper.replay.sfm.features import FeatureFinder
+from semantic_mapper.replay.sfm.film import Film, FilmFrame
+from semantic_mapper.replay.sfm.film_note import FilmNote
+from semantic_mapper.replay.sfm.refusals import (
+    LEAST_ANGLE_DEG,
+    refuse_features,
+    refuse_look,
+    refuse_outcome,
+    turning,
+)
+from semantic_mapper.replay.sfm.scale import (
+    NEIGHBOURS,
+    UNSCALED_DEPTH_M,
+    BoardScale,
+    Mark,
+    PlacedFrame,
+    ScaleHint,
+    floor_height,
+    marked_place,
+    median_depth,
+    nearest_frame,
+    upright,
+)
+from semantic_mapper.replay.sfm.selection import LEAST_MOTION, STEP, FilmLook, look_through, pick_frames
+from semantic_mapper.replay.sfm.vertical import find_edges, vertical
+from semantic_mapper.transport.images import CodecOptions
+from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
+from semantic_mapper.types import CameraIntrinsics, Float64, Int64, PosedFrame, UInt8
+
+FOCAL_PRIORS = (0.85, 1.2, 0.65)  # of the longer side, in the order of trial: phones, webcams, wide lenses
+RETRY_PRIORS = (1.0, 0.85, 1.2)  # of the focal length that was given as a guess
+FILL = 0.02  # motion between two frames of the log, of the image's width
+FILL_NS, FILL_LEAST = 140_000_000, LEAST_MOTION  # ... or this long after the last one, with this much motion
+MAX_FRAMES = 3000  # in a log; longer ways get longer steps
+FOLLOWED = 2.5 * STEP  # motion since the last placed frame within which a frame is followed
+MAX_POINT_ERROR_PX = 2.0  # points that are less exact are no guide
+EDGE_FRAMES = 60  # about as many are searched for upright edges
+MAX_POINTS = 20_000  # that the report shows
+PACKING = CodecOptions(rgb="jpeg", jpeg_quality=95)  # a film has lost more already
+
+_log = get_logger(__name__)
+
+Progress = Callable[[str, int, int], None]  # what is done; how much of it; of how much
+
+
+@dataclass(frozen=True, slots=True)
+class FilmOptions:
+    """How to read a film.
+
+    Args:
+        calibration: File of the camera's calibration; None = focal length and distortion are found.
+        focal_prior_px: About the focal length, in pixels of the film; None = guessed, or by the picture's EXIF data.
+        scale: What tells the size of the scene.
+        quarters: Turn every frame clockwise by this many quarters.
+        camera_id: Name that the camera gets in the log.
+    """
+
+    calibration: Path | None = None
+    focal_prior_px: float | None = None
+    scale: ScaleHint = field(default_factory=ScaleHint)
+    quarters: int = 0
+    camera_id: str = "camera"
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """Frames one after the other that are not in the log.
+
+    Args:
+        reason: Why.
+        start_s, end_s: Times of the first and the last.
+        frames: How many.
+    """
+
+    reason: str
+    start_s: float
+    end_s: float
+    frames: int
+
+
+@dataclass(frozen=True, slots=True)
+class OtherModel:
+    """A part of the film that does not hang together with the largest one, and is left out."""
+
+    frames: int
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilmReport:
+    """What became of a film.
+
+    Args:
+        film: Its file or folder.
+        looked_at: Frames of the film.
+        picked, registered: Frames that structure from motion was given, and has placed.
+        frames: In the log, with those in between.
+        left_out: The others, in order.
+        error_px: Mean reprojection error of the points.
+        points: How many there are.
+        focal_px: Of the frames before they are rectified, in pixels of the film.
+        focal_source: Where it comes from.
+        distortion: OpenCV's coefficients.
+        scale: How the scale was found; empty = unknown.
+        height_m: Median height of the camera over the floor; None where no floor is found.
+        stamps_ns: (N,) of the frames in the log.
+        T_world_camera: (N, 4, 4) theirs.
+        xyz: (M, 3) points, some of them.
+        others: Parts that are left out.
+        notices: Sentences on what had to be assumed.
+        pictures: RGB of a few frames of the log, with their times in seconds.
+        info: What stands in the log's head.
+        bytes: Size of the log.
+    """
+
+    film: Path
+    looked_at: int
+    picked: int
+    registered: int
+    frames: int
+    left_out: tuple[LeftOut, ...]
+    error_px: float
+    points: int
+    focal_px: float
+    focal_source: str
+    distortion: tuple[float, ...]
+    scale: str
+    height_m: float | None
+    stamps_ns: Int64
+    T_world_camera: Float64
+    xyz: Float64
+    others: tuple[OtherModel, ...]
+    notices: tuple[str, ...]
+    pictures: tuple[tuple[float, UInt8], ...]
+    info: StreamInfo
+    bytes: int
+
+    @property
+    def path_m(self) -> float:
+        """Length of the way; in the log's own unit where the scale is unknown."""
+        return float(np.linalg.norm(np.diff(self.T_world_camera[:, :3, 3], axis=0), axis=1).sum())
+
+    @property
+    def left_out_counts(self) -> dict[str, int]:
+        """Frames that are not in the log, by reason."""
+        counts: Counter[str] = Counter()
+        for part in self.left_out:
+            counts[part.reason] += part.frames
+        return dict(counts)
+
+
+def import_film(
+    src: Path, dst: Path, options: FilmOptions, on_progress: Progress, *, overwrite: bool = False
+) -> FilmReport:
+    """Write the log ``dst`` of a film, or of a folder of pictures, without poses; it is there once it is complete.
+
+    The world of the log has z up, by how the camera was held, and begins at the first camera, on the floor where one is
+    found. Deterministic: the same film, options and machine give the same poses.
+
+    Args:
+        src: Film file, or folder of pictures.
+        dst: Log to write.
+        options: How to read.
+        on_progress: Called with what is done, how much of it, and of how much.
+        overwrite: Whether a log that is there may be replaced.
+
+    Raises:
+        FilmError: no poses can be found; says why and what to do.
+        ImportSourceError: no film, or nothing of what was to tell the scale is found in it.
+        ConfigError: a calibration that does not fit.
+        DependencyError: pycolmap is not installed.
+        LogError: ``dst`` is there already, or cannot be written.
+    """
+    if find_spec("pycolmap") is None:
+        raise DependencyError(
+            "poses of films are found by pycolmap, which is not installed: pip install 'semantic-mapper[sfm]' (it has "
+            "no packages for Linux on ARM: import the film on another machine, and copy the log)"
+        )
+    film = Film(src, options.quarters)
+    lens = _Lens(film, options)
+    with tempfile.TemporaryDirectory(prefix="semantic-mapper-film-") as folder:
+        return _Import(film, lens, options, Path(folder), on_progress).run(dst, overwrite=overwrite)
+
+
+class _Lens:
+    """What structure from motion sees of a frame: rectified where there is a calibration, else as it is."""
+
+    def __init__(self, film: Film, options: FilmOptions) -> None:
+        self.rectify: Rectifier | None = None
+        self.measured: CameraIntrinsics | None = None
+        ratio = film.width / film.full_width
+        self.priors = tuple(f * max(film.width, film.height) for f in FOCAL_PRIORS)
+        self.source = "found, beginning with usual lenses"
+        if film.focal_px is not None:
+            self.priors = (film.focal_px, *self.priors)
+            self.source = "found, beginning with that of the picture's EXIF data"
+        if options.focal_prior_px is not None:
+            if not 0.1 <= options.focal_prior_px / max(film.full_width, film.full_height) <= 20:
+                raise ConfigError(
+                    f"--focal-prior {options.focal_prior_px:g}: is no focal length in pixels of pictures of "
+                    f"{film.full_width}x{film.full_height}; most lenses have 0.6 to 1.5 times the width"
+                )
+            self.priors = tuple(f * options.focal_prior_px * ratio for f in RETRY_PRIORS)
+            self.source = f"found, beginning with the given {options.focal_prior_px:g}"
+        if options.calibration is None:
+            return
+        if options.focal_prior_px is not None:
+            raise ConfigError("give a calibration or a guess of the focal length, not both")
+        given = rotate_intrinsics(load_calibration(options.calibration), options.quarters)
+        if given.width * film.full_height != given.height * film.full_width:
+            raise ConfigError(
+                f"{options.calibration}: is for images of {given.width}x{given.height}, the film has "
+                f"{film.full_width}x{film.full_height}, which is another form; calibrate with a film of the same mode"
+            )
+        self.source = f"given in {options.calibration.name}"
+        self.measured = scale_intrinsics(given, film.width, film.height)
+        self.rectify = Rectifier(self.measured)
+
+    def seen(self, bgr: UInt8) -> UInt8:
+        """(H, W, 3) BGR as structure from motion sees it."""
+        return bgr if self.rectify is None else np.asarray(cv2.cvtColor(self.rectify(bgr), cv2.COLOR_RGB2BGR), np.uint8)
+
+    def seen_pixel(self, u: float, v: float) -> tuple[float, float]:
+        """A pixel of the film, made smaller, in what is seen."""
+        if self.rectify is None or self.measured is None:
+            return u, v
+        lens = np.array(self.measured.distortion or (0.0,) * 4)
+        K = camera_matrix(self.rectify.intrinsics)
+        flat = cv2.undistortPoints(np.array([[[u, v]]]), camera_matrix(self.measured), lens, P=K)
+        return float(flat[0, 0, 0]), float(flat[0, 0, 1])
+
+    def request(self, film: Film) -> colmap.Camera:
+        """For the process."""
+        if self.rectify is None:
+            return colmap.Camera(film.width, film.height, None, self.priors)
+        i = self.rectify.intrinsics
+        return colmap.Camera(film.width, film.height, (i.fx, i.fy, i.cx + 0.5, i.cy + 0.5), (i.fx,))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Placed:
+    """The frames of the chosen model, by their index in the film, in the world of the log."""
+
+    frames: dict[int, PlacedFrame]
+    xy: dict[int, Float64]  # (N, 2) pixels of the points of each
+    seen: CameraIntrinsics  # of what was seen, with distortion
+
+
+class _Import:
+    """One import; its steps in order."""
+
+    def __init__(self, film: Film, lens: _Lens, options: FilmOptions, folder: Path, on_progress: Progress) -> None:
+        self._film, self._lens, self._options, self._folder = film, lens, options, folder
+        self._progress = on_progress
+        self._notices: list[str] = []
+        self._edges: dict[int, Float64] = {}  # of some of the picked frames
+
+    def run(self, dst: Path, *, overwrite: bool) -> FilmReport:
+        film = self._film
+        look = look_through(film, lambda done: self._progress("look", done, max(done, film.count)))
+        rows = pick_frames(look)
+        refuse_look(film.path, look, len(rows))
+        board = None if self._options.scale.board is None else BoardScale(self._options.scale.board)
+        picked = self._find_features(look, rows, board)
+        outcome = self._run_colmap()
+        models, attempt = self._judge(outcome, look, picked)
+        placed, scale, height, others = self._orient(models, look, picked, board)
+        chosen = attempt.models[0]
+        report = self._write(dst, look, picked, placed, scale, chosen.error_px, overwrite=overwrite)
+        ratio = film.full_width / film.width
+        return FilmReport(
+            film=film.path,
+            looked_at=len(look.index),
+            picked=len(picked),
+            registered=len(placed.frames),
+            frames=len(report.stamps),
+            left_out=tuple(report.left_out),
+            error_px=chosen.error_px,
+            points=len(models[0].points),
+            focal_px=placed.seen.fx * ratio,
+            focal_source=self._lens.source,
+            distortion=(self._lens.measured or placed.seen).distortion,
+            scale=scale,
+            height_m=height,
+            stamps_ns=np.array(report.stamps, np.int64),
+            T_world_camera=np.stack(report.poses),
+            xyz=self._some_points(placed),
+            others=others,
+            notices=tuple(self._notices),
+            pictures=tuple(report.pictures),
+            info=report.info,
+            bytes=dst.stat().st_size,
+        )
+
+    def _find_features(self, look: FilmLook, rows: Int64, board: BoardScale | None) -> list[int]:
+        """Index of each picked frame; its features are in the folder, under its place in the sequence."""
+        finder, counts = FeatureFinder(), list[int]()
+        picked: list[int] = []
+        (self._folder / colmap.FEATURES).mkdir()
+        for frame in self._frames({int(i) for i in look.index[rows]}):
+            seen = self._lens.seen(frame.bgr)
+            xy, descriptors = finder.find(seen)
+            np.savez(self._folder / colmap.FEATURES / f"{len(picked):06d}.npz", xy=xy, descriptors=descriptors)
+            if board is not None:
+                board.look(frame.index, np.asarray(cv2.cvtColor(seen, cv2.COLOR_BGR2RGB), np.uint8))
+            if len(picked) % max(1, len(rows) // EDGE_FRAMES) == 0:
+                self._edges[frame.index] = find_edges(_gray(seen))
+            counts.append(len(xy))
+            picked.append(frame.index)
+            self._progress("features", len(picked), len(rows))
+        refuse_features(self._film.path, counts)
+        return picked
+
+    def _frames(self, wanted: set[int]) -> Iterator[FilmFrame]:
+        last = max(wanted, default=-1)
+        for frame in self._film:
+            if frame.index in wanted:
+                yield frame
+            if frame.index >= last:
+                return
+
+    def _run_colmap(self) -> colmap.Outcome:
+        request = self._lens.request(self._film)
+        (self._folder / colmap.REQUEST).write_bytes(msgspec.json.encode(request))
+        errors = self._folder / "stderr.txt"
+        command = [sys.executable, "-I", "-m", colmap.__name__, str(self._folder)]
+        with errors.open("wb") as stderr:
+            process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=stderr)
+            try:
+                assert process.stdout is not None
+                for line in process.stdout:
+                    what, done, total = line.decode().split()
+                    self._progress(what, int(done), int(total))
+                code = process.wait()
+            finally:
+                process.kill()  # after Ctrl-C; one that has ended does not mind
+                process.wait()
+                if process.stdout is not None:
+                    process.stdout.close()
+        if code:
+            said = errors.read_text("utf-8", "replace").strip().splitlines()
+            raise ImportSourceError(
+                f"{self._film.path}: pycolmap ended with exit code {code}: {said[-1] if said else 'it said nothing'}"
+            )
+        return msgspec.json.decode((self._folder / colmap.RESULT).read_bytes(), type=colmap.Outcome)
+
+    def _judge(
+        self, outcome: colmap.Outcome, look: FilmLook, picked: list[int]
+    ) -> tuple[list[ColmapModel], colmap.Attempt]:
+        """Models of the best attempt, the largest first.
+
+        Raises:
+            FilmError: see ``refuse_outcome``.
+        """
+        best = max(
+            outcome.attempts,
+            key=lambda a: (a.models[0].images, -a.models[0].error_px) if a.models else (0, 0.0),
+        )
+        models = [read_model(self._folder / model.folder) for model in best.models]
+        spans = [[int(image.name) for image in model.images] for model in models]
+        times = [_seconds(look, index) for index in picked]
+        refuse_outcome(self._film.path, outcome, times, spans)
+        if _parallax_deg(models[0]) < LEAST_ANGLE_DEG:
+            raise turning(self._film.path)
+        tried = len(outcome.attempts)
+        if tried > 1:
+            priors = ", ".join(f"{a.focal_prior_px:.0f}" for a in outcome.attempts)
+            self._notices.append(f"{tried} focal lengths were tried: {priors} px; that of the largest model was kept")
+        return models, best
+
+    def _orient(
+        self, models: list[ColmapModel], look: FilmLook, picked: list[int], board: BoardScale | None
+    ) -> tuple[_Placed, str, float | None, tuple[OtherModel, ...]]:
+        """The largest model with z up, in metres, its floor at 0; how its scale was found; and the other ones."""
+        model = models[0]
+        seen = model.cameras[model.images[0].camera_id]
+        frames: dict[int, PlacedFrame] = {}
+        xy: dict[int, Float64] = {}
+        for image in model.images:
+            index = picked[int(image.name)]
+            good = [
+                (n, int(p))
+                for n, p in enumerate(image.point_ids)
+                if p >= 0 and model.errors_px.get(int(p), np.inf) < MAX_POINT_ERROR_PX
+            ]
+            xyz = np.array([model.points[p] for _, p in good]).reshape(-1, 3)
+            xy[index] = image.xy[[n for n, _ in good]]
+            frames[index] = PlacedFrame(_stamp(look, index), image.T_world_camera, xyz)
+        poses = {index: frame.T_world_camera for index, frame in frames.items()}
+        guess = camera_up(np.stack(list(poses.values())))
+        up = vertical(self._edges, poses, seen, guess)
+        if up is None:
+            self._notices.append("up is how the camera was held: too few upright edges are seen to tell it better")
+        frames = _moved(frames, upright(frames[min(frames)].T_world_camera, guess if up is None else up), 1.0)
+        placed = _Placed(_moved(frames, np.eye(4), UNSCALED_DEPTH_M / median_depth(list(frames.values()))), xy, seen)
+        factor, scale = self._scale(placed, board)
+        frames = _moved(placed.frames, np.eye(4), factor)
+        floor = floor_height(list(frames.values()))
+        down = np.eye(4)
+        down[2, 3] = 0.0 if floor is None else -floor
+        frames = _moved(frames, down, 1.0)
+        height = None if floor is None else float(np.median([f.T_world_camera[2, 3] for f in frames.values()]))
+        others = tuple(
+            OtherModel(
+                len(m.images),
+                _seconds(look, picked[int(m.images[0].name)]),
+                _seconds(look, picked[int(m.images[-1].name)]),
+            )
+            for m in models[1:]
+            if len(m.images) >= colmap.MIN_MODEL_IMAGES
+        )
+        for other in others:
+            self._notices.append(
+                f"the part from {other.start_s:.1f} to {other.end_s:.1f} s ({counted(other.frames, 'view')}) does not "
+                "hang together with the rest and is left out; import it as a film of its own"
+            )
+        return _Placed(frames, xy, seen), scale, height, others
+
+    def _scale(self, placed: _Placed, board: BoardScale | None) -> tuple[float, str]:
+        """Metres per unit, and how they were found; empty = they were not."""
+        hint, frames = self._options.scale, placed.frames
+        if hint.factor is not None:
+            return hint.factor, f"given: {hint.factor:g} m per unit"
+        if board is not None:
+            return board.metres_per_unit({i: f.T_world_camera for i, f in frames.items()}, placed.seen)
+        if hint.camera_height_m is not None:
+            floor = floor_height(list(frames.values()))
+            if floor is None:
+                raise ImportSourceError(
+                    f"{self._film.path}: no floor is found under the camera, so its height tells no scale; film more "
+                    "of the floor, or give the scale in another way"
+                )
+            height = float(np.median([f.T_world_camera[2, 3] for f in frames.values()])) - floor
+            return hint.camera_height_m / height, f"camera {hint.camera_height_m:g} m over the floor that was found"
+        if hint.distance is not None:
+            marks = [self._given_mark(mark) for mark in (hint.distance.a, hint.distance.b)]
+            a, b = (self._marked_place(mark, placed) for mark in marks)
+            found = float(np.linalg.norm(a - b))
+            if found < 1e-6:
+                raise ImportSourceError("the two marked points are one; mark two that are far apart")
+            return hint.distance.metres / found, f"two marked points, {hint.distance.metres:g} m apart"
+        self._notices.append(
+            "the scale is unknown: lengths of the log are not metres. Give one of --scale, --distance, --square-mm "
+            "(with a printed board in the film) or --camera-height"
+        )
+        return 1.0, ""
+
+    def _given_mark(self, mark: Mark) -> Mark:
+        ratio = self._film.width / self._film.full_width
+        return Mark(mark.time_s, *self._lens.seen_pixel(mark.u * ratio, mark.v * ratio))
+
+    def _marked_place(self, mark: Mark, placed: _Placed) -> Float64:
+        order = sorted(placed.frames)
+        at = order.index(nearest_frame(mark, placed.frames, order))
+        chosen = set(order[max(0, at - NEIGHBOURS) : at + NEIGHBOURS + 1])
+        pictures = {f.index: _gray(self._lens.seen(f.bgr)) for f in self._frames(chosen)}
+        return marked_place(mark, pictures, placed.frames, placed.seen)
+
+    def _write(
+        self,
+        dst: Path,
+        look: FilmLook,
+        picked: list[int],
+        placed: _Placed,
+        scale: str,
+        error_px: float,
+        *,
+        overwrite: bool,
+    ) -> _Written:
+        film, camera = self._film, self._options.camera_id
+        try:
+            rectify = self._lens.rectify or Rectifier(placed.seen)
+        except ConfigError as error:
+            raise ImportSourceError(f"{film.path}: the lens that was found cannot be undone: {error}") from error
+        chooser = _Chooser(look, set(picked), placed)
+        info = StreamInfo(
+            source=f"film {film.path.resolve().name}",
+            cameras={camera: rectify.intrinsics},
+            frame_hz=film.hz,
+            metadata={
+                "poses": "structure from motion",
+                SCALE_KEY: scale or SCALE_UNKNOWN,
+                "stamps": "time within the film",
+            },
+        )
+        written = _Written(info)
+        shown = set(np.linspace(0, len(look.index) - 1, 14).astype(int)[1:-1].tolist())
+        with atomic_log(dst, info, options=PACKING, overwrite=overwrite) as writer:
+            for row, frame in enumerate(film):
+                self._progress("write", row + 1, len(look.index))
+                pose, reason = chooser.pose(row, frame, self._lens)
+                if pose is None:
+                    written.leave_out(reason, frame.stamp_ns)
+                    continue
+                rgb = rectify(frame.bgr)
+                if shown and row >= min(shown):
+                    shown = {s for s in shown if s > row}
+                    written.pictures.append((frame.stamp_ns / 1e9, rgb))
+                posed = PosedFrame(
+                    stamp_ns=frame.stamp_ns,
+                    seq=frame.index,
+                    camera_id=camera,
+                    rgb=rgb,
+                    depth_m=None,
+                    label=None,
+                    intrinsics=rectify.intrinsics,
+                    T_world_camera=pose,
+                    pose_source="sfm",
+                )
+                try:
+                    writer.write_frame(posed)
+                except FrameError as error:
+                    written.leave_out(str(error), frame.stamp_ns)
+                    continue
+                written.stamps.append(frame.stamp_ns)
+                written.poses.append(pose)
+            counts: Counter[str] = Counter()
+            for part in written.left_out:
+                counts[part.reason] += part.frames
+            ratio = film.full_width / film.width
+            note = FilmNote(
+                len(look.index), dict(counts), len(picked), len(placed.frames), error_px, placed.seen.fx * ratio
+            )
+            writer.attach(note.attachment())
+        for file, reason in film.odd_pictures.items():
+            self._notices.append(f"{file.name} {reason}; it is left out")
+        return written
+
+    def _some_points(self, placed: _Placed) -> Float64:
+        xyz = np.unique(np.concatenate([frame.xyz for frame in placed.frames.values()]), axis=0)
+        return xyz[np.random.default_rng(0).permutation(len(xyz))[:MAX_POINTS]]
+
+
+@dataclass(slots=True)
+class _Written:
+    """What the log holds, and what it does not."""
+
+    info: StreamInfo
+    stamps: list[int] = field(default_factory=list[int])
+    poses: list[Float64] = field(default_factory=list[Float64])
+    left_out: list[LeftOut] = field(default_factory=list[LeftOut])
+    pictures: list[tuple[float, UInt8]] = field(default_factory=list[tuple[float, UInt8]])
+
+    def leave_out(self, reason: str, stamp_ns: int) -> None:
+        """Count one more frame; those of one reason that follow each other are one entry."""
+        last = self.left_out[-1] if self.left_out else None
+        if last is not None and last.reason == reason and (not self.stamps or last.end_s * 1e9 >= self.stamps[-1]):
+            self.left_out[-1] = LeftOut(reason, last.start_s, stamp_ns / 1e9, last.frames + 1)
+        else:
+            self.left_out.append(LeftOut(reason, stamp_ns / 1e9, stamp_ns / 1e9, 1))
+
+
+class _Chooser:
+    """Which frames come into the log, and with which pose; frames come in order."""
+
+    def __init__(self, look: FilmLook, picked: set[int], placed: _Placed) -> None:
+        self._look, self._picked, self._placed = look, picked, placed
+        self._way, self._blurred = look.way, look.blurred
+        self._fill = max(FILL, float(self._way[-1]) / MAX_FRAMES)
+        self._anchor: Anchor | None = None
+        self._anchor_way = self._last_way = -np.inf
+        self._last_ns = -(1 << 62)
+
+    def pose(self, row: int, frame: FilmFrame, lens: _Lens) -> tuple[Float64 | None, str]:
+        """T_world_camera (4, 4) of a frame of the log; or None and why it is left out."""
+        way = float(self._way[row])
+        placed = self._placed.frames.get(frame.index)
+        if placed is not None:
+            self._anchor = Anchor(
+                _gray(lens.seen(frame.bgr)), self._placed.xy[frame.index], placed.xyz, placed.T_world_camera
+            )
+            self._anchor_way = way
+            return self._taken(placed.T_world_camera, way, frame.stamp_ns), ""
+        if self._look.dark[row]:
+            return None, "shows nothing"
+        if self._blurred[row]:
+            return None, "blurred"
+        moved, since_ns = way - self._last_way, frame.stamp_ns - self._last_ns
+        wanted = moved >= self._fill or (since_ns >= FILL_NS and moved >= FILL_LEAST)
+        if not wanted and frame.index not in self._picked:
+            return None, "moved too little"
+        if self._anchor is None or way - self._anchor_way > FOLLOWED:
+            return None, "its place was not found"
+        pose = follow_pose(self._anchor, _gray(lens.seen(frame.bgr)), self._placed.seen)
+        if pose is None:
+            return None, "its place was not found"
+        return self._taken(pose, way, frame.stamp_ns), ""
+
+    def _taken(self, pose: Float64, way: float, stamp_ns: int) -> Float64:
+        self._last_way, self._last_ns = way, stamp_ns
+        return pose
+
+
+def _moved(frames: dict[int, PlacedFrame], T: Float64, scale: float) -> dict[int, PlacedFrame]:
+    """The frames after a rigid motion, then a change of scale."""
+    result: dict[int, PlacedFrame] = {}
+    for index, frame in frames.items():
+        pose = T @ frame.T_world_camera
+        pose[:3, 3] *= scale
+        result[index] = PlacedFrame(frame.stamp_ns, pose, scale * (frame.xyz @ T[:3, :3].T + T[:3, 3]))
+    return result
+
+
+def _parallax_deg(model: ColmapModel) -> float:
+    """Median over the points of the largest angle between two of the rays that they are seen by."""
+    centers: dict[int, list[Float64]] = {}
+    for image in model.images:
+        for point in image.point_ids[image.point_ids >= 0].tolist():
+            centers.setdefault(point, []).append(image.T_world_camera[:3, 3])
+    angles: list[float] = []
+    for point in sorted(centers)[:: max(1, len(centers) // 2000)]:
+        rays = model.points[point] - np.stack(centers[point])
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+        angles.append(float(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1)))))
+    return float(np.median(angles)) if angles else 0.0
+
+
+def _gray(bgr: UInt8) -> UInt8:
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+def _stamp(look: FilmLook, index: int) -> int:
+    return int(look.stamp_ns[np.searchsorted(look.index, index)])
+
+
+def _seconds(look: FilmLook, index: int) -> float:
+    return _stamp(look, index) / 1e9

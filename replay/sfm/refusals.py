@@ -1,0 +1,146 @@
+"""Why a film gives no poses, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from semantic_mapper.errors import ImportSourceError
+from semantic_mapper.replay.sfm.colmap_process import Outcome, Pair
+from semantic_mapper.replay.sfm.selection import STEP, FilmLook
+
+LEAST_PICKS = 8
+LEAST_WAY = LEAST_PICKS * STEP / 2  # of the image's width
+STILL = 0.1  # of the image's width: less motion in all is a camera that stands still
+MOST_DARK = 0.7  # of the frames
+LEAST_FEATURES = 80  # of a frame that can be matched, the median
+LEAST_LINKED = 0.5  # of the neighbours in the sequence
+LINK_MATCHES = 20
+FLAT = 0.93  # of the matches that one homography explains: nothing but a turn, or one plane
+LEAST_MODEL = 0.6  # of the picked frames in the largest model
+LEAST_ANGLE_DEG = 1.0  # between the rays to a point, the median: less is a camera that turns on the spot
+_HOW = "film again: walk slowly, sideways past things with texture, in good light"
+
+
+class FilmError(ImportSourceError):
+    """A film from which no poses can be found; ``reason`` is one word for it.
+
+    Args:
+        film: Its name.
+        reason: "dark", "still", "short", "blurred", "no-matches", "turning" or "several-scenes".
+        text: What is wrong, and what to do.
+    """
+
+    def __init__(self, film: object, reason: str, text: str) -> None:
+        super().__init__(f"{film}: {text}")
+        self.reason = reason
+
+
+def refuse_look(film: object, look: FilmLook, picks: int) -> None:
+    """Refuse a film by the first look at it.
+
+    Raises:
+        FilmError: dark, still, or too short.
+    """
+    count = len(look.index)
+    if not count:
+        raise FilmError(film, "short", "holds no frame that can be decoded; copy or convert it again")
+    dark = float(look.dark.mean())
+    if dark > MOST_DARK:
+        raise FilmError(
+            film, "dark", f"{100 * dark:.0f} % of its frames are black or show nothing; is the lens covered? {_HOW}"
+        )
+    seconds = (look.stamp_ns[-1] - look.stamp_ns[0]) / 1e9
+    way = float(np.nansum(look.motion))
+    if way < STILL and count >= LEAST_PICKS and np.isfinite(look.motion).mean() > 0.5:
+        raise FilmError(
+            film,
+            "still",
+            f"the camera does not move: in {seconds:.1f} s the picture shifts by {100 * way:.1f} % of its width; a map "
+            "needs views from different places; walk, or map a camera that stands still with poses of kind 'fixed'",
+        )
+    if picks < LEAST_PICKS:
+        raise FilmError(
+            film,
+            "short",
+            f"is too short: {count} frames in {seconds:.1f} s give {picks} views a step apart, {LEAST_PICKS} needed; "
+            "film for ten seconds or more while walking",
+        )
+
+
+def refuse_features(film: object, features: Sequence[int]) -> None:
+    """Refuse a film whose frames have nothing that can be found again.
+
+    Raises:
+        FilmError: blurred, or without texture.
+    """
+    found = float(np.median(features))
+    if found < LEAST_FEATURES:
+        raise FilmError(
+            film,
+            "blurred",
+            f"its frames are blurred, or show surfaces without texture: half of them have fewer than {found:.0f} "
+            f"features, {LEAST_FEATURES} needed; hold the camera still enough, wipe the lens, and {_HOW}",
+        )
+
+
+def refuse_outcome(film: object, outcome: Outcome, times_s: Sequence[float], spans: Sequence[Sequence[int]]) -> None:
+    """Refuse what structure from motion could not put together.
+
+    Args:
+        film: Its name.
+        outcome: Of the process.
+        times_s: Of the picked frames.
+        spans: Places in the sequence of the frames of each model of the best attempt, the largest first.
+
+    Raises:
+        FilmError: nothing matches, the camera only turns, or the film falls apart.
+    """
+    picks = len(times_s)
+    linked = {p.second for p in outcome.pairs if p.matches >= LINK_MATCHES and p.second - p.first == 1}
+    if len(linked) < LEAST_LINKED * (picks - 1) and (not spans or len(spans[0]) < LEAST_MODEL * picks):
+        raise FilmError(
+            film,
+            "no-matches",
+            f"its pictures do not match each other: {len(linked)} of {picks - 1} neighbours show the same place; the "
+            f"camera moves too fast, or what it sees changes or has no texture; {_HOW}",
+        )
+    if not spans:
+        if flat_fraction(outcome.pairs) >= 0.5:
+            raise turning(film)
+        raise FilmError(
+            film,
+            "no-matches",
+            "no two of its pictures show one place from two sides far enough apart; give --calibration or "
+            f"--focal-prior where the lens is unusual, or {_HOW}",
+        )
+    if len(spans[0]) < LEAST_MODEL * picks:
+        if flat_fraction(outcome.pairs) >= 0.5:  # what models it gives are noise
+            raise turning(film)
+        listed = "; ".join(
+            f"{times_s[min(span)]:.1f} to {times_s[max(span)]:.1f} s ({len(span)} of {picks} views)"
+            for span in spans[:4]
+        )
+        raise FilmError(
+            film,
+            "several-scenes",
+            f"falls into parts that do not hang together: {listed}; cut it into one film for each scene, or film again "
+            "without cuts and fast turns, coming back to what was seen before",
+        )
+
+
+def turning(film: object) -> FilmError:
+    """The error of a camera that turns on the spot."""
+    return FilmError(
+        film,
+        "turning",
+        "the camera only turns on the spot, or sees one flat surface: from one place nothing can be measured; "
+        "walk while filming, a step or more to the side for each turn",
+    )
+
+
+def flat_fraction(pairs: Sequence[Pair]) -> float:
+    """Of the pairs some steps apart, those that one homography explains."""
+    apart = [p for p in pairs if p.second - p.first >= 2 and p.matches >= LINK_MATCHES]
+    return float(np.mean([p.flat >= FLAT for p in apart])) if apart else 0.0

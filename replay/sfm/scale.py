@@ -1,0 +1,279 @@
+"""Which way is up in a model, and how large it is: what structure from motion cannot tell by itself."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from semantic_mapper.drivers.poses.board import BoardFinder
+from semantic_mapper.drivers.poses.config import BoardPoses
+from semantic_mapper.errors import ConfigError, ImportSourceError
+from semantic_mapper.geometry import camera_matrix
+from semantic_mapper.replay.sfm.between import track
+from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
+
+UNSCALED_DEPTH_M = 2.0  # median depth of the points of a model whose scale nobody tells
+MIN_ANGLE_DEG = 2.0  # between the rays that a place is found by
+MAX_RAY_ERROR = 0.01  # a place is no further from its rays than this fraction of its distance
+MIN_RAY_FRACTION = 0.5  # of the rays that must do so
+MAX_RAY_PAIRS = 100  # that a place is first found by
+MIN_BOARD_CORNERS = 6
+NEIGHBOURS = 12  # frames either side that a marked point is followed into
+FLOOR_BINS = 60
+FLOOR_SHARE = 0.2  # of the strongest layer below the camera: the lowest layer that is as strong is the floor
+MIN_FLOOR_POINTS = 20
+MOST_BELOW_FLOOR, FLOOR_MARGIN = 0.03, 0.1  # fraction of the points further below it than this part of the height
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A pixel of a frame: seconds within the film, and where in the picture (u right, v down)."""
+
+    time_s: float
+    u: float
+    v: float
+
+
+@dataclass(frozen=True, slots=True)
+class MarkedDistance:
+    """Two marked points, and how far apart they are in metres."""
+
+    a: Mark
+    b: Mark
+    metres: float
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleHint:
+    """What tells the size of the scene; at most one of these.
+
+    Args:
+        factor: Metres per unit of the log that comes without a scale: by how much its map is too small.
+        distance: Two marked points.
+        board: A printed board that is seen in the film.
+        camera_height_m: Of the camera over the floor, the median over the film.
+
+    Raises:
+        ConfigError: several of them, or a number that cannot be.
+    """
+
+    factor: float | None = None
+    distance: MarkedDistance | None = None
+    board: BoardPoses | None = None
+    camera_height_m: float | None = None
+
+    def __post_init__(self) -> None:
+        given = [name for name in self.__slots__ if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ConfigError(f"the scale comes from one source only; leave out all but one of {', '.join(given)}")
+        for number in (self.factor, self.camera_height_m):
+            if number is not None and not 1e-6 < number < 1e6:
+                raise ConfigError(f"a scale or height of {number:g} cannot be; give a number above 0")
+
+
+def parse_distance(text: str) -> MarkedDistance:
+    """``"T:U,V T:U,V METRES"``: seconds within the film, pixel, twice, and the distance of what they show.
+
+    Raises:
+        ConfigError: another form.
+    """
+    number = r"(\d+(?:\.\d+)?)"
+    found = re.fullmatch(rf"\s*{number}:{number},{number}\s+{number}:{number},{number}\s+{number}\s*", text)
+    if found is None or float(found[7]) <= 0:
+        raise ConfigError(
+            f"'{text}' marks no distance: write 'SECONDS:U,V SECONDS:U,V METRES', such as '3.2:310,220 3.2:560,231 0.9'"
+        )
+    a, b, c, d, e, f, metres = map(float, found.groups())
+    return MarkedDistance(Mark(a, b, c), Mark(d, e, f), metres)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedFrame:
+    """A frame of the model.
+
+    Args:
+        stamp_ns: Time within the film.
+        T_world_camera: (4, 4).
+        xyz: (N, 3) the points that it sees, in the world.
+    """
+
+    stamp_ns: int
+    T_world_camera: Float64
+    xyz: Float64
+
+
+def upright(T_world_first: Float64, up: Float64) -> Float64:
+    """T_level_world (4, 4) of a world with z up, and the first camera at its origin, looking along x.
+
+    Args:
+        T_world_first: (4, 4) pose of the first camera.
+        up: (3,) unit direction in the present world.
+    """
+    ahead = T_world_first[:3, 2] if abs(T_world_first[:3, 2] @ up) < 0.95 else -T_world_first[:3, 1]
+    x = ahead - (ahead @ up) * up
+    x /= np.linalg.norm(x)
+    T_level_world = np.eye(4)
+    T_level_world[:3, :3] = np.stack((x, np.cross(up, x), up))
+    T_level_world[:3, 3] = -T_level_world[:3, :3] @ T_world_first[:3, 3]
+    return T_level_world
+
+
+def median_depth(frames: Sequence[PlacedFrame]) -> float:
+    """Of all points as their frames see them."""
+    depths = [
+        (frame.xyz - frame.T_world_camera[:3, 3]) @ frame.T_world_camera[:3, 2] for frame in frames if len(frame.xyz)
+    ]
+    return float(np.median(np.concatenate(depths)))
+
+
+def floor_height(frames: Sequence[PlacedFrame]) -> float | None:
+    """z of the floor, where z is up: the lowest strong layer of points below the cameras; None = there is none."""
+    camera_z = float(np.median([frame.T_world_camera[2, 3] for frame in frames]))
+    z = np.concatenate([frame.xyz[:, 2] for frame in frames])
+    below = z[z < camera_z]
+    if len(below) < MIN_FLOOR_POINTS:
+        return None
+    low = float(np.percentile(below, 0.5))
+    counts, edges = np.histogram(below, bins=FLOOR_BINS, range=(low - 1e-6, camera_z))
+    summed = np.convolve(counts, (1, 1, 1), mode="same")  # a layer lies across bins
+    strong = np.flatnonzero(summed >= max(MIN_FLOOR_POINTS, FLOOR_SHARE * summed.max()))
+    if not len(strong):
+        return None
+    at = int(strong[0])
+    while at + 1 < len(summed) and summed[at + 1] > summed[at]:  # to the top of this layer
+        at += 1
+    near = below[(below >= edges[max(at - 1, 0)]) & (below <= edges[min(at + 2, len(edges) - 1)])]
+    floor = float(np.median(near))
+    deep = floor - FLOOR_MARGIN * (camera_z - floor)
+    return floor if (below < deep).mean() < MOST_BELOW_FLOOR else None  # a bed or a table
+
+
+def triangulate(rays: Sequence[tuple[Float64, Float64]]) -> Float64 | None:
+    """The place (3,) nearest to rays (origin, unit direction); None where they are too alike, or do not meet."""
+    if len(rays) < 2:
+        return None
+    origins, directions = (np.stack(rows) for rows in zip(*rays, strict=True))
+    angle = np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1, 1)))
+    if angle < MIN_ANGLE_DEG:
+        return None
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]  # (N, 3, 3)
+    pairs = np.argwhere(np.triu(directions @ directions.T < np.cos(np.radians(MIN_ANGLE_DEG)), 1))
+    chosen = pairs[np.random.default_rng(0).permutation(len(pairs))[:MAX_RAY_PAIRS]]
+    places = [_nearest_to_rays(origins[pair], across[pair]) for pair in chosen]
+    place = max(places, key=lambda p: int((_ray_error(p, origins, across, directions) < MAX_RAY_ERROR).sum()))
+    good = _ray_error(place, origins, across, directions) < MAX_RAY_ERROR
+    if good.sum() < 2 or good.sum() < MIN_RAY_FRACTION * len(rays):
+        return None
+    return _nearest_to_rays(origins[good], across[good])
+
+
+def _nearest_to_rays(origins: Float64, across: Float64) -> Float64:
+    """(3,) of rays from (N, 3), ``across`` (N, 3, 3) taking what is square to each."""
+    return np.linalg.solve(across.sum(axis=0), (across @ origins[:, :, None]).sum(axis=0))[:, 0]
+
+
+def _ray_error(place: Float64, origins: Float64, across: Float64, directions: Float64) -> Float64:
+    """Distance of a place from each ray, of its distance from the camera; infinite for what lies behind it."""
+    off = np.linalg.norm((across @ (place - origins)[:, :, None])[:, :, 0], axis=1)
+    ahead = ((place - origins) * directions).sum(axis=1)
+    return np.where(ahead > 0, off / np.maximum(ahead, 1e-12), np.inf)
+
+
+def ray_of(T_world_camera: Float64, xy: Float64, intrinsics: CameraIntrinsics) -> tuple[Float64, Float64]:
+    """Origin and unit direction in the world of a pixel (2,) of an image with distortion."""
+    lens = np.array(intrinsics.distortion or (0.0,) * 4)
+    flat = cv2.undistortPoints(np.asarray(xy, np.float64).reshape(1, 1, 2), camera_matrix(intrinsics), lens)
+    direction = T_world_camera[:3, :3] @ np.array((*np.ravel(flat), 1.0))
+    return T_world_camera[:3, 3], direction / np.linalg.norm(direction)
+
+
+class BoardScale:
+    """Collects the corners of a board over the film's frames, and tells the model's scale by them."""
+
+    def __init__(self, board: BoardPoses) -> None:
+        self._finder = BoardFinder(board)
+        self._seen: list[tuple[int, Float64, Float64]] = []  # frame, corners on the board, in the image
+
+    def look(self, index: int, rgb: UInt8) -> None:
+        """Look for the board in a frame."""
+        points, pixels = self._finder.find(rgb)
+        if len(points) >= MIN_BOARD_CORNERS:
+            self._seen.append((index, points, pixels))
+
+    def metres_per_unit(self, poses: Mapping[int, Float64], intrinsics: CameraIntrinsics) -> tuple[float, str]:
+        """Scale, and a sentence on how it was found.
+
+        Args:
+            poses: T_world_camera by frame.
+            intrinsics: Of the frames.
+
+        Raises:
+            ImportSourceError: the board was not seen from two sides by frames that have a pose.
+        """
+        rays: dict[tuple[float, ...], list[tuple[Float64, Float64]]] = {}
+        frames = 0
+        for index, points, pixels in self._seen:
+            if index in poses:
+                frames += 1
+                for point, xy in zip(points, pixels, strict=True):
+                    rays.setdefault(tuple(np.round(point, 6)), []).append(ray_of(poses[index], xy, intrinsics))
+        placed = {corner: place for corner, seen in rays.items() if (place := triangulate(seen)) is not None}
+        if len(placed) < MIN_BOARD_CORNERS:
+            raise ImportSourceError(
+                f"the board tells no scale: {frames} placed frames see it (of {len(self._seen)}), and {len(placed)} "
+                f"of its corners are seen from two sides, {MIN_BOARD_CORNERS} needed; film it larger and walk past it, "
+                "or give the scale in another way"
+            )
+        on_board, in_world = np.array(list(placed)), np.stack(list(placed.values()))
+        true = np.linalg.norm(on_board[:, None] - on_board[None], axis=2)
+        found = np.linalg.norm(in_world[:, None] - in_world[None], axis=2)
+        pairs = true > 0.5 * true.max()  # long ones are the most exact
+        return float(np.median(true[pairs] / found[pairs])), f"board: {len(placed)} corners in {frames} frames"
+
+
+def marked_place(
+    mark: Mark, pictures: Mapping[int, UInt8], frames: Mapping[int, PlacedFrame], intrinsics: CameraIntrinsics
+) -> Float64:
+    """Where in the world (3,) what a mark shows is: it is followed into the frames around, and triangulated.
+
+    Args:
+        mark: The pixel.
+        pictures: (H, W) gray pictures of placed frames around its time, by their index.
+        frames: The placed frames, by their index.
+        intrinsics: Of all.
+
+    Raises:
+        ImportSourceError: it lies outside of the picture, or cannot be followed.
+    """
+    if not (0 <= mark.u < intrinsics.width and 0 <= mark.v < intrinsics.height):
+        raise ImportSourceError(
+            f"the mark {mark.u:g},{mark.v:g} lies outside of the {intrinsics.width}x{intrinsics.height} pictures"
+        )
+    order = sorted(pictures)
+    at = nearest_frame(mark, frames, order)
+    rays: list[tuple[Float64, Float64]] = []
+    for way in (order[order.index(at) :], order[: order.index(at) + 1][::-1]):
+        xy = np.array([[[mark.u, mark.v]]], np.float32)
+        for last, now in pairwise(way):
+            xy, true = track(pictures[last], pictures[now], xy)
+            if not true[0]:
+                break
+            rays.append(ray_of(frames[now].T_world_camera, xy[0, 0], intrinsics))
+    rays.append(ray_of(frames[at].T_world_camera, np.array((mark.u, mark.v)), intrinsics))
+    place = triangulate(rays)
+    if place is None:
+        raise ImportSourceError(
+            f"the mark {mark.time_s:g}:{mark.u:g},{mark.v:g} cannot be placed: it is followed into {len(rays) - 1} "
+            "frames, from one side only; mark a corner with texture around it, at a time when the camera moves sideways"
+        )
+    return place
+
+
+def nearest_frame(mark: Mark, frames: Mapping[int, PlacedFrame], order: Sequence[int]) -> int:
+    """The frame of ``order`` that is nearest in time to a mark."""
+    return min(order, key=lambda index: abs(frames[index].stamp_ns - 1e9 * mark.time_s))

@@ -1,0 +1,218 @@
+"""Keyframes with the corners that they see, and the points in space that these are of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from semantic_mapper.bundle.adjustment import BundleProblem, BundleResult, reprojection_errors
+from semantic_mapper.bundle.tracks import Tracks
+from semantic_mapper.geometry import camera_matrix, invert_pose, project, transform
+from semantic_mapper.types import Bool, CameraIntrinsics, Float64, Int64
+
+_LEAST_PARALLAX = np.radians(1.0)  # between the rays that a point is found from
+_MAX_ERROR_PX = 3.0  # a sight that is further off is of something else
+_SHARED_LEAST = 10  # points that an old keyframe must share with the window to hold it
+_PNP_PX = 3.0
+_FLOW = 0.04  # of the image's width that corners move by to the next keyframe
+_LEFT = 0.6  # of the last keyframe's corners: fewer, and there is another keyframe
+_LEAST_CORNERS = 20
+
+
+@dataclass(slots=True, eq=False)
+class Keyframe:
+    """A frame that takes part in the bundle.
+
+    Args:
+        number: Counts keyframes from 0.
+        tracks: What it sees.
+        T_world_camera: (4, 4), the best that is known.
+        prior: (4, 4) as given; anything where ``prior_sigmas`` are infinite.
+        prior_sigmas: Metres and radians.
+    """
+
+    number: int
+    tracks: Tracks
+    T_world_camera: Float64
+    prior: Float64
+    prior_sigmas: tuple[float, float]
+
+
+class KeyframeMap:
+    """The last keyframes and their points.
+
+    Args:
+        intrinsics: Of the images that corners are followed in.
+        window: Keyframes that a bundle moves; as many before them hold it.
+    """
+
+    def __init__(self, intrinsics: CameraIntrinsics, window: int) -> None:
+        self.intrinsics = intrinsics
+        self.keyframes: list[Keyframe] = []
+        self.points: dict[int, Float64] = {}  # id of a track -> (3,) world
+        self._window = window
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Append a keyframe, and find the points that it is the second or later one to see."""
+        self.keyframes.append(keyframe)
+        del self.keyframes[: -2 * self._window]
+        self._triangulate()
+        seen = np.concatenate([k.tracks.ids for k in self.keyframes])
+        for gone in self.points.keys() - set(seen.tolist()):
+            del self.points[gone]
+
+    def known(self, tracks: Tracks) -> tuple[Bool, Float64]:
+        """Which tracks (N,) have a point, and these points (M, 3)."""
+        mask = np.array([i in self.points for i in tracks.ids.tolist()], bool)
+        return mask, np.array([self.points[i] for i in tracks.ids[mask].tolist()]).reshape(-1, 3)
+
+    def locate(self, tracks: Tracks, guess: Float64, least: int) -> tuple[Float64, Int64] | None:
+        """Pose of a frame from the points that it sees.
+
+        Returns:
+            (4, 4) T_world_camera; ids of tracks that do not agree. None where fewer than ``least`` agree.
+        """
+        mask, points = self.known(tracks)
+        if mask.sum() < least:
+            return None
+        pixels, K = tracks.pixels[mask], camera_matrix(self.intrinsics)
+        T_camera_world = invert_pose(guess)
+        turn, shift = cv2.Rodrigues(T_camera_world[:3, :3])[0], T_camera_world[:3, 3:].copy()
+        cv2.setRNGSeed(1)
+        found, turn, shift, inliers = cv2.solvePnPRansac(
+            points, pixels, K, None, turn, shift, True, 100, _PNP_PX, 0.99, flags=cv2.SOLVEPNP_ITERATIVE
+        )
+        if not found or inliers is None or len(inliers) < least:
+            return None
+        rows = np.asarray(inliers, np.int64).ravel()
+        turn, shift = cv2.solvePnPRefineLM(points[rows], pixels[rows], K, None, turn, shift)
+        T_camera_world = np.eye(4)
+        T_camera_world[:3, :3], T_camera_world[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
+        off = np.ones(len(points), bool)
+        off[rows] = False
+        return invert_pose(T_camera_world), tracks.ids[mask][off]
+
+    def wants_keyframe(self, tracks: Tracks) -> bool:
+        """Whether a frame that sees these corners should become the next keyframe."""
+        if not self.keyframes:
+            return True
+        before = self.keyframes[-1].tracks
+        shared = np.isin(before.ids, tracks.ids).sum()
+        return shared < max(_LEFT * len(before.ids), _LEAST_CORNERS) or self.flow(tracks) > _FLOW
+
+    def flow(self, tracks: Tracks) -> float:
+        """Median motion of corners since the last keyframe, as a fraction of the image's width; NaN where few stay."""
+        before = self.keyframes[-1].tracks
+        shared = before.ids[np.isin(before.ids, tracks.ids)]
+        if len(shared) < _LEAST_CORNERS:
+            return np.nan
+        moved = tracks.pixels[tracks.rows(shared)] - before.pixels[before.rows(shared)]
+        return float(np.median(np.linalg.norm(moved, axis=1))) / self.intrinsics.width
+
+    def predict(self, tracks: Tracks, T_world_before: Float64, T_world_camera: Float64) -> Float64:
+        """Where the tracks of the image before are expected (N, 2): by their points, or by the rotation alone."""
+        K = camera_matrix(self.intrinsics)
+        R = T_world_camera[:3, :3].T @ T_world_before[:3, :3]
+        rays = np.concatenate((tracks.pixels, np.ones((len(tracks.pixels), 1))), axis=1) @ np.linalg.inv(K).T @ R.T
+        mask, points = self.known(tracks)
+        rays[mask] = transform(invert_pose(T_world_camera), points)
+        front = rays[:, 2] > 1e-3
+        expected = tracks.pixels.copy()
+        expected[front] = project(rays[front], self.intrinsics)
+        return expected
+
+    def problem(self) -> tuple[BundleProblem, list[Keyframe], list[int]] | None:
+        """What the bundle is to solve, its keyframes and its ids of points; None where nothing is seen twice."""
+        free = self.keyframes[-self._window :]
+        wanted = set(np.concatenate([k.tracks.ids for k in free]).tolist()) & self.points.keys()
+        old = [
+            k
+            for k in self.keyframes[: -self._window]
+            if len(wanted.intersection(k.tracks.ids.tolist())) >= _SHARED_LEAST
+        ]
+        keyframes, ids = [*old, *free], sorted(wanted)
+        number = {track: row for row, track in enumerate(ids)}
+        sights = [
+            (row, number[track], pixel)
+            for row, k in enumerate(keyframes)
+            for track, pixel in zip(k.tracks.ids.tolist(), k.tracks.pixels, strict=True)
+            if track in number
+        ]
+        if not sights:
+            return None
+        rows, columns, pixels = zip(*sights, strict=True)
+        held = np.arange(len(keyframes)) < len(old)
+        held[0] |= not any(np.isfinite(k.prior_sigmas[0]) for k in keyframes)  # something must hold the others
+        problem = BundleProblem(
+            self.intrinsics,
+            np.array([k.T_world_camera for k in keyframes]),
+            held,
+            np.array([k.prior for k in keyframes]),
+            np.array([k.prior_sigmas for k in keyframes]),
+            np.array([self.points[i] for i in ids]),
+            np.array(rows),
+            np.array(columns),
+            np.array(pixels),
+        )
+        return problem, keyframes, ids
+
+    def apply(self, problem: BundleProblem, keyframes: list[Keyframe], ids: list[int], found: BundleResult) -> None:
+        """Take over what a bundle found. Keyframes added since move with the last one that took part."""
+        moved = found.poses[-1] @ invert_pose(keyframes[-1].T_world_camera)
+        taken = set(ids)
+        for keyframe, pose in zip(keyframes, found.poses, strict=True):
+            keyframe.T_world_camera = pose
+        for keyframe in self.keyframes:
+            if keyframe.number > keyframes[-1].number:
+                keyframe.T_world_camera = moved @ keyframe.T_world_camera
+        for track in self.points.keys() - taken:
+            self.points[track] = transform(moved, self.points[track])
+        for track, point in zip(ids, found.points, strict=True):
+            if track in self.points:
+                self.points[track] = point
+        self._forget(problem, keyframes, ids, found.errors_px > _MAX_ERROR_PX)
+
+    def _forget(self, problem: BundleProblem, keyframes: list[Keyframe], ids: list[int], wrong: Bool) -> None:
+        """Drop sights that are far off, and points with fewer than two left."""
+        for row in np.unique(problem.keyframe[wrong]).tolist():
+            bad = np.array([ids[c] for c in problem.point[wrong & (problem.keyframe == row)].tolist()])
+            tracks = keyframes[row].tracks
+            keep = ~np.isin(tracks.ids, bad)
+            keyframes[row].tracks = Tracks(tracks.ids[keep], tracks.pixels[keep])
+        left = np.bincount(problem.point[~wrong], minlength=len(ids))
+        for column in np.flatnonzero(left < 2).tolist():
+            self.points.pop(ids[column], None)
+
+    def _triangulate(self) -> None:
+        """Points of the newest keyframe's tracks that have none: from the keyframe furthest back that sees each."""
+        new = self.keyframes[-1]
+        left = np.array([i not in self.points for i in new.tracks.ids.tolist()], bool)
+        for other in self.keyframes[:-1]:
+            both = left & np.isin(new.tracks.ids, other.tracks.ids)
+            ids = new.tracks.ids[both]
+            if not len(ids):
+                continue
+            left &= ~both
+            a, b = other.tracks.pixels[other.tracks.rows(ids)], new.tracks.pixels[both]
+            points, good = triangulate(a, b, other.T_world_camera, new.T_world_camera, self.intrinsics)
+            self.points.update({int(i): p for i, p in zip(ids[good], points[good], strict=True)})
+
+
+def triangulate(
+    a: Float64, b: Float64, T_world_a: Float64, T_world_b: Float64, intrinsics: CameraIntrinsics
+) -> tuple[Float64, Bool]:
+    """Points (N, 3) seen at pixels (N, 2) of two views; and (N,) whether rays meet, in front and at a sure angle."""
+    K = camera_matrix(intrinsics)
+    P_a, P_b = K @ invert_pose(T_world_a)[:3], K @ invert_pose(T_world_b)[:3]
+    homogeneous = cv2.triangulatePoints(P_a, P_b, a.T, b.T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        points = np.nan_to_num((homogeneous[:3] / homogeneous[3]).T, posinf=0.0, neginf=0.0)
+    good = np.ones(len(points), bool)
+    for pixels, T in ((a, T_world_a), (b, T_world_b)):
+        good &= reprojection_errors(transform(invert_pose(T), points), pixels, intrinsics) < _MAX_ERROR_PX
+    to_a, to_b = T_world_a[:3, 3] - points, T_world_b[:3, 3] - points
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cosine = (to_a * to_b).sum(axis=1) / (np.linalg.norm(to_a, axis=1) * np.linalg.norm(to_b, axis=1))
+    return points, good & (cosine < np.cos(_LEAST_PARALLAX))

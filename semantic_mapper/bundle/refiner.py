@@ -1,0 +1,238 @@
+"""Poses that fit the pictures: given poses as a prior, corners followed over keyframes, a sliding bundle."""
+
+from __future__ import annotations
+
+from collections import Counter
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from semantic_mapper.bundle.adjustment import BundleProblem, BundleResult, adjust_bundle, reprojection_errors
+from semantic_mapper.bundle.keyframes import Keyframe, KeyframeMap
+from semantic_mapper.bundle.picture_checks import PictureChecker
+from semantic_mapper.bundle.tracks import Tracker, Tracks, prepare_image
+from semantic_mapper.config import PoseRefinerConfig
+from semantic_mapper.errors import FrameError
+from semantic_mapper.geometry import invert_pose, rotation_vector, scale_intrinsics, transform
+from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
+
+_LEAST_POINTS = 20  # that must agree on a frame's pose
+_MAX_SIGMAS = 4.0  # a pose that is further from the given one is not believed
+_ITERATIONS = 8
+_CORRECTED_M, _CORRECTED_RAD = 1e-3, 5e-4  # smaller changes are not told
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RefinedPose:
+    """What became of a frame's pose.
+
+    Args:
+        T_world_camera: (4, 4) float64.
+        refined: Whether the picture took part; the given pose, moved like the frames around it, where not.
+        given_error_px: Median distance in pixels of the frame between corners and where they would be by the given
+            poses of this frame and the last keyframe; NaN where too few corners are known.
+        error_px: The same by the refined poses.
+    """
+
+    T_world_camera: Float64
+    refined: bool
+    given_error_px: float
+    error_px: float
+
+
+@dataclass(slots=True, eq=False)
+class _Frame:
+    """A frame whose pose may still change: where it is relative to its keyframe, and what was told last.
+
+    ``tracks`` are of a frame that no points were known for yet: None of all others.
+    """
+
+    key: tuple[str, int]
+    keyframe: Keyframe
+    T_keyframe_camera: Float64
+    told: Float64
+    tracks: Tracks | None
+
+
+class PoseRefiner:
+    """Refines the poses of one camera's frames, in the order of capture. Deterministic unless ``background``.
+
+    Args:
+        config: How.
+        background: Whether the bundle runs in a thread of its own, so that no frame waits for it; the results arrive
+            with one of the next frames.
+    """
+
+    def __init__(self, config: PoseRefinerConfig, *, background: bool = False) -> None:
+        self._config = config
+        self._tracker = Tracker(config.corners)
+        self._map: KeyframeMap | None = None
+        self._camera: tuple[str, CameraIntrinsics] | None = None
+        self._frames: list[_Frame] = []
+        self._given = np.eye(4)  # of the frame before
+        self._refined = np.eye(4)
+        self._count = 0
+        self._checks = PictureChecker()
+        self._worker = ThreadPoolExecutor(1, "pose bundle") if background else None
+        self._pending: tuple[BundleProblem, list[Keyframe], list[int], Future[BundleResult]] | None = None
+
+    @property
+    def counters(self) -> Counter[str]:
+        """Frames by what is wrong with their pictures, or between them and their poses; see ``PictureChecker``."""
+        return self._checks.counters
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The same of the last frame, a sentence for each."""
+        return self._checks.warnings
+
+    def push(self, frame: PosedFrame) -> RefinedPose:
+        """Refine the next frame's pose.
+
+        Raises:
+            FrameError: a frame of another camera or size.
+        """
+        intrinsics, points = self._start(frame)
+        self._collect(wait=False)
+        image = prepare_image(frame.rgb, intrinsics.width, intrinsics.height)
+        given = _rigid(frame.T_world_camera)
+        guess = _rigid(self._refined @ invert_pose(self._given) @ given) if self._count else given
+        expected = points.predict(self._tracker.tracks, self._refined, guess)
+        tracks = self._tracker.advance(image, expected)
+        pose, refined = self._locate(points, tracks, guess, self._sigmas(frame))
+        given_px, error_px = self._disagreement(points, tracks, given, pose)
+        self._check(frame, points, tracks, given, given_px)
+        self._given, self._refined = given, pose
+        self._count += 1
+        if points.wants_keyframe(tracks):
+            tracks = self._tracker.replenish()
+            number = points.keyframes[-1].number + 1 if points.keyframes else 0
+            points.add(Keyframe(number, tracks, pose, given, self._sigmas(frame)))
+            self._adjust(points)
+        last = points.keyframes[-1]
+        relative = invert_pose(last.T_world_camera) @ self._refined
+        key = frame.camera_id, frame.stamp_ns
+        self._frames.append(_Frame(key, last, relative, self._refined, None if refined else tracks))
+        return RefinedPose(self._refined, refined, given_px, error_px)
+
+    def corrections(self) -> dict[tuple[str, int], Float64]:
+        """Better poses T_world_camera (4, 4) of earlier frames, by camera and stamp, since the last call.
+
+        A frame is told of again while its keyframe is in the window, wherever its pose changed by 1 mm or 0.03 degrees.
+        """
+        self._collect(wait=False)
+        changed: dict[tuple[str, int], Float64] = {}
+        kept: list[_Frame] = []
+        alive = set() if self._map is None else {k.number for k in self._map.keyframes[-self._config.window :]}
+        for frame in self._frames:
+            self._locate_late(frame)
+            pose = frame.keyframe.T_world_camera @ frame.T_keyframe_camera
+            moved = invert_pose(frame.told) @ pose
+            if np.linalg.norm(moved[:3, 3]) > _CORRECTED_M or np.linalg.norm(rotation_vector(moved)) > _CORRECTED_RAD:
+                changed[frame.key] = frame.told = pose
+            if frame.keyframe.number in alive:
+                kept.append(frame)
+        self._frames = kept
+        return changed
+
+    def close(self) -> None:
+        """Wait for a bundle that is under way."""
+        self._collect(wait=True)
+        if self._worker is not None:
+            self._worker.shutdown()
+
+    def _start(self, frame: PosedFrame) -> tuple[CameraIntrinsics, KeyframeMap]:
+        camera = (frame.camera_id, frame.intrinsics)
+        if self._map is None:
+            k = frame.intrinsics
+            width = min(k.width, self._config.width)
+            self._camera = camera
+            self._map = KeyframeMap(scale_intrinsics(k, width, round(k.height * width / k.width)), self._config.window)
+        if camera != self._camera:
+            raise FrameError(
+                f"frame seq={frame.seq} of camera '{frame.camera_id}': poses are refined of one camera of one size; "
+                "use a PoseRefiner for each camera"
+            )
+        return self._map.intrinsics, self._map
+
+    def _sigmas(self, frame: PosedFrame) -> tuple[float, float]:
+        return frame.pose_sigma or self._config.sigma_m, np.radians(self._config.sigma_deg)
+
+    def _locate(
+        self, points: KeyframeMap, tracks: Tracks, guess: Float64, sigmas: tuple[float, float]
+    ) -> tuple[Float64, bool]:
+        found = points.locate(tracks, guess, _LEAST_POINTS)
+        if found is None:
+            return guess, False
+        pose, wrong = found
+        off = invert_pose(guess) @ pose  # against the given motion since the frame before
+        metres, radians = sigmas
+        if np.hypot(np.linalg.norm(off[:3, 3]) / metres, np.linalg.norm(rotation_vector(off)) / radians) > _MAX_SIGMAS:
+            return guess, False
+        self._tracker.drop(wrong)
+        return pose, True
+
+    def _locate_late(self, frame: _Frame) -> None:
+        """Find a frame's place among points that became known after it."""
+        if self._map is None or frame.tracks is None or frame.keyframe.tracks.ids is frame.tracks.ids:
+            return
+        guess = frame.keyframe.T_world_camera @ frame.T_keyframe_camera
+        found = self._map.locate(frame.tracks, guess, _LEAST_POINTS)
+        if found is not None:
+            frame.T_keyframe_camera, frame.tracks = invert_pose(frame.keyframe.T_world_camera) @ found[0], None
+
+    def _check(self, frame: PosedFrame, points: KeyframeMap, tracks: Tracks, given: Float64, given_px: float) -> None:
+        self._checks.look(frame.rgb)
+        if points.keyframes:
+            moved = invert_pose(points.keyframes[-1].prior) @ given
+            self._checks.compare(moved, points.flow(tracks), given_px / frame.intrinsics.width)
+
+    def _adjust(self, points: KeyframeMap) -> None:
+        """Bundle now, or in the worker where that is free."""
+        if self._pending is not None:
+            return
+        asked = points.problem()
+        if asked is None:
+            return
+        if self._worker is None:
+            self._apply(*asked, adjust_bundle(asked[0], _ITERATIONS))
+        else:
+            self._pending = (*asked, self._worker.submit(adjust_bundle, asked[0], _ITERATIONS))
+
+    def _collect(self, wait: bool) -> None:
+        if self._pending is not None and (wait or self._pending[3].done()):
+            problem, keyframes, ids, future = self._pending
+            self._pending = None
+            self._apply(problem, keyframes, ids, future.result())
+
+    def _apply(self, problem: BundleProblem, keyframes: list[Keyframe], ids: list[int], found: BundleResult) -> None:
+        assert self._map is not None
+        last = self._map.keyframes[-1]
+        before = invert_pose(last.T_world_camera)
+        self._map.apply(problem, keyframes, ids, found)
+        self._refined = last.T_world_camera @ before @ self._refined
+
+    def _disagreement(
+        self, points: KeyframeMap, tracks: Tracks, given: Float64, refined: Float64
+    ) -> tuple[float, float]:
+        """Median errors of this frame by given and by refined poses, from points as the last keyframe saw them."""
+        mask, known = points.known(tracks)
+        if mask.sum() < _LEAST_POINTS:
+            return np.nan, np.nan
+        last = points.keyframes[-1]
+        factor = self._camera[1].width / points.intrinsics.width if self._camera else 1.0
+        in_last = transform(invert_pose(last.T_world_camera), known)
+        errors = [
+            reprojection_errors(transform(T, in_last), tracks.pixels[mask], points.intrinsics)
+            for T in (invert_pose(given) @ last.prior, invert_pose(refined) @ last.T_world_camera)
+        ]
+        return factor * float(np.median(errors[0])), factor * float(np.median(errors[1]))
+
+
+def _rigid(T: Float64) -> Float64:
+    """The nearest rigid transform: given rotations are exact to three digits only, and errors would add up."""
+    u, _, vt = np.linalg.svd(T[:3, :3])
+    exact = T.copy()
+    exact[:3, :3] = u @ vt
+    return exact

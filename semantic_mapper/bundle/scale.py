@@ -1,0 +1,69 @@
+"""How long a unit of a map without scale is, from coarse poses in metres over a long way."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from semantic_mapper.types import Float64
+
+_STEP_M = 0.2  # ways are compared over at least so much, so that a reference's jitter does not add to them
+_FIRST_M = 0.6  # of way, for a first scale
+_WINDOW_M = 4.0  # of way that the scale is taken over
+_MAX_RATIO = 3.0  # a way that differs so much from the others tells of a slip or a jump
+
+
+@dataclass(slots=True)
+class _Way:
+    """The same way in both worlds."""
+
+    metres: float
+    units: float
+
+
+class ScaleEstimator:
+    """Compares ways between the same moments in the map and in a reference (robot odometry, a board).
+
+    Only lengths of ways are used: how the reference's world is turned does not matter, and its drift hardly. Errors of
+    a single way average out over ``_WINDOW_M``.
+    """
+
+    def __init__(self) -> None:
+        self._ways: deque[_Way] = deque()
+        self._start: tuple[Float64, Float64] | None = None  # positions in metres, and in the map
+
+    def add(self, reference: Float64, position: Float64) -> None:
+        """Where the camera is by the reference (3,) in metres, and in the map (3,) in its units."""
+        if self._start is None:
+            self._start = reference, position
+            return
+        metres = float(np.linalg.norm(reference - self._start[0]))
+        if metres < _STEP_M:
+            return
+        self._ways.append(_Way(metres, float(np.linalg.norm(position - self._start[1]))))
+        self._start = reference, position
+        while sum(w.metres for w in self._ways) > _WINDOW_M + _STEP_M:
+            self._ways.popleft()
+
+    def interrupt(self) -> None:
+        """The next positions are not connected with the last ones: the camera was lost, or the reference was."""
+        self._start = None
+
+    def rescaled(self, factor: float, T_before: Float64, T_after: Float64) -> None:
+        """The map's unit has changed, as ``VisualOdometry.rescale`` does it."""
+        for way in self._ways:
+            way.units *= factor
+        if self._start is not None:
+            offset = T_before[:3, :3].T @ (self._start[1] - T_before[:3, 3])
+            self._start = self._start[0], T_after[:3, 3] + T_after[:3, :3] @ (factor * offset)
+
+    def scale(self) -> float | None:
+        """Metres a unit; None before ``_FIRST_M`` of way."""
+        ways = [w for w in self._ways if w.units > 0]
+        if sum(w.metres for w in ways) < _FIRST_M:
+            return None
+        middle = float(np.median([w.metres / w.units for w in ways]))
+        kept = [w for w in ways if 1 / _MAX_RATIO < w.metres / w.units / middle < _MAX_RATIO]
+        return sum(w.metres for w in kept) / sum(w.units for w in kept)

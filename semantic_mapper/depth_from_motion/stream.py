@@ -1,0 +1,147 @@
+"""Depth for a stream of posed frames, as they come or a few frames late."""
+
+from __future__ import annotations
+
+import itertools
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from semantic_mapper.config import DepthFromMotionConfig
+from semantic_mapper.depth_from_motion.enlarge import enlarge_estimate
+from semantic_mapper.depth_from_motion.estimate import estimate_depth, no_depth
+from semantic_mapper.depth_from_motion.sources import choose_sources
+from semantic_mapper.depth_from_motion.views import DepthEstimate, PreparedView, prepare_view
+from semantic_mapper.geometry import invert_pose, rotation_vector
+from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
+
+Hint = Callable[[PosedFrame, CameraIntrinsics], DepthEstimate]
+
+MAX_VIEWS = 24  # kept of one camera; half a megabyte each
+MAX_CAMERAS = 8  # those that sent nothing for longest are forgotten
+RECENT_VIEWS = 8  # of one camera, kept whatever they look at
+NEIGHBOURS = 6  # earlier estimates that a new one is compared with
+TURN_WEIGHT_M = 0.5  # a turn of one radian counts as this much way, where views are compared
+USUAL_DEPTH_M = 2.0  # until something is known
+WAIT_FACTOR = 4  # a frame whose camera is gone waits until this many times ``delay_frames`` frames wait
+
+
+@dataclass(slots=True)
+class _CameraViews:
+    views: list[PreparedView] = field(default_factory=list[PreparedView])
+    usual_m: float = USUAL_DEPTH_M  # of the last depth that was found
+
+
+@dataclass(slots=True)
+class _Waiting:
+    frame: PosedFrame
+    view: PreparedView | None  # None: has depth from a sensor
+    hint: Hint | None
+    later: int = 0  # frames of its camera that came after it
+
+
+class DepthFromMotion:
+    """Computes the depth of frames that have none, from the frames of the same camera before and after them.
+
+    Memory is bounded: a fixed number of small views of each camera, and ``delay_frames`` whole frames.
+    """
+
+    def __init__(self, config: DepthFromMotionConfig) -> None:
+        self._config = config
+        self._cameras: OrderedDict[str, _CameraViews] = OrderedDict()
+        self._waiting: deque[_Waiting] = deque()
+
+    def push(self, frame: PosedFrame, hint: Hint | None = None) -> list[PosedFrame]:
+        """Take a frame; returns the frames that are ready, oldest first, so that none is lost or overtaken.
+
+        Each has ``depth_m`` and ``depth_sigma_m`` of its full size, all 0 where the camera has not moved enough. A
+        frame with depth from a sensor passes through unchanged.
+
+        Args:
+            hint: Gives the depth of a frame as a map has it, at the size of the intrinsics that it is called with;
+                called when the frame's depth is computed.
+        """
+        if frame.depth_m is not None:
+            self._waiting.append(_Waiting(frame, None, None))
+            return self._ready()
+        view = prepare_view(frame, self._config.width)
+        for other in self._waiting:
+            other.later += other.frame.camera_id == frame.camera_id
+        self._waiting.append(_Waiting(frame, view, hint))
+        self._remember(frame.camera_id, view)
+        return self._ready()
+
+    def finish(self) -> list[PosedFrame]:
+        """The frames that still wait, oldest first."""
+        done = [self._complete(waiting) for waiting in self._waiting]
+        self._waiting.clear()
+        return done
+
+    def _ready(self) -> list[PosedFrame]:
+        done: list[PosedFrame] = []
+        delay = self._config.delay_frames
+        while self._waiting:
+            first = self._waiting[0]
+            if first.view is not None and first.later < delay and len(self._waiting) <= WAIT_FACTOR * delay:
+                break
+            done.append(self._complete(self._waiting.popleft()))
+        return done
+
+    def _complete(self, waiting: _Waiting) -> PosedFrame:
+        frame, view = waiting.frame, waiting.view
+        if view is None:
+            return frame
+        hint = waiting.hint(frame, view.intrinsics) if waiting.hint is not None else None
+        estimate = self._estimate(frame.camera_id, view, hint)
+        if estimate is None:
+            none = no_depth(frame.rgb.shape[:2])
+            return replace(frame, depth_m=none.depth_m, depth_sigma_m=none.sigma_m)
+        full = enlarge_estimate(estimate, view.rgb, frame.rgb)
+        return replace(frame, depth_m=full.depth_m, depth_sigma_m=full.sigma_m)
+
+    def _estimate(self, camera_id: str, view: PreparedView, hint: DepthEstimate | None) -> DepthEstimate | None:
+        """None where the camera has not moved enough."""
+        camera = self._cameras.get(camera_id, _CameraViews())
+        others = [v for v in camera.views if v is not view]
+        known = hint.depth_m if hint is not None else None
+        sources = choose_sources(view, others, self._config.sources, known, camera.usual_m)
+        if not sources:
+            return None
+        neighbours = _nearest_estimates(view, others)
+        estimate = estimate_depth(view, sources, self._config, hint, neighbours)
+        camera.usual_m = float(np.median(estimate.depth_m))
+        for k, other in enumerate(camera.views):
+            if other is view:
+                camera.views[k] = replace(view, estimate=estimate)
+        return estimate
+
+    def _remember(self, camera_id: str, view: PreparedView) -> None:
+        camera = self._cameras.setdefault(camera_id, _CameraViews())
+        self._cameras.move_to_end(camera_id)
+        camera.views.append(view)
+        if len(camera.views) > MAX_VIEWS + self._config.delay_frames:
+            del camera.views[_least_useful(camera.views, RECENT_VIEWS + self._config.delay_frames)]
+        if len(self._cameras) > MAX_CAMERAS:
+            self._cameras.popitem(last=False)
+
+
+def _distances(view: PreparedView, others: list[PreparedView]) -> Float64:
+    """Way from one view to others, turns counted as way."""
+    inverse = invert_pose(view.T_world_camera)
+    ways = [inverse @ other.T_world_camera for other in others]
+    return np.array(
+        [np.linalg.norm(T[:3, 3]) + TURN_WEIGHT_M * np.linalg.norm(rotation_vector(T)) for T in ways], np.float64
+    )
+
+
+def _least_useful(views: list[PreparedView], recent: int) -> int:
+    """Of all but the most recent views, the number of the one that is nearest to its successor."""
+    ways = [float(_distances(a, [b])[0]) for a, b in itertools.pairwise(views[: 1 - recent])]
+    return int(np.argmin(ways))
+
+
+def _nearest_estimates(view: PreparedView, others: list[PreparedView]) -> list[PreparedView]:
+    known = [other for other in others if other.estimate is not None]
+    return [known[k] for k in np.argsort(_distances(view, known), kind="stable")[:NEIGHBOURS]]

@@ -1,0 +1,109 @@
+"""Where the depth of a frame comes from: its sensor, the pictures of a moving camera, or neither."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from semantic_mapper.bundle.refiner import PoseRefiner
+from semantic_mapper.config import DepthConfig
+from semantic_mapper.depth_from_motion import DepthFromMotion
+from semantic_mapper.depth_from_motion.views import DepthEstimate
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
+
+SURE_SPREAD = 0.03  # spread, as a fraction of depth, up to which computed depth has its full weight
+MOST_SPREAD = 0.10  # from here on it has none
+HINT_SPREAD = 0.04  # of the map's own surface where it was computed, as a fraction of depth
+MEASURED_SPREAD = 0.01  # and where it was measured
+RECENT_FRAMES = 500
+
+
+@dataclass(slots=True)
+class PoseDisagreement:
+    """How far given poses and pictures disagree, and how far refined poses do: recent medians, in pixels."""
+
+    given_px: deque[float] = field(default_factory=lambda: deque[float](maxlen=RECENT_FRAMES))
+    refined_px: deque[float] = field(default_factory=lambda: deque[float](maxlen=RECENT_FRAMES))
+
+    def add(self, given_px: float, refined_px: float) -> None:
+        """Note a frame; NaN, of one that too little is known of, is left out."""
+        if math.isfinite(given_px) and math.isfinite(refined_px):
+            self.given_px.append(given_px)
+            self.refined_px.append(refined_px)
+
+    @property
+    def medians(self) -> tuple[float, float] | None:
+        """Of given and of refined poses; None before any frame was compared."""
+        if not self.given_px:
+            return None
+        return float(np.median(self.given_px)), float(np.median(self.refined_px))
+
+
+CastMap = Callable[[Float64, CameraIntrinsics], tuple[Float32, np.ndarray]]
+
+
+class FrameDepth:
+    """Gives frames the depth that the settings ask for.
+
+    Args:
+        config: Which depth, and how it is computed.
+        cast_map: Depth (h, w) of the map at a pose, 0 = no surface, and whether it was measured (h, w) bool.
+    """
+
+    def __init__(self, config: DepthConfig, cast_map: CastMap) -> None:
+        self._config = config
+        self._source = config.source
+        self._cast_map = cast_map
+        self._refiners: dict[str, PoseRefiner] = {}
+        self.disagreement = PoseDisagreement()
+        self._computer: DepthFromMotion | None = None
+        if config.source in ("auto", "computed"):
+            self._computer = DepthFromMotion(config.from_motion)
+
+    def push(self, frame: PosedFrame) -> list[PosedFrame]:
+        """Take a frame; the frames that are ready, oldest first. One whose depth is computed may wait for later ones.
+
+        A frame that has a spread of its depth was here before and is left as it is.
+        """
+        if frame.depth_sigma_m is not None:
+            return [frame]
+        if self._source in ("off", "computed") and frame.depth_m is not None:
+            frame = replace(frame, depth_m=None)
+        if self._computer is None or frame.depth_m is not None:
+            return [frame] if self._computer is None else self._computer.push(frame)
+        if self._config.refine_poses:
+            frame = self._refine(frame)
+        return self._computer.push(frame, self._hint)
+
+    def finish(self) -> list[PosedFrame]:
+        """The frames that still wait, oldest first."""
+        return [] if self._computer is None else self._computer.finish()
+
+    def _refine(self, frame: PosedFrame) -> PosedFrame:
+        if frame.camera_id not in self._refiners:
+            self._refiners[frame.camera_id] = PoseRefiner(self._config.poses)
+        refined = self._refiners[frame.camera_id].push(frame)
+        self.disagreement.add(refined.given_error_px, refined.error_px)
+        return replace(frame, T_world_camera=refined.T_world_camera)
+
+    def _hint(self, frame: PosedFrame, intrinsics: CameraIntrinsics) -> DepthEstimate:
+        depth_m, measured = self._cast_map(frame.T_world_camera, intrinsics)
+        spread = np.where(measured, np.float32(MEASURED_SPREAD), np.float32(HINT_SPREAD))
+        return DepthEstimate(depth_m, (spread * depth_m).astype(np.float32))
+
+
+def computed_trust(depth_m: Float32, sigma_m: Float32) -> Float32:
+    """Fraction (H, W) of its full weight that computed depth has: the inverse variance, relative to that of
+    ``SURE_SPREAD``, and nothing where little is known.
+
+    Args:
+        depth_m: (H, W) float32, 0 = none.
+        sigma_m: (H, W) float32 one-sigma spread.
+    """
+    spread = sigma_m / np.maximum(depth_m, np.float32(1e-3))
+    trust = np.minimum(1.0, (SURE_SPREAD / np.maximum(spread, np.float32(1e-6))) ** 2)
+    return np.where((depth_m > 0) & (spread < MOST_SPREAD), trust, 0).astype(np.float32)

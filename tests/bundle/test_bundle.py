@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+
+from semantic_mapper.bundle.adjustment import BundleProblem, adjust_bundle
+from semantic_mapper.bundle.keyframes import triangulate
+from semantic_mapper.bundle.refiner import PoseRefiner, RefinedPose
+from semantic_mapper.bundle.tracks import Tracker, follow, prepare_image
+from semantic_mapper.config import PoseRefinerConfig
+from semantic_mapper.errors import FrameError
+from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
+from semantic_mapper.geometry import invert_pose, project, transform, unproject
+from semantic_mapper.types import Float64, PosedFrame
+
+from .rooms import INTRINSICS, truth, walk
+
+CONFIG = PoseRefinerConfig(sigma_m=0.02, corners=200)
+
+
+@cache
+def disturbed() -> tuple[PosedFrame, ...]:
+    """The walk with poses that are off by 2 cm and half a degree, each on its own."""
+    rng = np.random.default_rng(3)
+    frames = []
+    for frame in walk():
+        T = frame.T_world_camera.copy()
+        T[:3, :3] = cv2.Rodrigues(np.radians(0.5) * rng.standard_normal(3))[0] @ T[:3, :3]
+        T[:3, 3] += 0.02 / np.sqrt(3) * rng.standard_normal(3)
+        frames.append(replace(frame, T_world_camera=T))
+    return tuple(frames)
+
+
+@cache
+def refine() -> tuple[tuple[RefinedPose, ...], Float64]:
+    """What each frame was told, and the poses after all corrections."""
+    refiner = PoseRefiner(CONFIG)
+    told, final = [], {}
+    for frame in disturbed():
+        told.append(refiner.push(frame))
+        final[frame.camera_id, frame.stamp_ns] = told[-1].T_world_camera
+        final |= refiner.corrections()
+    return tuple(told), np.array(list(final.values()))
+
+
+def test_disturbed_poses_come_nearer_to_the_truth_and_fit_the_pictures() -> None:
+    told, final = refine()
+    given = np.array([f.T_world_camera for f in disturbed()])
+    assert absolute_trajectory_error(final, truth()).rmse_m < 0.6 * absolute_trajectory_error(given, truth()).rmse_m
+    before, after = relative_pose_error(given, truth()), relative_pose_error(final, truth())
+    assert after.rmse_m < 0.4 * before.rmse_m and after.rmse_deg < 0.3 * before.rmse_deg
+    late = told[8:]
+    assert np.mean([r.refined for r in late]) > 0.9
+    assert np.median([r.error_px for r in late]) < 0.7 < np.median([r.given_error_px for r in late])
+
+
+def test_two_runs_give_the_same_poses_bit_for_bit() -> None:
+    told, _ = refine()
+    refiner = PoseRefiner(CONFIG)
+    again = [refiner.push(frame).T_world_camera for frame in disturbed()[:14]]
+    assert all(np.array_equal(a, b.T_world_camera) for a, b in zip(again, told, strict=False))
+
+
+def test_a_bundle_in_the_background_gives_poses_as_good() -> None:
+    refiner = PoseRefiner(CONFIG, background=True)
+    final = {}
+    for frame in disturbed():
+        final[frame.camera_id, frame.stamp_ns] = refiner.push(frame).T_world_camera
+        final |= refiner.corrections()
+    refiner.close()
+    final |= refiner.corrections()
+    given = np.array([f.T_world_camera for f in disturbed()])
+    found = np.array(list(final.values()))
+    assert relative_pose_error(found, truth()).median_m < 0.6 * relative_pose_error(given, truth()).median_m
+
+
+def test_pictures_without_corners_leave_given_poses_as_they_are() -> None:
+    refiner = PoseRefiner(CONFIG)
+    for frame in disturbed()[:6]:
+        result = refiner.push(replace(frame, rgb=np.full_like(frame.rgb, 90)))
+        assert not result.refined and np.isnan(result.given_error_px)
+        assert np.allclose(result.T_world_camera, frame.T_world_camera, atol=1e-9)
+    assert refiner.corrections() == {}
+
+
+def test_another_camera_is_refused() -> None:
+    refiner = PoseRefiner(CONFIG)
+    refiner.push(walk()[0])
+    with pytest.raises(FrameError, match="a PoseRefiner for each camera"):
+        refiner.push(replace(walk()[1], camera_id="other"))
+
+
+def test_corners_are_followed_to_where_the_scene_moved_them() -> None:
+    a, b = walk()[0], walk()[1]
+    images = [prepare_image(f.rgb, 320, 240) for f in (a, b)]
+    tracker = Tracker(150)
+    tracker.advance(images[0])
+    corners = tracker.replenish()
+    assert len(corners.ids) > 80 and (np.diff(corners.ids) > 0).all()
+    there, found = follow(images[0], images[1], corners.pixels, corners.pixels)
+    assert a.depth_m is not None
+    nearest = np.rint(corners.pixels).astype(int)
+    points = unproject(a.depth_m, INTRINSICS)[nearest[:, 1], nearest[:, 0]]
+    expected = project(transform(invert_pose(b.T_world_camera) @ a.T_world_camera, points), INTRINSICS)
+    assert found.mean() > 0.6
+    assert np.median(np.linalg.norm(there - expected, axis=1)[found]) < 0.5
+    after = tracker.advance(images[1])
+    assert set(after.ids.tolist()) <= set(corners.ids.tolist()) and len(after.ids) > 50
+
+
+def test_a_bundle_finds_poses_and_points_from_their_pixels(rng: np.random.Generator) -> None:
+    points = rng.uniform((-2, -1.5, 2), (2, 1.5, 5), (60, 3))
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 0, 3] = 0.1 * np.arange(5)
+    keyframe, point = (index.ravel() for index in np.indices((5, 60)))
+    pixels = project(points[point] - poses[keyframe, :3, 3], INTRINSICS)
+    pixels[7] += 40  # one is wrong
+    guess = poses.copy()
+    guess[1:, :3, 3] += 0.02 * rng.standard_normal((4, 3))
+    priors, sigmas = guess.copy(), np.full((5, 2), np.inf)
+    priors[-1], sigmas[-1] = poses[-1], (1e-3, 1e-3)  # tells the scale
+    held = np.arange(5) == 0
+    moved = points + 0.1 * rng.standard_normal(points.shape)
+    problem = BundleProblem(INTRINSICS, guess, held, priors, sigmas, moved, keyframe, point, pixels)
+    found = adjust_bundle(problem, 30)
+    assert np.abs(found.poses[:, :3, 3] - poses[:, :3, 3]).max() < 1e-3
+    assert np.abs(np.delete(found.points, point[7], axis=0) - np.delete(points, point[7], axis=0)).max() < 0.02
+    assert found.errors_px[7] > 20 and np.median(found.errors_px) < 0.01
+
+
+def test_points_are_found_where_rays_meet_at_an_angle(rng: np.random.Generator) -> None:
+    points = rng.uniform((-1, -1, 2), (1, 1, 4), (30, 3))
+    far = np.eye(4)
+    far[0, 3] = 0.3
+    a, b = project(points, INTRINSICS), project(points - far[:3, 3], INTRINSICS)
+    found, good = triangulate(a, b, np.eye(4), far, INTRINSICS)
+    assert good.all() and np.allclose(found, points, atol=1e-6)
+    b[3, 1] += 20
+    assert not triangulate(a, b, np.eye(4), far, INTRINSICS)[1][3]
+    assert not triangulate(a, a, np.eye(4), np.eye(4), INTRINSICS)[1].any()

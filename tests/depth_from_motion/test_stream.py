@@ -1,0 +1,176 @@
+"""Depth of streams: exact on a textured plane, none where the camera only turns, no frame lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semantic_mapper.config import DepthFromMotionConfig
+from semantic_mapper.depth_from_motion import DepthEstimate, DepthFromMotion, estimate_depth, prepare_view
+from semantic_mapper.depth_from_motion.stream import MAX_CAMERAS, MAX_VIEWS
+from semantic_mapper.errors import FrameError, ShapeError
+from semantic_mapper.geometry import scale_intrinsics
+from semantic_mapper.types import CameraIntrinsics, PosedFrame
+from tests.depth_from_motion.pictures import CAMERA, plane_frame
+
+CONFIG = DepthFromMotionConfig(width=64, near_m=0.8, far_m=6.0)
+
+
+def walk(count: int, *, gain: float = 1.0, **kwargs: object) -> list[tuple[PosedFrame, np.ndarray]]:
+    """A camera that moves sideways, 8 cm a frame; every second picture has the gain."""
+    ways = [0.08 * k for k in range(count)]
+    return [
+        plane_frame(x, 0.2 * x, seq=k, gain=gain if k % 2 else 1.0, **kwargs)  # type: ignore[arg-type]
+        for k, x in enumerate(ways)
+    ]
+
+
+def relative_error(frame: PosedFrame, truth: np.ndarray) -> float:
+    assert frame.depth_m is not None and (frame.depth_m > 0).all()
+    return float(np.median(np.abs(frame.depth_m - truth) / truth))
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.6])
+def test_a_camera_that_moves_sideways_finds_depth_whatever_the_exposure(gain: float) -> None:
+    stream = DepthFromMotion(CONFIG)
+    frames = walk(8, gain=gain)
+    done = [ready for frame, _ in frames for ready in stream.push(frame)]
+    assert [f.seq for f in done] == list(range(8))
+    assert done[0].depth_m is not None and not done[0].depth_m.any()  # nothing came before it
+    for frame, (_, truth) in list(zip(done, frames, strict=True))[4:]:
+        assert relative_error(frame, truth) < 0.02
+        assert frame.depth_sigma_m is not None and (frame.depth_sigma_m > 0).all()
+
+
+def test_a_delayed_frame_is_seen_from_both_sides_and_none_is_lost() -> None:
+    stream = DepthFromMotion(DepthFromMotionConfig(width=64, near_m=0.8, far_m=6.0, delay_frames=3))
+    frames = walk(6)
+    ready = [[f.seq for f in stream.push(frame)] for frame, _ in frames]
+    assert ready == [[], [], [], [0], [1], [2]]
+    rest = stream.finish()
+    assert [f.seq for f in rest] == [3, 4, 5] and not stream.finish()
+    assert relative_error(rest[0], frames[3][1]) < 0.02
+
+
+def test_the_first_frame_has_depth_where_it_waits_for_later_ones() -> None:
+    stream = DepthFromMotion(DepthFromMotionConfig(width=64, near_m=0.8, far_m=6.0, delay_frames=3))
+    frames = walk(4)
+    (first,) = [ready for frame, _ in frames for ready in stream.push(frame)]
+    assert relative_error(first, frames[0][1]) < 0.02
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.05])
+def test_a_camera_that_turns_or_stands_has_no_depth_and_keeps_its_frames(turn: float) -> None:
+    stream = DepthFromMotion(CONFIG)
+    for k in range(40):
+        (done,) = stream.push(plane_frame(turn=turn * k % 0.3, seq=k)[0])
+        assert done.depth_m is not None and not done.depth_m.any()
+        assert done.depth_sigma_m is not None and not done.depth_sigma_m.any()
+
+
+def test_a_camera_that_stood_has_depth_once_it_moves() -> None:
+    stream = DepthFromMotion(CONFIG)
+    for k in range(40):
+        stream.push(plane_frame(seq=k)[0])
+    frames = [plane_frame(0.1 * (k + 1), seq=40 + k) for k in range(4)]
+    done = [ready for frame, _ in frames for ready in stream.push(frame)]
+    assert relative_error(done[-1], frames[-1][1]) < 0.03
+
+
+def test_depth_of_a_sensor_passes_through_unchanged_and_in_order() -> None:
+    stream = DepthFromMotion(DepthFromMotionConfig(width=64, delay_frames=2))
+    frames = [frame for frame, _ in walk(4)]
+    measured = replace(frames[1], depth_m=np.ones(frames[1].rgb.shape[:2], np.float32))
+    done = [ready for f in (frames[0], measured, *frames[2:]) for ready in stream.push(f)]
+    assert [f.seq for f in done] == [0, 1] and done[1] is measured
+
+
+def test_a_camera_that_leaves_does_not_hold_up_the_others() -> None:
+    stream = DepthFromMotion(DepthFromMotionConfig(width=64, delay_frames=2))
+    assert not stream.push(plane_frame(camera_id="gone")[0])
+    done = [ready.camera_id for frame, _ in walk(12, camera_id="here") for ready in stream.push(frame)]
+    assert done[0] == "gone" and len(done) + len(stream.finish()) == 13
+
+
+def test_memory_is_bounded_and_old_places_are_kept() -> None:
+    stream = DepthFromMotion(CONFIG)
+    for k in range(3 * MAX_VIEWS):
+        stream.push(plane_frame(0.02 * k if k < MAX_VIEWS else 0.02 * MAX_VIEWS, seq=k)[0])
+    for k in range(2 * MAX_CAMERAS):
+        stream.push(plane_frame(camera_id=f"other {k}")[0])
+    assert len(stream._cameras) == MAX_CAMERAS
+    stream = DepthFromMotion(CONFIG)
+    for k in range(3 * MAX_VIEWS):
+        stream.push(plane_frame(min(0.05 * k, 0.5), seq=k)[0])
+    views = stream._cameras["cam"].views
+    assert len(views) == MAX_VIEWS and views[0].seq == 0
+
+
+def test_frames_of_another_size_serve_as_sources() -> None:
+    small = scale_intrinsics(CAMERA, 48, 36)
+    stream = DepthFromMotion(CONFIG)
+    for k in range(3):
+        stream.push(plane_frame(0.1 * k, seq=k, camera=small)[0])
+    frame, truth = plane_frame(0.3, seq=3)
+    (done,) = stream.push(frame)
+    assert done.depth_m is not None and done.depth_m.shape == truth.shape
+    assert relative_error(done, truth) < 0.05
+
+
+def test_a_hint_decides_where_the_picture_says_nothing() -> None:
+    frames = [plane_frame(0.1 * k, seq=k) for k in range(4)]
+    plain = [replace(frame, rgb=np.full_like(frame.rgb, 90)) for frame, _ in frames]
+    truth = frames[-1][1]
+    asked: list[CameraIntrinsics] = []
+
+    def hint(frame: PosedFrame, intrinsics: CameraIntrinsics) -> DepthEstimate:
+        asked.append(intrinsics)
+        return DepthEstimate(truth.copy(), np.full_like(truth, 0.02))
+
+    stream = DepthFromMotion(CONFIG)
+    done = [ready for frame in plain for ready in stream.push(frame, hint)]
+    assert relative_error(done[-1], truth) < 0.06  # near the hint to about a plane
+    assert asked[-1].width == 64
+
+
+def test_a_hint_of_another_size_is_refused() -> None:
+    views = [prepare_view(plane_frame(0.1 * k)[0], 64) for k in range(2)]
+    wrong = DepthEstimate(np.ones((3, 4), np.float32), np.ones((3, 4), np.float32))
+    with pytest.raises(ShapeError, match="hint depth"):
+        estimate_depth(views[0], views[1:], CONFIG, wrong)
+
+
+def test_a_spread_needs_a_depth_of_its_size() -> None:
+    frame, truth = plane_frame()
+    with pytest.raises(FrameError, match="depth_sigma_m is the spread of depth_m, which is missing"):
+        replace(frame, depth_sigma_m=truth)
+    with pytest.raises(FrameError, match="depth_sigma_m must be float32"):
+        replace(frame, depth_m=truth, depth_sigma_m=truth[:3])
+
+
+def test_the_spread_is_larger_where_the_picture_says_nothing() -> None:
+    plain = np.zeros(CAMERA.height * CAMERA.width, np.bool_).reshape(CAMERA.height, CAMERA.width)
+    stream = DepthFromMotion(CONFIG)
+    for k in range(6):
+        frame, _ = plane_frame(0.08 * k, seq=k)
+        rgb = frame.rgb.copy()
+        rgb[:, :24] = 90
+        (done,) = stream.push(replace(frame, rgb=rgb))
+    plain[:, :18] = True
+    assert done.depth_m is not None and done.depth_sigma_m is not None
+    spread = done.depth_sigma_m / done.depth_m
+    assert np.median(spread[plain]) > 2 * np.median(spread[:, 32:])
+
+
+def test_a_wrong_hint_does_not_outweigh_the_picture() -> None:
+    frames = walk(6)
+
+    def hint(frame: PosedFrame, intrinsics: CameraIntrinsics) -> DepthEstimate:
+        wrong = 1.5 * frames[frame.seq][1]
+        return DepthEstimate(wrong, 0.03 * wrong)
+
+    stream = DepthFromMotion(CONFIG)
+    done = [ready for frame, _ in frames for ready in stream.push(frame, hint)]
+    assert relative_error(done[-1], frames[-1][1]) < 0.03

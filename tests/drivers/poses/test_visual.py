@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import pytest
+
+from semantic_mapper.config import PoseRefinerConfig
+from semantic_mapper.drivers.base import CameraImage, PoseEstimate
+from semantic_mapper.drivers.poses.config import VisualPoses, begins_world
+from semantic_mapper.drivers.poses.sources import open_poses
+from semantic_mapper.drivers.poses.visual import VisualPoseSource
+from semantic_mapper.errors import CameraError, ConfigError
+from semantic_mapper.evaluation.trajectory import absolute_trajectory_error
+from semantic_mapper.scenes.config import PoseNoiseConfig
+from semantic_mapper.scenes.pose_noise import drifting_poses
+from semantic_mapper.types import Float64
+from tests.bundle.rooms import truth, walk, way_m
+
+from .images import as_image
+
+CONFIG = VisualPoses(tracking=PoseRefinerConfig(corners=200))
+
+
+class Wheels:
+    """Odometry that drifts by 2 %."""
+
+    warnings: tuple[str, ...] = ("a wheel squeaks",)
+
+    def __init__(self) -> None:
+        noise = PoseNoiseConfig(translation_share=0.02, rotation_deg_per_m=0.5, closure_frames=0)
+        poses = drifting_poses(truth(), 5, noise)
+        self._poses = {f.stamp_ns: T for f, T in zip(walk(), poses, strict=True)}
+        self.counters = {"messages": 7}
+        self.is_open = False
+
+    def __enter__(self) -> Self:
+        self.is_open = True
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.is_open = False
+
+    def pose(self, image: CameraImage) -> PoseEstimate | None:
+        T = self._poses.get(image.stamp_ns)
+        return None if T is None else PoseEstimate(T, "topic", 0.02)
+
+
+def follow(source: VisualPoseSource, count: int) -> list[PoseEstimate | None]:
+    with source:
+        return [source.pose(as_image(f)) for f in walk()[:count]]
+
+
+def poses_of(estimates: list[PoseEstimate | None]) -> tuple[Float64, Float64]:
+    """Found and true poses of the frames that have one."""
+    known = [i for i, e in enumerate(estimates) if e is not None]
+    return np.array([e.T_world_camera for e in estimates if e is not None]), truth()[known]
+
+
+def test_coarse_wheels_tell_the_scale_and_where_the_world_is() -> None:
+    wheels = Wheels()
+    source = VisualPoseSource(CONFIG, wheels)
+    assert source.scale == "awaited"
+    estimates = follow(source, 30)
+    found, true = poses_of(estimates)
+    assert len(found) > 8 and source.scale == "known" and not wheels.is_open
+    assert absolute_trajectory_error(found, true).rmse_m < 0.03 * way_m()
+    assert np.linalg.norm(found[0, :3, 3] - true[0, :3, 3]) < 0.1  # in the world of the wheels
+    assert {e.source for e in estimates if e is not None} == {"visual"}
+    assert source.counters["without_scale"] > 0 and source.counters["scale_messages"] == 7
+    assert "a wheel squeaks" in source.warnings
+
+
+def test_without_anything_the_poses_are_up_to_scale_and_the_status_says_so() -> None:
+    source = VisualPoseSource(CONFIG)
+    found, _ = poses_of(follow(source, 12))
+    assert len(found) > 5 and source.scale == "unknown"
+    assert source.warnings[0].startswith("scale: unknown")
+
+
+def test_a_typed_distance_tells_the_scale() -> None:
+    depth = walk()[0].depth_m
+    assert depth is not None
+    middle = float(np.median(depth[80:160, 107:213]))
+    source = VisualPoseSource(replace_config(distance_m=middle))
+    found, true = poses_of(follow(source, 30))
+    ways = [np.linalg.norm(np.diff(p[:, :3, 3], axis=0), axis=1).sum() for p in (found, true)]
+    assert source.scale == "known" and "scale: unknown" not in " ".join(source.warnings)
+    assert ways[0] == pytest.approx(ways[1], rel=0.25)  # one distance to a scene that is not flat
+    assert np.allclose(source.pose(as_image(walk()[29])) is not None, True)
+
+
+def replace_config(**changes: float) -> VisualPoses:
+    return VisualPoses(tracking=CONFIG.tracking, **changes)
+
+
+def test_a_camera_that_is_lost_says_why() -> None:
+    source = VisualPoseSource(CONFIG)
+    follow(source, 12)
+    dark = as_image(walk()[12])
+    assert source.pose(replace(dark, rgb=np.zeros_like(dark.rgb))) is None
+    assert "lost (the picture is too dark)" in source.warnings[0]
+    assert source.counters["lost"] == source.counters["dark"] == 1
+
+
+def test_another_camera_in_between_is_refused() -> None:
+    source = VisualPoseSource(CONFIG)
+    source.pose(as_image(walk()[0]))
+    with pytest.raises(CameraError, match="a pose source of its own"):
+        source.pose(replace(as_image(walk()[1]), camera_id="other"))
+
+
+def test_settings_make_the_source_and_what_its_scale_comes_from() -> None:
+    assert isinstance(open_poses({"kind": "visual"}), VisualPoseSource) and begins_world(VisualPoses())
+    source = open_poses({"kind": "visual", "scale": {"kind": "board", "columns": 5}})
+    assert isinstance(source, VisualPoseSource) and source.scale == "awaited"
+    for wrong, message in (
+        ({"scale": {"kind": "fixed"}}, 'must be "topic" or "board"'),
+        ({"scale": {"kind": "board", "colums": 5}}, "did you mean `columns`"),
+        ({"scale": {"kind": "board"}, "distance_m": 2.0}, "scale or distance_m"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            open_poses({"kind": "visual", **wrong})

@@ -1,0 +1,227 @@
+"""RealSense cameras over the SDK's software device; only the list of connected devices is the tests' own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Callable
+from itertools import islice, pairwise
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from semantic_mapper.config import convert_config
+from semantic_mapper.drivers.realsense import devices
+from semantic_mapper.drivers.realsense.camera import RealSenseCamera
+from semantic_mapper.drivers.realsense.config import Config
+from semantic_mapper.drivers.realsense.images import read_intrinsics
+from semantic_mapper.drivers.realsense.library import load_realsense
+from semantic_mapper.errors import CameraError, DependencyError
+from semantic_mapper.types import UInt8
+from tests.drivers.realsense.soft import HEIGHT, SERIAL, WIDTH, Feed, SoftDevice, lens
+from tests.small import tiny_frames
+
+try:
+    load_realsense()
+except DependencyError as error:  # there are wheels for Linux on x86-64 only
+    pytest.skip(str(error), allow_module_level=True)
+
+PATIENCE_S = 20.0
+FRAMES = tiny_frames(6)
+
+
+def picture(number: int) -> tuple[UInt8, np.ndarray]:
+    """A room, with the number of the image in its first pixel."""
+    frame = FRAMES[number % 6]
+    rgb = frame.rgb.copy()
+    rgb[0, 0] = number % 256
+    assert frame.depth_m is not None
+    return rgb, np.rint(frame.depth_m * 1000).astype(np.uint16)
+
+
+def camera_of(*found: SoftDevice, **settings: Any) -> RealSenseCamera:
+    """The camera of devices that are connected one after the other; none in between."""
+    waiting = list(found)
+
+    def find(serial: str, search_s: float) -> SoftDevice:
+        assert serial in ("", SERIAL)
+        for device in waiting:
+            if not device.gone:
+                return device
+        raise CameraError("no RealSense camera is connected")
+
+    small = {"width": WIDTH, "height": HEIGHT, "depth_width": WIDTH, "depth_height": HEIGHT, "retry_s": 0.05}
+    return RealSenseCamera(convert_config(small | settings, Config, "test"), "front", find)
+
+
+def until(holds: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_images_have_their_own_depth_and_stamps_on_our_clock() -> None:
+    device = SoftDevice()
+    with Feed(picture, device), camera_of(device) as camera:
+        assert camera.info.source == f"Soft D435 {SERIAL}" and camera.info.frame_hz == 30 and camera.warnings == ()
+        images = list(islice(camera, 8))
+        now_ns = time.monotonic_ns()
+    for image in images:
+        rgb, units = picture(int(image.rgb[0, 0, 0]))
+        assert np.array_equal(image.rgb, rgb)
+        # The SDK's alignment rounds to pixels, so that one in fifty takes the value of a neighbour, or none.
+        assert image.depth_m is not None and (np.abs(image.depth_m - units / 1000) < 1e-6).mean() > 0.95
+        assert image.depth_m.dtype == np.float32 and image.own_pose is None and image.camera_id == "front"
+        assert image.intrinsics == camera.info.cameras["front"] and image.intrinsics.fx == 66.0
+        assert 15e6 < now_ns - image.stamp_ns < PATIENCE_S * 1e9
+    assert [a.seq < b.seq and a.stamp_ns < b.stamp_ns for a, b in pairwise(images)] == [True] * 7
+
+
+def test_the_clock_of_the_device_is_put_on_ours() -> None:
+    device = SoftDevice()
+    with Feed(picture, device, "hardware_clock"), camera_of(device) as camera:
+        images = list(islice(camera, 5))
+        assert all(abs(time.monotonic_ns() - image.stamp_ns) < PATIENCE_S * 1e9 for image in images)
+    gaps = np.diff([image.stamp_ns for image in images]) / np.diff([image.seq for image in images])
+    assert (gaps > 20e6).all()
+
+
+def test_depth_of_the_other_sensor_is_aligned_to_colour() -> None:
+    """Depth from 3 cm to the left: what it sees at column u, 1.5 m away, colour sees 66 * 0.03 / 1.5 pixels further."""
+    T = np.eye(4)
+    T[0, 3] = 0.03
+    units = np.full((HEIGHT, WIDTH), 3000, np.uint16)
+    units[:, 50:] = 1500
+    device = SoftDevice(T_color_depth=T)
+    with Feed(lambda n: (picture(n)[0], units), device), camera_of(device) as camera:
+        depth = next(iter(camera)).depth_m
+    assert depth is not None
+    near = np.flatnonzero((np.abs(depth - 1.5) < 0.01).mean(axis=0) > 0.5)
+    assert abs(int(near.min()) - (50 + 66 * 0.03 / 1.5)) <= 1 and near.max() == WIDTH - 1
+    assert (np.abs(depth[:, 5:40] - 3.0) < 0.01).mean() > 0.9
+
+
+def test_settings_reach_the_sensor() -> None:
+    rs, device = load_realsense(), SoftDevice()
+    with Feed(picture, device), camera_of(device, preset="high_density", ir_dots=True):
+        assert device.depth_sensor.get_option(rs.option.visual_preset) == int(rs.rs400_visual_preset.high_density)
+        assert device.depth_sensor.get_option(rs.option.emitter_enabled) == 1.0
+
+
+def test_without_depth_colour_comes_alone() -> None:
+    device = SoftDevice()
+    with Feed(lambda n: (picture(n)[0], None), device), camera_of(device, depth=False) as camera:
+        images = list(islice(camera, 3))
+    assert all(image.depth_m is None for image in images)
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"width": 640}, "gives no color of 640x72 at 30 images/s, but 96x72 at 30; set `fps`, `width`"),
+        ({"fps": 60}, "gives no color of 96x72 at 60 images/s"),
+        ({"depth_height": 480}, "gives no depth of 96x480 at 30 images/s, but 96x72 at 30"),
+    ],
+)
+def test_a_mode_that_is_not_offered_is_refused_with_those_that_are(settings: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(CameraError, match=complaint), camera_of(SoftDevice(), **settings):
+        pass
+
+
+def test_a_device_that_gives_nothing_is_refused() -> None:
+    camera = camera_of(SoftDevice(), start_s=0.2)
+    with pytest.raises(CameraError, match=r"was opened, but it has given no image with depth for 0.2 s"), camera:
+        pass
+
+
+@pytest.mark.parametrize("how", ["unplugged", "stalled"])
+def test_a_device_that_goes_away_is_waited_for(how: str) -> None:
+    first, second = SoftDevice(), SoftDevice()
+    with Feed(picture, first) as feed, camera_of(first, second, stall_s=0.3) as camera:
+        images = iter(camera)
+        before = list(islice(images, 3))[-1]
+        feed.device = None
+        got: list[Any] = []
+        waiting = threading.Thread(target=lambda: got.append(next(images)))
+        if how == "unplugged":
+            first.gone = second.gone = True
+        waiting.start()
+        if how == "unplugged":
+            until(lambda: any("away: no RealSense camera is connected" in text for text in camera.warnings))
+            second.gone = False
+        else:
+            until(lambda: any("has given no image with depth for 0.3 s" in text for text in camera.warnings))
+            first.gone = True
+        feed.device = second
+        waiting.join(PATIENCE_S)
+        assert got and got[0].seq > before.seq + 1 and got[0].stamp_ns > before.stamp_ns
+        next(images)
+        assert camera.warnings == ()
+
+
+def test_stop_ends_the_iteration_while_the_device_is_gone() -> None:
+    device = SoftDevice()
+    with Feed(picture, device) as feed, camera_of(device) as camera:
+        images = iter(camera)
+        next(images)
+        feed.device, device.gone = None, True
+        threading.Timer(0.3, camera.stop).start()
+        assert len(list(images)) < 10
+
+
+def test_a_slow_port_is_told() -> None:
+    device = SoftDevice(usb="2.1")
+    with Feed(picture, device), camera_of(device) as camera:
+        assert "USB 2.1, too slow for its images" in camera.warnings[0]
+
+
+@pytest.mark.parametrize("model", ["brown_conrady", "inverse_brown_conrady"])
+def test_lens_models_of_the_sdk_become_opencv_s(model: str) -> None:
+    """As of a D455: its colour camera has the inverse of OpenCV's model."""
+    told = lens(640, 480, 385.0, model, (-0.056, 0.067, 0.0005, -0.0003, -0.022))
+    found = read_intrinsics(told)
+    rs = load_realsense()
+    pixels = np.array([(x, y) for x in (5.0, 200.0, 630.0) for y in (5.0, 300.0, 470.0)])
+    rays = np.array([rs.rs2_deproject_pixel_to_point(told, pixel.tolist(), 1.0) for pixel in pixels])
+    K = np.array(((found.fx, 0, found.cx), (0, found.fy, found.cy), (0, 0, 1)))
+    again, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, np.array(found.distortion))
+    assert np.abs(again[:, 0] - pixels).max() < 0.5
+
+
+def test_colour_and_depth_lose_the_lens_together() -> None:
+    told = lens(WIDTH, HEIGHT, 66.0, "brown_conrady", (-0.1, 0.02, 0.0, 0.0, 0.0))
+    device = SoftDevice(color=told, depth=told)
+    with Feed(picture, device), camera_of(device) as camera:
+        image = next(iter(camera))
+    assert image.intrinsics.distortion == () and image.intrinsics.fx != 66.0
+    assert image.depth_m is not None and (image.depth_m > 0).mean() > 0.9
+
+
+def test_connected_devices_are_listed_and_found_by_their_serial(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert devices.connected() == []  # the SDK's own answer on a machine without one
+    with pytest.raises(CameraError, match="no RealSense camera is connected: check its cable"):
+        devices.find_device("", 0.0)
+    soft = SoftDevice()
+    monkeypatch.setattr(devices, "connected", lambda: [soft])
+    (found,) = devices.list_devices()
+    assert (found.kind, found.name, found.address, found.note) == ("realsense", "Soft D435", SERIAL, "USB 3.2")
+    assert devices.find_device(SERIAL, 0.0) is soft
+    with pytest.raises(CameraError, match=r"the RealSense '77' is not connected .there is 0123."):
+        devices.find_device("77", 0.0)
+
+
+def test_without_the_extra_it_is_named() -> None:
+    script = """
+    import sys
+    sys.modules["pyrealsense2"] = None
+    from semantic_mapper.drivers.registry import find_cameras
+    print(find_cameras(("realsense",))[1])
+    """
+    run = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True)
+    assert "pip install 'semantic-mapper[realsense]'" in run.stdout

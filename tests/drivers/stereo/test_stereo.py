@@ -1,0 +1,193 @@
+"""Stereo pairs: rendered rooms through a real video file, and a webcam that goes away."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from semantic_mapper.drivers.base import Camera, CameraImage
+from semantic_mapper.drivers.registry import open_camera
+from semantic_mapper.drivers.stereo import list_devices
+from semantic_mapper.drivers.stereo.calibration import load_stereo, save_stereo
+from semantic_mapper.drivers.stereo.depth import StereoDepth
+from semantic_mapper.errors import CameraError, ConfigError
+from semantic_mapper.scenes import render_view
+from semantic_mapper.types import Float64
+from tests.drivers.fake_v4l2 import Machine, Sensor, make_machine, write_calibration
+from tests.drivers.stereo import pairs
+
+COUNT = 3
+PATIENCE_S = 20.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Film:
+    path: Path
+    scene: Any
+    poses: list[Float64]
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Film:
+    scene, poses = pairs.room_poses(COUNT)
+    path = pairs.write_film(tmp_path_factory.mktemp("film") / "pair.avi", pairs.room_pairs(scene, poses))
+    return Film(path, scene, poses)
+
+
+def stereo(film: Path, file: str, **settings: Any) -> Camera:
+    config = {"device": str(film), "calibration": file, "width": 480} | settings
+    return open_camera("stereo", config, "front", "test")
+
+
+def images_of(film: Film, calibration: str, **settings: Any) -> list[CameraImage]:
+    with stereo(film.path, calibration, source={"pace": "fast"}, **settings) as camera:
+        assert camera.warnings == () and camera.can_wait
+        images = list(camera)
+        assert camera.info.cameras == {"front": images[0].intrinsics}
+        assert camera.info.metadata["baseline_m"] == "0.1200" and camera.info.source == "stereo video pair.avi"
+    return images
+
+
+def until(holds: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_the_depth_of_a_room_is_that_of_the_rectified_left_camera(film: Film, tmp_path: Path) -> None:
+    """The errors that a third of a pixel makes: the room is 2 m away in the median, a pixel is 2.4 cm there."""
+    images = images_of(film, pairs.write_pair(tmp_path / "pair.toml"))
+    rectified = StereoDepth(pairs.pair(), 480, 0.4, 8.0)
+    assert len(images) == COUNT and [image.seq for image in images] == list(range(COUNT))
+    for image, T_world_left in zip(images, film.poses, strict=True):
+        truth = render_view(film.scene, image.intrinsics, T_world_left @ rectified.T_left_rectified)
+        assert image.depth_m is not None and image.depth_m.shape == image.rgb.shape[:2] == (360, 480)
+        assert np.abs(image.rgb.astype(int) - truth.rgb).mean() < 3
+        seen = (image.depth_m > 0) & (truth.exact_depth_m > 0)
+        error = image.depth_m[seen] / truth.exact_depth_m[seen] - 1
+        assert seen.mean() > 0.85
+        assert float(np.median(np.abs(error))) < 0.03 and abs(float(np.median(error))) < 0.005
+        assert float((np.abs(error) > 0.1).mean()) < 0.08
+
+
+def test_what_the_right_camera_does_not_see_has_no_depth() -> None:
+    """A near board before a far wall hides a strip of it from the right camera, on the board's left."""
+    pair = pairs.pair()
+    matcher = StereoDepth(dataclasses.replace(pair, right=pair.left, T_right_left=shift(-0.1)), 480, 0.4, 8.0)
+    focal = matcher.intrinsics.fx
+    rng = np.random.default_rng(1)
+    wall, board = (rng.integers(0, 255, (360, 900), np.uint8) for _ in range(2))
+    far, near = 16, 80  # disparities of wall and board
+    left, right = wall[:, 100:580].copy(), wall[:, 100 + far : 580 + far].copy()
+    left[100:260, 240:360] = board[100:260, :120]
+    right[100:260, 240 - near : 360 - near] = board[100:260, :120]
+    depth = matcher.depth(*(np.repeat(image[..., None], 3, axis=2) for image in (left, right)))
+    inner = slice(110, 250)
+    assert np.allclose(depth[inner, 250:350], focal * 0.1 / near, rtol=0.01)
+    assert np.median(depth[inner, 100:160]) == pytest.approx(focal * 0.1 / far, rel=0.01)
+    hidden = depth[inner, 240 - (near - far) + 6 : 240 - 6]
+    assert (hidden == 0).mean() > 0.8
+    assert (depth[inner, :far] == 0).all()  # left of the right camera's image
+
+
+def shift(x: float) -> Float64:
+    T = np.eye(4)
+    T[0, 3] = x
+    return T
+
+
+def test_swapped_halves_are_put_right(film: Film, tmp_path: Path) -> None:
+    other = pairs.write_film(
+        tmp_path / "pair.avi",
+        [np.hstack(np.hsplit(image, 2)[::-1]) for image in pairs.room_pairs(film.scene, film.poses[:1])],
+    )
+    (swapped,) = images_of(dataclasses.replace(film, path=other), pairs.write_pair(tmp_path / "p.toml", swapped=True))
+    plain = images_of(film, pairs.write_pair(tmp_path / "q.toml"))[0]
+    assert np.abs(swapped.rgb.astype(int) - plain.rgb).mean() < 2
+    assert swapped.depth_m is not None and (swapped.depth_m > 0).mean() > 0.85
+
+
+def test_narrower_images_have_their_own_intrinsics_and_the_same_depth(film: Film, tmp_path: Path) -> None:
+    file = pairs.write_pair(tmp_path / "pair.toml")
+    (large, *_), (small, *_) = images_of(film, file), images_of(film, file, width=240)
+    assert small.rgb.shape == (180, 240, 3) and small.intrinsics.fx == pytest.approx(large.intrinsics.fx / 2, rel=0.02)
+    assert small.depth_m is not None and large.depth_m is not None
+    a, b = (float(np.median(image[image > 0])) for image in (small.depth_m, large.depth_m))
+    assert a == pytest.approx(b, rel=0.05)
+
+
+def test_a_file_of_a_pair_reads_back_to_the_same_numbers(tmp_path: Path) -> None:
+    lens = dataclasses.replace(pairs.LEFT, distortion=(-0.1, 0.02, 1e-4, -2e-4, 0.003))
+    pair = dataclasses.replace(pairs.pair(swapped=True), left=lens)
+    save_stereo(tmp_path / "pair.toml", pair, {"made_by": 'a "test"', "rms_px": 0.25})
+    read = load_stereo(tmp_path / "pair.toml")
+    assert (read.left, read.right, read.swapped) == (pair.left, pair.right, True)
+    assert np.array_equal(read.T_right_left, pair.T_right_left)
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "complaint"),
+    [
+        ({"device": ""}, CameraError, "no device is named; `semantic-mapper cameras --kind stereo`"),
+        ({"calibration": ""}, CameraError, "has no calibration; make one with `semantic-mapper calibrate --stereo`"),
+        ({"calibration": "lens.toml"}, ConfigError, "lens.toml: .*calibrate --stereo` makes the file of a pair"),
+        ({"min_depth_m": 0.05}, ConfigError, r"min_depth_m = 0.05 is too near for this pair: .* 0\.\d\d m is possible"),
+        ({"min_depth_m": 9.0}, ConfigError, "must be below max_depth_m = 8"),
+        ({"source": {"calibration": "x"}}, CameraError, "`calibration` cannot be a key of `source`"),
+        ({"source": {"paze": "fast"}}, ConfigError, "did you mean `pace`"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_the_device_is_opened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], error: type[Exception], complaint: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_calibration(tmp_path / "lens.toml")
+    with pytest.raises(error, match=complaint):
+        stereo(Path("film.avi"), pairs.write_pair(tmp_path / "pair.toml"), **settings)
+
+
+def test_a_pair_that_is_not_side_by_side_and_a_film_of_another_size_are_refused(film: Film, tmp_path: Path) -> None:
+    turned = dataclasses.replace(pairs.pair(), T_right_left=shift(0.1))
+    save_stereo(tmp_path / "turned.toml", turned, {})
+    with pytest.raises(ConfigError, match="the right camera is not beside the left one"):
+        stereo(film.path, str(tmp_path / "turned.toml"))
+    small = pairs.write_film(tmp_path / "small.avi", [np.zeros((180, 480, 3), np.uint8)])
+    camera = stereo(small, pairs.write_pair(tmp_path / "pair.toml"))
+    with pytest.raises(CameraError, match="gives images of 480x180, and the pair was calibrated at 480x360"), camera:
+        pass
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Machine:
+    return make_machine(tmp_path, monkeypatch)
+
+
+def test_a_pair_that_is_unplugged_is_waited_for(machine: Machine, tmp_path: Path) -> None:
+    sensor = Sensor(card="Stereo", sizes=((960, 360), (64, 48)))
+    device = machine.plug(sensor, 0)
+    with stereo(device, pairs.write_pair(tmp_path / "pair.toml"), source={"stall_s": 0.1}) as camera:
+        images = iter(camera)
+        before = next(images)
+        assert before.rgb.shape == (360, 480, 3) and before.depth_m is not None and not before.depth_m.any()
+        assert camera.warnings == () and not camera.can_wait
+        machine.unplug(sensor)
+        until(lambda: any("no such camera" in text for text in camera.warnings))
+        plugged_ns = time.monotonic_ns()
+        machine.plug(sensor, 3)
+        assert next(image for image in images if image.stamp_ns > plugged_ns).seq > before.seq + 1
+
+
+def test_cameras_that_offer_images_side_by_side_are_listed(machine: Machine) -> None:
+    machine.plug(Sensor(), 0)
+    link = machine.plug(Sensor(card="Pair", sizes=((2560, 720), (1280, 720))), 1, link="usb-Pair-video-index0")
+    machine.plug(Sensor(answers=False), 2, link="")
+    (found,) = list_devices()
+    assert (found.kind, found.name, found.address) == ("stereo", "Pair", str(link))
+    assert found.note == "video1; side by side 2560x720"

@@ -1,0 +1,152 @@
+"""Rooms mapped without a depth sensor: where the surface lies, and what the map says of how it knows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.geometry import transform, unproject
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapping.frame_depth import MOST_SPREAD, SURE_SPREAD, computed_trust
+from semantic_mapper.mapping.fusion.depth_trust import COMPUTED_CAP, MEASURED
+from semantic_mapper.mapping.pipeline import MappingPipeline
+from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
+from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
+from tests.small import tiny_config, tiny_field
+
+CAMERA = CameraIntrinsics(110.0, 110.0, 79.5, 59.5, 160, 120)
+FINE = CameraIntrinsics(220.0, 220.0, 159.5, 119.5, 320, 240)
+
+
+@cache
+def walk(camera: CameraIntrinsics = CAMERA) -> tuple[PosedFrame, ...]:
+    """Frames with exact depth, 8 cm apart."""
+    return tuple(room_frames(TRAIN_SEEDS[7], 16, camera))
+
+
+def without_depth(frames: Sequence[PosedFrame]) -> list[PosedFrame]:
+    return [replace(frame, depth_m=None) for frame in frames]
+
+
+def make_pipeline(**changes: object) -> MappingPipeline:
+    config = tiny_config(**{"render": {"encode_width": 96, "scale": 0.25}, **changes})
+    return MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS)
+
+
+def mapped(frames: Sequence[PosedFrame], **changes: object) -> MappingPipeline:
+    pipeline = make_pipeline(**changes)
+    for frame in frames:
+        pipeline.step(frame)
+    return pipeline
+
+
+def true_surface(frames: Sequence[PosedFrame]) -> cKDTree:
+    clouds: list[Float64] = []
+    for frame in frames:
+        assert frame.depth_m is not None
+        known = frame.depth_m > 0
+        clouds.append(transform(frame.T_world_camera, unproject(frame.depth_m, frame.intrinsics)[known]))
+    return cKDTree(np.concatenate(clouds))
+
+
+def test_a_walk_without_depth_makes_a_surface_near_the_true_one_and_says_that_it_is_computed() -> None:
+    pipeline = mapped(without_depth(walk(FINE)))
+    points = pipeline.voxel_map.points()
+    assert len(points.xyz) > 3000
+    assert points.measured is not None and not points.measured.any()
+    mesh = pipeline.voxel_map.mesh()
+    assert mesh.measured is not None and len(mesh.measured) == len(mesh.vertices) and not mesh.measured.any()
+    assert np.median(true_surface(walk(FINE)).query(points.xyz)[0]) < 0.04  # of voxels of 5 cm
+    assert 0 < pipeline.voxel_map.block_state()["weight"].max() <= COMPUTED_CAP
+
+
+def test_a_walk_with_depth_says_that_all_of_its_surface_is_measured() -> None:
+    points = mapped(walk()).voxel_map.points()
+    assert len(points.xyz) > 3000 and points.measured is not None and points.measured.all()
+
+
+def test_computed_depth_adds_to_a_measured_map_and_leaves_it_as_it_is() -> None:
+    half = len(walk()) // 2
+    pipeline = mapped(walk()[:half])
+    before = pipeline.voxel_map.block_state()
+    for frame in without_depth(walk()[half:]):
+        pipeline.step(frame)
+    after = pipeline.voxel_map.block_state()
+    rows = {tuple(key): row for row, key in enumerate(after["keys"].tolist())}
+    here = [rows[tuple(key)] for key in before["keys"].tolist()]
+    measured = before["weight"] >= MEASURED
+    assert measured.sum() > 10_000
+    for name in ("tsdf", "weight", "color"):
+        assert after[name][here][measured].tobytes() == before[name][measured].tobytes(), name
+    new = (after["weight"] > 0) & (after["weight"] < MEASURED)
+    assert new.any(), "what the first half has not seen is computed"
+    said = pipeline.voxel_map.points().measured
+    assert said is not None and 0.1 < said.mean() < 1
+    view = pipeline.voxel_map.ray_cast(walk()[0].T_world_camera, CAMERA)
+    assert view.measured is not None and view.measured[view.depth_m > 0].mean() > 0.9
+
+
+@pytest.mark.parametrize(("source", "computed"), [("auto", False), ("computed", True)])
+def test_depth_of_a_sensor_is_used_unless_the_pictures_are_asked_for(source: str, computed: bool) -> None:
+    pipeline = make_pipeline(depth={"source": source})
+    ready = [frame for f in walk()[:4] for frame in pipeline.prepare(f)]
+    assert [frame.depth_sigma_m is not None for frame in ready] == [computed] * 4
+    same = [np.array_equal(a.depth_m, b.depth_m) for a, b in zip(ready, walk(), strict=False)]
+    assert same == [not computed] * 4
+
+
+@pytest.mark.parametrize("source", ["sensor", "off"])
+def test_nothing_is_computed_where_the_settings_say_so(source: str) -> None:
+    pipeline = make_pipeline(depth={"source": source})
+    for frame in (walk()[0], *without_depth(walk()[1:3])):
+        (ready,) = pipeline.prepare(frame)
+        assert (ready.depth_m is None) == (frame.depth_m is None or source == "off")
+        assert ready.depth_sigma_m is None
+
+
+def test_frames_that_wait_for_later_ones_come_once_and_in_order() -> None:
+    pipeline = make_pipeline(depth={"from_motion": {"delay_frames": 2}})
+    frames = without_depth(walk()[:7])
+    ready = [[frame.seq for frame in pipeline.prepare(f)] for f in frames]
+    assert ready == [[], [], [0], [1], [2], [3], [4]]
+    rest = pipeline.prepare_rest()
+    assert [frame.seq for frame in rest] == [5, 6] and not pipeline.prepare_rest()
+    assert all(frame.depth_sigma_m is not None for frame in rest)
+    assert pipeline.step(rest[0]).seq == 5
+
+
+def test_a_frame_that_has_to_wait_is_not_mapped_before_it_is_prepared() -> None:
+    pipeline = make_pipeline(depth={"from_motion": {"delay_frames": 2}})
+    with pytest.raises(ConfigError, match="give step what prepare returns"):
+        pipeline.step(without_depth(walk())[0])
+    assert pipeline.voxel_map.block_count == 0
+    assert pipeline.step(walk()[0]).fused, "depth of a sensor waits for nothing"
+
+
+def test_a_rebuild_of_a_computed_map_with_the_same_poses_is_the_same_map() -> None:
+    frames = without_depth(walk()[:10])
+    pipeline = mapped(frames, history={"max_frames": 100})
+    before = pipeline.voxel_map.block_state()
+    pipeline.correct_poses({frames[0].stamp_ns: pipeline.corrector.poses()["rooms", frames[0].stamp_ns]})
+    while pipeline.advance_correction(3):
+        pass
+    assert pipeline.corrector.status.poses == 1
+    after = pipeline.voxel_map.block_state()
+    assert before["weight"].any()
+    for name, values in before.items():
+        assert values.tobytes() == after[name].tobytes(), name
+
+
+def test_trust_is_the_inverse_variance_and_nothing_where_little_is_known() -> None:
+    spread = np.array([[0.0, SURE_SPREAD, 2 * SURE_SPREAD, 0.99 * MOST_SPREAD, MOST_SPREAD, 1.0]], np.float32)
+    depth = np.full_like(spread, 2.0)
+    expected = [[1, 1, 0.25, (SURE_SPREAD / 0.99 / MOST_SPREAD) ** 2, 0, 0]]
+    np.testing.assert_allclose(computed_trust(depth, spread * depth), expected, rtol=1e-5)
+    assert not computed_trust(np.zeros_like(depth), spread).any()

@@ -1,0 +1,104 @@
+"""Films on the command line: options, what counts as a film, the report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.nodes.cli.film import film_options, is_film, write_film_report
+from semantic_mapper.replay.sfm.film_note import FilmNote, read_left_out
+from semantic_mapper.replay.sfm.reconstruct import FilmReport, LeftOut, OtherModel
+from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
+from tests.nodes.support import run
+from tests.replay import recordings as rec
+
+
+def test_options_become_one_source_of_scale() -> None:
+    assert film_options(None, 0.0, 0.0, "", 0.0, None, 0.0).scale.factor is None
+    assert film_options(None, 500.0, 1.5, "", 0.0, None, 0.0, 1).scale.factor == 1.5
+    board = film_options(None, 0.0, 0.0, "", 39.6, None, 0.0).scale.board
+    assert board is not None and board.square_m == pytest.approx(0.0396)
+    with pytest.raises(ConfigError, match="one source"):
+        film_options(None, 0.0, 1.5, "", 0.0, None, 1.2)
+
+
+def test_a_folder_of_pictures_is_a_film_unless_it_is_a_recording(tmp_path: Path) -> None:
+    (tmp_path / "a.MOV").write_bytes(b"film")
+    assert is_film(tmp_path / "a.MOV") and not is_film(tmp_path / "none.mp4")
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    assert not is_film(pictures)
+    cv2.imwrite(str(pictures / "1.jpg"), np.zeros((8, 8, 3), np.uint8))
+    assert is_film(pictures)
+    assert not is_film(rec.make_folder(tmp_path / "kitchen"))
+
+
+def report(**changes: object) -> FilmReport:
+    poses = np.stack([np.eye(4)] * 3)
+    poses[:, 0, 3] = (0.0, 1.0, 2.5)
+    values = {
+        "film": Path("walk.mp4"),
+        "looked_at": 10,
+        "picked": 4,
+        "registered": 3,
+        "frames": 3,
+        "left_out": (
+            LeftOut("blurred", 0.5, 0.7, 3),
+            LeftOut("moved too little", 1.0, 2.0, 3),
+            LeftOut("blurred", 3, 3, 1),
+        ),
+        "error_px": 0.61,
+        "points": 900,
+        "focal_px": 812.5,
+        "focal_source": "found",
+        "distortion": (0.01, 0.0, 0.0, 0.0),
+        "scale": "",
+        "height_m": None,
+        "stamps_ns": np.arange(3),
+        "T_world_camera": poses,
+        "xyz": np.random.default_rng(0).normal(size=(50, 3)),
+        "others": (OtherModel(5, 4.0, 5.0),),
+        "notices": ("the scale is unknown",),
+        "pictures": ((0.5, np.zeros((8, 8, 3), np.uint8)),),
+        "info": StreamInfo("film walk.mp4", metadata={SCALE_KEY: SCALE_UNKNOWN}),
+        "bytes": 1000,
+    }
+    return FilmReport(**{**values, **changes})  # type: ignore[arg-type]
+
+
+def test_the_report_says_what_was_left_out_and_that_lengths_are_no_metres(tmp_path: Path) -> None:
+    assert report().left_out_counts == {"blurred": 4, "moved too little": 3} and report().path_m == 2.5
+    write_film_report(report(), tmp_path / "film.html")
+    page = (tmp_path / "film.html").read_text()
+    for text in ("4 blurred, 3 moved too little", "3 of 4 frames", "2.50 units (scale unknown)", "812.5 px", "0.61 px"):
+        assert text in page
+    write_film_report(report(scale="given", height_m=1.4), tmp_path / "film.html")
+    page = (tmp_path / "film.html").read_text()
+    assert "2.50 m" in page and "1.40 m" in page
+
+
+def test_options_of_films_are_refused_for_recordings(tmp_path: Path) -> None:
+    folder = rec.make_folder(tmp_path / "kitchen")
+    done = run("import", folder, tmp_path / "a.mcap", "--camera-height", "1.4")
+    assert done.returncode == 1 and "are for films" in done.stderr
+
+
+def test_a_log_keeps_how_many_frames_of_its_film_it_lacks() -> None:
+    note = FilmNote(10, {"blurred": 4, "moved too little": 3}, 4, 3, 0.6, 800.0)
+    assert read_left_out({"film.json": note.attachment()}) == 7
+    assert read_left_out({}) == 0
+
+
+def test_a_stream_is_metric_unless_it_says_otherwise() -> None:
+    assert StreamInfo("a").scale_known and not report().info.scale_known
+
+
+def test_what_is_no_film_is_refused_by_the_verb(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_bytes(b"no film")
+    done = run("map", tmp_path / "a.mp4", "--out", tmp_path / "out")
+    assert done.returncode == 1 and "no film that OpenCV can decode" in done.stderr
+    assert not (tmp_path / "out" / "a.mcap").exists()

@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from semantic_mapper.errors import ImportSourceError
+from semantic_mapper.replay.sfm.film import MAX_SIDE_PX, Film
+from semantic_mapper.replay.sfm.selection import FilmLook, look_through, pick_frames
+from semantic_mapper.types import UInt8
+
+from . import films
+
+
+def card(shift: int = 0, size: tuple[int, int] = (96, 128)) -> UInt8:
+    """A picture with texture, whose upper left quarter is white."""
+    rng = np.random.default_rng(0)
+    noise = cv2.resize(rng.integers(0, 200, (size[0] // 4, size[1] // 4 + 64), np.uint8), None, fx=4, fy=4)
+    gray = noise[:, shift : shift + size[1]].copy()
+    gray[: size[0] // 2, : size[1] // 2] = 255
+    return np.ascontiguousarray(np.repeat(gray[:, :, None], 3, axis=2))
+
+
+def test_frames_have_the_times_of_a_film_with_a_variable_rate(tmp_path: Path) -> None:
+    path = films.write_film(tmp_path / "a.mp4", [card() for _ in range(4)])
+    units = films.set_frame_times(path, (512, 2048, 512, 1024))
+    stamps = [frame.stamp_ns for frame in Film(path)]
+    assert stamps == [round(1e9 * t / units) for t in (0, 512, 2560, 3072)]
+
+
+def test_a_film_that_is_marked_as_turned_comes_upright(tmp_path: Path) -> None:
+    path = films.write_film(tmp_path / "a.mp4", [card()] * 3)
+    films.set_rotation(path)
+    film = Film(path)
+    assert (film.width, film.height) == (96, 128)
+    frame = next(iter(film)).bgr
+    assert frame[:64, 48:].mean() > 240 > frame[:64, :48].mean()  # the white quarter went from upper left to the right
+
+
+def test_a_turn_may_be_asked_for(tmp_path: Path) -> None:
+    path = films.write_film(tmp_path / "a.mp4", [card()] * 2)
+    frame = next(iter(Film(path, quarters=1))).bgr
+    assert frame.shape[:2] == (128, 96) and frame[:64, 48:].mean() > 240
+
+
+def test_large_frames_are_made_smaller(tmp_path: Path) -> None:
+    path = films.write_film(tmp_path / "a.mp4", [np.zeros((1080, 1920, 3), np.uint8)] * 2)
+    film = Film(path)
+    assert (film.full_width, film.width, film.height) == (1920, MAX_SIDE_PX, 720)
+    assert next(iter(film)).bgr.shape == (720, MAX_SIDE_PX, 3)
+
+
+def test_a_folder_of_pictures_is_a_film_in_the_order_of_its_numbers(tmp_path: Path) -> None:
+    for number in (10, 9, 11):
+        cv2.imwrite(str(tmp_path / f"IMG_{number}.jpg"), np.full((30, 40, 3), number, np.uint8))
+    cv2.imwrite(str(tmp_path / "IMG_12.png"), np.zeros((20, 40, 3), np.uint8))
+    (tmp_path / "IMG_13.jpg").write_bytes(b"no picture")
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 26
+    with Image.open(tmp_path / "IMG_9.jpg") as picture:
+        picture.save(tmp_path / "IMG_9.jpg", exif=exif, quality=95)
+    film = Film(tmp_path)
+    frames = list(film)
+    assert [round(float(frame.bgr.mean())) for frame in frames] == [9, 10, 11]
+    assert [frame.stamp_ns for frame in frames] == [0, 500_000_000, 1_000_000_000]
+    assert sorted(file.name for file in film.odd_pictures) == ["IMG_12.png", "IMG_13.jpg"]
+    assert film.focal_px == pytest.approx(26 * 50 / 43.27)
+
+
+def test_what_is_no_film_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ImportSourceError, match="no such film"):
+        Film(tmp_path / "none.mp4")
+    with pytest.raises(ImportSourceError, match="no pictures"):
+        Film(tmp_path)
+    (tmp_path / "a.mp4").write_bytes(b"not a film")
+    with pytest.raises(ImportSourceError, match="no film that OpenCV can decode"):
+        Film(tmp_path / "a.mp4")
+
+
+def test_the_look_measures_motion_and_finds_blurred_and_dark_frames(tmp_path: Path) -> None:
+    pictures = [card(2 * n) for n in range(12)]
+    pictures[5] = np.asarray(cv2.GaussianBlur(pictures[5], (0, 0), 5), np.uint8)
+    pictures[8] = np.full_like(pictures[8], 3)
+    look = look_through(Film(films.write_film(tmp_path / "a.avi", pictures)), lambda _: None)
+    assert np.flatnonzero(look.blurred).tolist() == [5] and np.flatnonzero(look.dark).tolist() == [8]
+    assert look.motion[1:4] == pytest.approx(2 / 128, rel=0.3)
+
+
+def look_of(motion: list[float], sharpness: list[float] | None = None) -> FilmLook:
+    count = len(motion)
+    return FilmLook(
+        np.arange(count),
+        np.arange(count) * 33_000_000,
+        np.array(motion),
+        np.array(sharpness or [1.0] * count),
+        np.zeros(count, np.bool_),
+    )
+
+
+def test_of_each_step_of_motion_the_sharpest_frame_is_picked() -> None:
+    sharpness = [1.0, 1.1, 1.0, 1.0, 1.0, 1.2, 1.0, 1.0]
+    look = look_of([0.0, *[0.011] * 7], sharpness)
+    assert pick_frames(look, step=0.04).tolist() == [1, 5]
+    still = look_of([0.0] * 8, sharpness)
+    assert pick_frames(still).tolist() == [5]
+
+
+def test_a_long_way_gets_longer_steps() -> None:
+    look = look_of([0.05] * 1000)
+    assert 90 <= len(pick_frames(look, most=100)) <= 101
+
+
+def test_a_frame_that_cannot_be_followed_counts_as_a_step() -> None:
+    assert len(pick_frames(look_of([0.0, float("nan"), float("nan"), 0.0]))) == 3

@@ -1,0 +1,130 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from semantic_mapper.drivers.poses.board import make_board
+from semantic_mapper.drivers.poses.config import BoardPoses
+from semantic_mapper.errors import ConfigError, ImportSourceError
+from semantic_mapper.geometry import invert_pose, look_at, project, transform
+from semantic_mapper.replay.sfm.scale import (
+    BoardScale,
+    Mark,
+    MarkedDistance,
+    PlacedFrame,
+    ScaleHint,
+    floor_height,
+    parse_distance,
+    ray_of,
+    triangulate,
+    upright,
+)
+from semantic_mapper.replay.sfm.vertical import vertical
+from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
+
+CAMERA = CameraIntrinsics(300.0, 300.0, 159.5, 119.5, 320, 240, (0.05, 0.0, 0.0, 0.0))
+UP = np.eye(3)[2]
+
+
+def test_marked_distances_are_read() -> None:
+    assert parse_distance("3.2:310,220 14:5.5,7 0.9") == MarkedDistance(Mark(3.2, 310, 220), Mark(14, 5.5, 7), 0.9)
+    for text in ("", "3:1,2 0.9", "3:1,2 4:1,2 0", "3:1,2 4:1,2 -1", "a:1,2 4:1,2 1"):
+        with pytest.raises(ConfigError, match="marks no distance"):
+            parse_distance(text)
+
+
+def test_the_scale_comes_from_one_source() -> None:
+    with pytest.raises(ConfigError, match="one source"):
+        ScaleHint(factor=2.0, camera_height_m=1.5)
+    with pytest.raises(ConfigError, match="above 0"):
+        ScaleHint(factor=-1.0)
+
+
+def test_a_place_is_found_where_rays_meet_and_only_from_two_sides() -> None:
+    place = np.array((0.3, 3.0, 1.0))
+    eyes = [np.array((0.2 * n, 0.0, 1.5)) for n in range(5)]
+    rays = [(eye, (place - eye) / np.linalg.norm(place - eye)) for eye in eyes]
+    found = triangulate([*rays, (eyes[0], np.array((0.0, 0.6, 0.8)))])  # one is wrong
+    assert found is not None and np.allclose(found, place, atol=1e-6)
+    assert triangulate(rays[:1]) is None and triangulate([rays[0], rays[0]]) is None
+
+
+def test_rays_take_the_lens_into_account() -> None:
+    T = look_at(np.array((1.0, 2.0, 1.5)), np.array((1.0, 5.0, 1.2)), UP)
+    origin, direction = ray_of(T, np.array((250.0, 60.0)), CAMERA)
+    x, y = (transform(invert_pose(T), (origin + direction)[None])[0][:2]) / (invert_pose(T)[:3, :3] @ direction)[2]
+    bent = 1 + 0.05 * (x * x + y * y)
+    assert (300 * x * bent + 159.5, 300 * y * bent + 119.5) == pytest.approx((250, 60), abs=1e-3)
+
+
+def test_a_world_is_turned_upright_about_the_first_camera() -> None:
+    T = look_at(np.array((3.0, 2.0, 1.5)), np.array((4.0, 5.0, 1.0)), UP)
+    askew = look_at(np.array((1.0, -2.0, 0.5)), np.array((0.0, 0.0, 0.0)), UP)
+    moved = upright(askew @ T, askew[:3, :3] @ UP) @ askew @ T
+    ahead = T[:3, 2]
+    assert np.allclose(moved[:3, 3], 0, atol=1e-9) and moved[2, 2] == pytest.approx(ahead[2])
+    assert moved[1, 2] == pytest.approx(0, abs=1e-9) and moved[0, 2] > 0
+
+
+def test_the_floor_is_the_lowest_strong_layer(rng: np.random.Generator) -> None:
+    T = np.eye(4)
+    T[2, 3] = 1.5
+    floor = np.column_stack((rng.uniform(-2, 2, (200, 2)), rng.normal(0.0, 0.01, 200)))
+    table = np.column_stack((rng.uniform(-1, 1, (300, 2)), rng.normal(0.75, 0.01, 300)))
+    stray = rng.uniform((-2, -2, -0.5), (2, 2, 2.5), (40, 3))
+    few = floor[:15]
+    frames = [PlacedFrame(0, T, np.concatenate((floor, table, stray)))]
+    found = floor_height(frames)
+    assert found is not None and abs(found) < 0.05
+    assert floor_height([PlacedFrame(0, T, np.concatenate((table, few)))]) is None  # most is on the table
+    assert floor_height([PlacedFrame(0, T, table + np.array((0, 0, 2.0)))]) is None
+
+
+def test_up_is_where_upright_edges_meet(rng: np.random.Generator) -> None:
+    poses = {n: look_at(np.array((0.3 * n, 0, 1.5)), np.array((0.3 * n + rng.normal(), 3, 0.9)), UP) for n in range(8)}
+    edges: dict[int, Float64] = {}
+    plain = CameraIntrinsics(300.0, 300.0, 159.5, 119.5, 320, 240)
+    for n, T in poses.items():
+        rows = []
+        for kind in range(40):
+            a = np.array((rng.uniform(-2, 4), 3.0, rng.uniform(0.3, 1.2)))
+            b = a + ((0, 0, 0.8) if kind % 4 == 0 else rng.normal(0, 0.5, 3))
+            rows.append(project(transform(invert_pose(T), np.stack((a, b))), plain).ravel())
+        edges[n] = np.stack(rows)
+    guess = np.array((0.3, -0.3, 1.0))
+    found = vertical(edges, poses, plain, guess)
+    assert found is not None and np.degrees(np.arccos(found @ UP)) < 0.3
+    random = {n: rng.uniform(0, 240, (40, 4)) for n in poses}
+    assert vertical({0: random[0][:5]}, poses, plain, guess) is None
+
+
+def board_view(T_board_camera: Float64, config: BoardPoses, camera: CameraIntrinsics) -> UInt8:
+    """A picture of the board by a camera at a pose in the board's world."""
+    import cv2
+
+    a_metre = 2000
+    size = (round(config.columns * config.square_m * a_metre), round(config.rows * config.square_m * a_metre))
+    sheet = make_board(config).generateImage(size, marginSize=0)
+    T = invert_pose(T_board_camera)
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    pixels = np.array([[1 / a_metre, 0, 0.5 / a_metre], [0, 1 / a_metre, 0.5 / a_metre], [0, 0, 0], [0, 0, 1]])
+    homography = K @ T[:3] @ pixels
+    options = {"flags": cv2.INTER_AREA, "borderMode": cv2.BORDER_CONSTANT, "borderValue": 180}
+    view = cv2.warpPerspective(sheet, homography, (camera.width, camera.height), **options)
+    return np.ascontiguousarray(np.repeat(np.asarray(view, np.uint8)[:, :, None], 3, axis=2))
+
+
+def test_a_board_tells_the_scale() -> None:
+    config = BoardPoses()
+    camera = CameraIntrinsics(500.0, 500.0, 319.5, 239.5, 640, 480)
+    scale, scaled, poses = BoardScale(config), 3.0, {}
+    middle = np.array((0.14, 0.1, 0.0))
+    for n in range(5):
+        T = look_at(middle + np.array((0.12 * (n - 2), 0.05 * n, -0.5)), middle, np.array((0.0, -1.0, 0.0)))
+        scale.look(n, board_view(T, config, camera))
+        poses[n] = T.copy()
+        poses[n][:3, 3] /= scaled
+    found, how = scale.metres_per_unit(poses, camera)
+    assert found == pytest.approx(scaled, rel=0.01) and "board" in how
+    with pytest.raises(ImportSourceError, match="board tells no scale"):
+        scale.metres_per_unit({0: poses[0]}, camera)
