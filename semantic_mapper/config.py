@@ -274,7 +274,7 @@ class DepthConfig(Config, frozen=True):
     from_motion: DepthFromMotionConfig = DepthFromMotionConfig()
     # Whether given poses are made to fit the pictures where depth is computed from these; without, poses that are some
     # pixels off give depth that is far off.
-    refine_poses: bool = True
+    refine_poses: bool = True  # in images from 320 pixels of width on
     poses: PoseRefinerConfig = PoseRefinerConfig()
 
 

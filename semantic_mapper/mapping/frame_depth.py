@@ -20,6 +20,7 @@ MOST_SPREAD = 0.10  # from here on it has none
 HINT_SPREAD = 0.04  # of the map's own surface where it was computed, as a fraction of depth
 MEASURED_SPREAD = 0.01  # and where it was measured
 RECENT_FRAMES = 500
+REFINED_WIDTH = 320  # pixels; corners of smaller images are too inexact to correct poses by
 
 
 @dataclass(slots=True)
@@ -75,7 +76,7 @@ class FrameDepth:
             frame = replace(frame, depth_m=None)
         if self._computer is None or frame.depth_m is not None:
             return [frame] if self._computer is None else self._computer.push(frame)
-        if self._config.refine_poses:
+        if self._config.refine_poses and frame.intrinsics.width >= REFINED_WIDTH:
             frame = self._refine(frame)
         return self._computer.push(frame, self._hint)
 
