@@ -56,11 +56,11 @@ def map_(
     from semantic_mapper.nodes.cli.film import film_options, import_film_log, is_film, print_film, recording_scale
     from semantic_mapper.nodes.cli.outputs import hold_folder
     from semantic_mapper.nodes.cli.report import REPORT_NAME
-    from semantic_mapper.nodes.cli.run_replay import ReplayRequest, mapper_config, replay_log
+    from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, ReplayRequest, mapper_config, replay_log
     from semantic_mapper.nodes.cli.summary_table import notes, result_lines, summary_table
     from semantic_mapper.replay.importers import ImportOptions, import_recording
 
-    settings = mapper_config(config, voxel_size, None, quality)
+    settings = mapper_config(config, voxel_size, None, quality, None, REPLAY_DELAY_FRAMES)
     options = film_options(
         calibration, focal_prior, scale, distance, square_mm, board, camera_height, int(rotate) // 90
     )

@@ -7,8 +7,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from rich.table import Table
 
+from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import LabelError, WeightsError
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.nodes.cli.console import frame_progress
@@ -47,7 +49,7 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
         stream_labels = log.info.label_set
         if stream_labels is None:
             raise LabelError(f"{request.log}: has no label images to score against")
-        bundle = Mapper.load(request.weights, mapper_config(request.config, None, request.seed))
+        bundle = Mapper.load(request.weights, _frame_by_frame(mapper_config(request.config, None, request.seed)))
         predictors = field_predictors(bundle)
         stamps = bundle.checkpoint.train_stamps_ns
         if request.baselines:
@@ -80,6 +82,12 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
             "weights": bundle.weights_path.name,
             "notes": list(shortfall),
         }
+
+
+def _frame_by_frame(config: MapperConfig) -> MapperConfig:
+    """Scores are of each frame as it comes: computed depth does not wait for later ones."""
+    from_motion = msgspec.structs.replace(config.depth.from_motion, delay_frames=0)
+    return msgspec.structs.replace(config, depth=msgspec.structs.replace(config.depth, from_motion=from_motion))
 
 
 def _frames_at(log: Log, stamps: frozenset[int]) -> list[PosedFrame]:
