@@ -114,7 +114,8 @@ def replay_log(
             raise
         summary = finish_session(session, request.out, stop.name)
     if not session.fused:
-        reason = session.refusals.first[0].reason if session.refusals else "no frame has depth or finds a source view"
+        reason = summary["map"]["nearly_empty"] or "no frame has depth or finds a source view"
+        reason = session.refusals.first[0].reason if session.refusals else reason
         raise LogError(f"{request.log}: none of {counted(done, 'frame')} could be mapped; the first: {reason}")
     return summary
 

@@ -231,7 +231,9 @@ def test_every_image_of_a_video_file_is_mapped(tmp_path: Path, weights: Path, co
         writer.write(np.roll(noise, shift, axis=1))
     writer.release()
     lens.write_text("fx = 80.0\nfy = 80.0\ncx = 47.5\ncy = 35.5\nwidth = 96\nheight = 72\n")
-    settings = {"video": film, "calibration": lens, "poses": "fixed", "weights": weights, "config": config}
+    rendered = tmp_path / "rendered.toml"  # a fixed camera shows no depth: the field has to guess it
+    rendered.write_text(f'{config.read_text()}\n[depth]\nsource = "sensor"\n')
+    settings = {"video": film, "calibration": lens, "poses": "fixed", "weights": weights, "config": rendered}
     options = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
     out = tmp_path / "out"
     done = run("up", REPLAY_LAUNCH.with_name("video.toml"), *options, "--out", out)
