@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -12,8 +12,9 @@ import numpy as np
 from semantic_mapper.bundle.refiner import PoseRefiner
 from semantic_mapper.config import DepthConfig
 from semantic_mapper.depth_from_motion import DepthFromMotion
+from semantic_mapper.depth_from_motion.stream import MAX_CAMERAS
 from semantic_mapper.depth_from_motion.views import DepthEstimate
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
+from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame
 
 SURE_SPREAD = 0.03  # spread, as a fraction of depth, up to which computed depth has its full weight
 MOST_SPREAD = 0.10  # from here on it has none
@@ -44,7 +45,7 @@ class PoseDisagreement:
         return float(np.median(self.given_px)), float(np.median(self.refined_px))
 
 
-CastMap = Callable[[Float64, CameraIntrinsics], tuple[Float32, np.ndarray]]
+CastMap = Callable[[PosedFrame, CameraIntrinsics], tuple[Float32, np.ndarray]]
 
 
 class FrameDepth:
@@ -52,14 +53,14 @@ class FrameDepth:
 
     Args:
         config: Which depth, and how it is computed.
-        cast_map: Depth (h, w) of the map at a pose, 0 = no surface, and whether it was measured (h, w) bool.
+        cast_map: Depth (h, w) of the map as a frame sees it, 0 = no surface, and whether it was measured (h, w) bool.
     """
 
     def __init__(self, config: DepthConfig, cast_map: CastMap) -> None:
         self._config = config
         self._source = config.source
         self._cast_map = cast_map
-        self._refiners: dict[str, PoseRefiner] = {}
+        self._refiners: OrderedDict[str, tuple[CameraIntrinsics, PoseRefiner]] = OrderedDict()
         self.disagreement = PoseDisagreement()
         self._computer: DepthFromMotion | None = None
         if config.source in ("auto", "computed"):
@@ -85,14 +86,19 @@ class FrameDepth:
         return [] if self._computer is None else self._computer.finish()
 
     def _refine(self, frame: PosedFrame) -> PosedFrame:
-        if frame.camera_id not in self._refiners:
-            self._refiners[frame.camera_id] = PoseRefiner(self._config.poses)
-        refined = self._refiners[frame.camera_id].push(frame)
+        """The frame at a pose that fits the pictures; a camera with another lens or size begins anew."""
+        intrinsics, refiner = self._refiners.pop(frame.camera_id, (None, None))
+        if refiner is None or intrinsics != frame.intrinsics:
+            refiner = PoseRefiner(self._config.poses)
+        self._refiners[frame.camera_id] = frame.intrinsics, refiner
+        if len(self._refiners) > MAX_CAMERAS:
+            self._refiners.popitem(last=False)
+        refined = refiner.push(frame)
         self.disagreement.add(refined.given_error_px, refined.error_px)
         return replace(frame, T_world_camera=refined.T_world_camera)
 
     def _hint(self, frame: PosedFrame, intrinsics: CameraIntrinsics) -> DepthEstimate:
-        depth_m, measured = self._cast_map(frame.T_world_camera, intrinsics)
+        depth_m, measured = self._cast_map(frame, intrinsics)
         spread = np.where(measured, np.float32(MEASURED_SPREAD), np.float32(HINT_SPREAD))
         return DepthEstimate(depth_m, (spread * depth_m).astype(np.float32))
 

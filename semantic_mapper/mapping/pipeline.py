@@ -34,7 +34,7 @@ from semantic_mapper.mapping.views.upsample import upsample
 from semantic_mapper.mapping.views.view_renderer import RenderedView, ViewRenderer
 from semantic_mapper.mapping.views.virtual_views import ViewpointChooser, VirtualLook
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, MapUpdate, PosedFrame, SourceViews, UInt8
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, MapUpdate, PosedFrame, SourceViews, UInt8
 
 _log = get_logger(__name__)
 
@@ -313,11 +313,11 @@ class MappingPipeline:
             raise ConfigError("depth.from_motion.delay_frames lets frames wait: give step what prepare returns")
         return frame
 
-    def _cast_for_hint(self, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> tuple[Float32, Bool]:
+    def _cast_for_hint(self, frame: PosedFrame, intrinsics: CameraIntrinsics) -> tuple[Float32, Bool]:
         if self.voxel_map.block_count == 0:
             empty = np.zeros((intrinsics.height, intrinsics.width), np.float32)
             return empty, empty > 0
-        view = self.voxel_map.ray_cast(T_world_camera, intrinsics)
+        view = self.voxel_map.ray_cast(self.corrector.place(frame).T_world_camera, intrinsics)
         assert view.measured is not None
         return view.depth_m, view.measured
 

@@ -1,4 +1,4 @@
-"""The arms of whoever wears the camera: before it in every frame of a sequence, with the ignore id."""
+"""Arms of the person who wears the camera: before it in every frame of a sequence, with the ignore id."""
 
 from __future__ import annotations
 

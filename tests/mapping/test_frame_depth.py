@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from semantic_mapper.depth_from_motion.stream import MAX_CAMERAS
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.geometry import transform, unproject
@@ -150,3 +151,17 @@ def test_trust_is_the_inverse_variance_and_nothing_where_little_is_known() -> No
     expected = [[1, 1, 0.25, (SURE_SPREAD / 0.99 / MOST_SPREAD) ** 2, 0, 0]]
     np.testing.assert_allclose(computed_trust(depth, spread * depth), expected, rtol=1e-5)
     assert not computed_trust(np.zeros_like(depth), spread).any()
+
+
+def test_a_camera_that_changes_its_lens_is_still_mapped_without_depth() -> None:
+    zoomed = replace(FINE, fx=230.0, fy=230.0)
+    frames = without_depth([*walk(FINE)[:6], *walk(zoomed)[6:10]])
+    pipeline = mapped(frames)
+    assert pipeline.voxel_map.frames == len(frames) and pipeline.pose_disagreement_px is not None
+
+
+def test_what_is_kept_to_refine_poses_is_bounded() -> None:
+    pipeline = make_pipeline()
+    for number in range(MAX_CAMERAS + 3):
+        pipeline.prepare(replace(without_depth(walk(FINE)[:1])[0], camera_id=f"camera {number}"))
+    assert len(pipeline._frame_depth._refiners) == MAX_CAMERAS
