@@ -65,9 +65,8 @@ def finetune(
     )
     if own := recipe["own_view"]:
         output.print(
-            f"  on keyframes left out until step {own['step']}: own image alone {own['own_image'] * 100:.1f} %, "
-            f"as one vote among other views {own['as_one_vote'] * 100:.1f} %; it counts {own['factor']:g} times: "
-            f"{own['accuracy'] * 100:.1f} %"
+            f"  a frame's own image counts {own['factor']:g} times among the views, "
+            f"{own['factor_without_depth']:g} times where there is no depth"
         )
     if stop:
         stderr_console().print(f"stopped by {stop.name}; the best weights so far are in {out}", style="yellow")

@@ -43,12 +43,14 @@ def _reason(field: str, name: str, methods: Mapping[str, Mapping[str, Any]], rec
         return f"It leaves {missing * 100:.1f} % of the pixels unknown, which count as wrong: no source view sees them."
     own = recipe.get("own_view") or {}
     if not own:
-        return "The other views outvote the query's image, whose weight no keyframe has chosen."
-    return (
-        f"The other views outvote the query's image, which counts {own['factor']:g} times: keyframes that were left "
-        f"out until step {own['step']} gave {own['accuracy'] * 100:.1f} % with that, {own['own_image'] * 100:.1f} % "
-        "alone."
-    )
+        return "The other views outvote the query's image, which counts as one among them."
+    return f"The other views outvote the query's image, which counts {own['factor']:g} times{_without_depth(own)}."
+
+
+def _without_depth(own: Mapping[str, Any]) -> str:
+    """Weights finetuned by earlier versions have one factor for all rays."""
+    factor = own.get("factor_without_depth", own["factor"])
+    return "" if factor == own["factor"] else f" ({factor:g} times where there is no depth)"
 
 
 def _figures(of_field: Mapping[str, Any], other: Mapping[str, Any]) -> str:

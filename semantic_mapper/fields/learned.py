@@ -74,8 +74,9 @@ class LearnedField(nn.Module, ABC):
         """Classify images as an ``image_classifier`` of another field does; False where a kind cannot."""
         return False
 
-    def weigh_own_view(self, factor: float) -> bool:
-        """Let the query's own image count ``factor`` times as much among the views; False = no choice."""
+    def weigh_own_view(self, factor: float, without_depth: float) -> bool:
+        """Let the query's own image count ``factor`` times as much among the views, and ``without_depth`` times on rays
+        without a depth prior; False = no choice."""
         return False
 
     def scene_config(self, views: SourceViews, far_m: float) -> Config:

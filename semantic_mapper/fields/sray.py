@@ -80,10 +80,11 @@ class SRay(LearnedField):
             self.weights.start_alike()
             nn.init.zeros_(self.radial.out.weight)
             nn.init.zeros_(self.cross.out.weight)
-            # Of the own view's blending weight: 1 = one vote among others, large = the own image alone. Not learned by
-            # gradients: on the pixels that it was trained on, the own image is always right.
+            # Of the own view's blending weight: 1 = one vote among others, large = the own image alone; for rays with a
+            # depth prior and for those without, whose views may look at different things. Not learned by gradients: on
+            # the pixels that it was trained on, the own image is always right.
             self.own_view_factor: torch.Tensor
-            self.register_buffer(OWN_VIEW_FACTOR, torch.ones(()))
+            self.register_buffer(OWN_VIEW_FACTOR, torch.ones(2))
             self.register_load_state_dict_pre_hook(_before_own_view_factor)
 
     def encode(self, views: SourceViews) -> EncodedViews:
@@ -144,11 +145,16 @@ class SRay(LearnedField):
             self.classifier.bias.copy_(bias)
         return True
 
-    def weigh_own_view(self, factor: float) -> bool:
+    def weigh_own_view(self, factor: float, without_depth: float) -> bool:
         """Set ``own_view_factor``, where tokens are at the surface."""
         if self.at_surface:
-            self.own_view_factor.fill_(factor)
+            self.own_view_factor.copy_(torch.tensor((factor, without_depth)))
         return self.at_surface
+
+    def own_view_factors(self, rays: RayBatch) -> torch.Tensor:
+        """(R,) how much the own view counts on each ray."""
+        with_depth, without = self.own_view_factor if self.at_surface else rays.prior_depth_m.new_ones(2)
+        return torch.where(rays.prior_depth_m > 0, with_depth, without)
 
     def mask_occluded(self, space: ContextualSpace) -> ContextualSpace:
         """M without the views to which a sample is hidden, where some other view sees it.
@@ -188,15 +194,20 @@ class SRay(LearnedField):
         return x.transpose(0, 1)
 
     def blend_views(
-        self, refined: torch.Tensor, space: ContextualSpace, content: torch.Tensor | None = None
+        self,
+        refined: torch.Tensor,
+        space: ContextualSpace,
+        content: torch.Tensor | None = None,
+        own_factor: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Semantic ray s (Eq. 11, 12) and colour of each sample: (R, N, C), (R, N, 3).
 
         With ``occlusion`` the weights of Eq. 12 are times the views' visibilities: the bounds hold among views that see
-        the sample alike. The own view's weight at the surface is times ``own_view_factor``.
+        the sample alike.
 
         Args:
             content: (m, R, N, C) what is blended, where that is not what the weights are made of.
+            own_factor: (R,) times which the own view's weight counts; None = once.
         """
         semantic_score, colour_score = self.weights(self._normalised(refined), space.cues)
         colour_weight = softmax_weights(colour_score, space.valid)
@@ -206,8 +217,9 @@ class SRay(LearnedField):
             semantic_weight = constrained_weights(semantic_score, space.valid, self.config.tau)
             if self.config.occlusion or self.at_surface:
                 semantic_weight = semantic_weight * (space.visibility + LEAST_VISIBILITY)
-                if self.at_surface:
-                    semantic_weight = semantic_weight * torch.where(space.cues[..., CUES] > 0, self.own_view_factor, 1)
+                if own_factor is not None:
+                    is_own = space.cues[..., CUES] > 0
+                    semantic_weight = semantic_weight * torch.where(is_own, own_factor[:, None], 1)
                 semantic_weight = semantic_weight / semantic_weight.sum(0).clamp_min(1e-12)
         if self.at_surface:
             colour_weight = colour_weight * (space.visibility + LEAST_VISIBILITY)
@@ -249,7 +261,8 @@ class SRay(LearnedField):
             seen = replace(seen, feature=refined)
             seen = self.mask_occluded(surface_space(seen, looked_at, rays, sources, occlusion=self.config.occlusion))
             token = self.attend_at_surface(seen)
-            s, colour = (blended[:, 0] for blended in self.blend_views(token, seen, token + self.semantic(token)))
+            content, own_factor = token + self.semantic(token), self.own_view_factors(rays)
+            s, colour = (blended[:, 0] for blended in self.blend_views(token, seen, content, own_factor))
             logits = self.classifier(s)
         else:
             s, colour = self.blend_views(refined, seen)
@@ -273,8 +286,9 @@ class SRay(LearnedField):
 
 
 def _before_own_view_factor(module: nn.Module, state_dict: dict[str, Any], prefix: str, *_: Any) -> None:
-    """Files from before there was such a factor: the own view is one among others."""
-    state_dict.setdefault(prefix + OWN_VIEW_FACTOR, torch.ones(()))
+    """Files from before there was such a factor: the own view is one among others. Older ones have one for all rays."""
+    stored = state_dict.get(prefix + OWN_VIEW_FACTOR, torch.ones(()))
+    state_dict[prefix + OWN_VIEW_FACTOR] = stored.expand(2).clone()
 
 
 def _check(config: SRayConfig) -> None:

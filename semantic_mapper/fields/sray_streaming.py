@@ -100,7 +100,7 @@ class StreamingSRay:
         carried = torch.empty(count, len(self.label_set))
         render_sray(
             count,
-            _Rays(_array(rays.origin), _array(rays.direction), _array(z)),
+            _Rays(_array(rays.origin), _array(rays.direction), _array(z), _array(self.model.own_view_factors(rays))),
             _source_maps(sources, channels),
             self._settings._replace(sample_weight_threshold=sample_weight_threshold),
             self._weights,
@@ -133,6 +133,7 @@ class _Rays(NamedTuple):
     origin: Float32  # (R, 3)
     direction: Float32  # (R, 3)
     z: Float32  # (R, N) ascending
+    own_factor: Float32  # (R,) times which the own view's weight counts, of tokens at the surface
 
 
 class _SourceMaps(NamedTuple):
@@ -160,7 +161,6 @@ class _Settings(NamedTuple):
     min_depth_m: float
     background_m: float
     own_radius_m: float
-    own_view_factor: float  # of the own view's weight, of tokens at the surface
 
 
 class _Layer(NamedTuple):
@@ -221,7 +221,6 @@ def _settings(model: SRay) -> _Settings:
         min_depth_m=MIN_DEPTH_M,
         background_m=BACKGROUND_M,
         own_radius_m=OWN_RADIUS_M,
-        own_view_factor=float(model.own_view_factor) if model.at_surface else 1.0,
     )
 
 

@@ -65,9 +65,10 @@ HELD_OUT_RAYS = 6144  # over all keyframes: a look must not cost more the more k
 HELD_OUT_SOURCES = 7  # that a held-out ray is rendered from, beside its own image: those that see most of its view
 IMAGES = 4  # of a step on single images
 MIRRORED = 0.5  # of them
-RESERVED = 4  # one in so many keyframes chooses among the factors, and is not learned from until then
-FACTOR_RAYS = 2048  # of all of them
-OWN_VIEW_FACTORS = (1.0, 4.0, 16.0, 1e3)  # of which one is chosen: from one vote among others to the own image alone
+# Times that the own image counts among the views after steps on images; without a depth prior nearly alone, because the
+# other views may look at something else there (docs/decisions/0018-images-in-finetuning.md).
+OWN_VIEW_FACTOR = 4.0
+OWN_VIEW_FACTOR_WITHOUT_DEPTH = 1e3
 
 
 class FinetuneConfig(Config, frozen=True):
@@ -252,10 +253,10 @@ def _run(
             _settle_norms(model, scene.train)
         return _evaluate(model, scene, config)
 
+    own_view = _weigh_own_view(model, scene, config)
     with clock.looking():
         best = _Best(*look(), 0, copy.deepcopy(model.state_dict()))
     images_from, images_until = config.frozen_encoder_fraction, _end_of_images(model, config)
-    reserved, own_view = _reserve(model, scene, config), dict[str, float]()
     step, evaluated, stale = 0, 0, 0
     best, encoded = (best, None) if alive else _linear_probe(model, scene, config, best)
     latest = (best.loss, best.accuracy)
@@ -266,14 +267,9 @@ def _run(
     while (fraction := clock.used(step)) < 1 and (patience == 0 or stale < patience) and not stopped():
         rate = cosine_rate(fraction, config.learning_rate, config.final_learning_rate)
         set_rates(optimiser, rate, config.encoder_rate)
-        if reserved and fraction >= 0.5 * (images_from + images_until):
-            if alive:
-                _settle_norms(model, scene.train)
-            own_view, reserved = _fit_own_view(model, scene, config, reserved) | {"step": step}, ()
         with norms():
             if images_from <= fraction < images_until:
-                learned = [i for i in scene.queries if i not in reserved]
-                loss = _draw_image_loss(model, [scene.train[i] for i in learned], config.step, generator)
+                loss = _draw_image_loss(model, [scene.train[i] for i in scene.queries], config.step, generator)
             else:
                 kept = encoded if fraction < images_from else None
                 loss = _draw_loss(model, scene, kept, config.step, generator)
@@ -305,8 +301,6 @@ def _run(
         latest = look()
         if latest[0] < best.loss or not math.isfinite(best.loss):
             best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
-    if best.step <= own_view.get("step", 0):  # the weights that are kept are from before the choice
-        own_view = {}
     return best, step, own_view
 
 
@@ -460,38 +454,18 @@ def _rays_of(
         yield _ViewRays(to_device(rays, device), to_device(targets, device), z, replace(chosen, channel=known))
 
 
-def _reserve(model: LearnedField, scene: _Scene, config: FinetuneConfig) -> Sequence[int]:
-    """Views that steps on images leave out until the own view's weight is chosen: one in ``RESERVED`` of those with
-    labels. None where nothing is to be chosen, or nothing would be left to learn from."""
-    no_images = _end_of_images(model, config) <= config.frozen_encoder_fraction
-    if no_images or len(scene.queries) < RESERVED or not model.weigh_own_view(1.0):
-        return ()
-    return scene.queries[::RESERVED]
-
-
-def _fit_own_view(
-    model: LearnedField, scene: _Scene, config: FinetuneConfig, reserved: Sequence[int]
-) -> dict[str, float]:
-    """Choose how much the own image counts beside the other views: what gives the best accuracy in the views that the
-    encoder has not seen yet. Held-out blocks cannot say it: what surrounds them was trained on.
+def _weigh_own_view(model: LearnedField, scene: _Scene, config: FinetuneConfig) -> dict[str, float]:
+    """Let the own image, which steps on images fit to this scene, count more than one view among others.
 
     Returns:
-        The choice, and the accuracies in those views: with it, with a vote among others, and of the own image alone.
+        The factors; empty where the encoder learns nothing of the scene, or where no view has depth: then every ray
+        needs the other views.
     """
-    generator = torch.Generator().manual_seed(config.seed)
-    model.eval()
-    with torch.inference_mode():
-        views = {i: scene.train[i] for i in reserved}
-        rays = list(_rays_of(model, scene, views, config, FACTOR_RAYS // len(reserved), generator))
-        alone = _score(model, [replace(part, sources=part.sources.select(torch.tensor([-1]))) for part in rays])
-        scores: dict[float, tuple[float, float]] = {}
-        for factor in OWN_VIEW_FACTORS:
-            model.weigh_own_view(factor)
-            scores[factor] = _score(model, rays)
-        best = max(scores, key=lambda factor: scores[factor][1])  # the smallest of equal ones
-        model.weigh_own_view(best)
-    model.train()
-    return {"factor": best, "accuracy": scores[best][1], "as_one_vote": scores[1.0][1], "own_image": alone[1]}
+    has_images = _end_of_images(model, config) > config.frozen_encoder_fraction
+    has_depth = any(bool((view.depth_m > 0).any()) for view in scene.train)
+    if not (has_images and has_depth and model.weigh_own_view(OWN_VIEW_FACTOR, OWN_VIEW_FACTOR_WITHOUT_DEPTH)):
+        return {}
+    return {"factor": OWN_VIEW_FACTOR, "factor_without_depth": OWN_VIEW_FACTOR_WITHOUT_DEPTH}
 
 
 def _score(model: LearnedField, parts: Sequence[_ViewRays]) -> tuple[float, float]:

@@ -105,6 +105,25 @@ def test_the_own_view_counts_as_much_more(factor: float):
         assert torch.equal(fast.logits, plain) == (pose is not POSES[1])
 
 
+def test_the_own_view_counts_otherwise_on_rays_without_a_depth_prior():
+    field = random_field()
+    views = labelled(wall_sources([*POSES, *BEHIND]))
+    rays = wall_rays(POSES[1], step=3)
+    z = sample_guided(rays, SamplingConfig())
+    half = torch.arange(len(z)) < len(z) // 2
+    rays = replace(rays, prior_depth_m=torch.where(half, rays.prior_depth_m, 0))
+    found: dict[tuple[float, float], torch.Tensor] = {}
+    for factors in ((4.0, 4.0), (4.0, 1e3), (1.0, 1e3)):
+        field.weigh_own_view(*factors)
+        fast, reference = render_both(field, views, rays, z)
+        assert_equal(fast, reference)
+        found[factors] = fast.logits
+    assert torch.equal(found[4.0, 4.0][half], found[4.0, 1e3][half])
+    assert torch.equal(found[4.0, 1e3][~half], found[1.0, 1e3][~half])
+    assert not torch.equal(found[4.0, 4.0][~half], found[4.0, 1e3][~half])
+    assert not torch.equal(found[4.0, 1e3][half], found[1.0, 1e3][half])
+
+
 @pytest.mark.parametrize(
     ("feature_dim", "heads"),
     [(4, 1), (4, 2), (12, 3), (16, 1), (20, 4), (24, 3), (28, 1), (32, 2), (32, 4), (32, 8), (36, 2), (64, 8)],

@@ -130,19 +130,22 @@ def test_the_factor_of_the_own_view_leads_from_the_vote_to_the_own_image_alone()
         assert (logits - wanted).abs().max() < (1e-4 if factor > 1e5 else 0.05) * (others - own).abs().max()
 
 
-def test_a_file_keeps_the_factor_of_the_own_view_and_one_without_has_1(tmp_path: Path):
+def test_a_file_keeps_the_factors_of_the_own_view_and_an_old_one_has_one_or_none(tmp_path: Path):
     field = small_field()
-    field.own_view_factor.fill_(4.0)
+    field.weigh_own_view(4.0, 16.0)
     path = tmp_path / "new.safetensors"
     save_checkpoint(Checkpoint(field), path, half=True)
     new = load_checkpoint(path).model
-    assert isinstance(new, SRay) and new.own_view_factor == 4
+    assert isinstance(new, SRay) and new.own_view_factor.tolist() == [4, 16]
     with safe_open(path, framework="pt") as stored:
         metadata = dict(stored.metadata() or {})
-    tensors = {name: t for name, t in load_file(path).items() if "own_view_factor" not in name}
-    save_file(tensors, path, metadata)
-    old = load_checkpoint(path).model
-    assert isinstance(old, SRay) and old.own_view_factor == 1
+    tensors = load_file(path)
+    name = next(name for name in tensors if "own_view_factor" in name)
+    others = {n: t for n, t in tensors.items() if n != name}
+    for stored, factors in (({name: torch.tensor(4.0)}, [4, 4]), ({}, [1, 1])):
+        save_file(others | stored, path, metadata)
+        old = load_checkpoint(path).model
+        assert isinstance(old, SRay) and old.own_view_factor.tolist() == factors
 
 
 def test_a_view_whose_sight_is_blocked_has_no_token():

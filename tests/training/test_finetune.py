@@ -220,44 +220,19 @@ def test_steps_on_images_are_the_first_ones_behind_a_resting_encoder(monkeypatch
     assert made == ["_draw_loss"] * 3, "an encoder that is to stay what it is learns no images"
 
 
-@pytest.mark.parametrize("reliable", [True, False])
-def test_the_own_image_counts_as_much_as_views_that_were_left_out_say(reliable: bool, monkeypatch: pytest.MonkeyPatch):
-    """Of those views, either the own image alone makes sense or the others do; what does not is sure of itself."""
-    rays_of, generator = finetuning._rays_of, torch.Generator().manual_seed(0)
-
-    def told(*given):
-        for part in rays_of(*given):
-            feature = part.sources.feature
-            noise = 9 * torch.randn(feature.shape, generator=generator)
-            own = torch.arange(len(feature)) == len(feature) - 1
-            feature = torch.where((own == reliable)[:, None, None, None], feature, noise)
-            unlabelled = torch.full_like(part.sources.channel, -1)
-            yield dataclasses.replace(
-                part, sources=dataclasses.replace(part.sources, feature=feature, channel=unlabelled)
-            )
-
-    monkeypatch.setattr(finetuning, "_rays_of", told)
-    still = {"learning_rate": 0.0, "final_learning_rate": 0.0, "weight_decay": 0.0}
-    last = {"steps": 4, "held_out_fraction": 0.0}  # the last weights are kept
-    result = finetune(tiny_frames(4), ROOMS, calibrated_field(), config(**last, **still))
-    chosen = result.recipe["own_view"]
-    assert (chosen["factor"] > 1) == reliable
-    assert (chosen["own_image"] > chosen["as_one_vote"]) == reliable
-
-
-def test_views_that_choose_the_own_image_s_weight_are_learned_from_only_then(monkeypatch: pytest.MonkeyPatch):
-    left_out: list[int] = []
-    draw = finetuning._draw_image_loss
-
-    def noted(model, views, *given):
-        left_out.append(8 - len(views))
-        return draw(model, views, *given)
-
-    monkeypatch.setattr(finetuning, "_draw_image_loss", noted)
-    finetune(tiny_frames(8), ROOMS, calibrated_field(), config(steps=8, image_fraction=1.0, patience=0))
-    assert left_out == [2] * 4 + [0] * 4
-    kept = finetune(tiny_frames(3), ROOMS, calibrated_field(), config(steps=2, image_fraction=1.0)).recipe
-    assert kept["own_view"] == {}, "too few to leave one out"
+@pytest.mark.parametrize(
+    ("changes", "depth", "factors"),
+    [({}, True, [4.0, 1e3]), ({"encoder_rate": 0.0}, True, [1.0, 1.0]), ({}, False, [1.0, 1.0])],
+)
+def test_the_own_image_counts_more_where_its_encoder_learned_the_scene(
+    changes: dict[str, float], depth: bool, factors: list[float]
+):
+    frames = [f if depth else dataclasses.replace(f, depth_m=None) for f in tiny_frames(4)]
+    result = finetune(frames, ROOMS, calibrated_field(), config(steps=2, **changes))
+    model = result.model
+    assert isinstance(model, SRay) and model.own_view_factor.tolist() == factors
+    wanted = {"factor": 4.0, "factor_without_depth": 1e3} if factors[0] > 1 else {}
+    assert result.recipe["own_view"] == wanted
 
 
 def test_doubt_is_what_the_images_alone_give_to_other_classes_than_the_right_one():

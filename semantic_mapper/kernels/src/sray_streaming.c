@@ -27,6 +27,7 @@ enum {
 typedef struct {
     F32 origin, direction; /* (R, 3) */
     F32 z;                 /* (R, N), N >= 2, ascending */
+    F32 own_factor;        /* (R,) times which the own view's weight counts, of tokens at the surface */
 } Rays;
 
 typedef struct {
@@ -54,7 +55,6 @@ typedef struct {
     double min_depth;          /* metres before a source camera */
     double background;         /* metres to what a ray meets that meets nothing */
     double own_radius;         /* metres from the ray's origin within which a camera is the query's own */
-    double own_view_factor;    /* of the own view's weight, of tokens at the surface */
 } Settings;
 
 typedef struct {
@@ -757,12 +757,12 @@ static int64_t blend_views(Scratch *s, float *colour) {
 }
 
 /* The same of tokens at the surface, which stay apart until they have been through `semantic`; as many as there are. */
-static int64_t weigh_views(Scratch *s, const Settings *set, int64_t count, float *colour) {
+static int64_t weigh_views(Scratch *s, float own_factor, int64_t count, float *colour) {
     const int64_t C = s->channels;
     float sum = 0, colour_sum = 0;
     memset(colour, 0, 3 * sizeof(float));
     for (int64_t i = 0; i < count; i++)
-        if (s->tokens[i * s->stride + C + OWN] > 0) s->semantic_score[i] *= (float)set->own_view_factor;
+        if (s->tokens[i * s->stride + C + OWN] > 0) s->semantic_score[i] *= own_factor;
     for (int64_t i = 0; i < count; i++) sum += s->semantic_score[i], colour_sum += s->colour_score[i];
     for (int64_t i = 0; i < count; i++) {
         const float *row = s->tokens + i * s->stride;
@@ -829,7 +829,8 @@ static void render_ray(const RenderArguments *a, Scratch *s, int64_t r) {
     if (w->cross.qkv.shape[0] > 0) attend_across_views(s, &w->cross, set, count);
     score_views(s, w, set, count);
     float *colour = a->out.colour.data + 3 * r;
-    const int64_t kept = set->at_surface ? weigh_views(s, set, count, colour) : blend_views(s, colour);
+    const float own_factor = a->rays.own_factor.data[r];
+    const int64_t kept = set->at_surface ? weigh_views(s, own_factor, count, colour) : blend_views(s, colour);
     composite_semantics(s, w, kept, a->out.feature.data + r * C);
 }
 
