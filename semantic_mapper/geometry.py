@@ -202,6 +202,7 @@ def pixel_rays(
     near_m: float,
     far_m: float,
     prior_depth_m: torch.Tensor | None = None,
+    measured: torch.Tensor | None = None,
 ) -> RayBatch:
     """Rays through pixels, in world coordinates (S-Ray Eq. 3 with z as the parameter).
 
@@ -211,6 +212,7 @@ def pixel_rays(
         T_world_camera: (4, 4) float32.
         near_m, far_m: z bounds for every ray.
         prior_depth_m: (R,) z, 0 = none.
+        measured: (R,) bool, where the prior is not filled in; None = wherever there is one.
     """
     count = expect_shape(pixels, "R 2", "pixels")["R"]
     x = (pixels[:, 0] - intrinsics.cx) / intrinsics.fx
@@ -226,6 +228,7 @@ def pixel_rays(
         near_m=torch.full_like(x, near_m),
         far_m=torch.full_like(x, far_m),
         prior_depth_m=prior_depth_m,
+        measured=measured,
     )
 
 

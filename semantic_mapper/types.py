@@ -209,6 +209,8 @@ class RayBatch:
         direction: (R, 3) float32, scaled so that ``origin + z * direction`` has camera depth z (not unit length).
         near_m, far_m: (R,) float32 z bounds of the search.
         prior_depth_m: (R,) float32 z from a sensor or a map, 0 = none.
+        measured: (R,) bool, where the prior is measured at the very pixel rather than filled in from others; None =
+            wherever there is a prior.
     """
 
     origin: torch.Tensor
@@ -216,6 +218,7 @@ class RayBatch:
     near_m: torch.Tensor
     far_m: torch.Tensor
     prior_depth_m: torch.Tensor
+    measured: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -76,7 +76,7 @@ class LearnedField(nn.Module, ABC):
 
     def weigh_own_view(self, factor: float, without_depth: float) -> bool:
         """Let the query's own image count ``factor`` times as much among the views, and ``without_depth`` times on rays
-        without a depth prior; False = no choice."""
+        without measured depth; False = no choice."""
         return False
 
     def scene_config(self, views: SourceViews, far_m: float) -> Config:

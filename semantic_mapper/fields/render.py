@@ -37,6 +37,7 @@ def render_image(
     sampling: SamplingConfig,
     rays_per_chunk: int,
     on_chunk: Callable[[int], None] | None = None,
+    measured: NDArray[np.bool_] | None = None,
 ) -> FieldRender:
     """Render every pixel of a view without gradients, row by row.
 
@@ -46,6 +47,7 @@ def render_image(
         prior_depth_m: (H, W), 0 = no prior.
         sampling: Near and far bounds.
         rays_per_chunk: Rays rendered at once; 0 = what suits the device.
+        measured: (H, W), where the prior is not filled in; None = wherever there is one.
         on_chunk: Called with the number of rays done after each chunk.
 
     Returns:
@@ -54,6 +56,7 @@ def render_image(
     device = sources.feature.device
     pixels = pixel_grid(intrinsics.width, intrinsics.height, device)
     prior = torch.from_numpy(np.ascontiguousarray(prior_depth_m)).to(device).flatten()
+    seen = None if measured is None else torch.from_numpy(np.ascontiguousarray(measured)).to(device).flatten()
     pose = torch.tensor(T_world_camera, device=device, dtype=torch.float32)
     parts: list[FieldRender] = []
     rays_per_chunk = chunk_size(rays_per_chunk, device, sampling)
@@ -66,6 +69,7 @@ def render_image(
                 near_m=sampling.near_m,
                 far_m=sampling.far_m,
                 prior_depth_m=prior[start : start + rays_per_chunk],
+                measured=None if seen is None else seen[start : start + rays_per_chunk],
             )
             parts.append(field.render(rays, sources))
             if on_chunk is not None:
@@ -88,9 +92,11 @@ def render_view(
     prior_depth_m: Float32,
     sampling: SamplingConfig,
     rays_per_chunk: int,
+    measured: NDArray[np.bool_] | None = None,
 ) -> tuple[Float32, NDArray[np.bool_], Float32]:
     """``render_image`` as arrays: class probabilities (H, W, L), known (H, W), depth (H, W) in metres."""
-    render = render_image(field, sources, intrinsics, T_world_camera, prior_depth_m, sampling, rays_per_chunk)
+    scene = (field, sources, intrinsics, T_world_camera, prior_depth_m, sampling, rays_per_chunk)
+    render = render_image(*scene, measured=measured)
     shape = (intrinsics.height, intrinsics.width)
     probabilities = torch.softmax(render.logits, dim=-1).view(*shape, -1)
     return (

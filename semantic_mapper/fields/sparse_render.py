@@ -35,12 +35,14 @@ def render_sparse_view(
     rays_per_chunk: int,
     rgb: UInt8,
     fraction: float,
+    measured: NDArray[np.bool_] | None = None,
 ) -> tuple[Float32, NDArray[np.bool_], Float32, int]:
     """As ``render_view``, with rays for at most a ``share`` of the pixels, and for every fourth a side at least.
 
     Args:
         rgb: (H, W, 3) uint8 colours of the view, whose edges tell where to look closer.
         fraction: Of the pixels that may have rays of their own, the most doubtful first; 0..1.
+        measured: (H, W), where the prior is not filled in; None = wherever there is one.
 
     Returns:
         Class probabilities (H, W, L), known (H, W), depth (H, W) in metres, and the number of rays rendered. Pixels
@@ -63,8 +65,9 @@ def render_sparse_view(
             v, u = rows[start : start + rays_per_chunk], columns[start : start + rays_per_chunk]
             pixels = torch.from_numpy(np.stack((u, v), axis=1).astype(np.float32)).to(pose.device)
             prior = torch.from_numpy(prior_depth_m[v, u]).to(pose.device)
-            near_m, far_m = sampling.near_m, sampling.far_m
-            rays = pixel_rays(pixels, intrinsics, pose, near_m=near_m, far_m=far_m, prior_depth_m=prior)
+            seen = None if measured is None else torch.from_numpy(measured[v, u]).to(pose.device)
+            bounds = {"near_m": sampling.near_m, "far_m": sampling.far_m}
+            rays = pixel_rays(pixels, intrinsics, pose, **bounds, prior_depth_m=prior, measured=seen)
             with torch.inference_mode():
                 render = field.render(rays, sources)
                 probabilities[v, u] = torch.softmax(render.logits, dim=-1).cpu().numpy()

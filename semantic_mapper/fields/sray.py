@@ -80,9 +80,9 @@ class SRay(LearnedField):
             self.weights.start_alike()
             nn.init.zeros_(self.radial.out.weight)
             nn.init.zeros_(self.cross.out.weight)
-            # Of the own view's blending weight: 1 = one vote among others, large = the own image alone; for rays with a
-            # depth prior and for those without, whose views may look at different things. Not learned by gradients: on
-            # the pixels that it was trained on, the own image is always right.
+            # Of the own view's blending weight: 1 = one vote among others, large = the own image alone; for rays with
+            # measured depth and for those without, whose views may look at different things. Not learned by
+            # gradients: on the pixels that it was trained on, the own image is always right.
             self.own_view_factor: torch.Tensor
             self.register_buffer(OWN_VIEW_FACTOR, torch.ones(2))
             self.register_load_state_dict_pre_hook(_before_own_view_factor)
@@ -154,7 +154,8 @@ class SRay(LearnedField):
     def own_view_factors(self, rays: RayBatch) -> torch.Tensor:
         """(R,) how much the own view counts on each ray."""
         with_depth, without = self.own_view_factor if self.at_surface else rays.prior_depth_m.new_ones(2)
-        return torch.where(rays.prior_depth_m > 0, with_depth, without)
+        measured = rays.prior_depth_m > 0 if rays.measured is None else rays.measured
+        return torch.where(measured, with_depth, without)
 
     def mask_occluded(self, space: ContextualSpace) -> ContextualSpace:
         """M without the views to which a sample is hidden, where some other view sees it.

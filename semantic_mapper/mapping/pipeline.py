@@ -417,9 +417,14 @@ class MappingPipeline:
             return RenderedView(np.zeros((height, width, len(self.label_set)), np.float32), empty > 0, empty, 0, 0)
         intrinsics = scale_intrinsics(frame.intrinsics, width, height)
         prior = self._depth_prior(resized, intrinsics)
-        rgb = resized.rgb(intrinsics)
         return (renderer or self._renderer).render(
-            stack_views(views), intrinsics, frame.T_world_camera, prior, rgb, computed=frame.depth_sigma_m is not None
+            stack_views(views),
+            intrinsics,
+            frame.T_world_camera,
+            prior,
+            resized.rgb(intrinsics),
+            measured=resized.depth(intrinsics) > 0 if frame.depth_m is not None else None,
+            computed=frame.depth_sigma_m is not None,
         )
 
     def _depth_prior(self, resized: FrameViews, intrinsics: CameraIntrinsics) -> Float32:

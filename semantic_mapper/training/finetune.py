@@ -65,8 +65,8 @@ HELD_OUT_RAYS = 6144  # over all keyframes: a look must not cost more the more k
 HELD_OUT_SOURCES = 7  # that a held-out ray is rendered from, beside its own image: those that see most of its view
 IMAGES = 4  # of a step on single images
 MIRRORED = 0.5  # of them
-# Times that the own image counts among the views after steps on images; without a depth prior nearly alone, because the
-# other views may look at something else there (docs/decisions/0018-images-in-finetuning.md).
+# Times that the own image counts among the views after steps on images; without measured depth nearly alone, because
+# the other views may look at something else there (docs/decisions/0018-images-in-finetuning.md).
 OWN_VIEW_FACTOR = 4.0
 OWN_VIEW_FACTOR_WITHOUT_DEPTH = 1e3
 

@@ -105,13 +105,14 @@ def test_the_own_view_counts_as_much_more(factor: float):
         assert torch.equal(fast.logits, plain) == (pose is not POSES[1])
 
 
-def test_the_own_view_counts_otherwise_on_rays_without_a_depth_prior():
+@pytest.mark.parametrize("filled", [True, False])
+def test_the_own_view_counts_otherwise_on_rays_without_measured_depth(filled: bool):
     field = random_field()
     views = labelled(wall_sources([*POSES, *BEHIND]))
     rays = wall_rays(POSES[1], step=3)
     z = sample_guided(rays, SamplingConfig())
     half = torch.arange(len(z)) < len(z) // 2
-    rays = replace(rays, prior_depth_m=torch.where(half, rays.prior_depth_m, 0))
+    rays = replace(rays, measured=half) if filled else replace(rays, prior_depth_m=rays.prior_depth_m * half)
     found: dict[tuple[float, float], torch.Tensor] = {}
     for factors in ((4.0, 4.0), (4.0, 1e3), (1.0, 1e3)):
         field.weigh_own_view(*factors)

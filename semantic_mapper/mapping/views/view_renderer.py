@@ -81,6 +81,7 @@ class ViewRenderer:
         prior_m: Float32,
         rgb: UInt8,
         *,
+        measured: NDArray[np.bool_] | None = None,
         computed: bool = False,
     ) -> RenderedView:
         """Render one view.
@@ -91,6 +92,7 @@ class ViewRenderer:
             T_world_camera: (4, 4).
             prior_m: (h, w) float32 depth prior, 0 = none.
             rgb: (h, w, 3) uint8 colours of the view.
+            measured: (h, w), where the prior is not filled in; None = wherever there is one.
             computed: Whether the prior was computed from pictures: it may be farther off than a sensor's.
         """
         fraction, sampling = self._config.ray_fraction, self._sampling
@@ -113,9 +115,9 @@ class ViewRenderer:
             samples = sampling.guided
         scene = (self._field, sources, intrinsics, T_world_camera, prior_m, sampling, self._config.rays_per_chunk)
         if fraction == 1:
-            probabilities, known, depth_m = render_view(*scene)
+            probabilities, known, depth_m = render_view(*scene, measured)
             rays = prior_m.size
         else:
-            probabilities, known, depth_m, rays = render_sparse_view(*scene, rgb, fraction)
+            probabilities, known, depth_m, rays = render_sparse_view(*scene, rgb, fraction, measured)
         self._last = (0 if blind else rays, samples)
         return RenderedView(probabilities, known, depth_m, rays, samples)
