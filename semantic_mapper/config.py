@@ -66,6 +66,9 @@ class EncoderConfig(Config, frozen=True):
     # ``channels`` and ``blocks`` are the decoder's then
     backbone: Literal["residual", "efficientnet-lite0"] = "residual"
     depth: bool = False  # whether it sees measured depth (as ``fields.surface`` puts it) beside colours
+    # Whether it has learned from depth that was computed from pictures, too (``pool.computed_depth`` of a training).
+    # An encoder that has not is shown none: it would be misled.
+    computed_depth: bool = False
 
 
 class SRayConfig(Config, frozen=True):

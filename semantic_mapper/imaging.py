@@ -38,6 +38,16 @@ def resize_depth(frame: PosedFrame, intrinsics: CameraIntrinsics) -> Float32:
     return np.where(measured, depth, 0).astype(np.float32)
 
 
+def resize_spread(frame: PosedFrame, intrinsics: CameraIntrinsics) -> Float32 | None:
+    """One-sigma spread (H, W) of ``resize_depth`` in metres; None where no depth was computed from pictures."""
+    if frame.depth_sigma_m is None:
+        return None
+    sigma = frame.depth_sigma_m
+    if sigma.shape != (intrinsics.height, intrinsics.width):
+        sigma = cv2.resize(sigma, (intrinsics.width, intrinsics.height), interpolation=cv2.INTER_NEAREST_EXACT)
+    return np.asarray(sigma, np.float32)
+
+
 class FrameViews:
     """A frame with its colour and depth at the sizes that a step needs, each resized once. Do not write to them."""
 

@@ -191,6 +191,8 @@ class SourceViews:
         K: (m, 3, 3) float32 pinhole matrices in pixels of (H, W).
         T_world_camera: (m, 4, 4) float32.
         channel: (m, H, W) int64 class channels that are known of the views, -1 = none; None for views without labels.
+        depth_sigma_m: (m, H, W) float32 one-sigma spread of ``depth_m`` where it was computed from pictures, 0 where it
+            was measured; None where all of it was.
     """
 
     rgb: torch.Tensor
@@ -198,6 +200,7 @@ class SourceViews:
     K: torch.Tensor
     T_world_camera: torch.Tensor
     channel: torch.Tensor | None = None
+    depth_sigma_m: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,6 +16,7 @@ from torch.nn import functional
 from semantic_mapper.config import EncoderConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.efficientnet import WIDTHS, EfficientNetLite0
+from semantic_mapper.fields.source_maps import sure_depth
 from semantic_mapper.fields.surface import SURFACE_CHANNELS, surface_maps
 from semantic_mapper.types import SourceViews
 
@@ -152,7 +153,7 @@ class ImageEncoder(nn.Module):
     else, in training mode too, they are constants, so that a view's features do not depend on the views beside it.
 
     Args:
-        config: Shape.
+        config: Shape, and whether depth that was computed from pictures is shown to it.
         feature_dim: C, channels of the output.
 
     Raises:
@@ -177,6 +178,7 @@ class ImageEncoder(nn.Module):
         unet = PretrainedUNet if pretrained else ResidualUNet
         self.colour_net = unet(COLOURS, config, feature_dim)
         self.depth_net = unet(COLOURS + SURFACE_CHANNELS, config, feature_dim) if config.depth else None
+        self.takes_computed_depth = config.depth and config.computed_depth
         self._of_batch = False
         self._colours_frozen = False
         self._backbones_frozen = False
@@ -189,6 +191,7 @@ class ImageEncoder(nn.Module):
         rgb = (views.rgb - COLOUR_MEAN) / COLOUR_DEVIATION
         if self.depth_net is None:
             return self.colour_net(rgb)
+        views = sure_depth(views, computed=self.takes_computed_depth)
         measured = has_depth(views.depth_m)
         if not bool(measured.any()):
             return self.colour_net(rgb)

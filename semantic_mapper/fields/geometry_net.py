@@ -36,7 +36,13 @@ class GeometryInit(nn.Module):
         nn.init.normal_(last.weight, std=1e-3)
         nn.init.zeros_(last.bias)
 
-    def forward(self, feature: torch.Tensor, depth_m: torch.Tensor, focal: torch.Tensor | None = None) -> torch.Tensor:
+    def forward(
+        self,
+        feature: torch.Tensor,
+        depth_m: torch.Tensor,
+        focal: torch.Tensor | None = None,
+        spread: torch.Tensor | None = None,
+    ) -> torch.Tensor:
         """Mixture parameters (m, 5, h, w).
 
         Args:
@@ -44,19 +50,22 @@ class GeometryInit(nn.Module):
             depth_m: (m, h, w), 0 = none.
             focal: (m,) focal length in image widths, which a predicted depth is proportional to: a thing looks the same
                 through a lens of twice the focal length at twice the distance. None = ``COMMON_FOCAL``.
+            spread: (m, h, w) of the given depth where it was computed from pictures, as a fraction of it; 0 = measured.
         """
         measured = depth_m > 0
         inverse = torch.where(measured, 1 / depth_m.clamp_min(NEAR_M), torch.zeros_like(depth_m))
         raw = self.net(torch.cat((feature, inverse[:, None], measured[:, None].to(feature.dtype)), dim=1))
-        shift, spread, behind, spread_behind, fraction, guess = raw.unbind(1)
+        shift, widen, behind, widen_behind, fraction, guess = raw.unbind(1)
         predicted = 1 / (1 / FAR_M + (1 / NEAR_M - 1 / FAR_M) * torch.sigmoid(guess - 2.0))
         if focal is not None:
             predicted = predicted * (focal / COMMON_FOCAL)[:, None, None]
         mu_1 = torch.where(measured, depth_m * (1 + MEASURED_SHIFT * torch.tanh(shift)), predicted)
         start = torch.where(measured, MEASURED_SCALE, PREDICTED_SCALE)
-        s_1 = mu_1 * start * torch.exp(spread.clamp(-3, 3))
+        if spread is not None:
+            start = torch.maximum(start, spread)
+        s_1 = mu_1 * start * torch.exp(widen.clamp(-3, 3))
         mu_2 = mu_1 * (1.02 + functional.softplus(behind))
-        s_2 = mu_2 * PREDICTED_SCALE * torch.exp(spread_behind.clamp(-3, 3))
+        s_2 = mu_2 * PREDICTED_SCALE * torch.exp(widen_behind.clamp(-3, 3))
         return torch.stack((mu_1, s_1, mu_2, s_2, torch.sigmoid(fraction + 3.0)), dim=1)
 
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import msgspec
 import torch
 
 from semantic_mapper.config import SamplingConfig
 from semantic_mapper.types import RayBatch
+
+COMPUTED_GUIDED = 8  # samples round a depth prior that was computed from pictures
+COMPUTED_SIGMA = 0.05  # half width of their interval, as a fraction of depth
 
 
 def sample_inverse_depth(
@@ -45,6 +49,15 @@ def sample_guided(rays: RayBatch, config: SamplingConfig) -> torch.Tensor:
         around = torch.cat((before, around), dim=1)
     blind = sample_inverse_depth(rays.near_m, rays.far_m, config.guided)
     return torch.where(has_prior[:, None], around, blind)
+
+
+def around_computed(config: SamplingConfig) -> SamplingConfig:
+    """The settings for depth priors that were computed from pictures: these may be farther off than a sensor's."""
+    return msgspec.structs.replace(
+        config,
+        guided=max(COMPUTED_GUIDED, config.guided),
+        guided_sigma=max(COMPUTED_SIGMA, config.guided_sigma),
+    )
 
 
 def sample_from_weights(

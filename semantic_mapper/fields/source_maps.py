@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch.nn import functional
 
@@ -9,6 +11,8 @@ from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.geometry_net import GEOMETRY_CHANNELS
 from semantic_mapper.geometry import expect_shape, invert_pose_torch
 from semantic_mapper.types import SourceViews
+
+UNSURE_SPREAD = 0.10  # spread of computed depth, as a fraction of it, from which on it counts as a hole
 
 
 def check_views(views: SourceViews) -> None:
@@ -24,6 +28,21 @@ def check_views(views: SourceViews) -> None:
     expect_shape(views.T_world_camera, f"{count} 4 4", "source T_world_camera")
     if views.channel is not None:
         expect_shape(views.channel, f"{count} {height} {width}", "source channel")
+    if views.depth_sigma_m is not None:
+        expect_shape(views.depth_sigma_m, f"{count} {height} {width}", "source depth_sigma_m")
+
+
+def sure_depth(views: SourceViews, *, computed: bool) -> SourceViews:
+    """The views with the depth that a field can go by: what was computed and is not sure becomes a hole.
+
+    Args:
+        computed: Whether the field has learned from computed depth; without, all of it becomes a hole.
+    """
+    if views.depth_sigma_m is None:
+        return views
+    worst = UNSURE_SPREAD * views.depth_m if computed else torch.zeros_like(views.depth_m)
+    sure = views.depth_sigma_m <= worst
+    return replace(views, depth_m=views.depth_m * sure, depth_sigma_m=views.depth_sigma_m * sure)
 
 
 def scaled_camera(K: torch.Tensor, scale_x: float, scale_y: float) -> torch.Tensor:
@@ -38,6 +57,14 @@ def scaled_camera(K: torch.Tensor, scale_x: float, scale_y: float) -> torch.Tens
 def depth_at(views: SourceViews, height: int, width: int) -> torch.Tensor:
     """Measured depth (m, height, width). Nearest, not averaged: a mean of depths across an edge lies on no surface."""
     return functional.interpolate(views.depth_m[:, None], size=(height, width), mode="nearest-exact")[:, 0]
+
+
+def spread_at(views: SourceViews, height: int, width: int) -> torch.Tensor | None:
+    """Spread (m, height, width) of ``depth_at`` as a fraction of it, 0 where it was measured; None where all was."""
+    if views.depth_sigma_m is None:
+        return None
+    spread = views.depth_sigma_m / views.depth_m.clamp_min(1e-3)
+    return functional.interpolate(spread[:, None], size=(height, width), mode="nearest-exact")[:, 0]
 
 
 def encoded_views(views: SourceViews, feature: torch.Tensor, geometry: torch.Tensor | None = None) -> EncodedViews:

@@ -34,7 +34,7 @@ from semantic_mapper.fields.contextual import CUES, SURFACE_CUES, ContextualSpac
 from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.geometry_net import COLOUR_SCALE, LEAST_VISIBILITY, DensityNet, GeometryInit
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.source_maps import check_views, depth_at, encoded_views
+from semantic_mapper.fields.source_maps import check_views, depth_at, encoded_views, spread_at, sure_depth
 from semantic_mapper.fields.view_weights import ViewWeightNet, constrained_weights, softmax_weights
 from semantic_mapper.fields.volume import composite, composite_depth, compositing_weights
 from semantic_mapper.labels import LabelSet
@@ -94,9 +94,11 @@ class SRay(LearnedField):
             ShapeError: tensors that do not fit together.
         """
         check_views(views)
+        views = sure_depth(views, computed=self.config.encoder.computed_depth)
         feature = self.encoder(views)
         focal = views.K[:, 0, 0] / views.rgb.shape[-1] if self.config.depth_by_focal else None
-        geometry = self.geometry_init(feature, depth_at(views, feature.shape[-2], feature.shape[-1]), focal)
+        size = (feature.shape[-2], feature.shape[-1])
+        geometry = self.geometry_init(feature, depth_at(views, *size), focal, spread_at(views, *size))
         encoded = encoded_views(views, feature, geometry)
         if views.channel is None or not self.config.source_labels:
             return encoded

@@ -19,7 +19,7 @@ from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.fields.base import EncodedViews, SemanticField, check_classes, stack_views
 from semantic_mapper.fields.depth_prior import depth_prior
 from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
-from semantic_mapper.imaging import FrameViews, fill_holes, resize_label, working_intrinsics
+from semantic_mapper.imaging import FrameViews, fill_holes, resize_label, resize_spread, working_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.correction.corrected_map import CorrectedPoses, CorrectionStatus, MapCorrector
@@ -372,14 +372,14 @@ class MappingPipeline:
         frame = resized.frame
         intrinsics = working_intrinsics(frame.intrinsics, self.config.render.encode_width or frame.intrinsics.width)
         rgb, depth = resized.rgb(intrinsics), resized.depth(intrinsics)
-        if frame.depth_sigma_m is not None:  # the image encoder learned from sensors: computed depth misleads it
-            depth = np.zeros_like(depth)
+        spread = resize_spread(frame, intrinsics)  # a field that has not learned from computed depth leaves it out
         views = SourceViews(
             rgb=torch.from_numpy(rgb).permute(2, 0, 1).float().div(255)[None],
             depth_m=torch.from_numpy(depth)[None],
             K=torch.from_numpy(camera_matrix(intrinsics)).float()[None],
             T_world_camera=torch.tensor(frame.T_world_camera, dtype=torch.float32)[None],
             channel=channel,
+            depth_sigma_m=None if spread is None else torch.from_numpy(spread)[None],
         )
         with torch.inference_mode():
             return self.field.encode(views)

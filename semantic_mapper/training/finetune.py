@@ -393,10 +393,9 @@ def _split(view: LabelledView, share: float, generator: torch.Generator) -> tupl
     blocks = torch.rand(rows, columns, generator=generator) < share
     mask = blocks.repeat_interleave(HELD_OUT_BLOCK, 0).repeat_interleave(HELD_OUT_BLOCK, 1)[:height, :width]
     ignored = torch.full_like(view.channel, IGNORE)
-    fields = (view.rgb, view.depth_m)
     return (
-        LabelledView(*fields, torch.where(mask, ignored, view.channel), view.intrinsics, view.T_world_camera),
-        LabelledView(*fields, torch.where(mask, view.channel, ignored), view.intrinsics, view.T_world_camera),
+        replace(view, channel=torch.where(mask, ignored, view.channel)),
+        replace(view, channel=torch.where(mask, view.channel, ignored)),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Self
@@ -15,14 +15,16 @@ from numpy.typing import NDArray
 
 from semantic_mapper.config import Config, Fraction
 from semantic_mapper.errors import ConfigError, SemanticMapperError
+from semantic_mapper.imaging import resize_depth, resize_spread, working_intrinsics
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.scenes import TRAIN_SEEDS, RoomConfig, room_frames
 from semantic_mapper.training.cameras import CameraDraw, draw_camera
+from semantic_mapper.training.computed_depth import ComputedDepth, compute_depth, draw_computed_depth
 from semantic_mapper.training.losses import IGNORE
 from semantic_mapper.training.room_feed import open_feed
 from semantic_mapper.training.views import LabelledView, view_from_frame
-from semantic_mapper.types import CameraIntrinsics, Float32, UInt8
+from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame, UInt8
 
 CPU = torch.device("cpu")
 
@@ -41,6 +43,9 @@ class RoomPoolConfig(Config, frozen=True):
     step_m_max: float = 0.35
     people: Fraction = 0.3  # of the rooms with people or animals in them
     variety: Fraction = 0.0  # of the rooms that hold what benchmark rooms lack; see ``RoomConfig.variety``
+    # Of the rooms whose views have depth that is computed from their pictures, instead of measured depth. What they are
+    # to render to is measured all the same. Needs ``computed_depth`` in [field.encoder].
+    computed_depth: Fraction = 0.0
     camera: CameraDraw = CameraDraw()
 
     def __post_init__(self) -> None:
@@ -61,6 +66,8 @@ class PackedRoom:
         channel: (V, H, W) int8 class channels, -1 = ignore.
         intrinsics: Of (H, W).
         T_world_camera: (V, 4, 4) float32.
+        computed_m, computed_sigma_m: (V, H, W) float32 depth that was computed from the pictures, and its spread; None
+            where views have measured depth alone.
     """
 
     seed: int
@@ -69,6 +76,8 @@ class PackedRoom:
     channel: NDArray[np.int8]
     intrinsics: CameraIntrinsics
     T_world_camera: Float32
+    computed_m: Float32 | None = None
+    computed_sigma_m: Float32 | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +102,9 @@ def pack_room(seed: int, config: RoomPoolConfig) -> PackedRoom | str:
     generator = torch.Generator().manual_seed(seed)
     u = float(torch.rand(1, generator=generator))
     step_m = config.step_m_min + u * (config.step_m_max - config.step_m_min)
-    camera = draw_camera(seed, config.width, step_m, config.camera)
+    computed = draw_computed_depth(seed, config.computed_depth, step_m)
+    between = 1 if computed is None else computed.between
+    camera = draw_camera(seed, config.width, step_m / between, config.camera)
     how = {
         "room": RoomConfig(people=config.people, variety=config.variety),
         "path": camera.path,
@@ -101,10 +112,10 @@ def pack_room(seed: int, config: RoomPoolConfig) -> PackedRoom | str:
         "pose_noise": camera.pose_noise,
     }
     try:
-        frames = list(room_frames(seed, config.views, camera.intrinsics, **how))
+        frames = list(room_frames(seed, config.views * between, camera.intrinsics, **how))
     except SemanticMapperError as error:
         return f"room {seed}: {error}"
-    views = [view_from_frame(f, ROOMS, config.width) for f in frames]
+    views = [view_from_frame(f, ROOMS, config.width) for f in frames[::between]]
     return PackedRoom(
         seed,
         np.stack([(v.rgb * 255).round().to(torch.uint8).numpy() for v in views]),
@@ -112,7 +123,15 @@ def pack_room(seed: int, config: RoomPoolConfig) -> PackedRoom | str:
         np.stack([v.channel.numpy().astype(np.int8) for v in views]),
         views[0].intrinsics,
         np.stack([v.T_world_camera.numpy() for v in views]),
+        *(_computed_depths(frames, computed, config.width) if computed is not None else (None, None)),
     )
+
+
+def _computed_depths(frames: Sequence[PosedFrame], how: ComputedDepth, width: int) -> tuple[Float32, Float32]:
+    """Depth and spread (V, H, W) of the views among ``frames``."""
+    size = working_intrinsics(frames[0].intrinsics, width)
+    pairs = [(resize_depth(f, size), resize_spread(f, size)) for f in compute_depth(frames, how)]
+    return np.stack([depth for depth, _ in pairs]), np.stack([spread for _, spread in pairs if spread is not None])
 
 
 def unpack_room(packed: PackedRoom, device: torch.device) -> RoomViews:
@@ -129,8 +148,21 @@ def _views_on(packed: PackedRoom, device: torch.device) -> tuple[LabelledView, .
     depth = torch.from_numpy(packed.depth_m).to(device)
     channel = torch.from_numpy(packed.channel).to(device).long()
     poses = torch.from_numpy(packed.T_world_camera).to(device)
+    computed, spread = (
+        None if depths is None else torch.from_numpy(depths).to(device)
+        for depths in (packed.computed_m, packed.computed_sigma_m)
+    )
     return tuple(
-        LabelledView(rgb[i], depth[i], channel[i], packed.intrinsics, poses[i]) for i in range(len(packed.rgb))
+        LabelledView(
+            rgb[i],
+            depth[i],
+            channel[i],
+            packed.intrinsics,
+            poses[i],
+            computed_m=None if computed is None else computed[i],
+            computed_sigma_m=None if spread is None else spread[i],
+        )
+        for i in range(len(packed.rgb))
     )
 
 

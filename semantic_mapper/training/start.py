@@ -33,8 +33,8 @@ def take_over(field: LearnedField, path: Path) -> dict[str, Any]:
     """
     checkpoint = load_checkpoint(path)
     start = checkpoint.model
-    own = (field.kind, to_plain(field.config), field.label_set)
-    if (start.kind, to_plain(start.config), start.label_set) != own:
+    own = (field.kind, _shape(field), field.label_set)
+    if (start.kind, _shape(start), start.label_set) != own:
         raise ConfigError(f"{path}: weights of another field than the config names, or of other classes")
     field.load_state_dict(start.state_dict())
     _log.info("training_starts_from", weights=path.name)
@@ -118,6 +118,13 @@ def imagenet_file() -> Path:
             "(part of semantic-mapper[training]), or set imagenet = false"
         )
     return files[0]
+
+
+def _shape(field: LearnedField) -> dict[str, Any]:
+    """The config without what says nothing of weights: whether the encoder was shown computed depth."""
+    shape = to_plain(field.config)
+    shape.get("encoder", {}).pop("computed_depth", None)
+    return shape
 
 
 def _shapes(module: nn.Module) -> dict[str, torch.Size]:

@@ -15,7 +15,7 @@ from semantic_mapper.config import AtLeastOne, AtLeastTwo, AtLeastZero, Config, 
 from semantic_mapper.fields.base import MAX_SOURCE_VIEWS, EncodedViews
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.sampling import sample_guided, sample_inverse_depth
+from semantic_mapper.fields.sampling import around_computed, sample_guided, sample_inverse_depth
 from semantic_mapper.training.losses import IGNORE, Loss, LossConfig, guess_loss, image_loss, mean_loss, ray_loss
 from semantic_mapper.training.views import (
     LabelledView,
@@ -297,9 +297,12 @@ def _draw_samples(
     noise = 1 + config.prior_noise * torch.randn(len(flat), generator=generator)
     withheld = float(torch.rand(1, generator=generator)) < config.depth_dropout
     near_m, far_m = config.sampling.near_m, config.sampling.far_m
-    if blind or withheld or not bool((target.depth_m > 0).any()):
+    depth_m = target.depth_m if target.computed_m is None else target.computed_m
+    if blind or withheld or not bool((depth_m > 0).any()):
         rays, targets = query_rays(target, flat[:: config.no_depth_thinning], near_m=near_m, far_m=far_m, prior=None)
         return rays, targets, sample_inverse_depth(rays.near_m, rays.far_m, config.samples_without_depth, generator)
-    prior = target.depth_m.flatten()[flat] * noise
+    # Computed depth has errors of its own.
+    prior = depth_m.flatten()[flat] * noise if target.computed_m is None else depth_m.flatten()[flat]
     rays, targets = query_rays(target, flat, near_m=near_m, far_m=far_m, prior=prior)
-    return rays, targets, sample_guided(rays, config.sampling)
+    sampling = config.sampling if target.computed_m is None else around_computed(config.sampling)
+    return rays, targets, sample_guided(rays, sampling)

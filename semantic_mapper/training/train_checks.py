@@ -45,6 +45,11 @@ def check_field(field: LearnedField, config: TrainConfig) -> None:
         )
     if config.images.fraction > 0 or config.images.later > 0:
         encoder_for_images(field)
+    if config.pool.computed_depth > 0 and not field.image_encoder.takes_computed_depth:
+        raise ConfigError(
+            "pool.computed_depth: this encoder is shown no computed depth; set depth = true and computed_depth = true "
+            "in [field.encoder]"
+        )
     check_parts(field, config.bfloat16)
     if config.encode_together and not _encodes_views_separately(field):
         raise ConfigError(

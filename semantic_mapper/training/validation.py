@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import msgspec
 import torch
 
 from semantic_mapper.config import Config
@@ -55,6 +56,7 @@ def validation_rooms(
     """
     if not 1 <= config.rooms <= len(VALIDATION_SEEDS) or config.queries < 1 or config.views < 1 or config.rays < 1:
         raise ConfigError(f"ValidationConfig: need 1 to {len(VALIDATION_SEEDS)} rooms, and queries, views and rays")
+    pool = msgspec.structs.replace(pool, computed_depth=0.0)  # scores are those with measured depth and without any
     seeds = VALIDATION_SEEDS[: config.rooms]
     return [render_room(seed, pool, device) for seed in seeds[ranks.rank :: ranks.world]]
 

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch.nn import functional
 
+from semantic_mapper.fields.source_maps import UNSURE_SPREAD
 from semantic_mapper.geometry import camera_matrix, pixel_rays
-from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, working_intrinsics
+from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, resize_spread, working_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import CameraIntrinsics, PosedFrame, RayBatch, SourceViews
 
@@ -27,6 +28,9 @@ class LabelledView:
         T_world_camera: (4, 4) float32.
         uncertainty: (H, W) float32 how likely a pixel is drawn among the hard examples
             (``uncertainty.with_uncertainty``); None = never.
+        computed_m: (H, W) float32 depth that was computed from pictures, 0 = none: what a field is given in the place
+            of ``depth_m``, which remains what it is to render. None = a field is given ``depth_m``.
+        computed_sigma_m: (H, W) float32 its one-sigma spread.
     """
 
     rgb: torch.Tensor
@@ -35,6 +39,8 @@ class LabelledView:
     intrinsics: CameraIntrinsics
     T_world_camera: torch.Tensor
     uncertainty: torch.Tensor | None = None
+    computed_m: torch.Tensor | None = None
+    computed_sigma_m: torch.Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,18 +57,26 @@ class RayTargets:
 
 
 def view_from_frame(frame: PosedFrame, label_set: LabelSet, width: int) -> LabelledView:
-    """Resize a frame to the working width; colours by area, depth and labels by nearest pixel."""
+    """Resize a frame to the working width; colours by area, depth and labels by nearest pixel.
+
+    Depth that was computed from pictures is what the view should render to where it is sure.
+    """
     intrinsics = working_intrinsics(frame.intrinsics, width)
     if frame.label is None:
         channel = np.full((intrinsics.height, intrinsics.width), -1, np.int64)
     else:
         channel = label_set.to_channels(resize_label(frame.label, intrinsics), f"frame seq={frame.seq}")
+    depth_m = torch.tensor(resize_depth(frame, intrinsics))  # a copy: the frame's own array is read-only
+    spread = resize_spread(frame, intrinsics)
+    sigma_m = None if spread is None else torch.tensor(spread)
     return LabelledView(
         torch.from_numpy(resize_rgb(frame, intrinsics)).permute(2, 0, 1).float().div_(255).contiguous(),
-        torch.tensor(resize_depth(frame, intrinsics)),  # a copy: the frame's own array is read-only
+        depth_m if sigma_m is None else depth_m * (sigma_m <= UNSURE_SPREAD * depth_m),
         torch.from_numpy(channel),
         intrinsics,
         torch.tensor(frame.T_world_camera, dtype=torch.float32),
+        computed_m=None if sigma_m is None else depth_m,
+        computed_sigma_m=sigma_m,
     )
 
 
@@ -76,6 +90,8 @@ def mirrored_view(view: LabelledView) -> LabelledView:
         view.channel.flip(-1),
         CameraIntrinsics(k.fx, k.fy, k.width - 1 - k.cx, k.cy, k.width, k.height),
         mirror @ view.T_world_camera @ mirror,
+        computed_m=None if view.computed_m is None else view.computed_m.flip(-1),
+        computed_sigma_m=None if view.computed_sigma_m is None else view.computed_sigma_m.flip(-1),
     )
 
 
@@ -92,23 +108,42 @@ def cropped_view(view: LabelledView, fraction: float, down: float, across: float
     part = slice(top, top + height), slice(left, left + width)
     size = (k.height, k.width)
     rgb = functional.interpolate(view.rgb[:, *part][None], size=size, mode="bilinear", align_corners=False)[0]
-    depth_m = functional.interpolate(view.depth_m[part][None, None], size=size, mode="nearest-exact")[0, 0]
-    channel = functional.interpolate(view.channel[part][None, None].float(), size=size, mode="nearest-exact")[0, 0]
+
+    def enlarged(values: torch.Tensor) -> torch.Tensor:
+        return functional.interpolate(values[part][None, None].float(), size=size, mode="nearest-exact")[0, 0]
+
     x, y = k.width / width, k.height / height
     lens = CameraIntrinsics(
         k.fx * x, k.fy * y, (k.cx - left + 0.5) * x - 0.5, (k.cy - top + 0.5) * y - 0.5, k.width, k.height
     )
-    return LabelledView(rgb, depth_m, channel.long(), lens, view.T_world_camera)
+    return LabelledView(
+        rgb,
+        enlarged(view.depth_m),
+        enlarged(view.channel).long(),
+        lens,
+        view.T_world_camera,
+        computed_m=None if view.computed_m is None else enlarged(view.computed_m),
+        computed_sigma_m=None if view.computed_sigma_m is None else enlarged(view.computed_sigma_m),
+    )
 
 
 def stack_sources(views: Sequence[LabelledView], *, with_labels: bool = False) -> SourceViews:
     """Views of one resolution as the input of ``SemanticField.encode``, with what is known of their labels if asked."""
     return SourceViews(
         torch.stack([v.rgb for v in views]),
-        torch.stack([v.depth_m for v in views]),
+        torch.stack([v.depth_m if v.computed_m is None else v.computed_m for v in views]),
         torch.stack([torch.from_numpy(camera_matrix(v.intrinsics)).float() for v in views]).to(views[0].rgb.device),
         torch.stack([v.T_world_camera for v in views]),
         torch.stack([v.channel for v in views]) if with_labels else None,
+        _stacked_spreads(views),
+    )
+
+
+def _stacked_spreads(views: Sequence[LabelledView]) -> torch.Tensor | None:
+    if all(v.computed_sigma_m is None for v in views):
+        return None
+    return torch.stack(
+        [torch.zeros_like(v.depth_m) if v.computed_sigma_m is None else v.computed_sigma_m for v in views]
     )
 
 
@@ -121,14 +156,20 @@ def join_sources(parts: Sequence[SourceViews]) -> SourceViews:
         torch.cat([p.K for p in parts]),
         torch.cat([p.T_world_camera for p in parts]),
         torch.cat(channels) if len(channels) == len(parts) else None,
+        None if all(p.depth_sigma_m is None for p in parts) else torch.cat([_spread(p) for p in parts]),
     )
+
+
+def _spread(sources: SourceViews) -> torch.Tensor:
+    return torch.zeros_like(sources.depth_m) if sources.depth_sigma_m is None else sources.depth_sigma_m
 
 
 def select_sources(sources: SourceViews, index: torch.Tensor) -> SourceViews:
     """The views at ``index`` (k,) int64."""
     channel = None if sources.channel is None else sources.channel[index]
+    spread = None if sources.depth_sigma_m is None else sources.depth_sigma_m[index]
     return SourceViews(
-        sources.rgb[index], sources.depth_m[index], sources.K[index], sources.T_world_camera[index], channel
+        sources.rgb[index], sources.depth_m[index], sources.K[index], sources.T_world_camera[index], channel, spread
     )
 
 

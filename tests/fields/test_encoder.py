@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import msgspec
 import pytest
 import torch
 
@@ -146,3 +147,34 @@ def test_an_encoder_of_colours_alone_has_no_network_to_grow():
 def test_a_shape_that_cannot_be_built_is_refused(config: EncoderConfig):
     with pytest.raises(ConfigError, match="channels and blocks"):
         encoder(config)
+
+
+def computed(given: SourceViews, spread: float) -> SourceViews:
+    return replace(given, depth_sigma_m=spread * given.depth_m)
+
+
+def test_computed_depth_is_shown_only_to_an_encoder_that_has_learned_from_it():
+    given = views(2)
+    none = without_depth(given, 0, 1)
+    assert torch.equal(encoder()(computed(given, 0.02)), encoder()(none))
+    shown = encoder(msgspec.structs.replace(SMALL_ENCODER, computed_depth=True))
+    assert torch.equal(shown(computed(given, 0.02)), shown(given))
+    assert not torch.equal(shown(computed(given, 0.02)), shown(none))
+
+
+def test_computed_depth_that_is_not_sure_is_a_hole():
+    shown = encoder(msgspec.structs.replace(SMALL_ENCODER, computed_depth=True))
+    given = views(2)
+    spread = torch.full_like(given.depth_m, 0.02)
+    spread[:, :10] = 0.2
+    holes = given.depth_m.clone()
+    holes[:, :10] = 0
+    partly = replace(given, depth_sigma_m=spread * given.depth_m)
+    assert torch.equal(shown(partly), shown(replace(given, depth_m=holes)))
+
+
+def test_a_measured_view_beside_computed_ones_is_shown_as_it_is():
+    given = views(2)
+    spread = torch.zeros_like(given.depth_m)
+    spread[1] = 0.02 * given.depth_m[1]
+    assert torch.equal(encoder()(replace(given, depth_sigma_m=spread)), encoder()(without_depth(given, 1)))

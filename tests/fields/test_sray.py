@@ -12,7 +12,7 @@ from semantic_mapper.fields.geometry_net import hit_and_visibility
 from semantic_mapper.fields.projection import gather, reproject
 from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
-from semantic_mapper.labels import make_label_set
+from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.types import RayBatch, SourceViews
 from tests.fields.scene import WALL_M, pose_at, wall_rays, wall_sources
 from tests.fields.tiny_fields import assert_gradients_are_right, tiny
@@ -297,3 +297,14 @@ def test_unknown_labels_are_the_same_as_none_and_the_switch_turns_labels_off():
 def test_labels_of_another_size_than_their_images_are_refused():
     with pytest.raises(ShapeError, match="source channel"):
         labelled_wall(small_field(), torch.zeros(1, 16, 24, dtype=torch.int64), pose_at(0.0))
+
+
+def test_the_farther_computed_depth_may_be_off_the_wider_is_where_a_view_ray_may_end():
+    torch.manual_seed(0)
+    encoder = EncoderConfig(channels=(8, 16), blocks=(1, 1), depth=True, computed_depth=True)
+    field = SRay(SRayConfig(feature_dim=16, heads=2, encoder=encoder), ROOMS).eval()
+    measured = wall_sources([pose_at(0.0), pose_at(0.2)])
+    sure, less = (replace(measured, depth_sigma_m=s * measured.depth_m) for s in (0.005, 0.08))
+    widths = [field.encode(views).geometry[:, 1] for views in (measured, sure, less)]
+    assert torch.equal(widths[1], widths[0])  # no surer than a sensor
+    torch.testing.assert_close(widths[2], 8 * widths[0])

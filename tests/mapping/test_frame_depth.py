@@ -6,12 +6,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
+import msgspec
 import numpy as np
 import pytest
+import torch
 from scipy.spatial import cKDTree
 
 from semantic_mapper.depth_from_motion.stream import MAX_CAMERAS
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS
@@ -20,7 +23,7 @@ from semantic_mapper.mapping.fusion.depth_trust import COMPUTED_CAP, MEASURED
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
-from tests.small import tiny_config, tiny_field
+from tests.small import SMALL_ENCODER, SMALL_MODEL, tiny_config, tiny_field
 
 CAMERA = CameraIntrinsics(110.0, 110.0, 79.5, 59.5, 160, 120)
 FINE = CameraIntrinsics(220.0, 220.0, 159.5, 119.5, 320, 240)
@@ -66,6 +69,23 @@ def test_a_walk_without_depth_makes_a_surface_near_the_true_one_and_says_that_it
     assert mesh.measured is not None and len(mesh.measured) == len(mesh.vertices) and not mesh.measured.any()
     assert np.median(true_surface(walk(FINE)).query(points.xyz)[0]) < 0.04  # of voxels of 5 cm
     assert 0 < pipeline.voxel_map.block_state()["weight"].max() <= COMPUTED_CAP
+
+
+@pytest.mark.parametrize("learned", [False, True])
+def test_computed_depth_is_shown_to_an_encoder_that_has_learned_from_it_and_to_no_other(learned: bool) -> None:
+    encoder = msgspec.structs.replace(SMALL_ENCODER, computed_depth=learned)
+    torch.manual_seed(0)
+    field = SRay(msgspec.structs.replace(SMALL_MODEL, encoder=encoder), ROOMS).eval()
+    pipeline = MappingPipeline(tiny_config(), field, ROOMS)
+    frame = next(f for f in walk() if f.depth_m is not None)
+    assert frame.depth_m is not None
+
+    def features(shown: PosedFrame) -> torch.Tensor:
+        return pipeline.encode_anchor(shown).encoded.feature
+
+    computed = features(replace(frame, depth_sigma_m=0.02 * frame.depth_m))
+    assert torch.equal(computed, features(frame if learned else replace(frame, depth_m=None)))
+    assert not torch.equal(computed, features(replace(frame, depth_m=None) if learned else frame))
 
 
 def test_a_walk_with_depth_says_that_all_of_its_surface_is_measured() -> None:

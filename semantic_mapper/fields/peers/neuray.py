@@ -24,7 +24,7 @@ from semantic_mapper.fields.encoder import ImageEncoder
 from semantic_mapper.fields.geometry_net import DensityNet, GeometryInit
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.ray_render import composite_render, weighted_moments
-from semantic_mapper.fields.source_maps import check_views, depth_at, encoded_views
+from semantic_mapper.fields.source_maps import check_views, depth_at, encoded_views, spread_at, sure_depth
 from semantic_mapper.fields.sray import CUES
 from semantic_mapper.fields.view_weights import softmax_weights
 from semantic_mapper.fields.volume import composite, compositing_weights
@@ -67,8 +67,10 @@ class NeuRay(LearnedField):
             ShapeError: tensors that do not fit together.
         """
         check_views(views)
+        views = sure_depth(views, computed=self.config.encoder.computed_depth)
         feature = self.encoder(views)
-        geometry = self.geometry_init(feature, depth_at(views, *feature.shape[-2:]))
+        size = (feature.shape[-2], feature.shape[-1])
+        geometry = self.geometry_init(feature, depth_at(views, *size), spread=spread_at(views, *size))
         return encoded_views(views, feature, geometry)
 
     def aggregate(

@@ -12,13 +12,11 @@ from semantic_mapper.config import RenderConfig, SamplingConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import EncodedViews, Sampled, SemanticField
 from semantic_mapper.fields.render import render_view
+from semantic_mapper.fields.sampling import around_computed
 from semantic_mapper.fields.sparse_render import render_sparse_view
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.rate_controller import RateController
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
-
-COMPUTED_GUIDED = 8  # samples round a depth prior that was computed
-COMPUTED_SIGMA = 0.05  # half width of their interval, as a fraction of depth
 
 _log = get_logger(__name__)
 
@@ -104,11 +102,7 @@ class ViewRenderer:
                 sampling, guided=max(self._config.samples_without_depth, sampling.guided)
             )
         elif computed:
-            sampling = msgspec.structs.replace(
-                sampling,
-                guided=max(COMPUTED_GUIDED, sampling.guided),
-                guided_sigma=max(COMPUTED_SIGMA, sampling.guided_sigma),
-            )
+            sampling = around_computed(sampling)
         samples = 0
         if isinstance(self._field, Sampled) and sampling.mode == "streaming":
             self._field.sampling = sampling
