@@ -21,6 +21,7 @@ from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.formats.ply import write_ply
 from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.picture_check import SENTENCES
 from semantic_mapper.plots import write_picture
 from semantic_mapper.transport.messages import SCALE_UNKNOWN
 from semantic_mapper.types import Float64
@@ -195,6 +196,11 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "contradicting_pairs": _rounded(pipeline.pose_check.contradicting, 4),
             "worst_contradicting_pairs": _rounded(pipeline.pose_check.worst_contradicting, 4),
             "warning": pipeline.pose_check.warning or None,
+        },
+        "pictures": {
+            "checked": pipeline.picture_check.checked,
+            **{name: pipeline.picture_check.counters[name] for name in SENTENCES},
+            "notes": pipeline.picture_check.notes,
         },
         "map": {
             "voxel_size_m": voxel_map.config.voxel_size_m,

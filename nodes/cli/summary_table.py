@@ -51,6 +51,7 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
         lines.append(f"warning: {summary['map']['nearly_empty']}")
     if dig(summary, "pose_check.warning"):
         lines.append(f"warning: {summary['pose_check']['warning']}")
+    lines.extend(f"warning: {note}" for note in dig(summary, "pictures.notes") or ())
     if fraction := dig(summary, "depth.computed_fraction"):
         lines.append(
             f"depth: computed from the pictures for {percent(fraction)} of the frames, which have no sensor depth; "

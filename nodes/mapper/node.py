@@ -317,6 +317,9 @@ class _Mapper:
             degraded += self._weights.degraded
         if self._taken_up:
             degraded += (self._taken_up,)
+        pictures = self._bundle.pipeline.picture_check
+        counters |= pictures.counters
+        degraded += pictures.warnings
         if self._bundle.pipeline.pose_check.warning:
             degraded += (self._bundle.pipeline.pose_check.warning,)
         if self._queries is not None:

@@ -14,6 +14,8 @@ from semantic_mapper.config import DepthConfig
 from semantic_mapper.depth_from_motion import DepthFromMotion
 from semantic_mapper.depth_from_motion.stream import MAX_CAMERAS
 from semantic_mapper.depth_from_motion.views import DepthEstimate
+from semantic_mapper.errors import FrameError
+from semantic_mapper.mapping.picture_check import PictureCheck
 from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame
 
 SURE_SPREAD = 0.03  # spread, as a fraction of depth, up to which computed depth has its full weight
@@ -21,7 +23,7 @@ MOST_SPREAD = 0.10  # from here on it has none
 HINT_SPREAD = 0.04  # of the map's own surface where it was computed, as a fraction of depth
 MEASURED_SPREAD = 0.01  # and where it was measured
 RECENT_FRAMES = 500
-REFINED_WIDTH = 320  # pixels; corners of smaller images are too inexact to correct poses by
+REFINED_WIDTH = 320  # pixels; corners of smaller images are too inexact to check or correct poses by
 
 
 @dataclass(slots=True)
@@ -62,6 +64,7 @@ class FrameDepth:
         self._cast_map = cast_map
         self._refiners: OrderedDict[str, tuple[CameraIntrinsics, PoseRefiner]] = OrderedDict()
         self.disagreement = PoseDisagreement()
+        self.pictures = PictureCheck()
         self._computer: DepthFromMotion | None = None
         if config.source in ("auto", "computed"):
             self._computer = DepthFromMotion(config.from_motion)
@@ -70,6 +73,9 @@ class FrameDepth:
         """Take a frame; the frames that are ready, oldest first. One whose depth is computed may wait for later ones.
 
         A frame that has a spread of its depth was here before and is left as it is.
+
+        Raises:
+            FrameError: a picture that would spoil the map; see ``PictureCheck``. The next frame is welcome.
         """
         if frame.depth_sigma_m is not None:
             return [frame]
@@ -77,8 +83,11 @@ class FrameDepth:
             frame = replace(frame, depth_m=None)
         if self._computer is None or frame.depth_m is not None:
             return [frame] if self._computer is None else self._computer.push(frame)
-        if self._config.refine_poses and frame.intrinsics.width >= REFINED_WIDTH:
-            frame = self._refine(frame)
+        if frame.intrinsics.width >= REFINED_WIDTH:
+            if why := self.pictures.look(frame):
+                raise FrameError(f"frame seq={frame.seq} of camera '{frame.camera_id}': {why}")
+            if self._config.refine_poses:
+                frame = self._refine(frame)
         return self._computer.push(frame, self._hint)
 
     def finish(self) -> list[PosedFrame]:

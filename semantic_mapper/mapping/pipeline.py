@@ -28,6 +28,7 @@ from semantic_mapper.mapping.frame_depth import FrameDepth, computed_trust
 from semantic_mapper.mapping.fusion.depth_trust import depth_trust
 from semantic_mapper.mapping.fusion.vote_fusion import add_votes
 from semantic_mapper.mapping.keyframes import EncodedSize, Keyframe, KeyframeStore
+from semantic_mapper.mapping.picture_check import PictureCheck
 from semantic_mapper.mapping.pose_check import PoseCheck
 from semantic_mapper.mapping.views.own_image import add_own_image
 from semantic_mapper.mapping.views.upsample import upsample
@@ -108,6 +109,7 @@ class MappingPipeline:
         One frame each, unless ``depth.from_motion.delay_frames`` lets frames wait for later ones.
 
         Raises:
+            FrameError: its picture cannot be mapped, such as a dark or blurred one; see ``picture_check``.
             PoseError: the pose is not a rigid transform.
         """
         check_pose(frame.T_world_camera, f"frame seq={frame.seq} of camera '{frame.camera_id}'")
@@ -122,6 +124,11 @@ class MappingPipeline:
         """Median distance in pixels of corners from where given poses have them, and where refined poses do, of the
         last frames whose depth was computed; None where there were none."""
         return self._frame_depth.disagreement.medians
+
+    @property
+    def picture_check(self) -> PictureCheck:
+        """What was wrong with pictures that depth was to be computed from, and between them and their poses."""
+        return self._frame_depth.pictures
 
     def correct_poses(self, poses: CorrectedPoses, *, until_ns: int | None = None) -> CorrectionStatus:
         """Begin to move the map with corrected poses of frames that it was fused from, as a loop closure gives them.
