@@ -134,7 +134,7 @@ def refine(walk: Walk, config: PoseRefinerConfig) -> dict[str, Any]:
             "ate_mm": 1e3 * absolute_trajectory_error(poses, walk.truth).rmse_m,
         }
     ms = {f"p{p}": float(np.percentile(processor_ms, p)) for p in (50, 95)}
-    return {**rows, "refined": refined / len(live), "processor_ms": ms, "counters": dict(refiner.counters)}
+    return {**rows, "refined": refined / len(live), "processor_ms": ms}
 
 
 class ListedPoses:

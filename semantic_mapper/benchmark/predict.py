@@ -65,8 +65,8 @@ def predict_view(field: LearnedField, sources: Sequence[PosedFrame], query: Pose
     depth_m = resize_depth(query, query.intrinsics)
     shown = any(frame is query for frame in sources)
     prior = depth_prior(depth_m, resize_rgb(query, query.intrinsics)) if shown else fill_holes(depth_m)
-    chunk = tier.rays_per_chunk
-    render = render_image(renderer, encoded, query.intrinsics, query.T_world_camera, prior, sampling, chunk)
+    scene = (renderer, encoded, query.intrinsics, query.T_world_camera, prior, sampling, tier.rays_per_chunk)
+    render = render_image(*scene, measured=depth_m > 0)
     return _as_prediction(render, field.label_set, (query.intrinsics.height, query.intrinsics.width))
 
 

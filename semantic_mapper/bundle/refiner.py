@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -10,7 +9,6 @@ import numpy as np
 
 from semantic_mapper.bundle.adjustment import BundleProblem, BundleResult, adjust_bundle, reprojection_errors
 from semantic_mapper.bundle.keyframes import Keyframe, KeyframeMap
-from semantic_mapper.bundle.picture_checks import PictureChecker
 from semantic_mapper.bundle.tracks import Tracker, Tracks, prepare_image
 from semantic_mapper.config import PoseRefinerConfig
 from semantic_mapper.errors import FrameError
@@ -73,19 +71,8 @@ class PoseRefiner:
         self._given = np.eye(4)  # of the frame before
         self._refined = np.eye(4)
         self._count = 0
-        self._checks = PictureChecker()
         self._worker = ThreadPoolExecutor(1, "pose bundle") if background else None
         self._pending: tuple[BundleProblem, list[Keyframe], list[int], Future[BundleResult]] | None = None
-
-    @property
-    def counters(self) -> Counter[str]:
-        """Frames by what is wrong with their pictures, or between them and their poses; see ``PictureChecker``."""
-        return self._checks.counters
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """The same of the last frame, a sentence for each."""
-        return self._checks.warnings
 
     def push(self, frame: PosedFrame) -> RefinedPose:
         """Refine the next frame's pose.
@@ -102,7 +89,6 @@ class PoseRefiner:
         tracks = self._tracker.advance(image, expected)
         pose, refined = self._locate(points, tracks, guess, self._sigmas(frame))
         given_px, error_px = self._disagreement(points, tracks, given, pose)
-        self._check(frame, points, tracks, given, given_px)
         self._given, self._refined = given, pose
         self._count += 1
         if points.wants_keyframe(tracks):
@@ -181,12 +167,6 @@ class PoseRefiner:
         found = self._map.locate(frame.tracks, guess, _LEAST_POINTS)
         if found is not None:
             frame.T_keyframe_camera, frame.tracks = invert_pose(frame.keyframe.T_world_camera) @ found[0], None
-
-    def _check(self, frame: PosedFrame, points: KeyframeMap, tracks: Tracks, given: Float64, given_px: float) -> None:
-        self._checks.look(frame.rgb)
-        if points.keyframes:
-            moved = invert_pose(points.keyframes[-1].prior) @ given
-            self._checks.compare(moved, points.flow(tracks), given_px / frame.intrinsics.width)
 
     def _adjust(self, points: KeyframeMap) -> None:
         """Bundle now, or in the worker where that is free."""

@@ -95,7 +95,7 @@ class FrameDepth:
         return [] if self._computer is None else self._computer.finish()
 
     def _refine(self, frame: PosedFrame) -> PosedFrame:
-        """The frame at a pose that fits the pictures; a camera with another lens or size begins anew."""
+        """The frame at a pose that fits the pictures; a camera with another lens or size starts over."""
         intrinsics, refiner = self._refiners.pop(frame.camera_id, (None, None))
         if refiner is None or intrinsics != frame.intrinsics:
             refiner = PoseRefiner(self._config.poses)

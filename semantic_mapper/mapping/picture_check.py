@@ -4,7 +4,7 @@ Depth that is computed from pictures needs sharp pictures, poses that are theirs
 calibrated. Corners are followed from picture to picture. Points found from corners and given poses are projected into
 the next pictures: where the corners are elsewhere, poses do not fit; where they are all farther from the centre by one
 factor, three times in a row, the focal length has changed. ``benchmarks/picture_faults.py`` measures how reliable
-this is. A rolling shutter is not told of: what it does to hand-held pictures is lost in the errors of poses.
+this is. A rolling shutter is not detected: what it does to hand-held pictures is lost in the errors of poses.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from semantic_mapper.bundle.keyframes import Keyframe, KeyframeMap
+from semantic_mapper.bundle.picture_checks import SENTENCES as PICTURE_SENTENCES
 from semantic_mapper.bundle.picture_checks import PictureChecker
 from semantic_mapper.bundle.tracks import Tracker, Tracks, prepare_image
 from semantic_mapper.geometry import invert_pose, project, rotation_vector, scale_intrinsics, transform
@@ -39,10 +40,7 @@ _SCALED = 0.02  # of the width by which corners may still be off once the pictur
 _RANSAC_PX = 2.0
 _RECENT = 30  # pictures that a warning lasts
 REFUSED = ("dark", "blurred", "still_pictures", "focal_change")  # would spoil a map of computed depth
-SENTENCES = {
-    "dark": "pictures are too dark: more light, or a longer exposure",
-    "blurred": "pictures are blurred: move the camera more slowly, or give it more light",
-    "exposure_jump": "the exposure jumps from picture to picture: fix it, or let it change more slowly",
+SENTENCES = PICTURE_SENTENCES | {
     "still_pictures": "poses move, but pictures do not: is the camera frozen, or do the poses belong to another one?",
     "misfit": "poses do not fit the pictures: check their stamps, T_world_camera or T_base_camera, and the calibration",
     "focal_change": "the focal length has changed (zoom or autofocus), so the calibration does not hold: fix the lens",

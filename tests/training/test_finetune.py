@@ -307,7 +307,7 @@ def test_frames_without_labels_are_source_views_only():
     given = [frames[0], *(dataclasses.replace(f, label=None) for f in frames[1:])]
     result = finetune(given, ROOMS, tiny_field(), config(steps=20))
     assert result.recipe["steps"] == 20 and result.recipe["best_step"] > 0
-    assert result.train_stamps_ns == {frames[0].stamp_ns}, "nobody was told the others' labels"
+    assert result.train_stamps_ns == {frames[0].stamp_ns}, "the others' labels are not used"
     assert len(result.anchors) == 1
 
 
