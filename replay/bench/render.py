@@ -17,19 +17,20 @@ from semantic_mapper.errors import ConfigError, LabelError, LogError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.fields.depth_prior import depth_prior
 from semantic_mapper.fields.device_field import DeviceField
 from semantic_mapper.fields.render import render_view
 from semantic_mapper.fields.sampling import sample_guided
-from semantic_mapper.fields.sparse_render import render_sparse_view
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.geometry import pixel_grid, pixel_rays
-from semantic_mapper.imaging import fill_holes, resize_depth
+from semantic_mapper.imaging import resize_depth
 from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.mapping.views.view_renderer import RenderedView, ViewRenderer
 from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.scenes import TEST_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.training.views import stack_sources, view_from_frame
-from semantic_mapper.types import CameraIntrinsics, FieldRender, PosedFrame, RayBatch, SourceViews, UInt8
+from semantic_mapper.types import Bool, CameraIntrinsics, FieldRender, Float32, PosedFrame, RayBatch, SourceViews, UInt8
 
 VIEW = CameraIntrinsics(220.6, 220.6, 159.5, 119.5, 320, 240)
 SOURCE_VIEWS = 8
@@ -104,8 +105,8 @@ def bench_render(
 
     At the same weights: the eager reference with 64 + 64 samples a ray, the eager renderer and the compiled one with 8
     guided samples, and the compiled one with the rays and samples of the mapper's "balanced" and "fast" quality; with a
-    GPU, the eager one there. The reference is timed on 2,048 rays spread over each view and scaled; all are scored at
-    the pixels of these rays.
+    GPU, the eager one there. All get the mapper's depth prior, and where it is measured. The reference is timed on
+    2,048 rays spread over each view and scaled; all are scored at the pixels of these rays.
 
     Returns:
         Plain data; ``speedup`` is wall time of the reference over that of "balanced" for the same views, and
@@ -188,8 +189,8 @@ def _bench_scene(
     if (gpu := find_gpu()) is not None:
         renders |= _bench_device(gpu, reference, views, query, repeats, (some.numpy(), truth))
     for quality in ("balanced", "fast"):
-        (p, known, _, _), timing = _timed(lambda q=quality: _sparse(q, streaming, sources, query), len(pixels), repeats)
-        predicted = labels.to_ids(np.where(known, p.argmax(axis=2), -1)).reshape(-1)[some.numpy()]
+        view, timing = _timed(lambda q=quality: _sparse(q, streaming, sources, query), len(pixels), repeats)
+        predicted = labels.to_ids(np.where(view.known, view.probabilities.argmax(axis=2), -1)).reshape(-1)[some.numpy()]
         renders[quality] = (timing, predicted, truth)
     difference = float((eager_render.logits - few_render.logits).abs().max())
     return _SceneBench(renders, difference, encode.wall_s)
@@ -211,25 +212,29 @@ def _bench_device(
     """As ``_SceneBench.renders``: the whole view with a ray for every pixel; ``scored`` pixels and their true ids."""
     some, truth = scored
     sampling = SamplingConfig()
-    prior = fill_holes(resize_depth(query, query.intrinsics))
+    prior, measured = query_prior(query)
     renders: dict[str, tuple[Timing, UInt8, UInt8]] = {}
     for name, bfloat16 in (("gpu", False), ("gpu_bfloat16", True)):
         field = DeviceField(model, device, sampling, bfloat16=bfloat16)
         scene = (field, field.encode(views), query.intrinsics, query.T_world_camera, prior, sampling, 0)
-        (p, known, _), timing = _timed(lambda s=scene: render_view(*s), prior.size, repeats)
+        (p, known, _), timing = _timed(lambda s=scene: render_view(*s, measured), prior.size, repeats)
         predicted = model.label_set.to_ids(np.where(known, p.argmax(axis=2), -1)).reshape(-1)[some]
         renders[name] = (timing, predicted, truth)
     return renders
 
 
-def _sparse(quality: Quality, streaming: StreamingSRay, sources: EncodedViews, query: PosedFrame) -> Any:
+def _sparse(quality: Quality, streaming: StreamingSRay, sources: EncodedViews, query: PosedFrame) -> RenderedView:
     """The whole view as the mapper renders it at a quality."""
     config = with_quality(MapperConfig(quality=quality))
-    streaming.sampling = config.sampling
-    prior = fill_holes(resize_depth(query, query.intrinsics))
-    render = config.render
-    scene = (streaming, sources, query.intrinsics, query.T_world_camera, prior, config.sampling)
-    return render_sparse_view(*scene, render.rays_per_chunk, query.rgb, render.ray_fraction)
+    prior, measured = query_prior(query)
+    renderer = ViewRenderer(streaming, config.render, config.sampling)
+    return renderer.render(sources, query.intrinsics, query.T_world_camera, prior, query.rgb, measured=measured)
+
+
+def query_prior(query: PosedFrame) -> tuple[Float32, Bool]:
+    """Depth prior (H, W) of the view as the mapper draws it, and where it is measured."""
+    depth = resize_depth(query, query.intrinsics)
+    return depth_prior(depth, query.rgb), depth > 0
 
 
 def _eager(field: SRay, rays: RayBatch, sources: EncodedViews) -> FieldRender:
@@ -237,23 +242,24 @@ def _eager(field: SRay, rays: RayBatch, sources: EncodedViews) -> FieldRender:
 
 
 def _rays(query: PosedFrame, pixels: torch.Tensor) -> RayBatch:
-    assert query.depth_m is not None
     u, v = pixels[:, 0].long(), pixels[:, 1].long()
     sampling = SamplingConfig()
+    prior, measured = (torch.from_numpy(each)[v, u] for each in query_prior(query))
     return pixel_rays(
         pixels,
         query.intrinsics,
         torch.tensor(query.T_world_camera, dtype=torch.float32),
         near_m=sampling.near_m,
         far_m=sampling.far_m,
-        prior_depth_m=torch.from_numpy(query.depth_m)[v, u],
+        prior_depth_m=prior,
+        measured=measured,
     )
 
 
 def _in_chunks(
     render: Callable[[RayBatch, EncodedViews], FieldRender], rays: RayBatch, sources: EncodedViews, size: int
 ) -> FieldRender:
-    fields = [getattr(rays, n) for n in ("origin", "direction", "near_m", "far_m", "prior_depth_m")]
+    fields = [getattr(rays, n) for n in ("origin", "direction", "near_m", "far_m", "prior_depth_m", "measured")]
     parts = [render(RayBatch(*(t[i : i + size] for t in fields)), sources) for i in range(0, len(rays.origin), size)]
     names = ("logits", "depth_m", "opacity", "rgb", "entropy", "known")
     return FieldRender(*(torch.cat([getattr(p, n) for p in parts]) for n in names))

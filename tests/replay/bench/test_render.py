@@ -1,3 +1,6 @@
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 
@@ -6,13 +9,16 @@ import semantic_mapper.replay.bench.render as bench
 from semantic_mapper.config import MapperConfig, with_quality
 from semantic_mapper.errors import LogError
 from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapping.pipeline import MappingPipeline
+from semantic_mapper.mapping.views.view_renderer import ViewRenderer
 from semantic_mapper.replay.bench.fusion import bench_fusion, bench_pipeline, bench_qualities
 from semantic_mapper.replay.bench.plots import draw_pipeline, step_parts
 from semantic_mapper.replay.bench.render import bench_render, log_scenes, room_scenes
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
-from tests.small import INTRINSICS, tiny_field, tiny_frames
+from tests.small import INTRINSICS, tiny_config, tiny_field, tiny_frames
 
 
 def test_bench_reports_ratios_of_renderers_that_agree():
@@ -26,6 +32,26 @@ def test_bench_reports_ratios_of_renderers_that_agree():
     assert found["miou_reference"] == renderers["reference, 64 + 64 samples"]["miou"]
     wall = {name.split(",")[-1].split()[-1]: row["view_wall_s"] for name, row in renderers.items()}
     assert found["speedup_fast"] > found["speedup_all_rays"] > 0 and wall["fast"] > 0
+
+
+def test_the_renderer_is_asked_as_the_mapper_asks_it(monkeypatch: pytest.MonkeyPatch):
+    asked, render = [], ViewRenderer.render
+
+    def recorded(self, sources, intrinsics, pose, prior, rgb, *, measured=None, **rest):
+        asked.append((prior, measured))
+        return render(self, sources, intrinsics, pose, prior, rgb, measured=measured, **rest)
+
+    monkeypatch.setattr(ViewRenderer, "render", recorded)
+    (scene,) = room_scenes(1, INTRINSICS)
+    holes = np.array(scene.query.depth_m)
+    holes[20:40, 30:60] = 0
+    scene = replace(scene, query=replace(scene.query, depth_m=holes))
+    config = tiny_config(render={"scale": 1.0})
+    MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS).step(scene.query)
+    bench_render(Checkpoint(tiny_field()), [scene], repeats=0, reference_rays=64)
+    (prior, measured), *others = asked
+    assert len(others) == 2 and 0 < measured.mean() < 1
+    assert all(np.array_equal(prior, p) and np.array_equal(measured, m) for p, m in others)
 
 
 @pytest.mark.slow
