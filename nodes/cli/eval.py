@@ -119,6 +119,7 @@ def _evaluate_targets(
     output = Output.guarded()
     output.quiet = print_json
     from semantic_mapper.errors import ConfigError
+    from semantic_mapper.nodes.cli.outputs import prepare_file, say_replaced
     from semantic_mapper.nodes.cli.report import write_eval_report
     from semantic_mapper.nodes.cli.results import print_results
     from semantic_mapper.nodes.cli.saved_maps import MAP_SUFFIX, is_log
@@ -131,6 +132,10 @@ def _evaluate_targets(
     folders = [t for t in targets if t not in logs]
     if mesh is not None and not folders:
         raise typer.BadParameter("goes with a DIR that `replay` has written", param_hint="--mesh")
+    path = json_file or (folders[0] / "eval.json" if folders else targets[0].with_suffix(".eval.json"))
+    if json_file is not None or targets[0].exists():  # no folders for a log that is not there
+        prepare_file(path)
+    say_replaced(path)
     found: dict[str, Any] = {"replays": {}, "logs": {}}
     tables: dict[str, Table] = {}
     if folders:
@@ -149,7 +154,6 @@ def _evaluate_targets(
         output.print(tables[str(log)])
         for note in scores["notes"]:
             output.print(note)
-    path = json_file or (folders[0] / "eval.json" if folders else targets[0].with_suffix(".eval.json"))
     write_json(path, found)
     write_eval_report(page := path.with_suffix(".html"), found["replays"], folders, tables, found)
     output.print(f"written to {path} and, for a browser, {page}")

@@ -13,6 +13,7 @@ import structlog
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.files import remove_stale
+from semantic_mapper.nodes.cli.console import stderr_console
 
 _log = structlog.get_logger(__name__)
 
@@ -40,6 +41,14 @@ def prepare_folder(out: Path) -> None:
             pass
     except OSError as error:
         raise ConfigError(f"{out}: cannot hold the results ({error.strerror}); choose another folder") from error
+
+
+def say_replaced(path: Path) -> None:
+    """One line on stderr where a file of results is there already: what this run finds will replace it."""
+    if path.exists():
+        stderr_console().print(
+            f"{path}: of an earlier run; will be replaced (--out names another file)", soft_wrap=True
+        )
 
 
 def free_name(path: Path) -> Path:

@@ -91,11 +91,19 @@ def test_ctrl_c_keeps_the_best_weights_so_far(log: Path, weights: Path, tmp_path
     assert "the best weights so far" in running.text
 
 
-def test_eval_of_a_log_writes_beside_it(log: Path, weights: Path, config: Path, tmp_path: Path) -> None:
+def test_eval_of_a_log_writes_beside_it_and_says_what_it_replaces(
+    log: Path, weights: Path, config: Path, tmp_path: Path
+) -> None:
     copy = Path(shutil.copy(log, tmp_path / "copy.mcap"))
-    done = run("eval", copy, "--weights", weights, "--config", config, "--max-frames", "2")
-    assert done.returncode == 0, done.stderr
-    assert json.loads((tmp_path / "copy.eval.json").read_text())["logs"][str(copy)]["scored"] == 2
+    written, options = tmp_path / "copy.eval.json", ("--weights", weights, "--config", config)
+    done = run("eval", copy, *options, "--max-frames", "2")
+    assert done.returncode == 0 and "replaced" not in done.stderr, done.stderr
+    assert json.loads(written.read_text())["logs"][str(copy)]["scored"] == 2
+    again = run("eval", copy, *options, "--max-frames", "1", "--json")
+    assert again.returncode == 0 and f"{written}: of an earlier run; will be replaced" in again.stderr
+    assert json.loads(written.read_text())["logs"][str(copy)]["scored"] == 1
+    other = run("eval", copy, *options, "--max-frames", "1", "--out", tmp_path / "other.json")
+    assert other.returncode == 0 and "replaced" not in other.stderr
 
 
 def test_finetuning_on_top_remembers_the_keyframes_of_both(log: Path, tuned: Path, tmp_path: Path) -> None:
