@@ -57,12 +57,19 @@ def map_rows_table(found: Mapping[str, Any]) -> Table:
 
 
 def difference_lines(found: Mapping[str, Any]) -> list[str]:
-    """One sentence a pair of weights files."""
+    """One sentence a difference."""
     return [
-        f"{d['first']} minus {d['second']}: {_points(d['observed'])} mIoU points, 95 % interval "
-        f"{_points(d['low'])} to {_points(d['high'])} ({d['scenes']} rooms, paired bootstrap)"
+        f"{d['first']} minus {d['second']}: {_points(d['observed'])} mIoU points, {_interval(d)}"
         for d in found["differences"]
+        if d["observed"] is not None
     ]
+
+
+def _interval(difference: Mapping[str, Any]) -> str:
+    if difference["note"] is not None:
+        return str(difference["note"])
+    low, high = _points(difference["low"]), _points(difference["high"])
+    return f"95 % interval {low} to {high} ({difference['scenes']} rooms, paired bootstrap)"
 
 
 def _add_curve(table: Table, entries: Sequence[Mapping[str, Any]]) -> None:

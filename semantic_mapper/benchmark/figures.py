@@ -18,6 +18,8 @@ from semantic_mapper.labels import ROOMS
 from semantic_mapper.plots import Curve, Panel, draw_panels
 from semantic_mapper.types import UInt8
 
+ONE_ROOM = "no interval: a bootstrap needs at least 2 rooms"
+
 
 def view_figures(records: Sequence[RoomRecord]) -> dict[str, Any]:
     """All figures of one weights file over its rooms, as plain data; None where nothing could be measured."""
@@ -72,12 +74,10 @@ def comparison_rows(records: Sequence[RoomRecord]) -> dict[str, dict[str, float 
 
 
 def compare_with_baselines(records: Sequence[RoomRecord], *, seed: int = 0) -> dict[str, dict[str, Any]]:
-    """Difference in data-set mIoU, field minus baseline, by baseline; empty for fewer than 2 rooms."""
-    if len(records) < 2:
-        return {}
+    """Field minus baseline, by baseline, as ``compare``; empty without rooms."""
     own = [from_rows(r.confusion) for r in records]
     return {
-        name: asdict(paired_bootstrap(own, [from_rows(r.rows[name].confusion) for r in records], seed=seed))
+        name: _difference(own, [from_rows(r.rows[name].confusion) for r in records], seed)
         for name in _common_rows(records)
     }
 
@@ -116,12 +116,17 @@ def map_row_figures(records: Sequence[MapRecord]) -> dict[str, float | None]:
 
 
 def compare_maps(first: Sequence[MapRecord], second: Sequence[MapRecord], *, seed: int = 0) -> dict[str, Any] | None:
-    """Difference in mIoU of the maps' points, ``first`` minus ``second``; None for fewer than 2 common rooms."""
+    """Difference in mIoU of the maps' points, ``first`` minus ``second``, as ``compare``."""
     return _compare(first, second, seed)
 
 
 def compare(first: Sequence[RoomRecord], second: Sequence[RoomRecord], *, seed: int = 0) -> dict[str, Any] | None:
-    """Difference in data-set mIoU, ``first`` minus ``second``, over the rooms of both; None for fewer than 2 rooms."""
+    """Difference in data-set mIoU, ``first`` minus ``second``, over the rooms of both; None where they share none.
+
+    Returns:
+        The fields of ``Difference``, and a ``note``. Of one room ``mean``, ``low`` and ``high`` are None and the note
+        says why; otherwise the note is None.
+    """
     return _compare(first, second, seed)
 
 
@@ -130,10 +135,18 @@ def _compare(
 ) -> dict[str, Any] | None:
     others = {r.room: r for r in second}
     both = [(r, others[r.room]) for r in first if r.room in others]
-    if len(both) < 2:
+    if not both:
         return None
     a, b = ([from_rows(r.confusion) for r in side] for side in zip(*both, strict=True))
-    return asdict(paired_bootstrap(a, b, seed=seed))
+    return _difference(a, b, seed)
+
+
+def _difference(first: Sequence[ConfusionMatrix], second: Sequence[ConfusionMatrix], seed: int) -> dict[str, Any]:
+    if len(first) > 1:
+        return {**asdict(paired_bootstrap(first, second, seed=seed)), "note": None}
+    a, b = first[0].metrics().miou, second[0].metrics().miou
+    observed = None if a is None or b is None else a - b
+    return {"observed": observed, "mean": None, "low": None, "high": None, "scenes": 1, "note": ONE_ROOM}
 
 
 def draw_fit_curves(figures: Mapping[str, Mapping[str, Any]], title: str) -> UInt8 | None:

@@ -119,7 +119,11 @@ def test_a_record_holds_the_rows_and_their_differences() -> None:
     assert from_rows(record.rows["own"].interior).metrics().pixels == inner.pixels
     differences = compare_with_baselines([record, record])
     assert set(differences) == set(BASELINES) and differences["own"]["scenes"] == 2
-    assert compare_with_baselines([record]) == {}
+    assert differences["own"]["low"] <= differences["own"]["high"] and differences["own"]["note"] is None
+    one = compare_with_baselines([record])["own"]
+    assert one["observed"] == pytest.approx(differences["own"]["observed"]) and one["scenes"] == 1
+    assert one["mean"] is one["low"] is one["high"] is None and "2 rooms" in one["note"]
+    assert compare_with_baselines([]) == {}
 
 
 @pytest.mark.parametrize("protocol", ["finetune", "scratch"])

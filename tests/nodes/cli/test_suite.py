@@ -63,6 +63,11 @@ def test_weights_side_by_side_with_maps_and_a_second_call_that_continues(
     )
     keys = {"miou", "total_accuracy", "average_accuracy", "interior_miou", "ece"}
     assert all(set(row) == keys for row in found["rows"].values() if row is not None)
+    against = [(d["first"], d["second"], d["low"], d["high"]) for d in found["differences"]]
+    baselines = [("sray", name) for name in ("own", "vote", "vote_exact", "oracle")]
+    assert against == [(*pair, None, None) for pair in [*baselines, ("sray map", "own image + votes")]]
+    assert all(isinstance(d["observed"], float) and d["note"] for d in found["differences"])
+    assert "sray minus own: " in first.stdout and "no interval" in first.stdout
     assert list(found["map_rows"]) == ["sray map", "own image + votes", "unet + votes"]
     assert found["map_rows"]["own image + votes"]["map_miou"] is not None
     assert "own image + votes" in first.stdout and "vote of the views" in first.stdout
@@ -76,7 +81,8 @@ def test_weights_side_by_side_with_maps_and_a_second_call_that_continues(
     assert found["weights"]["first"]["figures"]["rooms"] == 2 and found["weights"]["first"]["map"] is None
     assert found["differences"][0]["scenes"] == 2 and not found["map_rows"]
     pairs = [(d["first"], d["second"]) for d in found["differences"]]
-    assert pairs == [("first", "second"), *(("sray", name) for name in ("own", "vote", "vote_exact", "oracle"))]
+    assert pairs == [("first", "second"), *baselines]
+    assert all(d["low"] <= d["high"] and d["note"] is None for d in found["differences"])
     assert out.with_suffix(".png").stat().st_size > 1000
 
 
