@@ -119,7 +119,9 @@ def _draw(
     """Write the contact sheet, and the curves of what was fitted; yields the files."""
     if rows := sheet_rows(suite, entries, store, out.with_suffix(".views")):
         names = [c.name for c in entries]
-        write_picture(sheet := out.with_suffix(".png"), draw_sheet(rows, names, ROOMS, title=found["title"]))
+        title, _, how = found["title"].partition(": ")  # one line of a sheet of three columns is too short for both
+        picture = draw_sheet(rows, names, ROOMS, title=title, subtitle=how)
+        write_picture(sheet := out.with_suffix(".png"), picture)
         yield sheet
     figures = {name: entry["figures"] for name, entry in found["weights"].items()}
     if (picture := draw_fit_curves(figures, found["title"])) is not None:

@@ -28,7 +28,7 @@ from semantic_mapper.types import UInt8
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MARGIN, GAP, HEADER, CAPTION = 24, 14, 86, 26
+MARGIN, GAP, HEADER, CAPTION = 24, 14, 98, 26
 TILE_WIDTH = 320
 LEGEND_PITCH, LEGEND_COLUMN = 26, 180
 
@@ -53,7 +53,9 @@ class SheetRow:
 
 
 @rendered
-def draw_sheet(rows: Sequence[SheetRow], methods: Sequence[str], label_set: LabelSet, *, title: str) -> Figure:
+def draw_sheet(
+    rows: Sequence[SheetRow], methods: Sequence[str], label_set: LabelSet, *, title: str, subtitle: str = ""
+) -> Figure:
     """Draw the sheet: camera, truth and one column a method.
 
     Args:
@@ -61,6 +63,7 @@ def draw_sheet(rows: Sequence[SheetRow], methods: Sequence[str], label_set: Labe
         methods: Names of the columns, in their order.
         label_set: Of all label images.
         title: Head of the picture.
+        subtitle: A smaller line below it.
     """
     height = round(TILE_WIDTH * rows[0].rgb.shape[0] / rows[0].rgb.shape[1])
     columns = ("camera", "truth", *methods)
@@ -71,7 +74,7 @@ def draw_sheet(rows: Sequence[SheetRow], methods: Sequence[str], label_set: Labe
     legend_height = -(-len(legend) // across) * LEGEND_PITCH
     bottom = HEADER + len(rows) * (CAPTION + height + GAP)
     figure = new_figure(width + 2 * MARGIN, bottom + legend_height + MARGIN)
-    put_title(figure, title)
+    put_title(figure, title, subtitle)
     heads = place(figure, (MARGIN, HEADER - 18, width, 18))
     empty = np.full((1, 1, 3), PANEL, np.uint8)
     for column, name in enumerate(columns):
