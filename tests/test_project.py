@@ -98,11 +98,31 @@ def test_every_target_sets_up_what_it_needs(target: str) -> None:
 
 def test_every_relative_link_of_the_documentation_leads_somewhere() -> None:
     broken = []
-    for page in (*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")):
-        for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
-            if "://" not in target and not (page.parent / target).exists():
-                broken.append(f"{page.relative_to(ROOT)}: {target}")
+    for page in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), ROOT / "benchmarks" / "README.md"):
+        for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", page.read_text(encoding="utf-8")):
+            if "://" in target:
+                continue
+            other = page.parent / target if target else page
+            if not other.exists() or anchor not in {"", *anchors(other)}:
+                broken.append(f"{page.relative_to(ROOT)}: {target}#{anchor}")
     assert not broken
+
+
+def anchors(page: Path) -> list[str]:
+    """The anchors that a forge gives the headings of a page."""
+    if page.suffix != ".md":
+        return []
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings]
+
+
+def test_decisions_are_short() -> None:
+    long = []
+    for page in (ROOT / "docs" / "decisions").glob("0*.md"):
+        text = [line for line in page.read_text(encoding="utf-8").splitlines() if not line.startswith("|")]
+        if (words := len(" ".join(text).split())) > 120:
+            long.append(f"{page.name}: {words} words")
+    assert not long
 
 
 @pytest.mark.slow
