@@ -50,6 +50,7 @@ class MapInfo:
         voxel_size_m: Edge of a voxel.
         truncation_voxels: Of the TSDF.
         label_set: Its classes.
+        scale_known: Whether its lengths are metres.
     """
 
     map_id: str
@@ -59,6 +60,7 @@ class MapInfo:
     voxel_size_m: float
     truncation_voxels: float
     label_set: LabelSet
+    scale_known: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +118,8 @@ class MapClient:
 
     Every call answers as the query of its name does on a snapshot, raises what that raises (``MapError``,
     ``LabelError``), and further ``CodecError`` for what cannot be sent and ``TransportError`` where nobody answers. A
-    mapper that was restarted is found again. Any thread may call; calls wait for each other.
+    mapper that was restarted is found again. What takes or gives metres is refused (``MapError``) where the map has
+    none (``MapInfo.scale_known``). Any thread may call; calls wait for each other.
 
     ``version`` is the version of the map that the last answer was about.
 
@@ -153,7 +156,8 @@ class MapClient:
         h = self._ask("info", messages.InfoAnswer, messages.InfoRequest())
         labels = h.label_set.to_label_set()
         self._labels = h.map_id, labels
-        return MapInfo(h.map_id, h.version, h.epoch, h.blocks, h.voxel_size_m, h.truncation_voxels, labels)
+        numbers = h.blocks, h.voxel_size_m, h.truncation_voxels
+        return MapInfo(h.map_id, h.version, h.epoch, *numbers, labels, not h.scale_unknown)
 
     def at(self, points: ArrayLike, radius_m: float | None = None) -> PointAnswers:
         """What is at points (N, 3), world metres; see ``queries.lookup.at``."""
@@ -219,7 +223,9 @@ class MapClient:
                     self._mirrored, newest = info.map_id, -1
                     if h.map_id != info.map_id or h.since != 0:  # restarted between the two questions
                         continue
-                self._mirror.apply(BlockChanges(h.since, h.version, h.newest, h.epoch, **_arrays(h)))
+                self._mirror.apply(
+                    BlockChanges(h.since, h.version, h.newest, h.epoch, **_arrays(h), scale_known=not h.scale_unknown)
+                )
                 newest = h.newest if newest < 0 else newest  # as of the first answer: the map may outrun us
                 if h.version >= newest and self._mirror.is_whole:
                     return self._mirror

@@ -9,6 +9,7 @@ import numpy as np
 from rich.table import Table
 
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.map_scale import length_unit, scale_name
 from semantic_mapper.plain_text import counted
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.lookup import PointAnswers
@@ -16,6 +17,7 @@ from semantic_mapper.queries.nearest import NearestSurface
 from semantic_mapper.queries.occupancy import State
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_voxels
+from semantic_mapper.transport.messages import SCALE_UNKNOWN
 from semantic_mapper.types import Float64
 
 DIGITS = 4  # 0.1 mm
@@ -32,6 +34,7 @@ def describe_map(snapshot: MapSnapshot) -> dict[str, Any]:
     return {
         "question": "info",
         "frames": snapshot.version,
+        "scale": scale_name(snapshot.scale_known),
         "voxel_size_m": snapshot.voxel_size_m,
         "blocks": snapshot.block_count,
         "surface_voxels": len(label),
@@ -90,11 +93,12 @@ def answer_table(found: dict[str, Any], width: int) -> Table:
     """An answer, for people, on a terminal of ``width`` characters."""
     if found["question"] == "instances":
         return _instance_table(found, width)
+    unit = length_unit(found.get("scale") != SCALE_UNKNOWN)
     table = Table(title=found["map"], title_justify="left", show_header=False)
     for key, value in found.items():
         if key not in ("map", "question", "classes"):
             unnamed = key == "class" and value is None and found["surface_distance_m"] is not None
-            table.add_row(key.replace("_", " "), "unknown" if unnamed else _text(value))
+            table.add_row(key.replace("_", " "), "unknown" if unnamed else _text(value, unit))
     if "classes" in found:
         table.add_section()
         for name, count in sorted(found["classes"].items(), key=lambda item: -item[1]):
@@ -133,9 +137,9 @@ def _instance_table(found: dict[str, Any], width: int) -> Table:
     return table
 
 
-def _text(value: Any) -> str:
+def _text(value: Any, unit: str) -> str:
     if isinstance(value, list):
-        return f"{_joined(value)} m"
+        return f"{_joined(value)} {unit}"
     return "none" if value is None else str(value)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from rich.table import Table
 
+from semantic_mapper.mapping.map_scale import MEND
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.summary import dig
 
@@ -63,10 +64,7 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
             "is less exact than with a depth sensor"
         )
     if summary.get("scale") == "unknown":
-        lines.append(
-            "scale: unknown; lengths of this map are not metres. Import the film with --scale, --distance, --square-mm "
-            "or --camera-height"
-        )
+        lines.append(f"scale: unknown; lengths of this map are not metres, and what needs metres is refused: {MEND}")
     if frames.get("left_out"):
         lines.append(f"{counted(frames['left_out'], 'frame')} of the film left out by the import; its report says why")
     if frames.get("excluded_from_scores"):

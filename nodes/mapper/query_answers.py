@@ -157,7 +157,12 @@ class Answers:
         return messages.WeightsAnswer(**self._about(snapshot), **state)
 
     def _about(self, snapshot: MapSnapshot) -> dict[str, Any]:
-        return {"map_id": self.map_id, "version": snapshot.version, "epoch": snapshot.epoch}
+        return {
+            "map_id": self.map_id,
+            "version": snapshot.version,
+            "epoch": snapshot.epoch,
+            "scale_unknown": not snapshot.scale_known,
+        }
 
     def _plain(self, snapshot: MapSnapshot, kind: type[messages.Answer], found: object) -> messages.Answer:
         """The fields of a query's result are the arrays of its answer."""
@@ -218,6 +223,7 @@ class Answers:
             epoch=found.epoch,
             since=found.since,
             newest=snapshot.version,
+            scale_unknown=not found.scale_known,
             **_arrays(found, messages.ChangesAnswer),
         )
 

@@ -89,6 +89,11 @@ class RerunLog:
         infos.append(rr.AnnotationInfo(id=label_set.ignore_id, label="unknown", color=UNKNOWN))
         stream.log("/", rr.AnnotationContext(infos), static=True)
 
+    def note_scale(self, known: bool) -> None:
+        """Whether lengths are metres; where not, the recording says so (entity ``scale``)."""
+        if not known:
+            self._stream.log("scale", rr.TextDocument("scale: unknown; lengths are not metres"), static=True)
+
     def log_step(self, frame: PosedFrame, update: MapUpdate) -> None:
         """One frame and what was rendered for it."""
         self.log_frame(frame)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
 from semantic_mapper.labels import STUFF_NAMES
+from semantic_mapper.mapping.map_scale import require_metres
 from semantic_mapper.mapping.storage.block_index import unpack_keys
 from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_direction
@@ -102,7 +103,12 @@ class InstanceTracker:
         self._lock = threading.Lock()
 
     def update(self, snapshot: MapSnapshot) -> tuple[Instance, ...]:
-        """The instances of the map as it is now, by ascending id."""
+        """The instances of the map as it is now, by ascending id.
+
+        Raises:
+            MapError: lengths of the map are not metres.
+        """
+        require_metres(snapshot.scale_known, "instances")
         wanted = np.zeros(256, np.bool_)
         wanted[list(snapshot.label_set.thing_ids(self._stuff))] = True
         with self._lock:

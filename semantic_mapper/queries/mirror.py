@@ -110,6 +110,7 @@ class MapMirror:
                 versions=versions[order],
                 index=index,
                 voxels=pool,
+                scale_known=changes.scale_known,
             )
             if changes.epoch == self._snapshot.epoch or changes.version >= changes.newest:
                 self._snapshot = self._next

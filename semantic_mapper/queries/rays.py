@@ -12,7 +12,13 @@ from semantic_mapper.geometry import check_pose
 from semantic_mapper.kernels import kernel
 from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.storage.block_index import BlockIndex
-from semantic_mapper.queries.checks import as_numbers, check_direction, check_points, check_positive
+from semantic_mapper.queries.checks import (
+    as_numbers,
+    check_direction,
+    check_points,
+    check_positive,
+    voxel_coordinates,
+)
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int64, UInt8
 
@@ -62,6 +68,8 @@ def ray_cast(
 ) -> MapView:
     """The map as a camera would see it up to z = ``max_m``; as ``VoxelMap.ray_cast``, with classes of single voxels.
 
+    A picture needs no metres: without a known scale, pose, depth and range are in the map's own unit.
+
     Args:
         snapshot: The map.
         T_world_camera: (4, 4) float64.
@@ -79,7 +87,7 @@ def ray_cast(
         ((u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, np.ones(v.shape)), -1
     )
     direction = d_camera.reshape(-1, 3) @ T_world_camera[:3, :3].T  # of unit z: distances along it are depths
-    origin = check_points(T_world_camera[None, :3, 3], snapshot, "T_world_camera")
+    origin = voxel_coordinates(T_world_camera[None, :3, 3], snapshot, "T_world_camera")
     hits = _cast(snapshot, np.broadcast_to(origin, direction.shape), direction, max_m)
     size = (height, width)
     return MapView(

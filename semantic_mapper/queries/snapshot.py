@@ -50,6 +50,7 @@ class MapSnapshot:
         versions: (B,) int64 version that each block came with, at most ``version``.
         index: The same as a table for compiled code.
         voxels: Memory shared with other snapshots; only ``slots`` of it belong to this one.
+        scale_known: Whether lengths are metres.
     """
 
     version: int
@@ -63,6 +64,7 @@ class MapSnapshot:
     versions: NDArray[np.int64]
     index: BlockIndex
     voxels: BlockVoxels
+    scale_known: bool = True
 
     @property
     def block_count(self) -> int:
@@ -114,4 +116,5 @@ class MapSnapshot:
             voxels.label[slots],
             voxels.confidence[slots],
             voxels.rgb[slots],
+            self.scale_known,
         )

@@ -102,7 +102,7 @@ _RAISED = {
     e.__name__: e for e in (errors.MapError, errors.LabelError, errors.CodecError, errors.ShapeError, errors.PoseError)
 }
 _ZSTD_LEVEL = 1
-_NOT_SENT_AS_0 = ("unreadable",)  # came later: what does not need it is read by older releases, too
+_NOT_SENT_AS_0 = ("unreadable", "scale_unknown")  # came later: what does not need it is read by older releases, too
 
 MessageT = TypeVar("MessageT")
 AnswerT = TypeVar("AnswerT", bound=Answer)
@@ -242,9 +242,7 @@ def encode(message: Message, options: CodecOptions = _DEFAULTS, *, sender: str =
             header = to_plain(message, what)
             if isinstance(message, StreamInfo) and message.label_set is not None:
                 header["label_set"] = to_plain(LabelSetForm.of(message.label_set), what)
-            for name in _NOT_SENT_AS_0:
-                if header.get(name) == 0:
-                    del header[name]
+            _leave_out_zeros(header)
             return [topic_bytes(row.name, source), _pack(header, row.message, what)]
 
 
@@ -646,7 +644,14 @@ def _encode_query(kind: str, message: Request | Answer, what: str) -> tuple[list
     scalars = {name: getattr(message, name) for name in message.__struct_fields__ if name not in forms}
     header = to_plain({**scalars, "arrays": specs}, what)
     check_header({**header, **arrays}, type(message), what)
+    _leave_out_zeros(header)
     return [kind.encode(), pack_header(header, what), *buffers], tuple(specs)
+
+
+def _leave_out_zeros(header: dict[str, Any]) -> None:
+    for name in _NOT_SENT_AS_0:
+        if header.get(name) == 0:
+            del header[name]
 
 
 def _query_kind(parts: Parts) -> str:

@@ -90,13 +90,15 @@ class Request(Wire, frozen=True, kw_only=True):
 class Answer(Wire, frozen=True, kw_only=True):
     """Of every answer: which state of which map it is about.
 
-    ``map_id`` is another one after the mapper was restarted; versions of two maps cannot be compared.
+    ``map_id`` is another one after the mapper was restarted; versions of two maps cannot be compared. With
+    ``scale_unknown`` its lengths are not metres; sent only then.
     """
 
     map_id: Word
     version: Count
     epoch: Count
     arrays: ArraySpecs = ()
+    scale_unknown: bool = False
 
 
 class InfoRequest(Request, frozen=True, kw_only=True):

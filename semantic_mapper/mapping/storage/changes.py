@@ -41,6 +41,7 @@ class BlockChanges:
         label: (B, 512) uint8 class ids, the ignore id where nothing voted, or the map is too unsure.
         confidence: (B, 512) uint8 probability of the likeliest class, times 255; 0 where nothing voted.
         rgb: (B, 512, 3) uint8.
+        scale_known: Whether lengths of the map are metres.
     """
 
     since: int
@@ -52,6 +53,7 @@ class BlockChanges:
     label: UInt8
     confidence: UInt8
     rgb: UInt8
+    scale_known: bool = True
 
     @property
     def observed(self) -> NDArray[np.bool_]:
@@ -68,6 +70,7 @@ class ChosenBlocks(NamedTuple):
         label_set: For the ids.
         vote_discount, unknown_below: See ``readout``.
         min_weight: Voxels with fewer measurements count as not observed; > 0.
+        scale_known: Of the result.
     """
 
     packed: NDArray[np.int64]
@@ -79,6 +82,7 @@ class ChosenBlocks(NamedTuple):
     vote_discount: float
     unknown_below: float
     min_weight: float
+    scale_known: bool = True
 
 
 class CopiedChanges(NamedTuple):
@@ -175,6 +179,7 @@ def _room_for(chosen: ChosenBlocks) -> BlockChanges:
         np.empty(flat, np.uint8),
         np.empty(flat, np.uint8),
         np.empty((*flat, 3), np.uint8),
+        chosen.scale_known,
     )
 
 

@@ -114,6 +114,31 @@ def test_a_plan_says_what_was_found_out_for_it(corner: VoxelMap, tmp_path: Path)
     assert told.found == ()
 
 
+def test_files_of_a_map_without_metres_say_so_and_a_plan_is_refused(corner: VoxelMap, tmp_path: Path) -> None:
+    corner.save(tmp_path / "map.npz")
+    unknown = VoxelMap.load(tmp_path / "map.npz")
+    unknown.note_scale(False)
+    for name, where in (
+        ("a.ply", "comment scale: unknown"),
+        ("a.obj", "# scale: unknown"),
+        ("a.glb", '"scale":"unknown"'),
+    ):
+        report = export_map(unknown, tmp_path / name, ExportRequest(format_of(tmp_path / name, None)))
+        assert report.found[-1] == "scale: unknown; lengths are not metres"
+        assert where.encode() in (tmp_path / name).read_bytes()
+        report = export_map(corner, tmp_path / name, ExportRequest(format_of(tmp_path / name, None)))
+        assert where.encode() not in (tmp_path / name).read_bytes()
+        assert not any("scale" in line for line in report.found)
+    export_map(unknown, tmp_path / "a.npz", ExportRequest("npz"))
+    with np.load(tmp_path / "a.npz") as read:
+        assert str(read["scale"]) == "unknown"
+    export_map(unknown, tmp_path / "a.rrd", ExportRequest("rrd"))
+    assert "/scale" in {chunk.entity_path for chunk in rerun.chunk.RrdReader(tmp_path / "a.rrd").stream()}
+    with pytest.raises(MapError, match=r"floor plan: needs metres.*--distance"):
+        export_map(unknown, tmp_path / "plan.yaml", ExportRequest("grid"))
+    assert not (tmp_path / "plan.pgm").exists()
+
+
 def test_rerun_gets_a_cloud_for_each_colouring(corner: VoxelMap, tmp_path: Path) -> None:
     export_map(corner, tmp_path / "map.rrd", ExportRequest("rrd"))
     assert list(tmp_path.iterdir()) == [tmp_path / "map.rrd"]
