@@ -38,6 +38,7 @@ class Instance:
         centroid: (3,) float64 mean of its surface points, world metres.
         box: Upright box round its surface points.
         voxels: (N, 3) int32 coordinates of its surface voxels; centres at ``voxels * voxel_size_m``.
+        measured: Fraction of them that a sensor measured; the depth of the others was computed.
     """
 
     id: int
@@ -47,6 +48,7 @@ class Instance:
     centroid: Float64
     box: OrientedBox
     voxels: NDArray[np.int32]
+    measured: float = 1.0
 
 
 class _Found(NamedTuple):
@@ -184,6 +186,7 @@ class InstanceTracker:
             xyz.mean(axis=0),
             upright_box(xyz, self._up),
             unpack_keys(surface.packed[row[part]]) * 8 + within,
+            float(snapshot.measured(snapshot.slots[row[part]].astype(np.int64), voxel.astype(np.int64)).mean()),
         )
 
 

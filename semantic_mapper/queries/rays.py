@@ -20,7 +20,7 @@ from semantic_mapper.queries.checks import (
     voxel_coordinates,
 )
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int64, UInt8
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int64, UInt8
 
 MAX_RANGE_M = 100.0  # beyond, a ray through nothing takes long
 
@@ -34,12 +34,14 @@ class RayHits:
         label: (N,) uint8 class ids, the ignore id at misses and where unknown.
         confidence: (N,) float32 probability of the likeliest class, 0 at misses and where nothing voted.
         rgb: (N, 3) uint8.
+        measured: (N,) bool, whether a sensor measured that surface; False at misses; None = unknown.
     """
 
     distance_m: Float32
     label: UInt8
     confidence: Float32
     rgb: UInt8
+    measured: Bool | None = None
 
 
 def cast_rays(snapshot: MapSnapshot, origins: ArrayLike, directions: ArrayLike, max_m: float = 10.0) -> RayHits:
@@ -95,6 +97,7 @@ def ray_cast(
         hits.rgb.reshape(*size, 3),
         hits.label.reshape(size),
         hits.confidence.reshape(size),
+        None if hits.measured is None else hits.measured.reshape(size),
     )
 
 
@@ -117,7 +120,7 @@ def _cast(snapshot: MapSnapshot, origin: Float64, direction: Float64, max_m: flo
         voxel,
     )
     label, confidence, rgb = snapshot.read(slot, voxel)
-    return RayHits(distance, label, confidence, rgb)
+    return RayHits(distance, label, confidence, rgb, snapshot.measured(slot, voxel))
 
 
 def nearest_corners(points: Float64, snapshot: MapSnapshot) -> tuple[Int64, Int64]:

@@ -42,6 +42,7 @@ class BlockChanges:
         confidence: (B, 512) uint8 probability of the likeliest class, times 255; 0 where nothing voted.
         rgb: (B, 512, 3) uint8.
         scale_known: Whether lengths of the map are metres.
+        computed: (B, 512) uint8, 1 where no sensor measured what was observed; None = it did everywhere.
     """
 
     since: int
@@ -54,6 +55,7 @@ class BlockChanges:
     confidence: UInt8
     rgb: UInt8
     scale_known: bool = True
+    computed: UInt8 | None = None
 
     @property
     def observed(self) -> NDArray[np.bool_]:
@@ -180,10 +182,12 @@ def _room_for(chosen: ChosenBlocks) -> BlockChanges:
         np.empty(flat, np.uint8),
         np.empty((*flat, 3), np.uint8),
         chosen.scale_known,
+        np.empty(flat, np.uint8),
     )
 
 
 def _compact_into(out: BlockChanges, rows: NDArray[np.int64], blocks: PackedBlocks, chosen: ChosenBlocks) -> None:
+    assert out.computed is not None
     labels = chosen.label_set
     ids = np.array((*labels.ids, labels.ignore_id), np.uint8)
     _compact_blocks(
@@ -199,6 +203,7 @@ def _compact_into(out: BlockChanges, rows: NDArray[np.int64], blocks: PackedBloc
         out.label,
         out.confidence,
         out.rgb,
+        out.computed,
     )
 
 
@@ -217,6 +222,7 @@ def _compact_blocks(
     label: UInt8,
     confidence: UInt8,
     rgb: UInt8,
+    computed: UInt8,
 ) -> None:
     """Write packed blocks (B,) to ``rows`` (B,) of the output.
 
@@ -226,6 +232,6 @@ def _compact_blocks(
         rows: (B,) of the output.
         ids: (L + 1,) of the classes, and the ignore id.
         vote_discount, unknown_below, min_weight: See ``ChosenBlocks``.
-        tsdf, label, confidence, rgb: As in ``BlockChanges``.
+        tsdf, label, confidence, rgb, computed: As in ``BlockChanges``.
     """
     ...
