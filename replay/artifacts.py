@@ -21,7 +21,7 @@ from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.formats.ply import write_ply
 from semantic_mapper.mapping.map_scale import scale_name, voxel_size_text
-from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
 from semantic_mapper.mapping.picture_check import SENTENCES
 from semantic_mapper.plots import write_picture
 from semantic_mapper.types import Float64
@@ -70,8 +70,14 @@ def _draw_overview(session: MapSession, points: MapPoints, path: Path) -> None:
         title=f"{session.source or 'session'}: {session.fused} frames, {len(points.xyz):,} surface points, {size}",
         subtitle=_pose_line(session) + _empty_line(session, points) + _scores_line(session) + _depth_line(session),
         up=map_up(session),
+        unit=picture_unit(session),
     )
     write_picture(path, picture)
+
+
+def picture_unit(session: MapSession) -> str:
+    """Unit of lengths in pictures of a session."""
+    return "m" if session.pipeline.voxel_map.scale_known else "units"
 
 
 def map_up(session: MapSession) -> Float64 | None:
@@ -209,6 +215,7 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "blocks": voxel_map.block_count,
             "surface_points": len(points.xyz),
             "unknown": round(float((points.label == label_set.ignore_id).mean()), 4) if len(points.xyz) else None,
+            "computed": round(computed_fraction(points), 4) if len(points.xyz) else None,
             "memory_mb": round(voxel_map.memory_bytes / 1e6, 1),
             "corrected_poses": session.corrected_poses,
             "nearly_empty": nearly_empty(session, len(points.xyz)),

@@ -63,6 +63,11 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
             f"depth: rendered by the field for {percent(fraction)} of the frames, which have no sensor depth; geometry "
             "is less exact than with a depth sensor"
         )
+    if fraction := dig(summary, "map.computed"):
+        lines.append(
+            f"surface: {percent(fraction)} of its points were computed, not measured by a sensor; "
+            "`export --min-weight 1` leaves them out"
+        )
     if summary.get("scale") == "unknown":
         lines.append(f"scale: unknown; lengths of this map are not metres, and what needs metres is refused: {MEND}")
     if frames.get("left_out"):
@@ -135,6 +140,7 @@ _ROWS: Sequence[tuple[str, str, Any]] = (
     ("blocks", "map.blocks", str),
     ("surface points", "map", lambda m: f"{m['surface_points']}{' (nearly empty)' if m.get('nearly_empty') else ''}"),
     ("unknown surface", "map.unknown", percent),
+    ("computed surface", "map.computed", percent),
     ("map memory", "map.memory_mb", lambda v: f"{v} MB"),
     ("mIoU", "metrics.miou", percent),
     ("total accuracy", "metrics.total_accuracy", percent),

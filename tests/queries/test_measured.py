@@ -64,7 +64,7 @@ def test_nearest_at_rays_meshes_and_pictures_say_it(snapshot) -> None:
     answers = at(snapshot, [cup.xyz, table.xyz, (0.0, 0.0, 9.0)])
     assert answers.measured is not None and answers.measured.tolist() == [True, False, False]
     above = np.array([BALL, TABLE_TOP, (9.0, 9.0, 0.0)])
-    hits = cast_rays(snapshot, above + (0, 0, 1), (0, 0, -1))
+    hits = cast_rays(snapshot, above + np.array((0, 0, 1)), (0, 0, -1))
     assert hits.measured is not None and hits.measured.tolist() == [True, False, False]
     pose = look_at(BALL + np.array([0.0, -0.1, 1.0]), BALL, np.array([0.0, 0.0, 1.0]))
     view = ray_cast(snapshot, pose, INTRINSICS)
