@@ -20,10 +20,10 @@ from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.formats.ply import write_ply
-from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.map_scale import scale_name, voxel_size_text
+from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
 from semantic_mapper.mapping.picture_check import SENTENCES
 from semantic_mapper.plots import write_picture
-from semantic_mapper.transport.messages import SCALE_UNKNOWN
 from semantic_mapper.types import Float64
 
 if TYPE_CHECKING:  # session imports this module
@@ -46,8 +46,9 @@ def write_artifacts(session: MapSession, out: Path, rerun: RerunLog | None) -> d
     """Write everything to ``out`` (made if missing); the summary comes last, so its presence means "complete"."""
     out.mkdir(parents=True, exist_ok=True)
     points = session.pipeline.voxel_map.points()
-    write_ply(out / "map.ply", points, session.pipeline.label_set)
-    session.pipeline.voxel_map.save(out / "map.npz")
+    voxel_map = session.pipeline.voxel_map
+    write_ply(out / "map.ply", points, session.pipeline.label_set, scale_known=voxel_map.scale_known)
+    voxel_map.save(out / "map.npz")
     _draw_overview(session, points, out / "overview.png")
     if rerun is not None:
         rerun.finish(points)
@@ -60,7 +61,8 @@ def write_artifacts(session: MapSession, out: Path, rerun: RerunLog | None) -> d
 
 def _draw_overview(session: MapSession, points: MapPoints, path: Path) -> None:
     label_set = session.pipeline.label_set
-    size = f"{session.pipeline.voxel_map.config.voxel_size_m * 100:g} cm voxels"
+    voxel_map = session.pipeline.voxel_map
+    size = f"voxels of {voxel_size_text(voxel_map.config.voxel_size_m, voxel_map.scale_known)}"
     picture = draw_overview(
         view_strips(session, OVERVIEW_FRAMES),
         points,
@@ -68,8 +70,14 @@ def _draw_overview(session: MapSession, points: MapPoints, path: Path) -> None:
         title=f"{session.source or 'session'}: {session.fused} frames, {len(points.xyz):,} surface points, {size}",
         subtitle=_pose_line(session) + _empty_line(session, points) + _scores_line(session) + _depth_line(session),
         up=map_up(session),
+        unit=picture_unit(session),
     )
     write_picture(path, picture)
+
+
+def picture_unit(session: MapSession) -> str:
+    """Unit of lengths in pictures of a session."""
+    return "m" if session.pipeline.voxel_map.scale_known else "units"
 
 
 def map_up(session: MapSession) -> Float64 | None:
@@ -188,7 +196,7 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
         "latency_ms": {**_percentiles(session.step_ms), "first": _rounded(session.step_ms.first)},
         "stages_ms": {name: _percentiles(times) for name, times in session.stage_ms.items()},
         "depth": _depth_source(session),
-        "scale": "metres" if session.scale_known else SCALE_UNKNOWN,
+        "scale": scale_name(voxel_map.scale_known),
         "pose_check": {
             "keyframes_compared": pipeline.pose_check.compared,
             "depth_disagreement": _rounded(pipeline.pose_check.recent, 4),
@@ -207,6 +215,7 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "blocks": voxel_map.block_count,
             "surface_points": len(points.xyz),
             "unknown": round(float((points.label == label_set.ignore_id).mean()), 4) if len(points.xyz) else None,
+            "computed": round(computed_fraction(points), 4) if len(points.xyz) else None,
             "memory_mb": round(voxel_map.memory_bytes / 1e6, 1),
             "corrected_poses": session.corrected_poses,
             "nearly_empty": nearly_empty(session, len(points.xyz)),

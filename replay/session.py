@@ -50,6 +50,7 @@ class MapSession:
         stream_labels: Label set of the frames' label images; None where they have none.
         exclude_stamps: Frames to leave out of the scores, beside those that the weights were finetuned on.
         source: Name of the log or stream, for the summary.
+        scale_known: Whether its lengths are metres.
         rerun: Gets every frame, what was rendered for it, and the map at the end; see ``open_recording``.
     """
 
@@ -60,10 +61,12 @@ class MapSession:
         stream_labels: LabelSet | None,
         exclude_stamps: frozenset[int] = frozenset(),
         source: str = "",
+        scale_known: bool = True,
         rerun: RerunLog | None = None,
     ) -> None:
         self.bundle = bundle
         self.pipeline = bundle.pipeline
+        self.pipeline.voxel_map.note_scale(scale_known)
         self.source = source
         self.exclude_stamps = exclude_stamps | bundle.checkpoint.train_stamps_ns
         self.published = 0
@@ -76,7 +79,6 @@ class MapSession:
         self.learned: dict[str, Any] | None = None  # what became of weights that were offered meanwhile
         self.unfinished_correction = ""  # what the map has not moved with, and why
         self.left_out = 0  # by the import that has made the log
-        self.scale_known = True  # else lengths are not metres
         self.without_depth = 0  # their geometry was rendered, not measured
         self.computed_depth = 0  # their geometry was computed from the pictures
         self.too_little_motion = 0  # of these, those whose camera had not moved enough to compute any
@@ -93,6 +95,8 @@ class MapSession:
         self.snapshots: list[tuple[PosedFrame, MapUpdate]] = []
         self._snapshot_stride = 1
         self._rerun = rerun
+        if rerun is not None:
+            rerun.note_scale(scale_known)
 
     def process(self, frame: PosedFrame) -> list[MapUpdate | Refusal]:
         """Take one frame and map what is ready: the frame itself, unless its depth waits for later ones.

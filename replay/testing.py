@@ -257,7 +257,12 @@ class LogReplays:
 
         with open_log(path) as log:
             bundle = Mapper.load(weights, config)
-            session = MapSession(bundle, stream_labels=log.info.label_set, source=log.info.source)
+            session = MapSession(
+                bundle,
+                stream_labels=log.info.label_set,
+                source=log.info.source,
+                scale_known=log.info.scale_known,
+            )
             for error in log.errors:
                 session.note_damage(str(error))
             for number, item in enumerate(log.frames_or_errors(min(len(log), max_frames or len(log)))):

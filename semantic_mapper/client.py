@@ -31,7 +31,7 @@ from semantic_mapper.transport.codec import decode_answer, encode_request
 from semantic_mapper.transport.endpoints import default_endpoint
 from semantic_mapper.transport.query_sockets import QuerySocket
 from semantic_mapper.transport.security import ServerIdentity
-from semantic_mapper.types import Float64, UInt8
+from semantic_mapper.types import Bool, Float64, UInt8
 
 UP = (0.0, 0.0, 1.0)
 MIRROR_BLOCKS = 2000  # fetched at a time: 6 MB before compression
@@ -50,6 +50,7 @@ class MapInfo:
         voxel_size_m: Edge of a voxel.
         truncation_voxels: Of the TSDF.
         label_set: Its classes.
+        scale_known: Whether its lengths are metres.
     """
 
     map_id: str
@@ -59,6 +60,7 @@ class MapInfo:
     voxel_size_m: float
     truncation_voxels: float
     label_set: LabelSet
+    scale_known: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +118,8 @@ class MapClient:
 
     Every call answers as the query of its name does on a snapshot, raises what that raises (``MapError``,
     ``LabelError``), and further ``CodecError`` for what cannot be sent and ``TransportError`` where nobody answers. A
-    mapper that was restarted is found again. Any thread may call; calls wait for each other.
+    mapper that was restarted is found again. What takes or gives metres is refused (``MapError``) where the map has
+    none (``MapInfo.scale_known``). Any thread may call; calls wait for each other.
 
     ``version`` is the version of the map that the last answer was about.
 
@@ -153,12 +156,14 @@ class MapClient:
         h = self._ask("info", messages.InfoAnswer, messages.InfoRequest())
         labels = h.label_set.to_label_set()
         self._labels = h.map_id, labels
-        return MapInfo(h.map_id, h.version, h.epoch, h.blocks, h.voxel_size_m, h.truncation_voxels, labels)
+        numbers = h.blocks, h.voxel_size_m, h.truncation_voxels
+        return MapInfo(h.map_id, h.version, h.epoch, *numbers, labels, not h.scale_unknown)
 
     def at(self, points: ArrayLike, radius_m: float | None = None) -> PointAnswers:
         """What is at points (N, 3), world metres; see ``queries.lookup.at``."""
         request = messages.AtRequest(points=as_numbers(points, "points"), radius_m=radius_m)
-        return PointAnswers(**_arrays(self._ask("at", messages.AtAnswer, request)))
+        h = self._ask("at", messages.AtAnswer, request)
+        return PointAnswers(**_arrays(h), measured=_measured(np.isfinite(h.distance_m), h.computed))
 
     def nearest(self, class_name: str, point: ArrayLike, min_confidence: float = 0.0) -> NearestSurface | None:
         """The nearest surface of a class; see ``queries.nearest.nearest``."""
@@ -166,7 +171,9 @@ class MapClient:
             class_name=class_name, point=_point(point, "point"), min_confidence=min_confidence
         )
         h = self._ask("nearest", messages.NearestAnswer, request)
-        return NearestSurface(np.array(h.xyz, np.float64), h.distance_m, h.confidence) if h.found else None
+        if not h.found:
+            return None
+        return NearestSurface(np.array(h.xyz, np.float64), h.distance_m, h.confidence, not h.computed)
 
     def cast_rays(self, origins: ArrayLike, directions: ArrayLike, max_m: float = 10.0) -> RayHits:
         """The first surface that each ray meets; see ``queries.rays.cast_rays``."""
@@ -175,12 +182,14 @@ class MapClient:
             directions=np.atleast_2d(as_numbers(directions, "directions")),
             max_m=max_m,
         )
-        return RayHits(**_arrays(self._ask("cast_rays", messages.RaysAnswer, request)))
+        h = self._ask("cast_rays", messages.RaysAnswer, request)
+        return RayHits(**_arrays(h), measured=_measured(h.distance_m > 0, h.computed))
 
     def points_in_box(self, lower: ArrayLike, upper: ArrayLike) -> MapPoints:
         """Surface points in a box; see ``queries.boxes.points_in_box``."""
         request = messages.BoxRequest(lower=_point(lower, "lower"), upper=_point(upper, "upper"))
-        return MapPoints(**_arrays(self._ask("points_in_box", messages.BoxAnswer, request)))
+        h = self._ask("points_in_box", messages.BoxAnswer, request)
+        return MapPoints(**_arrays(h), measured=_measured(np.ones(len(h.xyz), np.bool_), h.computed))
 
     def instances(self, up: ArrayLike = UP) -> tuple[Instance, ...]:
         """All things; their ids stay from call to call, for each ``up``; see ``queries.instances.InstanceTracker``."""
@@ -219,7 +228,9 @@ class MapClient:
                     self._mirrored, newest = info.map_id, -1
                     if h.map_id != info.map_id or h.since != 0:  # restarted between the two questions
                         continue
-                self._mirror.apply(BlockChanges(h.since, h.version, h.newest, h.epoch, **_arrays(h)))
+                known, computed = not h.scale_unknown, h.computed
+                versions = h.since, h.version, h.newest, h.epoch
+                self._mirror.apply(BlockChanges(*versions, **_arrays(h), scale_known=known, computed=computed))
                 newest = h.newest if newest < 0 else newest  # as of the first answer: the map may outrun us
                 if h.version >= newest and self._mirror.is_whole:
                     return self._mirror
@@ -348,8 +359,14 @@ def _pose(T_world_camera: Float64, stamp_ns: int) -> Float64:
 
 
 def _arrays(answer: messages.Answer) -> dict[str, Any]:
-    """Array fields of an answer, as fields of a query's result."""
-    return {name: getattr(answer, name) for name in messages.array_forms(type(answer))}
+    """Array fields of an answer, as fields of a query's result; see ``_measured`` for what is optional."""
+    forms = messages.array_forms(type(answer))
+    return {name: getattr(answer, name) for name, form in forms.items() if not form.optional}
+
+
+def _measured(there: Bool, computed: UInt8 | None) -> Bool:
+    """Whether a sensor measured the surface that was found: N places, those ``there``."""
+    return there if computed is None else there & (computed == 0)
 
 
 def _things(found: messages.InstancesAnswer, labels: LabelSet) -> tuple[Instance, ...]:
@@ -366,8 +383,12 @@ def _things(found: messages.InstancesAnswer, labels: LabelSet) -> tuple[Instance
         raise CodecError(f"instances: of a class that label set '{labels.name}' does not have")
     names = dict(zip(labels.ids, labels.names, strict=True))
     parts: Sequence[Any] = np.split(voxels, np.cumsum(sizes)[:-1]) if len(sizes) else ()
+    measured = np.ones(len(numbers)) if found.measured is None else found.measured
+    if len(measured) != len(numbers):
+        raise CodecError(f"instances: {len(numbers)} things, {len(measured)} of them with a measured fraction")
     things: list[Instance] = []
-    for (number, class_id, _), p, part in zip(numbers.tolist(), places, parts, strict=True):
+    rows = zip(numbers.tolist(), places, parts, measured.tolist(), strict=True)
+    for (number, class_id, _), p, part, fraction in rows:
         box = OrientedBox(p[4:7], p[7:10], p[10:19].reshape(3, 3))
-        things.append(Instance(number, class_id, names[class_id], float(p[0]), p[1:4], box, part))
+        things.append(Instance(number, class_id, names[class_id], float(p[0]), p[1:4], box, part, fraction))
     return tuple(things)

@@ -139,6 +139,11 @@ class VisualPoses(Config, frozen=True):
 PoseConfig = DevicePoses | FixedPose | TopicPoses | BoardPoses | OdometryPoses | VisualPoses
 
 
+def gives_metres(config: PoseConfig) -> bool:
+    """Whether poses are in metres; those of pictures alone have a unit of their own."""
+    return not isinstance(config, VisualPoses) or bool(config.scale or config.distance_m)
+
+
 def begins_world(config: PoseConfig) -> bool:
     """Whether the world of the poses begins with the process: that of another process is another one."""
     return isinstance(config, DevicePoses | OdometryPoses | VisualPoses)

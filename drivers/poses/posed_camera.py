@@ -8,6 +8,7 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Protocol, Self, runtime_checkable
 
+import msgspec
 import numpy as np
 
 from semantic_mapper.drivers.base import Camera, CameraImage, PoseEstimate, PoseSource
@@ -16,7 +17,7 @@ from semantic_mapper.drivers.poses.outlier_filter import FilterResult, PoseOutli
 from semantic_mapper.errors import PoseError, ShapeError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.log_events import get_logger, is_power_of_two
-from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from semantic_mapper.types import MAX_POSE_SIGMA_M, Float64, PosedFrame
 
 _DEFAULTS = PoseChecks()
@@ -52,6 +53,7 @@ class PosedCamera:
         poses: Gives their poses.
         checks: What to refuse.
         T_rig_camera: (4, 4) where the poses are those of a rig, and the camera sits there.
+        scale_known: Whether poses are in metres.
 
     Attributes:
         counters: "frames" given; images left out: "no_pose" (the source has none), "stale" (the image is not later than
@@ -67,8 +69,10 @@ class PosedCamera:
         checks: PoseChecks = _DEFAULTS,
         *,
         T_rig_camera: Float64 | None = None,
+        scale_known: bool = True,
     ) -> None:
         self._camera = camera
+        self._scale_known = scale_known
         self._poses = poses
         self._checks = checks
         self._T_rig_camera = T_rig_camera
@@ -79,8 +83,11 @@ class PosedCamera:
 
     @property
     def info(self) -> StreamInfo:
-        """The camera's."""
-        return self._camera.info
+        """The camera's; it says so where poses are not in metres."""
+        info = self._camera.info
+        if self._scale_known:
+            return info
+        return msgspec.structs.replace(info, metadata={**info.metadata, SCALE_KEY: SCALE_UNKNOWN})
 
     @property
     def counters(self) -> dict[str, int]:

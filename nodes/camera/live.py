@@ -138,14 +138,20 @@ def with_poses(camera: Camera, config: dict[str, Any], mount: Mount) -> LiveSour
         ConfigError, CameraError: see ``run_live_camera``.
     """
     from semantic_mapper.config import convert_config
-    from semantic_mapper.drivers.poses.config import PoseChecks
+    from semantic_mapper.drivers.poses.config import PoseChecks, gives_metres
     from semantic_mapper.drivers.poses.posed_camera import PosedCamera
     from semantic_mapper.drivers.poses.sources import make_poses, read_pose_config
 
     config = dict(config)
     checks = convert_config(config.pop("checks", {}), PoseChecks, "poses: checks")
     poses = read_pose_config(config)
-    return PosedCamera(camera, make_poses(poses), checks=checks, T_rig_camera=mount.for_poses(poses))
+    return PosedCamera(
+        camera,
+        make_poses(poses),
+        checks=checks,
+        T_rig_camera=mount.for_poses(poses),
+        scale_known=gives_metres(poses),
+    )
 
 
 def table_of(named: str | dict[str, Any], where: str) -> tuple[dict[str, Any], str]:

@@ -162,7 +162,9 @@ def write_film_report(report: FilmReport, path: Path) -> None:
 
 
 def _figures(report: FilmReport) -> Mapping[str, str]:
-    unit = "m" if report.scale else "units (scale unknown)"
+    from semantic_mapper.mapping.map_scale import length_unit
+
+    unit = length_unit(bool(report.scale))
     lens = ", ".join(f"{value:.4f}" for value in report.distortion)
     found = {
         "scale": report.scale or "unknown: lengths are not metres",

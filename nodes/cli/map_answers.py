@@ -9,6 +9,7 @@ import numpy as np
 from rich.table import Table
 
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.map_scale import length_unit, scale_name
 from semantic_mapper.plain_text import counted
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.lookup import PointAnswers
@@ -16,6 +17,7 @@ from semantic_mapper.queries.nearest import NearestSurface
 from semantic_mapper.queries.occupancy import State
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_voxels
+from semantic_mapper.transport.messages import SCALE_UNKNOWN
 from semantic_mapper.types import Float64
 
 DIGITS = 4  # 0.1 mm
@@ -26,15 +28,18 @@ def describe_map(snapshot: MapSnapshot) -> dict[str, Any]:
     """Size and classes of a map."""
     surface = surface_voxels(snapshot)
     label = snapshot.voxels.label[snapshot.slots[surface.row], surface.voxel]
+    measured = snapshot.measured(snapshot.slots[surface.row].astype(np.int64), surface.voxel.astype(np.int64))
     labels = snapshot.label_set
     counts = {name: int((label == i).sum()) for i, name in zip(labels.ids, labels.names, strict=True)}
     xyz = surface.point * snapshot.voxel_size_m
     return {
         "question": "info",
         "frames": snapshot.version,
+        "scale": scale_name(snapshot.scale_known),
         "voxel_size_m": snapshot.voxel_size_m,
         "blocks": snapshot.block_count,
         "surface_voxels": len(label),
+        "computed": round(float(1 - measured.mean()), DIGITS) if len(label) else None,
         "without_class": int((label == labels.ignore_id).sum()),
         "lower": _rounded(xyz.min(axis=0)) if len(xyz) else None,
         "upper": _rounded(xyz.max(axis=0)) if len(xyz) else None,
@@ -54,6 +59,7 @@ def answer_at(labels: LabelSet, point: Sequence[float], answers: PointAnswers) -
         "confidence": round(float(answers.confidence[0]), DIGITS),
         "surface_distance_m": round(float(answers.distance_m[0]), DIGITS) if known else None,
         "state": State(int(answers.state[0])).name.lower(),
+        "measured": bool(answers.measured[0]) if known and answers.measured is not None else None,
     }
 
 
@@ -62,7 +68,7 @@ def answer_nearest(class_name: str, point: Sequence[float], hit: NearestSurface 
     found: dict[str, Any] = {"question": "nearest", "class": class_name, "point": list(point), "found": hit is not None}
     if hit is not None:
         found |= {"xyz": _rounded(hit.xyz), "distance_m": round(hit.distance_m, DIGITS)}
-        found["confidence"] = round(hit.confidence, DIGITS)
+        found |= {"confidence": round(hit.confidence, DIGITS), "measured": hit.measured}
     return found
 
 
@@ -74,6 +80,7 @@ def answer_instances(up: Sequence[float], instances: Sequence[Instance]) -> dict
             "class": thing.class_name,
             "confidence": round(thing.confidence, DIGITS),
             "voxels": len(thing.voxels),
+            "measured": round(thing.measured, DIGITS),
             "centroid": _rounded(thing.centroid),
             "box": {
                 "center": _rounded(thing.box.center),
@@ -90,11 +97,12 @@ def answer_table(found: dict[str, Any], width: int) -> Table:
     """An answer, for people, on a terminal of ``width`` characters."""
     if found["question"] == "instances":
         return _instance_table(found, width)
+    unit = length_unit(found.get("scale") != SCALE_UNKNOWN)
     table = Table(title=found["map"], title_justify="left", show_header=False)
     for key, value in found.items():
         if key not in ("map", "question", "classes"):
             unnamed = key == "class" and value is None and found["surface_distance_m"] is not None
-            table.add_row(key.replace("_", " "), "unknown" if unnamed else _text(value))
+            table.add_row(key.replace("_", " "), "unknown" if unnamed else _text(value, unit))
     if "classes" in found:
         table.add_section()
         for name, count in sorted(found["classes"].items(), key=lambda item: -item[1]):
@@ -111,12 +119,13 @@ def _instance_table(found: dict[str, Any], width: int) -> Table:
             thing["class"],
             f"{thing['confidence']:.2f}",
             str(thing["voxels"]),
+            f"{thing['measured'] * 100:.0f} %",
             _joined(thing["centroid"]),
             _joined(thing["box"]["size"]),
         )
         for thing in found["instances"]
     ]
-    names = ("id", "class", "confidence", "voxels", "centroid, m", "box, m")
+    names = ("id", "class", "confidence", "voxels", "measured", "centroid, m", "box, m")
     widths = [max(map(len, column)) for column in zip(names, *rows, strict=True)]
     for name, widest in zip(names, widths, strict=True):
         if name == "class":
@@ -133,9 +142,9 @@ def _instance_table(found: dict[str, Any], width: int) -> Table:
     return table
 
 
-def _text(value: Any) -> str:
+def _text(value: Any, unit: str) -> str:
     if isinstance(value, list):
-        return f"{_joined(value)} m"
+        return f"{_joined(value)} {unit}"
     return "none" if value is None else str(value)
 
 

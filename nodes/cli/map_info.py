@@ -9,6 +9,8 @@ from rich.table import Table
 
 from semantic_mapper.config import to_plain
 from semantic_mapper.mapping.files.map_file import describe_map
+from semantic_mapper.mapping.map_scale import length_unit, voxel_size_text
+from semantic_mapper.transport.messages import SCALE_UNKNOWN
 
 
 def map_summary(path: Path) -> dict[str, Any]:
@@ -23,6 +25,7 @@ def map_summary(path: Path) -> dict[str, Any]:
         "format_version": manifest.version,
         "size_bytes": path.stat().st_size,
         "frames": manifest.frames,
+        "scale": manifest.scale,
         "last_stamp_ns": manifest.last_stamp_ns,
         "voxel_size_m": manifest.config.voxel_size_m,
         "bounds_m": None if manifest.bounds_m is None else [list(corner) for corner in manifest.bounds_m],
@@ -44,13 +47,16 @@ def map_table(found: dict[str, Any]) -> Table:
     table.add_row("format", f"voxel map, version {found['format_version']}")
     table.add_row("size", f"{found['size_bytes'] / 1e6:.1f} MB")
     table.add_row("frames", f"{found['frames']}, the last one at {found['last_stamp_ns'] / 1e9:.3f} s")
-    table.add_row("voxels", f"{found['voxel_size_m'] * 100:g} cm")
+    table.add_row("scale", found["scale"])
+    known = found["scale"] != SCALE_UNKNOWN
+    unit = length_unit(known)
+    table.add_row("voxels", voxel_size_text(found["voxel_size_m"], known))
     bounds = found["bounds_m"]
     if bounds is not None:
         low, high = bounds
-        table.add_row("extent", " x ".join(f"{b - a:.2f}" for a, b in zip(low, high, strict=True)) + " m")
-        table.add_row("from", ", ".join(f"{x:.2f}" for x in low) + " m")
-        table.add_row("to", ", ".join(f"{x:.2f}" for x in high) + " m")
+        table.add_row("extent", " x ".join(f"{b - a:.2f}" for a, b in zip(low, high, strict=True)) + f" {unit}")
+        table.add_row("from", ", ".join(f"{x:.2f}" for x in low) + f" {unit}")
+        table.add_row("to", ", ".join(f"{x:.2f}" for x in high) + f" {unit}")
     table.add_row("blocks", f"{found['blocks']:,} of 8 x 8 x 8 voxels")
     table.add_row("measured", f"{found['measured_voxels']:,} voxels, {found['voted_voxels']:,} with class votes")
     label_set = found["label_set"]

@@ -27,7 +27,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.cli.summary_table import notes, summary_table
 from semantic_mapper.plain_text import visible
 from semantic_mapper.plots import UNKNOWN, Bar, class_rows, draw_bars, png_bytes
-from semantic_mapper.replay.artifacts import MAX_LISTED, map_up, view_strips
+from semantic_mapper.replay.artifacts import MAX_LISTED, map_up, picture_unit, view_strips
 from semantic_mapper.replay.summary import dig
 from semantic_mapper.types import Float64, UInt8
 
@@ -200,7 +200,11 @@ def write_replay_report(session: MapSession, summary: Mapping[str, Any], out: Pa
     label_set, points = session.pipeline.label_set, session.pipeline.voxel_map.points()
     overview = out / "overview.png", "Frames, what was rendered for them, and the map from above and aside"
     strips = [
-        picture(draw_strip(s, label_set), f"{s.name}: camera, and what was rendered for it", photo=True)
+        picture(
+            draw_strip(s, label_set, picture_unit(session)),
+            f"{s.name}: camera, and what was rendered for it",
+            photo=True,
+        )
         for s in view_strips(session, STRIPS)
     ]
     counts = [(name.replace("_", " "), str(count)) for name, count in summary["frames"].items()]

@@ -97,9 +97,10 @@ def replay_log(
             stream_labels=log.info.label_set,
             exclude_stamps=exclude,
             source=log.info.source,
+            scale_known=log.info.scale_known,
             rerun=open_recording(request.rerun, bundle.pipeline),
         )
-        session.scale_known, session.left_out = log.info.scale_known, read_left_out(log.attachments())
+        session.left_out = read_left_out(log.attachments())
         for error in log.errors:  # stretches of the file in which no frame can be made out
             session.note_damage(str(error))
         total = min(len(log), request.max_frames or len(log))

@@ -8,6 +8,7 @@ from typing import Any
 
 from rich.table import Table
 
+from semantic_mapper.mapping.map_scale import MEND
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.summary import dig
 
@@ -62,11 +63,13 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
             f"depth: rendered by the field for {percent(fraction)} of the frames, which have no sensor depth; geometry "
             "is less exact than with a depth sensor"
         )
-    if summary.get("scale") == "unknown":
+    if fraction := dig(summary, "map.computed"):
         lines.append(
-            "scale: unknown; lengths of this map are not metres. Import the film with --scale, --distance, --square-mm "
-            "or --camera-height"
+            f"surface: {percent(fraction)} of its points were computed, not measured by a sensor; "
+            "`export --min-weight 1` leaves them out"
         )
+    if summary.get("scale") == "unknown":
+        lines.append(f"scale: unknown; lengths of this map are not metres, and what needs metres is refused: {MEND}")
     if frames.get("left_out"):
         lines.append(f"{counted(frames['left_out'], 'frame')} of the film left out by the import; its report says why")
     if frames.get("excluded_from_scores"):
@@ -137,6 +140,7 @@ _ROWS: Sequence[tuple[str, str, Any]] = (
     ("blocks", "map.blocks", str),
     ("surface points", "map", lambda m: f"{m['surface_points']}{' (nearly empty)' if m.get('nearly_empty') else ''}"),
     ("unknown surface", "map.unknown", percent),
+    ("computed surface", "map.computed", percent),
     ("map memory", "map.memory_mb", lambda v: f"{v} MB"),
     ("mIoU", "metrics.miou", percent),
     ("total accuracy", "metrics.total_accuracy", percent),

@@ -238,6 +238,7 @@ class _Mapper:
 
         # A stream is announced again to a newcomer, or by a restarted camera; or another camera begins.
         self._broken |= self._streams.begin(info)
+        self._bundle.pipeline.voxel_map.note_scale(info.scale_known)  # of further streams, too
         if self._session is not None:
             self._session.source = self._streams.source
             return
@@ -295,6 +296,7 @@ class _Mapper:
         return True
 
     def _publish_status(self, state: NodeState, *, now: bool = False) -> None:
+        from semantic_mapper.mapping.map_scale import MEND
         from semantic_mapper.transport.codec import encode
         from semantic_mapper.transport.messages import Status
 
@@ -317,6 +319,8 @@ class _Mapper:
             degraded += self._weights.degraded
         if self._taken_up:
             degraded += (self._taken_up,)
+        if not self._bundle.pipeline.voxel_map.scale_known:
+            degraded += (f"scale: unknown; lengths of the map are not metres: {MEND}",)
         pictures = self._bundle.pipeline.picture_check
         counters |= pictures.counters
         degraded += pictures.warnings

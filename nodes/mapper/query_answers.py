@@ -11,20 +11,23 @@ import numpy as np
 import structlog
 
 from semantic_mapper.errors import MapError, SemanticMapperError
+from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.queries.boxes import points_in_box
 from semantic_mapper.queries.instances import Instance, InstanceTracker
-from semantic_mapper.queries.lookup import MAX_RADIUS_VOXELS, RADIUS_VOXELS, at
+from semantic_mapper.queries.lookup import MAX_RADIUS_VOXELS, RADIUS_VOXELS, PointAnswers, at
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.nearest import nearest
 from semantic_mapper.queries.occupancy import distance_field, occupancy
-from semantic_mapper.queries.rays import cast_rays
+from semantic_mapper.queries.rays import RayHits, cast_rays
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.transport import query_messages as messages
 from semantic_mapper.transport.codec import decode_request, encode_answer, encode_error
 from semantic_mapper.transport.framing import Parts
 from semantic_mapper.transport.headers import LabelSetForm
+from semantic_mapper.types import UInt8
 
 # One worker answers all that takes long: what would keep the others waiting for more than about a second is refused.
 MAX_VISITED_VOXELS = 1e8  # of `at`
@@ -157,7 +160,12 @@ class Answers:
         return messages.WeightsAnswer(**self._about(snapshot), **state)
 
     def _about(self, snapshot: MapSnapshot) -> dict[str, Any]:
-        return {"map_id": self.map_id, "version": snapshot.version, "epoch": snapshot.epoch}
+        return {
+            "map_id": self.map_id,
+            "version": snapshot.version,
+            "epoch": snapshot.epoch,
+            "scale_unknown": not snapshot.scale_known,
+        }
 
     def _plain(self, snapshot: MapSnapshot, kind: type[messages.Answer], found: object) -> messages.Answer:
         """The fields of a query's result are the arrays of its answer."""
@@ -180,6 +188,7 @@ class Answers:
             xyz=(0.0, 0.0, 0.0) if hit is None else tuple(hit.xyz.tolist()),
             distance_m=0.0 if hit is None else hit.distance_m,
             confidence=0.0 if hit is None else hit.confidence,
+            computed=hit is not None and not hit.measured,
         )
 
     def _instances(self, snapshot: MapSnapshot, up: messages.Point) -> messages.Answer:
@@ -218,6 +227,7 @@ class Answers:
             epoch=found.epoch,
             since=found.since,
             newest=snapshot.version,
+            scale_unknown=not found.scale_known,
             **_arrays(found, messages.ChangesAnswer),
         )
 
@@ -229,10 +239,29 @@ def _to_error(error: SemanticMapperError | MemoryError) -> SemanticMapperError:
 
 
 def _arrays(found: object, kind: type[messages.Answer]) -> dict[str, Any]:
-    return {name: getattr(found, name) for name in messages.array_forms(kind)}
+    """Arrays of an answer; what is optional is left out where it says nothing."""
+    values = {name: getattr(found, name) for name in messages.array_forms(kind) if name != "computed"}
+    return values | {"computed": _computed(found)}
+
+
+def _computed(found: object) -> UInt8 | None:
+    """Where no sensor measured the surface that was found; None = nowhere."""
+    match found:
+        case PointAnswers(distance_m=distance_m, measured=measured) if measured is not None:
+            computed = np.isfinite(distance_m) & ~measured
+        case RayHits(distance_m=distance_m, measured=measured) if measured is not None:
+            computed = (distance_m > 0) & ~measured
+        case MapPoints(measured=measured) if measured is not None:
+            computed = ~measured
+        case BlockChanges(computed=computed) if computed is not None:
+            pass
+        case _:
+            return None
+    return computed.astype(np.uint8) if computed.any() else None
 
 
 def _thing_arrays(things: Sequence[Instance]) -> dict[str, Any]:
+    measured = [t.measured for t in things]
     numbers = [(t.id, t.class_id, len(t.voxels)) for t in things]
     places = [
         np.concatenate(([t.confidence], t.centroid, t.box.center, t.box.size, t.box.R_world_box.ravel()))
@@ -242,6 +271,7 @@ def _thing_arrays(things: Sequence[Instance]) -> dict[str, Any]:
         "numbers": np.array(numbers, np.int64).reshape(-1, 3),
         "places": np.array(places, np.float64).reshape(-1, 19),
         "voxels": np.concatenate([np.empty((0, 3), np.int32), *(t.voxels for t in things)]),
+        "measured": np.array(measured) if min(measured, default=1.0) < 1 else None,
     }
 
 

@@ -95,6 +95,7 @@ def show_saved(path: Path, begin: Begin) -> None:
     """
     voxel_map = VoxelMap.load(path)
     log = RerunLog(begin(), voxel_map.label_set, voxel_map.config.voxel_size_m)
+    log.note_scale(voxel_map.scale_known)
     log.finish(voxel_map.points())
 
 
@@ -130,7 +131,13 @@ def show_log(
     with open_log(path) as reader:
         log = RerunLog(begin(), pipeline.label_set, voxel_map.config.voxel_size_m)
         show, mirror = _MapShow(log), MapMirror.of(voxel_map)
-        session = MapSession(bundle, stream_labels=None, source=reader.info.source, rerun=log)
+        session = MapSession(
+            bundle,
+            stream_labels=None,
+            source=reader.info.source,
+            scale_known=reader.info.scale_known,
+            rerun=log,
+        )
         total = min(len(reader), frames or len(reader))
         on_start(total)
         shown_at, stamp_ns = time.monotonic(), 0
@@ -171,6 +178,7 @@ def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tel
         if snapshot is None:
             return
         log = RerunLog(stream, snapshot.label_set, snapshot.voxel_size_m)
+        log.note_scale(snapshot.scale_known)
         show = _MapShow(log)
         show.show(snapshot, time.monotonic_ns())
         following = _Following(client, show, refresh_s)

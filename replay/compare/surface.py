@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from semantic_mapper.errors import MapError
 from semantic_mapper.evaluation.metrics import map_miou
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.map_scale import require_metres
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -44,6 +45,7 @@ def compare_with_mesh(folder: Path, mesh: Path) -> dict[str, Any]:
     except (OSError, KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
         raise MapError(f"{mesh}: needs arrays 'vertices' (V, 3) and 'faces' (F, 3) in an .npz: {error}") from error
     voxel_map = VoxelMap.load(folder / "map.npz")
+    require_metres(voxel_map.scale_known, f"{folder / 'map.npz'} beside {mesh}")
     points = voxel_map.points()
     if not len(points.xyz):
         raise MapError(f"{folder / 'map.npz'}: the map is empty")

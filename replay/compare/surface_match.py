@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.map_scale import require_same_scale
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
 from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE
@@ -55,7 +56,12 @@ class SurfaceMatch:
 
 
 def match_surfaces(a: VoxelMap, b: VoxelMap) -> tuple[SurfaceMatch, SurfaceMatch]:
-    """A's surface beside B's, and B's beside A's. Common is what lies within the larger of their voxels."""
+    """A's surface beside B's, and B's beside A's. Common is what lies within the larger of their voxels.
+
+    Raises:
+        MapError: only one of them is in metres.
+    """
+    require_same_scale(a.scale_known, b.scale_known, "compare")
     common_m = max(a.config.voxel_size_m, b.config.voxel_size_m)
     of_a, of_b = (a.points(), a.label_set), (b.points(), b.label_set)
     return _match(*of_a, *of_b, common_m), _match(*of_b, *of_a, common_m)

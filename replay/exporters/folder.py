@@ -9,7 +9,7 @@ import numpy as np
 
 from semantic_mapper.replay.exporters.base import ExportFrame, LeftOut, depth_units, quaternion, seconds, write_png
 from semantic_mapper.replay.importers.tum import DEPTH_SCALE
-from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
 TUM_UNITS_PER_M = DEPTH_SCALE.units_per_m
@@ -35,7 +35,7 @@ class FolderExporter:
         self._poses: list[str] = []
         self._stamps: list[int] = []
         self._depth = _DepthFiles(None)
-        self._intrinsics = _OneCamera()
+        self._intrinsics = _OneCamera(info.scale_known)
         (folder / "color").mkdir()
 
     def add(self, item: ExportFrame) -> None:
@@ -130,12 +130,13 @@ class TrajectoryExporter:
 
     Args:
         path: Of the file.
+        scale_known: Whether poses are in metres; a comment says where not.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, scale_known: bool) -> None:
         self.notices: list[str] = []
         self._path = path
-        self._trajectory = Trajectory()
+        self._trajectory = Trajectory(scale_known)
 
     def add(self, item: ExportFrame) -> None:
         """Take one frame.
@@ -153,8 +154,9 @@ class TrajectoryExporter:
 class Trajectory:
     """Poses by time."""
 
-    def __init__(self) -> None:
+    def __init__(self, scale_known: bool = True) -> None:
         self._lines: dict[int, str] = {}
+        self._about = () if scale_known else (f"# {SCALE_KEY}: {SCALE_UNKNOWN}",)
 
     def add(self, item: ExportFrame) -> None:
         """Take the pose of one frame.
@@ -170,7 +172,11 @@ class Trajectory:
 
     def write(self, file: Path) -> None:
         """Write them in order of time."""
-        lines = ("# timestamp tx ty tz qx qy qz qw", *(self._lines[stamp] for stamp in sorted(self._lines)))
+        lines = (
+            *self._about,
+            "# timestamp tx ty tz qx qy qz qw",
+            *(self._lines[stamp] for stamp in sorted(self._lines)),
+        )
         file.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
@@ -230,8 +236,9 @@ class _DepthFiles:
 class _OneCamera:
     """The intrinsics that all frames of a folder share."""
 
-    def __init__(self) -> None:
+    def __init__(self, scale_known: bool = True) -> None:
         self.value: CameraIntrinsics | None = None
+        self._about = {} if scale_known else {SCALE_KEY: SCALE_UNKNOWN}
 
     @property
     def notices(self) -> list[str]:
@@ -254,7 +261,9 @@ class _OneCamera:
         if self.value is not None:
             k = self.value
             plain = {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy}
-            file.write_text(json.dumps({**plain, "depth_scale": depth_scale}, indent=1), encoding="ascii")
+            file.write_text(
+                json.dumps({**plain, "depth_scale": depth_scale, **self._about}, indent=1), encoding="ascii"
+            )
 
 
 def _by_stamp(line: str) -> tuple[int, str]:

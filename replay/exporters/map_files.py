@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -18,6 +18,7 @@ from semantic_mapper.mapping.files.formats.obj import write_obj
 from semantic_mapper.mapping.files.formats.ply import write_ply, write_ply_mesh
 from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
+from semantic_mapper.mapping.map_scale import require_metres
 from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, occupancy_grid
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -122,31 +123,37 @@ def export_map(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> Expor
 
     Raises:
         ConfigError: an option that the format cannot honour.
-        MapError: nothing to write, impossible numbers, or the file cannot be written.
+        MapError: nothing to write, a floor plan of a map without metres, impossible numbers, or the file cannot be
+            written.
     """
     for option in ("color", "up", "height", "resolution", "floor"):
         if getattr(request, option) is not None and option not in _TAKES[request.format]:
             able = ", ".join(name for name, takes in _TAKES.items() if option in takes)
             raise ConfigError(f"--{option} means nothing for format {request.format}; it is for {able}")
-    if request.format in ("ply-mesh", "obj", "glb"):
-        return _export_mesh(voxel_map, path, request)
     if request.format == "grid":
+        require_metres(voxel_map.scale_known, f"{path}: a floor plan")
         return _export_grid(voxel_map, path, request)
-    return _export_points(voxel_map, path, request)
+    write = _export_mesh if request.format in ("ply-mesh", "obj", "glb") else _export_points
+    report = write(voxel_map, path, request)
+    if voxel_map.scale_known:
+        return report
+    return replace(report, found=(*report.found, "scale: unknown; lengths are not metres"))
 
 
 def _export_points(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> ExportReport:
     labels = voxel_map.label_set
     points = sure_points(voxel_map.points(request.min_weight), request.min_confidence)
     if request.format == "ply":
-        write_ply(path, colored(points, labels, request.color or "rgb"), labels)
+        write_ply(path, colored(points, labels, request.color or "rgb"), labels, scale_known=voxel_map.scale_known)
     elif request.format == "npz":
-        write_npz(path, points, labels)
+        write_npz(path, points, labels, scale_known=voxel_map.scale_known)
     else:
         with atomic_path(path, raises=MapError) as part:
             from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file
 
-            RerunLog(recording_file(part), labels, voxel_map.config.voxel_size_m).finish(points)
+            log = RerunLog(recording_file(part), labels, voxel_map.config.voxel_size_m)
+            log.note_scale(voxel_map.scale_known)
+            log.finish(points)
     return ExportReport((path,), f"{len(points.xyz):,} points")
 
 
@@ -158,9 +165,10 @@ def _export_mesh(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> Exp
     color = request.color or "rgb"
     mesh, files, found = colored(mesh, labels, color), (path,), ()
     if request.format == "ply-mesh":
-        write_ply_mesh(path, mesh, labels)
+        write_ply_mesh(path, mesh, labels, scale_known=voxel_map.scale_known)
     elif request.format == "obj":
-        files = write_obj(path, mesh, labels, class_materials=color == "class")
+        scale_known = voxel_map.scale_known
+        files = write_obj(path, mesh, labels, class_materials=color == "class", scale_known=scale_known)
     else:
         found = _write_glb(voxel_map, path, mesh, request)
     return ExportReport(files, f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces", found)
@@ -168,7 +176,7 @@ def _export_mesh(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> Exp
 
 def _write_glb(voxel_map: VoxelMap, path: Path, mesh: MapMesh, request: ExportRequest) -> tuple[str, ...]:
     up = request.up if request.up is not None else find_up(voxel_map.points(request.min_weight), voxel_map.label_set)
-    write_glb(path, mesh, voxel_map.label_set, up)
+    write_glb(path, mesh, voxel_map.label_set, up, scale_known=voxel_map.scale_known)
     return _found_up(request, up)
 
 

@@ -26,6 +26,7 @@ class RerunExporter:
         self.notices: list[str] = []
         self._label_set = info.label_set or make_label_set("none", ["no class"])
         self._log = RerunLog(recording_file(path), self._label_set)
+        self._log.note_scale(info.scale_known)
 
     def add(self, item: ExportFrame) -> None:
         """Draw one frame."""

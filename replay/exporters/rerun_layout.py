@@ -19,7 +19,8 @@ from semantic_mapper.types import Float32, Float64, UInt8
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COLOURINGS = ("class", "colour", "confidence", "age")
+COLOURINGS = ("class", "colour", "confidence", "measured", "age")
+MEASURED_COLOR, COMPUTED_COLOR = (86, 180, 233), (230, 159, 0)  # blue and orange, which the colour-blind can tell apart
 AGED_S = 60.0  # what has not changed for so long has the last colour of the scale
 CONFIDENCE_SCALE, AGE_SCALE = cv2.COLORMAP_VIRIDIS, cv2.COLORMAP_INFERNO
 LEGEND_WIDTH = 260
@@ -88,9 +89,15 @@ def scale_colors(level: Float32, scale: int) -> UInt8:
 
 
 @rendered
-def draw_map_legend(labels: UInt8, label_set: LabelSet, *, aged: bool) -> Figure:
-    """Picture of the classes of a map's points (N,) and of the scales of confidence and (``aged``) age."""
+def draw_map_legend(labels: UInt8, label_set: LabelSet, *, aged: bool, computed: float = 0.0) -> Figure:
+    """Picture of the classes of a map's points (N,), of the scales of confidence and (``aged``) age, and of what was
+    measured, where a fraction ``computed`` was not."""
     rows = class_rows(labels, label_set)
+    if computed:
+        rows += [
+            ("measured", MEASURED_COLOR, 1 - computed),
+            ("computed", COMPUTED_COLOR, computed),
+        ]
     scales = [("confidence: 0 to 1", CONFIDENCE_SCALE)]
     scales += [(f"age: {AGED_S:g} s or more, to 0 s", AGE_SCALE)] if aged else []
     width, height = LEGEND_WIDTH - 2 * _MARGIN, len(rows) * _PITCH
@@ -111,13 +118,16 @@ def camera_path(camera: str) -> str:
     return rr.new_entity_path(["world", "cameras", camera])
 
 
-def layout(cameras: Sequence[str], *, mapped: bool, aged: bool, eye: Eye | None) -> rrb.Blueprint:
+def layout(
+    cameras: Sequence[str], *, mapped: bool, aged: bool, computed: bool = False, eye: Eye | None
+) -> rrb.Blueprint:
     """The map in one tab a colouring, the legend beside it, the images of each camera, and the times of all stages.
 
     Args:
         cameras: Their names; none for a map alone.
         mapped: There is a map.
         aged: Its ages are known.
+        computed: No sensor measured some of it.
         eye: From where to look first; None leaves it to the viewer.
     """
     seen = [f"+ {camera_path(c)}/{part}" for c in cameras for part in ("", "image", "image/rgb")]
@@ -134,7 +144,7 @@ def layout(cameras: Sequence[str], *, mapped: bool, aged: bool, eye: Eye | None)
             line_grid=False,
         )
         for name in COLOURINGS
-        if aged or name != "age"
+        if (aged or name != "age") and (computed or name != "measured")
     ]
     space = rrb.Tabs(*maps, active_tab=0, name="map")
     legend = rrb.Spatial2DView(origin="/legend", name="legend")

@@ -1,4 +1,4 @@
-"""What Rerun shows of a session: cameras, rendered semantics, depth, path, the map in four colourings, stage times.
+"""What Rerun shows of a session: cameras, rendered semantics, depth, path, the map in five colourings, stage times.
 
 The same is written to a recording (.rrd) and sent to a viewer that watches, so both look alike.
 """
@@ -14,12 +14,14 @@ import numpy as np
 from semantic_mapper.errors import LogError
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
 from semantic_mapper.plots import UNKNOWN
 from semantic_mapper.replay.exporters.rerun_layout import (
     AGE_SCALE,
     AGED_S,
+    COMPUTED_COLOR,
     CONFIDENCE_SCALE,
+    MEASURED_COLOR,
     Eye,
     camera_path,
     draw_map_legend,
@@ -80,7 +82,7 @@ class RerunLog:
         self._seen: dict[str, int] = {}
         self._strides: dict[str, int] = {}
         self._eye: Eye | None = None
-        self._aged = False
+        self._aged = self._computed = False
         self._extent_m = -1.0  # of the map when the eye was set
         infos = [
             rr.AnnotationInfo(id=i, label=name, color=color)
@@ -88,6 +90,11 @@ class RerunLog:
         ]
         infos.append(rr.AnnotationInfo(id=label_set.ignore_id, label="unknown", color=UNKNOWN))
         stream.log("/", rr.AnnotationContext(infos), static=True)
+
+    def note_scale(self, known: bool) -> None:
+        """Whether lengths are metres; where not, the recording says so (entity ``scale``)."""
+        if not known:
+            self._stream.log("scale", rr.TextDocument("scale: unknown; lengths are not metres"), static=True)
 
     def log_step(self, frame: PosedFrame, update: MapUpdate) -> None:
         """One frame and what was rendered for it."""
@@ -127,7 +134,8 @@ class RerunLog:
             self._stream.log(f"stage_ms/{stage}", rr.Scalars(value))
 
     def log_map(self, points: MapPoints, age_s: Float32 | None = None, stamp_ns: int | None = None) -> None:
-        """The map as it is now, coloured by class, camera colour, confidence and, where it is known, age.
+        """The map as it is now, coloured by class, camera colour, confidence and, where there is
+        something to tell, by what a sensor measured and by age.
 
         Args:
             points: Of its surface.
@@ -136,7 +144,8 @@ class RerunLog:
         """
         if stamp_ns is not None:
             self._set_time(stamp_ns, None)
-        self._look_at(points, aged=age_s is not None)
+        computed = computed_fraction(points)
+        self._look_at(points, aged=age_s is not None, computed=computed > 0)
         for camera, poses in list(self._paths.items()):
             positions = np.stack([T[:3, 3] for T in list(poses)])
             self._stream.log(rr.new_entity_path(["world", "path", camera]), rr.LineStrips3D([positions]))
@@ -145,11 +154,14 @@ class RerunLog:
             "colour": {"colors": points.rgb},
             "confidence": {"colors": scale_colors(points.confidence, CONFIDENCE_SCALE)},
         }
+        if points.measured is not None and computed:
+            colors = np.array((COMPUTED_COLOR, MEASURED_COLOR), np.uint8)
+            looks["measured"] = {"colors": colors[points.measured.astype(np.intp)]}
         if age_s is not None:
             looks["age"] = {"colors": scale_colors(1 - age_s / np.float32(AGED_S), AGE_SCALE)}
         for name, look in looks.items():
             self._stream.log(f"world/map/{name}", rr.Points3D(points.xyz, radii=self._radius, **look))
-        legend = draw_map_legend(points.label, self._label_set, aged=age_s is not None)
+        legend = draw_map_legend(points.label, self._label_set, aged=age_s is not None, computed=computed)
         self._stream.log("legend", rr.Image(legend))
 
     def finish(self, points: MapPoints) -> None:
@@ -180,20 +192,21 @@ class RerunLog:
             self._lay_out()
         return camera_path(camera)
 
-    def _look_at(self, points: MapPoints, *, aged: bool) -> None:
+    def _look_at(self, points: MapPoints, *, aged: bool, computed: bool) -> None:
         """Set the view again where the map is the first one, or has grown much."""
         if not len(points.xyz):
             return
         extent = float(np.linalg.norm(np.ptp(np.percentile(points.xyz, (1, 99), axis=0), axis=0)))
-        if self._aged == aged and extent <= REGROWN * self._extent_m:
+        if (self._aged, self._computed) == (aged, computed) and extent <= REGROWN * self._extent_m:
             return
         poses = [T for poses in list(self._paths.values()) for T in list(poses)]
         self._eye = eye_on(points.xyz, camera_up(np.stack(poses)) if poses else None)
-        self._aged, self._extent_m = aged, extent
+        self._aged, self._computed, self._extent_m = aged, computed, extent
         self._lay_out()
 
     def _lay_out(self) -> None:
-        self._stream.send_blueprint(layout(self._cameras, mapped=self._eye is not None, aged=self._aged, eye=self._eye))
+        known = {"mapped": self._eye is not None, "aged": self._aged, "computed": self._computed}
+        self._stream.send_blueprint(layout(self._cameras, **known, eye=self._eye))
 
     def _set_time(self, stamp_ns: int, seq: int | None) -> None:
         self._stream.set_time("capture", duration=np.timedelta64(stamp_ns, "ns"))

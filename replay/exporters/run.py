@@ -9,6 +9,7 @@ from typing import Literal, get_args
 
 from semantic_mapper.errors import CodecError, ConfigError, LogError
 from semantic_mapper.files import atomic_folder, atomic_path
+from semantic_mapper.mapping.map_scale import require_metres
 from semantic_mapper.replay.exporters.base import Exporter, ExportFrame, LeftOut, encoded
 from semantic_mapper.replay.exporters.folder import FolderExporter, TrajectoryExporter, TumExporter
 from semantic_mapper.replay.log.sequence import Log
@@ -90,8 +91,11 @@ def export_log(log: Log, out: Path, request: LogExportRequest, on_frame: Callabl
 
     Raises:
         ConfigError: a camera that is not in the log, or several where the format holds one.
+        MapError: the format states metres, and the log has none.
         LogError: ``out`` is there already, or cannot be written; or no frame could be.
     """
+    if request.format == "tum":
+        require_metres(log.info.scale_known, f"{out}: depth and poses of a TUM sequence are in metres")
     is_folder = request.format in _FOLDERS
     if is_folder and out.exists():
         raise LogError(f"{out}: exists already; name a folder that is to be made")
@@ -118,7 +122,8 @@ def export_log(log: Log, out: Path, request: LogExportRequest, on_frame: Callabl
         if not frames:
             why = left_out[0] if left_out else "it holds none that can be read"
             raise LogError(f"{log.path}: no frame could be written: {why}")
-    return LogExportReport(frames, tuple(left_out), tuple(exporter.notices))
+    scale = () if log.info.scale_known else ("scale: unknown; lengths are not metres",)
+    return LogExportReport(frames, tuple(left_out), (*exporter.notices, *scale))
 
 
 def _exporter(place: Path, info: StreamInfo, name: LogFormat) -> Exporter:
@@ -131,7 +136,7 @@ def _exporter(place: Path, info: StreamInfo, name: LogFormat) -> Exporter:
 
         return RerunExporter(place, info)
     if name == "trajectory":
-        return TrajectoryExporter(place)
+        return TrajectoryExporter(place, info.scale_known)
     return TumExporter(place) if name == "tum" else FolderExporter(place, info)
 
 

@@ -2,7 +2,8 @@
 
 ``color/NNNNNN.jpg|png``, ``depth/NNNNNN.png`` (uint16), ``label/NNNNNN.png`` (uint8) with ``labels.json``,
 ``poses.txt`` (a row of 16 numbers a frame, row-major ``T_world_camera``), ``intrinsics.json`` (width height fx fy cx cy
-and, unless depth is in millimetres, depth_scale: units per metre), and, if there is one, ``timestamps.txt`` (a row a
+and, unless depth is in millimetres, depth_scale: units per metre;
+``"scale": "unknown"`` where poses are not in metres), and, if there is one, ``timestamps.txt`` (a row a
 frame: int nanoseconds, or seconds with a point). A frame without a depth image comes without depth.
 """
 
@@ -34,7 +35,7 @@ from semantic_mapper.replay.importers.base import (
     read_rgb,
     seconds_to_ns,
 )
-from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64, PosedFrame
 
 LEAST_PERIOD_NS = 100_000  # no camera is quicker: then stamps are in another unit
@@ -51,6 +52,7 @@ class _Intrinsics(msgspec.Struct):
     cx: float
     cy: float
     depth_scale: Annotated[float, Meta(gt=0, le=1e6)] | None = None  # units per metre; None = the format's convention
+    scale: str = ""  # "unknown" where poses are not in metres
 
 
 class _Labels(msgspec.Struct):
@@ -76,7 +78,7 @@ class FolderRecording:
         self.notices: list[str] = []
         self._folder = folder
         self._camera_id = options.camera_id
-        self._intrinsics, given = read_intrinsics(folder / "intrinsics.json")
+        self._intrinsics, given, scale_known = read_intrinsics(folder / "intrinsics.json")
         self.depth_scale = given or DEPTH_SCALE
         self._color = numbered_files(folder / "color", _COLOR)
         self._rows = read_lines(folder / "poses.txt")
@@ -101,6 +103,7 @@ class FolderRecording:
             label_set=labels,
             frame_count=self._count,
             frame_hz=hz,
+            metadata={} if scale_known else {SCALE_KEY: SCALE_UNKNOWN},
         )
 
     def __len__(self) -> int:
@@ -217,8 +220,8 @@ def _ignore_notices(labels: _Labels, label_set: LabelSet, file: Path) -> list[st
     return []
 
 
-def read_intrinsics(file: Path) -> tuple[CameraIntrinsics, DepthScale | None]:
-    """``intrinsics.json`` -> intrinsics, and the scale of depth images where the file gives it.
+def read_intrinsics(file: Path) -> tuple[CameraIntrinsics, DepthScale | None, bool]:
+    """``intrinsics.json`` -> intrinsics, the scale of depth images where given, and whether poses are in metres.
 
     Raises:
         ImportSourceError: missing, or a value that cannot be.
@@ -226,7 +229,7 @@ def read_intrinsics(file: Path) -> tuple[CameraIntrinsics, DepthScale | None]:
     try:
         i = read_json(file, _Intrinsics)
         scale = DepthScale(i.depth_scale, file) if i.depth_scale is not None else None
-        return CameraIntrinsics(i.fx, i.fy, i.cx, i.cy, i.width, i.height), scale
+        return CameraIntrinsics(i.fx, i.fy, i.cx, i.cy, i.width, i.height), scale, i.scale != SCALE_UNKNOWN
     except ConfigError as error:
         raise ImportSourceError(str(error)) from error
     except FrameError as error:

@@ -114,7 +114,7 @@ class TumRecording:
     def _read_intrinsics(self) -> CameraIntrinsics:
         file = self._folder / "intrinsics.json"
         if file.exists():
-            intrinsics, given = read_intrinsics(file)
+            intrinsics, given, _ = read_intrinsics(file)
             self.depth_scale = given or DEPTH_SCALE
             return intrinsics
         name = self._folder.resolve().name

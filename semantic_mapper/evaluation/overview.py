@@ -27,7 +27,7 @@ from semantic_mapper.plots import (
     put_title,
     rendered,
 )
-from semantic_mapper.types import Float32, Float64, UInt8
+from semantic_mapper.types import Bool, Float32, Float64, UInt8
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,6 +39,7 @@ MAP_HEIGHT = 620
 LEGEND_WIDTH = 250
 MAX_POINTS = 2_000_000
 ELEVATION = float(np.deg2rad(42))
+STRIPES, STRIPE_LIGHT = 40, 0.45  # across computed surface: how many, and how bright
 
 
 class LabelledPoints(Protocol):
@@ -62,6 +63,11 @@ class LabelledPoints(Protocol):
     @property
     def confidence(self) -> Float32:
         """(N,) of ``label``, in [0, 1]."""
+        ...
+
+    @property
+    def measured(self) -> Bool | None:
+        """(N,), False where no sensor measured the surface; None = unknown."""
         ...
 
 
@@ -95,6 +101,7 @@ def draw_overview(
     title: str,
     subtitle: str = "",
     up: Float64 | None = None,
+    unit: str = "m",
 ) -> Figure:
     """Draw a row of tiles for each strip, under them the map and the legend, 1600 pixels wide.
 
@@ -105,6 +112,7 @@ def draw_overview(
         title, subtitle: Head of the picture.
         up: (3,) rough up direction of the world frame (``upright.camera_up`` of the poses gives one); ``None``
             estimates it from the points alone.
+        unit: Of lengths.
 
     Raises:
         ShapeError: the arrays of ``points`` do not fit together.
@@ -115,23 +123,28 @@ def draw_overview(
     put_title(figure, title, subtitle)
     y = HEADER
     for strip in strips:
-        _put_strip(figure, y, strip, label_set)
+        _put_strip(figure, y, strip, label_set, unit)
         y += _strip_height(strip) + GAP
-    _put_map(figure, top + CAPTION, points, label_set, up)
+    _put_map(figure, top + CAPTION, points, label_set, up, unit)
     shown = [image for strip in strips for image in (strip.rendered, strip.truth) if image is not None]
     legend = place(figure, (WIDTH - MARGIN - LEGEND_WIDTH, top + CAPTION, LEGEND_WIDTH, MAP_HEIGHT))
     put_text(legend, (0, -11), "class, fraction of the map", color=DIM_TEXT)
-    put_text(legend, (0, MAP_HEIGHT - 10), "paler in the map = less sure", color=DIM_TEXT)
-    box = (WIDTH - MARGIN - LEGEND_WIDTH, top + CAPTION, LEGEND_WIDTH, MAP_HEIGHT - 30)
+    hints = ["paler in the map = less sure"]
+    if points.measured is not None and not points.measured.all():
+        share = f"{100 * (1 - points.measured.mean()):.0f} %"
+        hints.append(f"striped = computed: {share}" if points.measured.any() else "all of it computed, no sensor")
+    for row, hint in enumerate(reversed(hints)):
+        put_text(legend, (0, MAP_HEIGHT - 10 - 20 * row), hint, color=DIM_TEXT)
+    box = (WIDTH - MARGIN - LEGEND_WIDTH, top + CAPTION, LEGEND_WIDTH, MAP_HEIGHT - 10 - 20 * len(hints))
     put_legend(figure, box, class_rows(points.label, label_set, shown))
     return figure
 
 
 @rendered
-def draw_strip(strip: ViewStrip, label_set: LabelSet) -> Figure:
+def draw_strip(strip: ViewStrip, label_set: LabelSet, unit: str = "m") -> Figure:
     """One frame as a row of tiles with captions, 1600 pixels wide."""
     figure = new_figure(WIDTH, _strip_height(strip))
-    _put_strip(figure, 0, strip, label_set)
+    _put_strip(figure, 0, strip, label_set, unit)
     return figure
 
 
@@ -146,12 +159,12 @@ def _strip_height(strip: ViewStrip) -> int:
     return CAPTION + _tile_size(strip)[1]
 
 
-def _put_strip(figure: Figure, y: int, strip: ViewStrip, label_set: LabelSet) -> None:
+def _put_strip(figure: Figure, y: int, strip: ViewStrip, label_set: LabelSet, unit: str) -> None:
     tiles = [(f"{strip.name}: camera", strip.rgb), ("rendered semantics", class_colors(strip.rendered, label_set))]
     if strip.truth is not None:
         tiles.append(("truth", class_colors(strip.truth, label_set)))
     if strip.depth_m is not None:
-        caption, picture = _color_depth(strip.depth_m)
+        caption, picture = _color_depth(strip.depth_m, unit)
         tiles.append((f"rendered {caption}" if strip.depth_rendered else caption, picture))
     width, height = _tile_size(strip)
     for column, (caption, picture) in enumerate(tiles):
@@ -166,7 +179,7 @@ def _check(points: LabelledPoints) -> None:
         raise ShapeError(f"map points: expected xyz (N, 3), rgb (N, 3), label (N,), confidence (N,), got {shapes}")
 
 
-def _color_depth(depth_m: Float32) -> tuple[str, UInt8]:
+def _color_depth(depth_m: Float32, unit: str) -> tuple[str, UInt8]:
     known = np.isfinite(depth_m) & (depth_m > 0)
     if not known.any():
         return "depth: none", np.full((*depth_m.shape, 3), PANEL, np.uint8)
@@ -175,15 +188,19 @@ def _color_depth(depth_m: Float32) -> tuple[str, UInt8]:
     gray = np.where(known, 255 * (1 - level), 0).astype(np.uint8)
     picture = cv2.cvtColor(cv2.applyColorMap(gray, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB).astype(np.uint8)
     picture[~known] = PANEL
-    return f"depth: {near:.1f} m (red) to {far:.1f} m (blue)", picture
+    return f"depth: {near:.1f} {unit} (red) to {far:.1f} {unit} (blue)", picture
 
 
-def _put_map(figure: Figure, y: int, points: LabelledPoints, label_set: LabelSet, up: Float64 | None) -> None:
+def _put_map(
+    figure: Figure, y: int, points: LabelledPoints, label_set: LabelSet, up: Float64 | None, unit: str
+) -> None:
     width = (WIDTH - 2 * MARGIN - 2 * GAP - LEGEND_WIDTH) // 2
     size = (width, MAP_HEIGHT)
     step = max(1, -(-len(points.xyz) // MAX_POINTS))
     xyz, colors = points.xyz[::step], _point_colors(points, label_set)[::step]
     upright = xyz.astype(np.float64) @ upright_rotation(xyz, up).T
+    if points.measured is not None:
+        colors = _striped(colors, upright, ~points.measured[::step])
     inside = _without_ceiling(upright, points.label[::step], label_set)
     upright, colors = upright[inside], colors[inside]
 
@@ -192,7 +209,7 @@ def _put_map(figure: Figure, y: int, points: LabelledPoints, label_set: LabelSet
     seen = ~hides_the_room(upright, azimuth)
     angled, _ = draw_points(from_angle(upright[seen], azimuth, ELEVATION), colors[seen], size, PANEL)
     cut = "" if inside.all() else ", ceiling cut away"
-    _put_scale_bar(put_picture(figure, (MARGIN, y, *size), above, f"map from above{cut}"), scale)
+    _put_scale_bar(put_picture(figure, (MARGIN, y, *size), above, f"map from above{cut}"), scale, unit)
     put_picture(figure, (MARGIN + width + GAP, y, *size), angled, f"map from an angle{cut}")
 
 
@@ -207,6 +224,16 @@ def _point_colors(points: LabelledPoints, label_set: LabelSet) -> UInt8:
     return np.clip(colors * (1 - unsure) + 205 * unsure, 0, 255).astype(np.uint8)
 
 
+def _striped(colors: UInt8, upright: Float64, computed: NDArray[np.bool_]) -> UInt8:
+    """Dark stripes across what no sensor measured: N points, z up; some forty of them over a map that mixes both."""
+    if not computed.any() or computed.all():
+        return colors
+    across = upright @ np.ones(3)  # slanting on floors and on walls
+    low, high = np.percentile(across, (1, 99))
+    dark = computed & (np.floor((across - low) / max(high - low, 1e-6) * 2 * STRIPES).astype(np.int64) % 2 == 0)
+    return np.where(dark[:, None], colors * STRIPE_LIGHT, colors).astype(np.uint8)
+
+
 def _without_ceiling(upright: Float64, label: UInt8, label_set: LabelSet) -> NDArray[np.bool_]:
     inside = np.ones(len(upright), np.bool_)
     cut = ceiling_height(upright)
@@ -217,7 +244,7 @@ def _without_ceiling(upright: Float64, label: UInt8, label_set: LabelSet) -> NDA
     return inside if inside.any() else ~inside
 
 
-def _put_scale_bar(axes: Axes, scale: float) -> None:
+def _put_scale_bar(axes: Axes, scale: float, unit: str) -> None:
     """A bar of 1 m (or of the power of ten that fits) in the lower left corner; ``scale`` is in pixels a metre."""
     metres = 1.0
     while metres * scale > axes.get_xlim()[1] / 3:
@@ -227,4 +254,4 @@ def _put_scale_bar(axes: Axes, scale: float) -> None:
     y = MAP_HEIGHT - 18
     axes.plot((16, 16 + metres * scale), (y, y), color="white", linewidth=3, solid_capstyle="butt")
     behind = {"facecolor": "black", "alpha": 0.5, "linewidth": 0, "pad": 2}  # points may lie here
-    put_text(axes, (16, y - 15), f"{metres:g} m", bbox=behind)
+    put_text(axes, (16, y - 15), f"{metres:g} {unit}", bbox=behind)

@@ -68,3 +68,9 @@ class MapView:
     label: UInt8
     confidence: Float32
     measured: Bool | None = None
+
+
+def computed_fraction(surface: MapPoints | MapMesh) -> float:
+    """Fraction of the points, or vertices, whose depth no sensor measured; 0 of none, and where it is unknown."""
+    measured = surface.measured
+    return 0.0 if measured is None or not len(measured) else float(1 - measured.mean())

@@ -25,6 +25,7 @@ from semantic_mapper.mapping.fusion.allocation import blocks_in_band, frame_budg
 from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
 from semantic_mapper.mapping.fusion.frame_votes import check_depth, frame_votes, probability_table, trusted_depth
 from semantic_mapper.mapping.fusion.fuse import fuse_blocks, make_limits
+from semantic_mapper.mapping.map_scale import require_same_scale, scale_name
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView
 from semantic_mapper.mapping.storage.block_grid import BlockGrid
 from semantic_mapper.mapping.storage.block_index import pack_keys
@@ -56,7 +57,8 @@ class VoxelMap:
     several threads: calls wait for each other, and the long ones leave the GIL to others.
 
     ``frames`` counts what is fused; ``version`` grows with every change and never falls; ``epoch`` counts how often the
-    whole map was replaced by another one (``take_over``): blocks may be gone then.
+    whole map was replaced by another one (``take_over``): blocks may be gone then. ``scale_known`` says whether lengths
+    are metres; see ``note_scale``.
 
     Args:
         config: Voxel size, truncation, caps and limits.
@@ -75,6 +77,7 @@ class VoxelMap:
         self.version = 0
         self.epoch = 0
         self.last_stamp_ns = 0
+        self.scale_known = True
         self._grid = BlockGrid(
             config.voxel_size_m,
             len(label_set),
@@ -84,6 +87,13 @@ class VoxelMap:
             config.evidence,
         )
         self.truncation_m = config.truncation_voxels * config.voxel_size_m
+
+    def note_scale(self, known: bool) -> None:
+        """Say whether poses and depths of the frames to come are in metres; a map with some that are not stays unknown.
+
+        Frames do not say it: their stream does (``StreamInfo.scale_known``).
+        """
+        self.scale_known = self.scale_known and known
 
     @property
     def block_count(self) -> int:
@@ -243,6 +253,7 @@ class VoxelMap:
         with _KERNEL_LOCK:
             self._grid = other._grid
             self.frames, self.last_stamp_ns = other.frames, other.last_stamp_ns
+            self.note_scale(other.scale_known)
             self.version = self._grid.mark_all_changed(self.version + 1, BLOCKS_A_VERSION)
             self.epoch += 1
 
@@ -341,6 +352,7 @@ class VoxelMap:
                 label_set=self.label_set,
                 frames=self.frames,
                 last_stamp_ns=self.last_stamp_ns,
+                scale=scale_name(self.scale_known),
             )
             return MapSaving(self.locked, manifest)
 
@@ -372,6 +384,7 @@ class VoxelMap:
                     loaded._grid.mark_changed(blocks, saved.frames)
         loaded.frames = loaded.version = saved.frames
         loaded.last_stamp_ns = saved.last_stamp_ns
+        loaded.note_scale(saved.scale_known)
         return loaded
 
     def merged(self, other: VoxelMap, T_self_other: Float64) -> VoxelMap:
@@ -385,12 +398,15 @@ class VoxelMap:
             T_self_other: (4, 4) float64, where its frame lies in this map's.
 
         Raises:
-            MapError: the maps do not fit each other, or the new one would grow past ``max_blocks``.
+            MapError: the maps do not fit each other, only one is in metres, or the new one would grow past
+                ``max_blocks``.
             PoseError: the pose is not a rigid transform.
         """
         check_pose(T_self_other, "merge")
         check_fit(self.config, self.label_set, other.config, other.label_set)
+        require_same_scale(self.scale_known, other.scale_known, "merge")
         joined = VoxelMap(self.config, self.label_set)
+        joined.note_scale(self.scale_known)
         with _KERNEL_LOCK:
             joined.frames = joined.version = self.frames + other.frames
             joined.last_stamp_ns = max(self.last_stamp_ns, other.last_stamp_ns)
@@ -402,7 +418,8 @@ class VoxelMap:
     def _choose_changes(self, since: int, limit: int, min_weight: float) -> ChosenBlocks:
         _check_min_weight(min_weight)
         decision = (self.label_set, self.config.vote_discount, self.config.unknown_below, min_weight)
-        return choose_blocks(self._grid, (since, self.version, self.epoch), limit, decision)
+        chosen = choose_blocks(self._grid, (since, self.version, self.epoch), limit, decision)
+        return chosen._replace(scale_known=self.scale_known)
 
     def _read(
         self, grid: BlockGrid, voxels: Float64

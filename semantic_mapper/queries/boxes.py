@@ -56,8 +56,10 @@ def mesh_in_box(snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike) -> Ma
     kept, renumbered = np.unique(faces, return_inverse=True)
     vertices = corners[kept]
     places = vertices.astype(np.float64) / snapshot.voxel_size_m  # between observed voxels: each has one
-    label, confidence, rgb = snapshot.read(*nearest_corners(places, snapshot))
-    return MapMesh(vertices, renumbered.reshape(-1, 3).astype(np.int32), rgb, label, confidence)
+    corner = nearest_corners(places, snapshot)
+    label, confidence, rgb = snapshot.read(*corner)
+    faces = renumbered.reshape(-1, 3).astype(np.int32)
+    return MapMesh(vertices, faces, rgb, label, confidence, snapshot.measured(*corner))
 
 
 def _values(snapshot: MapSnapshot, rows: NDArray[np.int64]) -> BlockValues:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.mapping.map_scale import require_metres
 from semantic_mapper.mapping.storage.block_index import KEY_LIMIT
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.types import Float64
@@ -13,6 +14,16 @@ from semantic_mapper.types import Float64
 
 def check_points(points: ArrayLike, snapshot: MapSnapshot, name: str = "points") -> Float64:
     """Points (N, 3) in metres -> units of voxels.
+
+    Raises:
+        MapError: lengths of the map are not metres; or see ``voxel_coordinates``.
+    """
+    require_metres(snapshot.scale_known, name)
+    return voxel_coordinates(points, snapshot, name)
+
+
+def voxel_coordinates(points: ArrayLike, snapshot: MapSnapshot, name: str) -> Float64:
+    """Points (N, 3) in the map's own unit -> units of voxels.
 
     Raises:
         MapError: another shape, NaN or infinity, or farther than a map can reach.

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
 from semantic_mapper.labels import STUFF_NAMES
+from semantic_mapper.mapping.map_scale import require_metres
 from semantic_mapper.mapping.storage.block_index import unpack_keys
 from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_direction
@@ -37,6 +38,7 @@ class Instance:
         centroid: (3,) float64 mean of its surface points, world metres.
         box: Upright box round its surface points.
         voxels: (N, 3) int32 coordinates of its surface voxels; centres at ``voxels * voxel_size_m``.
+        measured: Fraction of them that a sensor measured; the depth of the others was computed.
     """
 
     id: int
@@ -46,6 +48,7 @@ class Instance:
     centroid: Float64
     box: OrientedBox
     voxels: NDArray[np.int32]
+    measured: float = 1.0
 
 
 class _Found(NamedTuple):
@@ -102,7 +105,12 @@ class InstanceTracker:
         self._lock = threading.Lock()
 
     def update(self, snapshot: MapSnapshot) -> tuple[Instance, ...]:
-        """The instances of the map as it is now, by ascending id."""
+        """The instances of the map as it is now, by ascending id.
+
+        Raises:
+            MapError: lengths of the map are not metres.
+        """
+        require_metres(snapshot.scale_known, "instances")
         wanted = np.zeros(256, np.bool_)
         wanted[list(snapshot.label_set.thing_ids(self._stuff))] = True
         with self._lock:
@@ -178,6 +186,7 @@ class InstanceTracker:
             xyz.mean(axis=0),
             upright_box(xyz, self._up),
             unpack_keys(surface.packed[row[part]]) * 8 + within,
+            float(snapshot.measured(snapshot.slots[row[part]].astype(np.int64), voxel.astype(np.int64)).mean()),
         )
 
 

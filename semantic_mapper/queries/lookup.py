@@ -13,7 +13,7 @@ from semantic_mapper.mapping.storage.block_index import BlockIndex
 from semantic_mapper.queries.checks import check_points, check_positive
 from semantic_mapper.queries.occupancy import read_states
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
-from semantic_mapper.types import Float32, Float64, Int64, UInt8
+from semantic_mapper.types import Bool, Float32, Float64, Int64, UInt8
 
 RADIUS_VOXELS = 2.5  # default: bridges half a voxel of rounding and a little noise, not the gap between two objects
 MAX_RADIUS_VOXELS = 25.0  # work grows with its cube; ``nearest`` searches farther
@@ -28,12 +28,14 @@ class PointAnswers:
         confidence: (N,) float32 probability of the likeliest class, 0 where none is near or nothing voted.
         distance_m: (N,) float32 to that surface, infinite where none is near.
         state: (N,) uint8 ``State`` of the voxel that the point itself lies in.
+        measured: (N,) bool, whether a sensor measured that surface; False where none is near; None = unknown.
     """
 
     label: UInt8
     confidence: Float32
     distance_m: Float32
     state: UInt8
+    measured: Bool | None = None
 
 
 def at(snapshot: MapSnapshot, points: ArrayLike, radius_m: float | None = None) -> PointAnswers:
@@ -60,7 +62,7 @@ def at(snapshot: MapSnapshot, points: ArrayLike, radius_m: float | None = None) 
     find_nearest_voxels(p, radius, snapshot.index, snapshot.voxels, slot, voxel, distance)
     label, confidence, _ = snapshot.read(slot, voxel)
     distance_m = (distance * snapshot.voxel_size_m).astype(np.float32)
-    return PointAnswers(label, confidence, distance_m, read_states(p, snapshot))
+    return PointAnswers(label, confidence, distance_m, read_states(p, snapshot), snapshot.measured(slot, voxel))
 
 
 @kernel

@@ -20,7 +20,7 @@ from semantic_mapper.mapping.storage.block_index import KEY_LIMIT, make_block_in
 from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
 from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
+from semantic_mapper.queries.snapshot import COMPUTED, MEASURED, BlockVoxels, MapSnapshot
 from semantic_mapper.queries.surface import NEAREST_STEPS
 from semantic_mapper.types import UInt8
 
@@ -110,6 +110,7 @@ class MapMirror:
                 versions=versions[order],
                 index=index,
                 voxels=pool,
+                scale_known=changes.scale_known,
             )
             if changes.epoch == self._snapshot.epoch or changes.version >= changes.newest:
                 self._snapshot = self._next
@@ -137,7 +138,8 @@ def _new_pool(blocks: int) -> BlockVoxels:
 def _write(pool: BlockVoxels, start: int, changes: BlockChanges, ignore_id: int) -> None:
     part = slice(start, start + len(changes.keys))
     pool.tsdf[part] = changes.tsdf
-    pool.weight[part] = changes.observed
+    computed = 0 if changes.computed is None else changes.computed
+    pool.weight[part] = np.where(changes.observed, np.where(computed, COMPUTED, MEASURED), 0)
     pool.label[part] = changes.label
     pool.confidence[part] = changes.confidence
     pool.rgb[part] = changes.rgb
@@ -158,6 +160,7 @@ def _check(changes: BlockChanges, label_set: LabelSet) -> NDArray[np.int64]:
     blocks = len(changes.keys)
     forms = {"keys": (np.int32, (3,)), "tsdf": (np.int8, (BLOCK_VOXELS,)), "label": (np.uint8, (BLOCK_VOXELS,))}
     forms |= {"confidence": (np.uint8, (BLOCK_VOXELS,)), "rgb": (np.uint8, (BLOCK_VOXELS, 3))}
+    forms |= {} if changes.computed is None else {"computed": (np.uint8, (BLOCK_VOXELS,))}
     for name, (dtype, tail) in forms.items():
         array: NDArray[np.generic] = getattr(changes, name)
         if array.dtype != dtype or array.shape != (blocks, *tail):

@@ -12,7 +12,7 @@ from semantic_mapper.kernels import kernel
 from semantic_mapper.mapping.storage.block_index import BlockIndex
 from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_point
-from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
+from semantic_mapper.queries.snapshot import MEASURED, BlockVoxels, MapSnapshot
 from semantic_mapper.types import Float64, Int32, Int64
 
 
@@ -24,11 +24,13 @@ class NearestSurface:
         xyz: (3,) float64 point of the surface, world metres.
         distance_m: From the point of the question.
         confidence: Probability of the class there.
+        measured: Whether a sensor measured it, or its depth was computed.
     """
 
     xyz: Float64
     distance_m: float
     confidence: float
+    measured: bool = True
 
 
 def nearest(
@@ -56,7 +58,8 @@ def nearest(
         return None
     confidence = float(snapshot.voxels.confidence.ravel()[place]) / CONFIDENCE_STEPS
     distance = float(np.sqrt(found[3]))
-    return NearestSurface(found[:3] * snapshot.voxel_size_m, distance * snapshot.voxel_size_m, confidence)
+    measured = bool(snapshot.voxels.weight.ravel()[place] == MEASURED)
+    return NearestSurface(found[:3] * snapshot.voxel_size_m, distance * snapshot.voxel_size_m, confidence, measured)
 
 
 def _search(snapshot: MapSnapshot, p: Float64, class_id: int, least: int) -> tuple[Float64, int]:

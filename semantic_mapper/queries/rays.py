@@ -12,9 +12,15 @@ from semantic_mapper.geometry import check_pose
 from semantic_mapper.kernels import kernel
 from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.storage.block_index import BlockIndex
-from semantic_mapper.queries.checks import as_numbers, check_direction, check_points, check_positive
+from semantic_mapper.queries.checks import (
+    as_numbers,
+    check_direction,
+    check_points,
+    check_positive,
+    voxel_coordinates,
+)
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, Int64, UInt8
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, Int64, UInt8
 
 MAX_RANGE_M = 100.0  # beyond, a ray through nothing takes long
 
@@ -28,12 +34,14 @@ class RayHits:
         label: (N,) uint8 class ids, the ignore id at misses and where unknown.
         confidence: (N,) float32 probability of the likeliest class, 0 at misses and where nothing voted.
         rgb: (N, 3) uint8.
+        measured: (N,) bool, whether a sensor measured that surface; False at misses; None = unknown.
     """
 
     distance_m: Float32
     label: UInt8
     confidence: Float32
     rgb: UInt8
+    measured: Bool | None = None
 
 
 def cast_rays(snapshot: MapSnapshot, origins: ArrayLike, directions: ArrayLike, max_m: float = 10.0) -> RayHits:
@@ -62,6 +70,8 @@ def ray_cast(
 ) -> MapView:
     """The map as a camera would see it up to z = ``max_m``; as ``VoxelMap.ray_cast``, with classes of single voxels.
 
+    A picture needs no metres: without a known scale, pose, depth and range are in the map's own unit.
+
     Args:
         snapshot: The map.
         T_world_camera: (4, 4) float64.
@@ -79,7 +89,7 @@ def ray_cast(
         ((u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, np.ones(v.shape)), -1
     )
     direction = d_camera.reshape(-1, 3) @ T_world_camera[:3, :3].T  # of unit z: distances along it are depths
-    origin = check_points(T_world_camera[None, :3, 3], snapshot, "T_world_camera")
+    origin = voxel_coordinates(T_world_camera[None, :3, 3], snapshot, "T_world_camera")
     hits = _cast(snapshot, np.broadcast_to(origin, direction.shape), direction, max_m)
     size = (height, width)
     return MapView(
@@ -87,6 +97,7 @@ def ray_cast(
         hits.rgb.reshape(*size, 3),
         hits.label.reshape(size),
         hits.confidence.reshape(size),
+        None if hits.measured is None else hits.measured.reshape(size),
     )
 
 
@@ -109,7 +120,7 @@ def _cast(snapshot: MapSnapshot, origin: Float64, direction: Float64, max_m: flo
         voxel,
     )
     label, confidence, rgb = snapshot.read(slot, voxel)
-    return RayHits(distance, label, confidence, rgb)
+    return RayHits(distance, label, confidence, rgb, snapshot.measured(slot, voxel))
 
 
 def nearest_corners(points: Float64, snapshot: MapSnapshot) -> tuple[Int64, Int64]:

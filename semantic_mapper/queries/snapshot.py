@@ -12,7 +12,9 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.storage.block_index import BlockIndex, unpack_keys
 from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS, TSDF_STEPS, BlockChanges, oldest_first
-from semantic_mapper.types import Float32, UInt8
+from semantic_mapper.types import Bool, Float32, UInt8
+
+COMPUTED, MEASURED = 1, 2  # ``BlockVoxels.weight``: depth was computed, or a sensor measured it
 
 
 class BlockVoxels(NamedTuple):
@@ -20,7 +22,7 @@ class BlockVoxels(NamedTuple):
 
     Args:
         tsdf: (S, 512) int8 signed distance over truncation, times 127.
-        weight: (S, 512) uint8, 1 where observed.
+        weight: (S, 512) uint8, 0 where not observed, ``COMPUTED`` where observed, ``MEASURED`` where by a sensor.
         label: (S, 512) uint8 class ids, the ignore id where nothing voted or the map is too unsure.
         confidence: (S, 512) uint8 probability of the likeliest class, times 255; 0 where nothing voted.
         rgb: (S, 512, 3) uint8.
@@ -50,6 +52,7 @@ class MapSnapshot:
         versions: (B,) int64 version that each block came with, at most ``version``.
         index: The same as a table for compiled code.
         voxels: Memory shared with other snapshots; only ``slots`` of it belong to this one.
+        scale_known: Whether lengths are metres.
     """
 
     version: int
@@ -63,6 +66,7 @@ class MapSnapshot:
     versions: NDArray[np.int64]
     index: BlockIndex
     voxels: BlockVoxels
+    scale_known: bool = True
 
     @property
     def block_count(self) -> int:
@@ -81,6 +85,10 @@ class MapSnapshot:
         steps = np.where(there, voxels.confidence[slot, voxel], 0)
         rgb = np.where(there[:, None], voxels.rgb[slot, voxel], 0).astype(np.uint8)
         return label, (steps / np.float32(CONFIDENCE_STEPS)).astype(np.float32), rgb
+
+    def measured(self, slot: NDArray[np.int64], voxel: NDArray[np.int64]) -> Bool:
+        """Whether a sensor measured voxels (N,); False where ``slot`` is -1."""
+        return (slot >= 0) & (self.voxels.weight[slot, voxel] == MEASURED)
 
     @property
     def voxels_per_step(self) -> float:
@@ -114,4 +122,6 @@ class MapSnapshot:
             voxels.label[slots],
             voxels.confidence[slots],
             voxels.rgb[slots],
+            self.scale_known,
+            (voxels.weight[slots] == COMPUTED).astype(np.uint8),
         )

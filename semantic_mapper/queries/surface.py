@@ -50,8 +50,10 @@ def surface_voxels(snapshot: MapSnapshot, rows: NDArray[np.int64] | None = None)
 def surface_points(snapshot: MapSnapshot, surface: SurfaceVoxels) -> MapPoints:
     """Surface points with class, confidence and colour, in the order of ``surface``."""
     slots = snapshot.slots[surface.row].astype(np.int64)
-    label, confidence, rgb = snapshot.read(slots, surface.voxel.astype(np.int64))
-    return MapPoints((surface.point * snapshot.voxel_size_m).astype(np.float32), rgb, label, confidence)
+    voxel = surface.voxel.astype(np.int64)
+    label, confidence, rgb = snapshot.read(slots, voxel)
+    xyz = (surface.point * snapshot.voxel_size_m).astype(np.float32)
+    return MapPoints(xyz, rgb, label, confidence, snapshot.measured(slots, voxel))
 
 
 @kernel

@@ -102,7 +102,11 @@ _RAISED = {
     e.__name__: e for e in (errors.MapError, errors.LabelError, errors.CodecError, errors.ShapeError, errors.PoseError)
 }
 _ZSTD_LEVEL = 1
-_NOT_SENT_AS_0 = ("unreadable",)  # came later: what does not need it is read by older releases, too
+_NOT_SENT_AS_0 = (
+    "unreadable",
+    "scale_unknown",
+    "computed",
+)  # came later: what does not need it is read by older releases, too
 
 MessageT = TypeVar("MessageT")
 AnswerT = TypeVar("AnswerT", bound=Answer)
@@ -242,9 +246,7 @@ def encode(message: Message, options: CodecOptions = _DEFAULTS, *, sender: str =
             header = to_plain(message, what)
             if isinstance(message, StreamInfo) and message.label_set is not None:
                 header["label_set"] = to_plain(LabelSetForm.of(message.label_set), what)
-            for name in _NOT_SENT_AS_0:
-                if header.get(name) == 0:
-                    del header[name]
+            _leave_out_zeros(header)
             return [topic_bytes(row.name, source), _pack(header, row.message, what)]
 
 
@@ -435,7 +437,7 @@ def decode_answer(kind: str, answer: type[AnswerT], parts: Parts) -> AnswerT:
     if actual != kind:
         raise CodecError(f"{what}: got one to {actual!r}")
     fields, specs = _open_query(parts, answer, what)
-    lengths = {s.shape[: f.free] for f, s in zip(array_forms(answer).values(), specs, strict=True)}
+    lengths = {s.shape[: f.free] for f, s in zip(array_forms(answer).values(), specs, strict=False)}
     if QUESTIONS[kind].aligned and len(lengths) > 1:
         raise CodecError(f"{what}: arrays of different lengths {sorted(lengths)}")
     return _decode_query(fields, specs, parts, answer, what)
@@ -636,6 +638,8 @@ def _encode_query(kind: str, message: Request | Answer, what: str) -> tuple[list
     specs: list[ArraySpec] = []
     buffers: list[bytes] = []
     for name, form in forms.items():
+        if form.optional and getattr(message, name) is None:
+            continue
         array = arrays[name] = np.ascontiguousarray(getattr(message, name), form.dtype)
         if array.nbytes > MAX_PART_BYTES:  # before it is copied; the rest is checked when all are there
             raise CodecError(f"{what}: {name} of {array.nbytes} bytes, at most {MAX_PART_BYTES} can be sent")
@@ -646,7 +650,14 @@ def _encode_query(kind: str, message: Request | Answer, what: str) -> tuple[list
     scalars = {name: getattr(message, name) for name in message.__struct_fields__ if name not in forms}
     header = to_plain({**scalars, "arrays": specs}, what)
     check_header({**header, **arrays}, type(message), what)
+    _leave_out_zeros(header)
     return [kind.encode(), pack_header(header, what), *buffers], tuple(specs)
+
+
+def _leave_out_zeros(header: dict[str, Any]) -> None:
+    for name in _NOT_SENT_AS_0:
+        if header.get(name) == 0:
+            del header[name]
 
 
 def _query_kind(parts: Parts) -> str:
@@ -672,7 +683,7 @@ def _decode_query(
     forms = array_forms(kind)
     buffers = check_buffers(parts, [spec.bytes for spec in specs], what)
     arrays: dict[str, NDArray[np.generic]] = {}
-    for (name, form), spec, buffer in zip(forms.items(), specs, buffers, strict=True):
+    for (name, form), spec, buffer in zip(list(forms.items())[: len(specs)], specs, buffers, strict=True):
         data = zstd_decompress(buffer, math.prod(spec.shape), f"{what}: {name}") if form.is_compressed else buffer
         array = np.frombuffer(data, form.dtype).reshape(spec.shape)
         arrays[name] = array.astype(np.dtype(form.dtype).newbyteorder("="))
@@ -686,9 +697,10 @@ def _check_rows(specs: tuple[ArraySpec, ...], what: str) -> None:
 
 
 def _check_specs(forms: Mapping[str, ArrayForm], specs: Sequence[ArraySpec], what: str) -> None:
-    if len(specs) != len(forms):
+    needed = sum(not form.optional for form in forms.values())
+    if not needed <= len(specs) <= len(forms):
         raise CodecError(f"{what}: has the arrays {list(forms)}, got {len(specs)}")
-    for (name, form), spec in zip(forms.items(), specs, strict=True):
+    for (name, form), spec in zip(forms.items(), specs, strict=False):  # those that are left out stand last
         if len(spec.shape) != form.free + len(form.tail) or spec.shape[form.free :] != form.tail:
             raise CodecError(f"{what}: {name} of shape {spec.shape}, expected {('N',) * form.free + form.tail}")
         size = math.prod(spec.shape) * np.dtype(form.dtype).itemsize

@@ -39,11 +39,14 @@ class ArrayForm:
         dtype: Of its elements; arrays of bytes travel compressed.
         tail: Its last axes.
         free: Number of axes before these, of any length.
+        optional: It may be left out (None): it came later, and what does not need it is read by older releases, too.
+            Such fields are the last arrays of their message.
     """
 
     dtype: DType
     tail: tuple[int, ...] = ()
     free: int = 1
+    optional: bool = False
 
     @property
     def is_compressed(self) -> bool:
@@ -55,6 +58,7 @@ Points = Annotated[Float64, ArrayForm("<f8", (3,))]
 Labels = Annotated[UInt8, ArrayForm("u1")]
 Floats = Annotated[Float32, ArrayForm("<f4")]
 Colors = Annotated[UInt8, ArrayForm("u1", (3,))]
+Computed = Annotated[UInt8 | None, ArrayForm("u1", optional=True)]  # 1 where no sensor measured it; None = nowhere
 
 
 @functools.cache
@@ -90,13 +94,15 @@ class Request(Wire, frozen=True, kw_only=True):
 class Answer(Wire, frozen=True, kw_only=True):
     """Of every answer: which state of which map it is about.
 
-    ``map_id`` is another one after the mapper was restarted; versions of two maps cannot be compared.
+    ``map_id`` is another one after the mapper was restarted; versions of two maps cannot be compared. With
+    ``scale_unknown`` its lengths are not metres; sent only then.
     """
 
     map_id: Word
     version: Count
     epoch: Count
     arrays: ArraySpecs = ()
+    scale_unknown: bool = False
 
 
 class InfoRequest(Request, frozen=True, kw_only=True):
@@ -126,6 +132,7 @@ class AtAnswer(Answer, frozen=True, kw_only=True):
     confidence: Floats
     distance_m: Floats
     state: Labels
+    computed: Computed = None
 
 
 class NearestRequest(Request, frozen=True, kw_only=True):
@@ -143,6 +150,7 @@ class NearestAnswer(Answer, frozen=True, kw_only=True):
     xyz: Point
     distance_m: Finite
     confidence: Finite
+    computed: bool = False  # no sensor measured it; sent only then
 
 
 class RaysRequest(Request, frozen=True, kw_only=True):
@@ -160,6 +168,7 @@ class RaysAnswer(Answer, frozen=True, kw_only=True):
     label: Labels
     confidence: Floats
     rgb: Colors
+    computed: Computed = None
 
 
 class BoxRequest(Request, frozen=True, kw_only=True):
@@ -176,6 +185,7 @@ class BoxAnswer(Answer, frozen=True, kw_only=True):
     rgb: Colors
     label: Labels
     confidence: Floats
+    computed: Computed = None
 
 
 class InstancesRequest(Request, frozen=True, kw_only=True):
@@ -188,12 +198,13 @@ class InstancesAnswer(Answer, frozen=True, kw_only=True):
     """All things, packed.
 
     ``numbers``: id, class id, voxels. ``places``: confidence, centroid, box: center, size, R_world_box row by row.
-    ``voxels``: of all things, one behind the other.
+    ``voxels``: of all things, one behind the other. ``measured``: fraction of each, None = 1.
     """
 
     numbers: Annotated[Int64, ArrayForm("<i8", (3,))]
     places: Annotated[Float64, ArrayForm("<f8", (19,))]
     voxels: Annotated[Int32, ArrayForm("<i4", (3,))]
+    measured: Annotated[Float64 | None, ArrayForm("<f8", optional=True)] = None
 
 
 class OccupancyRequest(Request, frozen=True, kw_only=True):
@@ -243,6 +254,7 @@ class ChangesAnswer(Answer, frozen=True, kw_only=True):
     label: Annotated[UInt8, ArrayForm("u1", (BLOCK_VOXELS,))]
     confidence: Annotated[UInt8, ArrayForm("u1", (BLOCK_VOXELS,))]
     rgb: Annotated[UInt8, ArrayForm("u1", (BLOCK_VOXELS, 3))]
+    computed: Annotated[UInt8 | None, ArrayForm("u1", (BLOCK_VOXELS,), optional=True)] = None
 
 
 class CorrectPosesRequest(Request, frozen=True, kw_only=True):

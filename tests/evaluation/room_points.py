@@ -17,6 +17,7 @@ class Points:
     rgb: np.ndarray
     label: np.ndarray
     confidence: np.ndarray
+    measured: np.ndarray | None = None
 
 
 def room_points(pitch: float = 0.04) -> Points:

@@ -45,6 +45,32 @@ def test_the_picture_shows_every_part() -> None:
     }
 
 
+def test_computed_surface_is_striped_and_the_legend_says_how_much() -> None:
+    points = room_points()
+    half = points.xyz[:, 0] < 2.0
+    figure = figure_of(draw_overview, [], replace(points, measured=~half), ROOMS, title="room", up=UP)
+    assert not misplaced_texts(figure)
+    said = {t.get_text() for t in figure.findobj(Text)}
+    assert f"striped = computed: {100 * half.mean():.0f} %" in said
+    assert "paler in the map = less sure" in said
+    plain = draw_overview([], replace(points, measured=np.ones_like(half)), ROOMS, title="room", up=UP)
+    assert np.array_equal(plain, draw_overview([], points, ROOMS, title="room", up=UP))
+    striped = draw_overview([], replace(points, measured=~half), ROOMS, title="room", up=UP)
+    above = [picture[120:700, 24:680].astype(int).mean(axis=-1) for picture in (plain, striped)]
+    darker = above[1] < above[0] - 20
+    left, right = np.array_split(darker, 2, axis=1)
+    assert 0.05 < max(left.mean(), right.mean()) < 0.5 and min(left.mean(), right.mean()) < 0.02
+    figure = figure_of(draw_overview, [], replace(points, measured=half & ~half), ROOMS, title="room", up=UP)
+    assert not misplaced_texts(figure)
+    assert "all of it computed, no sensor" in {t.get_text() for t in figure.findobj(Text)}
+
+
+def test_lengths_have_the_unit_that_they_are_in() -> None:
+    figure = figure_of(draw_overview, [strip()], room_points(), ROOMS, title="room", up=UP, unit="units")
+    said = " ".join(t.get_text() for t in figure.findobj(Text))
+    assert "1 units" in said and "1.0 units (red)" in said and "1 m" not in said
+
+
 def test_the_view_from_above_looks_under_the_ceiling() -> None:
     picture = draw_overview([], room_points(), ROOMS, title="room", up=UP)
     from_above = picture[100:, :660]

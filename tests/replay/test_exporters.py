@@ -16,7 +16,7 @@ import pytest
 import rerun.chunk
 from scipy.spatial.transform import Rotation
 
-from semantic_mapper.errors import ConfigError, ImportSourceError, LogError
+from semantic_mapper.errors import ConfigError, ImportSourceError, LogError, MapError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.export_log import export_recording
@@ -27,7 +27,7 @@ from semantic_mapper.replay.importers.tum import read_trajectory
 from semantic_mapper.replay.log.format import LogReader, LogWriter
 from semantic_mapper.transport.codec import encode_frame
 from semantic_mapper.transport.images import CodecOptions
-from semantic_mapper.transport.messages import StreamInfo
+from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from semantic_mapper.types import PosedFrame
 from tests.transport import samples
 
@@ -83,6 +83,23 @@ def test_a_sequence_folder_comes_back_bit_for_bit(log: Path, tmp_path: Path) -> 
         for (encoding, data), (e, parts) in zip(kept, other.frame_parts(), strict=True):
             if encoding != "raw":
                 assert (e.rgb_encoding, parts[2]) == (encoding, data)  # the very file
+
+
+def test_a_log_without_metres_stays_one(tmp_path: Path) -> None:
+    info = StreamInfo("film", {"cam": samples.INTRINSICS}, metadata={SCALE_KEY: SCALE_UNKNOWN})
+    with LogWriter(tmp_path / "log.mcap", info) as writer:
+        for seq in range(3):
+            writer.write_frame(turned(seq))
+    report = exported(tmp_path / "log.mcap", tmp_path / "sequence")
+    assert report.notices[-1] == "scale: unknown; lengths are not metres"
+    import_recording(tmp_path / "sequence", tmp_path / "back.mcap")
+    with LogReader(tmp_path / "back.mcap") as back:
+        assert not back.info.scale_known
+    exported(tmp_path / "log.mcap", tmp_path / "path.txt")
+    assert (tmp_path / "path.txt").read_text().startswith("# scale: unknown\n# timestamp")
+    with pytest.raises(MapError, match=r"TUM.*needs metres"):
+        exported(tmp_path / "log.mcap", tmp_path / "tum", "tum")
+    assert not (tmp_path / "tum").exists()
 
 
 def test_real_recording_goes_to_a_folder_and_back(redkitchen: Path, tmp_path: Path) -> None:

@@ -154,6 +154,13 @@ def test_summary_table_notes_and_picture_say_where_depth_comes_from(
     assert any(how in note for note in notes(summary)) == (measured < 6)
     ((strips, subtitle),) = drawn
     assert line in subtitle and (how in subtitle) == bool(line)
+    points = VoxelMap.load(tmp_path / "out/map.npz").points()
+    assert points.measured is not None
+    fraction = 1 - points.measured.mean() if len(points.xyz) else None
+    assert summary["map"]["computed"] == (None if fraction is None else pytest.approx(fraction, abs=1e-4))
+    told = any("were computed, not measured by a sensor" in note for note in notes(summary))
+    assert told == bool(fraction) and (cells.get("computed surface", "-") != "-") == (fraction is not None)
+    assert measured < 6 or fraction == 0
     last = measured < 6 and not computed
     assert [strip.depth_rendered for strip in strips] == [last and measured == 0, last]
 

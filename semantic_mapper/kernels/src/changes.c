@@ -17,6 +17,7 @@ typedef struct {
     I8 tsdf;                          /* (R, 512) */
     U8 label, confidence;             /* (R, 512) */
     U8 rgb;                           /* (R, 512, 3) */
+    U8 computed;                      /* (R, 512) 1 where no sensor measured what was observed */
 } CompactArguments;
 
 /* The TSDF in steps, never of another sign: the surface stays between the same voxels. */
@@ -34,6 +35,7 @@ KERNEL(compact_blocks, CompactArguments) {
         memset(a->label.data + first, ignore_id, BLOCK_VOXELS);
         memset(a->confidence.data + first, 0, BLOCK_VOXELS);
         memset(a->rgb.data + 3 * first, 0, 3 * BLOCK_VOXELS);
+        memset(a->computed.data + first, 0, BLOCK_VOXELS);
         PackedBlock block;
         int64_t begin = a->ends.data[n], end = a->ends.data[n + 1];
         if (!open_packed(a->data.data + begin, end - begin, width, &block)) continue;
@@ -44,6 +46,7 @@ KERNEL(compact_blocks, CompactArguments) {
                 observed = *block.weight >= a->min_weight;
                 if (observed) {
                     a->tsdf.data[at] = tsdf_steps(*block.tsdf);
+                    a->computed.data[at] = *block.weight < MEASURED;
                     for (int c = 0; c < 3; c++) a->rgb.data[3 * at + c] = to_byte(block.color[c]);
                 }
                 block.tsdf++, block.weight++, block.color += 3;

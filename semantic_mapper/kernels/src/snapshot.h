@@ -5,7 +5,7 @@
 
 typedef struct {
     I8 tsdf;       /* (S, 512) signed distance over truncation, times 127 */
-    U8 weight;     /* (S, 512) 1 where observed */
+    U8 weight;     /* (S, 512) 0 where not observed, 1 where computed, 2 where a sensor measured it */
     U8 label;      /* (S, 512) class ids */
     U8 confidence; /* (S, 512) probability times 255 */
     U8 rgb;        /* (S, 512, 3) */

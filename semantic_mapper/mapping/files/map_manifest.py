@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -11,6 +11,7 @@ from semantic_mapper.config import Config, NotNegative, VoxelMapConfig, convert_
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
+from semantic_mapper.transport.messages import SCALE_UNKNOWN
 
 FORMAT = "semantic-mapper voxel map"
 FORMAT_VERSION = 2
@@ -47,6 +48,7 @@ class MapManifest(Config, frozen=True, kw_only=True):
         blocks: Blocks of 8^3 voxels.
         bounds_m: Lowest and highest corner of all blocks, metres in the world; None of an empty map.
         chunks: In the order of the file.
+        scale: Whether lengths are metres; not written where they are, so older releases read such maps.
     """
 
     format: str = FORMAT
@@ -58,11 +60,20 @@ class MapManifest(Config, frozen=True, kw_only=True):
     blocks: NotNegative = 0
     bounds_m: tuple[Corner, Corner] | None = None
     chunks: tuple[MapChunk, ...] = ()
+    scale: Literal["metres", "unknown"] = "metres"
+
+    @property
+    def scale_known(self) -> bool:
+        """Whether lengths are metres."""
+        return self.scale != SCALE_UNKNOWN
 
 
 def encode_manifest(manifest: MapManifest) -> bytes:
     """JSON that is the same for the same map."""
-    return msgspec.json.format(msgspec.json.encode(manifest), indent=1)
+    plain: dict[str, Any] = msgspec.to_builtins(manifest)
+    if manifest.scale_known:
+        del plain["scale"]
+    return msgspec.json.format(msgspec.json.encode(plain), indent=1)
 
 
 def parse_manifest(content: bytes, where: str) -> MapManifest:

@@ -41,6 +41,8 @@ class BlockChanges:
         label: (B, 512) uint8 class ids, the ignore id where nothing voted, or the map is too unsure.
         confidence: (B, 512) uint8 probability of the likeliest class, times 255; 0 where nothing voted.
         rgb: (B, 512, 3) uint8.
+        scale_known: Whether lengths of the map are metres.
+        computed: (B, 512) uint8, 1 where no sensor measured what was observed; None = it did everywhere.
     """
 
     since: int
@@ -52,6 +54,8 @@ class BlockChanges:
     label: UInt8
     confidence: UInt8
     rgb: UInt8
+    scale_known: bool = True
+    computed: UInt8 | None = None
 
     @property
     def observed(self) -> NDArray[np.bool_]:
@@ -68,6 +72,7 @@ class ChosenBlocks(NamedTuple):
         label_set: For the ids.
         vote_discount, unknown_below: See ``readout``.
         min_weight: Voxels with fewer measurements count as not observed; > 0.
+        scale_known: Of the result.
     """
 
     packed: NDArray[np.int64]
@@ -79,6 +84,7 @@ class ChosenBlocks(NamedTuple):
     vote_discount: float
     unknown_below: float
     min_weight: float
+    scale_known: bool = True
 
 
 class CopiedChanges(NamedTuple):
@@ -175,10 +181,13 @@ def _room_for(chosen: ChosenBlocks) -> BlockChanges:
         np.empty(flat, np.uint8),
         np.empty(flat, np.uint8),
         np.empty((*flat, 3), np.uint8),
+        chosen.scale_known,
+        np.empty(flat, np.uint8),
     )
 
 
 def _compact_into(out: BlockChanges, rows: NDArray[np.int64], blocks: PackedBlocks, chosen: ChosenBlocks) -> None:
+    assert out.computed is not None
     labels = chosen.label_set
     ids = np.array((*labels.ids, labels.ignore_id), np.uint8)
     _compact_blocks(
@@ -194,6 +203,7 @@ def _compact_into(out: BlockChanges, rows: NDArray[np.int64], blocks: PackedBloc
         out.label,
         out.confidence,
         out.rgb,
+        out.computed,
     )
 
 
@@ -212,6 +222,7 @@ def _compact_blocks(
     label: UInt8,
     confidence: UInt8,
     rgb: UInt8,
+    computed: UInt8,
 ) -> None:
     """Write packed blocks (B,) to ``rows`` (B,) of the output.
 
@@ -221,6 +232,6 @@ def _compact_blocks(
         rows: (B,) of the output.
         ids: (L + 1,) of the classes, and the ignore id.
         vote_discount, unknown_below, min_weight: See ``ChosenBlocks``.
-        tsdf, label, confidence, rgb: As in ``BlockChanges``.
+        tsdf, label, confidence, rgb, computed: As in ``BlockChanges``.
     """
     ...

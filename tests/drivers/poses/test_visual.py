@@ -9,17 +9,20 @@ import pytest
 
 from semantic_mapper.config import PoseRefinerConfig
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate
+from semantic_mapper.drivers.mounts import Mount
 from semantic_mapper.drivers.poses.config import VisualPoses, begins_world
 from semantic_mapper.drivers.poses.sources import open_poses
 from semantic_mapper.drivers.poses.visual import VisualPoseSource
 from semantic_mapper.errors import CameraError, ConfigError
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error
+from semantic_mapper.nodes.camera.live import with_poses
 from semantic_mapper.scenes.config import PoseNoiseConfig
 from semantic_mapper.scenes.pose_noise import drifting_poses
+from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import Float64
 from tests.bundle.rooms import truth, walk, way_m
 
-from .images import as_image
+from .images import ListCamera, as_image
 
 CONFIG = VisualPoses(tracking=PoseRefinerConfig(corners=200))
 
@@ -80,6 +83,14 @@ def test_without_anything_the_poses_are_up_to_scale_and_the_status_says_so() -> 
     found, _ = poses_of(follow(source, 12))
     assert len(found) > 5 and source.scale == "unknown"
     assert source.warnings[0].startswith("scale: unknown")
+
+
+def test_a_camera_announces_that_its_poses_are_not_in_metres() -> None:
+    def announced(**config: object) -> StreamInfo:
+        return with_poses(ListCamera([]), {"kind": "visual", **config}, Mount(None, asked=False, camera="list")).info
+
+    assert not announced().scale_known and announced().source == "list"
+    assert announced(distance_m=2.0).scale_known and announced(scale={"kind": "board"}).scale_known
 
 
 def test_a_typed_distance_tells_the_scale() -> None:

@@ -15,6 +15,7 @@ from semantic_mapper.nodes.cli.query import Asked, Question, ask_file, ask_mappe
 from tests.nodes.mapper.test_query_service import a_folder, answering
 from tests.nodes.support import eventually, run, run_here
 from tests.queries.scene import BALL, BOX, HALF, RADIUS, whole_map
+from tests.queries.test_measured import part_measured
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +72,18 @@ def test_at_a_surface_that_the_map_is_unsure_of(map_file: Path, tmp_path: Path) 
     info, _ = ask(tmp_path / "map.npz", "info")
     assert info["without_class"] == info["surface_voxels"] > 1000
     assert ask(tmp_path / "map.npz", "nearest", "table", *point)[0]["found"] is False
+
+
+def test_answers_tell_computed_from_measured(tmp_path: Path) -> None:
+    part_measured().save(tmp_path / "map.npz")
+    assert 0.5 < ask(tmp_path / "map.npz", "info")[0]["computed"] < 1
+    for name, measured in (("table", False), ("cup", True)):
+        found, shown = ask(tmp_path / "map.npz", "nearest", name, *BALL)
+        assert found["measured"] is measured and "measured" in shown
+        assert ask(tmp_path / "map.npz", "at", *found["xyz"])[0]["measured"] is measured
+    found, shown = ask(tmp_path / "map.npz", "instances")
+    fraction = {thing["class"]: thing["measured"] for thing in found["instances"]}
+    assert fraction["cup"] > 0.9 and fraction["table"] < 0.1 and "measured" in shown
 
 
 def test_nearest(map_file: Path) -> None:

@@ -81,7 +81,13 @@ def config_file(folder: Path, history: int = 100) -> Path:
 
 @contextmanager
 def running_robot(
-    weights: Path, out: Path, history: int = 100, restarts: int = 0, notes: Path | None = None, **more: Any
+    weights: Path,
+    out: Path,
+    history: int = 100,
+    restarts: int = 0,
+    notes: Path | None = None,
+    metadata: dict[str, str] | None = None,
+    **more: Any,
 ) -> Iterator[Robot]:
     with a_folder() as folder:
         names = ("camera", "mapper", "query", "finetuner", "labels")
@@ -107,7 +113,8 @@ def running_robot(
 
                 ear = threading.Thread(target=listen)
                 ear.start()
-                camera.publish(encode(StreamInfo("test", {"rooms": INTRINSICS}, label_set=ROOMS, frame_hz=10.0)))
+                info = StreamInfo("test", {"rooms": INTRINSICS}, ROOMS, frame_hz=10.0, metadata=metadata or {})
+                camera.publish(encode(info))
                 try:
                     yield Robot(camera, endpoints["query"], out, status, mapper, stop, endpoints, weights)
                 finally:

@@ -33,6 +33,7 @@ from semantic_mapper.transport.query_sockets import MAX_REQUEST_BYTES
 from semantic_mapper.transport.security import Keys
 from tests.mapping.rendered_views import small_map
 from tests.queries.scene import BALL, LABELS, integrate, poses, whole, whole_map
+from tests.queries.test_measured import part_measured
 from tests.queries.test_mirror import assert_same
 
 PLACES = np.stack(np.meshgrid(np.linspace(-0.6, 1.2, 9), np.linspace(-0.5, 0.6, 9), [0.0, 0.2, 0.41]), -1).reshape(
@@ -143,6 +144,24 @@ def test_instances_keep_their_ids(client: MapClient) -> None:
             assert_equal_fields(a, b)
     for turn in range(6):  # more directions than trackers are kept
         assert [t.id for t in client.instances((turn, 1, 1))] == [t.id for t in local]
+
+
+def test_what_no_sensor_measured_is_told_over_the_socket(endpoint: str) -> None:
+    local = MapMirror.of(part_measured()).snapshot()
+    box = ((-0.5, -0.4, -0.1), (1.0, 0.5, 0.5))
+    with answering(endpoint, part_measured()), MapClient(endpoint, timeout_s=60) as client:
+        assert_equal_fields(client.at(PLACES), at(local, PLACES))
+        above = PLACES + np.array([0, 0, 1])
+        assert_equal_fields(client.cast_rays(above, BALL - above, 3), cast_rays(local, above, BALL - above, 3))
+        mine = client.points_in_box(*box)
+        assert_equal_fields(mine, points_in_box(local, *box))
+        assert mine.measured is not None and 0 < mine.measured.sum() < len(mine.measured)
+        for name, measured in (("table", False), ("cup", True)):
+            hit = client.nearest(name, BALL)
+            assert hit is not None and hit.measured is measured
+        for a, b in zip(client.instances(), InstanceTracker().update(local), strict=True):
+            assert_equal_fields(a, b)
+        assert_same(client.mirror().snapshot(), local)
 
 
 def test_a_bad_question_is_an_error_as_in_process(client: MapClient) -> None:

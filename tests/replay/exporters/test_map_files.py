@@ -15,8 +15,10 @@ from semantic_mapper.labels import make_label_set
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.exporters.map_files import AXES, ExportRequest, export_map, format_of, parse_up
+from semantic_mapper.replay.exporters.rerun_layout import COMPUTED_COLOR, MEASURED_COLOR
 from tests.mapping.files.test_formats import read_glb
 from tests.mapping.rendered_views import frame, plane_depth, small_map, sure
+from tests.queries.test_measured import part_measured
 
 LABELS = make_label_set("corner", ("table", "floor", "wall"), ids=(5, 9, 2))
 
@@ -112,6 +114,45 @@ def test_a_plan_says_what_was_found_out_for_it(corner: VoxelMap, tmp_path: Path)
     assert "cells of 0.05 m" in report.content and "m2 free" in report.content
     told = export_map(corner, tmp_path / "plan.yaml", ExportRequest("grid", up=AXES["z"], floor=0.0))
     assert told.found == ()
+
+
+def test_files_of_a_map_without_metres_say_so_and_a_plan_is_refused(corner: VoxelMap, tmp_path: Path) -> None:
+    corner.save(tmp_path / "map.npz")
+    unknown = VoxelMap.load(tmp_path / "map.npz")
+    unknown.note_scale(False)
+    for name, where in (
+        ("a.ply", "comment scale: unknown"),
+        ("a.obj", "# scale: unknown"),
+        ("a.glb", '"scale":"unknown"'),
+    ):
+        report = export_map(unknown, tmp_path / name, ExportRequest(format_of(tmp_path / name, None)))
+        assert report.found[-1] == "scale: unknown; lengths are not metres"
+        assert where.encode() in (tmp_path / name).read_bytes()
+        report = export_map(corner, tmp_path / name, ExportRequest(format_of(tmp_path / name, None)))
+        assert where.encode() not in (tmp_path / name).read_bytes()
+        assert not any("scale" in line for line in report.found)
+    export_map(unknown, tmp_path / "a.npz", ExportRequest("npz"))
+    with np.load(tmp_path / "a.npz") as read:
+        assert str(read["scale"]) == "unknown"
+    export_map(unknown, tmp_path / "a.rrd", ExportRequest("rrd"))
+    assert "/scale" in {chunk.entity_path for chunk in rerun.chunk.RrdReader(tmp_path / "a.rrd").stream()}
+    with pytest.raises(MapError, match=r"floor plan: needs metres.*--distance"):
+        export_map(unknown, tmp_path / "plan.yaml", ExportRequest("grid"))
+    assert not (tmp_path / "plan.pgm").exists()
+
+
+def test_rerun_has_a_colouring_by_what_was_measured(tmp_path: Path) -> None:
+    export_map(part_measured(), tmp_path / "map.rrd", ExportRequest("rrd"))
+    measured = part_measured().points().measured
+    assert measured is not None
+    for chunk in rerun.chunk.RrdReader(tmp_path / "map.rrd").stream():
+        if chunk.entity_path == "/world/map/measured":
+            colors = np.array(chunk.to_record_batch().column("Points3D:colors").to_pylist()[0], np.uint32)
+            break
+    else:
+        raise AssertionError("no such cloud")
+    for flag, color in ((True, MEASURED_COLOR), (False, COMPUTED_COLOR)):
+        assert set((colors[measured == flag] >> 8).tolist()) == {int.from_bytes(bytes(color), "big")}
 
 
 def test_rerun_gets_a_cloud_for_each_colouring(corner: VoxelMap, tmp_path: Path) -> None:

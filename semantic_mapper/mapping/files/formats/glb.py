@@ -5,7 +5,7 @@ rotation that takes the world's up to +y, so that viewers show the map upright a
 
 Vertex attributes: POSITION; COLOR_0 (linear light, as glTF asks, 16 bits so that sRGB's 8 survive); _LABEL (uint8
 class id, each padded to four bytes as glTF asks); _CONFIDENCE (float). ``extras.label_set`` of the mesh says what the
-ids mean.
+ids mean, ``extras.scale`` is "unknown" where lengths are not metres.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _VERTICES, _INDICES = 34962, 34963  # what a part of the numbers is for
 _MAX_BYTES = 2**32 - 1
 
 
-def write_glb(path: Path, mesh: MapMesh, label_set: LabelSet, up: Float64) -> None:
+def write_glb(path: Path, mesh: MapMesh, label_set: LabelSet, up: Float64, *, scale_known: bool = True) -> None:
     """Write a mesh as GLB.
 
     Args:
@@ -39,6 +39,7 @@ def write_glb(path: Path, mesh: MapMesh, label_set: LabelSet, up: Float64) -> No
         mesh: With at least one face: glTF has no empty meshes.
         label_set: For ``extras``.
         up: (3,) unit vector, up in the world.
+        scale_known: Whether lengths are metres; ``extras`` say where not.
 
     Raises:
         MapError: no faces, more than 4 GiB, or the file cannot be written.
@@ -75,6 +76,8 @@ def write_glb(path: Path, mesh: MapMesh, label_set: LabelSet, up: Float64) -> No
         accessors.append({"bufferView": n, "count": len(array), **accessor})
         start += array.nbytes
     document = _document(label_set, up, views, accessors, start)
+    if not scale_known:
+        document["meshes"][0]["extras"]["scale"] = "unknown"
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
     text += b" " * (-len(text) % 4)
     total = 12 + 8 + len(text) + 8 + start

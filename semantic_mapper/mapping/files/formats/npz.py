@@ -12,10 +12,10 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
 
 
-def write_npz(path: Path, points: MapPoints, label_set: LabelSet) -> None:
+def write_npz(path: Path, points: MapPoints, label_set: LabelSet, *, scale_known: bool = True) -> None:
     """Write xyz (N, 3) float32 metres in the world, rgb (N, 3) uint8, label (N,) uint8, confidence (N,) float32.
 
-    Where depth was computed somewhere: measured (N,) bool, False there.
+    Where depth was computed somewhere: measured (N,) bool, False there. Where lengths are not metres: scale, "unknown".
 
     And of the label set: label_ids (L,) uint8, label_names (L,) text, label_colors (L, 3) uint8, ignore_id, label_set
     (its name).
@@ -38,4 +38,5 @@ def write_npz(path: Path, points: MapPoints, label_set: LabelSet) -> None:
             label_set=np.str_(label_set.name),
             allow_pickle=False,
             **measured,
+            **({} if scale_known else {"scale": np.str_("unknown")}),
         )

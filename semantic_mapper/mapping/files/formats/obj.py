@@ -14,7 +14,9 @@ from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.types import UInt8
 
 
-def write_obj(path: Path, mesh: MapMesh, label_set: LabelSet, *, class_materials: bool) -> tuple[Path, Path]:
+def write_obj(
+    path: Path, mesh: MapMesh, label_set: LabelSet, *, class_materials: bool, scale_known: bool = True
+) -> tuple[Path, Path]:
     """Write ``path`` and, beside it, the material library of the same stem (.mtl).
 
     OBJ knows neither units nor an up axis: vertices are in the world frame, metres, to the micrometre. Each has its
@@ -24,6 +26,7 @@ def write_obj(path: Path, mesh: MapMesh, label_set: LabelSet, *, class_materials
     Args:
         class_materials: Whether materials have the colours of their classes; else they are white, so that programs
             which multiply both show the colours of the vertices.
+        scale_known: Whether lengths are metres; a comment says where not.
 
     Returns:
         The two files.
@@ -43,6 +46,7 @@ def write_obj(path: Path, mesh: MapMesh, label_set: LabelSet, *, class_materials
             file.write(f"newmtl {names[class_id]}\nKd {values}\nKa 0 0 0\nKs 0 0 0\nillum 1\n\n".encode())
     rows = np.concatenate((mesh.vertices.astype(np.float64), mesh.rgb / 255), axis=1).tolist()
     with atomic_write(path, raises=MapError) as file:
+        file.write(b"" if scale_known else b"# scale: unknown\n")
         file.write(f"mtllib {library.name}\n".encode())
         file.writelines(b"v %.6f %.6f %.6f %.4f %.4f %.4f\n" % tuple(row) for row in rows)
         for class_id in used.tolist():

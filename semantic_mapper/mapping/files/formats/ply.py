@@ -3,6 +3,8 @@
 ``comment label 3 chair`` says what the id 3 of the property ``label`` means. Names are ASCII, with Python's escapes for
 what is not, backslashes included: ``name.encode().decode("unicode_escape")`` gives the name back.
 
+``comment scale: unknown`` stands where lengths are not metres.
+
 Where depth was computed somewhere, there is a property ``measured``: 0 there, 1 where a sensor measured the surface.
 """
 
@@ -35,17 +37,17 @@ _FACE = np.dtype([("count", "u1"), ("corners", "<i4", (3,))])
 _TYPES = {"<f4": "float", "|u1": "uchar"}
 
 
-def write_ply(path: Path, points: MapPoints, label_set: LabelSet) -> None:
+def write_ply(path: Path, points: MapPoints, label_set: LabelSet, *, scale_known: bool = True) -> None:
     """Write points as x y z red green blue label confidence; a comment names each class.
 
     Raises:
         MapError: the file cannot be written.
     """
     vertices = _vertices(points.xyz, points)
-    _write(path, vertices, np.empty(0, _FACE), label_set, mesh=False)
+    _write(path, vertices, np.empty(0, _FACE), label_set, mesh=False, scale_known=scale_known)
 
 
-def write_ply_mesh(path: Path, mesh: MapMesh, label_set: LabelSet) -> None:
+def write_ply_mesh(path: Path, mesh: MapMesh, label_set: LabelSet, *, scale_known: bool = True) -> None:
     """Write a triangle mesh: vertices as ``write_ply`` has them, faces as lists ``vertex_indices``.
 
     Raises:
@@ -53,7 +55,7 @@ def write_ply_mesh(path: Path, mesh: MapMesh, label_set: LabelSet) -> None:
     """
     faces = np.empty(len(mesh.faces), _FACE)
     faces["count"], faces["corners"] = 3, mesh.faces
-    _write(path, _vertices(mesh.vertices, mesh), faces, label_set, mesh=True)
+    _write(path, _vertices(mesh.vertices, mesh), faces, label_set, mesh=True, scale_known=scale_known)
 
 
 def _vertices(xyz: Float32, surface: MapPoints | MapMesh) -> NDArray[np.void]:
@@ -70,8 +72,17 @@ def _vertices(xyz: Float32, surface: MapPoints | MapMesh) -> NDArray[np.void]:
     return vertices
 
 
-def _write(path: Path, vertices: NDArray[np.void], faces: NDArray[np.void], label_set: LabelSet, *, mesh: bool) -> None:
+def _write(
+    path: Path,
+    vertices: NDArray[np.void],
+    faces: NDArray[np.void],
+    label_set: LabelSet,
+    *,
+    mesh: bool,
+    scale_known: bool,
+) -> None:
     lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [] if scale_known else ["comment scale: unknown"]
     lines += [f"comment label {i} {_escaped(n)}" for i, n in zip(label_set.ids, label_set.names, strict=True)]
     lines.append(f"comment label {label_set.ignore_id} unknown")
     lines.append(f"element vertex {len(vertices)}")

@@ -1,0 +1,97 @@
+"""Whether a sensor measured the surface goes from the map's voxels into every answer."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import MapError
+from semantic_mapper.geometry import look_at
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.queries.boxes import mesh_in_box, points_in_box
+from semantic_mapper.queries.instances import InstanceTracker
+from semantic_mapper.queries.lookup import at
+from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.nearest import nearest
+from semantic_mapper.queries.rays import cast_rays, ray_cast
+from tests.mapping.rendered_views import INTRINSICS, frame, small_map
+from tests.queries.scene import BALL, BOX, CUP, HALF, LABELS, TABLE, poses, seen, whole
+
+LOW, HIGH = (-1.0, -1.0, -1.0), (2.0, 1.0, 1.0)
+TABLE_TOP = BOX + np.array([0.0, 0.0, HALF[2]])
+
+
+def part_measured() -> VoxelMap:
+    """The known scene by computed depth, and by a sensor that saw nothing but the cup."""
+    return _part_measured()
+
+
+@cache
+def _part_measured() -> VoxelMap:
+    voxel_map = small_map(LABELS)
+    for seq, pose in enumerate(poses(14)):
+        depth, label = seen(pose)
+        votes = np.full((*depth.shape, len(LABELS)), 0.1, np.float32)
+        np.put_along_axis(votes, np.maximum(LABELS.to_channels(label), 0)[..., None], 0.7, axis=2)
+        voxel_map.integrate(frame(pose, seq=seq), depth, votes, label > 0, measured=False)
+        cup = np.where(label == CUP, depth, 0).astype(np.float32)
+        voxel_map.integrate(frame(pose, seq=seq), cup, votes, label == CUP)
+    return voxel_map
+
+
+@pytest.fixture(scope="module", params=["map", "mirror"])
+def snapshot(request: pytest.FixtureRequest):
+    direct = MapMirror.of(part_measured())
+    if request.param == "map":
+        return direct.snapshot()
+    return MapMirror(0.02, 4.0, LABELS).apply(direct.snapshot().changes(0))
+
+
+def test_points_say_it_as_those_of_the_map_do(snapshot) -> None:
+    points = points_in_box(snapshot, LOW, HIGH)
+    assert points.measured is not None
+    assert points.measured[points.label == CUP].mean() > 0.9 and points.measured[points.label == TABLE].mean() < 0.1
+    of_map = part_measured().points()
+    assert of_map.measured is not None and abs(of_map.measured.mean() - points.measured.mean()) < 0.05
+
+
+def test_nearest_at_rays_meshes_and_pictures_say_it(snapshot) -> None:
+    cup, table = nearest(snapshot, "cup", BALL), nearest(snapshot, "table", TABLE_TOP)
+    assert cup is not None and cup.measured and table is not None and not table.measured
+    answers = at(snapshot, [cup.xyz, table.xyz, (0.0, 0.0, 9.0)])
+    assert answers.measured is not None and answers.measured.tolist() == [True, False, False]
+    above = np.array([BALL, TABLE_TOP, (9.0, 9.0, 0.0)])
+    hits = cast_rays(snapshot, above + np.array((0, 0, 1)), (0, 0, -1))
+    assert hits.measured is not None and hits.measured.tolist() == [True, False, False]
+    pose = look_at(BALL + np.array([0.0, -0.1, 1.0]), BALL, np.array([0.0, 0.0, 1.0]))
+    view = ray_cast(snapshot, pose, INTRINSICS)
+    assert view.measured is not None and view.measured[view.label == CUP].mean() > 0.8
+    assert not view.measured[view.depth_m == 0].any()
+
+
+def test_corners_of_a_mesh_say_it(snapshot) -> None:
+    mesh = mesh_in_box(snapshot, LOW, HIGH)
+    assert mesh.measured is not None and mesh.measured[mesh.label == CUP].mean() > 0.9
+    assert not mesh.measured[mesh.label == TABLE].all()
+
+
+def test_things_have_the_fraction_that_was_measured(snapshot) -> None:
+    fraction = {thing.class_name: thing.measured for thing in InstanceTracker().update(snapshot)}
+    assert fraction["cup"] > 0.9 and fraction["table"] < 0.1
+    assert all(thing.measured == 1 for thing in InstanceTracker().update(whole()))
+
+
+def test_a_mapper_that_does_not_say_it_counts_as_measured() -> None:
+    changes = dataclasses.replace(part_measured().changes(0), computed=None)
+    points = points_in_box(MapMirror(0.02, 4.0, LABELS).apply(changes), LOW, HIGH)
+    assert points.measured is not None and points.measured.all()
+
+
+def test_a_damaged_mask_is_refused() -> None:
+    changes = part_measured().changes(0)
+    bad = dataclasses.replace(changes, computed=np.zeros((len(changes.keys), 4), np.uint8))
+    with pytest.raises(MapError, match="computed must be uint8"):
+        MapMirror(0.02, 4.0, LABELS).apply(bad)
