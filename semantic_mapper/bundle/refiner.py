@@ -122,6 +122,39 @@ class PoseRefiner:
         self._frames = kept
         return changed
 
+    @property
+    def T_given_refined(self) -> Float64:
+        """(4, 4) from the world of refined poses to that of given ones, as the keyframes in reach say in the mean.
+
+        Refined poses fit each other, but drift; the mean of given ones does not, whatever the error of each.
+        """
+        keyframes = [] if self._map is None else self._map.keyframes
+        import os
+        n = int(os.environ.get('ANCHOR', '20'))
+        if n == 0:
+            return self._given @ invert_pose(self._refined)
+        keyframes = keyframes[-n:]
+        if not keyframes:
+            return np.eye(4)
+        refined = np.array([k.T_world_camera for k in keyframes])
+        given = np.array([k.prior for k in keyframes])
+        turn = np.eye(4)
+        turn[:3, :3] = np.einsum("kij,klj->il", given[:, :3, :3], refined[:, :3, :3])
+        turn = _rigid(turn)
+        turn[:3, 3] = given[:, :3, 3].mean(axis=0) - turn[:3, :3] @ refined[:, :3, 3].mean(axis=0)
+        return turn
+
+    @property
+    def scale_spread(self) -> float:
+        """One sigma of the scale of refined poses, a fraction: errors of given ones against the way between them."""
+        keyframes = [] if self._map is None else self._map.keyframes
+        if not keyframes:
+            return np.inf
+        places = np.array([k.prior[:3, 3] for k in keyframes])
+        sigma = float(np.mean([k.prior_sigmas[0] for k in keyframes]))
+        way = float(np.linalg.norm(places - places.mean(axis=0)))
+        return sigma / way if way > 0 else np.inf
+
     def close(self) -> None:
         """Wait for a bundle that is under way."""
         self._collect(wait=True)
