@@ -71,6 +71,7 @@ class PoseRefiner:
         self._given = np.eye(4)  # of the frame before
         self._refined = np.eye(4)
         self._count = 0
+        self._sigma_m = config.sigma_m  # of the last given pose
         self._worker = ThreadPoolExecutor(1, "pose bundle") if background else None
         self._pending: tuple[BundleProblem, list[Keyframe], list[int], Future[BundleResult]] | None = None
 
@@ -84,6 +85,7 @@ class PoseRefiner:
         self._collect(wait=False)
         image = prepare_image(frame.rgb, intrinsics.width, intrinsics.height)
         given = _rigid(frame.T_world_camera)
+        self._sigma_m = self._sigmas(frame)[0]
         guess = _rigid(self._refined @ invert_pose(self._given) @ given) if self._count else given
         expected = points.predict(self._tracker.tracks, self._refined, guess)
         tracks = self._tracker.advance(image, expected)
@@ -124,36 +126,30 @@ class PoseRefiner:
 
     @property
     def T_given_refined(self) -> Float64:
-        """(4, 4) from the world of refined poses to that of given ones, as the keyframes in reach say in the mean.
+        """(4, 4) from the world of refined poses to that of given ones: the rigid transform that most nearly takes the
+        keyframes in reach to where they were given.
 
-        Refined poses fit each other, but drift; the mean of given ones does not, whatever the error of each.
+        Refined poses fit each other but drift; given ones do not drift, whatever the error of each.
         """
-        keyframes = [] if self._map is None else self._map.keyframes
-        import os
-        n = int(os.environ.get('ANCHOR', '20'))
-        if n == 0:
-            return self._given @ invert_pose(self._refined)
-        keyframes = keyframes[-n:]
-        if not keyframes:
-            return np.eye(4)
-        refined = np.array([k.T_world_camera for k in keyframes])
-        given = np.array([k.prior for k in keyframes])
-        turn = np.eye(4)
-        turn[:3, :3] = np.einsum("kij,klj->il", given[:, :3, :3], refined[:, :3, :3])
-        turn = _rigid(turn)
-        turn[:3, 3] = given[:, :3, 3].mean(axis=0) - turn[:3, :3] @ refined[:, :3, 3].mean(axis=0)
-        return turn
+        refined, given = self._keyframe_poses()
+        return align_poses(refined, given) if len(given) else np.eye(4)
 
     @property
     def scale_spread(self) -> float:
-        """One sigma of the scale of refined poses, a fraction: errors of given ones against the way between them."""
-        keyframes = [] if self._map is None else self._map.keyframes
-        if not keyframes:
+        """One sigma of the scale of refined poses and of what is computed from them, a fraction: the error of given
+        poses against the extent of the path that they tell it from. Infinite before the camera has moved."""
+        _, given = self._keyframe_poses()
+        if not len(given):
             return np.inf
-        places = np.array([k.prior[:3, 3] for k in keyframes])
-        sigma = float(np.mean([k.prior_sigmas[0] for k in keyframes]))
-        way = float(np.linalg.norm(places - places.mean(axis=0)))
-        return sigma / way if way > 0 else np.inf
+        places = given[:, :3, 3]
+        extent = float(np.linalg.norm(places - places.mean(axis=0)))  # sqrt of the sum of squares over all keyframes
+        return self._sigma_m / extent if extent > 0 else np.inf
+
+    def _keyframe_poses(self) -> tuple[Float64, Float64]:
+        """Refined and given poses (K, 4, 4) of the keyframes in reach."""
+        keyframes = [] if self._map is None else self._map.keyframes
+        refined = np.array([k.T_world_camera for k in keyframes]).reshape(-1, 4, 4)
+        return refined, np.array([k.prior for k in keyframes]).reshape(-1, 4, 4)
 
     def close(self) -> None:
         """Wait for a bundle that is under way."""
@@ -241,6 +237,18 @@ class PoseRefiner:
             for T in (invert_pose(given) @ last.prior, invert_pose(refined) @ last.T_world_camera)
         ]
         return factor * float(np.median(errors[0])), factor * float(np.median(errors[1]))
+
+
+def align_poses(moved: Float64, to: Float64) -> Float64:
+    """Rigid T (4, 4) that takes poses (K, 4, 4) to others, T @ moved[k] = to[k], in the mean: of rotations, and of places.
+
+    Unlike a fit of places alone it is sure of the rotation where the camera has moved little, or straight on.
+    """
+    T = np.eye(4)
+    T[:3, :3] = np.einsum("kij,klj->il", to[:, :3, :3], moved[:, :3, :3])
+    T = _rigid(T)
+    T[:3, 3] = to[:, :3, 3].mean(axis=0) - T[:3, :3] @ moved[:, :3, 3].mean(axis=0)
+    return T
 
 
 def _rigid(T: Float64) -> Float64:
