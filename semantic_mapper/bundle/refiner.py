@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -18,6 +19,9 @@ from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 _LEAST_POINTS = 20  # that must agree on a frame's pose
 _MAX_SIGMAS = 4.0  # a pose that is further from the given one is not believed
 _ITERATIONS = 8
+_MISFIT_RAD = 2.2e-3  # by which corners are off, beyond what refining leaves: from here on given poses have all of their sigma
+_LEAST_SIGMAS = 0.25  # of it where they fit the pictures as well as refined ones
+_MISFIT_FRAMES = 30  # that this is judged by; from a third of them on
 _CORRECTED_M, _CORRECTED_RAD = 1e-3, 5e-4  # smaller changes are not told
 
 
@@ -72,6 +76,7 @@ class PoseRefiner:
         self._refined = np.eye(4)
         self._count = 0
         self._sigma_m = config.sigma_m  # of the last given pose
+        self._misfits: deque[float] = deque(maxlen=_MISFIT_FRAMES)  # of given poses beyond refined ones, radians
         self._worker = ThreadPoolExecutor(1, "pose bundle") if background else None
         self._pending: tuple[BundleProblem, list[Keyframe], list[int], Future[BundleResult]] | None = None
 
@@ -91,6 +96,8 @@ class PoseRefiner:
         tracks = self._tracker.advance(image, expected)
         pose, refined = self._locate(points, tracks, guess, self._sigmas(frame))
         given_px, error_px = self._disagreement(points, tracks, given, pose)
+        if np.isfinite(given_px - error_px):
+            self._misfits.append((given_px - error_px) / frame.intrinsics.fx)
         self._given, self._refined = given, pose
         self._count += 1
         if points.wants_keyframe(tracks):
@@ -172,7 +179,11 @@ class PoseRefiner:
         return self._map.intrinsics, self._map
 
     def _sigmas(self, frame: PosedFrame) -> tuple[float, float]:
-        return frame.pose_sigma or self._config.sigma_m, np.radians(self._config.sigma_deg)
+        """Metres and radians; less than the config says where given poses have fitted the pictures."""
+        fraction = 1.0
+        if 3 * len(self._misfits) >= _MISFIT_FRAMES:
+            fraction = float(np.clip(np.median(self._misfits) / _MISFIT_RAD, _LEAST_SIGMAS, 1.0))
+        return frame.pose_sigma or fraction * self._config.sigma_m, fraction * np.radians(self._config.sigma_deg)
 
     def _locate(
         self, points: KeyframeMap, tracks: Tracks, guess: Float64, sigmas: tuple[float, float]

@@ -91,7 +91,7 @@ class FrameDepth:
         return [self._anchored(f) for f in self._computer.push(frame, self._hint)]
 
     def _anchored(self, frame: PosedFrame) -> PosedFrame:
-        """A frame with computed depth where the given poses have it in the mean, its spread with that of their scale."""
+        """A frame with computed depth where the given poses have it in the mean; its spread has that of their scale."""
         _, refiner = self._refiners.get(frame.camera_id, (None, None))
         if refiner is None or frame.depth_sigma_m is None:
             return frame
