@@ -195,10 +195,11 @@ class VoxelMapConfig(Config, frozen=True):
 class PoseRefinerConfig(Config, frozen=True):
     """How given poses are made to fit the pictures; see ``bundle/refiner.py``."""
 
-    # One sigma of given poses against each other over metres of path, where frames tell none (``pose_sigma`` 0) ...
-    sigma_m: Positive = 0.05
-    sigma_deg: Positive = 5.0  # ... and of their rotations
-    window: Annotated[int, msgspec.Meta(ge=3, le=100)] = 10  # keyframes that are adjusted together
+    # One sigma of given poses where frames tell none (``pose_sigma`` 0); down to a quarter of it where they fit the
+    # pictures ...
+    sigma_m: Positive = 0.02
+    sigma_deg: Positive = 0.5  # ... and of their rotations
+    window: Annotated[int, msgspec.Meta(ge=3, le=100)] = 20  # keyframes that are adjusted together
     corners: Annotated[int, msgspec.Meta(ge=50, le=5000)] = 300  # followed in an image
     width: Annotated[int, msgspec.Meta(ge=64, le=4096)] = 640  # of the images that they are followed in, at most
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -18,6 +19,9 @@ from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 _LEAST_POINTS = 20  # that must agree on a frame's pose
 _MAX_SIGMAS = 4.0  # a pose that is further from the given one is not believed
 _ITERATIONS = 8
+_MISFIT_RAD = 2.2e-3  # by which corners are off, beyond what refining leaves: from here on given poses have all of their sigma
+_LEAST_SIGMAS = 0.25  # of it where they fit the pictures as well as refined ones
+_MISFIT_FRAMES = 30  # that this is judged by; from a third of them on
 _CORRECTED_M, _CORRECTED_RAD = 1e-3, 5e-4  # smaller changes are not told
 
 
@@ -71,6 +75,8 @@ class PoseRefiner:
         self._given = np.eye(4)  # of the frame before
         self._refined = np.eye(4)
         self._count = 0
+        self._sigma_m = config.sigma_m  # of the last given pose
+        self._misfits: deque[float] = deque(maxlen=_MISFIT_FRAMES)  # of given poses beyond refined ones, radians
         self._worker = ThreadPoolExecutor(1, "pose bundle") if background else None
         self._pending: tuple[BundleProblem, list[Keyframe], list[int], Future[BundleResult]] | None = None
 
@@ -84,11 +90,14 @@ class PoseRefiner:
         self._collect(wait=False)
         image = prepare_image(frame.rgb, intrinsics.width, intrinsics.height)
         given = _rigid(frame.T_world_camera)
+        self._sigma_m = self._sigmas(frame)[0]
         guess = _rigid(self._refined @ invert_pose(self._given) @ given) if self._count else given
         expected = points.predict(self._tracker.tracks, self._refined, guess)
         tracks = self._tracker.advance(image, expected)
         pose, refined = self._locate(points, tracks, guess, self._sigmas(frame))
         given_px, error_px = self._disagreement(points, tracks, given, pose)
+        if np.isfinite(given_px - error_px):
+            self._misfits.append((given_px - error_px) / frame.intrinsics.fx)
         self._given, self._refined = given, pose
         self._count += 1
         if points.wants_keyframe(tracks):
@@ -122,6 +131,33 @@ class PoseRefiner:
         self._frames = kept
         return changed
 
+    @property
+    def T_given_refined(self) -> Float64:
+        """(4, 4) from the world of refined poses to that of given ones: the rigid transform that most nearly takes the
+        keyframes in reach to where they were given.
+
+        Refined poses fit each other but drift; given ones do not drift, whatever the error of each.
+        """
+        refined, given = self._keyframe_poses()
+        return align_poses(refined, given) if len(given) else np.eye(4)
+
+    @property
+    def scale_spread(self) -> float:
+        """One sigma of the scale of refined poses and of what is computed from them, a fraction: the error of given
+        poses against the extent of the path that they tell it from. Infinite before the camera has moved."""
+        _, given = self._keyframe_poses()
+        if not len(given):
+            return np.inf
+        places = given[:, :3, 3]
+        extent = float(np.linalg.norm(places - places.mean(axis=0)))  # sqrt of the sum of squares over all keyframes
+        return self._sigma_m / extent if extent > 0 else np.inf
+
+    def _keyframe_poses(self) -> tuple[Float64, Float64]:
+        """Refined and given poses (K, 4, 4) of the keyframes in reach."""
+        keyframes = [] if self._map is None else self._map.keyframes
+        refined = np.array([k.T_world_camera for k in keyframes]).reshape(-1, 4, 4)
+        return refined, np.array([k.prior for k in keyframes]).reshape(-1, 4, 4)
+
     def close(self) -> None:
         """Wait for a bundle that is under way."""
         self._collect(wait=True)
@@ -143,7 +179,11 @@ class PoseRefiner:
         return self._map.intrinsics, self._map
 
     def _sigmas(self, frame: PosedFrame) -> tuple[float, float]:
-        return frame.pose_sigma or self._config.sigma_m, np.radians(self._config.sigma_deg)
+        """Metres and radians; less than the config says where given poses have fitted the pictures."""
+        fraction = 1.0
+        if 3 * len(self._misfits) >= _MISFIT_FRAMES:
+            fraction = float(np.clip(np.median(self._misfits) / _MISFIT_RAD, _LEAST_SIGMAS, 1.0))
+        return frame.pose_sigma or fraction * self._config.sigma_m, fraction * np.radians(self._config.sigma_deg)
 
     def _locate(
         self, points: KeyframeMap, tracks: Tracks, guess: Float64, sigmas: tuple[float, float]
@@ -208,6 +248,18 @@ class PoseRefiner:
             for T in (invert_pose(given) @ last.prior, invert_pose(refined) @ last.T_world_camera)
         ]
         return factor * float(np.median(errors[0])), factor * float(np.median(errors[1]))
+
+
+def align_poses(moved: Float64, to: Float64) -> Float64:
+    """Rigid T (4, 4) that takes poses (K, 4, 4) to others, T @ moved[k] = to[k], in the mean: of rotations, and of places.
+
+    Unlike a fit of places alone it is sure of the rotation where the camera has moved little, or straight on.
+    """
+    T = np.eye(4)
+    T[:3, :3] = np.einsum("kij,klj->il", to[:, :3, :3], moved[:, :3, :3])
+    T = _rigid(T)
+    T[:3, 3] = to[:, :3, 3].mean(axis=0) - T[:3, :3] @ moved[:, :3, 3].mean(axis=0)
+    return T
 
 
 def _rigid(T: Float64) -> Float64:

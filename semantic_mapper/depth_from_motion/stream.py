@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -73,6 +73,19 @@ class DepthFromMotion:
         self._remember(frame.camera_id, view)
         return self._ready()
 
+    def correct_poses(self, poses: Mapping[tuple[str, int], Float64]) -> None:
+        """Move earlier frames, by camera and stamp, to better poses T_world_camera (4, 4); unknown ones are left out.
+
+        Depth is computed from them there from now on, and frames that wait come out there.
+        """
+        for camera_id, camera in self._cameras.items():
+            for k, view in enumerate(camera.views):
+                if (better := poses.get((camera_id, view.stamp_ns))) is not None:
+                    camera.views[k] = replace(view, T_world_camera=better)
+                    for waiting in self._waiting:
+                        if waiting.view is view:
+                            waiting.view = camera.views[k]
+
     def finish(self) -> list[PosedFrame]:
         """The frames that still wait, oldest first."""
         done = [self._complete(waiting) for waiting in self._waiting]
@@ -93,6 +106,7 @@ class DepthFromMotion:
         frame, view = waiting.frame, waiting.view
         if view is None:
             return frame
+        frame = replace(frame, T_world_camera=view.T_world_camera)
         hint = waiting.hint(frame, view.intrinsics) if waiting.hint is not None else None
         estimate = self._estimate(frame.camera_id, view, hint)
         if estimate is None:

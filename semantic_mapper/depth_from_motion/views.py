@@ -31,7 +31,7 @@ class PreparedView:
     """A frame at the working size, with what matching looks up.
 
     Args:
-        seq: Of the frame.
+        stamp_ns: Of the frame.
         intrinsics: At the working size (h, w).
         intrinsics_double: Of the image at twice the size. Pixel k of ``census`` covers coordinates k to k + 1 of it.
         T_world_camera: (4, 4) float64.
@@ -40,7 +40,7 @@ class PreparedView:
         estimate: Depth that was found for the view earlier; None where there was none.
     """
 
-    seq: int
+    stamp_ns: int
     intrinsics: CameraIntrinsics
     intrinsics_double: CameraIntrinsics
     T_world_camera: Float64
@@ -67,7 +67,7 @@ def prepare_view(frame: PosedFrame, width: int) -> PreparedView:
     small = (intrinsics.width, intrinsics.height)
     shrinks = intrinsics.width < frame.intrinsics.width
     return PreparedView(
-        seq=frame.seq,
+        stamp_ns=frame.stamp_ns,
         intrinsics=intrinsics,
         intrinsics_double=double,
         T_world_camera=frame.T_world_camera,

@@ -88,11 +88,21 @@ class FrameDepth:
                 raise FrameError(f"frame seq={frame.seq} of camera '{frame.camera_id}': {why}")
             if self._config.refine_poses:
                 frame = self._refine(frame)
-        return self._computer.push(frame, self._hint)
+        return [self._anchored(f) for f in self._computer.push(frame, self._hint)]
+
+    def _anchored(self, frame: PosedFrame) -> PosedFrame:
+        """A frame with computed depth where the given poses have it in the mean; its spread has that of their scale."""
+        _, refiner = self._refiners.get(frame.camera_id, (None, None))
+        if refiner is None or frame.depth_sigma_m is None:
+            return frame
+        assert frame.depth_m is not None
+        sigma_m = np.hypot(frame.depth_sigma_m, np.float32(min(refiner.scale_spread, 1.0)) * frame.depth_m)
+        T_world_camera = refiner.T_given_refined @ frame.T_world_camera
+        return replace(frame, T_world_camera=T_world_camera, depth_sigma_m=sigma_m.astype(np.float32))
 
     def finish(self) -> list[PosedFrame]:
         """The frames that still wait, oldest first."""
-        return [] if self._computer is None else self._computer.finish()
+        return [] if self._computer is None else [self._anchored(f) for f in self._computer.finish()]
 
     def _refine(self, frame: PosedFrame) -> PosedFrame:
         """The frame at a pose that fits the pictures; a camera with another lens or size starts over."""
@@ -104,10 +114,11 @@ class FrameDepth:
             self._refiners.popitem(last=False)
         refined = refiner.push(frame)
         self.disagreement.add(refined.given_error_px, refined.error_px)
+        self._computer.correct_poses(refiner.corrections())
         return replace(frame, T_world_camera=refined.T_world_camera)
 
     def _hint(self, frame: PosedFrame, intrinsics: CameraIntrinsics) -> DepthEstimate:
-        depth_m, measured = self._cast_map(frame, intrinsics)
+        depth_m, measured = self._cast_map(self._anchored(frame), intrinsics)
         spread = np.where(measured, np.float32(MEASURED_SPREAD), np.float32(HINT_SPREAD))
         return DepthEstimate(depth_m, (spread * depth_m).astype(np.float32))
 

@@ -9,12 +9,12 @@ import pytest
 
 from semantic_mapper.bundle.adjustment import BundleProblem, adjust_bundle
 from semantic_mapper.bundle.keyframes import triangulate
-from semantic_mapper.bundle.refiner import PoseRefiner, RefinedPose
+from semantic_mapper.bundle.refiner import PoseRefiner, RefinedPose, align_poses
 from semantic_mapper.bundle.tracks import Tracker, follow, prepare_image
 from semantic_mapper.config import PoseRefinerConfig
 from semantic_mapper.errors import FrameError
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
-from semantic_mapper.geometry import invert_pose, project, transform, unproject
+from semantic_mapper.geometry import invert_pose, project, rotation_vector, transform, unproject
 from semantic_mapper.types import Float64, PosedFrame
 
 from .rooms import INTRINSICS, truth, walk
@@ -56,6 +56,41 @@ def test_disturbed_poses_come_nearer_to_the_truth_and_fit_the_pictures() -> None
     late = told[8:]
     assert np.mean([r.refined for r in late]) > 0.9
     assert np.median([r.error_px for r in late]) < 0.7 < np.median([r.given_error_px for r in late])
+
+
+def test_poses_are_aligned_by_the_mean_of_what_each_says() -> None:
+    turn = np.eye(4)
+    turn[:3, :3], turn[:3, 3] = cv2.Rodrigues(np.array([0.3, -1.2, 0.4]))[0], (0.5, -2.0, 1.0)
+    assert np.allclose(align_poses(truth(), turn @ truth()), turn, atol=1e-9)
+    off = align_poses(truth(), turn @ np.array([f.T_world_camera for f in disturbed()])) @ invert_pose(turn)
+    assert np.degrees(np.linalg.norm(rotation_vector(off))) < 0.25  # one pose: 0.9 in the mean
+    middle = (turn @ truth())[:, :3, 3].mean(axis=0)
+    assert np.linalg.norm(transform(off, middle[None])[0] - middle) < 0.01
+    assert np.allclose(align_poses(truth()[:1], turn @ truth()[:1]), turn, atol=1e-9)
+
+
+def test_refined_poses_stay_where_given_ones_are_in_the_mean() -> None:
+    refiner = PoseRefiner(CONFIG)
+    anchored = [refiner.T_given_refined @ refiner.push(frame).T_world_camera for frame in disturbed()]
+    given = np.array([f.T_world_camera for f in disturbed()])
+    assert absolute_trajectory_error(np.array(anchored), truth()).rmse_m < 0.03
+    before, after = relative_pose_error(given, truth()), relative_pose_error(np.array(anchored), truth())
+    assert after.rmse_m < 0.6 * before.rmse_m and after.rmse_deg < 0.6 * before.rmse_deg
+
+
+def test_the_scale_becomes_sure_as_the_camera_moves_and_given_poses_are_exact() -> None:
+    def spreads(sigma_m: float) -> list[float]:
+        refiner = PoseRefiner(PoseRefinerConfig(sigma_m=sigma_m, corners=200))
+        found = [refiner.scale_spread]
+        for frame in walk():
+            refiner.push(frame)
+            found.append(refiner.scale_spread)
+        return found
+
+    exact, rough = spreads(0.01), spreads(0.04)
+    assert np.isinf(exact[0]) and np.isinf(exact[1])
+    assert exact[-1] < 0.5 * exact[8] and exact[-1] < 0.05
+    assert rough[-1] == pytest.approx(4 * exact[-1], rel=0.2)
 
 
 def test_two_runs_give_the_same_poses_bit_for_bit() -> None:

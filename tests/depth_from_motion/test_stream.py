@@ -54,6 +54,26 @@ def test_a_delayed_frame_is_seen_from_both_sides_and_none_is_lost() -> None:
     assert relative_error(rest[0], frames[3][1]) < 0.02
 
 
+def test_depth_is_computed_from_corrected_poses_of_frames_before_and_frames_that_wait_come_out_there() -> None:
+    config = DepthFromMotionConfig(width=64, near_m=0.8, far_m=6.0, delay_frames=3)
+    frames = [frame for frame, _ in walk(6)]
+
+    def off(frame: PosedFrame) -> PosedFrame:
+        T = frame.T_world_camera.copy()
+        T[0, 3] *= 0.8  # ways too short: depth, too
+        return replace(frame, T_world_camera=T)
+
+    right, corrected, wrong = (DepthFromMotion(config) for _ in range(3))
+    for frame in frames:
+        right.push(frame), wrong.push(off(frame))
+        corrected.push(off(frame))
+        corrected.correct_poses({(f.camera_id, f.stamp_ns): f.T_world_camera for f in frames} | {("other", 1): np.eye(4)})
+    for a, b, c in zip(right.finish(), corrected.finish(), wrong.finish(), strict=True):
+        assert np.array_equal(a.T_world_camera, b.T_world_camera)
+        assert a.depth_m is not None and b.depth_m is not None and c.depth_m is not None
+        assert np.median(np.abs(b.depth_m / a.depth_m - 1)) < 0.01 < np.median(np.abs(c.depth_m / a.depth_m - 1))
+
+
 def test_the_first_frame_has_depth_where_it_waits_for_later_ones() -> None:
     stream = DepthFromMotion(DepthFromMotionConfig(width=64, near_m=0.8, far_m=6.0, delay_frames=3))
     frames = walk(4)
@@ -105,7 +125,7 @@ def test_memory_is_bounded_and_old_places_are_kept() -> None:
     for k in range(3 * MAX_VIEWS):
         stream.push(plane_frame(min(0.05 * k, 0.5), seq=k)[0])
     views = stream._cameras["cam"].views
-    assert len(views) == MAX_VIEWS and views[0].seq == 0
+    assert len(views) == MAX_VIEWS and views[0].stamp_ns == 100_000_000
 
 
 def test_frames_of_another_size_serve_as_sources() -> None:

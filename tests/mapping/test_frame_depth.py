@@ -88,6 +88,22 @@ def test_computed_depth_is_shown_to_an_encoder_that_has_learned_from_it_and_to_n
     assert not torch.equal(computed, features(replace(frame, depth_m=None) if learned else frame))
 
 
+def test_depth_counts_little_where_the_scale_of_the_poses_is_not_known() -> None:
+    def spread(sigma_m: float) -> list[float]:
+        pipeline = make_pipeline(depth={"poses": {"sigma_m": sigma_m}})
+        found = []
+        for frame in without_depth(walk(FINE)):
+            (ready,) = pipeline.prepare(frame)
+            assert ready.depth_m is not None and ready.depth_sigma_m is not None
+            known = ready.depth_m > 0
+            found.append(float(np.median(ready.depth_sigma_m[known] / ready.depth_m[known])) if known.any() else np.inf)
+        return found
+
+    sure, unsure = spread(0.005), spread(0.2)
+    assert sure[-1] < 0.1 < unsure[-1]
+    assert unsure[4] > 2 * unsure[-1], "a longer way tells more of the scale"
+
+
 def test_a_walk_with_depth_says_that_all_of_its_surface_is_measured() -> None:
     points = mapped(walk()).voxel_map.points()
     assert len(points.xyz) > 3000 and points.measured is not None and points.measured.all()
