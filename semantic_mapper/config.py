@@ -202,6 +202,9 @@ class PoseRefinerConfig(Config, frozen=True):
     window: Annotated[int, msgspec.Meta(ge=3, le=100)] = 20  # keyframes that are adjusted together
     corners: Annotated[int, msgspec.Meta(ge=50, le=5000)] = 300  # followed in an image
     width: Annotated[int, msgspec.Meta(ge=64, le=4096)] = 640  # of the images that they are followed in, at most
+    # Whether the bundle runs in a thread of its own, so that no frame waits for it; poses then depend on the time it takes.
+    # A mapper whose ``delivery`` is "newest" does so.
+    background: bool = False
 
 
 class HistoryConfig(Config, frozen=True):

@@ -143,6 +143,7 @@ def mapper_config(
     quality: Quality | None = None,
     depth: DepthSource | None = None,
     delay_frames: int = 0,
+    live: bool = False,
 ) -> MapperConfig:
     """The mapper's config from a TOML file (None = defaults) with what the command line says on top.
 
@@ -150,6 +151,7 @@ def mapper_config(
         path: The file.
         voxel_size_m, seed, quality, depth: What the command line says, None = nothing.
         delay_frames: How many later frames one may wait for whose depth is computed, where the file does not say it.
+        live: No frame waits for the bundle of poses.
 
     Raises:
         ConfigError: see ``load_config`` and ``check_quality``.
@@ -160,6 +162,9 @@ def mapper_config(
     if voxel_size_m is not None:
         voxel_map = msgspec.structs.replace(config.voxel_map, voxel_size_m=voxel_size_m)
         config = msgspec.structs.replace(config, voxel_map=voxel_map)
+    if live:
+        poses = msgspec.structs.replace(config.depth.poses, background=True)
+        config = msgspec.structs.replace(config, depth=msgspec.structs.replace(config.depth, poses=poses))
     if "delay_frames" not in data.get("depth", {}).get("from_motion", {}):
         from_motion = msgspec.structs.replace(config.depth.from_motion, delay_frames=delay_frames)
         config = msgspec.structs.replace(config, depth=msgspec.structs.replace(config.depth, from_motion=from_motion))

@@ -56,7 +56,11 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
     from semantic_mapper.transport.sockets import LosslessSubscriber, NewestSubscriber
 
     prepare_folder(Path(options.out))
-    config = mapper_config(Path(options.config) if options.config else None, options.voxel_size_m or None)
+    config = mapper_config(
+        Path(options.config) if options.config else None,
+        options.voxel_size_m or None,
+        live=options.delivery == "newest",
+    )
     bundle = Mapper.load(Path(options.weights) if options.weights else None, config)
     taken_up = take_up(context, Path(options.out) / MAP_NAME, bundle.pipeline.voxel_map)
     correction = LiveCorrection(bundle.pipeline)

@@ -58,15 +58,14 @@ class _Frame:
 
 
 class PoseRefiner:
-    """Refines the poses of one camera's frames, in the order of capture. Deterministic unless ``background``.
+    """Refines the poses of one camera's frames, in the order of capture. Deterministic, unless the bundle runs in the
+    background: its results then arrive with one of the next frames.
 
     Args:
         config: How.
-        background: Whether the bundle runs in a thread of its own, so that no frame waits for it; the results arrive
-            with one of the next frames.
     """
 
-    def __init__(self, config: PoseRefinerConfig, *, background: bool = False) -> None:
+    def __init__(self, config: PoseRefinerConfig) -> None:
         self._config = config
         self._tracker = Tracker(config.corners)
         self._map: KeyframeMap | None = None
@@ -77,7 +76,7 @@ class PoseRefiner:
         self._count = 0
         self._sigma_m = config.sigma_m  # of the last given pose
         self._misfits: deque[float] = deque(maxlen=_MISFIT_FRAMES)  # of given poses beyond refined ones, radians
-        self._worker = ThreadPoolExecutor(1, "pose bundle") if background else None
+        self._worker = ThreadPoolExecutor(1, "pose bundle") if config.background else None
         self._pending: tuple[BundleProblem, list[Keyframe], list[int], Future[BundleResult]] | None = None
 
     def push(self, frame: PosedFrame) -> RefinedPose:
