@@ -22,6 +22,8 @@ _ITERATIONS = 8
 _MISFIT_RAD = 2.2e-3  # by which corners are off, beyond what refining leaves: from here on given poses have all of their sigma
 _LEAST_SIGMAS = 0.25  # of it where they fit the pictures as well as refined ones
 _MISFIT_FRAMES = 30  # that this is judged by; from a third of them on
+_SCALE_SIGMA = 0.05  # of refined poses, before they are compared with given ones
+_CORRELATED = 5.0  # keyframes whose given poses share an error
 _CORRECTED_M, _CORRECTED_RAD = 1e-3, 5e-4  # smaller changes are not told
 
 
@@ -130,15 +132,19 @@ class PoseRefiner:
         self._frames = kept
         return changed
 
-    @property
-    def T_given_refined(self) -> Float64:
-        """(4, 4) from the world of refined poses to that of given ones: the rigid transform that most nearly takes the
-        keyframes in reach to where they were given.
+    def to_given(self, T_world_camera: Float64) -> tuple[Float64, float]:
+        """Where the given poses have a camera (4, 4) of the world of refined poses, as the keyframes in reach say in the
+        mean; and what depth that is computed from refined poses has to be multiplied by.
 
-        Refined poses fit each other but drift; given ones do not drift, whatever the error of each.
+        Refined poses fit each other but drift in place and scale; given ones do not drift, whatever the error of each.
         """
         refined, given = self._keyframe_poses()
-        return align_poses(refined, given) if len(given) else np.eye(4)
+        if not len(given):
+            return T_world_camera, 1.0
+        T, scale = align_poses(refined, given)
+        moved = T @ T_world_camera
+        moved[:3, 3] = scale * (moved[:3, 3] - T[:3, 3]) + T[:3, 3]
+        return moved, scale
 
     @property
     def scale_spread(self) -> float:
@@ -249,16 +255,27 @@ class PoseRefiner:
         return factor * float(np.median(errors[0])), factor * float(np.median(errors[1]))
 
 
-def align_poses(moved: Float64, to: Float64) -> Float64:
-    """Rigid T (4, 4) that takes poses (K, 4, 4) to others, T @ moved[k] = to[k], in the mean: of rotations, and of places.
+def align_poses(moved: Float64, to: Float64) -> tuple[Float64, float]:
+    """Rigid T (4, 4) and scale that take poses (K, 4, 4) to others in the mean: the rotation from theirs, the rest from
+    their places p, ``scale * T[:3, :3] @ p + T[:3, 3]``.
 
-    Unlike a fit of places alone it is sure of the rotation where the camera has moved little, or straight on.
+    Unlike a fit of places alone it is sure of the rotation where the camera has moved little, or straight on. The scale
+    is near 1 where the places do not tell it: they do not where what is left of their distances is large beside the path.
     """
     T = np.eye(4)
     T[:3, :3] = np.einsum("kij,klj->il", to[:, :3, :3], moved[:, :3, :3])
     T = _rigid(T)
-    T[:3, 3] = to[:, :3, 3].mean(axis=0) - T[:3, :3] @ moved[:, :3, 3].mean(axis=0)
-    return T
+    middle, to_middle = moved[:, :3, 3].mean(axis=0), to[:, :3, 3].mean(axis=0)
+    a, b = (moved[:, :3, 3] - middle) @ T[:3, :3].T, to[:, :3, 3] - to_middle
+    extent = float((a * a).sum())
+    scale = 1.0
+    if extent > 0:
+        fit = float((a * b).sum()) / extent
+        left = float(((b - fit * a) ** 2).mean(axis=0).sum())
+        variance = left * _CORRELATED / extent
+        scale += (fit - 1) * _SCALE_SIGMA**2 / (_SCALE_SIGMA**2 + variance)
+    T[:3, 3] = to_middle - scale * T[:3, :3] @ middle
+    return T, scale
 
 
 def _rigid(T: Float64) -> Float64:

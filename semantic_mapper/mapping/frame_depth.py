@@ -97,8 +97,14 @@ class FrameDepth:
             return frame
         assert frame.depth_m is not None
         sigma_m = np.hypot(frame.depth_sigma_m, np.float32(min(refiner.scale_spread, 1.0)) * frame.depth_m)
-        T_world_camera = refiner.T_given_refined @ frame.T_world_camera
-        return replace(frame, T_world_camera=T_world_camera, depth_sigma_m=sigma_m.astype(np.float32))
+        T_world_camera, scale = refiner.to_given(frame.T_world_camera)
+        factor = np.float32(scale)
+        return replace(
+            frame,
+            T_world_camera=T_world_camera,
+            depth_m=factor * frame.depth_m,
+            depth_sigma_m=factor * sigma_m.astype(np.float32),
+        )
 
     def finish(self) -> list[PosedFrame]:
         """The frames that still wait, oldest first."""

@@ -62,17 +62,29 @@ def test_disturbed_poses_come_nearer_to_the_truth_and_fit_the_pictures() -> None
 def test_poses_are_aligned_by_the_mean_of_what_each_says() -> None:
     turn = np.eye(4)
     turn[:3, :3], turn[:3, 3] = cv2.Rodrigues(np.array([0.3, -1.2, 0.4]))[0], (0.5, -2.0, 1.0)
-    assert np.allclose(align_poses(truth(), turn @ truth()), turn, atol=1e-9)
-    off = align_poses(truth(), turn @ np.array([f.T_world_camera for f in disturbed()])) @ invert_pose(turn)
+    T, scale = align_poses(truth(), turn @ truth())
+    assert np.allclose(T, turn, atol=1e-9) and scale == pytest.approx(1)
+    T, scale = align_poses(truth(), turn @ np.array([f.T_world_camera for f in disturbed()]))
+    assert scale == pytest.approx(1, abs=0.02)
+    off = T @ invert_pose(turn)
     assert np.degrees(np.linalg.norm(rotation_vector(off))) < 0.25  # one pose: 0.9 in the mean
     middle = (turn @ truth())[:, :3, 3].mean(axis=0)
-    assert np.linalg.norm(transform(off, middle[None])[0] - middle) < 0.01
-    assert np.allclose(align_poses(truth()[:1], turn @ truth()[:1]), turn, atol=1e-9)
+    assert np.linalg.norm(scale * T[:3, :3] @ truth()[:, :3, 3].mean(axis=0) + T[:3, 3] - middle) < 0.01
+    assert np.allclose(align_poses(truth()[:1], turn @ truth()[:1])[0], turn, atol=1e-9)
+
+
+def test_the_scale_follows_given_poses_as_far_as_these_tell_it(rng: np.random.Generator) -> None:
+    longer = truth()
+    longer[:, :3, 3] *= 1.06
+    assert align_poses(truth(), longer)[1] == pytest.approx(1.06, abs=1e-6)
+    rough = longer.copy()
+    rough[:, :3, 3] += rng.standard_normal((len(rough), 3))  # metres, beside a path of one and a half
+    assert abs(align_poses(truth(), rough)[1] - 1) < 0.03
 
 
 def test_refined_poses_stay_where_given_ones_are_in_the_mean() -> None:
     refiner = PoseRefiner(CONFIG)
-    anchored = [refiner.T_given_refined @ refiner.push(frame).T_world_camera for frame in disturbed()]
+    anchored = [refiner.to_given(refiner.push(frame).T_world_camera)[0] for frame in disturbed()]
     given = np.array([f.T_world_camera for f in disturbed()])
     assert absolute_trajectory_error(np.array(anchored), truth()).rmse_m < 0.03
     before, after = relative_pose_error(given, truth()), relative_pose_error(np.array(anchored), truth())
