@@ -195,7 +195,7 @@ class VoxelMapConfig(Config, frozen=True):
 class PoseRefinerConfig(Config, frozen=True):
     """How given poses are made to fit the pictures; see ``bundle/refiner.py``."""
 
-    # One sigma of given poses where frames tell none (``pose_sigma`` 0); down to a quarter of it where they fit the
+    # One sigma of given poses where frames tell none (``pose_sigma`` 0); down to a twentieth where they fit the
     # pictures ...
     sigma_m: Positive = 0.02
     sigma_deg: Positive = 0.5  # ... and of their rotations
