@@ -1,4 +1,4 @@
-"""Maps from computed depth in rooms whose poses are exact or off, with poses as given and refined, against the true surface.
+"""Maps from computed depth in rooms, with poses that are exact or off, as given and refined, against the true surface.
 
 Example: python -m benchmarks.computed_maps --rooms 4
 """
@@ -138,8 +138,9 @@ def main() -> None:
             config = convert_config(data, DepthConfig, "settings")
             rows = [measure(walk, config) for walk in walks]
             row = {key: float(np.mean([r[key] for r in rows])) for key in rows[0]}
-            figures[f"{name}; {'refined' if refined else 'as given'}"] = row
-            print(f"{name}; {'refined' if refined else 'as given'}: {json.dumps({k: round(v, 3) for k, v in row.items()})}")
+            what = f"{name}; {'refined' if refined else 'as given'}"
+            figures[what] = row
+            print(f"{what}: {json.dumps({k: round(v, 3) for k, v in row.items()})}")
     if given.json is not None:
         given.json.write_text(json.dumps(figures, indent=1), encoding="utf-8")
 

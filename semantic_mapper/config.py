@@ -202,9 +202,6 @@ class PoseRefinerConfig(Config, frozen=True):
     window: Annotated[int, msgspec.Meta(ge=3, le=100)] = 20  # keyframes that are adjusted together
     corners: Annotated[int, msgspec.Meta(ge=50, le=5000)] = 300  # followed in an image
     width: Annotated[int, msgspec.Meta(ge=64, le=4096)] = 640  # of the images that they are followed in, at most
-    # Whether the bundle runs in a thread of its own, so that no frame waits for it; poses then depend on the time it takes.
-    # A mapper whose ``delivery`` is "newest" does so.
-    background: bool = False
 
 
 class HistoryConfig(Config, frozen=True):
@@ -282,6 +279,9 @@ class DepthConfig(Config, frozen=True):
     # Whether given poses are made to fit the pictures where depth is computed from these; without, poses that are some
     # pixels off give depth that is far off.
     refine_poses: bool = True  # in images from 320 pixels of width on
+    # Whether bundles of poses run in a thread of their own, so that no frame waits for them; poses then depend on the
+    # time that they take. A mapper whose ``delivery`` is "newest" does so.
+    refine_in_background: bool = False
     poses: PoseRefinerConfig = PoseRefinerConfig()
 
 

@@ -126,7 +126,7 @@ class VisualPoses(Config, frozen=True):
     scale: dict[str, Any] = msgspec.field(default_factory=dict)
     distance_m: AtLeastZero = 0.0  # in its place: from the camera to what is in the middle of its first picture
     T_world_start: Matrix = IDENTITY  # T_world_camera of the first picture, where there is no ``scale``
-    tracking: PoseRefinerConfig = PoseRefinerConfig()
+    tracking: PoseRefinerConfig = PoseRefinerConfig(window=10)
     drift: Fraction = 0.03  # of the way: what ``sigma`` grows by
 
     def __post_init__(self) -> None:

@@ -163,8 +163,7 @@ def mapper_config(
         voxel_map = msgspec.structs.replace(config.voxel_map, voxel_size_m=voxel_size_m)
         config = msgspec.structs.replace(config, voxel_map=voxel_map)
     if live:
-        poses = msgspec.structs.replace(config.depth.poses, background=True)
-        config = msgspec.structs.replace(config, depth=msgspec.structs.replace(config.depth, poses=poses))
+        config = msgspec.structs.replace(config, depth=msgspec.structs.replace(config.depth, refine_in_background=True))
     if "delay_frames" not in data.get("depth", {}).get("from_motion", {}):
         from_motion = msgspec.structs.replace(config.depth.from_motion, delay_frames=delay_frames)
         config = msgspec.structs.replace(config, depth=msgspec.structs.replace(config.depth, from_motion=from_motion))

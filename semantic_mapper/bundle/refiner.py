@@ -19,7 +19,8 @@ from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 _LEAST_POINTS = 20  # that must agree on a frame's pose
 _MAX_SIGMAS = 4.0  # a pose that is further from the given one is not believed
 _ITERATIONS = 8
-_MISFIT_RAD = 2.2e-3  # by which corners are off, beyond what refining leaves: from here on given poses have all of their sigma
+# By which corners are off, beyond what refining leaves: from here on given poses have all of their sigma.
+_MISFIT_RAD = 2.2e-3
 _LEAST_SIGMAS = 0.05  # of it where they fit the pictures as well as refined ones
 _MISFIT_FRAMES = 30  # that this is judged by; from a third of them on
 _SCALE_SIGMA = 0.05  # of refined poses, before they are compared with given ones
@@ -60,14 +61,15 @@ class _Frame:
 
 
 class PoseRefiner:
-    """Refines the poses of one camera's frames, in the order of capture. Deterministic, unless the bundle runs in the
-    background: its results then arrive with one of the next frames.
+    """Refines the poses of one camera's frames, in the order of capture. Deterministic unless ``background``.
 
     Args:
         config: How.
+        background: Whether the bundle runs in a thread of its own, so that no frame waits for it; the results arrive
+            with one of the next frames.
     """
 
-    def __init__(self, config: PoseRefinerConfig) -> None:
+    def __init__(self, config: PoseRefinerConfig, *, background: bool = False) -> None:
         self._config = config
         self._tracker = Tracker(config.corners)
         self._map: KeyframeMap | None = None
@@ -78,7 +80,7 @@ class PoseRefiner:
         self._count = 0
         self._sigma_m = config.sigma_m  # of the last given pose
         self._misfits: deque[float] = deque(maxlen=_MISFIT_FRAMES)  # of given poses beyond refined ones, radians
-        self._worker = ThreadPoolExecutor(1, "pose bundle") if config.background else None
+        self._worker = ThreadPoolExecutor(1, "pose bundle") if background else None
         self._pending: tuple[BundleProblem, list[Keyframe], list[int], Future[BundleResult]] | None = None
 
     def push(self, frame: PosedFrame) -> RefinedPose:
@@ -133,8 +135,8 @@ class PoseRefiner:
         return changed
 
     def to_given(self, T_world_camera: Float64) -> tuple[Float64, float]:
-        """Where the given poses have a camera (4, 4) of the world of refined poses, as the keyframes in reach say in the
-        mean; and what depth that is computed from refined poses has to be multiplied by.
+        """Where the given poses have a camera (4, 4) of the world of refined poses, as the keyframes in reach say in
+        the mean; and what depth that is computed from refined poses has to be multiplied by.
 
         Refined poses fit each other but drift in place and scale; given ones do not drift, whatever the error of each.
         """
@@ -260,7 +262,7 @@ def align_poses(moved: Float64, to: Float64) -> tuple[Float64, float]:
     their places p, ``scale * T[:3, :3] @ p + T[:3, 3]``.
 
     Unlike a fit of places alone it is sure of the rotation where the camera has moved little, or straight on. The scale
-    is near 1 where the places do not tell it: they do not where what is left of their distances is large beside the path.
+    is near 1 where the places do not tell it: where what is left of their distances is large beside the path.
     """
     T = np.eye(4)
     T[:3, :3] = np.einsum("kij,klj->il", to[:, :3, :3], moved[:, :3, :3])

@@ -87,7 +87,7 @@ class FrameDepth:
             if why := self.pictures.look(frame):
                 raise FrameError(f"frame seq={frame.seq} of camera '{frame.camera_id}': {why}")
             if self._config.refine_poses:
-                frame = self._refine(frame)
+                frame = self._refine(frame, self._computer)
         return [self._anchored(f) for f in self._computer.push(frame, self._hint)]
 
     def _anchored(self, frame: PosedFrame) -> PosedFrame:
@@ -110,17 +110,17 @@ class FrameDepth:
         """The frames that still wait, oldest first."""
         return [] if self._computer is None else [self._anchored(f) for f in self._computer.finish()]
 
-    def _refine(self, frame: PosedFrame) -> PosedFrame:
+    def _refine(self, frame: PosedFrame, computer: DepthFromMotion) -> PosedFrame:
         """The frame at a pose that fits the pictures; a camera with another lens or size starts over."""
         intrinsics, refiner = self._refiners.pop(frame.camera_id, (None, None))
         if refiner is None or intrinsics != frame.intrinsics:
-            refiner = PoseRefiner(self._config.poses)
+            refiner = PoseRefiner(self._config.poses, background=self._config.refine_in_background)
         self._refiners[frame.camera_id] = frame.intrinsics, refiner
         if len(self._refiners) > MAX_CAMERAS:
             self._refiners.popitem(last=False)
         refined = refiner.push(frame)
         self.disagreement.add(refined.given_error_px, refined.error_px)
-        self._computer.correct_poses(refiner.corrections())
+        computer.correct_poses(refiner.corrections())
         return replace(frame, T_world_camera=refined.T_world_camera)
 
     def _hint(self, frame: PosedFrame, intrinsics: CameraIntrinsics) -> DepthEstimate:

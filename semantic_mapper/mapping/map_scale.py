@@ -6,8 +6,9 @@ say so. What needs no metres goes on: pictures, classes, counts.
 
 from __future__ import annotations
 
+from typing import Literal
+
 from semantic_mapper.errors import MapError
-from semantic_mapper.transport.messages import SCALE_UNKNOWN
 
 MEND = (
     "give a scale when the film or recording is imported (--distance, --square-mm, --camera-height or --scale), or to "
@@ -39,9 +40,9 @@ def require_same_scale(one_known: bool, other_known: bool, what: str) -> None:
         raise MapError(f"{what}: one map is in metres, the scale of the other is unknown; {MEND}")
 
 
-def scale_name(scale_known: bool) -> str:
-    """What files and answers say: ``metres`` or ``unknown``."""
-    return "metres" if scale_known else SCALE_UNKNOWN
+def scale_name(scale_known: bool) -> Literal["metres", "unknown"]:
+    """What files and answers say."""
+    return "metres" if scale_known else "unknown"
 
 
 def voxel_size_text(size: float, scale_known: bool) -> str:

@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import cache
 
 import cv2
-import msgspec
 import numpy as np
 import pytest
 
@@ -114,7 +113,7 @@ def test_two_runs_give_the_same_poses_bit_for_bit() -> None:
 
 
 def test_a_bundle_in_the_background_gives_poses_as_good() -> None:
-    refiner = PoseRefiner(msgspec.structs.replace(CONFIG, background=True))
+    refiner = PoseRefiner(CONFIG, background=True)
     final = {}
     for frame in disturbed():
         final[frame.camera_id, frame.stamp_ns] = refiner.push(frame).T_world_camera

@@ -67,7 +67,9 @@ def test_depth_is_computed_from_corrected_poses_of_frames_before_and_frames_that
     for frame in frames:
         right.push(frame), wrong.push(off(frame))
         corrected.push(off(frame))
-        corrected.correct_poses({(f.camera_id, f.stamp_ns): f.T_world_camera for f in frames} | {("other", 1): np.eye(4)})
+        corrected.correct_poses(
+            {(f.camera_id, f.stamp_ns): f.T_world_camera for f in frames} | {("other", 1): np.eye(4)}
+        )
     for a, b, c in zip(right.finish(), corrected.finish(), wrong.finish(), strict=True):
         assert np.array_equal(a.T_world_camera, b.T_world_camera)
         assert a.depth_m is not None and b.depth_m is not None and c.depth_m is not None
