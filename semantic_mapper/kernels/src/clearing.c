@@ -27,8 +27,8 @@ KERNEL(bound_depth_cells, BoundsArguments) {
                 for (int64_t y = 0; y < cell; y++)
                     for (int64_t x = 0; x < cell; x++) {
                         float z = a->depth.data[(v * cell + y) * width + u * cell + x];
-                        z = (z > 0) & (z <= far) ? z : 0.0f; /* NaN, too */
-                        least = min_f(least, z), most = max_f(most, z);
+                        bool measured = (z > 0) & (z <= far); /* not NaN */
+                        least = min_f(least, measured ? z : INFINITY), most = max_f(most, measured ? z : 0.0f);
                     }
                 nearest[u] = least;
                 farthest[u / COARSE] = max_f(farthest[u / COARSE], most);
@@ -137,21 +137,21 @@ typedef struct {
 KERNEL(clear_blocks, ClearArguments) {
     const GridBuffers *buffers = &a->buffers;
     float voxel_size = (float)a->limits.voxel_size, truncation = (float)a->limits.truncation;
-    float focal = (float)max_d(a->camera.fx, a->camera.fy);
+    float focal = (float)max_d(a->camera.fx, a->camera.fy), depth_max = (float)a->limits.depth_max;
     VoxelOffsets offsets;
     find_offsets(&a->camera, a->limits.voxel_size, &offsets);
     for (int64_t i = start; i < stop; i++) {
         int64_t block = a->indices.data[i];
         VoxelsInView found;
         int64_t count = look_up_voxels(buffers->keys.data + 3 * block, &offsets, &a->camera, a->limits.voxel_size,
-                                       &a->depth, -least_margin(voxel_size), (float)a->limits.depth_max, &found);
+                                       &a->depth, -least_margin(voxel_size), depth_max, &found);
         a->seen.data[i] = a->cleared.data[i] = 0;
         for (int64_t k = 0; k < count; k++) {
             int64_t at = block * BLOCK_VOXELS + found.voxel[k], pixel = found.pixel[k];
             float tsdf = buffers->tsdf.data[at];
             if (!(tsdf < LARGEST_CLEARED_TSDF && buffers->weight.data[at] > 0)) continue;
             float z = a->depth.data[pixel] - found.distance[k];
-            if (!sees_through(&a->bounds, focal, voxel_size, truncation, pixel, a->depth.shape[1], z, tsdf)) continue;
+            if (!sees_through(&a->bounds, &a->depth, depth_max, focal, voxel_size, truncation, pixel, z, tsdf)) continue;
             a->seen.data[i]++;
             if (a->changes) a->cleared.data[i] += weaken(buffers, at, a->rgb.data + 3 * pixel);
         }

@@ -123,7 +123,7 @@ static int64_t fuse_block(const FuseArguments *a, int64_t block, const VoxelOffs
         float *tsdf = buffers->tsdf.data + at, *color = buffers->color.data + 3 * at;
         float old = buffers->weight.data[at], new = weighted ? look * a->trust.data[pixel] : look;
         if (clears && found.distance[k] > margin && old > 0 && *tsdf < LARGEST_CLEARED_TSDF &&
-            sees_through(&a->bounds, focal, voxel_size, truncation, pixel, a->depth.shape[1],
+            sees_through(&a->bounds, &a->depth, (float)a->limits.depth_max, focal, voxel_size, truncation, pixel,
                          a->depth.data[pixel] - found.distance[k], *tsdf)) {
             cleared += weaken(buffers, at, a->rgb.data + 3 * pixel);
             continue;
