@@ -8,9 +8,9 @@
 #define LARGEST_CLEARED_TSDF 0.5f /* of a voxel that is part of a surface; of mapping/fusion/clearing.py, as the next */
 #define MARGIN_VOXELS 2.0f
 #define MARGIN_PER_M 0.015f
-#define ASIDE_VOXELS 1.25f
+#define ASIDE_VOXELS 1.4f
 #define ASIDE_PER_M 0.005f
-#define MOST_KEPT 2.0f
+#define MOST_KEPT 3.5f
 
 /* Least and greatest depths of a frame: DepthBounds of mapping/fusion/clearing.py. */
 typedef struct {

@@ -1,22 +1,22 @@
 """Free space clears: a surface that a frame sees through loses its weight, and is gone after a few such frames.
 
-A voxel is part of a surface where its TSDF is below ``LARGEST_TSDF``. A frame sees through it where all that it
-measures around the voxel lies well behind what the voxel says: around, as far as voxel and pose may be off
-(``ASIDE_VOXELS``, ``ASIDE_PER_M``), so that thin things, depth edges and grazing views are safe; well behind, by a
-margin that grows with the voxels and with the depth (``MARGIN_VOXELS``, ``MARGIN_PER_M``). Where a part of these
-surroundings was not measured, is farther than ``depth_max`` or outside of the image, nothing is cleared: black and
-shiny things return nothing. Nor does computed or rendered depth clear anything: where pictures are matched wrongly, it
-lies far behind, frame after frame.
+A voxel is part of a surface where its TSDF is below ``LARGEST_TSDF``. A frame sees through it where its pixel and the
+eight around it are measured, and all that is measured in its surroundings lies well behind what the voxel says. The
+surroundings reach as far as voxel and pose may be off (``ASIDE_VOXELS``, ``ASIDE_PER_M``), so that thin things, depth
+edges and grazing views are safe; the margin grows with the voxels and with the depth (``MARGIN_VOXELS``,
+``MARGIN_PER_M``). A pixel without depth, or farther than ``depth_max``, clears nothing: black and shiny things return
+nothing. Nor do the edges of the image, nor computed or rendered depth: where pictures are matched wrongly, that lies far
+behind, frame after frame.
 
 Each such frame halves the weight of the voxel, of which ``MOST_KEPT`` stays at most, and leaves its TSDF alone. Where
-less than one measurement is left, the voxel becomes free and loses its class votes. So a surface that n frames saw is
-cleared by 1 + log2(n) frames that see through it, by five at most. A frame that sees the surface adds its measurement
-as ever: what is seen through in every second frame or less, as by mirrors, stays.
+less than one measurement is left, the voxel becomes free and loses its class votes. So three frames that see through it
+clear any surface, and one is enough for what a single frame saw, or for what was only computed. A frame that sees the
+surface adds its measurement as ever: what is seen through in every second frame or less, as by mirrors, stays.
 
 The state of this is the weight alone: what pages, saves, restores and rebuilds the map need not know of it.
 
 The blocks of the truncation band are fused anyway, and cleared in that pass (``fusion.c``). This module finds and
-clears the others: those in view, in front of the depth, that hold a surface.
+clears the others: those in view, in front of the depth, that hold a surface. The numbers stand in ``see_through.h``, too.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from semantic_mapper.types import Float32, Int32, Int64, UInt8
 
 LARGEST_TSDF = 0.5
 MARGIN_VOXELS, MARGIN_PER_M = 2.0, 0.015
-ASIDE_VOXELS, ASIDE_PER_M = 1.25, 0.005  # a pose that is off by 5 mm and one of 0.2 degrees at 1.5 m, say
-MOST_KEPT = 8.0
+ASIDE_VOXELS, ASIDE_PER_M = 1.4, 0.005  # a pose that is off by 5 mm and one of 0.2 degrees at 1.5 m, say
+MOST_KEPT = 3.5
 
 
 def clear_in_view(

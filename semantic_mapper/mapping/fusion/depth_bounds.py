@@ -22,7 +22,7 @@ class DepthBounds(NamedTuple):
     """Least and greatest depth of parts of an image that is cut into square cells.
 
     Args:
-        nearest: (levels, h, w) float32 metres: of the 2^level x 2^level cells from each one on; 0 where a pixel has no
+        nearest: (levels, h, w) float32 metres: of the 2^level x 2^level cells from each one on; inf where there is no
             depth. No levels: nothing is to be cleared.
         farthest: (ceil(h / 8), ceil(w / 8)) float32 metres, of 8 x 8 cells; 0 where there is no depth.
         cell: Pixels a side.
