@@ -3,7 +3,8 @@
 
 #include "see_through.h"
 
-#define COARSE 8 /* cells a side of those of `farthest` */
+#define COARSE 8   /* cells a side of those of `farthest` */
+#define CHUNK 1024 /* pixels of a row at a time */
 
 typedef struct {
     F32 depth; /* (H, W) metres */
@@ -11,49 +12,57 @@ typedef struct {
     DepthBounds bounds; /* to fill */
 } BoundsArguments;
 
-/* The cells of rows start * COARSE to stop * COARSE: the first level of `nearest`, and `farthest`. */
-KERNEL(bound_depth_cells, BoundsArguments) {
-    int64_t width = a->depth.shape[1], cell = a->bounds.cell;
-    int64_t rows = a->bounds.nearest.shape[1], columns = a->bounds.nearest.shape[2];
-    int64_t coarse_columns = a->bounds.farthest.shape[1];
-    float far = (float)a->depth_max;
-    for (int64_t band = start; band < stop; band++) {
-        float *farthest = a->bounds.farthest.data + band * coarse_columns;
-        memset(farthest, 0, (size_t)coarse_columns * sizeof *farthest);
-        for (int64_t v = band * COARSE; v < min_i((band + 1) * COARSE, rows); v++) {
-            float *nearest = a->bounds.nearest.data + v * columns;
-            for (int64_t u = 0; u < columns; u++) {
-                float least = INFINITY, most = 0.0f;
-                for (int64_t y = 0; y < cell; y++)
-                    for (int64_t x = 0; x < cell; x++) {
-                        float z = a->depth.data[(v * cell + y) * width + u * cell + x];
-                        bool measured = (z > 0) & (z <= far); /* not NaN */
-                        least = min_f(least, measured ? z : INFINITY), most = max_f(most, measured ? z : 0.0f);
-                    }
-                nearest[u] = least;
-                farthest[u / COARSE] = max_f(farthest[u / COARSE], most);
-            }
+/* Least and greatest depth of each column of `count` pixels over `rows` rows. */
+static void bound_columns(const float *from, int64_t width, int64_t rows, int64_t count, float far, float *restrict least,
+                          float *restrict most) {
+    for (int64_t x = 0; x < count; x++) least[x] = INFINITY, most[x] = 0.0f;
+    for (int64_t y = 0; y < rows; y++) {
+        const float *restrict row = from + y * width;
+        for (int64_t x = 0; x < count; x++) {
+            float z = row[x];
+            bool measured = (z > 0) & (z <= far); /* not NaN */
+            least[x] = min_f(least[x], measured ? z : INFINITY);
+            most[x] = max_f(most[x], measured ? z : 0.0f);
         }
     }
-    return 0;
 }
 
-typedef struct {
-    DepthBounds bounds; /* the first level is there, the others to fill */
-} LevelsArguments;
+/* The first level of `nearest`, and `farthest`. */
+static void bound_cells(const BoundsArguments *a) {
+    int64_t width = a->depth.shape[1], cell = a->bounds.cell, coarse_columns = a->bounds.farthest.shape[1];
+    int64_t rows = a->bounds.nearest.shape[1], columns = a->bounds.nearest.shape[2], at_once = CHUNK / cell;
+    float least[CHUNK], most[CHUNK];
+    memset(a->bounds.farthest.data, 0, (size_t)(a->bounds.farthest.shape[0] * coarse_columns) * sizeof(float));
+    for (int64_t v = 0; v < rows; v++)
+        for (int64_t first = 0; first < columns; first += at_once) {
+            int64_t count = min_i(at_once, columns - first);
+            const float *from = a->depth.data + v * cell * width + first * cell;
+            bound_columns(from, width, cell, count * cell, (float)a->depth_max, least, most);
+            float *nearest = a->bounds.nearest.data + v * columns + first;
+            float *farthest = a->bounds.farthest.data + v / COARSE * coarse_columns;
+            for (int64_t u = 0; u < count; u++) {
+                float low = least[u * cell], high = most[u * cell];
+                for (int64_t x = 1; x < cell; x++)
+                    low = min_f(low, least[u * cell + x]), high = max_f(high, most[u * cell + x]);
+                int64_t coarse = (first + u) / COARSE;
+                nearest[u] = low, farthest[coarse] = max_f(farthest[coarse], high);
+            }
+        }
+}
 
-/* Each level from the one before. What reaches beyond the last row or column is left as it is: nobody looks at it. */
-KERNEL(bound_depth_levels, LevelsArguments) {
+/* Then each level from the one before. What reaches beyond the last row or column stays: nobody looks at it. */
+KERNEL(bound_depth, BoundsArguments) {
     int64_t levels = a->bounds.nearest.shape[0], rows = a->bounds.nearest.shape[1];
     int64_t columns = a->bounds.nearest.shape[2];
+    bound_cells(a);
     for (int64_t level = 1; level < levels; level++) {
         int64_t step = (int64_t)1 << (level - 1);
-        const float *restrict from = a->bounds.nearest.data + (level - 1) * rows * columns;
-        float *restrict to = a->bounds.nearest.data + level * rows * columns;
+        const float *from = a->bounds.nearest.data + (level - 1) * rows * columns;
         for (int64_t v = 0; v + 2 * step <= rows; v++) {
             const float *up = from + v * columns, *down = up + step * columns;
+            float *restrict to = a->bounds.nearest.data + (level * rows + v) * columns;
             for (int64_t u = 0; u + 2 * step <= columns; u++)
-                to[v * columns + u] = min_f(min_f(up[u], up[u + step]), min_f(down[u], down[u + step]));
+                to[u] = min_f(min_f(up[u], up[u + step]), min_f(down[u], down[u + step]));
         }
     }
     return 0;
@@ -111,7 +120,7 @@ typedef struct {
 } HoldsArguments;
 
 KERNEL(blocks_hold_surface, HoldsArguments) {
-    for (int64_t i = start; i < stop; i++) {
+    for (int64_t i = 0; i < a->indices.shape[0]; i++) {
         const float *tsdf = a->tsdf.data + (int64_t)a->indices.data[i] * BLOCK_VOXELS;
         const float *weight = a->weight.data + (int64_t)a->indices.data[i] * BLOCK_VOXELS;
         int32_t count = 0;

@@ -89,6 +89,8 @@ def _candidates(
     slots = np.flatnonzero(_before_depth(keys, considered, camera, limits, bounds)).astype(np.int32)
     slots = slots[grid.hold_surface(slots)]
     stored = grid.stored_surface
+    if not len(stored):
+        return np.sort(pack_keys(keys[slots]))
     stored = stored[~np.isin(stored, band)]
     before = _before_depth(unpack_keys(stored), np.ones(len(stored), np.uint8), camera, limits, bounds)
     return np.sort(np.concatenate((pack_keys(keys[slots]), stored[before > 0])))

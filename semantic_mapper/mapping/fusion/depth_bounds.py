@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from semantic_mapper.kernels import kernel, parallel_kernel
+from semantic_mapper.kernels import kernel
 from semantic_mapper.types import Float32
 
 _CELLS = 320  # along the longer side of an image, at least; a cell has 2 x 2 pixels at 640 x 480
@@ -42,18 +42,12 @@ def depth_bounds(depth: Float32, depth_max_m: float) -> DepthBounds:
     h, w = depth.shape[0] // cell, depth.shape[1] // cell
     nearest = np.empty((_LEVELS, h, w), np.float32)
     bounds = DepthBounds(nearest, np.empty((-(-h // _COARSE), -(-w // _COARSE)), np.float32), cell)
-    _bound_depth_cells(len(bounds.farthest), depth, depth_max_m, bounds)
-    _bound_depth_levels(bounds)
+    _bound_depth(depth, depth_max_m, bounds)
     return bounds
 
 
-@parallel_kernel()
-def _bound_depth_cells(count: int, depth: Float32, depth_max: float, bounds: DepthBounds) -> None:
-    """Fill ``farthest``, ``count`` rows, and the first level of ``nearest``."""
-    ...
-
-
+# Serial: it takes less time than to wake another thread would.
 @kernel
-def _bound_depth_levels(bounds: DepthBounds) -> None:
-    """Fill the other levels of ``nearest``."""
+def _bound_depth(depth: Float32, depth_max: float, bounds: DepthBounds) -> None:
+    """Fill the bounds."""
     ...

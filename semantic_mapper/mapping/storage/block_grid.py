@@ -213,7 +213,7 @@ class BlockGrid:
         """Whether the blocks (B,) in memory hold a surface: a voxel that ``fusion/clearing`` may have to clear."""
         unknown = blocks[self._surface[blocks] == _UNKNOWN]
         holds = np.empty(len(unknown), np.uint8)
-        blocks_hold_surface(len(unknown), unknown, self._buffers.tsdf, self._buffers.weight, holds)
+        blocks_hold_surface(unknown, self._buffers.tsdf, self._buffers.weight, holds)
         self._surface[unknown] = np.where(holds, _SURFACE, _NO_SURFACE)
         return self._surface[blocks] == _SURFACE
 

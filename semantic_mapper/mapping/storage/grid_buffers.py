@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.kernels import parallel_kernel
+from semantic_mapper.kernels import kernel
 from semantic_mapper.mapping.fusion.evidence import EVIDENCE_DTYPES
 from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
 from semantic_mapper.types import Float32, Int32, UInt8
@@ -68,12 +68,11 @@ def advised_mb(blocks: int, block_bytes: int) -> int:
     return math.ceil(SPARE_SHARE * blocks * block_bytes / 1e6)
 
 
-@parallel_kernel()
-def blocks_hold_surface(count: int, indices: Int32, tsdf: Float32, weight: Float32, holds: UInt8) -> None:
+@kernel
+def blocks_hold_surface(indices: Int32, tsdf: Float32, weight: Float32, holds: UInt8) -> None:
     """Which blocks have a voxel that may have to be cleared one day (``fusion/clearing``).
 
     Args:
-        count: B.
         indices: (B,) buffer indices.
         tsdf, weight: Of the grid.
         holds: (B,) to fill, 0 or 1.
