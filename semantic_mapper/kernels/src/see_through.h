@@ -10,6 +10,7 @@
 #define MARGIN_PER_M 0.015f
 #define ASIDE_VOXELS 1.4f
 #define ASIDE_PER_M 0.005f
+#define MOST_HOLES 2
 #define MOST_KEPT 3.5f
 
 /* Least and greatest depths of a frame: DepthBounds of mapping/fusion/clearing.py. */
@@ -21,16 +22,16 @@ typedef struct {
 
 static inline float least_margin(float voxel_size) { return MARGIN_VOXELS * voxel_size; }
 
-/* Whether a pixel, not at the edge of the image, and the eight around it were all measured. */
+/* Whether of a pixel, not at the edge of the image, and the eight around it at most MOST_HOLES were not measured. */
 static inline bool is_surely_measured(const F32 *depth, int64_t pixel, float depth_max) {
     int64_t width = depth->shape[1];
-    bool all = true;
+    int holes = 0;
     for (int64_t v = -1; v <= 1; v++)
         for (int64_t u = -1; u <= 1; u++) {
             float z = depth->data[pixel + v * width + u];
-            all &= (z > 0) & (z <= depth_max); /* not NaN */
+            holes += !((z > 0) & (z <= depth_max)); /* NaN, too */
         }
-    return all;
+    return holes <= MOST_HOLES;
 }
 
 /* Whether the thing that a voxel is part of, at depth `z` (metres) and seen at a pixel, cannot be there: all that is

@@ -1,8 +1,8 @@
 """Free space clears: a surface that a frame sees through loses its weight, and is gone after a few such frames.
 
-A voxel is part of a surface where its TSDF is below ``LARGEST_TSDF``. A frame sees through it where its pixel and the
-eight around it are measured, and all that is measured in its surroundings lies well behind what the voxel says. The
-surroundings reach as far as voxel and pose may be off (``ASIDE_VOXELS``, ``ASIDE_PER_M``), so that thin things, depth
+A voxel is part of a surface where its TSDF is below ``LARGEST_TSDF``. A frame sees through it where its pixel is
+measured, of the eight around at most ``MOST_HOLES`` are not (speckles are noise, the edge of a hole may be that of a
+thing), and all that is measured in its surroundings lies well behind what the voxel says. The surroundings reach as far as voxel and pose may be off (``ASIDE_VOXELS``, ``ASIDE_PER_M``), so that thin things, depth
 edges and grazing views are safe; the margin grows with the voxels and with the depth (``MARGIN_VOXELS``,
 ``MARGIN_PER_M``). A pixel without depth, or farther than ``depth_max``, clears nothing: black and shiny things return
 nothing. Nor do the edges of the image, nor computed or rendered depth: where pictures are matched wrongly, that lies far
@@ -36,6 +36,7 @@ from semantic_mapper.types import Float32, Int32, Int64, UInt8
 LARGEST_TSDF = 0.5
 MARGIN_VOXELS, MARGIN_PER_M = 2.0, 0.015
 ASIDE_VOXELS, ASIDE_PER_M = 1.4, 0.005  # a pose that is off by 5 mm and one of 0.2 degrees at 1.5 m, say
+MOST_HOLES = 2
 MOST_KEPT = 3.5
 
 

@@ -64,6 +64,7 @@ def test_the_constants_are_those_of_the_kernels() -> None:
         ("MARGIN_PER_M", clearing.MARGIN_PER_M),
         ("ASIDE_VOXELS", clearing.ASIDE_VOXELS),
         ("ASIDE_PER_M", clearing.ASIDE_PER_M),
+        ("MOST_HOLES", clearing.MOST_HOLES),
         ("MOST_KEPT", clearing.MOST_KEPT),
     ):
         assert float(defined[name].rstrip("f")) == value
