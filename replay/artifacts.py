@@ -214,6 +214,7 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "voxel_size_m": voxel_map.config.voxel_size_m,
             "blocks": voxel_map.block_count,
             "surface_points": len(points.xyz),
+            "cleared_voxels": voxel_map.cleared,
             "unknown": round(float((points.label == label_set.ignore_id).mean()), 4) if len(points.xyz) else None,
             "computed": round(computed_fraction(points), 4) if len(points.xyz) else None,
             "memory_mb": round(voxel_map.memory_bytes / 1e6, 1),

@@ -189,6 +189,7 @@ class VoxelMapConfig(Config, frozen=True):
     vote_discount: Fraction = 0.75  # rho: how much a repeated view of a voxel repeats what earlier views said
     vote_band_voxels: Positive = 2.0  # only voxels this near the surface take class votes
     unknown_below: Fraction = 0.0  # labels of less confidence read as unknown; 0 = none do
+    clear_free_space: bool = True  # forget surfaces that frames with sensor depth see through (``fusion/clearing.py``)
     evidence: Literal["float32", "int16"] = "float32"  # "int16": half the memory for classes (``evidence.py``)
 
 

@@ -311,6 +311,7 @@ class _Mapper:
         if self._session is not None:
             s = self._session
             counters |= {"published": s.published, "fused": s.fused, "refused": len(s.refusals), "dropped": s.dropped}
+            counters["cleared"] = s.pipeline.voxel_map.cleared
             counters["step_us"] = self._step_us
         silent = self._frames.silent_s
         ages = self._streams.ages_s | ({} if silent is None else {"frame": silent})

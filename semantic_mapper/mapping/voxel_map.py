@@ -22,6 +22,8 @@ from semantic_mapper.mapping.files.map_manifest import MapManifest
 from semantic_mapper.mapping.files.map_saving import MapSaving
 from semantic_mapper.mapping.files.merge import add_blocks, check_fit, copy_blocks, voxel_transform
 from semantic_mapper.mapping.fusion.allocation import blocks_in_band, frame_budget, make_camera
+from semantic_mapper.mapping.fusion.clearing import clear_in_view
+from semantic_mapper.mapping.fusion.depth_bounds import NO_BOUNDS, depth_bounds
 from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
 from semantic_mapper.mapping.fusion.frame_votes import check_depth, frame_votes, probability_table, trusted_depth
 from semantic_mapper.mapping.fusion.fuse import fuse_blocks, make_limits
@@ -58,7 +60,8 @@ class VoxelMap:
 
     ``frames`` counts what is fused; ``version`` grows with every change and never falls; ``epoch`` counts how often the
     whole map was replaced by another one (``take_over``): blocks may be gone then. ``scale_known`` says whether lengths
-    are metres; see ``note_scale``.
+    are metres; see ``note_scale``. ``cleared`` counts the voxels of surfaces that frames saw through, and that were
+    forgotten (``clear_free_space``), in this process.
 
     Args:
         config: Voxel size, truncation, caps and limits.
@@ -78,6 +81,7 @@ class VoxelMap:
         self.epoch = 0
         self.last_stamp_ns = 0
         self.scale_known = True
+        self.cleared = 0
         self._grid = BlockGrid(
             config.voxel_size_m,
             len(label_set),
@@ -201,8 +205,10 @@ class VoxelMap:
                 frame_budget(self.config.max_blocks),
             )
             rgb = np.ascontiguousarray(frame.rgb)
+            clears = measured and self.config.clear_free_space
+            bounds = depth_bounds(depth, self.config.depth_max_m) if clears else NO_BOUNDS
             for blocks in self.changing(packed):
-                fuse_blocks(
+                self.cleared += fuse_blocks(
                     blocks,
                     self._grid.buffers(),
                     camera,
@@ -213,6 +219,11 @@ class VoxelMap:
                     votes,
                     self.frames,
                     measured=measured,
+                    bounds=bounds,
+                )
+            if clears:
+                self.cleared += clear_in_view(
+                    self._grid, packed, camera, self._limits, depth, rgb, bounds, self.version
                 )
             self.frames += 1
             self.last_stamp_ns = frame.stamp_ns

@@ -1,7 +1,7 @@
 /* Fusion of one frame: TSDF, color and class evidence in one pass; see mapping/fusion/fuse.py. */
 #include <string.h>
 
-#include "voxel_lookup.h"
+#include "see_through.h"
 
 #define PROBABILITY_FLOOR 1e-4f /* of mapping/fusion/evidence.py */
 #define FULL_TRUST_RANGE_M 2.0f /* of mapping/fusion/fuse.py, as the next */
@@ -98,15 +98,21 @@ typedef struct {
     F32 dither; /* see evidence.h */
     int64_t moment;
     double look, weight_cap; /* what one depth weighs, and what all of its kind together may */
+    DepthBounds bounds;      /* of the depth; no levels: nothing is cleared */
+    I64 cleared;             /* (B,) to fill: voxels of a surface that were cleared */
 } FuseArguments;
 
-static void fuse_block(const FuseArguments *a, int64_t block, const VoxelOffsets *offsets) {
+/* Returns how many voxels were cleared. */
+static int64_t fuse_block(const FuseArguments *a, int64_t block, const VoxelOffsets *offsets) {
     const GridBuffers *buffers = &a->buffers;
     const int32_t *key = buffers->keys.data + 3 * block;
     float truncation = (float)a->limits.truncation, band = (float)a->limits.vote_band;
     float cap = (float)a->limits.max_weight;
     float look = (float)a->look, weight_cap = (float)a->weight_cap;
-    bool weighted = a->trust.shape[0] > 0;
+    float focal = (float)max_d(a->camera.fx, a->camera.fy), voxel_size = (float)a->limits.voxel_size;
+    float margin = least_margin(voxel_size);
+    bool weighted = a->trust.shape[0] > 0, clears = a->bounds.nearest.shape[0] > 0;
+    int64_t cleared = 0;
     int64_t classes = a->votes.log_p.shape[1];
     uint64_t seed = dither_seed(key, a->moment);
     VoxelsInView found;
@@ -116,6 +122,12 @@ static void fuse_block(const FuseArguments *a, int64_t block, const VoxelOffsets
         int64_t voxel = found.voxel[k], pixel = found.pixel[k], at = block * BLOCK_VOXELS + voxel;
         float *tsdf = buffers->tsdf.data + at, *color = buffers->color.data + 3 * at;
         float old = buffers->weight.data[at], new = weighted ? look * a->trust.data[pixel] : look;
+        if (clears && found.distance[k] > margin && old > 0 && *tsdf < LARGEST_CLEARED_TSDF &&
+            sees_through(&a->bounds, &a->depth, (float)a->limits.depth_max, focal, voxel_size, truncation, pixel,
+                         a->depth.data[pixel] - found.distance[k], *tsdf)) {
+            cleared += weaken(buffers, at, a->rgb.data + 3 * pixel);
+            continue;
+        }
         if (look == MEASURED || old < MEASURED) { /* what is computed leaves alone what was measured */
             float fraction = 1.0f / (old + new);
             *tsdf = (old * *tsdf + new * min_f(found.distance[k] / truncation, 1.0f)) * fraction;
@@ -127,11 +139,12 @@ static void fuse_block(const FuseArguments *a, int64_t block, const VoxelOffsets
             add_vote(buffers, at, a->votes.log_p.data + a->votes.rows.data[pixel] * classes, weight, cap,
                      a->dither.data, first_dither(seed, voxel));
     }
+    return cleared;
 }
 
 KERNEL(fuse_frame_into_blocks, FuseArguments) {
     VoxelOffsets offsets;
     find_offsets(&a->camera, a->limits.voxel_size, &offsets);
-    for (int64_t i = start; i < stop; i++) fuse_block(a, a->indices.data[i], &offsets);
+    for (int64_t i = start; i < stop; i++) a->cleared.data[i] = fuse_block(a, a->indices.data[i], &offsets);
     return 0;
 }

@@ -18,6 +18,7 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.fusion.allocation import Camera
+from semantic_mapper.mapping.fusion.depth_bounds import NO_BOUNDS, DepthBounds
 from semantic_mapper.mapping.fusion.depth_trust import COMPUTED_CAP, COMPUTED_LOOK, MEASURED
 from semantic_mapper.mapping.fusion.evidence import DITHER
 from semantic_mapper.mapping.storage.grid_buffers import GridBuffers
@@ -128,7 +129,8 @@ def fuse_blocks(
     moment: int,
     *,
     measured: bool = True,
-) -> None:
+    bounds: DepthBounds = NO_BOUNDS,
+) -> int:
     """Fuse one frame into blocks, in place.
 
     Args:
@@ -142,10 +144,16 @@ def fuse_blocks(
         votes: Of the frame.
         moment: A number that changes from frame to frame; see ``evidence``.
         measured: Whether a sensor measured the depth; see ``depth_trust``.
+        bounds: Of the depth, where what the frame sees through is to be cleared; see ``clearing``.
+
+    Returns:
+        Voxels of a surface that were cleared.
     """
+    cleared = np.empty(len(indices), np.int64)
     look, cap = (MEASURED, limits.max_weight) if measured else (COMPUTED_LOOK, COMPUTED_CAP)
     args = (indices, buffers, camera, limits, depth, rgb, trust, votes, DITHER, moment, look, cap)
-    _fuse_frame_into_blocks(len(indices), *args)
+    _fuse_frame_into_blocks(len(indices), *args, bounds, cleared)
+    return int(cleared.sum())
 
 
 @parallel_kernel()
@@ -195,4 +203,6 @@ def _fuse_frame_into_blocks(
     moment: int,
     look: float,
     weight_cap: float,
+    bounds: DepthBounds,
+    cleared: Int64,
 ) -> None: ...

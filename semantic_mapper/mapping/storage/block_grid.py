@@ -32,8 +32,10 @@ from semantic_mapper.mapping.storage.grid_buffers import (
     ATTRIBUTES,
     GridBuffers,
     advised_mb,
+    blocks_hold_surface,
     make_buffers,
 )
+from semantic_mapper.types import UInt8
 
 LEAST_RESIDENT = 256  # blocks that memory has room for, whatever the limit
 EVICTED_AT_ONCE = 32  # at least, and
@@ -42,6 +44,7 @@ TILE_BLOCKS = 4096  # blocks brought together at a time to be read where some ar
 NEIGHBOURS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
 _READ_AT_ONCE = 256  # blocks between memory and disk: a copy of them takes room beside both
 _FREE = -1  # no packed key is negative
+_NO_SURFACE, _SURFACE, _UNKNOWN = 0, 1, 2  # whether a block holds a surface; unknown since it was last changed
 
 _log = get_logger(__name__)
 
@@ -87,6 +90,8 @@ class BlockGrid:
         self._packed = np.full(capacity, _FREE, np.int64)  # key of the block there
         self._used = np.zeros(capacity, np.int64)  # when last asked for
         self._version = np.zeros(capacity, np.int64)  # see ``mark_changed``
+        self._surface = np.zeros(capacity, np.uint8)
+        self.stored_surface = np.empty(0, np.int64)  # packed keys, sorted, of blocks on disk that hold a surface
         self._resident_count = 0
         self._ever_used = 0  # from here on, buffers are as they were made: zero
         # Called with the packed keys that ``activate`` gets, before anything is done with them.
@@ -153,7 +158,9 @@ class BlockGrid:
         """
         for watcher in self.watchers:
             watcher(packed)
-        return self._bring_together(packed)
+        found = self._bring_together(packed)
+        self._surface[found] = _UNKNOWN
+        return found
 
     def _bring_together(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
         self._clock += 1
@@ -190,9 +197,25 @@ class BlockGrid:
         if min(blocks, self._max_resident) > self.capacity:
             self._grow(blocks)
 
-    def page_in(self, packed: NDArray[np.int64]) -> None:
-        """Make sure that the first of these existing blocks (B,) are in memory to be read: as many as have room."""
-        self._bring_together(packed[: self._max_resident])
+    def page_in(self, packed: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Make sure that the first of these existing blocks (B,) are in memory to be read: as many as have room.
+
+        Returns:
+            Their buffer indices.
+        """
+        return self._bring_together(packed[: self._max_resident])
+
+    def may_hold_surface(self) -> UInt8:
+        """A copy of (capacity,), by buffer index: 0 where there is no block, or one without a surface."""
+        return self._surface.copy()
+
+    def hold_surface(self, blocks: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Whether the blocks (B,) in memory hold a surface: a voxel that ``fusion/clearing`` may have to clear."""
+        unknown = blocks[self._surface[blocks] == _UNKNOWN]
+        holds = np.empty(len(unknown), np.uint8)
+        blocks_hold_surface(unknown, self._buffers.tsdf, self._buffers.weight, holds)
+        self._surface[unknown] = np.where(holds, _SURFACE, _NO_SURFACE)
+        return self._surface[blocks] == _SURFACE
 
     def mark_changed(self, blocks: NDArray[np.int32], version: int) -> None:
         """Note that blocks with these buffer indices were changed at ``version`` of the map."""
@@ -341,6 +364,8 @@ class BlockGrid:
             for name in ATTRIBUTES:
                 getattr(buffers, name)[indices] = getattr(values, name)
             self._version[indices] = versions
+            self._surface[indices] = np.where(np.isin(part, self.stored_surface), _SURFACE, _NO_SURFACE)
+            self.stored_surface = np.setdiff1d(self.stored_surface, part, assume_unique=True)
         self._add(new)
 
     def _evict(self, count: int, keep: NDArray[np.int64]) -> None:
@@ -361,6 +386,9 @@ class BlockGrid:
                 part = going[start : start + _READ_AT_ONCE]
                 blobs = pack_blocks(values, indices[part]).blobs()
                 self._store.put_packed(packed[part], self._version[indices[part]], blobs)
+                surface = packed[part][self.hold_surface(indices[part])]
+                self.stored_surface = np.union1d(self.stored_surface, surface)
+                self._surface[indices[part]] = _NO_SURFACE
                 self._packed[indices[part]] = _FREE
                 self._resident_count -= len(indices[part])
         finally:  # also where the disk is full: blocks that are there have left memory
@@ -398,6 +426,7 @@ class BlockGrid:
         self._packed = np.concatenate((self._packed, np.full(more, _FREE)))
         self._used = np.concatenate((self._used, np.zeros(more, np.int64)))
         self._version = np.concatenate((self._version, np.zeros(more, np.int64)))
+        self._surface = np.concatenate((self._surface, np.zeros(more, np.uint8)))
 
     def _add(self, packed: NDArray[np.int64]) -> None:
         """Give new blocks (B,) a place in the buffers, which have room; all their voxels are zero."""
@@ -414,3 +443,4 @@ class BlockGrid:
             values[used_before] = 0
         self._ever_used = max(self._ever_used, int(added.max(initial=-1)) + 1)
         self._version[added] = 0
+        self._surface[added] = _NO_SURFACE

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic_mapper.kernels import kernel
 from semantic_mapper.mapping.fusion.evidence import EVIDENCE_DTYPES
 from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
-from semantic_mapper.types import Float32
+from semantic_mapper.types import Float32, Int32, UInt8
 
 BLOCK_SIDE = 8
 SPARE_SHARE = 1.5  # of what one frame touches, where memory is to have room for it without pushing the last one out
@@ -65,3 +66,15 @@ def _zeros(shape: tuple[int, ...], dtype: type[np.generic]) -> NDArray[Any]:
 def advised_mb(blocks: int, block_bytes: int) -> int:
     """The ``voxel_map.memory_mb`` that this many blocks of one frame, and some of the frames before, fit in."""
     return math.ceil(SPARE_SHARE * blocks * block_bytes / 1e6)
+
+
+@kernel
+def blocks_hold_surface(indices: Int32, tsdf: Float32, weight: Float32, holds: UInt8) -> None:
+    """Which blocks have a voxel that may have to be cleared one day (``fusion/clearing``).
+
+    Args:
+        indices: (B,) buffer indices.
+        tsdf, weight: Of the grid.
+        holds: (B,) to fill, 0 or 1.
+    """
+    ...

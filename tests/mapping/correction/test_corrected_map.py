@@ -98,6 +98,21 @@ def median_error(voxel_map: VoxelMap, truth: tuple[cKDTree, Float64, Float64]) -
     return float(np.median(np.abs(((xyz - points[nearest]) * normals[nearest]).sum(axis=1))))
 
 
+def test_what_was_cleared_is_cleared_again_by_a_rebuild() -> None:
+    frames = list(tiny_frames(12))
+    for i in range(4):  # something stands 0.6 m before the camera, then leaves
+        depth = np.array(frames[i].depth_m)
+        depth[24:48, 32:64] = 0.6
+        frames[i] = replace(frames[i], depth_m=depth)
+    frames += [replace(f, seq=100 + f.seq, stamp_ns=f.stamp_ns + 10**10) for f in tiny_frames(12)]
+    pipeline, other = mapped(frames), mapped(frames, voxel_map={"voxel_size_m": 0.05, "clear_free_space": False})
+    assert pipeline.voxel_map.cleared > 20 and not same(pipeline.voxel_map, other.voxel_map)
+    before = bits(pipeline.voxel_map)
+    pipeline.correct_poses({f.stamp_ns: f.T_world_camera for f in frames})
+    finish(pipeline)
+    assert pipeline.corrector.status.completed == 1 and bits(pipeline.voxel_map) == before
+
+
 def test_the_corrected_map_of_a_drifting_camera_is_as_good_as_that_of_true_poses():
     frames = tiny_frames(COUNT)
     truth = true_planes()

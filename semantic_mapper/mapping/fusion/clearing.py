@@ -1,0 +1,153 @@
+"""Free space clears: a surface that a frame sees through loses its weight, and is gone after a few such frames.
+
+A voxel is part of a surface where its TSDF is below ``LARGEST_TSDF``. A frame sees through it where its pixel is
+measured, of the eight around at most ``MOST_HOLES`` are not (speckles are noise, the edge of a hole may be that of a
+thing), and all that is measured in its surroundings lies well behind what the voxel says. The surroundings reach as far as voxel and pose may be off (``ASIDE_VOXELS``, ``ASIDE_PER_M``), so that thin things, depth
+edges and grazing views are safe; the margin grows with the voxels and with the depth (``MARGIN_VOXELS``,
+``MARGIN_PER_M``). A pixel without depth, or farther than ``depth_max``, clears nothing: black and shiny things return
+nothing. Nor do the edges of the image, nor computed or rendered depth: where pictures are matched wrongly, that lies far
+behind, frame after frame.
+
+Each such frame halves the weight of the voxel, of which ``MOST_KEPT`` stays at most, and leaves its TSDF alone. Where
+less than one measurement is left, the voxel becomes free and loses its class votes. So three frames that see through it
+clear any surface, and one is enough for what a single frame saw, or for what was only computed. A frame that sees the
+surface adds its measurement as ever: what is seen through in every second frame or less, as by mirrors, stays.
+
+The state of this is the weight alone: what pages, saves, restores and rebuilds the map need not know of it.
+
+The blocks of the truncation band are fused anyway, and cleared in that pass (``fusion.c``). This module finds and
+clears the others: those in view, in front of the depth, that hold a surface. The numbers stand in ``see_through.h``, too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.kernels import parallel_kernel
+from semantic_mapper.mapping.fusion.allocation import Camera
+from semantic_mapper.mapping.fusion.depth_bounds import DepthBounds
+from semantic_mapper.mapping.fusion.fuse import FusionLimits
+from semantic_mapper.mapping.storage.block_grid import BlockGrid
+from semantic_mapper.mapping.storage.block_index import find_blocks, pack_keys, unpack_keys
+from semantic_mapper.mapping.storage.grid_buffers import GridBuffers
+from semantic_mapper.types import Float32, Int32, Int64, UInt8
+
+LARGEST_TSDF = 0.5
+MARGIN_VOXELS, MARGIN_PER_M = 2.0, 0.015
+ASIDE_VOXELS, ASIDE_PER_M = 1.4, 0.005  # a pose that is off by 5 mm and one of 0.2 degrees at 1.5 m, say
+MOST_HOLES = 2
+MOST_KEPT = 3.5
+
+
+def clear_in_view(
+    grid: BlockGrid,
+    band: NDArray[np.int64],
+    camera: Camera,
+    limits: FusionLimits,
+    depth: Float32,
+    rgb: UInt8,
+    bounds: DepthBounds,
+    version: int,
+) -> int:
+    """Clear what a frame sees through outside of the truncation band, in place; hold the map's lock meanwhile.
+
+    Args:
+        grid: The map's storage. Blocks on disk come back where the frame may see through them.
+        band: (B,) sorted packed keys of the blocks that the frame was fused into.
+        camera: Of the frame.
+        limits: Of the map.
+        depth: (H, W) float32 metres, from a sensor.
+        rgb: (H, W, 3) uint8.
+        bounds: Of ``depth``.
+        version: Of the map, for the blocks that change.
+
+    Returns:
+        Voxels cleared.
+
+    Raises:
+        MapError: the disk fails.
+    """
+    packed, cleared = _candidates(grid, band, camera, limits, bounds), 0
+    for start in range(0, len(packed), grid.room):
+        part = packed[start : start + grid.room]
+        seen, _ = _clear(grid.page_in(part), grid.buffers(), camera, limits, depth, rgb, bounds, changes=False)
+        if seen.any():  # only these count as changed
+            blocks = grid.activate(part[seen > 0])
+            cleared += int(_clear(blocks, grid.buffers(), camera, limits, depth, rgb, bounds, changes=True)[1].sum())
+            grid.mark_changed(blocks, version)
+    return cleared
+
+
+def _candidates(
+    grid: BlockGrid, band: NDArray[np.int64], camera: Camera, limits: FusionLimits, bounds: DepthBounds
+) -> NDArray[np.int64]:
+    """Packed keys (B,), sorted, of blocks outside of the band that hold a surface, in front of some depth."""
+    considered = grid.may_hold_surface()
+    inside = find_blocks(grid.index, band)
+    considered[inside[inside >= 0]] = 0
+    keys = grid.buffers().keys
+    slots = np.flatnonzero(_before_depth(keys, considered, camera, limits, bounds)).astype(np.int32)
+    slots = slots[grid.hold_surface(slots)]
+    stored = grid.stored_surface
+    if not len(stored):
+        return np.sort(pack_keys(keys[slots]))
+    stored = stored[~np.isin(stored, band)]
+    before = _before_depth(unpack_keys(stored), np.ones(len(stored), np.uint8), camera, limits, bounds)
+    return np.sort(np.concatenate((pack_keys(keys[slots]), stored[before > 0])))
+
+
+def _before_depth(
+    keys: NDArray[np.int32], considered: UInt8, camera: Camera, limits: FusionLimits, bounds: DepthBounds
+) -> UInt8:
+    found = np.empty(len(keys), np.uint8)
+    _blocks_before_depth(len(keys), keys, considered, camera, limits.voxel_size, bounds, found)
+    return found
+
+
+def _clear(
+    blocks: NDArray[np.int32],
+    buffers: GridBuffers,
+    camera: Camera,
+    limits: FusionLimits,
+    depth: Float32,
+    rgb: UInt8,
+    bounds: DepthBounds,
+    *,
+    changes: bool,
+) -> tuple[Int64, Int64]:
+    seen, cleared = np.empty(len(blocks), np.int64), np.empty(len(blocks), np.int64)
+    _clear_blocks(len(blocks), blocks, buffers, camera, limits, depth, rgb, bounds, changes, seen, cleared)
+    return seen, cleared
+
+
+@parallel_kernel()
+def _blocks_before_depth(
+    count: int,
+    keys: Int32,
+    considered: UInt8,
+    camera: Camera,
+    voxel_size: float,
+    bounds: DepthBounds,
+    found: UInt8,
+) -> None:
+    """Which of the blocks (B, 3) that are ``considered`` (B,) may have a voxel in front of the depth: (B,) to fill."""
+    ...
+
+
+@parallel_kernel(chunks_per_thread=4)
+def _clear_blocks(
+    count: int,
+    indices: Int32,
+    buffers: GridBuffers,
+    camera: Camera,
+    limits: FusionLimits,
+    depth: Float32,
+    rgb: UInt8,
+    bounds: DepthBounds,
+    changes: bool,
+    seen: Int64,
+    cleared: Int64,
+) -> None:
+    """Weaken voxels that the frame sees through where ``changes``; count them, and those that were cleared: (B,)."""
+    ...
