@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from semantic_mapper.config import DepthFromMotionConfig
-from semantic_mapper.depth_from_motion.agreement import find_agreement
+from semantic_mapper.depth_from_motion.agreement import Agreement, find_agreement
 from semantic_mapper.depth_from_motion.smooth import smooth_planes
 from semantic_mapper.depth_from_motion.spread import spread_of_match, spread_of_surface
-from semantic_mapper.depth_from_motion.sweep import inverse_depths, sweep_and_match
+from semantic_mapper.depth_from_motion.sweep import SweepResult, inverse_depths, sweep_and_match
 from semantic_mapper.depth_from_motion.views import DepthEstimate, PreparedView
 from semantic_mapper.geometry import expect_shape
+from semantic_mapper.types import Float32
 
 
 def estimate_depth(
@@ -40,6 +42,26 @@ def estimate_depth(
         expect_shape(hint.sigma_m, f"{size[0]} {size[1]}", "hint sigma")
     if not sources:
         return no_depth(size)
+    return match_views(reference, sources, config, hint, neighbours).estimate
+
+
+class Matched(NamedTuple):
+    """What matching found of a view, and the depth that follows."""
+
+    swept: SweepResult
+    agreement: Agreement
+    surface: Float32  # (h, w) planes
+    estimate: DepthEstimate
+
+
+def match_views(
+    reference: PreparedView,
+    sources: Sequence[PreparedView],
+    config: DepthFromMotionConfig,
+    hint: DepthEstimate | None,
+    neighbours: Sequence[PreparedView],
+) -> Matched:
+    """The work of ``estimate_depth``, with at least one source."""
     inverse_depth = inverse_depths(config.planes, config.near_m, config.far_m)
     swept = sweep_and_match(reference, sources, inverse_depth, hint)
     first, step = float(inverse_depth[0]), float(inverse_depth[1] - inverse_depth[0])
@@ -50,7 +72,7 @@ def estimate_depth(
     surface = np.clip(smooth_planes(plane, matched, reference.rgb), 0, config.planes - 1)
     depth = (1 / (first + surface * step)).astype(np.float32)
     sigma = spread_of_surface(plane, surface, matched, agreement, depth)
-    return DepthEstimate(depth, (depth**2 * step * sigma).astype(np.float32))
+    return Matched(swept, agreement, surface, DepthEstimate(depth, (depth**2 * step * sigma).astype(np.float32)))
 
 
 def no_depth(size: tuple[int, int]) -> DepthEstimate:

@@ -268,6 +268,55 @@ KERNEL(pick_planes, PickArguments) {
 }
 
 typedef struct {
+    U16 sum;      /* (h, w, D) costs summed along paths */
+    U8 cost;      /* (h, w, D) */
+    F32 second;   /* (h, w) the best plane but for the winner and its neighbours */
+    F32 winner;   /* (h, w) plane of the lowest cost, without paths */
+    F32 interval; /* (4, h, w) planes from the winner to the ends of what costs little more, and somewhat more */
+    F32 around;   /* (13, h, w) costs and sums of planes near the winner, see OFFSETS; fractions of MOST_COST, MOST_SUM */
+} DescribeArguments;
+
+#define MOST_COST 48.0f
+#define MOST_SUM 256.0f
+static const int64_t OFFSETS[7] = {0, -6, -3, -1, 1, 3, 6};
+static const uint16_t MARGINS[2] = {40, 160};
+
+/* How the costs of each pixel lie round its winner: whether there is one minimum or several, sharp or flat. */
+KERNEL(describe_costs, DescribeArguments) {
+    const int64_t width = a->cost.shape[1], planes = a->cost.shape[2], size = a->cost.shape[0] * width;
+    for (int64_t at = start * width; at < stop * width; at++) {
+        const uint16_t *s = a->sum.data + at * planes;
+        const uint8_t *c = a->cost.data + at * planes;
+        int64_t best = 0, cheapest = 0;
+        for (int64_t d = 1; d < planes; d++) {
+            if (s[d] < s[best]) best = d;
+            if (c[d] < c[cheapest]) cheapest = d;
+        }
+        int64_t next = -1;
+        for (int64_t d = 0; d < planes; d++)
+            if ((d < best - 1 || d > best + 1) && (next < 0 || s[d] < s[next])) next = d;
+        a->second.data[at] = (float)next, a->winner.data[at] = (float)cheapest;
+        for (int64_t k = 0; k < 2; k++) {
+            const int64_t most = (int64_t)s[best] + MARGINS[k];
+            int64_t low = 0, high = planes - 1;
+            while (s[low] > most) low++;
+            while (s[high] > most) high--;
+            a->interval.data[2 * k * size + at] = (float)(low - best);
+            a->interval.data[(2 * k + 1) * size + at] = (float)(high - best);
+        }
+        for (int64_t k = 0; k < 7; k++) {
+            const int64_t d = best + OFFSETS[k], inside = d < 0 ? 0 : d < planes ? d : planes - 1;
+            a->around.data[k * size + at] = (float)c[inside] * (1.0f / MOST_COST);
+            if (k) {
+                const float above = (float)(s[inside] - s[best]) * (1.0f / MOST_SUM);
+                a->around.data[(6 + k) * size + at] = min_f(above, 2.0f);
+            }
+        }
+    }
+    return 0;
+}
+
+typedef struct {
     F32 depth;           /* (h, w) of the reference, 0 = none */
     F32 neighbour_depth; /* (n, H, W) 0 = none */
     I64 neighbour_size;  /* (n, 2) height and width */
