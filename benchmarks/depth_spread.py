@@ -1,4 +1,4 @@
-"""Fits the spread of computed depth to rooms of training seeds: the factors in depth_from_motion/spread.py.
+"""Fits the spread of what was matched to rooms of training seeds: the factors in depth_from_motion/spread.py.
 
 Example: python -m benchmarks.depth_spread --rooms 10
 """
@@ -16,14 +16,14 @@ import torch
 
 from benchmarks.motion_depth import Walk, room_walk
 from semantic_mapper.config import DepthFromMotionConfig
-from semantic_mapper.depth_from_motion.agreement import Agreement, find_agreement
+from semantic_mapper.depth_from_motion.agreement import find_agreement
 from semantic_mapper.depth_from_motion.smooth import smooth_planes
 from semantic_mapper.depth_from_motion.sources import choose_sources
-from semantic_mapper.depth_from_motion.spread import LEAST, MOST, match_terms, spread_of_match, surface_terms
-from semantic_mapper.depth_from_motion.sweep import SweepResult, inverse_depths, sweep_and_match
+from semantic_mapper.depth_from_motion.spread import match_terms, spread_of_match
+from semantic_mapper.depth_from_motion.sweep import inverse_depths, sweep_and_match
 from semantic_mapper.depth_from_motion.views import DepthEstimate, PreparedView, prepare_view
 from semantic_mapper.scenes import TRAIN_SEEDS
-from semantic_mapper.types import Float32, UInt8
+from semantic_mapper.types import Float32
 
 FIRST_SEED = 500  # of the training seeds
 STEPS_M = (0.04, 0.08, 0.12, 0.2)
@@ -35,12 +35,10 @@ STEADY, QUICK, SLOW, TURNS = 250, 0.03, 0.005, 400  # of the fit
 
 
 class Sample(NamedTuple):
-    """One view as matched, and its exact depth."""
+    """Terms (h, w, n) of one view as matched, its planes (h, w), and the true ones, NaN where there is none."""
 
-    swept: SweepResult
-    agreement: Agreement
+    terms: Float32
     plane: Float32
-    rgb: UInt8
     truth: Float32
 
 
@@ -70,14 +68,14 @@ def samples(walk: Walk, config: DepthFromMotionConfig, ahead: int) -> Iterator[S
         swept = sweep_and_match(view, sources, planes, None)
         agreement = find_agreement(view, 1 / (first + swept.plane * step), [v for v in views[:k] if v.estimate][-6:])
         plane = ((1 / agreement.mean_m - first) / step).astype(np.float32)
-        surface = smooth_planes(plane, spread_of_match(swept, agreement), view.rgb)
+        surface = smooth_planes(plane, spread_of_match(swept, agreement, config.near_m), view.rgb)
         depth = 1 / (first + np.clip(surface, 0, config.planes - 1) * step)
         views[k] = replace(view, estimate=DepthEstimate(depth.astype(np.float32), np.ones_like(depth)))
         size = (view.intrinsics.width, view.intrinsics.height)
         small = cv2.resize(truth, size, interpolation=cv2.INTER_NEAREST_EXACT)
         inside = (small > config.near_m) & (small < config.far_m)
         true_plane = np.where(inside, (1 / np.maximum(small, config.near_m) - first) / step, np.nan)
-        yield Sample(swept, agreement, plane, view.rgb, true_plane.astype(np.float32))
+        yield Sample(match_terms(swept, agreement, config.near_m), plane, true_plane.astype(np.float32))
 
 
 def fit(terms: Float32, off: Float32) -> Float32:
@@ -103,35 +101,21 @@ def main() -> None:
     count = parser.parse_args().rooms
     torch.set_num_threads(1)
     config, rng = DepthFromMotionConfig(), np.random.default_rng(0)
-    planes = inverse_depths(config.planes, config.near_m, config.far_m)
     found: list[Sample] = []
     for k in range(count):
         walk = room_walk(TRAIN_SEEDS[FIRST_SEED + k], FRAMES, STEPS_M[k % len(STEPS_M)])
         walk = jittered(walk, k) if k % 2 else walk
         found += [sample for ahead in (0, 4) for sample in samples(walk, config, ahead)]
     chosen = [rng.choice(np.flatnonzero(np.isfinite(s.truth)), PIXELS) for s in found]
-
-    def fit_all(terms: list[Float32], off: list[Float32], name: str) -> Float32:
-        x = np.concatenate([t.reshape(-1, t.shape[-1])[at] for t, at in zip(terms, chosen, strict=True)])
-        y = np.concatenate([o.ravel()[at] for o, at in zip(off, chosen, strict=True)])
-        factors = fit(x, y)
-        spread = np.exp(x @ factors)
-        print(f"{name} = ({', '.join(f'{f:.2f}' for f in factors)})")
-        print(f"within 1 and 2 spreads: {(y < spread).mean():.3f} {(y < 2 * spread).mean():.3f}")
-        for part in np.array_split(np.argsort(spread), 8):
-            print(f"  spread {np.median(spread[part]):6.2f}   68 % of errors {np.quantile(y[part], QUANTILE):6.2f}")
-        return factors
-
-    terms = [match_terms(s.swept, s.agreement) for s in found]
-    factors = fit_all(terms, [np.abs(s.plane - s.truth) for s in found], "MATCHED")
-    matched = [np.clip(np.exp(t @ factors), LEAST, MOST) for t in terms]
-    pairs = list(zip(found, matched, strict=True))
-    surfaces = [np.clip(smooth_planes(s.plane, m, s.rgb), 0, config.planes - 1) for s, m in pairs]
-    step = planes[1] - planes[0]
-    depths = [1 / (planes[0] + surface * step) for surface in surfaces]
-    triples = list(zip(found, matched, surfaces, depths, strict=True))
-    terms = [surface_terms(s.plane, u, m, s.agreement, d) for s, m, u, d in triples]
-    fit_all(terms, [np.abs(u - s.truth) for s, u in zip(found, surfaces, strict=True)], "SMOOTHED")
+    pairs = list(zip(found, chosen, strict=True))
+    terms = np.concatenate([s.terms.reshape(-1, s.terms.shape[-1])[at] for s, at in pairs])
+    off = np.concatenate([np.abs(s.plane - s.truth).ravel()[at] for s, at in pairs])
+    factors = fit(terms, off)
+    spread = np.exp(terms @ factors)
+    print(f"MATCHED = ({', '.join(f'{f:.2f}' for f in factors)})")
+    print(f"within 1 and 2 spreads: {(off < spread).mean():.3f} {(off < 2 * spread).mean():.3f}")
+    for part in np.array_split(np.argsort(spread), 8):
+        print(f"  spread {np.median(spread[part]):6.2f}   68 % of errors {np.quantile(off[part], QUANTILE):6.2f}")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,8 @@ Inverse depths are fractions of the sweep's largest one, and enter as logarithms
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,20 +19,28 @@ from semantic_mapper.types import Float32, UInt8
 UInt16 = NDArray[np.uint16]
 
 CANDIDATES = slice(5, 11)  # channels of depths that the network chooses from: `Evidence` says which
-HINT_CHANNELS = slice(10, 13)
+MEMBRANE, HINT_CHANNELS, COST_CHANNELS = 7, slice(10, 13), slice(24, 37)
 CHANNELS = 37
 LEAST_INVERSE = 0.01  # fraction of the sweep's largest inverse depth; nothing is farther away
-MEMBRANE, RAW = 7, 6  # channels
+
+
+class Matched(NamedTuple):
+    """What matching found of a view.
+
+    Args:
+        inverse_depth: (D,) of the sweep's planes.
+        swept, agreement: Of each pixel.
+        surface: (h, w) the membrane through it, in planes.
+    """
+
+    inverse_depth: Float32
+    swept: SweepResult
+    agreement: Agreement
+    surface: Float32
 
 
 def gather_evidence(
-    reference: PreparedView,
-    inverse_depth: Float32,
-    source_count: int,
-    swept: SweepResult,
-    agreement: Agreement,
-    surface: Float32,
-    hint: DepthEstimate | None,
+    reference: PreparedView, matched: Matched, source_count: int, hint: DepthEstimate | None
 ) -> Float32:
     """Channels (37, h, w) of ``reference``.
 
@@ -40,17 +50,16 @@ def gather_evidence(
     19-23 width of the minimum of the costs; 24-36 costs beside it.
 
     Args:
-        inverse_depth: (D,) of the sweep's planes.
         source_count: Views that were swept.
-        surface: (h, w) the membrane, in planes.
         hint: As the sweep had it.
     """
+    inverse_depth, swept, agreement, surface = matched
     size = reference.gray.shape
     first, last = float(inverse_depth[0]), float(inverse_depth[-1])
     step = float(inverse_depth[1] - inverse_depth[0])
     second, winner = np.empty(size, np.float32), np.empty(size, np.float32)
     interval, out = np.empty((4, *size), np.float32), np.empty((CHANNELS, *size), np.float32)
-    describe_costs(size[0], swept.path_sum, swept.cost, second, winner, interval, out[24:37])
+    describe_costs(size[0], swept.path_sum, swept.cost, second, winner, interval, out[COST_CHANNELS])
 
     def logarithm(plane: Float32) -> Float32:
         return np.log(np.maximum((first + plane * step) / last, LEAST_INVERSE))
@@ -62,7 +71,7 @@ def gather_evidence(
     out[5] = np.log(np.maximum(1 / (agreement.mean_m * last), LEAST_INVERSE))
     out[6], out[7] = logarithm(swept.plane), logarithm(surface)
     out[8], out[9] = logarithm(second), logarithm(winner)
-    out[10:13] = _hint_channels(hint, last, out[7])
+    out[HINT_CHANNELS] = _hint_channels(hint, last, out[7])
     out[13], out[14] = swept.confidence, swept.match / 48
     out[15], out[16] = swept.seen / 4, agreement.agree / 6
     out[17], out[18] = agreement.visible / 6, source_count / 4

@@ -65,9 +65,7 @@ def walk_samples(seed: int) -> Iterator[DepthSample]:
 
 def _pictures(seed: int, rng: np.random.Generator) -> list[_Picture]:
     focal = KINECT_FOCAL if rng.uniform() < KINECT else np.exp(rng.uniform(*np.log(FOCALS)))
-    camera = CameraIntrinsics(
-        focal * WIDTH, focal * WIDTH, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT
-    )
+    camera = CameraIntrinsics(focal * WIDTH, focal * WIDTH, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, WIDTH, HEIGHT)
     path = CameraPathConfig(
         step_m=float(rng.choice(STEPS_M)),
         min_height_m=float(rng.uniform(0.8, 1.2)),
@@ -101,12 +99,11 @@ def _version(pictures: list[_Picture], rng: np.random.Generator) -> Iterator[Dep
             continue
         known: list[PreparedView] = [v for v in views[:k] if v.estimate is not None][-NEIGHBOURS:]
         matched = match_views(view, sources, config, hint, known)
-        usual_m = float(np.median(matched.estimate.depth_m))
-        views[k] = replace(view, estimate=matched.estimate)
+        depth = (1 / (planes[0] + matched.surface * (planes[1] - planes[0]))).astype(np.float32)
+        usual_m = float(np.median(depth))
+        views[k] = replace(view, estimate=DepthEstimate(depth, np.ones_like(depth)))
         if kept:
-            found = gather_evidence(
-                view, planes, len(sources), matched.swept, matched.agreement, matched.surface, hint
-            )
+            found = gather_evidence(view, matched, len(sources), hint)
             yield DepthSample(found, np.log(1 / (np.maximum(truth, 0.05) * planes[-1])).astype(np.float32))
 
 

@@ -6,10 +6,13 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from semantic_mapper.depth_from_motion.agreement import TOLERANCE, find_agreement
+from semantic_mapper.depth_from_motion.convolution import add_doubled, pack_convolution
 from semantic_mapper.depth_from_motion.enlarge import enlarge_estimate
+from semantic_mapper.depth_from_motion.evidence import describe_costs
 from semantic_mapper.depth_from_motion.smooth import relax_membrane, smooth_planes
 from semantic_mapper.depth_from_motion.sweep import (
     EDGE_GRAY,
@@ -252,3 +255,45 @@ def _on_threads(work: Callable[[], bytes]) -> list[bytes]:
     finally:
         torch.set_num_threads(count)
     return found
+
+
+@pytest.mark.parametrize(("size", "stride", "dilation"), [(1, 1, 1), (2, 2, 1), (3, 1, 1), (3, 1, 2)])
+def test_convolutions_are_those_of_torch(size: int, stride: int, dilation: int) -> None:
+    rng = np.random.default_rng(size)
+    image = rng.standard_normal((10, 18, 7)).astype(np.float32)
+    weight, bias = rng.standard_normal((20, 7, size, size)).astype(np.float32), np.arange(20, dtype=np.float32)
+    found = pack_convolution(weight, bias, stride, dilation)(image)
+    given = [torch.from_numpy(x) for x in (image.transpose(2, 0, 1)[None].copy(), weight, bias)]
+    expected = torch.nn.functional.conv2d(*given, stride=stride, dilation=dilation)[0].numpy().transpose(1, 2, 0)
+    height, width = expected.shape[:2]
+    np.testing.assert_allclose(found[:height, :width], expected, atol=1e-4)
+
+
+def test_doubling_is_bilinear() -> None:
+    small = np.random.default_rng(0).standard_normal((5, 7, 3)).astype(np.float32)
+    out = np.ones((10, 14, 3), np.float32)
+    add_doubled(small, out)
+    double = torch.nn.functional.interpolate(
+        torch.from_numpy(small.transpose(2, 0, 1).copy())[None], scale_factor=2.0, mode="bilinear", align_corners=False
+    )
+    np.testing.assert_allclose(out, 1 + double[0].numpy().transpose(1, 2, 0), atol=1e-5)
+
+
+def test_costs_are_described_round_the_winner() -> None:
+    rng = np.random.default_rng(0)
+    sums = rng.integers(0, 900, (4, 5, 32)).astype(np.uint16)
+    cost = rng.integers(0, 48, (4, 5, 32)).astype(np.uint8)
+    second, winner = np.empty((4, 5), np.float32), np.empty((4, 5), np.float32)
+    interval, around = np.empty((4, 4, 5), np.float32), np.empty((13, 4, 5), np.float32)
+    describe_costs(4, sums, cost, second, winner, interval, around)
+    for y, x in np.ndindex(4, 5):
+        s, c = sums[y, x].astype(int), cost[y, x].astype(int)
+        best = int(s.argmin())
+        others = np.where(np.abs(np.arange(32) - best) <= 1, 99999, s)
+        assert second[y, x] == others.argmin() and winner[y, x] == c.argmin()
+        for k, margin in enumerate((40, 160)):
+            near = np.flatnonzero(s <= s[best] + margin) - best
+            assert tuple(interval[2 * k : 2 * k + 2, y, x]) == (near.min(), near.max())
+        at = np.clip(best + np.array((0, -6, -3, -1, 1, 3, 6)), 0, 31)
+        np.testing.assert_allclose(around[:7, y, x], c[at] / 48, rtol=1e-6)
+        np.testing.assert_allclose(around[7:, y, x], np.minimum((s[at[1:]] - s[best]) / 256, 2), rtol=1e-6)
