@@ -1,11 +1,12 @@
 """Trains the network of computed depth in rooms of training seeds: ``semantic_mapper/weights/depth.safetensors``.
 
-Example: python -m tools.train_depth --samples samples --out depth.safetensors --walks 300 --minutes 25
+Example: python -m tools.train_depth --samples samples --out semantic_mapper/weights/depth.safetensors
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -14,20 +15,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn import functional as F
 
 from semantic_mapper.depth_from_motion.evidence import HINT_CHANNELS, MEMBRANE
-from semantic_mapper.depth_from_motion.network import DepthNetwork, Prediction, save_network
+from semantic_mapper.depth_from_motion.network import DepthNetwork, Prediction, load_network, save_network
 from semantic_mapper.scenes import TRAIN_SEEDS
 from semantic_mapper.training.depth_samples import walk_samples
 
 FIRST_SEED, FIRST_HELD_OUT = 1_000, 90_000  # of the training seeds
-BATCH, RATE, WARM_UP, WEIGHT_DECAY, AVERAGE = 4, 1.5e-3, 0.02, 1e-4, 0.998
+BATCH, RATE, WARM_UP, FALL, WEIGHT_DECAY = 4, 1.5e-3, 50, 0.5, 1e-4  # warm-up in steps, fall as a fraction of them
+AVERAGE, MOST_GRADIENT = 0.99, 5.0
 LEAST, MOST = -4.0, 1.2  # logarithms of inverse depth that count
 ERROR_WEIGHT, EDGE_WEIGHT, SPREAD_WEIGHT = 8.0, 2.0, 0.5
 DROP_HINT, COLOUR = 0.3, 0.15
 QUANTILE = 0.683
-SAY_EVERY = 200  # steps
+SAY_EVERY = 50  # steps
 
 Half = NDArray[np.float16]
 
@@ -57,14 +58,14 @@ def make(folder: Path, first: int, walks: int) -> None:
         partial.rename(path)
 
 
-def load(folder: Path, known: set[Path], into: Samples) -> None:
-    """Add the files of ``folder`` that are not known yet."""
+def load(folder: Path) -> Samples:
+    """The samples that ``make`` wrote into ``folder``."""
+    found = Samples([], [])
     for path in sorted(folder.glob("[0-9]*[0-9].npz")):
-        if path not in known:
-            known.add(path)
-            with np.load(path) as file:
-                into.evidence.extend(file["evidence"])
-                into.truth.extend(file["truth"])
+        with np.load(path) as file:
+            found.evidence.extend(file["evidence"])
+            found.truth.extend(file["truth"])
+    return found
 
 
 def batch(samples: Samples, chosen: NDArray[np.int64], rng: np.random.Generator) -> tuple[Tensor, Tensor]:
@@ -100,48 +101,40 @@ def loss_of(found: Prediction, truth: Tensor) -> Tensor:
     return ERROR_WEIGHT * error + EDGE_WEIGHT * sum(edges) + SPREAD_WEIGHT * likelihood.sum() / count
 
 
-def train(folder: Path, minutes: float, seed: int) -> DepthNetwork:
-    """The average of the last steps' weights. Files that come while it trains are used as well."""
-    torch.manual_seed(seed)
+def train(samples: Samples, network: DepthNetwork, steps: int, seed: int, out: Path) -> DepthNetwork:
+    """Train ``network``, and return the average of its last weights, which ``out`` has every so many steps as well."""
     rng = np.random.default_rng(seed)
-    network = DepthNetwork().to(memory_format=torch.channels_last)
-    average = {name: p.detach().clone() for name, p in network.named_parameters()}
+    network = network.train().requires_grad_(True).to(memory_format=torch.channels_last)
+    average = copy.deepcopy(network)
     optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=WEIGHT_DECAY)
-    samples, known = Samples([], []), set[Path]()
-    start, step, losses = time.monotonic(), 0, list[float]()
-    while (done := (time.monotonic() - start) / (60 * minutes)) < 1:
-        load(folder, known, samples)
-        order = rng.permutation(len(samples.truth))
-        for first in range(0, len(order) - BATCH + 1, BATCH):
-            done = (time.monotonic() - start) / (60 * minutes)
-            if done >= 1:
-                break
-            rate = RATE * min(done / WARM_UP + 0.01, 1.0) * 0.5 * (1 + np.cos(np.pi * done))
-            optimiser.param_groups[0]["lr"] = rate
-            evidence, truth = batch(samples, order[first : first + BATCH], rng)
-            with torch.autocast("cpu", torch.bfloat16):
-                found = network(evidence)
-            loss = loss_of(found, truth)
-            optimiser.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
-            optimiser.step()
-            step += 1
-            keep = min(AVERAGE, step / (step + 10))
-            with torch.no_grad():
-                for name, p in network.named_parameters():
-                    average[name].lerp_(p, 1 - keep)
-            losses.append(float(loss.detach()))
-            if step % SAY_EVERY == 0:
-                print(f"{done:.2f} step {step} of {len(order)} samples: {np.mean(losses[-SAY_EVERY:]):.3f}", flush=True)
-    network.load_state_dict(average)
-    return network
+    order, losses = np.zeros(0, np.int64), list[float]()
+    for step in range(1, steps + 1):
+        if len(order) < BATCH:
+            order = rng.permutation(len(samples.truth))
+        chosen, order = order[:BATCH], order[BATCH:]
+        optimiser.param_groups[0]["lr"] = RATE * min(step / WARM_UP, 1.0, (steps + 1 - step) / (FALL * steps))
+        evidence, truth = batch(samples, chosen, rng)
+        with torch.autocast("cpu", torch.bfloat16):
+            found = network(evidence)
+        loss = loss_of(found, truth)
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), MOST_GRADIENT)
+        optimiser.step()
+        keep = min(AVERAGE, step / (step + 10))
+        with torch.no_grad():
+            for mean, p in zip(average.parameters(), network.parameters(), strict=True):
+                mean.lerp_(p, 1 - keep)
+        losses.append(float(loss.detach()))
+        if step % SAY_EVERY == 0:
+            spent = time.process_time()
+            print(f"step {step}: loss {np.mean(losses[-SAY_EVERY:]):.3f}, {spent:.0f} s of CPU time", flush=True)
+            save_network(average, out)
+    return average.eval()
 
 
-def evaluate(network: DepthNetwork, folder: Path) -> float:
+def evaluate(network: DepthNetwork, samples: Samples) -> float:
     """Print the errors on held-out walks; returns the spread's factor so that 68 % of the errors are within it."""
-    samples = Samples([], [])
-    load(folder, set(), samples)
     rows: dict[str, list[float]] = {}
     ratios: list[NDArray[np.float32]] = []
     for evidence, truth in zip(samples.evidence, samples.truth, strict=True):
@@ -171,16 +164,20 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--walks", type=int, default=300, help="walks to make samples of; 22 MB each")
     parser.add_argument("--held-out", type=int, default=12, help="walks of rooms that only figures are made of")
-    parser.add_argument("--minutes", type=float, default=25)
+    parser.add_argument("--steps", type=int, default=12_000, help="of 4 samples; 0.1 s of CPU time each")
+    parser.add_argument("--start", type=Path, help="weights to go on from")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     torch.set_num_threads(1)
     make(given.samples / "train", FIRST_SEED, given.walks)
     make(given.samples / "held_out", FIRST_HELD_OUT, given.held_out)
-    network = train(given.samples / "train", given.minutes, given.seed)
-    factor = evaluate(network, given.samples / "held_out")
+    torch.manual_seed(given.seed)
+    network = DepthNetwork() if given.start is None else load_network(given.start)
+    network = train(load(given.samples / "train"), network, given.steps, given.seed, given.out)
+    factor = evaluate(network, load(given.samples / "held_out"))
+    assert network.head.bias is not None
     with torch.no_grad():
-        network.head.bias[-1] += np.log(factor)
+        network.head.bias[-1] += float(np.log(factor))
     save_network(network, given.out)
 
 

@@ -10,7 +10,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
-from torch.nn import functional as F
+from torch.nn import functional
 
 from semantic_mapper.depth_from_motion.evidence import CANDIDATES, CHANNELS, MEMBRANE
 from semantic_mapper.errors import WeightsError
@@ -62,7 +62,7 @@ class DepthNetwork(nn.Module):
     def forward(self, evidence: Tensor) -> Prediction:
         """Depth and spread of ``evidence`` (B, C, h, w)."""
         height, width = evidence.shape[2:]
-        padded = F.pad(evidence, (0, -width % STRIDE, 0, -height % STRIDE), mode="replicate")
+        padded = functional.pad(evidence, (0, -width % STRIDE, 0, -height % STRIDE), mode="replicate")
         full = self.at_full(self.enter(padded))  # B 16 h w
         half = self.at_half(self.down_half(full))  # B 32 h/2 w/2
         quarter = self.at_quarter(self.down_quarter(half))  # B 48 h/4 w/4
@@ -85,11 +85,11 @@ class Block(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, h, w) to the same."""
-        return x + self.conv(F.relu(x))
+        return x + self.conv(functional.relu(x))
 
 
 def _double(x: Tensor) -> Tensor:
-    return F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
+    return functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
 
 
 def default_network_path() -> Path:
