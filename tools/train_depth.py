@@ -26,7 +26,7 @@ BATCH, RATE, WARM_UP, FALL, WEIGHT_DECAY = 4, 1.5e-3, 50, 0.5, 1e-4  # warm-up i
 AVERAGE, MOST_GRADIENT = 0.99, 5.0
 LEAST, MOST = -4.0, 1.2  # logarithms of inverse depth that count
 ERROR_WEIGHT, EDGE_WEIGHT, SPREAD_WEIGHT = 8.0, 2.0, 0.5
-DROP_HINT, COLOUR = 0.3, 0.15
+DROP_HINT, WRONG_HINT, HINT_OFF, COLOUR = 0.25, 0.3, 0.35, 0.15
 QUANTILE = 0.683
 SAY_EVERY = 200  # steps
 
@@ -69,12 +69,14 @@ def load(folder: Path) -> Samples:
 
 
 def batch(samples: Samples, chosen: NDArray[np.int64], rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Evidence (B, C, h, w) and truth (B, h, w) float32, mirrored, coloured and robbed of hints at random."""
+    """Evidence (B, C, h, w) and truth (B, h, w) float32, mirrored, coloured, and with wrong hints or none at random."""
     evidence = torch.from_numpy(np.stack([samples.evidence[k] for k in chosen])).float()
     truth = torch.from_numpy(np.stack([samples.truth[k] for k in chosen])).float()
     for k in range(len(chosen)):
         if rng.uniform() < DROP_HINT:
             without_hint(evidence[k])
+        elif rng.uniform() < WRONG_HINT:
+            evidence[k, HINT_CHANNELS.start] += evidence[k, HINT_CHANNELS.start + 1] * rng.normal(0, HINT_OFF)
         if rng.uniform() < 0.5:
             evidence[k] = evidence[k].flip(-1)
             evidence[k, 3] *= -1
@@ -164,7 +166,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--walks", type=int, default=106, help="walks to make samples of; 20 MB each")
     parser.add_argument("--held-out", type=int, default=6, help="walks of rooms that only figures are made of")
-    parser.add_argument("--steps", type=int, default=6_000, help="of 4 samples; 0.08 s of CPU time each")
+    parser.add_argument("--steps", type=int, default=5_000, help="of 4 samples; 0.08 s of CPU time each")
     parser.add_argument("--start", type=Path, help="weights to go on from")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()

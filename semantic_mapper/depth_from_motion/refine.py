@@ -60,12 +60,11 @@ class DepthRefiner:
             add_doubled(self._run(f"up_{level}", x), image)
             self._activate(f"join_{level}", image)
             x = image
-        out = self._run("head", x)[:height, :width]
-        weights = np.exp(out[..., :-2] - out[..., :-2].max(-1, keepdims=True))
-        depths = evidence[CANDIDATES].transpose(1, 2, 0)
-        chosen = (weights * depths).sum(-1) / weights.sum(-1)
-        spread = np.exp(np.clip(out[..., -1], LEAST_LOG_SPREAD, MOST_LOG_SPREAD))
-        return RefinedDepth((chosen + out[..., -2]).astype(np.float32), spread.astype(np.float32))
+        out = np.ascontiguousarray(self._run("head", x)[:height, :width].transpose(2, 0, 1))
+        weights = np.exp(out[:-2] - out[:-2].max(0))
+        chosen = (weights * evidence[CANDIDATES]).sum(0) / weights.sum(0)
+        spread = np.exp(np.clip(out[-1], LEAST_LOG_SPREAD, MOST_LOG_SPREAD))
+        return RefinedDepth(chosen + out[-2], spread)
 
     def _run(self, name: str, image: Float32) -> Float32:
         return np.ascontiguousarray(self.convolutions[name](np.ascontiguousarray(image)))

@@ -287,14 +287,16 @@ KERNEL(describe_costs, DescribeArguments) {
     for (int64_t at = start * width; at < stop * width; at++) {
         const uint16_t *s = a->sum.data + at * planes;
         const uint8_t *c = a->cost.data + at * planes;
-        int64_t best = 0, cheapest = 0;
-        for (int64_t d = 1; d < planes; d++) {
-            if (s[d] < s[best]) best = d;
-            if (c[d] < c[cheapest]) cheapest = d;
-        }
-        int64_t next = -1;
-        for (int64_t d = 0; d < planes; d++)
-            if ((d < best - 1 || d > best + 1) && (next < 0 || s[d] < s[next])) next = d;
+        uint16_t lowest_sum = UINT16_MAX, lowest_other = UINT16_MAX;
+        uint8_t lowest_cost = UINT8_MAX;
+        for (int64_t d = 0; d < planes; d++) lowest_sum = s[d] < lowest_sum ? s[d] : lowest_sum;
+        for (int64_t d = 0; d < planes; d++) lowest_cost = c[d] < lowest_cost ? c[d] : lowest_cost;
+        int64_t best = 0, cheapest = 0, next = 0;
+        while (s[best] != lowest_sum) best++;
+        while (c[cheapest] != lowest_cost) cheapest++;
+        for (int64_t d = 0; d < best - 1; d++) lowest_other = s[d] < lowest_other ? s[d] : lowest_other;
+        for (int64_t d = best + 2; d < planes; d++) lowest_other = s[d] < lowest_other ? s[d] : lowest_other;
+        while (s[next] != lowest_other || (next >= best - 1 && next <= best + 1)) next++;
         a->second.data[at] = (float)next, a->winner.data[at] = (float)cheapest;
         for (int64_t k = 0; k < 2; k++) {
             const int64_t most = (int64_t)s[best] + MARGINS[k];
