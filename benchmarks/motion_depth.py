@@ -22,6 +22,9 @@ import torch
 from semantic_mapper.config import DepthFromMotionConfig, convert_config, read_toml
 from semantic_mapper.depth_from_motion import DepthFromMotion, choose_sources, estimate_depth, prepare_view
 from semantic_mapper.depth_from_motion.enlarge import enlarge_estimate
+from semantic_mapper.depth_from_motion.estimate import match_views
+from semantic_mapper.depth_from_motion.evidence import gather_evidence
+from semantic_mapper.depth_from_motion.refine import default_refiner
 from semantic_mapper.depth_from_motion.sweep import inverse_depths, sweep_and_match
 from semantic_mapper.plots import write_picture
 from semantic_mapper.replay.log.format import LogReader
@@ -106,12 +109,13 @@ def stages(walk: Walk, config: DepthFromMotionConfig, repeats: int = 5) -> dict[
     reference, others = views[middle], views[max(middle - 24, 0) : middle]
     sources = choose_sources(reference, others, config.sources, None, 2.0)
     planes = inverse_depths(config.planes, config.near_m, config.far_m)
-    estimate = estimate_depth(reference, sources, config)
+    estimate, matched = estimate_depth(reference, sources, config), match_views(reference, sources, config, None, ())
     neighbours = [replace(v, estimate=estimate) for v in others[-6:]]
     work: dict[str, Callable[[], object]] = {
         "prepare": lambda: prepare_view(frame, config.width),
         "choose sources": lambda: choose_sources(reference, others, config.sources, None, 2.0),
         "sweep and match": lambda: sweep_and_match(reference, sources, planes, None),
+        "evidence and network": lambda: default_refiner()(gather_evidence(reference, matched, len(sources), None)),
         "estimate in all": lambda: estimate_depth(reference, sources, config, None, neighbours),
         "enlarge": lambda: enlarge_estimate(estimate, reference.rgb, frame.rgb),
     }
