@@ -183,7 +183,8 @@ def run_gone(given: argparse.Namespace) -> dict[str, Any]:
     if given.log == "rooms":
         for seed in TEST_SEEDS[: given.rooms]:
             path = CameraPathConfig(step_m=0.03)
-            walk = list(room_frames(seed, ROOM_FRAMES, ROOM_CAMERA, path=path, noise=None if given.exact else NoiseConfig()))
+            noise = None if given.exact else NoiseConfig()
+            walk = list(room_frames(seed, ROOM_FRAMES, ROOM_CAMERA, path=path, noise=noise))
             walks.append((f"room {seed}", walk, ROOMS, [0]))
     else:
         frames, labels = _read(Path(given.log))
@@ -301,7 +302,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", choices=[name for name, _ in _runs()])
     parser.add_argument("log", help="a log, or (gone) `rooms`")
-    parser.add_argument("--rooms", type=int, default=4, help="test rooms")
+    parser.add_argument("--rooms", type=int, default=3, help="test rooms")
     parser.add_argument("--exact", action="store_true", help="rooms without noise and holes in depth")
     parser.add_argument("--mesh", type=Path, help="vertices and faces of the reference, .npz")
     parser.add_argument("--picture", type=Path, help="PNG of the map before and after")

@@ -42,17 +42,19 @@ static inline bool sees_through(const DepthBounds *bounds, const F32 *depth, flo
     float cell = (float)bounds->cell, y = (float)(pixel / width), x = (float)(pixel % width);
     float aside = focal * (ASIDE_VOXELS * voxel_size / z + ASIDE_PER_M);
     int64_t height_cells = bounds->nearest.shape[1], width_cells = bounds->nearest.shape[2];
-    float left = x - aside, top = y - aside;
-    if (!(left >= 1 && top >= 1 && x + aside < cell * (float)width_cells - 1 && y + aside < cell * (float)height_cells - 1))
-        return false;
-    int64_t u0 = (int64_t)(left / cell), u1 = (int64_t)((x + aside) / cell);
-    int64_t v0 = (int64_t)(top / cell), v1 = (int64_t)((y + aside) / cell);
+    float right = cell * (float)width_cells - 1, bottom = cell * (float)height_cells - 1;
+    float border = focal * ASIDE_PER_M + 1; /* nearer to the edge of the image it may as well be outside */
+    if (!(x >= border && y >= border && x <= right - border && y <= bottom - border)) return false;
+    int64_t u0 = (int64_t)(max_f(x - aside, 0.0f) / cell), u1 = (int64_t)(min_f(x + aside, right) / cell);
+    int64_t v0 = (int64_t)(max_f(y - aside, 0.0f) / cell), v1 = (int64_t)(min_f(y + aside, bottom) / cell);
     int level = 63 - __builtin_clzll((unsigned long long)(min_i(u1 - u0, v1 - v0) + 1));
     if (level >= bounds->nearest.shape[0]) return false;
-    u1 = max_i(u1 + 1 - ((int64_t)1 << level), u0), v1 = max_i(v1 + 1 - ((int64_t)1 << level), v0);
+    int64_t side = (int64_t)1 << level;
     const float *nearest = bounds->nearest.data + level * height_cells * width_cells;
-    float least = min_f(min_f(nearest[v0 * width_cells + u0], nearest[v0 * width_cells + u1]),
-                        min_f(nearest[v1 * width_cells + u0], nearest[v1 * width_cells + u1]));
+    float least = INFINITY; /* two by two squares, or three along the edge of the image, which overlap */
+    for (int64_t v = v0; v <= v1; v += side)
+        for (int64_t u = u0; u <= u1; u += side)
+            least = min_f(least, nearest[min_i(v, v1 + 1 - side) * width_cells + min_i(u, u1 + 1 - side)]);
     float limit = z + max_f(tsdf, 0.0f) * truncation + least_margin(voxel_size) + MARGIN_PER_M * z;
     return least > limit && is_surely_measured(depth, pixel, depth_max);
 }

@@ -5,8 +5,8 @@ measured, of the eight around at most ``MOST_HOLES`` are not (speckles are noise
 thing), and all that is measured in its surroundings lies well behind what the voxel says. The surroundings reach as far as voxel and pose may be off (``ASIDE_VOXELS``, ``ASIDE_PER_M``), so that thin things, depth
 edges and grazing views are safe; the margin grows with the voxels and with the depth (``MARGIN_VOXELS``,
 ``MARGIN_PER_M``). A pixel without depth, or farther than ``depth_max``, clears nothing: black and shiny things return
-nothing. Nor do the edges of the image, nor computed or rendered depth: where pictures are matched wrongly, that lies far
-behind, frame after frame.
+nothing. Nor does a pixel as near to the edge of the image as a pose may be off, nor computed or rendered depth: where
+pictures are matched wrongly, that lies far behind, frame after frame.
 
 Each such frame halves the weight of the voxel, of which ``MOST_KEPT`` stays at most, and leaves its TSDF alone. Where
 less than one measurement is left, the voxel becomes free and loses its class votes. So three frames that see through it
