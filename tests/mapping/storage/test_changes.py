@@ -140,7 +140,7 @@ def test_a_copy_is_made_compact_later_and_is_of_its_moment(memory_mb: int, evide
 def test_voxels_are_rounded_as_plain_numpy_rounds_them(evidence: str, rng: np.random.Generator) -> None:
     _, buffers = random_grid(rng, evidence)
     values = BlockValues(*(getattr(buffers, name).copy() for name in BlockValues._fields))
-    values.weight[0, :8] = 5.0
+    values.weight[0, :8], values.weight[0, 8:16] = 5.0, 0.5  # the latter of no sensor
     values.tsdf[0, :8] = (0.0, 1e-9, -1e-9, 3.0, -3.0, 0.5 / 127, -0.5 / 127, np.nan)
     values.color[0, :4, 0] = (np.nan, -7.0, 300.0, 254.5)
     order, ids = np.array([3, 0, 6], np.int32), np.array([9, 5, 7, 2, 0], np.uint8)
@@ -148,14 +148,16 @@ def test_voxels_are_rounded_as_plain_numpy_rounds_them(evidence: str, rng: np.ra
     rows = np.array([1, 2, 0])
     tsdf, label, confidence = np.empty((3, 512), np.int8), np.empty((3, 512), np.uint8), np.empty((3, 512), np.uint8)
     rgb, itemsize = np.empty((3, 512, 3), np.uint8), packed.evidence.itemsize
+    computed = np.empty((3, 512), np.uint8)
     changes_module._compact_blocks(
-        packed.data, packed.ends, itemsize, rows, ids, 0.3, 0.4, 2.0, tsdf, label, confidence, rgb
+        packed.data, packed.ends, itemsize, rows, ids, 0.3, 0.4, 0.25, tsdf, label, confidence, rgb, computed
     )
     for row, block in zip(rows, order, strict=True):
-        seen, value = values.weight[block] >= 2.0, values.tsdf[block].astype(float)
+        seen, value = values.weight[block] >= 0.25, values.tsdf[block].astype(float)
         steps = np.nan_to_num(np.rint(np.clip(value, -1, 1) * 127))
         steps = np.where((value > 0) & (steps == 0), 1, steps)
         np.testing.assert_array_equal(tsdf[row], np.where(seen, steps, -128))
+        np.testing.assert_array_equal(computed[row], seen & (values.weight[block] < 1))
         color = np.nan_to_num(np.clip(values.color[block] + 0.5, 0, 255))
         np.testing.assert_array_equal(rgb[row], np.where(seen[:, None], color, 0).astype(np.uint8))
         for voxel in range(512):
