@@ -2,8 +2,8 @@
 
 ``gone`` draws a box or a person-sized cylinder into depth and colour of ten frames of a log or of a test room; then the
 same camera goes on without it. Of each of its surface points in the map it counts the frames that see through it, and
-looks whether the point is there after the fifth. ``static`` replays a log ten times into one map. ``cost`` maps the same
-frames with clearing on and off in turns.
+looks whether the point is there after the fifth. ``static`` replays a log ten times into one map. ``cost`` maps the
+same frames with clearing on and off in turns.
 
 Example: python -m benchmarks.ghosts gone rooms --picture ghost.png
          python -m benchmarks.ghosts gone kitchen.mcap

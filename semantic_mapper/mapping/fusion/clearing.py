@@ -2,11 +2,12 @@
 
 A voxel is part of a surface where its TSDF is below ``LARGEST_TSDF``. A frame sees through it where its pixel is
 measured, of the eight around at most ``MOST_HOLES`` are not (speckles are noise, the edge of a hole may be that of a
-thing), and all that is measured in its surroundings lies well behind what the voxel says. The surroundings reach as far as voxel and pose may be off (``ASIDE_VOXELS``, ``ASIDE_PER_M``), so that thin things, depth
-edges and grazing views are safe; the margin grows with the voxels and with the depth (``MARGIN_VOXELS``,
-``MARGIN_PER_M``). A pixel without depth, or farther than ``depth_max``, clears nothing: black and shiny things return
-nothing. Nor does a pixel as near to the edge of the image as a pose may be off, nor computed or rendered depth: where
-pictures are matched wrongly, that lies far behind, frame after frame.
+thing), and all that is measured in its surroundings lies well behind what the voxel says. The surroundings reach as far
+as voxel and pose may be off (``ASIDE_VOXELS``, ``ASIDE_PER_M``), so that thin things, depth edges and grazing views are
+safe; the margin grows with the voxels and with the depth (``MARGIN_VOXELS``, ``MARGIN_PER_M``). A pixel without depth,
+or farther than ``depth_max``, clears nothing: black and shiny things return nothing. Nor does a pixel as near to the
+edge of the image as a pose may be off, nor computed or rendered depth: where pictures are matched wrongly, that lies
+far behind, frame after frame.
 
 Each such frame halves the weight of the voxel, of which ``MOST_KEPT`` stays at most, and leaves its TSDF alone. Where
 less than one measurement is left, the voxel becomes free and loses its class votes. So three frames that see through it
@@ -16,7 +17,8 @@ surface adds its measurement as ever: what is seen through in every second frame
 The state of this is the weight alone: what pages, saves, restores and rebuilds the map need not know of it.
 
 The blocks of the truncation band are fused anyway, and cleared in that pass (``fusion.c``). This module finds and
-clears the others: those in view, in front of the depth, that hold a surface. The numbers stand in ``see_through.h``, too.
+clears the others: those in view, in front of the depth, that hold a surface. Its numbers stand in ``see_through.h``,
+too.
 """
 
 from __future__ import annotations
