@@ -124,7 +124,12 @@ class FrameDepth:
         return replace(frame, T_world_camera=refined.T_world_camera)
 
     def _hint(self, frame: PosedFrame, intrinsics: CameraIntrinsics) -> DepthEstimate:
-        depth_m, measured = self._cast_map(self._anchored(frame), intrinsics)
+        _, refiner = self._refiners.get(frame.camera_id, (None, None))
+        T_world_camera, scale = (
+            (frame.T_world_camera, 1.0) if refiner is None else refiner.to_given(frame.T_world_camera)
+        )
+        depth_m, measured = self._cast_map(replace(frame, T_world_camera=T_world_camera), intrinsics)
+        depth_m = depth_m / np.float32(scale)  # as the refined poses, which it is compared by, have it
         spread = np.where(measured, np.float32(MEASURED_SPREAD), np.float32(HINT_SPREAD))
         return DepthEstimate(depth_m, (spread * depth_m).astype(np.float32))
 

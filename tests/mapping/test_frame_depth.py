@@ -12,17 +12,18 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from semantic_mapper.config import DepthConfig, PoseRefinerConfig
 from semantic_mapper.depth_from_motion.stream import MAX_CAMERAS
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS
-from semantic_mapper.mapping.frame_depth import MOST_SPREAD, SURE_SPREAD, computed_trust
+from semantic_mapper.mapping.frame_depth import MOST_SPREAD, SURE_SPREAD, FrameDepth, computed_trust
 from semantic_mapper.mapping.fusion.depth_trust import COMPUTED_CAP, MEASURED
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.scenes import TRAIN_SEEDS, room_frames
-from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
+from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
 from tests.small import SMALL_ENCODER, SMALL_MODEL, tiny_config, tiny_field
 
 CAMERA = CameraIntrinsics(110.0, 110.0, 79.5, 59.5, 160, 120)
@@ -102,6 +103,25 @@ def test_depth_counts_little_where_the_scale_of_the_poses_is_not_known() -> None
     sure, unsure = spread(0.005), spread(0.2)
     assert 2 * sure[4] < unsure[4], "what is not known of the poses yet counts"
     assert unsure[4] > 2 * unsure[-1], "a longer way, and poses that fit the pictures, tell more of the scale"
+
+
+def test_the_map_is_asked_for_a_hint_where_frames_are_fused() -> None:
+    asked: dict[int, Float64] = {}
+
+    def cast_map(frame: PosedFrame, k: CameraIntrinsics) -> tuple[Float32, np.ndarray]:
+        asked[frame.seq] = frame.T_world_camera
+        return np.zeros((k.height, k.width), np.float32), np.zeros((k.height, k.width), bool)
+
+    computer = FrameDepth(DepthConfig(poses=PoseRefinerConfig(sigma_m=0.2)), cast_map)
+    rng = np.random.default_rng(0)
+    moved = 0.0
+    for frame in without_depth(walk(FINE)):
+        T = frame.T_world_camera.copy()
+        T[:3, 3] += 0.01 * rng.standard_normal(3)  # so that refined poses are elsewhere
+        for fused in computer.push(replace(frame, T_world_camera=T)):
+            assert np.array_equal(asked[fused.seq], fused.T_world_camera)
+            moved = max(moved, float(np.linalg.norm(fused.T_world_camera[:3, 3] - T[:3, 3])))
+    assert moved > 0.005
 
 
 def test_a_walk_with_depth_says_that_all_of_its_surface_is_measured() -> None:
