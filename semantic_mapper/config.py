@@ -49,7 +49,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     infinite: ClassVar[bool] = False  # whether ``inf`` is a value of its numbers
     old_names: ClassVar[Mapping[str, str]] = {}  # of settings that were renamed -> their name now
-    old_values: ClassVar[Mapping[str, Mapping[str, str]]] = {}  # by setting: values that were renamed
+    old_values: ClassVar[Mapping[str, Mapping[str | bool, str]]] = {}  # by setting: values that were renamed
 
 
 class EncoderConfig(Config, frozen=True):
@@ -170,8 +170,9 @@ class KeyframeConfig(Config, frozen=True):
     )
     source_views: Annotated[int, msgspec.Meta(ge=1, le=16)] = 8  # m of the paper
     use_current_view: bool = True  # the frame being mapped is itself a source view of its rendering
-    # Weight of what its image says by itself in its class probabilities, against the rendered view.
-    own_image_weight: Fraction = 0.0
+    # Weight of what its image says by itself, against the rendered view, in what it tells the map; its own labels are
+    # those of the rendered view.
+    own_image_weight: Fraction = 0.2
 
 
 class VoxelMapConfig(Config, frozen=True):
@@ -436,7 +437,7 @@ def rename_settings(data: Any, kind: Any, where: str) -> Any:
             if data[name] == value:  # as in summaries, which hold both
                 continue
             raise ConfigError(f"{where}: `{key}` is the old name of `{name}`, which is there, too; give one of them")
-        new_value = old_values.get(name, {}).get(value, value) if isinstance(value, str) else value
+        new_value = old_values.get(name, {}).get(value, value) if isinstance(value, str | bool) else value
         if (name, new_value) != (key, value):
             _log.warning(
                 "setting_renamed", file=where, old=key, new=name, **({} if new_value == value else {"value": new_value})

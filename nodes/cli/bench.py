@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -62,6 +62,10 @@ PlotOption = Annotated[
         "pipeline: the stages of a step, of qualities fast and balanced (measures both).",
     ),
 ]
+DepthOption = Annotated[
+    Literal["sensor", "computed"] | None,
+    typer.Option(help="pipeline: the frames' depth is measured, or computed from their pictures.  [default: sensor]"),
+]
 OutOption = Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Also write the figures here, as JSON.")]
 
 
@@ -76,6 +80,7 @@ def bench(
     config: ConfigOption = None,
     quality: QualityOption = None,
     voxel_size: VoxelSizeOption = None,
+    depth: DepthOption = None,
     rooms: RoomsOption = None,
     loops: LoopsOption = 6,
     returns: Annotated[int | None, typer.Option(min=0, hidden=True)] = None,
@@ -104,6 +109,7 @@ def bench(
 
     Example: semantic-mapper bench --out runs/bench.json
     Example: semantic-mapper bench pipeline --frames 40 --quality fast
+    Example: semantic-mapper bench pipeline --depth computed
     Example: semantic-mapper bench queries --frames 60 --rate 20 --out runs/queries.json
     Example: semantic-mapper bench growth --frames 8 --width 160 --plot runs/growth.png
     Example: semantic-mapper bench map --rooms 4 --loops 1 --minutes 2 --quality fast --memory-mb 200
@@ -122,7 +128,9 @@ def bench(
         if path is not None:
             prepare_file(path)
     plan = WalkPlan(rooms or 30, loops, minutes, hz, width or 320)
-    settings = mapper_config(config, voxel_size, None, quality)
+    if depth is not None and part is not Part.PIPELINE:
+        raise typer.BadParameter("goes with pipeline", param_hint="--depth")
+    settings = mapper_config(config, voxel_size, None, quality, depth, live=True)
     rendering, queries = RenderRequest(repeats, views or 1, log), QueriesRequest(rate, width or 640)
     virtual = (rooms or 4, views or 8)
     request = BenchRequest(weights, settings, rendering, frames, plan, memory_mb, plot, virtual, queries)

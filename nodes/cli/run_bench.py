@@ -99,8 +99,8 @@ def run_pipeline(request: BenchRequest, output: Output) -> dict[str, Any]:
     found = bench_pipeline(request.weights, request.config, request.frames)
     stages = ", ".join(f"{name} {value}" for name, value in found["stages_ms"].items())
     output.print(
-        f"pipeline at {found['size']}: {found['hz']} frames/s, a step {found['p50_ms']} ms (p50), "
-        f"{found['p95_ms']} ms (p95); mIoU {found['miou'] * 100:.1f} %; stages in ms: {stages}"
+        f"pipeline at {found['size']}, {found['depth']} depth: {found['hz']} frames/s, a step {found['p50_ms']} ms "
+        f"(p50), {found['p95_ms']} ms (p95); mIoU {found['miou'] * 100:.1f} %; stages in ms: {stages}"
     )
     if request.plot is not None:
         qualities = bench_qualities(request.weights, request.config, request.frames, found)

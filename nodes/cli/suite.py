@@ -131,7 +131,7 @@ def _draw(
 
 def _file_stem(suite: SuiteConfig) -> str:
     """One file for each table that a comparison usually has."""
-    depth = "depth" if suite.depth else "no-depth"
+    depth = {"on": "depth", "computed": "computed-depth", "off": "no-depth"}[suite.depth]
     own = "" if suite.own_image else "novel-"
     views = f"{suite.sources}-{own}" if suite.protocol == "generalize" else ""
     views += "hard-" if suite.current == "hard" else ""
@@ -252,7 +252,7 @@ def _title(suite: SuiteConfig, rooms: int) -> str:
     own = ", the query's own image among them" if suite.own_image else ""
     sources = f"{suite.views} {suite.sources} views{own}" if suite.protocol == "generalize" else _fit_title(suite)
     sources += ", hard query images" if suite.current == "hard" else ""
-    depth = "with depth" if suite.depth else "without depth"
+    depth = {"on": "with depth", "computed": "with computed depth", "off": "without depth"}[suite.depth]
     width, count = suite.tier.width, "1 room" if rooms == 1 else f"{rooms} rooms"
     return f"ROOMS {suite.split}, {count}, {suite.protocol}: {sources}, {depth}, {width}x{width * 3 // 4}"
 

@@ -43,7 +43,8 @@ CurrentOption = Annotated[
 ]
 BaselineOption = Annotated[Literal["wide", "narrow"] | None, typer.Option(hidden=True)]
 DepthOption = Annotated[
-    Literal["on", "off"] | None, typer.Option(help="Whether the frames have sensor depth.  [default: on]")
+    Literal["on", "computed", "off"] | None,
+    typer.Option(help="The sensor's depth, depth computed from the pictures of the walk, or none.  [default: on]"),
 ]
 TierOption = Annotated[
     Literal["cpu", "gpu"] | None,
@@ -93,7 +94,7 @@ def suite_config(
         given["seconds"] = 0.0
     for name, value in given.items():
         section = plain["scene"] if name in ("keyframes", "seconds", "steps") else plain
-        section[name] = value == "on" if name == "depth" else value
+        section[name] = value
     settings = convert_config(plain, SuiteConfig, "command line")
     _refuse_idle(settings.protocol, given, maps)
     return settings

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from semantic_mapper.benchmark.config import MAP_WIDTH, SuiteConfig, camera_of_width, settings_digest
 from semantic_mapper.benchmark.records import MapRecord
 from semantic_mapper.benchmark.rooms import as_given
 from semantic_mapper.benchmark.scoring import as_calibration, as_rows
+from semantic_mapper.config import DepthConfig
 from semantic_mapper.errors import MapError
 from semantic_mapper.evaluation.metrics import (
     ConfusionMatrix,
@@ -23,9 +25,11 @@ from semantic_mapper.geometry import invert_pose, project, transform, unproject
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.map_types import MapView
+from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, RoomConfig, Scene, make_room, render_view, room_frames
-from semantic_mapper.types import Float32, Float64, UInt8
+from semantic_mapper.training.computed_depth import DELAY_FRAMES
+from semantic_mapper.types import Float32, Float64, PosedFrame, UInt8
 
 NEAR_M = 0.05  # a map point this near to the true surface speaks for it
 SEEN_M = 0.03  # a frame sees a map point that is this near, in depth, to where its ray meets the map
@@ -63,17 +67,32 @@ def map_room(seed: int, weights: Path, digest: str, suite: SuiteConfig) -> MapRe
         WeightsError: see ``Mapper.load``.
         MapError: the map came out empty.
     """
-    pipeline = Mapper.load(weights, suite.mapper).pipeline
+    pipeline = Mapper.load(weights, msgspec.structs.replace(suite.mapper, depth=_depth(suite))).pipeline
     camera = camera_of_width(MAP_WIDTH)
     path = CameraPathConfig(step_m=suite.sequence.step_m)
     furnished = RoomConfig(camouflage=suite.sequence.camouflage)
     scene = make_room(seed, furnished)
     views: list[_View] = []
     for frame in room_frames(seed, suite.map_frames, camera, room=furnished, path=path, noise=NoiseConfig()):
-        label = in_rooms(pipeline.step(as_given(frame, depth=suite.depth)).label, pipeline.label_set)
-        assert frame.label is not None
-        views.append(_View(frame.T_world_camera, frame.label, label))
+        ready = pipeline.prepare(as_given(frame, depth=suite.depth == "on", label=True))
+        views += [_step(pipeline, waited) for waited in ready]
+    views += [_step(pipeline, waited) for waited in pipeline.prepare_rest()]
     return _compare(scene, pipeline.voxel_map, views, digest, suite)
+
+
+def _depth(suite: SuiteConfig) -> DepthConfig:
+    """Where the mapper takes depth from: computed as in ``replay``, and by the field where no frame has any."""
+    config = suite.mapper.depth
+    if suite.depth == "computed":
+        waits = msgspec.structs.replace(config.from_motion, delay_frames=DELAY_FRAMES)
+        return msgspec.structs.replace(config, source="computed", from_motion=waits)
+    return msgspec.structs.replace(config, source="off" if suite.depth == "off" else config.source)
+
+
+def _step(pipeline: MappingPipeline, frame: PosedFrame) -> _View:
+    assert frame.label is not None
+    label = in_rooms(pipeline.step(frame).label, pipeline.label_set)
+    return _View(frame.T_world_camera, frame.label, label)
 
 
 def in_rooms(label: UInt8, label_set: LabelSet) -> UInt8:

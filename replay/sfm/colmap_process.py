@@ -152,6 +152,8 @@ def _match(pycolmap: Any, folder: Path, names: list[str], pairs: list[tuple[int,
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     verification.compute_relative_pose = False
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.sift.cpu_brute_force_matcher = True  # the search through an index differs now and then between runs
     listed = folder / "pairs.txt"
     for start in range(0, len(pairs), PAIRS_AT_ONCE):
         chosen = pairs[start : start + PAIRS_AT_ONCE]
@@ -159,6 +161,7 @@ def _match(pycolmap: Any, folder: Path, names: list[str], pairs: list[tuple[int,
         pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
         pycolmap.match_image_pairs(
             folder / DATABASE,
+            matching_options=matching,
             pairing_options=pairing,
             verification_options=verification,
             device=pycolmap.Device.cpu,

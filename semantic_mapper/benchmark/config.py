@@ -37,6 +37,7 @@ Split = Literal["test", "val"]
 Protocol = Literal["generalize", "finetune", "scratch"]
 SourceChoice = Literal["near", "wide", "cover"]
 CurrentFrame = Literal["clean", "hard"]
+GivenDepth = Literal["on", "computed", "off"]
 Tier = Literal["cpu", "gpu"]
 
 
@@ -123,7 +124,7 @@ class SuiteConfig(Config, frozen=True):
     """A run of the benchmark."""
 
     old_names: ClassVar = {"baseline": "sources"}
-    old_values: ClassVar = {"sources": {"narrow": "near"}}
+    old_values: ClassVar = {"sources": {"narrow": "near"}, "depth": {True: "on", False: "off"}}
 
     split: Split = "test"
     rooms: NotNegative = 0  # the first this many of the split; 0 = all
@@ -134,7 +135,8 @@ class SuiteConfig(Config, frozen=True):
     current: CurrentFrame = (
         "clean"  # "hard": query images with blur, noise, 2 stops too dark, a narrow lens, or too close
     )
-    depth: bool = True  # whether fields are given sensor depth
+    # What fields are given: the sensor's; computed from the pictures of the walk, at twice the size; or none.
+    depth: GivenDepth = "on"
     tier: TierConfig = TierConfig()
     sequence: SequenceConfig = SequenceConfig()
     scene: SceneBudget = SceneBudget()
@@ -158,8 +160,10 @@ def check_suite(suite: SuiteConfig) -> None:
     seeds = TEST_SEEDS if suite.split == "test" else VALIDATION_SEEDS
     if not 0 <= suite.rooms <= len(seeds):
         raise ConfigError(f"rooms: split '{suite.split}' has {len(seeds)} rooms, {suite.rooms} are requested; 0 = all")
-    if suite.depth and suite.sequence.camera.sensor == "none":
-        raise ConfigError("sequence.camera: a camera without a depth sensor gives no depth; --depth off")
+    if suite.depth == "on" and suite.sequence.camera.sensor == "none":
+        raise ConfigError("sequence.camera: a camera without a depth sensor gives no depth; --depth off or computed")
+    if suite.depth == "computed" and suite.current == "hard":
+        raise ConfigError("--depth computed needs a walk; --current hard has single images: ask for one of them")
     if suite.protocol == "generalize":
         return
     scene = suite.scene
@@ -185,7 +189,7 @@ def camera_of_width(width: int, focal_per_width: float = FOCAL_PER_WIDTH) -> Cam
 def fit_config(suite: SuiteConfig, share: float) -> FinetuneConfig:
     """How a field is fitted to one room with a share of the budget."""
     scene = suite.scene
-    sampling = suite.tier.guided if suite.depth else suite.tier.blind
+    sampling = suite.tier.blind if suite.depth == "off" else suite.tier.guided
     return FinetuneConfig(
         seconds=scene.seconds * share,
         steps=max(1, round(scene.steps * share)) if scene.steps else 0,

@@ -16,6 +16,7 @@ from semantic_mapper.fields.depth_prior import depth_prior
 from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.render import render_image
+from semantic_mapper.fields.sampling import around_computed
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_streaming import StreamingSRay, compiled_covers
 from semantic_mapper.imaging import fill_holes, resize_depth, resize_rgb
@@ -57,6 +58,8 @@ def predict_view(field: LearnedField, sources: Sequence[PosedFrame], query: Pose
     """
     device = next(field.parameters()).device
     sampling = tier.blind if query.depth_m is None else tier.guided
+    if query.depth_sigma_m is not None:
+        sampling = around_computed(sampling)
     views = [view_from_frame(frame, field.label_set, query.intrinsics.width) for frame in sources]
     labelled = any(frame.label is not None for frame in sources)
     renderer = _renderer(field, sampling, device)

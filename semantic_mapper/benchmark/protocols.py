@@ -173,8 +173,8 @@ def _answer(
     """Render a query view from ``sources``, positions in ``pool``; frames of ``labelled`` bring their labels."""
     frames = room.frames
     chosen = [pool[i] for i in sources.numbers][: _source_count(field, suite)]
-    given = [as_given(frames[n], depth=suite.depth, label=n in labelled) for n in chosen]
-    asked = as_given(room.current[query], depth=suite.depth)
+    given = [as_given(room.given[n], depth=True, label=n in labelled) for n in chosen]
+    asked = room.asked(query)
     own = _shows_own(field, suite)
     # The own image comes last, where the mapping pipeline has the current view, too.
     prediction = predict_view(field, [*given, asked] if own else given, asked, suite.tier)
@@ -197,8 +197,8 @@ def _fit_and_score(
     """Fit to the keyframes with growing shares of the budget; the whole budget gives the room's figures."""
     check_suite(suite)
     keyframes = choose_fitted(room, suite)
-    frames = [as_given(room.frames[n], depth=suite.depth, label=True) for n in keyframes.labelled]
-    frames += [as_given(room.frames[n], depth=suite.depth) for n in keyframes.unlabelled]
+    frames = [as_given(room.given[n], depth=True, label=True) for n in keyframes.labelled]
+    frames += [as_given(room.given[n], depth=True) for n in keyframes.unlabelled]
     views = stack_sources([view_from_frame(frame, ROOMS, suite.tier.width) for frame in frames])
     field = _start(entry.field, suite, views)
     answers = answer_from_keyframes(room, field.eval(), suite, keyframes)
@@ -279,6 +279,6 @@ def _scored(
         rows=room_rows(room, answers),
         keyframes=keyframes,
         curve=curve,
-        carried=_carried_labels(room, keyframes) if keyframes and suite.depth else None,
+        carried=_carried_labels(room, keyframes) if keyframes and suite.depth == "on" else None,
     )
     return RoomResult(record, answers)

@@ -8,6 +8,7 @@ import numpy as np
 
 from semantic_mapper.benchmark.config import SuiteConfig, camera_of_width
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.imaging import resize_depth, resize_spread
 from semantic_mapper.scenes import (
     CameraPathConfig,
     NoiseConfig,
@@ -19,6 +20,7 @@ from semantic_mapper.scenes import (
 )
 from semantic_mapper.scenes.scene import Scene
 from semantic_mapper.scenes.shots import motion_between, sequence_shots
+from semantic_mapper.training.computed_depth import DELAY_FRAMES, ComputedDepth, compute_depth
 from semantic_mapper.types import Float64, PosedFrame
 
 CLEAN = "clean"
@@ -28,6 +30,8 @@ ISO_FACTOR = 8.0
 DARK_GAIN = 0.25  # two stops
 NARROW_FOCAL = 1.4  # image widths
 CLOSE_M = (0.3, 0.6)  # from what is in the middle of the image
+COMPUTED_SCALE = 2  # depth is computed from pictures this much larger than those that fields see, as in the mapper
+AS_REPLAYED = ComputedDepth(between=1, delay_frames=DELAY_FRAMES)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +42,7 @@ class BenchmarkRoom:
         seed: Of the room.
         template: Kind of room.
         frames: The walk, with the noise of the sensor, in the order of their ``seq``.
+        given: The same with the depth that fields are given.
         truth: By frame number of each query view, in order: colour of a perfect camera at even exposure, exact depth,
             labels.
         pairs: Frame numbers of neighbouring query views by one camera.
@@ -52,6 +57,14 @@ class BenchmarkRoom:
     pairs: tuple[tuple[int, int], ...]
     current: dict[int, PosedFrame]
     condition: dict[int, str]
+    given: tuple[PosedFrame, ...]
+
+    def asked(self, query: int) -> PosedFrame:
+        """``current`` of a query view, without label, with the depth that fields are given."""
+        frame, given = self.current[query], self.given[query]
+        if frame is self.frames[query]:
+            return as_given(given, depth=True)
+        return as_given(frame, depth=given.depth_m is not None)
 
     @property
     def queries(self) -> tuple[int, ...]:
@@ -86,7 +99,21 @@ def make_benchmark_room(seed: int, suite: SuiteConfig) -> BenchmarkRoom:
     else:
         condition, current = dict.fromkeys(queries, CLEAN), {q: frames[q] for q in queries}
     truth = {q: render_view(scene, frame.intrinsics, frame.T_world_camera) for q, frame in current.items()}
-    return BenchmarkRoom(seed, scene.template, frames, truth, pairs, current, condition)
+    if suite.depth == "on":
+        given = frames
+    elif suite.depth == "off":
+        given = tuple(replace(frame, depth_m=None) for frame in frames)
+    else:
+        larger = camera_of_width(COMPUTED_SCALE * suite.tier.width, asked.focal_per_width)
+        walk = room_frames(seed, len(frames), larger, room=furnished, path=path, noise=noise)
+        given = tuple(_with_depth(f, c) for f, c in zip(frames, compute_depth(list(walk), AS_REPLAYED), strict=True))
+    return BenchmarkRoom(seed, scene.template, frames, truth, pairs, current, condition, given)
+
+
+def _with_depth(frame: PosedFrame, computed: PosedFrame) -> PosedFrame:
+    """The frame with depth and spread of a larger picture at the same pose."""
+    size = frame.intrinsics
+    return replace(frame, depth_m=resize_depth(computed, size), depth_sigma_m=resize_spread(computed, size))
 
 
 def hard_frame(
@@ -151,4 +178,9 @@ def query_pairs(suite: SuiteConfig) -> tuple[tuple[int, int], ...]:
 
 def as_given(frame: PosedFrame, *, depth: bool, label: bool = False) -> PosedFrame:
     """What a field may see of a frame."""
-    return replace(frame, depth_m=frame.depth_m if depth else None, label=frame.label if label else None)
+    return replace(
+        frame,
+        depth_m=frame.depth_m if depth else None,
+        depth_sigma_m=frame.depth_sigma_m if depth else None,
+        label=frame.label if label else None,
+    )

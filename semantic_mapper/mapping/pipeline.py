@@ -263,16 +263,16 @@ class MappingPipeline:
         with self._stage("render"):
             own = [current] if self.config.keyframes.use_current_view else []
             view = self._render(resized, [*(k.encoded for k in sources), *own], self.config.render.scale)
-            view = add_own_image(view, self.field, current, self._own_image_weight)
+            votes = add_own_image(view, self.field, current, self._own_image_weight)
         with self._stage("lift"):
-            depth, rows, trust = self._lift(resized, view, self.voxel_map)
-        table = view.probabilities.reshape(-1, len(self.label_set))
+            depth, rows, trust = self._lift(resized, votes, self.voxel_map)
         with self._stage("fuse"):
             measured = is_measured(frame)
+            table = votes.probabilities.reshape(-1, len(self.label_set))
             touched = self.voxel_map.integrate(frame, depth, table, rows=rows, trust=trust, measured=measured)
         if self.corrector.records:
             with self._stage("history"):
-                self.corrector.record(FusedFrame(frame, view.probabilities, view.known, view.depth_m))
+                self.corrector.record(FusedFrame(frame, votes.probabilities, votes.known, votes.depth_m))
         with self._stage("keyframe"):
             is_keyframe = self.keyframes.wants(frame.T_world_camera, current.size)
             if is_keyframe:
@@ -282,7 +282,7 @@ class MappingPipeline:
                 self.keyframes.add(keyframe)
         self._intrinsics[frame.camera_id] = frame.intrinsics
         self._odd_sizes.pop(frame.camera_id, None)
-        label, confidence = self._at_rows(table, rows)
+        label, confidence = self._at_rows(view.probabilities.reshape(-1, len(self.label_set)), rows)
         spent = self._stage_ms
         self._renderer.note(spent["render"], sum(spent.values()) - spent["render"])
         self._steps += 1

@@ -21,6 +21,7 @@ from semantic_mapper.benchmark.protocols import (
 from semantic_mapper.benchmark.rooms import as_given
 from semantic_mapper.benchmark.scoring import from_rows
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.sampling import around_computed
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.training.views import stack_sources, view_from_frame
@@ -51,7 +52,7 @@ def watched(kind: type[Watched] = Watched) -> Watched:
 
 
 def score(entry: Entry, suite: SuiteConfig, on_fit: Callable[[float], None] | None = None) -> RoomResult:
-    result = run_room(tiny_room(), entry, suite, on_fit)
+    result = run_room(tiny_room(suite.depth), entry, suite, on_fit)
     assert result is not None
     return result
 
@@ -86,6 +87,21 @@ def test_without_depth_nothing_of_it_reaches_the_field() -> None:
     assert field.sampling == tiny_suite().tier.blind
     score(Entry("seeing", "seeing", field), tiny_suite())
     assert field.seen.depth_m.any() and field.sampling == tiny_suite().tier.guided
+
+
+def test_computed_depth_comes_with_its_spread_and_is_sampled_more_widely() -> None:
+    field = watched()
+    suite = tiny_suite(depth="computed")
+    score(Entry("x", "x", field), suite)
+    assert field.seen.depth_sigma_m is not None and field.seen.depth_sigma_m.any()
+    assert field.sampling == around_computed(suite.tier.guided)
+    room = tiny_room("computed")
+    asked, truth = room.asked(room.queries[0]), room.truth[room.queries[0]]
+    assert asked.label is None and asked.depth_m is not None and asked.depth_sigma_m is not None
+    known = (asked.depth_m > 0) & (truth.depth_m > 0)
+    assert known.mean() > 0.5
+    assert np.median(np.abs(asked.depth_m - truth.depth_m)[known] / truth.depth_m[known]) < 0.1
+    assert not np.array_equal(asked.depth_m, room.frames[room.queries[0]].depth_m)
 
 
 def test_without_depth_coarse_samples_may_guide_fine_ones() -> None:

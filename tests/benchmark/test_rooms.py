@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semantic_mapper.benchmark.config import TIERS, SuiteConfig, settings_digest, suite_seeds
+from semantic_mapper.benchmark.config import TIERS, SuiteConfig, check_suite, settings_digest, suite_seeds
 from semantic_mapper.benchmark.rooms import CLEAN, HARD, as_given, make_benchmark_room, query_pairs
 from semantic_mapper.config import convert_config
 from semantic_mapper.errors import ConfigError
@@ -49,7 +49,8 @@ def test_records_are_told_apart_by_what_made_them_and_by_nothing_else() -> None:
     assert settings_digest(tiny_suite(map_frames=9), "views") == base
     assert settings_digest(tiny_suite(scene={"steps": 99}), "views") == base  # generalize fits nothing
     different = [
-        settings_digest(tiny_suite(depth=False), "views"),
+        settings_digest(tiny_suite(depth="off"), "views"),
+        settings_digest(tiny_suite(depth="computed"), "views"),
         settings_digest(tiny_suite(sources="wide"), "views"),
         settings_digest(tiny_suite(sources="cover"), "views"),
         settings_digest(tiny_suite(own_image=False), "views"),
@@ -60,7 +61,7 @@ def test_records_are_told_apart_by_what_made_them_and_by_nothing_else() -> None:
         settings_digest(tiny_suite(), "map"),
         settings_digest(tiny_suite(map_frames=9), "map"),
     ]
-    assert len({base, *different}) == 11
+    assert len({base, *different}) == 12
     assert settings_digest(tiny_suite(views=5), "map") == settings_digest(tiny_suite(), "map")
 
 
@@ -77,6 +78,22 @@ def test_the_camera_of_the_sequence_may_be_another():
     assert min(heights) > 0.45 and max(heights) < 0.75
     assert room.frames[0].intrinsics.fx == pytest.approx(0.9 * suite.tier.width) and room.frames[0].depth_m is None
     assert settings_digest(suite, "views") != settings_digest(SuiteConfig(), "views")
+
+
+def test_depth_may_be_said_as_it_was_before() -> None:
+    assert (tiny_suite(depth=True).depth, tiny_suite(depth=False).depth) == ("on", "off")
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"sequence": {"camera": {"sensor": "none"}}}, "--depth off or computed"),
+        ({"depth": "computed", "current": "hard"}, "needs a walk"),
+    ],
+)
+def test_depth_that_there_cannot_be_is_refused(changes: dict[str, object], says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        check_suite(tiny_suite(**changes))
 
 
 def test_the_old_name_of_the_source_views_still_works() -> None:

@@ -29,8 +29,8 @@ def tiny_suite(**changes: object) -> SuiteConfig:
 
 
 @cache
-def tiny_room() -> BenchmarkRoom:
-    return make_benchmark_room(ROOM, tiny_suite())
+def tiny_room(depth: str = "on") -> BenchmarkRoom:
+    return make_benchmark_room(ROOM, tiny_suite(depth=depth))
 
 
 def tiny_contestant(seed: int = 0) -> Entry:

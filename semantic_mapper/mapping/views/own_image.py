@@ -26,10 +26,12 @@ def add_own_image(view: RenderedView, field: SemanticField, current: EncodedView
         current: The frame's own image, encoded.
         weight: Of what the image says by itself, 0..1; 0 = the view as it is.
     """
-    logits = field.source_logits(current) if weight > 0 and isinstance(field, ImageClassifier) else None
-    if logits is None:
+    if weight == 0 or not isinstance(field, ImageClassifier):
         return view
     with torch.inference_mode():
+        logits = field.source_logits(current)
+        if logits is None:
+            return view
         own = logits.float().cpu()
         if own.shape[2:] != view.known.shape:
             own = functional.interpolate(own, size=view.known.shape, mode="bilinear", align_corners=False)
