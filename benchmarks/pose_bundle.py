@@ -3,6 +3,7 @@
 Examples:
     python -m benchmarks.pose_bundle refine --log kitchen.mcap --rooms 2
     python -m benchmarks.pose_bundle visual --log kitchen.mcap --rooms 5
+    python -m benchmarks.pose_bundle height --rooms 5
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
 CAMERA = CameraIntrinsics(220.6, 220.6, 159.5, 119.5, 320, 240)
 WALK = CameraPathConfig(step_m=0.05)
+HEIGHT_M = 1.2  # of the camera that is carried at one height
 NOISE = NoiseConfig(depth="exact")  # pictures as a camera takes them; depth only judges the poses
 WHEELS = PoseNoiseConfig(translation_share=0.02, rotation_deg_per_m=0.5, closure_frames=0)
 DISTURBED_M, DISTURBED_DEG = 0.02, 0.5
@@ -54,9 +56,9 @@ class Walk:
         return float(np.linalg.norm(np.diff(self.truth[:, :3, 3], axis=0), axis=1).sum())
 
 
-def room_walk(seed: int, count: int) -> Walk:
+def room_walk(seed: int, count: int, path: CameraPathConfig = WALK) -> Walk:
     """Frames through a room."""
-    frames = list(room_frames(seed, count, CAMERA, path=WALK, noise=NOISE))
+    frames = list(room_frames(seed, count, CAMERA, path=path, noise=NOISE))
     return Walk(f"room {seed}", frames, np.array([f.T_world_camera for f in frames]))
 
 
@@ -160,9 +162,11 @@ class ListedPoses:
 
 
 def visual(walk: Walk, config: VisualPoses) -> dict[str, Any]:
-    """Figures of visual odometry whose scale comes from drifting wheels."""
+    """Figures of visual odometry whose scale comes from drifting wheels, or (``config``) from the camera's height."""
     wheels = drifting_poses(walk.truth, 1, WHEELS)
     reference = ListedPoses({f.stamp_ns: T for f, T in zip(walk.frames, wheels, strict=True)})
+    if config.camera_height_m:
+        reference = None
     estimated: list[Float64] = []
     processor_ms: list[float] = []
     with VisualPoseSource(config, reference) as source:
@@ -174,6 +178,8 @@ def visual(walk: Walk, config: VisualPoses) -> dict[str, Any]:
     poses = np.array(estimated)
     known = np.isfinite(poses[:, 0, 0])
     error = absolute_trajectory_error(poses[known], walk.truth[known]).rmse_m if known.sum() > 3 else np.nan
+    ways = (np.linalg.norm(np.diff(p[known, :3, 3], axis=0), axis=1).sum() for p in (poses, walk.truth))
+    way, true_way = ways
     wheel_error = absolute_trajectory_error(wheels, walk.truth).rmse_m
     return {
         "frames": len(poses),
@@ -181,6 +187,7 @@ def visual(walk: Walk, config: VisualPoses) -> dict[str, Any]:
         "with_pose": float(known.mean()),
         "ate_m": error,
         "ate_percent_of_path": 100 * error / walk.path_m,
+        "scale": float(way / max(true_way, 1e-9)),
         "wheels_percent_of_path": 100 * wheel_error / walk.path_m,
         "processor_ms": {f"p{p}": float(np.percentile(processor_ms, p)) for p in (50, 95)},
         "counters": {name: count for name, count in source.counters.items() if count},
@@ -190,11 +197,19 @@ def visual(walk: Walk, config: VisualPoses) -> dict[str, Any]:
 def main() -> None:
     """Run it, and print the figures as JSON, a line for each recording."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("refine", "visual"))
+    parser.add_argument("what", choices=("refine", "visual", "height"))
     parser.add_argument("--log", type=Path, action="append", default=[])
     parser.add_argument("--rooms", type=int, default=0, help="walks through this many rooms of the test split")
     parser.add_argument("--frames", type=int, default=200, help="of each recording, at most")
     given = parser.parse_args()
+    if given.what == "height":
+        level = CameraPathConfig(step_m=WALK.step_m, min_height_m=HEIGHT_M, max_height_m=HEIGHT_M)
+        for seed in TEST_SEEDS[: given.rooms]:
+            walk = room_walk(seed, given.frames, level)
+            start = tuple(tuple(row) for row in walk.truth[0].tolist())
+            figures = visual(walk, VisualPoses(camera_height_m=HEIGHT_M, T_world_start=start))
+            print(json.dumps({"recording": walk.name, **figures}), flush=True)
+        return
     for path in given.log:
         walk = log_walk(path, given.frames)
         figures = refine(walk, PoseRefinerConfig()) if given.what == "refine" else visual(walk, VisualPoses())

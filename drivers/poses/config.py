@@ -125,6 +125,9 @@ class VisualPoses(Config, frozen=True):
     # seen at the beginning). The world is the one of these poses then.
     scale: dict[str, Any] = msgspec.field(default_factory=dict)
     distance_m: AtLeastZero = 0.0  # in its place: from the camera to what is in the middle of its first picture
+    # In its place, for a camera that is carried at one height over a flat floor that it sees: how high. Every keyframe
+    # that sees the floor corrects the scale. Without T_world_start the camera is taken to be level.
+    camera_height_m: AtLeastZero = 0.0
     T_world_start: Matrix = IDENTITY  # T_world_camera of the first picture, where there is no ``scale``
     tracking: PoseRefinerConfig = PoseRefinerConfig(window=10)
     drift: Fraction = 0.03  # of the way: what ``sigma`` grows by
@@ -132,8 +135,8 @@ class VisualPoses(Config, frozen=True):
     def __post_init__(self) -> None:
         if self.scale and self.scale.get("kind") not in ("topic", "board"):
             raise ValueError('scale: kind must be "topic" or "board"')
-        if self.scale and self.distance_m:
-            raise ValueError("give scale or distance_m")
+        if bool(self.scale) + bool(self.distance_m) + bool(self.camera_height_m) > 1:
+            raise ValueError("give one of scale, distance_m and camera_height_m")
 
 
 PoseConfig = DevicePoses | FixedPose | TopicPoses | BoardPoses | OdometryPoses | VisualPoses
@@ -141,7 +144,7 @@ PoseConfig = DevicePoses | FixedPose | TopicPoses | BoardPoses | OdometryPoses |
 
 def gives_metres(config: PoseConfig) -> bool:
     """Whether poses are in metres; those of pictures alone have a unit of their own."""
-    return not isinstance(config, VisualPoses) or bool(config.scale or config.distance_m)
+    return not isinstance(config, VisualPoses) or bool(config.scale or config.distance_m or config.camera_height_m)
 
 
 def begins_world(config: PoseConfig) -> bool:

@@ -12,16 +12,19 @@ from semantic_mapper.bundle.odometry import VisualOdometry
 from semantic_mapper.bundle.picture_checks import PictureChecker
 from semantic_mapper.bundle.scale import ScaleEstimator
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate
-from semantic_mapper.drivers.poses.config import VisualPoses, matrix
+from semantic_mapper.drivers.poses.config import VisualPoses, gives_metres, matrix
 from semantic_mapper.drivers.poses.posed_camera import DiagnosticPoseSource
 from semantic_mapper.errors import CameraError
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import CameraIntrinsics, Float64
 
+_LEVEL = np.array(((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)))  # looking along x, z up
+_AWAITED_FLOOR = "the scale is not known yet: move the camera on, and let it see the floor"
 _GAIN = 0.3  # of the way to a new scale that a keyframe goes
 _UNKNOWN = (
     "scale: unknown: poses are up to scale, and nothing in the map is in metres; give the robot's odometry "
-    '(scale = { kind = "topic", endpoint = ... }), a board (scale = { kind = "board", ... }) or distance_m'
+    '(scale = { kind = "topic", endpoint = ... }), a board (scale = { kind = "board", ... }), distance_m or '
+    "camera_height_m"
 )
 
 _log = get_logger(__name__)
@@ -58,7 +61,7 @@ class VisualPoseSource:
         """Whether poses are in metres: "known", "unknown", or "awaited" from the reference."""
         if self._metric:
             return "known"
-        return "unknown" if self._reference is None and not self._config.distance_m else "awaited"
+        return "awaited" if self._reference is not None or gives_metres(self._config) else "unknown"
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -106,7 +109,9 @@ class VisualPoseSource:
         pose = self._scaled(odometry, pose, None if reference is None else reference.T_world_camera)
         if self.scale == "awaited":
             self._without_scale += 1
-            self._trouble = "the scale is not known yet: move the camera on"
+            self._trouble = (
+                _AWAITED_FLOOR if self._config.camera_height_m else "the scale is not known yet: move the camera on"
+            )
             return None
         self._trouble = ""
         if self._last is not None:
@@ -135,6 +140,8 @@ class VisualPoseSource:
 
     def _scaled(self, odometry: VisualOdometry, pose: Float64, reference: Float64 | None) -> Float64:
         """The pose once what is known of the scale, and of where the world begins, is brought into the map."""
+        if self._config.camera_height_m:
+            return self._over_floor(odometry, pose)
         if not self._metric and self._reference is None:
             depth = odometry.center_depth() if self._config.distance_m else None
             self._metric = depth is not None
@@ -157,6 +164,23 @@ class VisualPoseSource:
         factor = float(scale**_GAIN)
         odometry.rescale(factor, pose, pose, everything=False)
         self._estimator.rescaled(factor, pose, pose)
+        return pose
+
+    def _over_floor(self, odometry: VisualOdometry, pose: Float64) -> Float64:
+        """The pose once the distance from the floor is brought to what the camera's height over it is."""
+        if not odometry.keyframe_added:
+            return pose
+        start = matrix(self._config.T_world_start)
+        if np.array_equal(start, np.eye(4)):
+            start[:3, :3], start[2, 3] = _LEVEL, self._config.camera_height_m
+        found = odometry.floor_below(np.array((0.0, 0.0, 1.0)) if self._world_begun else start[2, :3])
+        if found is None:
+            return pose
+        factor = self._config.camera_height_m / found
+        self._metric = True
+        if not self._world_begun:
+            return self._begin_world(odometry, pose, factor, start)
+        odometry.rescale(factor**_GAIN, pose, pose, everything=False)
         return pose
 
     def _begin_world(self, odometry: VisualOdometry, pose: Float64, factor: float, start: Float64) -> Float64:

@@ -9,6 +9,7 @@ import typer
 
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
+from semantic_mapper.nodes.cli.replay import DepthOption
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.process import StopRequest
 
@@ -30,12 +31,13 @@ def finetune(
         Path | None, typer.Option(help="Weights to start from; without it the small ones in the package.")
     ] = None,
     from_scratch: Annotated[bool, typer.Option("--from-scratch", help="Start from random weights.")] = False,
+    depth: DepthOption = None,
 ) -> int:
     """Fit the field to a few labelled keyframes of a log.
 
     The keyframes are those that together show most of what the log shows; no other label is trained on. The weights
-    remember them, so that `replay` and `eval` never score on them. Ctrl-C writes the
-    best weights so far (exit code 130).
+    remember them, so that `replay` and `eval` never score on them. Depth of a log without a depth sensor is computed
+    from its pictures. Ctrl-C writes the best weights so far (exit code 130).
 
     Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors
     """
@@ -46,6 +48,7 @@ def finetune(
 
     from semantic_mapper.config import load_config
     from semantic_mapper.nodes.cli.run_finetune import FinetuneRequest, finetune_log
+    from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, mapper_config
     from semantic_mapper.training.finetune import FinetuneConfig
 
     given = {"seconds": seconds, "steps": steps, "seed": seed}
@@ -54,7 +57,8 @@ def finetune(
     if settings.seconds == 0 and settings.steps == 0:
         raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
     keep_freed_memory()
-    request = FinetuneRequest(log, keyframes, out, settings, weights, from_scratch)
+    depths = mapper_config(None, None, depth=depth, delay_frames=REPLAY_DELAY_FRAMES).depth
+    request = FinetuneRequest(log, keyframes, out, settings, weights, from_scratch, depths)
     with StopRequest() as stop, frame_progress("finetune", None, unit="%") as bar:
         checkpoint, chosen = finetune_log(request, stop, bar)
     recipe = checkpoint.recipe

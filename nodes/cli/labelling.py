@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from semantic_mapper.config import DepthConfig
 from semantic_mapper.errors import LabelError, LogError, TransportError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.cli.console import FrameProgress
@@ -55,8 +56,8 @@ def choose_keyframes(
             raise LabelError(f"{path}: has no label images; give --images with a folder that has labels.json")
         numbers = sorted(set(frames)) or ([] if images is None else _numbered(images))
         if images is None and not numbers:
-            request = FinetuneRequest(path, count, path, FinetuneConfig(), None, from_scratch=False)
-            return choose_labelled(log, label_set, request, stop, bar), label_set
+            request = FinetuneRequest(path, count, path, FinetuneConfig(), None, False, DepthConfig(source="sensor"))
+            return choose_labelled(log, label_set, request, {}, stop, bar), label_set
         bar.start(len(numbers))
         chosen: list[PosedFrame] = []
         for number in numbers:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import structlog
 
+from semantic_mapper.config import DepthConfig
 from semantic_mapper.errors import FrameError, LabelError, LogError
 from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint, save_checkpoint
 from semantic_mapper.geometry import check_pose
@@ -15,6 +17,7 @@ from semantic_mapper.nodes.cli.console import FrameProgress
 from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.log.sequence import Log, open_log
+from semantic_mapper.replay.log_depth import ComputedFrame, compute_depths
 from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, finetune
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.types import PosedFrame
@@ -24,7 +27,10 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class FinetuneRequest:
-    """What the verb was requested; ``weights`` None = those in the package, ``from_scratch`` = random ones."""
+    """What the verb was requested; ``weights`` None = those in the package, ``from_scratch`` = random ones.
+
+    ``depth`` says where the frames' depth comes from.
+    """
 
     log: Path
     keyframes: int
@@ -32,6 +38,7 @@ class FinetuneRequest:
     config: FinetuneConfig
     weights: Path | None
     from_scratch: bool
+    depth: DepthConfig
 
 
 def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress) -> tuple[Checkpoint, list[int]]:
@@ -50,7 +57,8 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
         label_set = log.info.label_set
         if label_set is None:
             raise LabelError(f"{request.log}: has no label images; finetuning needs labelled keyframes")
-        frames = choose_labelled(log, label_set, request, stop, bar)
+        computed = _compute_depths(log, request.depth, stop, bar)
+        frames = choose_labelled(log, label_set, request, computed, stop, bar)
     bar.start(100)
 
     def on_progress(progress: FinetuneProgress) -> None:
@@ -73,10 +81,47 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
     return checkpoint, [f.seq for f in frames]
 
 
+def _compute_depths(
+    log: Log, config: DepthConfig, stop: StopRequest, bar: FrameProgress
+) -> Mapping[tuple[str, int], ComputedFrame]:
+    """What ``config`` asks to compute; nothing of a log whose first frame has depth, unless it says "computed".
+
+    Raises:
+        KeyboardInterrupt: a stop request came.
+    """
+    if config.source not in ("auto", "computed"):
+        return {}
+    if config.source == "auto" and next(iter(log)).depth_m is not None:
+        return {}
+    bar.start(len(log))
+
+    def on_frame(done: int) -> None:
+        bar.set(done, "computing depth from pictures")
+        if stop:
+            raise KeyboardInterrupt
+
+    return compute_depths(log, config, on_frame)
+
+
+def _as_given(frame: PosedFrame, computed: Mapping[tuple[str, int], ComputedFrame], config: DepthConfig) -> PosedFrame:
+    """The frame with the depth that it is trained with."""
+    if config.source in ("off", "computed") and frame.depth_m is not None:
+        frame = replace(frame, depth_m=None)
+    found = computed.get((frame.camera_id, frame.stamp_ns))
+    return frame if frame.depth_m is not None or found is None else found.on(frame)
+
+
 def choose_labelled(
-    log: Log, label_set: LabelSet, request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
+    log: Log,
+    label_set: LabelSet,
+    request: FinetuneRequest,
+    computed: Mapping[tuple[str, int], ComputedFrame],
+    stop: StopRequest,
+    bar: FrameProgress,
 ) -> list[PosedFrame]:
-    """The labelled frames that show most of what the log shows.
+    """The labelled frames that show most of what the log shows, with the depth that the request asks for.
+
+    Of a log whose depth is computed, frames that it could be computed for.
 
     Raises:
         LogError: fewer usable labelled frames than requested.
@@ -91,7 +136,7 @@ def choose_labelled(
             raise KeyboardInterrupt
         try:
             frame = log.frame(number)
-            if frame.label is None:
+            if frame.label is None or (computed and (frame.camera_id, frame.stamp_ns) not in computed):
                 continue
             check_pose(frame.T_world_camera, f"frame seq={frame.seq}")
             label_set.to_channels(frame.label, f"frame seq={frame.seq}")
@@ -100,14 +145,18 @@ def choose_labelled(
         except (LogError, FrameError, LabelError) as error:
             _log.warning("frame_left_out", frame=number, reason=str(error))
             continue
-        candidates.append(candidate_from_frame(frame))
+        candidate = candidate_from_frame(_as_given(frame, computed, request.depth))
+        if computed and len(candidate.cells) == 0:  # the camera had not moved yet
+            continue
+        candidates.append(candidate)
         numbers.append(number)
     if len(candidates) < request.keyframes:
         raise LogError(
             f"{request.log}: {len(candidates)} of its {len(log)} frames have usable labels; "
             f"--keyframes {request.keyframes} is more than that"
         )
-    return [log.frame(numbers[i]) for i in choose_keyframes(candidates, request.keyframes, request.config.seed)]
+    chosen = choose_keyframes(candidates, request.keyframes, request.config.seed)
+    return [_as_given(log.frame(numbers[i]), computed, request.depth) for i in chosen]
 
 
 def _check_size(frame: PosedFrame, size: tuple[int, int]) -> None:

@@ -43,7 +43,7 @@ from semantic_mapper.replay.sfm.scale import (
     Mark,
     PlacedFrame,
     ScaleHint,
-    floor_height,
+    floor_under,
     marked_place,
     median_depth,
     nearest_frame,
@@ -424,7 +424,7 @@ class _Import:
         placed = _Placed(_moved(frames, np.eye(4), UNSCALED_DEPTH_M / median_depth(list(frames.values()))), xy, seen)
         factor, scale = self._scale(placed, board)
         frames = _moved(placed.frames, np.eye(4), factor)
-        floor = floor_height(list(frames.values()))
+        floor = floor_under(list(frames.values()))
         down = np.eye(4)
         down[2, 3] = 0.0 if floor is None else -floor
         frames = _moved(frames, down, 1.0)
@@ -453,7 +453,7 @@ class _Import:
         if board is not None:
             return board.metres_per_unit({i: f.T_world_camera for i, f in frames.items()}, placed.seen)
         if hint.camera_height_m is not None:
-            floor = floor_height(list(frames.values()))
+            floor = floor_under(list(frames.values()))
             if floor is None:
                 raise ImportSourceError(
                     f"{self._film.path}: no floor is found under the camera, so its height tells no scale; film more "

@@ -10,6 +10,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
+from semantic_mapper.bundle.floor import floor_height
 from semantic_mapper.drivers.poses.board import BoardFinder
 from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError, ImportSourceError
@@ -24,10 +25,6 @@ MIN_RAY_FRACTION = 0.5  # of the rays that must do so
 MAX_RAY_PAIRS = 100  # that a place is first found by
 MIN_BOARD_CORNERS = 6
 NEIGHBOURS = 12  # frames either side that a marked point is followed into
-FLOOR_BINS = 60
-FLOOR_SHARE = 0.2  # of the strongest layer below the camera: the lowest layer that is as strong is the floor
-MIN_FLOOR_POINTS = 20
-MOST_BELOW_FLOOR, FLOOR_MARGIN = 0.03, 0.1  # fraction of the points further below it than this part of the height
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,26 +128,10 @@ def median_depth(frames: Sequence[PlacedFrame]) -> float:
     return float(np.median(np.concatenate(depths)))
 
 
-def floor_height(frames: Sequence[PlacedFrame]) -> float | None:
-    """z of the floor, where z is up: the lowest strong layer of points below the cameras; None = there is none."""
+def floor_under(frames: Sequence[PlacedFrame]) -> float | None:
+    """z of the floor under the frames, where z is up; None = there is none."""
     camera_z = float(np.median([frame.T_world_camera[2, 3] for frame in frames]))
-    z = np.concatenate([frame.xyz[:, 2] for frame in frames])
-    below = z[z < camera_z]
-    if len(below) < MIN_FLOOR_POINTS:
-        return None
-    low = float(np.percentile(below, 0.5))
-    counts, edges = np.histogram(below, bins=FLOOR_BINS, range=(low - 1e-6, camera_z))
-    summed = np.convolve(counts, (1, 1, 1), mode="same")  # a layer lies across bins
-    strong = np.flatnonzero(summed >= max(MIN_FLOOR_POINTS, FLOOR_SHARE * summed.max()))
-    if not len(strong):
-        return None
-    at = int(strong[0])
-    while at + 1 < len(summed) and summed[at + 1] > summed[at]:  # to the top of this layer
-        at += 1
-    near = below[(below >= edges[max(at - 1, 0)]) & (below <= edges[min(at + 2, len(edges) - 1)])]
-    floor = float(np.median(near))
-    deep = floor - FLOOR_MARGIN * (camera_z - floor)
-    return floor if (below < deep).mean() < MOST_BELOW_FLOOR else None  # a bed or a table
+    return floor_height(np.concatenate([frame.xyz[:, 2] for frame in frames]), camera_z)
 
 
 def triangulate(rays: Sequence[tuple[Float64, Float64]]) -> Float64 | None:

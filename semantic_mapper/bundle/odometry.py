@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from semantic_mapper.bundle.adjustment import adjust_bundle
+from semantic_mapper.bundle.floor import floor_height
 from semantic_mapper.bundle.keyframes import Keyframe, KeyframeMap, triangulate
 from semantic_mapper.bundle.tracks import Tracker, Tracks, prepare_image
 from semantic_mapper.config import PoseRefinerConfig
@@ -120,6 +121,18 @@ class VisualOdometry:
             self._places = [
                 replace(p, T_world_camera=moved(p.T_world_camera), points=moved_points(p.points)) for p in self._places
             ]
+
+    def floor_below(self, up: Float64) -> float | None:
+        """How far the cameras of the last keyframes are above the floor that they see; None where they see none.
+
+        Args:
+            up: (3,) unit direction in the present world.
+        """
+        if not self._map.points:
+            return None
+        camera = float(np.median([k.T_world_camera[:3, 3] @ up for k in self._map.keyframes]))
+        floor = floor_height(np.stack(list(self._map.points.values())) @ up, camera)
+        return None if floor is None else camera - floor
 
     def center_depth(self) -> float | None:
         """Median distance along the view of points in the middle third of the world's first view; None without any."""

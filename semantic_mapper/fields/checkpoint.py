@@ -27,7 +27,7 @@ from semantic_mapper.fields.registry import build_field
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.files import write_bytes
 from semantic_mapper.geometry import check_pose
-from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, working_intrinsics
+from semantic_mapper.imaging import resize_depth, resize_label, resize_rgb, resize_spread, working_intrinsics
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
@@ -223,12 +223,14 @@ def anchor_from_frame(frame: PosedFrame, width: int) -> PosedFrame:
     depth = None
     if frame.depth_m is not None:
         depth = _depth_from_units(_depth_to_units(resize_depth(frame, intrinsics)))
+    spread = resize_spread(frame, intrinsics)
     return PosedFrame(
         stamp_ns=frame.stamp_ns,
         seq=frame.seq,
         camera_id=frame.camera_id,
         rgb=resize_rgb(frame, intrinsics),
         depth_m=depth,
+        depth_sigma_m=None if spread is None else _depth_from_units(_depth_to_units(spread)),
         label=None if frame.label is None else resize_label(frame.label, intrinsics),
         intrinsics=intrinsics,
         T_world_camera=frame.T_world_camera,
@@ -271,6 +273,8 @@ def _pack_anchors(anchors: Sequence[PosedFrame]) -> tuple[dict[str, torch.Tensor
         tensors[f"anchor.{i}.rgb"] = torch.from_numpy(np.ascontiguousarray(a.rgb))
         if a.depth_m is not None:
             tensors[f"anchor.{i}.depth"] = torch.from_numpy(_depth_to_units(a.depth_m))
+        if a.depth_sigma_m is not None:
+            tensors[f"anchor.{i}.depth_sigma"] = torch.from_numpy(_depth_to_units(a.depth_sigma_m))
         if a.label is not None:
             tensors[f"anchor.{i}.label"] = torch.from_numpy(np.ascontiguousarray(a.label))
         k = a.intrinsics
@@ -291,7 +295,7 @@ def _unpack_anchors(tensors: dict[str, torch.Tensor], described: list[dict[str, 
     for i, d in enumerate(described):
         pose = np.array(d["T_world_camera"], np.float64)
         check_pose(pose, f"anchor {i}")
-        depth, label = tensors.get(f"anchor.{i}.depth"), tensors.get(f"anchor.{i}.label")
+        depth, label, sigma = (tensors.get(f"anchor.{i}.{name}") for name in ("depth", "label", "depth_sigma"))
         anchors.append(
             PosedFrame(
                 stamp_ns=int(d["stamp_ns"]),
@@ -299,6 +303,7 @@ def _unpack_anchors(tensors: dict[str, torch.Tensor], described: list[dict[str, 
                 camera_id=str(d["camera_id"]),
                 rgb=tensors[f"anchor.{i}.rgb"].numpy(),
                 depth_m=None if depth is None else _depth_from_units(depth.numpy()),
+                depth_sigma_m=None if sigma is None else _depth_from_units(sigma.numpy()),
                 label=None if label is None else label.numpy(),
                 intrinsics=CameraIntrinsics(*d["intrinsics"]),
                 T_world_camera=pose,

@@ -112,6 +112,17 @@ def test_metadata_that_cannot_be_used_are_refused_with_the_reason(tmp_path, chan
         load_checkpoint(path)
 
 
+def test_anchors_with_computed_depth_keep_its_spread(tmp_path):
+    frame = tiny_frames(1)[0]
+    computed = dataclasses.replace(frame, depth_sigma_m=np.float32(0.05) * frame.depth_m)
+    save_checkpoint(
+        Checkpoint(tiny_field(), (anchor_from_frame(computed, 64), anchor_from_frame(frame, 64))), tmp_path / "w"
+    )
+    kept, measured = load_checkpoint(tmp_path / "w").anchors
+    assert measured.depth_sigma_m is None
+    np.testing.assert_allclose(kept.depth_sigma_m, 0.05 * kept.depth_m, atol=5e-4)
+
+
 def test_an_anchor_without_a_usable_pose_is_refused(tmp_path):
     path = tmp_path / "w.safetensors"
     pose = tiny_frames(1)[0].T_world_camera.copy()

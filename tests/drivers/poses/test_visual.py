@@ -1,8 +1,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import pytest
@@ -16,11 +17,12 @@ from semantic_mapper.drivers.poses.visual import VisualPoseSource
 from semantic_mapper.errors import CameraError, ConfigError
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error
 from semantic_mapper.nodes.camera.live import with_poses
+from semantic_mapper.scenes import TEST_SEEDS, CameraPathConfig, room_frames
 from semantic_mapper.scenes.config import PoseNoiseConfig
 from semantic_mapper.scenes.pose_noise import drifting_poses
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import Float64
-from tests.bundle.rooms import truth, walk, way_m
+from semantic_mapper.types import Float64, PosedFrame
+from tests.bundle.rooms import INTRINSICS, truth, walk, way_m
 
 from .images import ListCamera, as_image
 
@@ -105,7 +107,38 @@ def test_a_typed_distance_tells_the_scale() -> None:
     assert np.allclose(source.pose(as_image(walk()[29])) is not None, True)
 
 
-def replace_config(**changes: float) -> VisualPoses:
+@cache
+def level_walk() -> tuple[PosedFrame, ...]:
+    path = CameraPathConfig(step_m=0.05, min_height_m=1.1, max_height_m=1.1)
+    return tuple(room_frames(TEST_SEEDS[1], 40, INTRINSICS, path=path))
+
+
+def test_the_height_over_a_floor_that_is_seen_tells_the_scale_and_where_the_floor_is() -> None:
+    start = tuple(tuple(row) for row in level_walk()[0].T_world_camera.tolist())
+    source = VisualPoseSource(replace_config(camera_height_m=1.1, T_world_start=start))
+    assert source.scale == "awaited"
+    with source:
+        estimates = [source.pose(as_image(f)) for f in level_walk()]
+    known = [i for i, e in enumerate(estimates) if e is not None]
+    found = np.array([e.T_world_camera for e in estimates if e is not None])
+    true = np.array([level_walk()[i].T_world_camera for i in known])
+    ways = [np.linalg.norm(np.diff(p[:, :3, 3], axis=0), axis=1).sum() for p in (found, true)]
+    assert source.scale == "known" and len(known) > 25
+    assert ways[0] == pytest.approx(ways[1], rel=0.1)
+    assert np.abs(found[:, 2, 3] - 1.1).max() < 0.1
+
+
+def test_without_a_floor_in_sight_the_scale_is_awaited_and_the_status_says_for_what() -> None:
+    turned = np.eye(4)
+    turned[:3, :3] = ((0, 0, 1), (1, 0, 0), (0, 1, 0))  # as if the camera was held upside down: no floor under it
+    start = tuple(tuple(row) for row in turned.tolist())
+    source = VisualPoseSource(replace_config(camera_height_m=1.1, T_world_start=start))
+    with source:
+        estimates = [source.pose(as_image(f)) for f in level_walk()[:15]]
+    assert not any(estimates) and source.scale == "awaited" and "see the floor" in source.warnings[0]
+
+
+def replace_config(**changes: Any) -> VisualPoses:
     return VisualPoses(tracking=CONFIG.tracking, **changes)
 
 
@@ -132,7 +165,8 @@ def test_settings_make_the_source_and_what_its_scale_comes_from() -> None:
     for wrong, message in (
         ({"scale": {"kind": "fixed"}}, 'must be "topic" or "board"'),
         ({"scale": {"kind": "board", "colums": 5}}, "did you mean `columns`"),
-        ({"scale": {"kind": "board"}, "distance_m": 2.0}, "scale or distance_m"),
+        ({"scale": {"kind": "board"}, "distance_m": 2.0}, "one of scale, distance_m and camera_height_m"),
+        ({"camera_height_m": 1.0, "distance_m": 2.0}, "one of scale, distance_m and camera_height_m"),
     ):
         with pytest.raises(ConfigError, match=message):
             open_poses({"kind": "visual", **wrong})

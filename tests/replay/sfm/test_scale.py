@@ -13,7 +13,7 @@ from semantic_mapper.replay.sfm.scale import (
     MarkedDistance,
     PlacedFrame,
     ScaleHint,
-    floor_height,
+    floor_under,
     parse_distance,
     ray_of,
     triangulate,
@@ -74,10 +74,10 @@ def test_the_floor_is_the_lowest_strong_layer(rng: np.random.Generator) -> None:
     stray = rng.uniform((-2, -2, -0.5), (2, 2, 2.5), (40, 3))
     few = floor[:15]
     frames = [PlacedFrame(0, T, np.concatenate((floor, table, stray)))]
-    found = floor_height(frames)
+    found = floor_under(frames)
     assert found is not None and abs(found) < 0.05
-    assert floor_height([PlacedFrame(0, T, np.concatenate((table, few)))]) is None  # most is on the table
-    assert floor_height([PlacedFrame(0, T, table + np.array((0, 0, 2.0)))]) is None
+    assert floor_under([PlacedFrame(0, T, np.concatenate((table, few)))]) is None  # most is on the table
+    assert floor_under([PlacedFrame(0, T, table + np.array((0, 0, 2.0)))]) is None
 
 
 def test_up_is_where_upright_edges_meet(rng: np.random.Generator) -> None:
