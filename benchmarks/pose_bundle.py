@@ -22,7 +22,7 @@ import numpy as np
 
 from semantic_mapper.bundle.refiner import PoseRefiner
 from semantic_mapper.bundle.tracks import follow
-from semantic_mapper.config import PoseRefinerConfig
+from semantic_mapper.config import PoseRefinerConfig, convert_config
 from semantic_mapper.drivers.base import CameraImage, PoseEstimate
 from semantic_mapper.drivers.poses.config import VisualPoses
 from semantic_mapper.drivers.poses.visual import VisualPoseSource
@@ -206,8 +206,8 @@ def main() -> None:
         level = CameraPathConfig(step_m=WALK.step_m, min_height_m=HEIGHT_M, max_height_m=HEIGHT_M)
         for seed in TEST_SEEDS[: given.rooms]:
             walk = room_walk(seed, given.frames, level)
-            start = tuple(tuple(row) for row in walk.truth[0].tolist())
-            figures = visual(walk, VisualPoses(camera_height_m=HEIGHT_M, T_world_start=start))
+            asked = {"camera_height_m": HEIGHT_M, "T_world_start": walk.truth[0].tolist()}
+            figures = visual(walk, convert_config(asked, VisualPoses, "benchmark"))
             print(json.dumps({"recording": walk.name, **figures}), flush=True)
         return
     for path in given.log:
