@@ -3,6 +3,9 @@
 The film is made here: of the pictures of a sequence folder (with its poses as truth), or of a rendered walk through a
 ROOMS room, with auto exposure and, with ``--rolling-shutter``, rows that are read one after the other.
 
+``aligned.mcap`` is the log of the film in the world and the metres of the true poses: what ``replay`` makes of it can
+be compared with a mesh.
+
 Example: python -m benchmarks.video path/to/redkitchen --focal-error 0.1 --out runs/video
 Example: python -m benchmarks.video rooms --seed 200003 --rolling-shutter 0.02 --out runs/video-room
 """
@@ -14,7 +17,7 @@ import json
 import resource
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -26,13 +29,15 @@ from semantic_mapper.geometry import interpolate_pose, transform
 from semantic_mapper.plots import draw_paths, write_picture
 from semantic_mapper.replay.importers import ImportOptions
 from semantic_mapper.replay.importers.folder import FolderRecording
+from semantic_mapper.replay.log.atomic_log import atomic_log
 from semantic_mapper.replay.log.reader import LogReader
-from semantic_mapper.replay.sfm.reconstruct import FilmOptions, import_film
+from semantic_mapper.replay.sfm.reconstruct import PACKING, FilmOptions, import_film
 from semantic_mapper.scenes.camera import camera_path
 from semantic_mapper.scenes.config import CameraPathConfig, NoiseConfig
 from semantic_mapper.scenes.render import render_view
 from semantic_mapper.scenes.room import make_room
 from semantic_mapper.scenes.shots import sequence_shots
+from semantic_mapper.transport.messages import SCALE_KEY
 from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
 
 ROOM_HZ = 15.0
@@ -104,6 +109,18 @@ def write_film(path: Path, walk: Walk) -> None:
     writer.release()
 
 
+def write_aligned(log: Path, T_true_film: Float64, scale: float) -> None:
+    """Write ``aligned.mcap`` beside the log of a film: its world moved and scaled to that of the true poses."""
+    with LogReader(log) as reader:
+        metadata = {**reader.info.metadata, SCALE_KEY: "aligned with true poses"}
+        info = replace(reader.info, metadata=metadata)
+        with atomic_log(log.with_name("aligned.mcap"), info, options=PACKING, overwrite=True) as writer:
+            for frame in reader:
+                pose = frame.T_world_camera.copy()
+                pose[:3, 3] *= scale
+                writer.write_frame(replace(frame, T_world_camera=T_true_film @ pose))
+
+
 def main() -> None:
     """Run one film."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -135,6 +152,7 @@ def main() -> None:
     found, true = report.T_world_camera[:, :3, 3], truth[:, :3, 3]
     T, scale = align_similar(found, true)
     aligned = transform(T, scale * found)
+    write_aligned(given.out / "film.mcap", T, scale)
     off = np.linalg.norm(aligned - true, axis=1)
     up = T[:3, 2]
     figures = {

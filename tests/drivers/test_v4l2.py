@@ -163,7 +163,7 @@ def test_named_by_its_number_it_is_known_by_its_id_from_then_on(machine: Machine
         until(lambda: camera.warnings != ())
         plugged_ns = time.monotonic_ns()
         machine.plug(sensor, 5)
-        image_where(images, lambda image: image.stamp_ns > plugged_ns)
+        assert image_where(images, lambda image: image.stamp_ns > plugged_ns).stamp_ns > plugged_ns
 
 
 def test_a_stream_that_stalls_is_told_and_started_anew(machine: Machine, tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ def outcome(linked: int, flat: float = 0.5) -> Outcome:
 
 
 def test_a_film_that_hangs_together_passes() -> None:
-    refuse_outcome("film.mp4", outcome(19), TIMES, [range(18)])
+    assert refuse_outcome("film.mp4", outcome(19), TIMES, [range(18)]) is None  # a FilmError otherwise
 
 
 @pytest.mark.parametrize(
