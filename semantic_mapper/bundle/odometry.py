@@ -27,6 +27,9 @@ _BEGIN_CORNERS = 50  # that two views must share to begin the world
 _BEGIN_FLOW = 0.05  # of the image's width that they move by at least
 _BEGIN_PARALLAX_DEG = 1.5  # median angle between the rays of both views
 _BEGIN_FITTING = 0.7  # of the shared corners
+_FLAT = 0.9  # of them within a pixel of what one plane explains: two motions fit such views, and a third view decides
+_DECIDED = 1.3  # times the error of the right motion is that of the wrong one, at least
+_MAX_BETWEEN = 40  # views kept since the first one
 _GAUGE = (1e-3, 1e-3)  # sigmas of the keyframes that the world begins with
 _NONE = (np.inf, np.inf)
 _ITERATIONS = 8
@@ -66,6 +69,7 @@ class VisualOdometry:
         self._tracker = Tracker(config.corners)
         self._map = KeyframeMap(self._intrinsics, config.window)
         self._first: Tracks | None = None  # of the view that the world may begin with
+        self._between: list[Tracks] = []  # of the views since
         self._places: list[_Place] = []
         self._next_try = 0
         self._past: list[tuple[int, Float64]] = []  # the last two poses
@@ -150,14 +154,18 @@ class VisualOdometry:
         if first is None or len(shared) < _BEGIN_CORNERS:
             self._tracker = Tracker(self._config.corners)
             self._tracker.advance(image)
-            self._first = self._tracker.replenish()
+            self._first, self._between = self._tracker.replenish(), []
             return None
         a, b = first.pixels[first.rows(shared)], tracks.pixels[tracks.rows(shared)]
-        if np.median(np.linalg.norm(b - a, axis=1)) < _BEGIN_FLOW * self._intrinsics.width:
-            return None
-        found = two_views(a, b, self._intrinsics)
+        found = None
+        if np.median(np.linalg.norm(b - a, axis=1)) >= _BEGIN_FLOW * self._intrinsics.width:
+            found = two_views(a, b, self._intrinsics, self._half_way(shared, a, b))
         if found is None:
+            self._between.append(tracks)
+            if len(self._between) > _MAX_BETWEEN:
+                del self._between[::2]
             return None
+        self._between = []
         pose, points, good = found
         unit = 1.0 / float(np.median(points[good, 2]))
         pose[:3, 3] *= unit
@@ -166,6 +174,17 @@ class VisualOdometry:
         self._tracker.drop(shared[~good])
         self._places.append(self._place(image, self._tracker.tracks, pose))
         return self._add_keyframe(image, pose, _GAUGE)
+
+    def _half_way(self, shared: Any, a: Float64, b: Float64) -> Float64 | None:
+        """Pixels (N, 2) of the shared tracks in the view between that has moved half as far; None without one."""
+        half = 0.5 * float(np.median(np.linalg.norm(b - a, axis=1)))
+        best: tuple[float, Float64] | None = None
+        for tracks in self._between:
+            pixels = tracks.pixels[tracks.rows(shared)]  # a track that is there now was there all the time
+            off = abs(float(np.median(np.linalg.norm(pixels - a, axis=1))) - half)
+            if best is None or off < best[0]:
+                best = off, pixels
+        return None if best is None else best[1]
 
     def _track(self, image: UInt8, stamp_ns: int) -> Float64 | None:
         guess = before = self._past[-1][1] if self._past else self._map.keyframes[-1].T_world_camera
@@ -234,8 +253,15 @@ class VisualOdometry:
         return self._add_keyframe(image, pose, _NONE)
 
 
-def two_views(a: Float64, b: Float64, intrinsics: CameraIntrinsics) -> tuple[Float64, Float64, Any] | None:
+def two_views(
+    a: Float64, b: Float64, intrinsics: CameraIntrinsics, between: Float64 | None = None
+) -> tuple[Float64, Float64, Any] | None:
     """Motion between two views from corners that both see at pixels (N, 2).
+
+    Args:
+        a, b: (N, 2) pixels in both.
+        intrinsics: Of both.
+        between: (N, 2) pixels in a third view, which decides where all corners lie on one plane.
 
     Returns:
         T_a_b (4, 4) with a way of length 1; points (N, 3) in the axes of a; (N,) which of them can be used. None where
@@ -243,21 +269,62 @@ def two_views(a: Float64, b: Float64, intrinsics: CameraIntrinsics) -> tuple[Flo
     """
     K = camera_matrix(intrinsics)
     cv2.setRNGSeed(1)
-    E, mask = cv2.findEssentialMat(a, b, K, cv2.RANSAC, 0.999, 1.0, 1000)
-    if E is None or E.shape != (3, 3) or mask.mean() < _BEGIN_FITTING:
-        return None
-    _, R, t, _ = cv2.recoverPose(E, a, b, K, mask=mask.copy())
-    T_b_a = np.eye(4)
-    T_b_a[:3, :3], T_b_a[:3, 3] = R, np.ravel(t)
-    T_a_b = invert_pose(T_b_a)
-    points, good = triangulate(a, b, np.eye(4), T_a_b, intrinsics)
-    good &= mask.ravel() > 0
+    H, flat = cv2.findHomography(a, b, cv2.RANSAC, 1.0)
+    if H is not None and flat.mean() >= _FLAT:
+        found = _flat_views(H, a, b, intrinsics, between)
+        if found is None:
+            return None
+        T_a_b, points, good = found
+    else:
+        E, mask = cv2.findEssentialMat(a, b, K, cv2.RANSAC, 0.999, 1.0, 1000)
+        if E is None or E.shape != (3, 3) or mask.mean() < _BEGIN_FITTING:
+            return None
+        _, R, t, _ = cv2.recoverPose(E, a, b, K, mask=mask.copy())
+        T_a_b = _inverse_motion(R, t)
+        points, good = triangulate(a, b, np.eye(4), T_a_b, intrinsics)
+        good &= mask.ravel() > 0
     if good.sum() < _BEGIN_CORNERS // 2:
         return None
     to_b = points[good] - T_a_b[:3, 3]
     cosine = (points[good] * to_b).sum(axis=1) / np.linalg.norm(points[good], axis=1) / np.linalg.norm(to_b, axis=1)
     sure = np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))) > _BEGIN_PARALLAX_DEG
     return (T_a_b, points, good) if sure and good.mean() > 0.5 * _BEGIN_FITTING else None
+
+
+def _inverse_motion(R: Any, t: Any) -> Float64:
+    """T_a_b (4, 4) with a way of length 1, of the rotation and the way of b from a as OpenCV has them."""
+    T_b_a = np.eye(4)
+    T_b_a[:3, :3], T_b_a[:3, 3] = R, np.ravel(t) / max(float(np.linalg.norm(t)), 1e-12)
+    return invert_pose(T_b_a)
+
+
+def _flat_views(
+    H: Any, a: Float64, b: Float64, intrinsics: CameraIntrinsics, between: Float64 | None
+) -> tuple[Float64, Float64, Any] | None:
+    """``two_views`` of one plane: of the motions that fit, the one whose points fit the view between, too.
+
+    None where two fit it about as well, or there is no such view.
+    """
+    _, rotations, ways, _ = cv2.decomposeHomographyMat(H, camera_matrix(intrinsics))
+    motions = [_inverse_motion(R, t) for R, t in zip(rotations, ways, strict=True)]
+    found = [(T_a_b, *triangulate(a, b, np.eye(4), T_a_b, intrinsics)) for T_a_b in motions]
+    most = max(int(good.sum()) for _, _, good in found)
+    found = [f for f in found if f[2].sum() > 0.8 * most]
+    if most < _LEAST_POINTS or (between is None and len(found) > 1):
+        return None
+    if between is None or len(found) == 1:
+        return found[0]
+    errors = [_placed_error(points[good], between[good], intrinsics) for _, points, good in found]
+    order = np.argsort(errors)
+    return found[int(order[0])] if errors[order[1]] > _DECIDED * errors[order[0]] else None
+
+
+def _placed_error(points: Float64, pixels: Float64, intrinsics: CameraIntrinsics) -> float:
+    """RMS pixels by which points (N, 3) are off in the view that they fit best."""
+    K = camera_matrix(intrinsics)
+    _, turn, shift = cv2.solvePnP(points, pixels, K, None, flags=cv2.SOLVEPNP_ITERATIVE)
+    seen, _ = cv2.projectPoints(points, turn, shift, K, None)
+    return float(np.sqrt((np.linalg.norm(seen[:, 0] - pixels, axis=1) ** 2).mean()))
 
 
 def _describe(image: UInt8, pixels: Float64) -> tuple[Any, UInt8]:

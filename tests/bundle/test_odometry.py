@@ -1,12 +1,13 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from semantic_mapper.bundle.odometry import VisualOdometry, two_views
 from semantic_mapper.bundle.scale import ScaleEstimator
 from semantic_mapper.config import PoseRefinerConfig
 from semantic_mapper.evaluation.trajectory import absolute_trajectory_error, relative_pose_error
-from semantic_mapper.geometry import look_at, project
+from semantic_mapper.geometry import invert_pose, look_at, project, transform
 from semantic_mapper.types import Float64
 
 from .rooms import INTRINSICS, truth, walk, way_m
@@ -86,3 +87,29 @@ def test_the_scale_is_that_of_long_ways_and_follows_a_change_of_unit(rng: np.ran
     estimator.interrupt()
     estimator.add(np.full(3, 9.0), np.zeros(3))  # elsewhere in both
     assert abs((estimator.scale() or 0) - 1) < 0.01
+
+
+def test_before_a_flat_wall_a_third_view_tells_which_of_two_motions_it_was() -> None:
+    """Two views of one plane have two explanations; begun with the wrong one, the world is a twisted one."""
+    rng = np.random.default_rng(0)
+    alone, decided = list[bool](), list[bool]()
+    for _ in range(60):
+        slope = rng.uniform(-0.6, 0.6, 2)
+        xy = rng.uniform(-1, 1, (150, 2)) * (1.2, 0.9)
+        wall = np.column_stack((xy, 2 + xy @ slope))
+        b, between = np.eye(4), np.eye(4)
+        b[:3, :3], between[:3, :3] = (cv2.Rodrigues(rng.normal(0, 0.05, 3))[0] for _ in range(2))
+        way = rng.normal(size=3)
+        b[:3, 3] = way / np.linalg.norm(way) * rng.uniform(0.2, 0.6)
+        between[:3, 3] = b[:3, 3] / 2 + rng.normal(0, 0.02, 3)
+        pixels = [
+            project(transform(invert_pose(T), wall), INTRINSICS) + rng.normal(0, 0.2, (150, 2))
+            for T in (np.eye(4), b, between)
+        ]
+        for answers, third in ((alone, None), (decided, pixels[2])):
+            found = two_views(pixels[0], pixels[1], INTRINSICS, third)
+            if found is not None:
+                cosine = found[0][:3, 3] @ b[:3, 3] / np.linalg.norm(found[0][:3, 3]) / np.linalg.norm(b[:3, 3])
+                answers.append(bool(cosine > 0.96))
+    assert len(alone) < 45 and alone.count(False) <= 3  # often one of the two has points behind a camera
+    assert decided.count(True) >= 40 and decided.count(False) <= 3
