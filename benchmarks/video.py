@@ -22,6 +22,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 
 from semantic_mapper.evaluation.trajectory import align_similar
@@ -113,7 +114,7 @@ def write_aligned(log: Path, T_true_film: Float64, scale: float) -> None:
     """Write ``aligned.mcap`` beside the log of a film: its world moved and scaled to that of the true poses."""
     with LogReader(log) as reader:
         metadata = {**reader.info.metadata, SCALE_KEY: "aligned with true poses"}
-        info = replace(reader.info, metadata=metadata)
+        info = msgspec.structs.replace(reader.info, metadata=metadata)
         with atomic_log(log.with_name("aligned.mcap"), info, options=PACKING, overwrite=True) as writer:
             for frame in reader:
                 pose = frame.T_world_camera.copy()

@@ -15,7 +15,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from semantic_mapper.replay.sfm.features import loop_pairs
+from semantic_mapper.replay.sfm.features import loop_pairs, match_features
+from semantic_mapper.types import UInt8
 
 REQUEST, RESULT, DATABASE, FEATURES = "request.json", "result.json", "database.db", "features"
 OVERLAP = 8  # frames before each that it is matched to
@@ -24,6 +25,8 @@ ENOUGH = 0.9  # of the frames in one model: no further focal length is tried
 SEED = 1  # pycolmap takes 0 for "another each time"
 MIN_MODEL_IMAGES = 5
 INIT_TRIALS = 40
+LARGE, LEAST_PRECISION = 1280, 0.25  # pixels of the longer side from which on COLMAP's limits hold; their least factor
+FOCAL_RANGE = 0.2, 5.0  # times the longer side; a model beyond it has run away
 
 
 class Camera(msgspec.Struct, frozen=True):
@@ -98,7 +101,7 @@ def main(folder: Path) -> None:
     descriptors = _fill_database(pycolmap, folder / DATABASE, camera, files)
     pairs = [(i, j) for i in range(len(files)) for j in range(i + 1, min(i + OVERLAP + 1, len(files)))]
     pairs += loop_pairs(descriptors, OVERLAP, SEED)
-    _match(pycolmap, folder, [file.stem for file in files], pairs)
+    _match(pycolmap, folder, [file.stem for file in files], descriptors, pairs, _precision(camera))
     attempts: list[Attempt] = []
     for number, prior in enumerate(camera.focal_priors if camera.fixed is None else (camera.fixed[0],)):
         models = _map(pycolmap, folder, number, camera, prior, len(files))
@@ -110,8 +113,8 @@ def main(folder: Path) -> None:
     (folder / RESULT).write_bytes(msgspec.json.encode(outcome))
 
 
-def _fill_database(pycolmap: Any, path: Path, camera: Camera, files: list[Path]) -> list[np.ndarray]:
-    descriptors: list[np.ndarray] = []
+def _fill_database(pycolmap: Any, path: Path, camera: Camera, files: list[Path]) -> list[UInt8]:
+    descriptors: list[UInt8] = []
     with pycolmap.Database.open(path) as database:
         camera_id = database.write_camera(_camera(pycolmap, camera, camera.focal_priors[0]))
         rig = pycolmap.Rig()
@@ -126,9 +129,6 @@ def _fill_database(pycolmap: Any, path: Path, camera: Camera, files: list[Path])
             frame.add_data_id(pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id), image_id))
             database.write_frame(frame)
             database.write_keypoints(image_id, (xy + 0.5).astype(np.float32))
-            database.write_descriptors(
-                image_id, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, np.ascontiguousarray(rows))
-            )
             descriptors.append(rows)
     return descriptors
 
@@ -148,25 +148,29 @@ def _camera(pycolmap: Any, camera: Camera, prior: float) -> Any:
     )
 
 
-def _match(pycolmap: Any, folder: Path, names: list[str], pairs: list[tuple[int, int]]) -> None:
+def _match(
+    pycolmap: Any,
+    folder: Path,
+    names: list[str],
+    descriptors: list[UInt8],
+    pairs: list[tuple[int, int]],
+    precision: float,
+) -> None:
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
+    verification.ransac.max_error *= precision
     verification.compute_relative_pose = False
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.sift.cpu_brute_force_matcher = True  # the search through an index differs now and then between runs
     listed = folder / "pairs.txt"
-    for start in range(0, len(pairs), PAIRS_AT_ONCE):
-        chosen = pairs[start : start + PAIRS_AT_ONCE]
-        listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in chosen), encoding="utf-8")
-        pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
-        pycolmap.match_image_pairs(
-            folder / DATABASE,
-            matching_options=matching,
-            pairing_options=pairing,
-            verification_options=verification,
-            device=pycolmap.Device.cpu,
-        )
-        _tell("match", min(start + PAIRS_AT_ONCE, len(pairs)), len(pairs))
+    with pycolmap.Database.open(folder / DATABASE) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        for done, (i, j) in enumerate(pairs):
+            matches = match_features(descriptors[i], descriptors[j])
+            database.write_matches(ids[names[i]], ids[names[j]], matches)
+            if done % PAIRS_AT_ONCE == 0:
+                _tell("match", done, len(pairs))
+    listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs), encoding="utf-8")
+    pycolmap.verify_matches(folder / DATABASE, listed, verification)
+    _tell("match", len(pairs), len(pairs))
 
 
 def _map(pycolmap: Any, folder: Path, number: int, camera: Camera, prior: float, count: int) -> list[Model]:
@@ -181,9 +185,15 @@ def _map(pycolmap: Any, folder: Path, number: int, camera: Camera, prior: float,
     options.init_num_trials = INIT_TRIALS
     options.extract_colors = False
     options.ba_refine_focal_length = options.ba_refine_extra_params = camera.fixed is None
+    precision = _precision(camera)
+    options.mapper.init_max_error *= precision
+    options.mapper.abs_pose_max_error *= precision
+    options.mapper.filter_max_reproj_error *= precision
+    options.triangulation.merge_max_reproj_error *= precision
+    options.triangulation.complete_max_reproj_error *= precision
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = camera.fixed is None
-    options.min_focal_length_ratio = options.mapper.min_focal_length_ratio = 0.2
-    options.max_focal_length_ratio = options.mapper.max_focal_length_ratio = 5.0
+    options.min_focal_length_ratio = options.mapper.min_focal_length_ratio = FOCAL_RANGE[0]
+    options.max_focal_length_ratio = options.mapper.max_focal_length_ratio = FOCAL_RANGE[1]
     done = [0]
 
     def step(images: int) -> None:
@@ -211,7 +221,14 @@ def _map(pycolmap: Any, folder: Path, number: int, camera: Camera, prior: float,
         )
         for index, model in found.items()
     ]
+    size = max(camera.width, camera.height)
+    models = [model for model in models if FOCAL_RANGE[0] < model.focal_px / size < FOCAL_RANGE[1]]
     return sorted(models, key=lambda model: (-model.images, model.error_px))
+
+
+def _precision(camera: Camera) -> float:
+    """Factor of COLMAP's limits in pixels, which are for large photographs."""
+    return min(1.0, max(LEAST_PRECISION, max(camera.width, camera.height) / LARGE))
 
 
 def _verified(pycolmap: Any, path: Path, window: int) -> list[Pair]:

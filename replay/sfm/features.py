@@ -1,9 +1,10 @@
-"""Features of the picked frames, and which of those frames show the same place again."""
+"""Features of the picked frames, which of those frames show the same place again, and which features are the same."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from semantic_mapper.types import Float32, Float64, UInt8
 
@@ -11,6 +12,7 @@ MOST_FEATURES = 2500
 _CONTRAST = 0.02  # half of OpenCV's default: walls of rooms have little
 WORDS, TRAIN_ROWS, ROUNDS = 32, 20_000, 8  # of the vocabulary that the film's own features make
 LOOPS_A_FRAME = 3
+MAX_ANGLE, MAX_ANGLE_RATIO = 0.7, 0.8  # radians between two descriptors of one thing, and of the angle to the second
 MIN_SIMILARITY = 0.15  # of two frames that may show the same place; of two any frames it is about 0
 
 
@@ -29,6 +31,29 @@ class FeatureFinder:
         rows = np.asarray(found, np.float32)[:MOST_FEATURES]
         rooted = np.sqrt(rows / np.maximum(rows.sum(axis=1, keepdims=True), 1e-9))
         return xy, np.clip(np.round(512 * rooted), 0, 255).astype(np.uint8)
+
+
+def match_features(a: UInt8, b: UInt8) -> NDArray[np.uint32]:
+    """Rows (M, 2) of features that are each other's nearest, by angle, and clearly nearer than the second one.
+
+    Every feature is compared with every other one: COLMAP's search through an index differs now and then between runs.
+    Products of bytes are whole numbers below 2^24, so that the outcome is the same on any number of threads.
+
+    Args:
+        a, b: (N, 128) descriptors of two frames.
+    """
+    if min(len(a), len(b)) < 2:
+        return np.zeros((0, 2), np.uint32)
+    alike = a.astype(np.float32) @ b.astype(np.float32).T
+    best = alike.argmax(axis=1)
+    rows = np.flatnonzero(alike.argmax(axis=0)[best] == np.arange(len(a)))
+    pairs = rows, best[rows]
+    near = alike[pairs]
+    alike[pairs] = -1  # what is left is the second nearest
+    second = np.maximum(alike[rows].max(axis=1), alike[:, best[rows]].max(axis=0))
+    angle, next_angle = (np.arccos(np.minimum(x / 512.0**2, 1.0)) for x in (near, second))
+    good = (angle < MAX_ANGLE) & (angle < MAX_ANGLE_RATIO * next_angle)
+    return np.stack((pairs[0][good], pairs[1][good]), axis=1).astype(np.uint32)
 
 
 def loop_pairs(descriptors: list[UInt8], window: int, seed: int) -> list[tuple[int, int]]:

@@ -111,5 +111,5 @@ def test_before_a_flat_wall_a_third_view_tells_which_of_two_motions_it_was() -> 
             if found is not None:
                 cosine = found[0][:3, 3] @ b[:3, 3] / np.linalg.norm(found[0][:3, 3]) / np.linalg.norm(b[:3, 3])
                 answers.append(bool(cosine > 0.96))
-    assert len(alone) < 45 and alone.count(False) <= 3  # often one of the two has points behind a camera
-    assert decided.count(True) >= 40 and decided.count(False) <= 3
+    assert len(alone) < 45 and alone.count(False) <= 5  # often one of the two has points behind a camera
+    assert decided.count(True) >= 40 and decided.count(False) <= 5
