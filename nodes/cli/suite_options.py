@@ -113,6 +113,8 @@ def _refuse_idle(protocol: str, given: dict[str, Any], maps: bool) -> None:
         raise typer.BadParameter(
             "goes with --protocol generalize: maps are made with weights as they are", param_hint="--map"
         )
+    if given.get("depth") == "computed" and given.get("current") == "hard":
+        raise typer.BadParameter("is computed of a walk; images of --current hard stand alone", param_hint="--depth")
     if protocol == "generalize" and given.keys() & {"keyframes", "steps", "seconds"}:
         hint = "--steps, --seconds, --keyframes"
         raise typer.BadParameter("go with --protocol finetune and scratch", param_hint=hint)

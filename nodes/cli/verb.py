@@ -97,11 +97,18 @@ class JsonCommand(TyperCommand):
 
 
 def results_file(out: Path | None, json: Path | None) -> tuple[Path | None, bool]:
-    """The file that ``--out`` or an old ``--json FILE`` names, and whether JSON is to be printed."""
-    if json is None or str(json) == STDOUT:
-        return out, json is not None
-    warn_of_old_name("--json FILE", "--out FILE")
-    return out or json, False
+    """The file that ``--out`` or an old ``--json FILE`` names, and whether JSON is to be printed.
+
+    Raises:
+        typer.BadParameter: the file is there and is no JSON, such as weights that were named by mistake.
+    """
+    print_json = json is not None and str(json) == STDOUT
+    if json is not None and not print_json:
+        warn_of_old_name("--json FILE", "--out FILE")
+        out = out or json
+    if out is not None and out.is_file() and out.suffix != ".json":
+        raise typer.BadParameter(f"{out} is there and does not end in .json; results would replace it")
+    return out, print_json
 
 
 def warn_of_old_name(old: str, new: str) -> None:

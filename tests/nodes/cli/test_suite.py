@@ -95,7 +95,7 @@ def test_fitting_shows_its_curve(suite: Path, two: tuple[Path, Path], tmp_path: 
     assert "mIoU before fitting" in done.stdout and "2 steps" in done.stdout
     assert out.with_suffix(".curves.png").stat().st_size > 1000
     written = json.loads(out.read_text())
-    assert written["suite"]["scene"]["seconds"] == 0 and not written["suite"]["depth"]
+    assert written["suite"]["scene"]["seconds"] == 0 and written["suite"]["depth"] == "off"
     assert written["title"].endswith("1 room, scratch: 3 keyframes, 2 steps, 3 views, without depth, 48x36")
 
 
@@ -133,6 +133,8 @@ def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Pat
         ("benchmark", "klevr"),
         ("benchmark", "rooms", "--protocol", "finetune", "--map"),
         ("benchmark", "rooms", "--views", "17"),
+        ("benchmark", "rooms", "--depth", "computed", "--current", "hard"),
+        ("benchmark", "rooms", "--rooms", "1", "--out", __file__),
     ],
 )
 def test_options_that_do_not_go_together_are_wrong_usage(arguments: tuple[str, ...]) -> None:
