@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
-from semantic_mapper.nodes.cli.replay import DepthOption
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.process import StopRequest
+
+FinetuneDepthOption = Annotated[
+    Literal["auto", "sensor", "computed", "off"] | None,
+    typer.Option(
+        "--depth",
+        help="auto: the sensor's, and computed from the pictures where the log has none; computed: always; off: none.  "
+        "[default: sensor]",
+    ),
+]
 
 
 @verb
@@ -31,13 +39,13 @@ def finetune(
         Path | None, typer.Option(help="Weights to start from; without it the small ones in the package.")
     ] = None,
     from_scratch: Annotated[bool, typer.Option("--from-scratch", help="Start from random weights.")] = False,
-    depth: DepthOption = None,
+    depth: FinetuneDepthOption = None,
 ) -> int:
     """Fit the field to a few labelled keyframes of a log.
 
     The keyframes are those that together show most of what the log shows; no other label is trained on. The weights
-    remember them, so that `replay` and `eval` never score on them. Depth of a log without a depth sensor is computed
-    from its pictures. Ctrl-C writes the best weights so far (exit code 130).
+    remember them, so that `replay` and `eval` never score on them. With --depth computed the
+    keyframes have depth computed from the log's pictures. Ctrl-C writes the best weights so far (exit code 130).
 
     Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors
     """
@@ -57,7 +65,7 @@ def finetune(
     if settings.seconds == 0 and settings.steps == 0:
         raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
     keep_freed_memory()
-    depths = mapper_config(None, None, depth=depth, delay_frames=REPLAY_DELAY_FRAMES).depth
+    depths = mapper_config(None, None, depth=depth or "sensor", delay_frames=REPLAY_DELAY_FRAMES).depth
     request = FinetuneRequest(log, keyframes, out, settings, weights, from_scratch, depths)
     with StopRequest() as stop, frame_progress("finetune", None, unit="%") as bar:
         checkpoint, chosen = finetune_log(request, stop, bar)
