@@ -7,7 +7,7 @@ from pathlib import Path
 
 from semantic_mapper.config import MapperConfig, convert_config, load_config, to_plain, with_quality
 from semantic_mapper.fields.base import SemanticField
-from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint
+from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, find_checkpoint, load_checkpoint
 from semantic_mapper.fields.device import choose_device
 from semantic_mapper.fields.device_field import DeviceField
 from semantic_mapper.fields.learned import LearnedField
@@ -48,7 +48,7 @@ class Mapper:
         if not isinstance(config, MapperConfig):
             config = MapperConfig() if config is None else load_config(Path(config), MapperConfig)
         config = with_quality(config)
-        path = default_checkpoint_path() if weights is None else Path(weights)
+        path = default_checkpoint_path() if weights is None else find_checkpoint(Path(weights))
         checkpoint = load_checkpoint(path)
         if config.render.encode_width == 0:
             plain = to_plain(config)

@@ -47,12 +47,14 @@ def map_(
 
     The folder gets the log (NAME.mcap), the report on the film (NAME.html), and what `replay` writes. Walk slowly,
     sideways, in good light; a camera that turns on the spot shows no depth. A film tells no metres: give one of
-    --scale, --distance, --square-mm, --camera-height. The last line is the path of the report.
+    --scale, --distance, --square-mm, --camera-height. Films are mapped with weights that have learned from computed
+    depth (rooms-computed-depth). The last line is the path of the report.
 
     Example: semantic-mapper map film.mp4 --out runs/film
     Example: semantic-mapper map film.mp4 --out runs/film --calibration camera.toml --camera-height 1.5
     """
     output = Output.guarded()
+    from semantic_mapper.fields.checkpoint import COMPUTED_DEPTH
     from semantic_mapper.nodes.cli.film import film_options, import_film_log, is_film, print_film, recording_scale
     from semantic_mapper.nodes.cli.outputs import hold_folder
     from semantic_mapper.nodes.cli.report import REPORT_NAME
@@ -76,7 +78,8 @@ def map_(
                 import_recording(source, log, on_progress=lambda done, _: bar.set(done), options=plain, overwrite=True)
     with StopRequest() as stop:
         with frame_progress("replay", None) as bar:
-            summary = replay_log(ReplayRequest(log, out, weights, settings), stop, bar.start, bar.set)
+            chosen = weights or (COMPUTED_DEPTH if is_film(source) else None)
+            summary = replay_log(ReplayRequest(log, out, chosen, settings), stop, bar.start, bar.set)
         output.print(summary_table({out.name: summary}))
         for line in (*notes(summary), *result_lines(out), str(out / REPORT_NAME)):
             output.print(line)

@@ -13,7 +13,12 @@ from semantic_mapper.nodes.process import StopRequest
 
 OutOption = Annotated[Path, typer.Option("--out", help="Folder for the results; made if missing.")]
 WeightsOption = Annotated[
-    Path | None, typer.Option("--weights", help="Weights file; without it the small one in the package.")
+    Path | None,
+    typer.Option(
+        "--weights",
+        help="Weights file, or `rooms-computed-depth` for cameras without a depth sensor; without it the small one in "
+        "the package.",
+    ),
 ]
 VoxelSizeOption = Annotated[
     float | None, typer.Option("--voxel-size", min=0.002, max=1.0, help="Edge of a voxel in metres.  [default: 0.02]")

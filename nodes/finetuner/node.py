@@ -25,7 +25,7 @@ def run_finetuner(context: NodeContext, options: FinetunerOptions) -> None:
     """
     _lower_priority(options)
     from semantic_mapper.config import load_config
-    from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
+    from semantic_mapper.fields.checkpoint import default_checkpoint_path, find_checkpoint, load_checkpoint
     from semantic_mapper.memory import keep_freed_memory
     from semantic_mapper.nodes.finetuner.finetuner import Finetuner
     from semantic_mapper.training.online import OnlineConfig
@@ -34,7 +34,7 @@ def run_finetuner(context: NodeContext, options: FinetunerOptions) -> None:
 
     keep_freed_memory()
     config = load_config(Path(options.config), OnlineConfig) if options.config else OnlineConfig()
-    path = Path(options.weights) if options.weights else default_checkpoint_path()
+    path = find_checkpoint(Path(options.weights)) if options.weights else default_checkpoint_path()
     start, digest = load_checkpoint(path), digest_of(path.read_bytes())
     endpoint = options.labels if "://" in options.labels else context.endpoint(options.labels)
     with (

@@ -70,9 +70,22 @@ class Checkpoint:
         return frozenset(int(s) for s in self.recipe.get("train_stamps_ns", ()))
 
 
+COMPUTED_DEPTH = Path("rooms-computed-depth")  # names the weights that ship for cameras without a depth sensor
+
+
 def default_checkpoint_path() -> Path:
     """The small checkpoint that ships with the package."""
-    return Path(str(resources.files("semantic_mapper"))) / "weights" / "rooms.safetensors"
+    return _shipped() / "rooms.safetensors"
+
+
+def find_checkpoint(path: Path) -> Path:
+    """The path itself, or that of weights which ship with the package under this name (``COMPUTED_DEPTH``)."""
+    named = _shipped() / f"{path}.safetensors"
+    return named if not path.exists() and path.parent == Path() and named.exists() else path
+
+
+def _shipped() -> Path:
+    return Path(str(resources.files("semantic_mapper"))) / "weights"
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: Path, *, half: bool = False) -> None:
@@ -125,11 +138,12 @@ def save_tensors(tensors: dict[str, torch.Tensor], path: Path, metadata: dict[st
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Read a weights file.
+    """Read a weights file; a name of weights that ship with the package ("rooms-computed-depth") will do.
 
     Raises:
         WeightsError: missing, damaged, of another format or version, or weights that do not fit their own config.
     """
+    path = find_checkpoint(path)
     if path.exists() and not path.is_file():
         raise WeightsError(f"{path}: is no regular file; copy its content to one")
     if not path.exists():

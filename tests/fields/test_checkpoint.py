@@ -9,14 +9,17 @@ from safetensors.torch import save_file
 
 from semantic_mapper.errors import WeightsError
 from semantic_mapper.fields.checkpoint import (
+    COMPUTED_DEPTH,
     Checkpoint,
     adapt_model,
     anchor_from_frame,
     default_checkpoint_path,
+    find_checkpoint,
     load_checkpoint,
     save_checkpoint,
 )
 from semantic_mapper.labels import ROOMS, make_label_set
+from semantic_mapper.mapper import Mapper
 from tests.small import tiny_field, tiny_frames
 
 
@@ -170,3 +173,15 @@ def test_a_network_too_large_for_any_use_is_refused_before_it_is_made(tmp_path, 
     save_file(tensors, path, metadata)
     with pytest.raises(WeightsError, match=r"metadata is damaged: ConfigError: .*Expected"):
         load_checkpoint(path)
+
+
+def test_weights_that_ship_are_found_by_name_and_files_come_first(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shipped = find_checkpoint(COMPUTED_DEPTH)
+    assert shipped.name == "rooms-computed-depth.safetensors" and shipped.exists()
+    assert load_checkpoint(COMPUTED_DEPTH).model.config.encoder.computed_depth
+    assert Mapper.load(COMPUTED_DEPTH).weights_path == shipped
+    COMPUTED_DEPTH.write_bytes(b"mine")
+    assert find_checkpoint(COMPUTED_DEPTH) == COMPUTED_DEPTH
+    with pytest.raises(WeightsError, match="no such weights file"):
+        load_checkpoint(tmp_path / "rooms-computed-depth.else")
