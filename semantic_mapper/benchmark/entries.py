@@ -12,7 +12,7 @@ import torch
 from semantic_mapper.benchmark.protocols import Entry
 from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError, WeightsError
-from semantic_mapper.fields.checkpoint import load_checkpoint
+from semantic_mapper.fields.checkpoint import find_checkpoint, load_checkpoint
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS
@@ -29,6 +29,7 @@ def load_entries(paths: Sequence[Path], kinds: Sequence[str] = ()) -> list[Entry
         ConfigError: no such kind, or one given twice.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    paths = [find_checkpoint(path) for path in paths]
     checkpoints = [load_checkpoint(path) for path in paths]
     # The config too: a file of before may lack a setting, whose default changes what the weights do.
     digests = [
