@@ -129,7 +129,7 @@ def median_depth(frames: Sequence[PlacedFrame]) -> float:
 
 
 def floor_under(frames: Sequence[PlacedFrame]) -> float | None:
-    """z of the floor under the frames, where z is up; None = there is none."""
+    """z of the floor under the frames, where z is up; None if no floor is found."""
     camera_z = float(np.median([frame.T_world_camera[2, 3] for frame in frames]))
     return floor_height(np.concatenate([frame.xyz[:, 2] for frame in frames]), camera_z)
 

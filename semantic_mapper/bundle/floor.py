@@ -13,7 +13,7 @@ _MOST_BELOW, _MARGIN = 0.03, 0.1  # fraction of the points further below it than
 
 
 def floor_height(z: Float64, camera_z: float) -> float | None:
-    """z of the floor: the lowest strong layer of points below the camera; None = there is none.
+    """z of the floor: the lowest strong layer of points below the camera; None if no floor is found.
 
     Args:
         z: (N,) of points.
