@@ -10,6 +10,9 @@ import numpy as np
 from semantic_mapper.types import Float64, Int64, UInt8
 
 _WINDOW = (21, 21)  # pixels that a corner is compared by
+_CONTRAST_WINDOW = (31, 31)  # pixels; each has the mean and spread of these taken away
+_CONTRAST_NOISE = 4.0  # of 255; what varies less stays flat
+_CONTRAST_GAIN = 40.0  # grey levels a spread
 _LEVELS = 3  # of the pyramid, beside the image itself
 _STEPS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
 _BACK_PX = 0.7  # followed forth and back, a corner must come so near to where it was
@@ -44,7 +47,12 @@ def prepare_image(rgb: UInt8, width: int, height: int) -> UInt8:
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     if gray.shape != (height, width):
         gray = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.createCLAHE(2.0, (8, 8)).apply(gray), np.uint8)  # exposure may change between images
+    # Exposure may change between images. What evens it out has to move with the scene: CLAHE's tiles stand still, and
+    # corners lag behind the motion by 1 to 2 %.
+    light = gray.astype(np.float32)
+    mean = cv2.blur(light, _CONTRAST_WINDOW)
+    spread = np.sqrt(np.maximum(cv2.blur(light * light, _CONTRAST_WINDOW) - mean * mean, 0)) + _CONTRAST_NOISE
+    return np.clip(128 + _CONTRAST_GAIN * (light - mean) / spread, 0, 255).astype(np.uint8)
 
 
 def follow(before: UInt8, after: UInt8, pixels: Float64, guess: Float64) -> tuple[Float64, np.ndarray]:

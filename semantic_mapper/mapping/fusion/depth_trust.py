@@ -20,7 +20,7 @@ from semantic_mapper.types import Float32
 MEASURED = 1.0
 COMPUTED_LOOK = 1 / 32
 COMPUTED_CAP = 31 / 32
-SURFACE_WEIGHT = 2 * COMPUTED_LOOK  # from which on a voxel is part of the surface: two looks have to agree
+SURFACE_WEIGHT = 4 * COMPUTED_LOOK  # from which on a voxel is part of the surface: four sure looks, or more unsure ones
 MOST_TRUST = 1.0  # of a rendered depth
 GUESS_TRUST = 0.1  # where the map has no surface yet
 LEAST_TRUST = 0.05  # below, nothing is fused
