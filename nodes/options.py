@@ -101,6 +101,7 @@ class MapperOptions(Config, frozen=True):
     weights: str = ""  # empty = those that ship with the package
     config: str = ""  # TOML file with settings of the mapper; empty = defaults
     voxel_size_m: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0  # 0 = what the config says
+    depth: Literal["", "auto", "sensor", "computed", "off"] = ""  # where depth comes from; empty = what the config says
     eval_exclude: str = ""  # weights whose finetuning frames are left out of the scores, too
     rerun: str = ""  # write a Rerun recording there; empty = none
     # Also write the map of the moment to ``map.npz`` in ``out`` every n seconds, beside mapping: what a killed

@@ -143,6 +143,12 @@ def nearly_empty(session: MapSession, points: int) -> str | None:
             "the pictures: move it sideways, a few centimetres a frame, with views that overlap; turning alone or "
             "standing still shows no depth"
         )
+    if 2 * session.computed_depth >= mapped and 2 * session.fused <= session.computed_depth:
+        return (
+            f"{found}; depth computed from their pictures is too unsure in all but {session.fused} of them: the way of "
+            "the camera is too short, against the error of its poses, to tell lengths from it; move on sideways, by half "
+            "a metre or more"
+        )
     if 2 * session.computed_depth >= mapped:
         return (
             f"{found}; depth computed from their pictures does not agree from frame to frame: it needs poses that are "

@@ -124,7 +124,8 @@ class VisualPoses(Config, frozen=True):
     # Where the scale comes from: a table of "topic" (the robot's odometry, however coarse) or "board" (a printed one,
     # seen at the beginning). The world is the one of these poses then.
     scale: dict[str, Any] = msgspec.field(default_factory=dict)
-    distance_m: AtLeastZero = 0.0  # in its place: from the camera to what is in the middle of its first picture
+    # In its place: from the camera to what is in the middle of the picture that the world begins with.
+    distance_m: AtLeastZero = 0.0
     # In its place, for a camera that is carried at one height over a flat floor that it sees: how high. Every keyframe
     # that sees the floor corrects the scale. Without T_world_start the camera is taken to be level.
     camera_height_m: AtLeastZero = 0.0

@@ -112,10 +112,13 @@ class RealSenseCamera:
             except StreamEnded as end:
                 self._lose(str(end))
                 continue
-            image = None if frames is None else self._maker.image(frames)
+            if frames is None:
+                continue
+            image, self._lost = self._maker.image(frames), ""
             if image is not None:
-                self._lost = ""
                 yield image
+            else:
+                self._lost = f"an image was passed over ({self._maker.passed_over} so far): {self._maker.reason}"
 
     def _open(self, search_s: float) -> None:
         """Connect, and wait for the first image, whose profile has the intrinsics.

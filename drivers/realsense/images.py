@@ -71,10 +71,12 @@ class ImageMaker:
 
     Attributes:
         passed_over: Images that could not be used: out of order, or stamped in the future.
+        reason: Why the last of them could not.
     """
 
     def __init__(self, camera_id: str, told: Any) -> None:
         self.passed_over = 0
+        self.reason = ""
         self._camera_id = camera_id
         self._last: tuple[int, int] | None = None  # number and stamp of the last image
         self._shift: int | None = None  # from the device's numbers to ours; None = not known of this connection
@@ -95,7 +97,12 @@ class ImageMaker:
     def image(self, frames: FrameSet) -> CameraImage | None:
         """The image of a set; None for one that is not later than the one before, or claims to be of the future."""
         stamp_ns = self._stamp_ns(frames.color)
-        if stamp_ns > time.monotonic_ns() + FUTURE_NS or (self._last is not None and stamp_ns <= self._last[1]):
+        self.reason = ""
+        if stamp_ns > time.monotonic_ns() + FUTURE_NS:
+            self.reason = "its stamp is in the future: check the clocks of this machine and of the device"
+        elif self._last is not None and stamp_ns <= self._last[1]:
+            self.reason = "its stamp is not later than that of the image before"
+        if self.reason:
             self.passed_over += 1
             return None
         rgb = np.array(frames.color.get_data(), np.uint8)  # a copy: the SDK has few buffers

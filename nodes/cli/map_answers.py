@@ -36,7 +36,7 @@ def describe_map(snapshot: MapSnapshot) -> dict[str, Any]:
         "question": "info",
         "frames": snapshot.version,
         "scale": scale_name(snapshot.scale_known),
-        "voxel_size_m": snapshot.voxel_size_m,
+        "voxel_size_m" if snapshot.scale_known else "voxel_size": snapshot.voxel_size_m,
         "blocks": snapshot.block_count,
         "surface_voxels": len(label),
         "computed": round(float(1 - measured.mean()), DIGITS) if len(label) else None,

@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.table import Table
 
-from semantic_mapper.mapping.map_scale import MEND
+from semantic_mapper.mapping.map_scale import MEND, voxel_size_text
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.summary import dig
 
@@ -21,7 +21,7 @@ def summary_table(summaries: Mapping[str, Mapping[str, Any]]) -> Table:
         table.add_column(name, justify="right")
     columns = list(summaries.values())
     for name, path, show in _ROWS:
-        values = [dig(s, path) for s in columns]
+        values = [dig(s, path) if path else s for s in columns]
         if any(v is not None for v in values):
             table.add_row(name, *(show(v) if v is not None else "-" for v in values))
     classes = [dig(s, "metrics.per_class") or {} for s in columns]
@@ -68,6 +68,14 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
             f"surface: {percent(fraction)} of its points were computed, not measured by a sensor; "
             "`export --min-weight 1` leaves them out"
         )
+    unused = sum(
+        frames.get(k, 0) * sign for k, sign in (("published", 1), ("dropped", -1), ("refused", -1), ("fused", -1))
+    )
+    if unused and dig(summary, "depth.computed_fraction"):
+        lines.append(
+            f"{counted(unused, 'frame')} added nothing to the map: no depth was computed, or it was too unsure, as at the "
+            "beginning of a walk"
+        )
     if summary.get("scale") == "unknown":
         lines.append(f"scale: unknown; lengths of this map are not metres, and what needs metres is refused: {MEND}")
     if frames.get("left_out"):
@@ -100,6 +108,11 @@ def percent(value: float) -> str:
 
 def _ms(value: float) -> str:
     return f"{value:.0f} ms"
+
+
+def _voxel_size(summary: Mapping[str, Any]) -> str:
+    size = dig(summary, "map.voxel_size_m")
+    return "-" if size is None else voxel_size_text(size, summary.get("scale") != "unknown")
 
 
 def _pose_figure(check: Mapping[str, Any], key: str) -> str:
@@ -136,7 +149,7 @@ _ROWS: Sequence[tuple[str, str, Any]] = (
     ("contradicting pairs", "pose_check", lambda c: _pose_figure(c, "contradicting_pairs")),
     ("latency p50", "latency_ms.p50", _ms),
     ("latency p95", "latency_ms.p95", _ms),
-    ("voxel size", "map.voxel_size_m", lambda v: f"{v * 100:g} cm"),
+    ("voxel size", "", _voxel_size),
     ("blocks", "map.blocks", str),
     ("surface points", "map", lambda m: f"{m['surface_points']}{' (nearly empty)' if m.get('nearly_empty') else ''}"),
     ("unknown surface", "map.unknown", percent),

@@ -59,6 +59,7 @@ def run_mapper(context: NodeContext, options: MapperOptions) -> None:
     config = mapper_config(
         Path(options.config) if options.config else None,
         options.voxel_size_m or None,
+        depth=options.depth or None,
         live=options.delivery == "newest",
     )
     bundle = Mapper.load(Path(options.weights) if options.weights else None, config)

@@ -139,8 +139,11 @@ class VisualOdometry:
         return None if floor is None else camera - floor
 
     def center_depth(self) -> float | None:
-        """Median distance along the view of points in the middle third of the world's first view; None without any."""
+        """Median distance along the view of points in the middle third of the view that the world begins with; None
+        without any, or once the view is no longer kept."""
         first = self._map.keyframes[0]
+        if first.number:
+            return None
         mask, points = self._map.known(first.tracks)
         z = transform(invert_pose(first.T_world_camera), points)[:, 2]
         size = np.array((self._intrinsics.width, self._intrinsics.height))

@@ -10,7 +10,7 @@ import numpy as np
 from semantic_mapper.types import Float64, Int64, UInt8
 
 _WINDOW = (21, 21)  # pixels that a corner is compared by
-_CONTRAST_WINDOW = (31, 31)  # pixels; each has the mean and spread of these taken away
+_CONTRAST_WINDOW = 0.1  # of the width; each pixel has the mean and spread of such a square around it taken away
 _CONTRAST_NOISE = 4.0  # of 255; what varies less stays flat
 _CONTRAST_GAIN = 40.0  # grey levels a spread
 _LEVELS = 3  # of the pyramid, beside the image itself
@@ -49,9 +49,9 @@ def prepare_image(rgb: UInt8, width: int, height: int) -> UInt8:
         gray = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
     # Exposure may change between images. What evens it out has to move with the scene: CLAHE's tiles stand still, and
     # corners lag behind the motion by 1 to 2 %.
-    light = gray.astype(np.float32)
-    mean = cv2.blur(light, _CONTRAST_WINDOW)
-    spread = np.sqrt(np.maximum(cv2.blur(light * light, _CONTRAST_WINDOW) - mean * mean, 0)) + _CONTRAST_NOISE
+    light, side = gray.astype(np.float32), 2 * round(_CONTRAST_WINDOW * width / 2) + 1
+    mean = cv2.blur(light, (side, side))
+    spread = np.sqrt(np.maximum(cv2.blur(light * light, (side, side)) - mean * mean, 0)) + _CONTRAST_NOISE
     return np.clip(128 + _CONTRAST_GAIN * (light - mean) / spread, 0, 255).astype(np.uint8)
 
 

@@ -15,12 +15,15 @@ from semantic_mapper.depth_from_motion.estimate import estimate_depth, no_depth
 from semantic_mapper.depth_from_motion.sources import choose_sources
 from semantic_mapper.depth_from_motion.views import DepthEstimate, PreparedView, prepare_view
 from semantic_mapper.geometry import invert_pose, rotation_vector
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
+
+_log = get_logger(__name__)
 
 Hint = Callable[[PosedFrame, CameraIntrinsics], DepthEstimate]
 
 MAX_VIEWS = 24  # kept of one camera; half a megabyte each
-MAX_CAMERAS = 8  # those that sent nothing for longest are forgotten
+MAX_CAMERAS = 32  # those that sent nothing for longest are forgotten
 RECENT_VIEWS = 8  # of one camera, kept whatever they look at
 NEIGHBOURS = 6  # earlier estimates that a new one is compared with
 TURN_WEIGHT_M = 0.5  # a turn of one radian counts as this much way, where views are compared
@@ -138,7 +141,8 @@ class DepthFromMotion:
         if len(camera.views) > MAX_VIEWS + self._config.delay_frames:
             del camera.views[_least_useful(camera.views, RECENT_VIEWS + self._config.delay_frames)]
         if len(self._cameras) > MAX_CAMERAS:
-            self._cameras.popitem(last=False)
+            forgotten, _ = self._cameras.popitem(last=False)
+            _log.warning("camera_forgotten", camera=forgotten, reason=f"depth is computed for {MAX_CAMERAS} cameras")
 
 
 def _distances(view: PreparedView, others: list[PreparedView]) -> Float64:

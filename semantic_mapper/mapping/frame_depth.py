@@ -83,12 +83,15 @@ class FrameDepth:
             frame = replace(frame, depth_m=None)
         if self._computer is None or frame.depth_m is not None:
             return [frame] if self._computer is None else self._computer.push(frame)
+        done: list[PosedFrame] = []
         if frame.intrinsics.width >= REFINED_WIDTH:
             if why := self.pictures.look(frame):
                 raise FrameError(f"frame seq={frame.seq} of camera '{frame.camera_id}': {why}")
             if self._config.refine_poses:
+                if self._lens_changed(frame):
+                    done = self.finish()  # frames that wait are in the world of the refiner that goes
                 frame = self._refine(frame, self._computer)
-        return [self._anchored(f) for f in self._computer.push(frame, self._hint)]
+        return done + [self._anchored(f) for f in self._computer.push(frame, self._hint)]
 
     def _anchored(self, frame: PosedFrame) -> PosedFrame:
         """A frame with computed depth where the given poses have it in the mean; its spread has that of their scale."""
@@ -110,10 +113,15 @@ class FrameDepth:
         """The frames that still wait, oldest first."""
         return [] if self._computer is None else [self._anchored(f) for f in self._computer.finish()]
 
+    def _lens_changed(self, frame: PosedFrame) -> bool:
+        intrinsics, _ = self._refiners.get(frame.camera_id, (frame.intrinsics, None))
+        return intrinsics != frame.intrinsics
+
     def _refine(self, frame: PosedFrame, computer: DepthFromMotion) -> PosedFrame:
         """The frame at a pose that fits the pictures; a camera with another lens or size starts over."""
-        intrinsics, refiner = self._refiners.pop(frame.camera_id, (None, None))
-        if refiner is None or intrinsics != frame.intrinsics:
+        starts = self._lens_changed(frame)
+        _, refiner = self._refiners.pop(frame.camera_id, (None, None))
+        if refiner is None or starts:
             refiner = PoseRefiner(self._config.poses, background=self._config.refine_in_background)
         self._refiners[frame.camera_id] = frame.intrinsics, refiner
         if len(self._refiners) > MAX_CAMERAS:

@@ -12,7 +12,7 @@ from semantic_mapper.errors import MapError
 
 MEND = (
     "give a scale when the film or recording is imported (--distance, --square-mm, --camera-height or --scale), or to "
-    "visual odometry (scale or distance_m), and map it again"
+    "visual odometry (scale, distance_m or camera_height_m), and map it again"
 )
 
 

@@ -104,6 +104,7 @@ class Feed:
         self, make: Callable[[int], tuple[UInt8, np.ndarray | None]], device: SoftDevice, domain: str = "global_time"
     ) -> None:
         self.device: SoftDevice | None = device
+        self.ahead_ms = 0.0  # of the true time
         self._make, self._domain = make, domain
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -123,7 +124,7 @@ class Feed:
             if device is None or not device.color_sensor.get_active_streams():
                 continue
             ms = time.time() * 1000 if self._domain != "hardware_clock" else time.monotonic() * 1000 - 5e6
-            device.give(*self._make(number), ms - 20.0, self._domain)
+            device.give(*self._make(number), ms - 20.0 + self.ahead_ms, self._domain)
             number += 1
 
 

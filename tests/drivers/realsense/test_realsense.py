@@ -165,6 +165,22 @@ def test_a_device_that_goes_away_is_waited_for(how: str) -> None:
         assert camera.warnings == ()
 
 
+def test_images_stamped_in_the_future_are_passed_over_and_named() -> None:
+    with Feed(picture, SoftDevice()) as feed, camera_of(feed.device) as camera:
+        images = iter(camera)
+        before = next(images)
+        feed.ahead_ms = 60_000.0
+        got: list[Any] = []
+        waiting = threading.Thread(target=lambda: got.append(next(images)))
+        waiting.start()
+        until(lambda: any("its stamp is in the future" in text for text in camera.warnings))
+        feed.ahead_ms = 0.0
+        waiting.join(PATIENCE_S)
+        assert got[0].stamp_ns > before.stamp_ns
+        next(images)
+        assert camera.warnings == ()
+
+
 def test_stop_ends_the_iteration_while_the_device_is_gone() -> None:
     device = SoftDevice()
     with Feed(picture, device) as feed, camera_of(device) as camera:
