@@ -24,7 +24,6 @@ sys.modules["torch"] = types.ModuleType("torch")  # the library names its types,
 
 import numpy as np  # noqa: E402
 import zmq  # noqa: E402
-from scipy.spatial.transform import Rotation  # noqa: E402
 
 from semantic_mapper.drivers.v4l2 import ioctls, paths  # noqa: E402
 from semantic_mapper.transport.messages import Status  # noqa: E402
@@ -54,11 +53,12 @@ S_DV_TIMINGS = _request(3, 87, TIMINGS_SIZE)
 
 
 class Film(NamedTuple):
-    """Pictures (N, bytes) as YUYV, where the camera was (N, 4, 4), and how many are shown a second."""
+    """Pictures (N, bytes) as YUYV, how many are shown a second, and the camera's positions and quaternions (x y z w)."""
 
     pictures: np.ndarray
-    poses: np.ndarray
     hz: float
+    positions: list[list[float]]
+    quaternions: list[list[float]]
 
 
 class Output:
@@ -132,10 +132,8 @@ def play(film: Film, output: Output, poses: zmq.Socket[bytes], begin: LosslessSu
     """Stand at the first picture until the camera node has published, then walk to the last one."""
 
     def tell(stamp_ns: int, index: int) -> None:
-        T = film.poses[index]
-        turn = Rotation.from_matrix(T[:3, :3]).as_quat()
-        message = PoseMessage(stamp_ns=stamp_ns, position=tuple(T[:3, 3]), quaternion=tuple(turn))
-        poses.send_multipart(encode_pose(message))
+        position, quaternion = tuple(film.positions[index]), tuple(film.quaternions[index])
+        poses.send_multipart(encode_pose(PoseMessage(stamp_ns=stamp_ns, position=position, quaternion=quaternion)))
 
     def stand(index: int, until_s: float) -> None:
         while (left_s := until_s - time.monotonic()) > 0:
@@ -165,9 +163,7 @@ def main() -> int:
 
         run_camera(read_job(sys.argv[2]))
     settings = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
-    film = Film(
-        np.load(settings["pictures"], mmap_mode="r"), np.array(settings["poses"], np.float64), settings["hz"]
-    )
+    film = Film(np.load(settings["pictures"], mmap_mode="r"), **settings["walk"])
     camera, output = connect_cable()
     job = settings["job"]
     job["options"]["camera"]["config"]["device"] = str(camera)
@@ -179,8 +175,10 @@ def main() -> int:
         subprocess.Popen([sys.executable, __file__, "camera", json.dumps(job)]) as node,
         LosslessSubscriber(job["endpoints"]["camera"], ("status",)) as begin,
     ):
-        play(film, shown, socket, begin)
-        node.send_signal(signal.SIGINT)
+        try:
+            play(film, shown, socket, begin)
+        finally:
+            node.send_signal(signal.SIGINT)
         return node.wait()
 
 

@@ -29,6 +29,7 @@ SHARING = ("9p", "9pnet_virtio", "virtio_pci")  # modules that the guest needs t
 CAMERA = ("vivid",)  # ... and to have a camera ...
 NETWORK = ("virtio_net",)  # ... and to be reached by us
 ADDRESS = "10.0.2.15"  # of the guest in QEMU's own network
+RELAY_PORT = 700  # there
 DONE = "guest: exit code "
 
 INIT = """#!/bin/busybox sh
@@ -48,9 +49,11 @@ chroot /host {command}
 echo "{done}$?"
 poweroff -f
 """
-# Nodes of the guest listen on its loopback; what comes from outside is passed on to there, as ``ssh -L`` does.
+# Nodes of the guest listen on its loopback; what comes from outside is passed on to there, as ``ssh -L`` does. Not before
+# they listen: our side tries again at once where a connection is made and lost, and each costs the guest a process.
 INIT_NETWORK = """ifconfig lo 127.0.0.1 up; ifconfig eth0 {address} up
-nc -ll -p {port} -e /bin/nc 127.0.0.1 {port} &"""
+(until grep -q "0100007F:{port:04X} 00000000:0000 0A" /proc/net/tcp; do sleep 0.5; done
+ nc -ll -p {relay} -e /bin/nc 127.0.0.1 {port}) &"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +110,7 @@ def make_initrd(guest: Guest) -> bytes:
         sharing=" ".join(sharing),
         camera=" ".join(camera),
         vivid=guest.vivid,
-        network=INIT_NETWORK.format(address=ADDRESS, port=guest.port) if guest.port else "",
+        network=INIT_NETWORK.format(address=ADDRESS, port=guest.port, relay=RELAY_PORT) if guest.port else "",
         root=ROOT,
         command=shlex.join((str(Path(sys.prefix) / "bin" / "python"), *guest.command)),
         done=DONE,
@@ -157,8 +160,8 @@ def boot(initrd: Path, guest: Guest) -> int:
     libraries = ":".join(str(TREE / folder) for folder in ("usr/lib/x86_64-linux-gnu", "lib/x86_64-linux-gnu"))
     network = ("-nic", "none")
     if guest.port:
-        forward = f"hostfwd=tcp:127.0.0.1:{guest.port}-{ADDRESS}:{guest.port}"
-        network = ("-nic", f"user,restrict=on,model=virtio-net-pci,romfile=,{forward}")
+        forward = f"hostfwd=tcp:127.0.0.1:{guest.port}-{ADDRESS}:{RELAY_PORT}"
+        network = ("-netdev", f"user,id=net,restrict=on,{forward}", "-device", "virtio-net-pci,netdev=net,romfile=")
     command = [
         str(TREE / "usr/bin/qemu-system-x86_64"),
         # Emulated, also where there is a /dev/kvm: within a virtual machine that may hang for ever.

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from benchmarks import v4l2_machine
 from benchmarks.computed_maps import distances, true_surface
@@ -82,7 +83,12 @@ def film_settings(walk: Walk, folder: Path, camera: CameraIntrinsics, port: int,
         "endpoints": {"camera": f"tcp://127.0.0.1:{port}"},
         "subscribers": 2,
     }
-    settings = {"pictures": str(folder / "film.npy"), "poses": walk.poses.tolist(), "hz": hz, "job": job}
+    told = {
+        "hz": hz,
+        "positions": walk.poses[:, :3, 3].tolist(),
+        "quaternions": Rotation.from_matrix(walk.poses[:, :3, :3]).as_quat().tolist(),
+    }
+    settings = {"pictures": str(folder / "film.npy"), "walk": told, "job": job}
     path = folder / "film.json"
     path.write_text(json.dumps(settings), encoding="utf-8")
     return path
