@@ -123,7 +123,7 @@ def _nothing(k: CameraIntrinsics) -> tuple[Float32, np.ndarray]:
 
 
 def true_surface(views: Iterable[tuple[Float32, CameraIntrinsics, Float64]], every: int = EVERY_POINT) -> Float64:
-    """Points (N, 3) of what was truly seen, from depths (H, W), their cameras and poses (4, 4); of each ``every``-th."""
+    """Points (N, 3) of what was truly seen, from depths (H, W), cameras and poses (4, 4); of each ``every``-th."""
     return np.concatenate([transform(T, unproject(depth, k)[depth > 0])[::every] for depth, k, T in views])
 
 

@@ -20,7 +20,7 @@ import types
 from pathlib import Path
 from typing import NamedTuple
 
-sys.modules["torch"] = types.ModuleType("torch")  # the library names its types, the camera node computes nothing with it
+sys.modules["torch"] = types.ModuleType("torch")  # the library names its types, the camera node uses nothing of it
 
 import numpy as np  # noqa: E402
 import zmq  # noqa: E402
@@ -34,6 +34,7 @@ POSES = "tcp://127.0.0.1:5560"
 HEARTBEAT_S = 0.05  # between two poses
 LAST_S = 1.0  # that the last picture stays
 SWITCH_NS = 1000  # between the last pose of a picture and the first of the next
+AHEAD = 8  # pictures that the robot may go on before the status says what was published meanwhile
 BUFFERS = 3
 
 # Layouts and numbers of linux/videodev2.h on 64 bit machines.
@@ -53,10 +54,12 @@ S_DV_TIMINGS = _request(3, 87, TIMINGS_SIZE)
 
 
 class Film(NamedTuple):
-    """Pictures (N, bytes) as YUYV, how many are shown a second, and the camera's positions and quaternions (x y z w)."""
+    """Pictures (N, bytes) as YUYV, how many are shown a second and a published frame at most, and the camera's
+    positions and quaternions (x y z w)."""
 
     pictures: np.ndarray
     hz: float
+    a_frame: int
     positions: list[list[float]]
     quaternions: list[list[float]]
 
@@ -83,8 +86,7 @@ class Output:
     def show(self, picture: bytes) -> int:
         """Show another picture; returns the moment of the change on the monotonic clock, in nanoseconds.
 
-        The driver takes the stamps of what its camera sees and of this change under one lock: a picture of the camera
-        that was captured before the change shows what was there before, one from then on shows this one.
+        A picture of the camera with an earlier stamp shows what was there before, one from then on shows this one.
         """
         self._queue(picture)
         told = self._ask(DQBUF, self._buffer(0), BUFFER_SIZE)
@@ -125,34 +127,59 @@ def connect_cable() -> tuple[Path, Path]:
         controls = ioctls.list_controls(fd)
         ioctls.set_control(fd, controls["osd_text_mode"].id, 2)  # no text over the picture
         ioctls.set_control(fd, controls["loop_video"].id, 1)
+        # At the moment when the picture is taken; else most of a frame's time is added, in which it may have changed.
+        ioctls.set_control(fd, controls["timestamp_source"].id, 1)
     return nodes[True], nodes[False]
 
 
-def play(film: Film, output: Output, poses: zmq.Socket[bytes], begin: LosslessSubscriber) -> None:
-    """Stand at the first picture until the camera node has published, then walk to the last one."""
+class Robot:
+    """Walks through the film, and tells where it is.
 
-    def tell(stamp_ns: int, index: int) -> None:
-        position, quaternion = tuple(film.positions[index]), tuple(film.quaternions[index])
-        poses.send_multipart(encode_pose(PoseMessage(stamp_ns=stamp_ns, position=position, quaternion=quaternion)))
+    Args:
+        film: What it sees and where.
+        output: Shows it.
+        status: What the camera node says about itself.
+    """
 
-    def stand(index: int, until_s: float) -> None:
-        while (left_s := until_s - time.monotonic()) > 0:
-            tell(time.monotonic_ns(), index)
-            time.sleep(min(HEARTBEAT_S, left_s))
+    def __init__(self, film: Film, output: Output, status: LosslessSubscriber) -> None:
+        self._film = film
+        self._output = output
+        self._status = status
+        self._published = 0  # frames of the camera node
+        self._poses = zmq.Context.instance().socket(zmq.PUB)
+        self._poses.bind(POSES)
 
-    published = 0
-    while not published:
-        stand(0, time.monotonic() + HEARTBEAT_S)
-        message = begin.receive(0.0)
-        published = message.counters.get("published", 0) if isinstance(message, Status) else 0
-    began = time.monotonic()
-    for index in range(1, len(film.pictures)):
-        stand(index - 1, began + index / film.hz)
-        stamp_ns = output.show(film.pictures[index].tobytes())
-        tell(stamp_ns - SWITCH_NS, index - 1)
-        tell(stamp_ns, index)
-    stand(len(film.pictures) - 1, time.monotonic() + LAST_S)
-    print(f"guest: {len(film.pictures)} pictures shown in {time.monotonic() - began:.0f} s", flush=True)
+    def walk(self) -> None:
+        """Stand at the first picture until the camera node has published, then go to the last one.
+
+        It goes no faster than the camera publishes: an emulated processor is slow, on a busy machine very slow.
+        """
+        while not self._published:
+            self._stand(0, HEARTBEAT_S)
+        began, first = time.monotonic(), self._published
+        for index in range(1, len(self._film.pictures)):
+            self._stand(index - 1, 1 / self._film.hz)
+            while index > AHEAD + self._film.a_frame * (self._published - first):
+                self._stand(index - 1, HEARTBEAT_S)
+            stamp_ns = self._output.show(self._film.pictures[index].tobytes())
+            self._tell(stamp_ns - SWITCH_NS, index - 1)
+            self._tell(stamp_ns, index)
+        self._stand(len(self._film.pictures) - 1, LAST_S)
+        print(f"guest: {len(self._film.pictures)} pictures shown in {time.monotonic() - began:.0f} s", flush=True)
+
+    def _stand(self, index: int, seconds: float) -> None:
+        """Stay at a picture."""
+        until = time.monotonic() + seconds
+        while (left_s := until - time.monotonic()) > 0:
+            self._tell(time.monotonic_ns(), index)
+            message = self._status.receive(min(HEARTBEAT_S, left_s))
+            if isinstance(message, Status):
+                self._published = message.counters.get("published", 0)
+
+    def _tell(self, stamp_ns: int, index: int) -> None:
+        position, quaternion = tuple(self._film.positions[index]), tuple(self._film.quaternions[index])
+        message = PoseMessage(stamp_ns=stamp_ns, position=position, quaternion=quaternion)
+        self._poses.send_multipart(encode_pose(message))
 
 
 def main() -> int:
@@ -169,14 +196,12 @@ def main() -> int:
     job["options"]["camera"]["config"]["device"] = str(camera)
     job["options"]["camera"]["poses"]["endpoint"] = POSES
     shown = Output(output, film.pictures[0].tobytes())
-    socket = zmq.Context.instance().socket(zmq.PUB)
-    socket.bind(POSES)
     with (
         subprocess.Popen([sys.executable, __file__, "camera", json.dumps(job)]) as node,
-        LosslessSubscriber(job["endpoints"]["camera"], ("status",)) as begin,
+        LosslessSubscriber(job["endpoints"]["camera"], ("status",)) as status,
     ):
         try:
-            play(film, shown, socket, begin)
+            Robot(film, shown, status).walk()
         finally:
             node.send_signal(signal.SIGINT)
         return node.wait()

@@ -49,11 +49,11 @@ chroot /host {command}
 echo "{done}$?"
 poweroff -f
 """
-# Nodes of the guest listen on its loopback; what comes from outside is passed on to there, as ``ssh -L`` does. Not before
-# they listen: our side tries again at once where a connection is made and lost, and each costs the guest a process.
+# Nodes of the guest listen on its loopback; what comes from outside is passed on to there, as ``ssh -L`` does. Not
+# before they listen: our side tries again at once where a connection is made and lost, at a process of the guest each.
 INIT_NETWORK = """ifconfig lo 127.0.0.1 up; ifconfig eth0 {address} up
 (until grep -q "0100007F:{port:04X} 00000000:0000 0A" /proc/net/tcp; do sleep 0.5; done
- nc -ll -p {relay} -e /bin/nc 127.0.0.1 {port}) &"""
+ nc -ll -p {relay} -e /bin/nc 127.0.0.1 {port} 2>/dev/null) &"""
 
 
 @dataclass(frozen=True, slots=True)

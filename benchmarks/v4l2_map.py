@@ -1,9 +1,9 @@
 """A map through a real V4L2 camera: Debian's kernel in QEMU, a film in its virtual camera, poses on the pose topic.
 
 A walk through a ROOMS room is rendered. In the virtual machine the kernel's ``vivid`` shows it to its own camera
-(``v4l2_film.py``), the camera node reads that through the V4L2 driver and publishes posed frames. On this machine, which
-reaches it over TCP, a mapper node maps them with computed depth, and a recorder node keeps them. Maps are measured
-against the true surface, beside maps of the same frames with the pictures as rendered.
+(``v4l2_film.py``), the camera node reads that through the V4L2 driver and publishes posed frames. On this machine,
+which reaches it over TCP, a mapper node maps them with computed depth, and a recorder node keeps them. Maps are
+measured against the true surface, beside maps of the same frames with the pictures as rendered.
 
 Example: python -m benchmarks.v4l2_map --out runs/v4l2
 """
@@ -45,6 +45,7 @@ VIVID_HZ = 59.94
 WEIGHTS = "rooms-computed-depth"  # as ``launch/webcam.toml`` has it
 TRUTH_M = 0.15  # way between the views that the true surface is made of, and ...
 EVERY_POINT = 20  # ... which of their pixels are taken
+A_FRAME = 4  # pictures of the film that are shown, at most, for each frame that the camera node has published
 PATIENCE_S = 600.0
 
 
@@ -75,8 +76,8 @@ def film_settings(walk: Walk, folder: Path, camera: CameraIntrinsics, port: int,
     numbers = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
     (folder / "camera.toml").write_text("".join(f"{name} = {value}\n" for name, value in numbers.items()))
     v4l2 = {"calibration": str(folder / "camera.toml"), "fourcc": "YUYV", "fps": VIVID_HZ}
-    # The guest is slow: a picture waits for the pose that was told after it.
-    poses = {"kind": "topic", "wait_s": 1.0}
+    # The guest is slow: a picture may be read seconds after it was captured, and its pose may come after that.
+    poses = {"kind": "topic", "wait_s": 1.0, "max_clock_difference_s": 5.0}
     job = {
         "name": "camera",
         "options": {"camera": {"kind": "v4l2", "config": v4l2, "poses": poses}},
@@ -85,6 +86,7 @@ def film_settings(walk: Walk, folder: Path, camera: CameraIntrinsics, port: int,
     }
     told = {
         "hz": hz,
+        "a_frame": A_FRAME,
         "positions": walk.poses[:, :3, 3].tolist(),
         "quaternions": Rotation.from_matrix(walk.poses[:, :3, :3]).as_quat().tolist(),
     }
@@ -163,7 +165,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=TEST_SEEDS[0], help="of room and walk")
     parser.add_argument("--pictures", type=int, default=240, help="of the film")
     parser.add_argument("--step", type=float, default=0.0125, help="metres between two of them")
-    parser.add_argument("--hz", type=float, default=3.0, help="pictures of the film a second")
+    parser.add_argument("--hz", type=float, default=6.0, help="pictures of the film a second, at most")
     given = parser.parse_args()
     if error := v4l2_machine.fetch():
         print(f"v4l2_map: skipped: {error}", file=sys.stderr)
