@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -99,12 +100,21 @@ def measure(steps: list[Step], config: DepthConfig) -> dict[str, float]:
         trust = computed_trust(frame.depth_m, frame.depth_sigma_m)
         voxel_map.integrate(frame, frame.depth_m, None, trust=trust, measured=False)
     found = {"abs_rel": float(np.mean(off)), "pose_mm": float(np.mean(away)) * 1e3}
-    surface, points = _surface(steps), voxel_map.points().xyz
+    surface = true_surface([(s.depth_m, s.frame.intrinsics, s.T_world_camera) for s in steps[::EVERY_TRUTH]])
+    return found | distances(voxel_map.points().xyz, surface)
+
+
+def distances(points: Float32, surface: Float64) -> dict[str, float]:
+    """How far the points (N, 3) of a map are from the true surface (M, 3), and what fraction of that one they show."""
     if not len(points):
-        return found | {"median_mm": float("nan"), "within_5_cm": 0.0, "within_10_cm": 0.0}
-    seen = cKDTree(points).query(surface)[0]
-    found["median_mm"] = float(np.median(cKDTree(surface).query(points)[0])) * 1e3
-    return found | {"within_5_cm": float((seen < 0.05).mean()), "within_10_cm": float((seen < 0.10).mean())}
+        return {"median_mm": float("nan"), "points_within_5_cm": 0.0, "within_5_cm": 0.0, "within_10_cm": 0.0}
+    off, seen = cKDTree(surface).query(points)[0], cKDTree(points).query(surface)[0]
+    return {
+        "median_mm": float(np.median(off)) * 1e3,
+        "points_within_5_cm": float((off < 0.05).mean()),
+        "within_5_cm": float((seen < 0.05).mean()),
+        "within_10_cm": float((seen < 0.10).mean()),
+    }
 
 
 def _nothing(k: CameraIntrinsics) -> tuple[Float32, np.ndarray]:
@@ -112,13 +122,9 @@ def _nothing(k: CameraIntrinsics) -> tuple[Float32, np.ndarray]:
     return np.zeros((k.height, k.width), np.float32), np.zeros((k.height, k.width), bool)
 
 
-def _surface(steps: list[Step]) -> Float64:
-    """Points (N, 3) of what the walk has truly seen."""
-    clouds = [
-        transform(T, unproject(depth, frame.intrinsics)[depth > 0])[::EVERY_POINT]
-        for frame, depth, T in steps[::EVERY_TRUTH]
-    ]
-    return np.concatenate(clouds)
+def true_surface(views: Iterable[tuple[Float32, CameraIntrinsics, Float64]], every: int = EVERY_POINT) -> Float64:
+    """Points (N, 3) of what was truly seen, from depths (H, W), cameras and poses (4, 4); of each ``every``-th."""
+    return np.concatenate([transform(T, unproject(depth, k)[depth > 0])[::every] for depth, k, T in views])
 
 
 def main() -> None:

@@ -134,7 +134,9 @@ class TopicPoseSource:
         return (
             f"poses of {self._config.endpoint} that come now are stamped {(newest - image.stamp_ns) / 1e9:+.3f} s from "
             f"the images of '{image.camera_id}': they are of another clock; stamp both with CLOCK_MONOTONIC of one "
-            f"machine, or set clock_offset_ns (now {self._config.clock_offset_ns}) if the difference is constant"
+            f"machine, or set clock_offset_ns (now {self._config.clock_offset_ns}) if the difference is constant; on a "
+            "machine that is too slow for its camera, and has its images so late, raise max_clock_difference_s (now "
+            f"{self._config.max_clock_difference_s:g})"
         )
 
     def _empty_trouble(self) -> str:

@@ -132,6 +132,7 @@ def test_other_clocks_are_refused_with_the_difference_and_mended_by_the_offset(e
         assert source.pose(image(1000 * MS)) is None  # at once, not after ``wait_s``
         assert source.counters["clock"] == 1 and "+4.020 s" in source.warnings[0]
         assert "clock_offset_ns" in source.warnings[0]
+        assert "raise max_clock_difference_s (now 1)" in source.warnings[0]
     with listening(endpoint, robot, clock_offset_ns=-4000 * MS) as source:
         robot.tell(5000)
         robot.tell(5020)
