@@ -105,7 +105,10 @@ def _compute_depths(
 
 def _as_given(frame: PosedFrame, computed: Mapping[tuple[str, int], ComputedFrame], config: DepthConfig) -> PosedFrame:
     """The frame with the depth that it is trained with."""
-    if config.source in ("off", "computed") and frame.depth_m is not None:
+    if frame.depth_sigma_m is not None:  # the log's depth is no sensor's
+        if config.source in ("off", "sensor"):
+            frame = replace(frame, depth_m=None, depth_sigma_m=None)
+    elif config.source in ("off", "computed") and frame.depth_m is not None:
         frame = replace(frame, depth_m=None)
     found = computed.get((frame.camera_id, frame.stamp_ns))
     return frame if frame.depth_m is not None or found is None else found.on(frame)
