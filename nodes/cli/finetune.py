@@ -79,8 +79,8 @@ def finetune(
     if pseudo := recipe.get("pseudo_labels"):
         by = f" that {pseudo['of']} has rendered" if pseudo["of"] else ""
         output.print(
-            f"  {pseudo['keyframes']} of the {len(chosen)} keyframes have pseudo labels{by}: the figures above say how well "
-            "these are learned, not how right they are"
+            f"  {pseudo['keyframes']} of the {len(chosen)} keyframes have pseudo labels{by}: the figures above say how "
+            "well these are learned, not how right they are"
         )
     if own := recipe["own_view"]:
         output.print(

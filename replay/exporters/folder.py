@@ -91,8 +91,8 @@ class FolderExporter:
             )
         if self._computed_depths:
             self.notices.append(
-                f"depth of {self._computed_depths} frames is computed, not a sensor's: it is in {COMPUTED_DEPTH}/, with "
-                f"its spread in {DEPTH_SIGMA}/, not in depth/"
+                f"depth of {self._computed_depths} frames is computed, not a sensor's: it is in {COMPUTED_DEPTH}/, "
+                f"with its spread in {DEPTH_SIGMA}/, not in depth/"
             )
         self.notices += self._depth.notices + self._intrinsics.notices
 
