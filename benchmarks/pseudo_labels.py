@@ -55,8 +55,9 @@ def main() -> None:
     assert found.miou is not None and found.total_accuracy is not None, "no frame has a pseudo label and a label"
     keyframes = sum(frame.stamp_ns in seen for frame, _ in drawn)
     print(
-        f"{len(drawn)} frames with pseudo labels, of which {keyframes} are keyframes of the weights: accuracy {found.total_accuracy * 100:.1f} %, mIoU {found.miou * 100:.1f} % of "
-        f"{len(truth_of.shared)} classes, {known / max(total, 1) * 100:.1f} % of the labelled pixels are named"
+        f"{len(drawn)} frames with pseudo labels, of which {keyframes} are keyframes of the weights: accuracy "
+        f"{found.total_accuracy * 100:.1f} %, mIoU {found.miou * 100:.1f} % of {len(truth_of.shared)} classes, "
+        f"{known / max(total, 1) * 100:.1f} % of the labelled pixels are named"
     )
     if given.out is not None:
         write_picture(given.out, _sheet(drawn, labels, true_labels))
