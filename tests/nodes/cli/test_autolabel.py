@@ -12,13 +12,16 @@ import msgspec
 import numpy as np
 import pytest
 
+from semantic_mapper.config import SemanticNeRFConfig
 from semantic_mapper.errors import LogError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.peers.semantic_nerf import SemanticNeRF
+from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS, LabelSet, make_label_set
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.pipeline import is_measured
 from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, mapper_config
-from semantic_mapper.replay.autolabel import AutolabelReport, AutolabelRequest, autolabel
+from semantic_mapper.replay.autolabel import RENDERED_SPREAD, AutolabelReport, AutolabelRequest, autolabel
 from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.exporters import LogExportRequest, export_log
 from semantic_mapper.replay.importers import import_recording
@@ -486,3 +489,20 @@ def test_frames_without_marks_are_packed_as_before() -> None:
     marked = encode_frame(dataclasses.replace(tiny_frames(1)[0], label_is_pseudo=True))
     assert msgspec.msgpack.decode(marked[1])["pseudo_label"] is True
     assert read_envelope(marked).has_pseudo_label
+
+
+def test_weights_that_hold_a_scene_render_depth_with_an_assumed_spread(tmp_path: Path) -> None:
+    config = SemanticNeRFConfig(width=16, depth=2, position_frequencies=4, half_extent_m=20.0)
+    field = build_field("semantic_nerf", config, ROOMS).eval()
+    assert isinstance(field, SemanticNeRF)
+    field.fitted_steps.fill_(1)
+    save_checkpoint(Checkpoint(field, (), {"width": 96}), tmp_path / "nerf.safetensors")
+    plain = without_depth(tmp_path / "plain.mcap", tiny_frames(3))
+    report = relabelled(plain, tmp_path / "new.mcap", tmp_path / "nerf.safetensors", depth=True)
+    assert (report.note.kind, report.note.depth_written) == ("semantic_nerf", 3)
+    with LogReader(tmp_path / "new.mcap") as log:
+        for frame in log:
+            assert frame.depth_m is not None and frame.depth_sigma_m is not None and not is_measured(frame)
+            there = frame.depth_m > 0
+            assert there.any()
+            assert np.allclose(frame.depth_sigma_m[there], RENDERED_SPREAD * frame.depth_m[there], atol=2e-3)
