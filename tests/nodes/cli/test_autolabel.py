@@ -8,21 +8,26 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
 
 from semantic_mapper.config import SemanticNeRFConfig
-from semantic_mapper.errors import LogError
+from semantic_mapper.errors import LabelError, LogError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.peers.semantic_nerf import SemanticNeRF
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import ROOMS, LabelSet, make_label_set
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.pipeline import is_measured
+from semantic_mapper.nodes.cli.console import frame_progress
+from semantic_mapper.nodes.cli.labelling import choose_keyframes
 from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, mapper_config
+from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.autolabel import RENDERED_SPREAD, AutolabelReport, AutolabelRequest, autolabel
 from semantic_mapper.replay.autolabel_note import read_note
+from semantic_mapper.replay.bench.render import log_scenes
 from semantic_mapper.replay.exporters import LogExportRequest, export_log
 from semantic_mapper.replay.importers import import_recording
 from semantic_mapper.replay.log.format import LogAttachment, LogReader, LogWriter
@@ -506,3 +511,16 @@ def test_weights_that_hold_a_scene_render_depth_with_an_assumed_spread(tmp_path:
             there = frame.depth_m > 0
             assert there.any()
             assert np.allclose(frame.depth_sigma_m[there], RENDERED_SPREAD * frame.depth_m[there], atol=2e-3)
+
+
+def test_bench_takes_no_pseudo_labels_for_truth(new: Path) -> None:
+    with pytest.raises(LabelError, match="has pseudo labels"):
+        log_scenes(new, 1, 1)
+
+
+def test_label_images_of_a_person_take_the_mark_away(new: Path, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "000003.png"), np.full((72, 96), ROOMS.ids[0], np.uint8))
+    with StopRequest() as stop, frame_progress("label", None) as bar:
+        (own,), _ = choose_keyframes(new, 1, [], tmp_path, stop, bar)
+        (pseudo,), _ = choose_keyframes(new, 1, [3], None, stop, bar)
+    assert not own.label_is_pseudo and pseudo.label_is_pseudo
