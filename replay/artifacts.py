@@ -102,7 +102,7 @@ def view_strips(session: MapSession, count: int) -> list[ViewStrip]:
 def _scores_line(session: MapSession) -> str:
     miou = session.confusion.metrics().miou
     if miou is None:
-        return "no labels to score against"
+        return "no score: its labels are pseudo labels" if session.pseudo_labelled else "no labels to score against"
     return f"mIoU {100 * miou:.1f} % over {session.scored} labelled frames that the weights have not seen"
 
 
@@ -197,6 +197,7 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "scored": session.scored,
             "without_depth": session.without_depth,
             "excluded_from_scores": session.excluded,
+            "pseudo_labels": session.pseudo_labelled,
             "left_out": session.left_out,
         },
         "latency_ms": {**_percentiles(session.step_ms), "first": _rounded(session.step_ms.first)},

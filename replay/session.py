@@ -75,6 +75,7 @@ class MapSession:
         self.unreadable = 0  # refused by the player of a log; they never came here
         self.scored = 0
         self.excluded = 0
+        self.pseudo_labelled = 0  # frames whose labels a field has rendered; they are no truth
         self.corrected_poses = 0  # given; the map has moved with them
         self.learned: dict[str, Any] | None = None  # what became of weights that were offered meanwhile
         self.unfinished_correction = ""  # what the map has not moved with, and why
@@ -201,9 +202,12 @@ class MapSession:
         return write_artifacts(self, out, self._rerun)
 
     def _score(self, frame: PosedFrame, update: MapUpdate) -> PosedFrame:
-        """Score a frame against its label; returns it without a label that cannot be read."""
+        """Score a frame against its label; returns it without a label that is no truth, or cannot be read."""
         if self.truth is None or frame.label is None:
             return replace(frame, label=None)
+        if frame.label_is_pseudo:
+            self.pseudo_labelled += 1
+            return replace(frame, label=None, label_is_pseudo=False)
         try:
             truth = self.truth.to_map_ids(frame.label, f"frame seq={frame.seq}")
         except LabelError as error:

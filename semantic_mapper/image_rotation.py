@@ -39,6 +39,9 @@ def rotate_frame(frame: PosedFrame, quarters: int) -> PosedFrame:
         rgb=np.ascontiguousarray(np.rot90(frame.rgb, -quarters)),
         depth_m=None if frame.depth_m is None else np.ascontiguousarray(np.rot90(frame.depth_m, -quarters)),
         label=None if frame.label is None else np.ascontiguousarray(np.rot90(frame.label, -quarters)),
+        depth_sigma_m=(
+            None if frame.depth_sigma_m is None else np.ascontiguousarray(np.rot90(frame.depth_sigma_m, -quarters))
+        ),
         intrinsics=rotate_intrinsics(frame.intrinsics, quarters),
         T_world_camera=frame.T_world_camera @ _turn(quarters),
     )

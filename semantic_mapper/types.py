@@ -125,7 +125,9 @@ class PosedFrame:
         pose_source: Where the pose comes from ("log", "odometry", ...).
         pose_sigma: One-sigma position uncertainty in metres; 0 = not known.
         depth_sigma_m: (H, W) float32 one-sigma spread of ``depth_m`` in metres, where it was computed from pictures;
-            None where a sensor measured it. Not part of messages and logs.
+            None where a sensor measured it.
+        label_is_pseudo: ``label`` was rendered by a field (``autolabel``). It may be learned from, and is no truth:
+            nothing is scored against it.
 
     Raises:
         FrameError: a shape or dtype is off, or a number out of its range. ``geometry.check_pose`` checks the pose.
@@ -142,6 +144,7 @@ class PosedFrame:
     pose_source: str = "log"
     pose_sigma: float = 0.0
     depth_sigma_m: Float32 | None = None
+    label_is_pseudo: bool = False
 
     def __post_init__(self) -> None:
         size = (self.intrinsics.height, self.intrinsics.width)

@@ -44,7 +44,8 @@ def finetune(
     """Fit the field to a few labelled keyframes of a log.
 
     The keyframes are those that together show most of what the log shows; no other label is trained on. The weights
-    remember them, so that `replay` and `eval` never score on them. With --depth computed the
+    remember them, so that `replay` and `eval` never score on them; of pseudo labels (`autolabel`), also the keyframes
+    of the weights that rendered these. With --depth computed the
     keyframes have depth computed from the log's pictures. Ctrl-C writes the best weights so far (exit code 130).
 
     Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors
@@ -75,6 +76,12 @@ def finetune(
         f"  {recipe['steps']} steps in {recipe['seconds']} s, best at step {recipe['best_step']}: held-out loss "
         f"{recipe['held_out_loss']:.3f}, accuracy {recipe['held_out_accuracy'] * 100:.1f} %"
     )
+    if pseudo := recipe.get("pseudo_labels"):
+        by = f" that {pseudo['of']} has rendered" if pseudo["of"] else ""
+        output.print(
+            f"  {pseudo['keyframes']} of the {len(chosen)} keyframes have pseudo labels{by}: the figures above say how "
+            "well these are learned, not how right they are"
+        )
     if own := recipe["own_view"]:
         output.print(
             f"  a frame's own image counts {own['factor']:g} times among the views, "

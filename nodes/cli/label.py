@@ -66,6 +66,8 @@ def label(
         f"{counted(len(chosen), 'labelled keyframe')} sent: frames {', '.join(str(f.seq) for f in chosen)} "
         f"of {log.name}"
     )
+    if pseudo := sum(frame.label_is_pseudo for frame in chosen):
+        output.print(f"  {pseudo} of them have pseudo labels (`autolabel`): what weights have rendered, right or wrong")
 
 
 def _refuse_without_finetuner(folder: Path) -> None:

@@ -134,4 +134,4 @@ def _labelled(frame: PosedFrame, number: int, images: Path | None, label_set: La
         label = read_label(file, label_set, (frame.intrinsics.height, frame.intrinsics.width))
     except BadFrameError as error:
         raise LogError(str(error)) from error
-    return dataclasses.replace(frame, label=label)
+    return dataclasses.replace(frame, label=label, label_is_pseudo=False)

@@ -10,6 +10,7 @@ from typing import Any
 from rich.table import Table
 
 from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.log.gaps import find_gaps, gaps_text
 from semantic_mapper.replay.log.sequence import LogSequence, open_log, read_part
 
@@ -27,7 +28,7 @@ def describe_log(paths: Sequence[Path], on_message: Callable[[], None]) -> dict[
     sizes: Counter[str] = Counter()
     stamps: dict[str, list[int]] = {}  # of frames, by camera; seqs likewise
     seqs: dict[str, list[int]] = {}
-    depth = labelled = 0
+    depth = labelled = computed = pseudo = 0
     with open_log(paths, allow_empty=True) as log:
         logs = log.logs if isinstance(log, LogSequence) else [log]
         files = [part.path for part in logs]
@@ -42,8 +43,10 @@ def describe_log(paths: Sequence[Path], on_message: Callable[[], None]) -> dict[
                 camera = envelope.source if envelope.source in stamps or len(stamps) < MAX_TOPICS else OTHER_TOPICS
                 stamps.setdefault(camera, []).append(envelope.stamp_ns)
                 seqs.setdefault(camera, []).append(envelope.seq)
-                depth += envelope.has_depth
-                labelled += envelope.has_label
+                computed += envelope.has_computed_depth
+                depth += envelope.has_depth and not envelope.has_computed_depth
+                pseudo += envelope.has_pseudo_label
+                labelled += envelope.has_label and not envelope.has_pseudo_label
             on_message()
         stream, attachments = log.info, log.attachments()
         damage, notices, finished = [str(e) for e in log.errors], list(log.notices), log.finished
@@ -58,6 +61,8 @@ def describe_log(paths: Sequence[Path], on_message: Callable[[], None]) -> dict[
         "frames": frames,
         "frames_with_depth": depth,
         "frames_with_labels": labelled,
+        "frames_with_computed_depth": computed,
+        "frames_with_pseudo_labels": pseudo,
         "duration_s": round(seconds, 3),
         "frame_hz": round((frames - 1) / seconds, 2) if seconds > 0 else None,
         "cameras": {
@@ -74,7 +79,32 @@ def describe_log(paths: Sequence[Path], on_message: Callable[[], None]) -> dict[
         "finished": finished,
         "notices": notices,
         "damage": damage,
+        "autolabel": None if (note := read_note(attachments)) is None else note.plain(),
     }
+
+
+def autolabel_rows(note: dict[str, Any]) -> list[tuple[str, str]]:
+    """Who has rendered pseudo labels, for people: names and texts of rows.
+
+    Args:
+        note: As ``AutolabelNote.plain`` gives it.
+    """
+    confidence = "" if note["mean_confidence"] is None else f", mean confidence {note['mean_confidence'] * 100:.1f} %"
+    counts = [f"{note['labelled']} of {counted(note['frames'], 'frame')} labelled{confidence}"]
+    counts += [f"{note[key]} {text}" for key, text in _AUTOLABEL_COUNTS.items() if note[key]]
+    settings = [f"--min-confidence {note['min_confidence']:g}"] if note["min_confidence"] else []
+    settings += ["--overwrite-labels"] if note["overwrite_labels"] else []
+    settings += ["--depth"] if note["depth"] else []
+    by = f"{note['weights']} ({note['kind']}, SHA-256 {note['digest'][:16]})"
+    return [("pseudo labels by", " ".join([by, *settings])), ("pseudo labels", "; ".join(counts))]
+
+
+_AUTOLABEL_COUNTS = {
+    "kept": "labels kept",
+    "replaced": "labels replaced",
+    "unlabelled": "left without a label",
+    "depth_written": "depth images computed or rendered",
+}
 
 
 def info_table(found: dict[str, Any]) -> Table:
@@ -87,7 +117,13 @@ def info_table(found: dict[str, Any]) -> Table:
     elif found["part"] is not None:
         table.add_row("part", f"{found['part']} of a recording")
     depth, labels = found["frames_with_depth"], found["frames_with_labels"]
-    table.add_row("frames", f"{found['frames']} ({depth} with depth, {labels} with labels)")
+    held = [f"{depth} with depth", f"{labels} with labels"]
+    for key, what in (("frames_with_computed_depth", "computed depth"), ("frames_with_pseudo_labels", "pseudo labels")):
+        held += [f"{found[key]} with {what}"] if found[key] else []
+    table.add_row("frames", f"{found['frames']} ({', '.join(held)})")
+    if found["autolabel"] is not None:
+        for name, text in autolabel_rows(found["autolabel"]):
+            table.add_row(name, text)
     rate = f", {found['frame_hz']:g} Hz" if found["frame_hz"] else ""
     table.add_row("duration", f"{found['duration_s']:g} s{rate}")
     for name, k in found["cameras"].items():

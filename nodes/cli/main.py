@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from semantic_mapper import __version__
+from semantic_mapper.nodes.cli import autolabel as cli_autolabel
 from semantic_mapper.nodes.cli import bench as cli_bench
 from semantic_mapper.nodes.cli import benchmark as cli_benchmark
 from semantic_mapper.nodes.cli import calibrate as cli_calibrate
@@ -58,6 +59,7 @@ for _function in (
     cli_export.export,
     cli_export.merge,
     cli_finetune.finetune,
+    cli_autolabel.autolabel,
     cli_correct.correct,
     cli_label.label,
     cli_weights.weights,

@@ -16,6 +16,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.nodes.cli.console import FrameProgress
 from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.log_depth import ComputedFrame, compute_depths
 from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, finetune
@@ -59,6 +60,10 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
             raise LabelError(f"{request.log}: has no label images; finetuning needs labelled keyframes")
         computed = _compute_depths(log, request.depth, stop, bar)
         frames = choose_labelled(log, label_set, request, computed, stop, bar)
+        note = read_note(log.attachments())
+    seen = frozenset[int]() if start is None else start.train_stamps_ns
+    if (pseudo := sum(frame.label_is_pseudo for frame in frames)) and note is not None:
+        seen |= frozenset(note.train_stamps_ns)  # who learns from a teacher has learned from its keyframes
     bar.start(100)
 
     def on_progress(progress: FinetuneProgress) -> None:
@@ -72,11 +77,13 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
         request.config,
         on_progress,
         lambda: stop,
-        () if start is None else start.train_stamps_ns,
+        seen,
     )
     if stop and not checkpoint.recipe["steps"]:  # nothing learned: no reason to touch the file
         raise KeyboardInterrupt
     checkpoint.recipe["source"] = request.log.name
+    if pseudo:
+        checkpoint.recipe["pseudo_labels"] = {"keyframes": pseudo, "of": "" if note is None else note.weights}
     save_checkpoint(checkpoint, request.out)
     return checkpoint, [f.seq for f in frames]
 
@@ -105,7 +112,10 @@ def _compute_depths(
 
 def _as_given(frame: PosedFrame, computed: Mapping[tuple[str, int], ComputedFrame], config: DepthConfig) -> PosedFrame:
     """The frame with the depth that it is trained with."""
-    if config.source in ("off", "computed") and frame.depth_m is not None:
+    if frame.depth_sigma_m is not None:  # the log's depth is no sensor's
+        if config.source in ("off", "sensor"):
+            frame = replace(frame, depth_m=None, depth_sigma_m=None)
+    elif config.source in ("off", "computed") and frame.depth_m is not None:
         frame = replace(frame, depth_m=None)
     found = computed.get((frame.camera_id, frame.stamp_ns))
     return frame if frame.depth_m is not None or found is None else found.on(frame)

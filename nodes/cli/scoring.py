@@ -16,6 +16,8 @@ from semantic_mapper.mapper import Mapper
 from semantic_mapper.nodes.cli.console import frame_progress
 from semantic_mapper.nodes.cli.run_replay import mapper_config
 from semantic_mapper.nodes.cli.summary_table import percent
+from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.evaluate.methods import baseline_predictors, evaluate_frames, field_predictors
 from semantic_mapper.replay.evaluate.shortfall import explain_shortfall
 from semantic_mapper.replay.log.sequence import Log, open_log
@@ -49,6 +51,7 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
         stream_labels = log.info.label_set
         if stream_labels is None:
             raise LabelError(f"{request.log}: has no label images to score against")
+        check_scorable(log)
         bundle = Mapper.load(request.weights, _frame_by_frame(mapper_config(request.config, None, request.seed)))
         predictors = field_predictors(bundle)
         stamps = bundle.checkpoint.train_stamps_ns
@@ -84,6 +87,26 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
         }
 
 
+def check_scorable(log: Log) -> None:
+    """Make sure that not all labels of a log were rendered by weights.
+
+    Raises:
+        LabelError: they were.
+    """
+    pseudo = 0
+    for envelope, _ in log.frame_parts():
+        if envelope.has_label and not envelope.has_pseudo_label:
+            return
+        pseudo += envelope.has_pseudo_label
+    if pseudo:
+        note = read_note(log.attachments())
+        by = f" that {note.weights} has rendered" if note is not None else ""
+        raise LabelError(
+            f"{log.path}: there is no score: all of its {counted(pseudo, 'label image')} are pseudo labels{by}, "
+            "which are no truth; score on the log that it was made of, or on labels of your own"
+        )
+
+
 def _frame_by_frame(config: MapperConfig) -> MapperConfig:
     """Scores are of each frame as it comes: computed depth does not wait for later ones."""
     from_motion = msgspec.structs.replace(config.depth.from_motion, delay_frames=0)
@@ -104,6 +127,8 @@ def score_table(title: str, scores: Mapping[str, Any]) -> Table:
     """One column a method."""
     methods: Mapping[str, Mapping[str, Any]] = scores["methods"]
     counts = f"{scores['scored']} frames scored, {scores['excluded']} left out as keyframes"
+    if scores["pseudo_labelled"]:
+        counts += f", {scores['pseudo_labelled']} with pseudo labels"
     table = Table(title=f"{title}: {counts}", title_justify="left")
     table.add_column("")
     for name in methods:

@@ -84,6 +84,11 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
         lines.append(
             f"{counted(frames['excluded_from_scores'], 'frame')} left out of the scores: weights were finetuned on them"
         )
+    if frames.get("pseudo_labels"):
+        lines.append(
+            f"{counted(frames['pseudo_labels'], 'frame')} not scored: their labels are pseudo labels, which weights "
+            "have rendered (`autolabel`)"
+        )
     if frames.get("refused"):
         first = summary["refusals"][0]["reason"] if summary.get("refusals") else ""
         lines.append(f"{counted(frames['refused'], 'frame')} refused; the first: {first}")

@@ -88,6 +88,10 @@ def log_scenes(path: Path, count: int, step: int = 5) -> list[BenchScene]:
     with LogReader(path) as log:
         if log.info.label_set is None:
             raise LabelError(f"{path}: has no label images to score against")
+        if any(envelope.has_pseudo_label for envelope, _ in log.frame_parts()):
+            raise LabelError(
+                f"{path}: has pseudo labels, which weights have rendered; give a log with labels of its own"
+            )
         reach, total = SOURCE_VIEWS // 2 * step, len(log)
         if total < 2 * reach + count:
             raise LogError(f"{path}: {count} scenes need {2 * reach + count} frames, the log has {total}")

@@ -46,7 +46,7 @@ Predictor = Callable[[PosedFrame], Opinion]
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Metrics by method, and how many frames were scored, left out, and refused.
+    """Metrics by method, and how many frames were scored, left out, and refused, or have pseudo labels.
 
     Beside the figures of ``SegmentationMetrics`` a method has ``ece``, and ``open_set_auroc`` where some labels are of
     classes that it cannot name; both None without confidences. The map also has ``open_set_unknown``: the fraction of
@@ -57,6 +57,7 @@ class Evaluation:
     scored: int
     excluded: int
     refused: int
+    pseudo_labelled: int = 0
 
 
 def field_predictors(bundle: Mapper) -> dict[str, Predictor]:
@@ -122,7 +123,8 @@ def evaluate_frames(
     on_frame: Callable[[int], None] | None = None,
     voxel_map: VoxelMap | None = None,
 ) -> Evaluation:
-    """Run every predictor over every frame; frames in ``exclude_stamps`` are predicted but not scored.
+    """Run every predictor over every frame; frames in ``exclude_stamps`` are predicted but not scored,
+    and so are those with pseudo labels.
 
     ``voxel_map``, where it is given and one of the predictors fills it, is scored in the end as the method ``MAP``: its
     points against the majority of the labels of the frames with depth that see them.
@@ -131,13 +133,15 @@ def evaluate_frames(
     truth_mapper = TruthMapper(stream_labels, label_set)
     confusions = {name: ConfusionMatrix(label_set) for name in predictors}
     confidences = {name: ConfidenceScores() for name in predictors}
-    scored = excluded = refused = 0
+    scored = excluded = refused = pseudo = 0
     for index, frame in enumerate(frames):
         where = f"frame seq={frame.seq}"
         try:
             predicted = {name: predict(frame) for name, predict in predictors.items()}
             if frame.stamp_ns in exclude_stamps:
                 excluded += 1
+            elif frame.label is not None and frame.label_is_pseudo:
+                pseudo += 1
             elif frame.label is not None:
                 truth = truth_mapper.to_map_ids(frame.label, where)
                 scored += 1
@@ -175,7 +179,7 @@ def evaluate_frames(
     }
     if MAP in methods:
         methods[MAP]["open_set_unknown"] = rejected
-    return Evaluation(methods, scored, excluded, refused)
+    return Evaluation(methods, scored, excluded, refused, pseudo)
 
 
 def _with_current_view(config: MapperConfig, use: bool) -> MapperConfig:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from semantic_mapper.replay.exporters.base import ExportFrame, LeftOut, depth_units, quaternion, seconds, write_png
+from semantic_mapper.replay.importers.folder import COMPUTED_DEPTH, DEPTH_SIGMA, PSEUDO_LABEL
 from semantic_mapper.replay.importers.tum import DEPTH_SCALE
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
@@ -21,7 +22,8 @@ class FolderExporter:
     """The sequence folder (see ``replay/importers/folder.py``): the same frames come back from ``import``.
 
     Colour images keep the bytes of the log, depth its units, poses and stamps every digit. Numbers of frames are their
-    places in the folder.
+    places in the folder. Pseudo labels and computed depth lie in folders of their own, so that nobody takes them for
+    labels of people and depth of a sensor.
 
     Args:
         folder: Is there, and empty.
@@ -35,6 +37,7 @@ class FolderExporter:
         self._poses: list[str] = []
         self._stamps: list[int] = []
         self._depth = _DepthFiles(None)
+        self._pseudo_labels = self._computed_depths = 0
         self._intrinsics = _OneCamera(info.scale_known)
         (folder / "color").mkdir()
 
@@ -51,10 +54,17 @@ class FolderExporter:
         number = len(self._poses)
         color = self._folder / "color" / f"{number:06d}.{_SUFFIX[item.rgb.encoding]}"
         color.write_bytes(item.rgb.data)
-        self._depth.write(self._folder / "depth" / f"{number:06d}.png", item)
+        name = f"{number:06d}.png"
+        if frame.depth_sigma_m is None:
+            self._depth.write(self._folder / "depth" / name, item)
+        else:
+            self._depth.write_computed(self._folder / COMPUTED_DEPTH / name, self._folder / DEPTH_SIGMA / name, item)
+            self._computed_depths += 1
         if frame.label is not None and self._labels is not None:
-            (self._folder / "label").mkdir(exist_ok=True)
-            write_png(self._folder / "label" / f"{number:06d}.png", frame.label)
+            folder = self._folder / (PSEUDO_LABEL if frame.label_is_pseudo else "label")
+            folder.mkdir(exist_ok=True)
+            write_png(folder / name, frame.label)
+            self._pseudo_labels += frame.label_is_pseudo
         self._poses.append(" ".join(map(repr, frame.T_world_camera.ravel().tolist())))
         self._stamps.append(frame.stamp_ns)
 
@@ -74,13 +84,24 @@ class FolderExporter:
             }
             text = json.dumps(plain, indent=1, ensure_ascii=False)
             (self._folder / "labels.json").write_text(text, encoding="utf-8")
+        if self._pseudo_labels:
+            self.notices.append(
+                f"{self._pseudo_labels} label images are pseudo labels, which weights have rendered: they are in "
+                f"{PSEUDO_LABEL}/, not in label/"
+            )
+        if self._computed_depths:
+            self.notices.append(
+                f"depth of {self._computed_depths} frames is computed, not a sensor's: it is in {COMPUTED_DEPTH}/, "
+                f"with its spread in {DEPTH_SIGMA}/, not in depth/"
+            )
         self.notices += self._depth.notices + self._intrinsics.notices
 
 
 class TumExporter:
     """A TUM RGB-D sequence: ``rgb/``, ``depth/`` (5000 units a metre), their lists and ``groundtruth.txt``.
 
-    Beside what the data set has there is ``intrinsics.json``, which our import reads.
+    Beside what the data set has there is ``intrinsics.json``, which our import reads. Depth that was computed is left
+    out, since readers would take it for a sensor's.
 
     Args:
         folder: Is there, and empty.
@@ -92,6 +113,7 @@ class TumExporter:
         self._names: dict[str, list[str]] = {"rgb": [], "depth": []}
         self._trajectory = Trajectory()
         self._depth = _DepthFiles(TUM_UNITS_PER_M)
+        self._computed_depths = 0
         self._intrinsics = _OneCamera()
         (folder / "rgb").mkdir()
 
@@ -108,7 +130,9 @@ class TumExporter:
         color = f"rgb/{stamp}.{_SUFFIX[item.rgb.encoding]}"
         (self._folder / color).write_bytes(item.rgb.data)
         self._names["rgb"].append(f"{stamp} {color}")
-        if self._depth.write(self._folder / "depth" / f"{stamp}.png", item):
+        if frame.depth_sigma_m is not None:
+            self._computed_depths += 1
+        elif self._depth.write(self._folder / "depth" / f"{stamp}.png", item):
             self._names["depth"].append(f"{stamp} depth/{stamp}.png")
 
     def finish(self) -> None:
@@ -119,6 +143,8 @@ class TumExporter:
             (self._folder / f"{name}.txt").write_text(text + "\n", encoding="ascii")
         self._trajectory.write(self._folder / "groundtruth.txt")
         self._intrinsics.write(self._folder / "intrinsics.json", TUM_UNITS_PER_M)
+        if self._computed_depths:
+            self.notices.append(f"depth of {self._computed_depths} frames is computed, not a sensor's, and is left out")
         missing = len(self._names["rgb"]) - len(self._names["depth"])
         if missing:
             self.notices.append(f"{missing} frames have no depth; programs that pair the lists will leave them out")
@@ -222,6 +248,18 @@ class _DepthFiles:
         write_png(file, units)
         self._written.add(file.name)
         return True
+
+    def write_computed(self, file: Path, sigma_file: Path, item: ExportFrame) -> None:
+        """Write computed depth and its spread, in the same units."""
+        frame = item.frame
+        assert frame.depth_m is not None and frame.depth_sigma_m is not None
+        self._scale = self._scale or item.depth_scale or None
+        for image, metres in ((file, frame.depth_m), (sigma_file, frame.depth_sigma_m)):
+            units, error = depth_units(metres, self.scale)
+            self._inexact += error > _EXACT_M
+            self._largest_error = max(self._largest_error, error)
+            image.parent.mkdir(exist_ok=True)
+            write_png(image, units)
 
     def fill_in(self, folder: Path, count: int, intrinsics: CameraIntrinsics | None) -> None:
         """Empty images for frames without depth, where others have some: the layout has one for each or none."""

@@ -99,11 +99,13 @@ class FoxgloveExporter:
         image = head | {"data": _base64(item.rgb.data), "format": item.rgb.encoding}
         self._write(f"{camera}/rgb", "foxglove.CompressedImage", frame, image)
         if frame.depth_m is not None:
-            self._write(f"{camera}/depth", "foxglove.RawImage", frame, head | _depth(frame.depth_m))
+            name = "depth" if frame.depth_sigma_m is None else "computed_depth"
+            self._write(f"{camera}/{name}", "foxglove.RawImage", frame, head | _depth(frame.depth_m))
         if frame.label is not None and self._labels is not None:
             drawn = encoded(self._labels.colorize(frame.label))
             image = head | {"data": _base64(drawn.data), "format": drawn.encoding}
-            self._write(f"{camera}/labels", "foxglove.CompressedImage", frame, image)
+            name = "pseudo_labels" if frame.label_is_pseudo else "labels"
+            self._write(f"{camera}/{name}", "foxglove.CompressedImage", frame, image)
 
     def finish(self) -> None:
         """Write the index and close the file."""

@@ -94,7 +94,11 @@ class RerunLog:
     def note_scale(self, known: bool) -> None:
         """Whether lengths are metres; where not, the recording says so (entity ``scale``)."""
         if not known:
-            self._stream.log("scale", rr.TextDocument("scale: unknown; lengths are not metres"), static=True)
+            self.note("scale", "unknown; lengths are not metres")
+
+    def note(self, name: str, text: str) -> None:
+        """Something to know of the whole recording: the entity ``name``."""
+        self._stream.log(name, rr.TextDocument(f"{name}: {text}"), static=True)
 
     def log_step(self, frame: PosedFrame, update: MapUpdate) -> None:
         """One frame and what was rendered for it."""

@@ -5,6 +5,9 @@
 and, unless depth is in millimetres, depth_scale: units per metre;
 ``"scale": "unknown"`` where poses are not in metres), and, if there is one, ``timestamps.txt`` (a row a
 frame: int nanoseconds, or seconds with a point). A frame without a depth image comes without depth.
+
+``export`` also writes ``pseudo_label/NNNNNN.png``, labels that weights have rendered, and ``computed_depth/NNNNNN.png``
+with its one-sigma spread in ``depth_sigma/NNNNNN.png``: they come back with that mark, for frames without the other.
 """
 
 from __future__ import annotations
@@ -38,6 +41,7 @@ from semantic_mapper.replay.importers.base import (
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from semantic_mapper.types import MAX_STAMP_NS, CameraIntrinsics, Float64, PosedFrame
 
+PSEUDO_LABEL, COMPUTED_DEPTH, DEPTH_SIGMA = "pseudo_label", "computed_depth", "depth_sigma"  # folders
 LEAST_PERIOD_NS = 100_000  # no camera is quicker: then stamps are in another unit
 DEFAULT_HZ = 6.0  # of a recording without timestamps.txt
 DEPTH_SCALE = DepthScale(1000.0, convention="millimetres; another one belongs into intrinsics.json as depth_scale")
@@ -96,7 +100,7 @@ class FolderRecording:
             )
         self._has_depth = (folder / "depth").is_dir()
         labels = self._read_label_set()
-        self._has_label = labels is not None and (folder / "label").is_dir()
+        self._has_label = labels is not None and any((folder / name).is_dir() for name in ("label", PSEUDO_LABEL))
         self.info = StreamInfo(
             source=f"folder {folder.resolve().name}",
             cameras={options.camera_id: self._intrinsics},
@@ -121,11 +125,19 @@ class FolderRecording:
         image_size_must_be(rgb, self._intrinsics, file)
         size = (self._intrinsics.height, self._intrinsics.width)
         depth_file = self._beside(file, "depth") if self._has_depth else None
-        depth = read_depth_if_there(depth_file, self.depth_scale, size)
-        label, label_error = None, None
+        depth, sigma = read_depth_if_there(depth_file, self.depth_scale, size), None
+        if depth is None and self._beside(file, COMPUTED_DEPTH).exists():
+            depth = read_depth_if_there(self._beside(file, COMPUTED_DEPTH), self.depth_scale, size)
+            sigma = read_depth_if_there(self._beside(file, DEPTH_SIGMA), self.depth_scale, size)
+            if sigma is None:
+                raise BadFrameError(self._beside(file, DEPTH_SIGMA), "is missing: the spread of computed depth")
+        label, label_error, pseudo = None, None, False
         if self._has_label and self.info.label_set is not None:
+            label_file = self._beside(file, "label")
+            if not label_file.exists() and self._beside(file, PSEUDO_LABEL).exists():
+                label_file, pseudo = self._beside(file, PSEUDO_LABEL), True
             try:
-                label = read_label(self._beside(file, "label"), self.info.label_set, size)
+                label = read_label(label_file, self.info.label_set, size)
             except BadFrameError as error:
                 label_error = Skipped(error.file, error.reason, number, label_only=True)
         frame = PosedFrame(
@@ -137,6 +149,8 @@ class FolderRecording:
             label=label,
             intrinsics=self._intrinsics,
             T_world_camera=pose,
+            depth_sigma_m=sigma,
+            label_is_pseudo=pseudo and label is not None,
         )
         return LoadedFrame(frame, encoded, label_error)
 

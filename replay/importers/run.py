@@ -12,6 +12,7 @@ import numpy as np
 
 from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LabelError, LogError
 from semantic_mapper.image_rotation import rotate_frame, rotate_intrinsics
+from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.importers.base import (
     BadFrameError,
     ImportOptions,
@@ -211,7 +212,7 @@ def import_recording(
         depth_scale=recording.depth_scale,
         median_depth_m=tally.median_depth_m,
         skipped=tuple(tally.skipped),
-        notices=tuple(recording.notices),
+        notices=(*recording.notices, *tally.notices),
         format=name,
         info=info,
         bytes=dst.stat().st_size,
@@ -241,16 +242,29 @@ def _changes(
 @dataclass(slots=True)
 class _Tally:
     labelled: int = 0
+    pseudo_labelled: int = 0
+    computed_depth: int = 0
     with_depth: int = 0
     median_depth_m: float = 0.0
     skipped: list[Skipped] = dataclasses.field(default_factory=list[Skipped])
 
+    @property
+    def notices(self) -> list[str]:
+        """On what people and sensors have not made."""
+        found = (
+            (self.pseudo_labelled, "pseudo labels, which weights have rendered"),
+            (self.computed_depth, "computed depth"),
+        )
+        return [f"{counted(count, 'frame')} with {what}; marked in the log" for count, what in found if count]
+
     def count(self, loaded: LoadedFrame) -> None:
         frame = loaded.frame
-        self.labelled += frame.label is not None
+        self.labelled += frame.label is not None and not frame.label_is_pseudo
+        self.pseudo_labelled += frame.label is not None and frame.label_is_pseudo
+        self.computed_depth += frame.depth_sigma_m is not None
         if loaded.label_error is not None:
             self.skipped.append(loaded.label_error)
-        if frame.depth_m is not None:
+        if frame.depth_m is not None and frame.depth_sigma_m is None:
             self.with_depth += 1
             if not self.median_depth_m and (frame.depth_m > 0).any():
                 self.median_depth_m = float(np.median(frame.depth_m[frame.depth_m > 0]))

@@ -96,6 +96,18 @@ class LogWriter:
         """Keep a file in the log, from the next message on; of several of one name readers give the last."""
         self._writer.add_attachment(0, 0, attachment.name, attachment.media_type, attachment.data)
 
+    def flush(self) -> None:
+        """Bring attachments to the file that no message has followed.
+
+        Raises:
+            LogError: the disk is full or gone; the log is as it was, and takes nothing more.
+        """
+        try:
+            self._file.commit()
+        except OSError as error:
+            self._failed = True
+            raise self._cannot_write(error) from error
+
     def write_frame(self, frame: PosedFrame, *, encoded_rgb: EncodedImage | None = None) -> None:
         """Append one frame.
 

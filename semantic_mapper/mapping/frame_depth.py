@@ -72,13 +72,14 @@ class FrameDepth:
     def push(self, frame: PosedFrame) -> list[PosedFrame]:
         """Take a frame; the frames that are ready, oldest first. One whose depth is computed may wait for later ones.
 
-        A frame that has a spread of its depth was here before and is left as it is.
+        A frame that has a spread of its depth, as it was here before or as its log has it, is left as it is; with
+        ``source`` "sensor" or "off" its depth is left out.
 
         Raises:
             FrameError: a picture that would spoil the map; see ``PictureCheck``. The next frame is welcome.
         """
         if frame.depth_sigma_m is not None:
-            return [frame]
+            return [frame if self._computer is not None else replace(frame, depth_m=None, depth_sigma_m=None)]
         if self._source in ("off", "computed") and frame.depth_m is not None:
             frame = replace(frame, depth_m=None)
         if self._computer is None or frame.depth_m is not None:

@@ -84,7 +84,7 @@ from semantic_mapper.transport.query_messages import (
     array_forms,
 )
 from semantic_mapper.transport.topics import TOPICS, Topic, read_topic, topic_bytes
-from semantic_mapper.types import MAX_PIXELS, MAX_POSE_SIGMA_M, CameraIntrinsics, MapUpdate, PosedFrame, UInt8
+from semantic_mapper.types import MAX_PIXELS, MAX_POSE_SIGMA_M, CameraIntrinsics, Float32, MapUpdate, PosedFrame, UInt8
 
 _DEFAULTS = CodecOptions()
 _ROWS = {row.message: row for row in TOPICS.values()}
@@ -106,7 +106,10 @@ _NOT_SENT_AS_0 = (
     "unreadable",
     "scale_unknown",
     "computed",
+    "pseudo_label",
+    "depth_sigma",
 )  # came later: what does not need it is read by older releases, too
+_FRAME_BUFFERS = ("rgb", "depth", "label", "depth_sigma")  # fields of a frame's header, in the order of their buffers
 
 MessageT = TypeVar("MessageT")
 AnswerT = TypeVar("AnswerT", bound=Answer)
@@ -129,6 +132,7 @@ class Envelope:
         stamp_ns, seq: 0 where the message has none.
         T_world_camera: Of a frame, 16 numbers row by row; else empty.
         has_depth, has_label: Of a frame.
+        has_computed_depth, has_pseudo_label: Whether no sensor and no person has made them.
         rgb_encoding: Of a frame: "png", "jpeg" or "raw".
         depth_scale: Units a metre of a frame's depth where it is packed as uint16, else 0.
     """
@@ -142,10 +146,12 @@ class Envelope:
     has_label: bool = False
     rgb_encoding: str = ""
     depth_scale: float = 0.0
+    has_computed_depth: bool = False
+    has_pseudo_label: bool = False
 
 
 class FrameHeader(Wire, frozen=True):
-    """``PosedFrame`` without its images; buffers: rgb, depth, label, those that there are."""
+    """``PosedFrame`` without its images; buffers: rgb, depth, label, depth_sigma, those that there are."""
 
     stamp_ns: CaptureStamp
     seq: Count
@@ -157,6 +163,8 @@ class FrameHeader(Wire, frozen=True):
     rgb: RgbSpec
     depth: DepthSpec | None = None
     label: LabelSpec | None = None
+    depth_sigma: DepthSpec | None = None  # of computed depth
+    pseudo_label: bool = False
 
     @property
     def name(self) -> str:
@@ -253,7 +261,8 @@ def encode(message: Message, options: CodecOptions = _DEFAULTS, *, sender: str =
 def encode_frame(
     frame: PosedFrame, options: CodecOptions = _DEFAULTS, *, encoded_rgb: EncodedImage | None = None
 ) -> list[bytes]:
-    """Posed frame -> parts. Depth, labels, stamps and the float64 pose are exact; so is colour unless "jpeg".
+    """Posed frame -> parts. Depth, its spread, labels, stamps and the float64 pose are exact; so is colour unless
+    "jpeg".
 
     Args:
         frame: With a finite pose; whether it is a rotation is for the receiver to judge.
@@ -268,12 +277,15 @@ def encode_frame(
     else:
         encoded_rgb_bytes, encoding = encoded_rgb.data, encoded_rgb.encoding
     buffers = [encoded_rgb_bytes]
-    depth = label = None
+    depth = label = sigma = None
     if frame.depth_m is not None:
         depth, data = encode_depth(frame.depth_m, options)
         buffers.append(data)
     if frame.label is not None:
         label, data = encode_label(frame.label, options)
+        buffers.append(data)
+    if frame.depth_sigma_m is not None:
+        sigma, data = encode_depth(frame.depth_sigma_m, options)
         buffers.append(data)
     header = FrameHeader(
         stamp_ns=frame.stamp_ns,
@@ -286,9 +298,42 @@ def encode_frame(
         rgb=RgbSpec(encoding, len(encoded_rgb_bytes)),
         depth=depth,
         label=label,
+        depth_sigma=sigma,
+        pseudo_label=frame.label_is_pseudo and label is not None,
     )
-    what = header.name
-    return [topic_bytes("frame", frame.camera_id), _pack(to_plain(header, what), FrameHeader, what), *buffers]
+    return [topic_bytes("frame", frame.camera_id), _pack_frame_header(header), *buffers]
+
+
+def with_label(parts: Parts, pseudo_label: UInt8 | None, options: CodecOptions = _DEFAULTS) -> list[bytes]:
+    """A frame with a pseudo label (H, W), or none, in place of its label; all else stays, byte for byte.
+
+    Raises:
+        CodecError: no frame.
+    """
+    packed = None if pseudo_label is None else encode_label(pseudo_label, options)
+    return _rebuilt(parts, {"label": packed}, pseudo_label=packed is not None)
+
+
+def with_computed_depth(
+    parts: Parts, depth_m: Float32, sigma_m: Float32, options: CodecOptions = _DEFAULTS
+) -> list[bytes]:
+    """A frame with computed depth (H, W) and its one-sigma spread, in metres; all else stays, byte for byte.
+
+    Raises:
+        CodecError: no frame.
+    """
+    return _rebuilt(parts, {"depth": encode_depth(depth_m, options), "depth_sigma": encode_depth(sigma_m, options)})
+
+
+def _rebuilt(parts: Parts, images: Mapping[str, tuple[Wire, bytes] | None], **fields: Any) -> list[bytes]:
+    """A frame with other images, by their fields in the header, and other fields; None = without the image."""
+    header, buffers = _open_frame(parts)
+    data = {name: bytes(buffer) for name, buffer in _named(header, buffers).items()}
+    for name, packed in images.items():
+        fields[name], data[name] = (None, b"") if packed is None else packed
+    header = msgspec.structs.replace(header, **fields)
+    there = [data[name] for name in _FRAME_BUFFERS if getattr(header, name) is not None]
+    return [bytes(parts[0]), _pack_frame_header(header), *there]
 
 
 def repack_rgb(parts: Parts, options: CodecOptions) -> list[bytes]:
@@ -301,9 +346,7 @@ def repack_rgb(parts: Parts, options: CodecOptions) -> list[bytes]:
     if header.rgb.encoding == options.rgb:
         return [bytes(part) for part in parts]
     data = encode_rgb(_decode_rgb(header, buffers[0]), options.rgb, options.jpeg_quality)
-    header = msgspec.structs.replace(header, rgb=RgbSpec(options.rgb, len(data)))
-    packed = pack_header(to_plain(header, header.name), header.name)
-    return [bytes(parts[0]), packed, data, *(bytes(buffer) for buffer in buffers[1:])]
+    return _rebuilt(parts, {"rgb": (RgbSpec(options.rgb, len(data)), data)})
 
 
 def decode(parts: Parts) -> Message:
@@ -449,6 +492,12 @@ def _pack(header: Mapping[str, Any], kind: type[object], what: str) -> bytes:
     return pack_header(header, what)
 
 
+def _pack_frame_header(header: FrameHeader) -> bytes:
+    plain = to_plain(header, header.name)
+    _leave_out_zeros(plain)
+    return _pack(plain, FrameHeader, header.name)
+
+
 def _read(header: Mapping[str, Any], kind: type[WireT], what: str) -> WireT:
     """Plain fields -> struct; intrinsics and label sets among them become what they are in Python."""
     try:
@@ -491,8 +540,16 @@ def _open_plain(parts: Parts, row: Topic) -> Any:
 
 def _open_frame(parts: Parts) -> tuple[FrameHeader, Parts]:
     header = _open(parts, "frame", FrameHeader)
-    specs = (header.rgb, header.depth, header.label)
+    if header.depth_sigma is not None and header.depth is None:
+        raise CodecError(f"{header.name}: has a spread of its depth, and no depth")
+    specs = [getattr(header, name) for name in _FRAME_BUFFERS]
     return header, check_buffers(parts, [s.bytes for s in specs if s is not None], header.name)
+
+
+def _named(header: FrameHeader, buffers: Parts) -> dict[str, Buffer]:
+    """The buffers of a frame by the fields of its header."""
+    names = [name for name in _FRAME_BUFFERS if getattr(header, name) is not None]
+    return dict(zip(names, buffers, strict=True))
 
 
 def _frame_envelope(topic: str, header: FrameHeader) -> Envelope:
@@ -506,6 +563,8 @@ def _frame_envelope(topic: str, header: FrameHeader) -> Envelope:
         has_label=header.label is not None,
         rgb_encoding=header.rgb.encoding,
         depth_scale=header.depth.scale if header.depth and header.depth.encoding == "u16_delta_planes_zstd" else 0.0,
+        has_computed_depth=header.depth_sigma is not None,
+        has_pseudo_label=header.pseudo_label and header.label is not None,
     )
 
 
@@ -517,18 +576,21 @@ def _decode_rgb(header: FrameHeader, buffer: Buffer) -> UInt8:
 
 
 def _decode_frame(header: FrameHeader, buffers: Parts) -> PosedFrame:
-    size, what = header.size, header.name
+    size, what, data = header.size, header.name, _named(header, buffers)
+    sigma = header.depth_sigma
     return PosedFrame(
         stamp_ns=header.stamp_ns,
         seq=header.seq,
         camera_id=header.camera_id,
-        rgb=_decode_rgb(header, buffers[0]),
-        depth_m=None if header.depth is None else decode_depth(header.depth, buffers[1], size, what),
-        label=None if header.label is None else decode_label(buffers[-1], size, what),
+        rgb=_decode_rgb(header, data["rgb"]),
+        depth_m=None if header.depth is None else decode_depth(header.depth, data["depth"], size, what),
+        label=None if header.label is None else decode_label(data["label"], size, what),
         intrinsics=header.intrinsics,
         T_world_camera=np.array(header.T_world_camera, np.float64).reshape(4, 4),
         pose_source=header.pose_source,
         pose_sigma=header.pose_sigma,
+        depth_sigma_m=None if sigma is None else decode_depth(sigma, data["depth_sigma"], size, f"{what}: spread of"),
+        label_is_pseudo=header.pseudo_label and header.label is not None,
     )
 
 
@@ -656,7 +718,7 @@ def _encode_query(kind: str, message: Request | Answer, what: str) -> tuple[list
 
 def _leave_out_zeros(header: dict[str, Any]) -> None:
     for name in _NOT_SENT_AS_0:
-        if header.get(name) == 0:
+        if header.get(name, 1) in (0, None):
             del header[name]
 
 

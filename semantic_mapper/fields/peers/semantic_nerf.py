@@ -43,6 +43,7 @@ class SemanticNeRF(LearnedField):
     """
 
     kind = "semantic_nerf"
+    holds_scene = True
     class_rows = ("classifier.weight", "classifier.bias")
     fitted_steps: torch.Tensor
 
