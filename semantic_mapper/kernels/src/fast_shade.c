@@ -57,7 +57,16 @@ static int own_normal(int64_t shape, const double *local, const double *half, do
         return 2;
     }
     double n[3] = {qx / half[0], qy / half[1], 0.0};
-    if (shape == 2)
+    if (shape == 6) { /* the nearest of five faces */
+        double slant = fabs(qx + qy) * 0.7071067811865476, x = fabs(1.0 + qx), y = fabs(1.0 + qy), z = fabs(1.0 - fabs(qz));
+        double least = min_d(min_d(slant, x), min_d(y, z));
+        n[0] = least == slant ? 1.0 / half[0] : least == x ? -1.0 : 0.0;
+        n[1] = least == slant ? 1.0 / half[1] : least == y && least != x ? -1.0 : 0.0;
+        n[2] = least == z && least != slant && least != x && least != y ? (local[2] > 0 ? 1.0 : -1.0) : 0.0;
+    } else if (shape == 5) {
+        double out = (radial - TORUS_RING) / (radial * (1.0 - TORUS_RING) * (1.0 - TORUS_RING));
+        n[0] *= out, n[1] *= out, n[2] = qz / half[2];
+    } else if (shape == 2)
         n[2] = qz / half[2];
     else if (shape == 3)
         n[2] = 0.2 * radius / half[2];
@@ -82,9 +91,11 @@ static int normal_at(const Primitives *primitives, int64_t p, const double *worl
     return axis;
 }
 
-/* Fraction of the ambient light that reaches a point: less near the room's walls, floor and ceiling. */
+/* Fraction of the ambient light that reaches a point: less near the room's walls, floor and ceiling. A room without end
+ * has none. */
 static double openness(const double *world, const double *normal, const double *room) {
     double fraction = 1.0;
+    if (isinf(room[0])) return fraction;
     for (int i = 0; i < 3; i++) {
         if (fabs(normal[i]) < 0.7) {
             double low = world[i] / CORNER_REACH_M, high = (room[i] - world[i]) / CORNER_REACH_M;
@@ -183,6 +194,30 @@ static void shade_point(const ShadeArguments *a, int64_t p, double *world, doubl
         for (int i = 0; i < 3; i++) world[i] = world[i] + t * ray[i], view[i] = -t * ray[i];
         way += t;
     }
+}
+
+typedef struct {
+    F64 depth; /* (H, W) along the camera's z */
+    I32 index; /* (H, W) number of the primitive, -1 = none */
+    F64 origin, camera_axes;
+    double fx, fy, cx, cy;
+    Primitives primitives;
+    F64 out; /* (H, W, 3) zeros */
+} NormalArguments;
+
+KERNEL(surface_normals, NormalArguments) {
+    int64_t height = a->depth.shape[0], width = a->depth.shape[1];
+    for (int64_t v = 0; v < height; v++) {
+        for (int64_t u = 0; u < width; u++) {
+            int64_t pixel = v * width + u, p = a->index.data[pixel];
+            if (p < 0) continue;
+            double z = a->depth.data[pixel], world[3], local[3];
+            double own[3] = {((double)u - a->cx) / a->fx * z, ((double)v - a->cy) / a->fy * z, z};
+            for (int i = 0; i < 3; i++) world[i] = a->origin.data[i] + dot(a->camera_axes.data + 3 * i, own);
+            normal_at(&a->primitives, p, world, local, a->out.data + 3 * pixel);
+        }
+    }
+    return 0;
 }
 
 KERNEL(shade_hits, ShadeArguments) {
