@@ -6,6 +6,7 @@
 #define LIGHT_RADIUS_SQ 0.5 /* softens the fall-off near a light, square metres */
 #define CORNER_DIM 0.3      /* fraction of the ambient light that a wall, floor or ceiling takes from what touches it */
 #define CORNER_REACH_M 0.18
+#define SOFT_RIM 0.999 /* by day, the last thousandth of a cylinder's side shines as its lid does */
 
 typedef struct {
     I64 pattern;                 /* (M,) materials.Pattern */
@@ -37,8 +38,9 @@ typedef struct {
 
 static double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
-/* Writes the unit normal in the primitive's own axes at the point `local`; returns its dominant axis. */
-static int own_normal(int64_t shape, const double *local, const double *half, double *own) {
+/* Writes the unit normal in the primitive's own axes at the point `local`; returns its dominant axis. A cylinder's lid
+ * begins at `rim`. */
+static int own_normal(int64_t shape, const double *local, const double *half, double rim, double *own) {
     own[0] = own[1] = own[2] = 0.0;
     double qx = local[0] / half[0], qy = local[1] / half[1], qz = local[2] / half[2];
     if (shape == 0) {
@@ -51,7 +53,7 @@ static int own_normal(int64_t shape, const double *local, const double *half, do
         return axis;
     }
     double radial = sqrt(qx * qx + qy * qy), radius = 0.8 - 0.2 * qz;
-    bool lid = (shape == 1 && fabs(qz) >= radial) || (shape == 3 && 1.0 - fabs(qz) < fabs(radial - radius));
+    bool lid = (shape == 1 && fabs(qz) >= radial * rim) || (shape == 3 && 1.0 - fabs(qz) < fabs(radial - radius));
     if (lid) {
         own[2] = local[2] > 0 ? 1.0 : -1.0;
         return 2;
@@ -79,14 +81,15 @@ static int own_normal(int64_t shape, const double *local, const double *half, do
 }
 
 /* Writes the point `world` in primitive p's own axes, and the unit normal there; returns its dominant own axis. */
-static int normal_at(const Primitives *primitives, int64_t p, const double *world, double *local, double *normal) {
+static int normal_at(const Primitives *primitives, int64_t p, const double *world, double rim, double *local,
+                     double *normal) {
     const double *center = primitives->center.data + 3 * p, *rotation = primitives->rotation.data + 9 * p;
     double own[3];
     for (int i = 0; i < 3; i++) {
         local[i] = 0.0;
         for (int j = 0; j < 3; j++) local[i] += rotation[3 * j + i] * (world[j] - center[j]);
     }
-    int axis = own_normal(primitives->shape.data[p], local, primitives->half.data + 3 * p, own);
+    int axis = own_normal(primitives->shape.data[p], local, primitives->half.data + 3 * p, rim, own);
     for (int i = 0; i < 3; i++) normal[i] = dot(rotation + 3 * i, own);
     return axis;
 }
@@ -176,7 +179,7 @@ static void shade_point(const ShadeArguments *a, int64_t p, double *world, doubl
     double way = sqrt(dot(view, view)); /* of the light from there to the camera */
     for (int bounces = 0; bounces < 2 && p >= 0 && p < a->primitives.shape.shape[0]; bounces++) {
         double local[3], normal[3], albedo[3], light[3], ray[3];
-        int axis = normal_at(&a->primitives, p, world, local, normal);
+        int axis = normal_at(&a->primitives, p, world, 1.0, local, normal);
         int64_t m = a->material.data[p];
         texture(materials->pattern.data[m], materials->color_a.data + 3 * m, materials->color_b.data + 3 * m,
                 materials->scale.data[m], materials->seed.data[m], local, a->primitives.half.data + 3 * p, axis,
@@ -214,7 +217,7 @@ KERNEL(surface_normals, NormalArguments) {
             double z = a->depth.data[pixel], world[3], local[3];
             double own[3] = {((double)u - a->cx) / a->fx * z, ((double)v - a->cy) / a->fy * z, z};
             for (int i = 0; i < 3; i++) world[i] = a->origin.data[i] + dot(a->camera_axes.data + 3 * i, own);
-            normal_at(&a->primitives, p, world, local, a->out.data + 3 * pixel);
+            normal_at(&a->primitives, p, world, SOFT_RIM, local, a->out.data + 3 * pixel);
         }
     }
     return 0;
