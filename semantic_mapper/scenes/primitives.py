@@ -224,7 +224,11 @@ def part_bounds(part: Part) -> tuple[Float64, Float64]:
 
 def place_parts(assembly: Assembly, yaw: float, position: Float64) -> list[Part]:
     """The parts of ``assembly``, turned by ``yaw`` about z and moved to ``position`` (3,)."""
-    turn = rotation_z(yaw)
+    return turned_parts(assembly, rotation_z(yaw), position)
+
+
+def turned_parts(assembly: Assembly, turn: Float64, position: Float64) -> list[Part]:
+    """The parts of ``assembly``, turned by ``turn`` (3, 3) and moved to ``position`` (3,)."""
     return [
         Part(
             p.shape,
