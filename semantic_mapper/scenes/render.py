@@ -8,8 +8,8 @@ import numpy as np
 
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.scenes.config import NoiseConfig
-from semantic_mapper.scenes.fast_cast import cast_pixels
 from semantic_mapper.scenes.daylight import lit_by_day
+from semantic_mapper.scenes.fast_cast import cast_pixels
 from semantic_mapper.scenes.fast_shade import shade_pixels, surface_normals
 from semantic_mapper.scenes.scene import Scene, kernel_arrays
 from semantic_mapper.scenes.sensor_color import develop, expose

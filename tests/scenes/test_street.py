@@ -55,7 +55,9 @@ def test_things_cast_shadows_onto_some_of_the_road(street: Scene):
     assert day is not None
     shadows = (day.shadow, np.full_like(day.shadow, np.inf), np.zeros_like(day.shadow))
     cast, lit, covered = (
-        render_street(replace(street, daylight=replace(day, shadow=s)), CAMERA, pose, single_shot(0, steady), steady, 0).rgb.astype(int)
+        render_street(
+            replace(street, daylight=replace(day, shadow=s)), CAMERA, pose, single_shot(0, steady), steady, 0
+        ).rgb.astype(int)
         for s in shadows
     )
     assert (covered <= cast).all() and (cast <= lit).all()

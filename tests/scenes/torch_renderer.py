@@ -14,6 +14,7 @@ import torch
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.scenes.config import NoiseConfig
+from semantic_mapper.scenes.daylight import lit_by_day
 from semantic_mapper.scenes.fast_cast import NEAR_M
 from semantic_mapper.scenes.fast_shade import (
     CORNER_DIM,
@@ -22,7 +23,6 @@ from semantic_mapper.scenes.fast_shade import (
     SHADOW_BIAS_M,
     LightArrays,
 )
-from semantic_mapper.scenes.daylight import lit_by_day
 from semantic_mapper.scenes.primitives import Shape
 from semantic_mapper.scenes.render import RenderedView, Sensor, finish_view
 from semantic_mapper.scenes.scene import Scene, kernel_arrays
