@@ -1,4 +1,4 @@
-"""Claims of a paper as relative checks: the difference of two scores, its interval over scenes, and what is accepted."""
+"""Claims of a paper as relative checks: the difference of two scores, its interval over scenes, and the result."""
 
 from __future__ import annotations
 
