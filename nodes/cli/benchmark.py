@@ -51,8 +51,8 @@ def benchmark(
     it was. docs/benchmarks.md says what each figure means. Writes JSON, and beside it a page of HTML, the contact sheet
     and the records of the rooms.
 
-    klevr: arms learn classes from the label maps of training scenes and are scored on novel scenes. Only --arm, --claims,
-    --tier, --config, --seed, --out and --json go with it.
+    klevr: arms learn classes from the label maps of training scenes and are scored on novel scenes. Only --arm,
+    --claims, --tier, --config, --seed, --out and --json go with it.
 
     Example: semantic-mapper benchmark rooms --weights a.safetensors --weights b.safetensors --out runs/ab.json
     Example: semantic-mapper benchmark rooms --sources wide --depth off --rooms 5 --json

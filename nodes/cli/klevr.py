@@ -67,6 +67,8 @@ def run_klevr_verb(
     Raises:
         ConfigError: with what is wrong and the mend.
     """
+    if unknown := sorted(set(names) - ARMS.keys()):
+        raise typer.BadParameter(f"no arm {', '.join(unknown)}; there are {', '.join(ARMS)}", param_hint="--arm")
     output = Output.guarded()
     output.quiet = print_json
     keep_freed_memory()

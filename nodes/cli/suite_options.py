@@ -68,9 +68,7 @@ MapOption = Annotated[bool, typer.Option("--map", help="generalize: also fuse ea
 SuiteConfigOption = Annotated[
     Path | None, typer.Option("--config", help="TOML file with a SuiteConfig; klevr: a KlevrConfig.")
 ]
-ArmOption = Annotated[
-    list[Literal["color", "unet"]] | None, typer.Option("--arm", help="klevr: what to run; may repeat.  [default: all]")
-]
+ArmOption = Annotated[list[str] | None, typer.Option("--arm", help="klevr: what to run; may repeat.  [default: all]")]
 ClaimsOption = Annotated[bool, typer.Option("--claims", help="klevr: judge the paper's claims.")]
 
 

@@ -170,8 +170,9 @@ def unet_arm(config: KlevrConfig) -> SceneScores:
                 unet.net.train()
 
         unet.fit(frames, look)
-        gain = _miou(checked, unet.predict) - before[0]
-        _log.info("unet_fitted", steps=steps, last_fifth=round(gain, 4), checked_miou=round(before[0] + gain, 4))
+        reached = _miou(checked, unet.predict)
+        gain = reached - (before[0] if before else 0.0)  # a handful of steps has no last fifth
+        _log.info("unet_fitted", steps=steps, last_fifth=round(gain, 4), checked_miou=round(reached, 4))
         if gain < _PLATEAU or doubling == _MOST_DOUBLINGS:
             break
         steps *= 2

@@ -132,6 +132,7 @@ def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Pat
         ("benchmark", "rooms", "--keyframes", "3"),
         ("benchmark", "klevr", "--rooms", "3"),
         ("benchmark", "klevr", "--map"),
+        ("benchmark", "klevr", "--arm", "nerf"),
         ("benchmark", "klevr", "--tier", "gpu"),
         ("benchmark", "rooms", "--claims"),
         ("benchmark", "rooms", "--tier", "record"),
