@@ -156,27 +156,35 @@ def unet_arm(config: KlevrConfig) -> SceneScores:
     It is fitted anew with twice the steps until those after four fifths of them bring less than half a point of mIoU at
     test cameras of training scenes.
     """
-    frames = labelled_frames(config)
+    frames, steps = labelled_frames(config), config.unet_steps
     checked = [f for s in train_seeds(config)[:_CHECKED_SCENES] for f in _held_out(config, s)]
-    steps = config.unet_steps
-    for doubling in range(_MOST_DOUBLINGS + 1):
-        unet = UNetBaseline(KLEVR_SUITE.label_set, UNetConfig(steps=steps, width=config.width, seed=config.seed))
-        before: list[float] = []
-
-        def look(fraction: float, unet: UNetBaseline = unet, before: list[float] = before) -> None:
-            if fraction >= 0.8 and not before:
-                unet.net.eval()
-                before.append(_miou(checked, unet.predict))
-                unet.net.train()
-
-        unet.fit(frames, look)
-        reached = _miou(checked, unet.predict)
-        gain = reached - (before[0] if before else 0.0)  # a handful of steps has no last fifth
-        _log.info("unet_fitted", steps=steps, last_fifth=round(gain, 4), checked_miou=round(reached, 4))
-        if gain < _PLATEAU or doubling == _MOST_DOUBLINGS:
+    unet, gain = _fit_unet(config, frames, checked, steps)
+    for _ in range(_MOST_DOUBLINGS):
+        if gain < _PLATEAU:
             break
         steps *= 2
+        unet, gain = _fit_unet(config, frames, checked, steps)
     return score_images(config, unet.predict)
+
+
+def _fit_unet(
+    config: KlevrConfig, frames: list[PosedFrame], checked: list[PosedFrame], steps: int
+) -> tuple[UNetBaseline, float]:
+    """A U-Net fitted to ``frames``, and what the last fifth of the steps brought at ``checked``."""
+    unet = UNetBaseline(KLEVR_SUITE.label_set, UNetConfig(steps=steps, width=config.width, seed=config.seed))
+    before: list[float] = []
+
+    def look(fraction: float) -> None:
+        if fraction >= 0.8 and not before:
+            unet.net.eval()
+            before.append(_miou(checked, unet.predict))
+            unet.net.train()
+
+    unet.fit(frames, look)
+    reached = _miou(checked, unet.predict)
+    gain = reached - (before[0] if before else 0.0)  # a handful of steps has no last fifth
+    _log.info("unet_fitted", steps=steps, last_fifth=round(gain, 4), miou=round(reached, 4))
+    return unet, gain
 
 
 ARMS: dict[str, Arm] = {"color": color_arm, "unet": unet_arm}  # NeSF's arms join here under the names of ``CLAIMS``

@@ -40,10 +40,13 @@ class Lights:
     ambient: Float64
 
 
+_NO_CUBES = np.zeros((0, 6, 1, 1), np.float32)
 NO_LAMPS = Lights(  # ambient light of strength 1 alone
     np.zeros((0, 3)),
     np.zeros((0, 3)),
-    *(np.zeros((0, 6, 1, 1), np.float32) for _ in range(3)),
+    _NO_CUBES,
+    _NO_CUBES,
+    _NO_CUBES,
     np.zeros(0),
     np.ones(3),
 )

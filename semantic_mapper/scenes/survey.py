@@ -167,7 +167,7 @@ def speed(rooms: Rooms = 8, views: Views = 30, depth: Annotated[str, typer.Optio
 def klevr(
     out: Annotated[Path, typer.Option(help="PNG or JPEG to write")],
     scenes: Annotated[int, typer.Option(help="how many of each variant")] = 8,
-    width: Annotated[int, typer.Option(help="pixels of a picture")] = 160,
+    width: Annotated[int, typer.Option(help="pixels of a picture")] = 144,
 ) -> None:
     """Write pictures and labels of KLEVR scenes, upright and floating, and measure 100 views of 72x72 a scene."""
     rows: list[UInt8] = []

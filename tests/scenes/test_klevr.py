@@ -25,7 +25,8 @@ from tests.scenes.torch_renderer import render_view_torch
 
 CAMERA = klevr_camera(72)
 VARIANTS: tuple[Variant, ...] = ("upright", "float")
-DIGEST_OF_VERSION_1 = "36e5a3381cfafe196c8bdc5cb7706d9bc45a34699a64ee00581aa47c8387f01e"  # of what a change may not touch unless it raises ``KLEVR_VERSION``
+# Of what a change may not touch unless it raises ``KLEVR_VERSION``.
+DIGEST_OF_VERSION_1 = "36e5a3381cfafe196c8bdc5cb7706d9bc45a34699a64ee00581aa47c8387f01e"
 
 
 def test_scenes_are_those_of_this_version() -> None:
