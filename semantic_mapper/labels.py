@@ -201,19 +201,22 @@ _CARLA = (
     "static dynamic water roadline ground bridge"
 ).split()
 
+_KLEVR = "background cube cylinder sphere torus gear".split()
+
 NYU40 = make_label_set("nyu40", _NYU40)
 SCANNET20 = make_label_set("scannet20", [_NYU40[i - 1] for i in _SCANNET20_IDS], ids=_SCANNET20_IDS)
 ROOMS = make_label_set("rooms", _ROOMS)
 CAMVID11 = make_label_set("camvid11", _CAMVID11)
 KITTI360 = make_label_set("kitti360", _KITTI360)
 CARLA = make_label_set("carla", _CARLA)
+KLEVR = make_label_set("klevr", _KLEVR)
 
-PROVIDED = {s.name: s for s in (NYU40, SCANNET20, ROOMS, CAMVID11, KITTI360, CARLA)}
+PROVIDED = {s.name: s for s in (NYU40, SCANNET20, ROOMS, CAMVID11, KITTI360, CARLA, KLEVR)}
 
 # Classes of the provided sets that are surfaces or masses, not countable things.
 STUFF_NAMES = frozenset(
     "wall floor ceiling floormat otherstructure sky building road roads roadline pavement sidewalk sidewalks parking "
-    "terrain vegetation tree fence ground water bridge static".split()
+    "terrain vegetation tree fence ground water bridge static background".split()
 )
 
 

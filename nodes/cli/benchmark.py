@@ -1,4 +1,4 @@
-"""``semantic-mapper benchmark``: score weights on rooms that nothing was trained on."""
+"""``semantic-mapper benchmark``: score weights on rooms, or arms on KLEVR, that nothing was trained on."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SeedOption = Annotated[int | None, typer.Option(min=0, help="Of everything that 
 
 @verb
 def benchmark(
-    suite: Annotated[Literal["rooms"], typer.Argument(help="The suite.")] = "rooms",
+    suite: Annotated[Literal["rooms", "klevr"], typer.Argument(help="The suite.")] = "rooms",
     weights: WeightsOption = None,
     protocol: suites.ProtocolOption = None,
     split: suites.SplitOption = None,
@@ -37,6 +37,8 @@ def benchmark(
     seconds: suites.SecondsOption = None,
     steps: suites.StepsOption = None,
     maps: suites.MapOption = False,
+    arms: suites.ArmOption = None,
+    claims: suites.ClaimsOption = False,
     config: suites.SuiteConfigOption = None,
     seed: SeedOption = None,
     out: OutOption = None,
@@ -49,15 +51,26 @@ def benchmark(
     it was. docs/benchmarks.md says what each figure means. Writes JSON, and beside it a page of HTML, the contact sheet
     and the records of the rooms.
 
+    klevr: arms learn classes from the label maps of training scenes and are scored on novel scenes. Only --arm,
+    --claims, --tier, --config, --seed, --out and --json go with it.
+
     Example: semantic-mapper benchmark rooms --weights a.safetensors --weights b.safetensors --out runs/ab.json
     Example: semantic-mapper benchmark rooms --sources wide --depth off --rooms 5 --json
     Example: semantic-mapper benchmark rooms --protocol scratch --kind semantic_nerf --rooms 3 --seconds 600
+    Example: semantic-mapper benchmark klevr --claims --out runs/klevr.json
     """
-    from semantic_mapper.nodes.cli.suite import run_suite_verb
-
     given = {"split": split, "rooms": rooms, "protocol": protocol, "views": views, "baseline": baseline, "depth": depth}
     given |= {"sources": sources, "own_image": own_image, "current": current}
     given |= {"keyframes": keyframes, "steps": steps, "seconds": seconds, "seed": seed}
-    settings = suites.suite_config(config, tier, given, maps)
     out, print_json = results_file(out, json)
+    if suite == "klevr":
+        from semantic_mapper.nodes.cli.klevr import klevr_configs, run_klevr_verb
+
+        del given["seed"]
+        suites.refuse_given("klevr", given | {"weights": weights, "kind": kind, "map": maps or None})
+        return run_klevr_verb(klevr_configs(config, tier, seed), arms or [], claims, out, print_json=print_json)
+    from semantic_mapper.nodes.cli.suite import run_suite_verb
+
+    suites.refuse_given("rooms", {"arm": arms, "claims": claims or None})
+    settings = suites.suite_config(config, suites.room_tier(tier), given, maps)
     return run_suite_verb(settings, weights or [], kind or [], maps, out, print_json=print_json)

@@ -30,7 +30,6 @@ from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.sheet import draw_sheet
 from semantic_mapper.fields.checkpoint import default_checkpoint_path
-from semantic_mapper.labels import ROOMS
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.cli.console import FrameProgress, Output, frame_progress, stderr_console
 from semantic_mapper.nodes.cli.outputs import prepare_file
@@ -39,6 +38,7 @@ from semantic_mapper.nodes.cli.suite_table import difference_lines, map_rows_tab
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plots import cannot_draw, write_picture
 from semantic_mapper.replay.artifacts import write_json
+from semantic_mapper.scenes.suite import ROOMS_SUITE
 
 PACKAGES = ("torch", "numpy")
 
@@ -120,7 +120,7 @@ def _draw(
     if rows := sheet_rows(suite, entries, store, out.with_suffix(".views")):
         names = [c.name for c in entries]
         title, _, how = found["title"].partition(": ")  # one line of a sheet of three columns is too short for both
-        picture = draw_sheet(rows, names, ROOMS, title=title, subtitle=how)
+        picture = draw_sheet(rows, names, ROOMS_SUITE.label_set, title=title, subtitle=how)
         write_picture(sheet := out.with_suffix(".png"), picture)
         yield sheet
     figures = {name: entry["figures"] for name, entry in found["weights"].items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -47,8 +48,11 @@ DepthOption = Annotated[
     typer.Option(help="The sensor's depth, depth computed from the pictures of the walk, or none.  [default: on]"),
 ]
 TierOption = Annotated[
-    Literal["cpu", "gpu"] | None,
-    typer.Option(help="160x120 and few samples, or 320x240 and many.  [default: cpu]"),
+    Literal["cpu", "gpu", "record"] | None,
+    typer.Option(
+        help="rooms: cpu = 160x120 and few samples, gpu = 320x240 and many. klevr: cpu = 52 scenes at 72x72, record = "
+        "120 at 256x256, three seeds.  [default: cpu]"
+    ),
 ]
 KeyframesOption = Annotated[
     int | None, typer.Option(min=2, help="finetune and scratch: labelled keyframes a room.  [default: 12]")
@@ -61,7 +65,32 @@ SecondsOption = Annotated[
     typer.Option(min=0, help="finetune and scratch: training time a room.  [default: 120]"),
 ]
 MapOption = Annotated[bool, typer.Option("--map", help="generalize: also fuse each room and score the map.")]
-SuiteConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with a SuiteConfig.")]
+SuiteConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="TOML file with a SuiteConfig; klevr: a KlevrConfig.")
+]
+ArmOption = Annotated[list[str] | None, typer.Option("--arm", help="klevr: what to run; may repeat.  [default: all]")]
+ClaimsOption = Annotated[bool, typer.Option("--claims", help="klevr: judge the paper's claims.")]
+
+
+def refuse_given(suite: str, given: Mapping[str, object]) -> None:
+    """Refuse options that were given (not None) and that the suite makes no use of.
+
+    Raises:
+        typer.BadParameter: names them.
+    """
+    if idle := [f"--{name.replace('_', '-')}" for name, value in given.items() if value is not None]:
+        raise typer.BadParameter(f"suite {suite} makes no use of it", param_hint=", ".join(idle))
+
+
+def room_tier(tier: Literal["cpu", "gpu", "record"] | None) -> Literal["cpu", "gpu"] | None:
+    """The tier of a run of ROOMS.
+
+    Raises:
+        typer.BadParameter: rooms have no such tier.
+    """
+    if tier == "record":
+        raise typer.BadParameter("rooms has the tiers cpu and gpu", param_hint="--tier")
+    return tier
 
 
 def suite_config(

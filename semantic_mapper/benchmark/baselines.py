@@ -27,12 +27,14 @@ from semantic_mapper.fields.device import to_device
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.geometry import invert_pose, transform, unproject
 from semantic_mapper.imaging import fill_holes
-from semantic_mapper.labels import IGNORE_CHANNEL, ROOMS, LabelSet
+from semantic_mapper.labels import IGNORE_CHANNEL, LabelSet
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 from semantic_mapper.view_selection import visible_points
 
 BASELINES = ("own", "vote", "vote_exact", "oracle")
+
+_Sets = tuple[LabelSet, LabelSet]  # of the field, and of the suite
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +42,7 @@ class BaselinePrediction:
     """What a baseline says of a query view.
 
     Args:
-        label: (H, W) uint8 ids of ``labels.ROOMS``, its ignore id where unknown.
+        label: (H, W) uint8 ids of the suite's label set, its ignore id where unknown.
         confidence: (H, W) float32, of the label.
         known: (H, W) bool.
     """
@@ -58,6 +60,7 @@ def baseline_predictions(
     prediction: Prediction,
     exact_depth_m: Float32,
     truth: UInt8,
+    label_set: LabelSet,
     *,
     own_image: bool,
 ) -> dict[str, BaselinePrediction]:
@@ -70,13 +73,14 @@ def baseline_predictions(
         current: The query's own image as the field was given it.
         prediction: What the field made of it: its depth is used where ``current`` has none.
         exact_depth_m: (H, W) of the query view.
-        truth: (H, W) ids of ``ROOMS``, for the oracle.
+        truth: (H, W) ids of ``label_set``, for the oracle.
+        label_set: Of the answers.
         own_image: Whether the query's own image has a vote.
     """
     log_p = _log_probabilities(field, [*sources, current])
     if log_p is None:
         return {}
-    size = truth.shape
+    size, sets = truth.shape, (field.label_set, label_set)
     own = functional.interpolate(log_p[-1:], size=size, mode="bilinear", align_corners=False)
     own = torch.log_softmax(own[0].permute(1, 2, 0).reshape(-1, own.shape[1]), dim=-1).numpy()
     if current.depth_m is None:
@@ -84,7 +88,7 @@ def baseline_predictions(
     else:  # the very depth prior that the field has, or its lead would be the prior's
         given_m = depth_prior(current.depth_m, current.rgb) if own_image else fill_holes(current.depth_m)
     everywhere = np.ones(own.shape[0], bool)
-    found = {"own": _as_prediction(own, everywhere, field.label_set, size)}
+    found = {"own": _as_prediction(own, everywhere, sets, size)}
     votes: dict[str, tuple[Float32, NDArray[np.bool_]]] = {}
     for name, frames, depth_m in (("vote", sources, given_m), ("vote_exact", sensed, exact_depth_m)):
         said, seen = _opinions(log_p[:-1], frames, current, depth_m)
@@ -92,8 +96,8 @@ def baseline_predictions(
             said, seen = np.concatenate([said, own[None]]), np.concatenate([seen, everywhere[None]])
         votes[name] = said, seen
         mean = (said * seen[..., None]).sum(0) / np.maximum(seen.sum(0), 1)[:, None]
-        found[name] = _as_prediction(mean, np.asarray(seen.any(0)), field.label_set, size)
-    found["oracle"] = _oracle(*votes["vote_exact"], found["vote_exact"], truth, field.label_set)
+        found[name] = _as_prediction(mean, np.asarray(seen.any(0)), sets, size)
+    found["oracle"] = _oracle(*votes["vote_exact"], found["vote_exact"], truth, sets)
     return found
 
 
@@ -143,24 +147,23 @@ def _normalised(points: Float64, T_world_camera: Float64, intrinsics: CameraIntr
     return np.clip(np.stack([x, y], axis=1), -2, 2).astype(np.float32)
 
 
-def _as_prediction(
-    log_p: Float32, known: NDArray[np.bool_], label_set: LabelSet, size: tuple[int, ...]
-) -> BaselinePrediction:
+def _as_prediction(log_p: Float32, known: NDArray[np.bool_], sets: _Sets, size: tuple[int, ...]) -> BaselinePrediction:
     p = np.exp(log_p - log_p.max(1, keepdims=True))
     confidence = (p.max(1) / p.sum(1)).astype(np.float32)
-    label = _rooms_ids(np.where(known, log_p.argmax(1), IGNORE_CHANNEL), label_set)
+    label = _suite_ids(np.where(known, log_p.argmax(1), IGNORE_CHANNEL), sets)
     return BaselinePrediction(label.reshape(size), confidence.reshape(size), known.reshape(size))
 
 
 def _oracle(
-    said: Float32, seen: NDArray[np.bool_], vote: BaselinePrediction, truth: UInt8, label_set: LabelSet
+    said: Float32, seen: NDArray[np.bool_], vote: BaselinePrediction, truth: UInt8, sets: _Sets
 ) -> BaselinePrediction:
-    right = seen & (_rooms_ids(said.argmax(2), label_set) == truth.ravel()) & (truth.ravel() != ROOMS.ignore_id)
+    right = seen & (_suite_ids(said.argmax(2), sets) == truth.ravel()) & (truth.ravel() != sets[1].ignore_id)
     any_right = right.any(0).reshape(truth.shape)
     best = np.where(right, np.exp(said.max(2)), 0).max(0).reshape(truth.shape).astype(np.float32)
     label = np.where(any_right, truth, vote.label).astype(np.uint8)
     return BaselinePrediction(label, np.where(any_right, best, vote.confidence), vote.known)
 
 
-def _rooms_ids(channel: NDArray[np.integer], label_set: LabelSet) -> UInt8:
-    return ROOMS.to_ids(ROOMS.channel_map_from(label_set)[label_set.to_ids(channel.astype(np.int64))])
+def _suite_ids(channel: NDArray[np.integer], sets: _Sets) -> UInt8:
+    own, suite = sets
+    return suite.to_ids(suite.channel_map_from(own)[own.to_ids(channel.astype(np.int64))])

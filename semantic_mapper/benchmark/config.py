@@ -22,8 +22,9 @@ from semantic_mapper.config import (
 )
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.base import MAX_SOURCE_VIEWS
-from semantic_mapper.scenes import SUITE_VERSION, TEST_SEEDS, VALIDATION_SEEDS, CameraPathConfig, RoomConfig
+from semantic_mapper.scenes import SUITE_VERSION, CameraPathConfig, RoomConfig
 from semantic_mapper.scenes.config import DepthSensorName
+from semantic_mapper.scenes.suite import ROOMS_SUITE
 from semantic_mapper.training.finetune import FinetuneConfig
 from semantic_mapper.training.step import StepConfig
 from semantic_mapper.types import CameraIntrinsics
@@ -157,7 +158,7 @@ def check_suite(suite: SuiteConfig) -> None:
     Raises:
         ConfigError: which, and what to do.
     """
-    seeds = TEST_SEEDS if suite.split == "test" else VALIDATION_SEEDS
+    seeds = ROOMS_SUITE.seeds[suite.split]
     if not 0 <= suite.rooms <= len(seeds):
         raise ConfigError(f"rooms: split '{suite.split}' has {len(seeds)} rooms, {suite.rooms} are requested; 0 = all")
     if suite.depth == "on" and suite.sequence.camera.sensor == "none":
@@ -175,7 +176,7 @@ def check_suite(suite: SuiteConfig) -> None:
 
 def suite_seeds(suite: SuiteConfig) -> list[int]:
     """Seeds of the rooms, in order."""
-    seeds = TEST_SEEDS if suite.split == "test" else VALIDATION_SEEDS
+    seeds = ROOMS_SUITE.seeds[suite.split]
     return list(seeds[: suite.rooms] if suite.rooms else seeds)
 
 

@@ -15,7 +15,7 @@ from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.fields.checkpoint import find_checkpoint, load_checkpoint
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
-from semantic_mapper.labels import ROOMS
+from semantic_mapper.scenes.suite import ROOMS_SUITE
 
 
 def load_entries(paths: Sequence[Path], kinds: Sequence[str] = ()) -> list[Entry]:
@@ -47,7 +47,7 @@ def load_entries(paths: Sequence[Path], kinds: Sequence[str] = ()) -> list[Entry
 
 
 def _of_kind(kind: str, device: torch.device) -> Entry:
-    field = build_field(kind, {}, ROOMS).to(device).eval()
+    field = build_field(kind, {}, ROOMS_SUITE.label_set).to(device).eval()
     return Entry(kind, _digest(b"", field), field)
 
 

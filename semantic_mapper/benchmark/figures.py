@@ -14,8 +14,8 @@ from semantic_mapper.evaluation.bootstrap import paired_bootstrap
 from semantic_mapper.evaluation.consistency import Agreement
 from semantic_mapper.evaluation.depth_error import DepthErrors
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration_of_bins
-from semantic_mapper.labels import ROOMS
 from semantic_mapper.plots import Curve, Panel, draw_panels
+from semantic_mapper.scenes.suite import ROOMS_SUITE
 from semantic_mapper.types import UInt8
 
 ONE_ROOM = "no interval: a bootstrap needs at least 2 rooms"
@@ -171,7 +171,8 @@ def draw_fit_curves(figures: Mapping[str, Mapping[str, Any]], title: str) -> UIn
 
 
 def _summed(confusions: Sequence[ConfusionMatrix]) -> ConfusionMatrix:
-    return sum(confusions, ConfusionMatrix(ROOMS))
+    label_set = confusions[0].label_set if confusions else ROOMS_SUITE.label_set
+    return sum(confusions, ConfusionMatrix(label_set))
 
 
 def _ece(records: Sequence[RoomRecord] | Sequence[MapRecord] | Sequence[BaselineRecord]) -> float | None:

@@ -20,7 +20,7 @@ from semantic_mapper.fields.sampling import around_computed
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.fields.sray_streaming import StreamingSRay, compiled_covers
 from semantic_mapper.imaging import fill_holes, resize_depth, resize_rgb
-from semantic_mapper.labels import IGNORE_CHANNEL, ROOMS, LabelSet
+from semantic_mapper.labels import IGNORE_CHANNEL, LabelSet
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import FieldRender, Float32, PosedFrame, UInt8
 
@@ -30,8 +30,8 @@ class Prediction:
     """A rendered query view.
 
     Args:
-        label: (H, W) uint8 ids of ``labels.ROOMS``, its ignore id where unknown or where the field's class is none of
-            these.
+        label: (H, W) uint8 ids of the suite's label set, its ignore id where unknown or where the field's class is none
+            of these.
         confidence: (H, W) float32 probability of the field's most likely class.
         rgb: (H, W, 3) float32 in [0, 1].
         depth_m: (H, W) float32.
@@ -45,7 +45,9 @@ class Prediction:
     known: NDArray[np.bool_]
 
 
-def predict_view(field: LearnedField, sources: Sequence[PosedFrame], query: PosedFrame, tier: TierConfig) -> Prediction:
+def predict_view(
+    field: LearnedField, sources: Sequence[PosedFrame], query: PosedFrame, tier: TierConfig, label_set: LabelSet
+) -> Prediction:
     """Render every pixel of the query view.
 
     Args:
@@ -55,6 +57,7 @@ def predict_view(field: LearnedField, sources: Sequence[PosedFrame], query: Pose
             has a say in that only where it is one of ``sources``. A query without depth is rendered with the tier's
             blind samples.
         tier: Samples and chunk size.
+        label_set: Of the answer.
     """
     device = next(field.parameters()).device
     sampling = tier.blind if query.depth_m is None else tier.guided
@@ -70,7 +73,7 @@ def predict_view(field: LearnedField, sources: Sequence[PosedFrame], query: Pose
     prior = depth_prior(depth_m, resize_rgb(query, query.intrinsics)) if shown else fill_holes(depth_m)
     scene = (renderer, encoded, query.intrinsics, query.T_world_camera, prior, sampling, tier.rays_per_chunk)
     render = render_image(*scene, measured=depth_m > 0)
-    return _as_prediction(render, field.label_set, (query.intrinsics.height, query.intrinsics.width))
+    return _as_prediction(render, field.label_set, label_set, (query.intrinsics.height, query.intrinsics.width))
 
 
 def _renderer(field: LearnedField, sampling: SamplingConfig, device: torch.device) -> SemanticField:
@@ -82,11 +85,11 @@ def _renderer(field: LearnedField, sampling: SamplingConfig, device: torch.devic
     return field
 
 
-def _as_prediction(render: FieldRender, label_set: LabelSet, size: tuple[int, int]) -> Prediction:
+def _as_prediction(render: FieldRender, own_set: LabelSet, label_set: LabelSet, size: tuple[int, int]) -> Prediction:
     confidence, channel = torch.softmax(render.logits.float(), dim=-1).max(dim=-1)
     known = render.known.cpu().numpy()
-    own_ids = label_set.to_ids(np.where(known, channel.cpu().numpy(), IGNORE_CHANNEL))
-    label = ROOMS.to_ids(ROOMS.channel_map_from(label_set)[own_ids])
+    own_ids = own_set.to_ids(np.where(known, channel.cpu().numpy(), IGNORE_CHANNEL))
+    label = label_set.to_ids(label_set.channel_map_from(own_set)[own_ids])
     return Prediction(
         label.reshape(size),
         confidence.cpu().numpy().reshape(size),

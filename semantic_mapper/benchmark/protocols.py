@@ -35,7 +35,7 @@ from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.fields.checkpoint import adapt_model
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
-from semantic_mapper.labels import ROOMS
+from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.baselines import WarpBaseline
 from semantic_mapper.training.finetune import FinetuneProgress, finetune
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
@@ -177,12 +177,12 @@ def _answer(
     asked = room.asked(query)
     own = _shows_own(field, suite)
     # The own image comes last, where the mapping pipeline has the current view, too.
-    prediction = predict_view(field, [*given, asked] if own else given, asked, suite.tier)
+    prediction = predict_view(field, [*given, asked] if own else given, asked, suite.tier, room.label_set)
     rows = {}
     if suite.protocol == "generalize" and not field.needs_own_view:
         sensed, truth = [as_given(frames[n], depth=True) for n in chosen], room.truth[query]
         rows = baseline_predictions(
-            field, given, sensed, asked, prediction, truth.exact_depth_m, truth.label, own_image=own
+            field, given, sensed, asked, prediction, truth.exact_depth_m, truth.label, room.label_set, own_image=own
         )
     return Answer(prediction, sources, (*chosen, query) if own else tuple(chosen), room.condition[query], rows)
 
@@ -199,8 +199,8 @@ def _fit_and_score(
     keyframes = choose_fitted(room, suite)
     frames = [as_given(room.given[n], depth=True, label=True) for n in keyframes.labelled]
     frames += [as_given(room.given[n], depth=True) for n in keyframes.unlabelled]
-    views = stack_sources([view_from_frame(frame, ROOMS, suite.tier.width) for frame in frames])
-    field = _start(entry.field, suite, views)
+    views = stack_sources([view_from_frame(frame, room.label_set, suite.tier.width) for frame in frames])
+    field = _start(entry.field, suite, views, room.label_set)
     answers = answer_from_keyframes(room, field.eval(), suite, keyframes)
     curve = [_curve_point(0.0, 0.0, 0, room_confusion(room, answers))]
     device = next(field.parameters()).device
@@ -208,12 +208,12 @@ def _fit_and_score(
         one_step = msgspec.structs.replace(
             fit_config(suite, 1.0), seconds=0, steps=1, linear_probe_steps=1, held_out_rays=64
         )
-        finetune(frames, ROOMS, _start(entry.field, suite, views), one_step)
+        finetune(frames, room.label_set, _start(entry.field, suite, views, room.label_set), one_step)
     spent, whole = 0.0, sum(suite.scene.shares)
     for share in sorted(suite.scene.shares):
-        start = _start(entry.field, suite, views)
+        start = _start(entry.field, suite, views, room.label_set)
         progress = _progress(on_fit, spent, share, whole)
-        fitted = finetune(frames, ROOMS, start, fit_config(suite, share), progress, stopped)
+        fitted = finetune(frames, room.label_set, start, fit_config(suite, share), progress, stopped)
         if stopped():
             return None
         answers = answer_from_keyframes(room, fitted.model.to(device).eval(), suite, keyframes)
@@ -230,17 +230,18 @@ def _progress(
     return None if on_fit is None else lambda p: on_fit((spent + p.fraction * share) / whole)
 
 
-def _start(field: LearnedField, suite: SuiteConfig, views: SourceViews) -> LearnedField:
+def _start(field: LearnedField, suite: SuiteConfig, views: SourceViews, label_set: LabelSet) -> LearnedField:
     """A copy to start from: the field's own weights in the classes of the rooms, or random ones of its shape.
 
     Args:
         views: Of the scene to be fitted; a kind for one scene alone takes its box from them.
+        label_set: Of the scene.
     """
     torch.manual_seed(suite.seed)
     if suite.protocol == "finetune":
-        return adapt_model(field, ROOMS)
+        return adapt_model(field, label_set)
     config = field.scene_config(views, suite.tier.guided.far_m)
-    return build_field(field.kind, config, ROOMS, field.sampling).to(next(field.parameters()).device)
+    return build_field(field.kind, config, label_set, field.sampling).to(next(field.parameters()).device)
 
 
 def _curve_point(share: float, seconds: float, steps: int, confusion: ConfusionMatrix) -> CurvePoint:
@@ -249,8 +250,8 @@ def _curve_point(share: float, seconds: float, steps: int, confusion: ConfusionM
 
 def _carried_labels(room: BenchmarkRoom, keyframes: Sequence[int]) -> Rows:
     """What the labelled keyframes give by depth alone, without any field: the confusion over all query views."""
-    carried = WarpBaseline(ROOMS, [as_given(room.frames[n], depth=True, label=True) for n in keyframes])
-    total = ConfusionMatrix(ROOMS)
+    carried = WarpBaseline(room.label_set, [as_given(room.frames[n], depth=True, label=True) for n in keyframes])
+    total = ConfusionMatrix(room.label_set)
     for query, truth in room.truth.items():
         total.update(truth.label, carried.predict(as_given(room.current[query], depth=True)), f"query view {query}")
     return as_rows(total)
@@ -271,7 +272,7 @@ def _scored(
         room=room.seed,
         template=room.template,
         confusion=as_rows(room_confusion(room, answers)),
-        images=tuple(image_record(q, answer, room.truth[q]) for q, answer in answers.items()),
+        images=tuple(image_record(q, answer, room.truth[q], room.label_set) for q, answer in answers.items()),
         calibration=room_calibration(room, answers),
         agreeing=agreement.agreeing,
         compared=agreement.compared,

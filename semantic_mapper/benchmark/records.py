@@ -60,7 +60,7 @@ class CurvePoint(Config, frozen=True):
 
 
 class RoomRecord(Config, frozen=True, tag_field="record", tag="views"):
-    """The query views of one room by one weights file. Confusions are (L, L + 1) of ``labels.ROOMS``."""
+    """The query views of one room by one weights file. Confusions are (L, L + 1) of the suite's classes."""
 
     settings: str  # digest
     weights: str  # digest
@@ -79,7 +79,7 @@ class RoomRecord(Config, frozen=True, tag_field="record", tag="views"):
 
 
 class MapRecord(Config, frozen=True, tag_field="record", tag="map"):
-    """The fused map of one room by one weights file. Confusions are (L, L + 1) of ``labels.ROOMS``."""
+    """The fused map of one room by one weights file. Confusions are (L, L + 1) of the suite's classes."""
 
     settings: str
     weights: str
@@ -98,4 +98,13 @@ class MapRecord(Config, frozen=True, tag_field="record", tag="map"):
     calibration: CalibrationRecord  # of the map's points with a label and a truth
 
 
-Record = RoomRecord | MapRecord
+class SceneRecord(Config, frozen=True, tag_field="record", tag="scene"):
+    """One scene by one arm of a comparison. Confusions are (L, L + 1) of the suite's classes, by what is scored."""
+
+    settings: str
+    weights: str  # name of the arm
+    room: int  # seed of the scene
+    confusions: dict[str, Rows]
+
+
+Record = RoomRecord | MapRecord | SceneRecord

@@ -9,6 +9,7 @@ import numpy as np
 from semantic_mapper.benchmark.config import SuiteConfig, camera_of_width
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.imaging import resize_depth, resize_spread
+from semantic_mapper.labels import LabelSet
 from semantic_mapper.scenes import (
     CameraPathConfig,
     NoiseConfig,
@@ -43,6 +44,7 @@ class BenchmarkRoom:
         template: Kind of room.
         frames: The walk, with the noise of the sensor, in the order of their ``seq``.
         given: The same with the depth that fields are given.
+        label_set: Of all labels.
         truth: By frame number of each query view, in order: colour of a perfect camera at even exposure, exact depth,
             labels.
         pairs: Frame numbers of neighbouring query views by one camera.
@@ -58,6 +60,7 @@ class BenchmarkRoom:
     current: dict[int, PosedFrame]
     condition: dict[int, str]
     given: tuple[PosedFrame, ...]
+    label_set: LabelSet
 
     def asked(self, query: int) -> PosedFrame:
         """``current`` of a query view, without label, with the depth that fields are given."""
@@ -107,7 +110,7 @@ def make_benchmark_room(seed: int, suite: SuiteConfig) -> BenchmarkRoom:
         larger = camera_of_width(COMPUTED_SCALE * suite.tier.width, asked.focal_per_width)
         walk = room_frames(seed, len(frames), larger, room=furnished, path=path, noise=noise)
         given = tuple(_with_depth(f, c) for f, c in zip(frames, compute_depth(list(walk), AS_REPLAYED), strict=True))
-    return BenchmarkRoom(seed, scene.template, frames, truth, pairs, current, condition, given)
+    return BenchmarkRoom(seed, scene.template, frames, truth, pairs, current, condition, given, scene.label_set)
 
 
 def _with_depth(frame: PosedFrame, computed: PosedFrame) -> PosedFrame:

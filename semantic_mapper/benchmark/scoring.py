@@ -18,8 +18,9 @@ from semantic_mapper.evaluation.colour import match_colours, psnr, ssim
 from semantic_mapper.evaluation.consistency import Agreement, label_agreement, matching_pixels
 from semantic_mapper.evaluation.depth_error import depth_errors
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration, confusion_of
-from semantic_mapper.labels import ROOMS
+from semantic_mapper.labels import LabelSet
 from semantic_mapper.scenes import RenderedView
+from semantic_mapper.scenes.suite import ROOMS_SUITE
 from semantic_mapper.types import Float32, UInt8
 
 BORDER_PX = 2  # pixels at most this far from another label are not interior
@@ -36,10 +37,10 @@ class Answer:
     baselines: Mapping[str, BaselinePrediction] = field(default_factory=dict[str, BaselinePrediction])
 
 
-def image_record(frame: int, answer: Answer, truth: RenderedView) -> ImageRecord:
+def image_record(frame: int, answer: Answer, truth: RenderedView, label_set: LabelSet) -> ImageRecord:
     """All figures of one view."""
     prediction = answer.prediction
-    scores = confusion_of(truth.label, prediction.label, ROOMS, f"query view {frame}").metrics()
+    scores = confusion_of(truth.label, prediction.label, label_set, f"query view {frame}").metrics()
     depth = depth_errors(truth.depth_m, prediction.depth_m, prediction.known & (prediction.depth_m > 0))
     was_shown = frame in answer.source_frames
     colour = np.divide(truth.rgb, 255, dtype=np.float32)
@@ -60,11 +61,11 @@ def image_record(frame: int, answer: Answer, truth: RenderedView) -> ImageRecord
     )
 
 
-def interior_truth(label: UInt8) -> UInt8:
+def interior_truth(label: UInt8, ignore_id: int) -> UInt8:
     """True ids (H, W) with the ignore id wherever another label is at most ``BORDER_PX`` away."""
     window = np.ones((2 * BORDER_PX + 1, 2 * BORDER_PX + 1), np.uint8)
     same = cv2.dilate(label, window) == cv2.erode(label, window)
-    return np.where(same, label, np.uint8(ROOMS.ignore_id))
+    return np.where(same, label, np.uint8(ignore_id))
 
 
 def room_confusion(room: BenchmarkRoom, answers: Mapping[int, Answer]) -> ConfusionMatrix:
@@ -99,10 +100,14 @@ def room_calibration(room: BenchmarkRoom, answers: Mapping[int, Answer]) -> Cali
 def _confusion(
     room: BenchmarkRoom, predictions: Mapping[int, Prediction | BaselinePrediction], *, interior: bool
 ) -> ConfusionMatrix:
-    total = ConfusionMatrix(ROOMS)
+    total = ConfusionMatrix(room.label_set)
     for frame, prediction in predictions.items():
         truth = room.truth[frame].label
-        total.update(interior_truth(truth) if interior else truth, prediction.label, f"query view {frame}")
+        total.update(
+            interior_truth(truth, room.label_set.ignore_id) if interior else truth,
+            prediction.label,
+            f"query view {frame}",
+        )
     return total
 
 
@@ -111,7 +116,7 @@ def _calibration(room: BenchmarkRoom, predictions: Mapping[int, Prediction | Bas
     right: list[np.ndarray] = []
     for frame, prediction in predictions.items():
         truth = room.truth[frame].label
-        counted = (truth != ROOMS.ignore_id) & prediction.known
+        counted = (truth != room.label_set.ignore_id) & prediction.known
         confidence.append(np.clip(prediction.confidence[counted], 0, 1))
         right.append(prediction.label[counted] == truth[counted])
     return as_calibration(np.concatenate(confidence), np.concatenate(right))
@@ -139,9 +144,9 @@ def room_agreement(room: BenchmarkRoom, answers: Mapping[int, Answer]) -> Agreem
         )
         # Rounding to pixels carries some pixels across an object's outline; that is no fault of the field.
         same = truth_a.label.ravel()[index_a] == truth_b.label.ravel()[index_b]
-        same &= truth_a.label.ravel()[index_a] != ROOMS.ignore_id
+        same &= truth_a.label.ravel()[index_a] != room.label_set.ignore_id
         labels = answers[a].prediction.label, answers[b].prediction.label
-        total += label_agreement(*labels, (index_a[same], index_b[same]), ROOMS.ignore_id)
+        total += label_agreement(*labels, (index_a[same], index_b[same]), room.label_set.ignore_id)
     return total
 
 
@@ -150,8 +155,8 @@ def as_rows(confusion: ConfusionMatrix) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(int(n) for n in row) for row in confusion.counts)
 
 
-def from_rows(rows: Sequence[Sequence[int]]) -> ConfusionMatrix:
+def from_rows(rows: Sequence[Sequence[int]], label_set: LabelSet = ROOMS_SUITE.label_set) -> ConfusionMatrix:
     """The reverse of ``as_rows``."""
-    matrix = ConfusionMatrix(ROOMS)
+    matrix = ConfusionMatrix(label_set)
     matrix.counts = np.array(rows, np.int64).reshape(matrix.counts.shape)
     return matrix

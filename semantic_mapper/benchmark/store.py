@@ -7,14 +7,14 @@ from typing import TypeVar
 
 import msgspec
 
-from semantic_mapper.benchmark.records import MapRecord, Record, RoomRecord
+from semantic_mapper.benchmark.records import MapRecord, Record, RoomRecord, SceneRecord
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.files import open_unlinked
 from semantic_mapper.log_events import get_logger
 
 _log = get_logger(__name__)
 
-RecordT = TypeVar("RecordT", RoomRecord, MapRecord)
+RecordT = TypeVar("RecordT", RoomRecord, MapRecord, SceneRecord)
 
 
 class RecordStore:

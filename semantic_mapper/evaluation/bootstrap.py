@@ -38,6 +38,7 @@ def paired_bootstrap(
     first: Sequence[ConfusionMatrix],
     second: Sequence[ConfusionMatrix],
     *,
+    factor: float = 1.0,
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> Difference:
@@ -48,6 +49,7 @@ def paired_bootstrap(
 
     Args:
         first, second: One matrix a scene, the same scenes in the same order.
+        factor: ``second`` counts this many times.
         resamples: How many are drawn.
         seed: Of the draws.
 
@@ -65,18 +67,18 @@ def paired_bootstrap(
     for start in range(0, resamples, _AT_ONCE):
         draws = min(_AT_ONCE, resamples - start)
         times = rng.multinomial(scenes, np.full(scenes, 1 / scenes), size=draws).astype(np.float64)  # (B, S)
-        differences.append(_difference(counts, times))
+        differences.append(_difference(counts, times, factor))
     drawn = np.concatenate(differences)
     drawn = drawn[np.isfinite(drawn)]
     low, high = np.percentile(drawn, (2.5, 97.5))
-    observed = float(_difference(counts, np.ones((1, scenes)))[0])
+    observed = float(_difference(counts, np.ones((1, scenes)), factor)[0])
     return Difference(observed, float(drawn.mean()), float(low), float(high), scenes)
 
 
-def _difference(counts: Float64, times: Float64) -> Float64:
+def _difference(counts: Float64, times: Float64, factor: float) -> Float64:
     """(2, S, L, L + 1) counts, (B, S) how often each scene was drawn -> (B,) difference in mIoU."""
     first, second = (_miou(np.einsum("bs,slc->blc", times, c, optimize=True)) for c in counts)
-    return first - second
+    return first - factor * second
 
 
 def _miou(counts: NDArray[np.float64]) -> Float64:

@@ -10,7 +10,7 @@ import numpy as np
 from semantic_mapper.errors import ConfigError, SemanticMapperError
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes.config import SUITE_VERSION, CameraPathConfig
-from semantic_mapper.scenes.primitives import rotation_x, rotation_z
+from semantic_mapper.scenes.daylight import pose_of
 from semantic_mapper.scenes.render import cast_view
 from semantic_mapper.scenes.scene import Scene
 from semantic_mapper.types import CameraIntrinsics, Float64
@@ -210,15 +210,6 @@ def _score(scene: Scene, state: Float64) -> float:
     classes = np.unique(label[worth > 0], return_counts=True)[1]
     near = float((depth < 0.8).mean())
     return min(float(np.minimum(worth, 1.7).mean()), 0.5) * 2.5 + 0.15 * float((classes > 8).sum()) - 1.5 * near
-
-
-def pose_of(position: Float64, yaw: float, pitch: float, roll: float = 0.0) -> Float64:
-    """T_world_camera (4, 4) of a camera looking along ``yaw`` (about z, 0 = x axis), raised by ``pitch``, radians."""
-    level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # camera axes for yaw 0: z ahead, y down
-    T = np.eye(4)
-    T[:3, :3] = rotation_z(yaw) @ level @ rotation_x(pitch) @ rotation_z(roll)
-    T[:3, 3] = position
-    return T
 
 
 def _smooth_path(scene: Scene, points: Float64, config: CameraPathConfig) -> Float64:

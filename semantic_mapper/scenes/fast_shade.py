@@ -46,7 +46,7 @@ class MaterialArrays(NamedTuple):
 
 
 class LightArrays(NamedTuple):
-    """What it reads of ``Lights``, and the size (3,) of the room."""
+    """What it reads of ``Lights``, and the size (3,) of the room; inf = it has no walls."""
 
     position: Float64
     color: Float64
@@ -90,6 +90,32 @@ def shade_pixels(
     return out
 
 
+def surface_normals(
+    depth: Float64,
+    index: Int32,
+    primitives: PrimitiveArrays,
+    origin: Float64,
+    camera_axes: Float64,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+) -> Float64:
+    """Unit normals (H, W, 3) float64 in world axes of the hits that ``cast_pixels`` found; zeros where it found none.
+
+    Args: as ``shade_pixels``.
+
+    Raises:
+        ShapeError: an array has another shape.
+    """
+    expect_shape(index, "{} {}".format(*expect_shape(depth, "H W", "depth").values()), "index")
+    expect_primitives(*primitives[:4])
+    out = np.zeros((*depth.shape, 3))
+    camera = (np.ascontiguousarray(origin), np.ascontiguousarray(camera_axes), fx, fy, cx, cy)
+    _surface_normals(np.ascontiguousarray(depth), np.ascontiguousarray(index), *camera, *primitives[:4], out)
+    return out
+
+
 def _check(
     depth: Float64, index: Int32, primitives: PrimitiveArrays, materials: MaterialArrays, lights: LightArrays
 ) -> None:
@@ -107,6 +133,26 @@ def _check(
     patterns = (f"{count} 3", f"{count} 3", cubes, str(count), "3", "3", cubes, cubes)
     for name, pattern, array in zip(lights._fields, patterns, lights, strict=True):
         expect_shape(array, pattern, name)
+
+
+@kernel
+def _surface_normals(
+    depth: Float64,
+    index: Int32,
+    origin: Float64,
+    camera_axes: Float64,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    shape: Int64,
+    center: Float64,
+    half: Float64,
+    rotation: Float64,
+    out: Float64,
+) -> None:
+    """Write ``out`` (H, W, 3), which holds zeros."""
+    ...
 
 
 @kernel

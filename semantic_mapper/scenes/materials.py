@@ -49,6 +49,7 @@ class Pattern(IntEnum):
     PAGE = 13  # a printed page: text, headlines, pictures; the scale is the height of a line
     OUTSIDE = 14  # what is seen through a window: sky, trees, houses
     STAINS = 15  # worn paint: clouds, and streaks that run down
+    FLAT = 16  # the first colour everywhere
 
 
 @dataclass(frozen=True, slots=True)

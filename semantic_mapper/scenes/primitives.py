@@ -1,11 +1,11 @@
 """Analytic primitives, assemblies of them, and the arrays that the ray casters read.
 
-A primitive is a unit shape (box [-1, 1]^3, cylinder about z, sphere, frustum about z, pillow) scaled by its half
-extents, turned and moved.
+A primitive is a unit shape (see ``Shape``; all fit into [-1, 1]^3) scaled by its half extents, turned and moved.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
@@ -27,6 +27,8 @@ class Shape(IntEnum):
     ELLIPSOID = 2
     FRUSTUM = 3  # a cone cut off: radius 1 at z = -1, 0.6 at z = 1
     PILLOW = 4  # a superellipsoid x^4 + y^4 + z^4 = 1: a box with soft edges
+    TORUS = 5  # about z: the tube is 0.6 of the ring's radius thick; round where the height is 0.3 of the width
+    PRISM = 6  # half a box: x + y <= 0. ``Assembly.prism`` makes any convex polygon of such halves
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,6 +129,33 @@ class Assembly:
         """``add`` a box with soft edges."""
         self.add(Shape.PILLOW, material, center, size, **options)  # type: ignore[arg-type]
 
+    def torus(self, material: int, center: Vector, size: Vector, **options: object) -> None:
+        """``add`` a lying torus."""
+        self.add(Shape.TORUS, material, center, size, **options)  # type: ignore[arg-type]
+
+    def prism(self, material: int, corners: Sequence[tuple[float, float]], z: tuple[float, float]) -> None:
+        """Add a convex polygon extruded from ``z[0]`` to ``z[1]``, as right-angled prisms that meet without a gap.
+
+        Args:
+            material: Number in the palette.
+            corners: At least 3, (x, y) in metres, anticlockwise.
+            z: Lower and upper end, metres.
+        """
+        points = np.array(corners, np.float64)
+        for k in range(1, len(points) - 1):
+            triangle = points[[0, k, k + 1]]
+            sides = np.linalg.norm(np.roll(triangle, -1, axis=0) - triangle, axis=1)
+            a, b, apex = np.roll(triangle, -int(sides.argmax()), axis=0)  # the longest side runs from a to b
+            foot = a + (b - a) * ((apex - a) @ (b - a)) / ((b - a) @ (b - a))
+            for x_end, y_end in ((b, apex), (apex, a)):  # the right angle is at the foot of the apex's height
+                x_leg, y_leg = x_end - foot, y_end - foot
+                middle = foot + (x_leg + y_leg) / 2
+                size = (float(np.linalg.norm(x_leg)), float(np.linalg.norm(y_leg)), z[1] - z[0])
+                if min(size) > 0.0:
+                    yaw = float(np.arctan2(x_leg[1], x_leg[0]))
+                    center = (float(middle[0]), float(middle[1]), (z[0] + z[1]) / 2)
+                    self.add(Shape.PRISM, material, center, size, yaw=yaw)
+
     def bounds(self) -> tuple[Float64, Float64]:
         """Lower and upper corner (3,) of all parts, in the assembly's frame."""
         lows, highs = zip(*(part_bounds(part) for part in self.parts), strict=True)
@@ -195,7 +224,11 @@ def part_bounds(part: Part) -> tuple[Float64, Float64]:
 
 def place_parts(assembly: Assembly, yaw: float, position: Float64) -> list[Part]:
     """The parts of ``assembly``, turned by ``yaw`` about z and moved to ``position`` (3,)."""
-    turn = rotation_z(yaw)
+    return turned_parts(assembly, rotation_z(yaw), position)
+
+
+def turned_parts(assembly: Assembly, turn: Float64, position: Float64) -> list[Part]:
+    """The parts of ``assembly``, turned by ``turn`` (3, 3) and moved to ``position`` (3,)."""
     return [
         Part(
             p.shape,

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from semantic_mapper.geometry import check_pose
-from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes.config import NoiseConfig
+from semantic_mapper.scenes.daylight import lit_by_day
 from semantic_mapper.scenes.fast_cast import cast_pixels
-from semantic_mapper.scenes.fast_shade import shade_pixels
+from semantic_mapper.scenes.fast_shade import shade_pixels, surface_normals
 from semantic_mapper.scenes.scene import Scene, kernel_arrays
 from semantic_mapper.scenes.sensor_color import develop, expose
 from semantic_mapper.scenes.sensor_depth import measure_depth
@@ -25,7 +25,7 @@ class RenderedView:
     Args:
         rgb: (H, W, 3) uint8.
         depth_m: (H, W) float32 z-depth in metres as the sensor gives it, 0 = no measurement.
-        label: (H, W) uint8 ids of ``labels.ROOMS``, its ignore id where nothing was hit.
+        label: (H, W) uint8 ids of the scene's label set; where nothing was hit that of the sky, indoors the ignore id.
         instance: (H, W) uint16, 0 where nothing was hit.
         exact_depth_m: (H, W) float32 the true z-depth, 0 = nothing hit; of a mirror, that of its surface.
     """
@@ -64,7 +64,7 @@ def render_view(
     """Render one view.
 
     Args:
-        scene: From ``make_room``.
+        scene: From ``make_room`` or another suite.
         intrinsics: Pinhole; distortion coefficients are not modelled and must be empty.
         T_world_camera: (4, 4) float64, OpenCV camera axes.
         noise: Seed of the sensor noise on colour and depth; None for a perfect camera.
@@ -76,10 +76,7 @@ def render_view(
     """
     check_pose(T_world_camera, "render_view")
     depth, index = cast_view(scene, intrinsics, T_world_camera)
-    linear = shade_pixels(
-        depth, index, *kernel_arrays(scene), T_world_camera[:3, 3].copy(), T_world_camera[:3, :3].copy(),
-        intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy,
-    )  # fmt: skip
+    linear = light_seen(scene, intrinsics, T_world_camera, depth, index)
     sensor = None if noise is None else Sensor(noise, noise_config, shot)
     return finish_view(scene, intrinsics, depth, index, linear, sensor)
 
@@ -94,6 +91,33 @@ def cast_view(scene: Scene, intrinsics: CameraIntrinsics, T_world_camera: Float6
     )  # fmt: skip
 
 
+def light_seen(
+    scene: Scene, intrinsics: CameraIntrinsics, T_world_camera: Float64, depth: Float64, index: np.ndarray
+) -> Float32:
+    """Linear RGB (H, W, 3) float32 of what ``cast_view`` found; of misses that of the sky, black indoors."""
+    i = intrinsics
+    primitives, materials, lights = kernel_arrays(scene)
+    camera = (T_world_camera[:3, 3].copy(), T_world_camera[:3, :3].copy(), i.fx, i.fy, i.cx, i.cy)
+    lit = shade_pixels(depth, index, primitives, materials, lights, *camera)
+    if scene.daylight is None:
+        return lit
+    normal = surface_normals(depth, index, primitives, *camera)
+    return lit_by_day(scene.daylight, lit, normal, depth, camera_rays(i, T_world_camera), camera[0])
+
+
+def camera_rays(intrinsics: CameraIntrinsics, T_world_camera: Float64) -> Float64:
+    """(H, W, 3) float64 directions of all pixels in world axes, 1 along the camera's z."""
+    i = intrinsics
+    u, v = np.meshgrid(np.arange(i.width), np.arange(i.height))
+    return np.stack(((u - i.cx) / i.fx, (v - i.cy) / i.fy, np.ones(u.shape)), axis=-1) @ T_world_camera[:3, :3].T
+
+
+def seen_labels(scene: Scene, index: np.ndarray) -> UInt8:
+    """Ids (H, W) of the primitives ``index`` (H, W), -1 = nothing was hit."""
+    nothing = scene.label_set.ignore_id if scene.daylight is None else scene.label_set.id_of(scene.daylight.miss_label)
+    return np.append(scene.primitives.label, np.uint8(nothing))[index]  # index -1 is the appended entry
+
+
 def finish_view(
     scene: Scene,
     intrinsics: CameraIntrinsics,
@@ -103,7 +127,7 @@ def finish_view(
     sensor: Sensor | None,
 ) -> RenderedView:
     """Linear light (H, W, 3) and primitive numbers (H, W) -> what the sensors give; perfect ones where None."""
-    label = np.append(scene.primitives.label, np.uint8(ROOMS.ignore_id))[index]  # index -1 is the appended entry
+    label = seen_labels(scene, index)
     instance = np.append(scene.primitives.instance, np.uint16(0))[index]
     exact = np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
     if sensor is None:

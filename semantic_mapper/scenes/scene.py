@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.scenes.daylight import Daylight
 from semantic_mapper.scenes.fast_cast import cast_pixels
 from semantic_mapper.scenes.fast_shade import LightArrays, MaterialArrays, PrimitiveArrays
 from semantic_mapper.scenes.materials import MaterialTable
@@ -39,18 +40,32 @@ class Lights:
     ambient: Float64
 
 
+_NO_CUBES = np.zeros((0, 6, 1, 1), np.float32)
+NO_LAMPS = Lights(  # ambient light of strength 1 alone
+    np.zeros((0, 3)),
+    np.zeros((0, 3)),
+    _NO_CUBES,
+    _NO_CUBES,
+    _NO_CUBES,
+    np.zeros(0),
+    np.ones(3),
+)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """One room.
+    """One room, or a place under the sky.
 
     Args:
         seed: That it was made from.
         template: Kind of room ("kitchen", ...).
-        size_m: (width, depth, height); the room fills [0, width] x [0, depth] x [0, height], z up.
+        size_m: (width, depth, height); the room fills [0, width] x [0, depth] x [0, height], z up. inf = no walls.
         primitives: Everything that can be seen, walls included.
         materials: Rows are what ``primitives.material`` counts.
         lights: Point lights and ambient light.
         walks: What moves from frame to frame.
+        label_set: Of the label images.
+        daylight: Sun and sky; None indoors. ``lights`` are then ``NO_LAMPS``.
     """
 
     seed: int
@@ -60,11 +75,8 @@ class Scene:
     materials: MaterialTable
     lights: Lights
     walks: tuple[Walk, ...] = ()
-
-    @property
-    def label_set(self) -> LabelSet:
-        """Of the label images."""
-        return ROOMS
+    label_set: LabelSet = ROOMS
+    daylight: Daylight | None = None
 
 
 def scene_at(scene: Scene, frame: int) -> Scene:

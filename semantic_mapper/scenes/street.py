@@ -10,14 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from semantic_mapper.geometry import expect_shape, invert_pose, transform
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.scenes.camera import pose_of
 from semantic_mapper.scenes.config import NoiseConfig
-from semantic_mapper.scenes.fast_cast import cast_pixels
-from semantic_mapper.scenes.fast_shade import LightArrays, MaterialArrays, PrimitiveArrays, shade_pixels
+from semantic_mapper.scenes.daylight import Daylight, pose_of, shadow_map, sun_camera
 from semantic_mapper.scenes.materials import Color, Material, Pattern, display_hsv, material_table
-from semantic_mapper.scenes.primitives import Assembly, Part, Primitives, Shape, pack, place_parts
+from semantic_mapper.scenes.primitives import Assembly, Part, Shape, pack, place_parts
+from semantic_mapper.scenes.render import cast_view, light_seen, seen_labels
+from semantic_mapper.scenes.scene import NO_LAMPS, Scene
 from semantic_mapper.scenes.sensor_color import expose
 from semantic_mapper.scenes.shots import Shot
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
@@ -40,37 +39,6 @@ _SHADOW_BIAS_M = 0.25
 _SKY_SHADE = 0.45  # light of the sky, as a fraction of the sun's
 _HAZE_M = 700.0
 _GRID = 4  # pixels of the scanner's depth image in one step of its azimuth
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Street:
-    """One street.
-
-    Args:
-        seed: That it was made from.
-        length_m: From x = 0, where the first frame is taken; all coordinates are relative to ``ORIGIN_M``.
-        primitives: Everything that can be seen; labels are ids of ``label_set``.
-        label_set: Has at least the classes of ``CLASSES``.
-        materials: As the shading reads them; a primitive's material counts them.
-        sun: (3,) unit vector towards it.
-        sky: Linear RGB at the horizon and at the zenith.
-        clouds: (S, S) float32 in [0, 1], cover of the sky; tiles.
-        shadow: (``_SHADOW_SIZE``, ``_SHADOW_SIZE``) float32 depth of the first surface as the sun's camera sees it.
-        T_world_sun: (4, 4) pose of that camera.
-        sun_focal: Its focal length, pixels.
-    """
-
-    seed: int
-    length_m: float
-    primitives: Primitives
-    label_set: LabelSet
-    materials: MaterialArrays
-    sun: Float64
-    sky: tuple[Color, Color]
-    clouds: Float32
-    shadow: Float32
-    T_world_sun: Float64
-    sun_focal: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +89,7 @@ class _Builder:
         self.groups.append(place_parts(assembly, yaw, ORIGIN_M + np.array([x, y, z])))
 
 
-def make_street(seed: int, length_m: float, label_set: LabelSet) -> Street:
+def make_street(seed: int, length_m: float, label_set: LabelSet) -> Scene:
     """Build a street; everything follows from the arguments.
 
     Args:
@@ -143,26 +111,20 @@ def make_street(seed: int, length_m: float, label_set: LabelSet) -> Street:
         far.ellipsoid(b.pick(b.leaves), (0, (k - 12) * 9.0, b.between(2, 5)), (14, 16, b.between(12, 22)))
     b.place(far, end + 60, 0)
     primitives = pack(b.groups, label_set)
-    table = material_table(b.materials)
     azimuth, elevation = b.between(0, 2 * np.pi), np.radians(b.between(30, 55))
-    sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
     horizon = display_hsv(0.57, b.between(0.05, 0.2), 0.97)
     zenith = display_hsv(0.6, b.between(0.3, 0.6), b.between(0.75, 0.95))
-    middle = ORIGIN_M + np.array([end / 2, 0.0, 0.0])
-    T_world_sun = pose_of(middle + sun * _SUN_M, azimuth + np.pi, -elevation)
+    sun, T_world_sun = sun_camera(ORIGIN_M + np.array([end / 2, 0.0, 0.0]), azimuth, elevation, _SUN_M)
     focal = _SHADOW_SIZE / 2 * _SUN_M / (end / 2 + 40.0)
-    shadow = _cast(primitives, T_world_sun, focal, (_SHADOW_SIZE, _SHADOW_SIZE))[0].astype(np.float32)
-    return Street(
-        seed, length_m, primitives, label_set,
-        MaterialArrays(
-            table.pattern, table.color_a, table.color_b, table.scale_m, table.seed, table.emission, table.gloss,
-            table.mirror,
-        ),
-        sun, (horizon, zenith), _clouds(b.rng), shadow, T_world_sun, focal,
-    )  # fmt: skip
+    shadow = shadow_map(primitives, T_world_sun, focal, _SHADOW_SIZE)
+    daylight = Daylight(
+        "sky", sun, shadow, T_world_sun, focal, _SHADOW_BIAS_M, _SKY_SHADE, (horizon, zenith), _clouds(b.rng), _HAZE_M
+    )
+    size = (1e6, 1e6, 1e6)
+    return Scene(seed, "street", size, primitives, material_table(b.materials), NO_LAMPS, (), label_set, daylight)
 
 
-def drive(street: Street, count: int) -> Float64:
+def drive(street: Scene, count: int) -> Float64:
     """Poses T_world_camera (count, 4, 4), ``STEP_M`` apart, in the right lane, with the small sway of a car."""
     rng = np.random.default_rng((street.seed, 361))
     phase = rng.uniform(0, 2 * np.pi, 3)
@@ -175,7 +137,7 @@ def drive(street: Street, count: int) -> Float64:
 
 
 def render_street(
-    street: Street, intrinsics: CameraIntrinsics, T_world_camera: Float64, shot: Shot, config: NoiseConfig, seed: int
+    street: Scene, intrinsics: CameraIntrinsics, T_world_camera: Float64, shot: Shot, config: NoiseConfig, seed: int
 ) -> StreetView:
     """What the camera sees.
 
@@ -186,23 +148,14 @@ def render_street(
         shot: Exposure and motion of this frame.
         config, seed: Noise of the colour camera.
     """
-    i = intrinsics
-    depth, index = cast_pixels(
-        *_shapes(street.primitives), *_axes(T_world_camera), i.fx, i.fy, i.cx, i.cy, i.width, i.height
-    )
-    u, v = np.meshgrid(np.arange(i.width), np.arange(i.height))
-    ray = np.stack(((u - i.cx) / i.fx, (v - i.cy) / i.fy, np.ones(u.shape)), axis=-1) @ T_world_camera[:3, :3].T
-    hit = index >= 0
-    linear = _sky_light(street, ray)
-    linear[hit] = _surface_light(street, intrinsics, T_world_camera, depth, index, ray)[hit]
-    exact = np.where(hit, depth, 0.0).astype(np.float32)
+    depth, index = cast_view(street, intrinsics, T_world_camera)
+    linear = light_seen(street, intrinsics, T_world_camera, depth, index)
+    exact = np.where(index >= 0, depth, 0.0).astype(np.float32)
     rgb = expose(linear, exact, intrinsics, shot, config, np.random.default_rng((street.seed, seed, 362)))
-    sky = dict(zip(street.label_set.names, street.label_set.ids, strict=True))["sky"]
-    label = np.append(street.primitives.label, np.uint8(sky))[index]  # index -1 is the appended entry
-    return StreetView(rgb, label, exact)
+    return StreetView(rgb, seen_labels(street, index), exact)
 
 
-def scan_street(street: Street, T_world_scanner: Float64, seed: int) -> Float32:
+def scan_street(street: Scene, T_world_scanner: Float64, seed: int) -> Float32:
     """Points (N, 4) that the laser scanner measures ahead of it: x ahead, y left, z up in metres, and reflectance.
 
     Only what lies within 52 degrees of straight ahead, which is more than the camera sees.
@@ -220,7 +173,8 @@ def scan_street(street: Street, T_world_scanner: Float64, seed: int) -> Float32:
     a, e = (grid.ravel() for grid in np.meshgrid(azimuth, np.radians(RINGS_DEG)))
     width, height = 2 * int(np.tan(np.radians(53)) * focal), 2 * int(np.tan(np.radians(38)) * focal)
     u, v = np.tan(a), np.tan(e) / np.cos(a)  # left and up, on the plane ahead
-    depth, index = _cast(street.primitives, T_world_ahead, focal, (height, width))
+    ahead = CameraIntrinsics(focal, focal, width / 2 - 0.5, height / 2 - 0.5, width, height)
+    depth, index = cast_view(street, ahead, T_world_ahead)
     row = np.rint(height / 2 - 0.5 - v * focal).astype(int)
     column = np.rint(width / 2 - 0.5 - u * focal).astype(int)
     z, hit = depth[row, column], index[row, column]
@@ -384,23 +338,6 @@ def _cars(b: _Builder, side: float, verge: float, end: float) -> None:
         x += b.between(5.5, 9) if side > 0 and b.rng.uniform() < 0.7 else b.between(14, 40)
 
 
-def _shapes(p: Primitives) -> tuple[np.ndarray, Float64, Float64, Float64]:
-    return p.shape, p.center, p.half, p.rotation
-
-
-def _axes(T_world_camera: Float64) -> tuple[Float64, Float64]:
-    return T_world_camera[:3, 3].copy(), T_world_camera[:3, :3].copy()
-
-
-def _cast(
-    primitives: Primitives, T_world_camera: Float64, focal: float, size: tuple[int, int]
-) -> tuple[Float64, np.ndarray]:
-    """Depth (H, W), inf = miss, and primitive (H, W), of a pinhole camera with its centre in the middle."""
-    height, width = size
-    middle = (width / 2 - 0.5, height / 2 - 0.5)
-    return cast_pixels(*_shapes(primitives), *_axes(T_world_camera), focal, focal, *middle, width, height)
-
-
 def _clouds(rng: np.random.Generator) -> Float32:
     """(256, 256) cover of the sky, which goes on over its edges."""
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(256), np.fft.fftfreq(256)))
@@ -408,65 +345,3 @@ def _clouds(rng: np.random.Generator) -> Float32:
     clouds = np.fft.ifft2(spectrum).real
     clouds = (clouds - clouds.mean()) / clouds.std()
     return np.clip(0.5 * clouds + rng.uniform(-0.4, 0.5), 0, 1).astype(np.float32)
-
-
-def _sky_light(street: Street, ray: Float64) -> Float32:
-    """Linear RGB (H, W, 3) of the sky along rays (H, W, 3)."""
-    up = np.clip(ray[..., 2] / np.linalg.norm(ray, axis=-1), 0.0, 1.0)
-    blend = np.clip(up * 2.2, 0, 1)[..., None] ** 0.7
-    light = (1 - blend) * np.array(street.sky[0]) + blend * np.array(street.sky[1])
-    size = len(street.clouds)
-    plane = ray[..., :2] / np.maximum(ray[..., 2:], 0.05) * 60  # clouds hang in a plane
-    row, column = (np.floor(plane).astype(int) % size).transpose(2, 0, 1)
-    cover = street.clouds[row, column][..., None] * np.clip(up * 6, 0, 1)[..., None]
-    return ((1 - cover) * light + cover * 0.95).astype(np.float32) * np.float32(1.15)
-
-
-def _surface_light(
-    street: Street, i: CameraIntrinsics, T_world_camera: Float64, depth: Float64, index: np.ndarray, ray: Float64
-) -> Float32:
-    """Linear RGB (H, W, 3) of what was hit: sun with shadows, sky, haze."""
-    p = street.primitives
-    flat = LightArrays(
-        np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 6, 1, 1), np.float32), np.zeros(0), np.ones(3),
-        np.full(3, 1e6), np.zeros((0, 6, 1, 1), np.float32), np.zeros((0, 6, 1, 1), np.float32),
-    )  # fmt: skip
-    primitives = PrimitiveArrays(p.shape, p.center, p.half, p.rotation, p.material)
-    lit = shade_pixels(depth, index, primitives, street.materials, flat, *_axes(T_world_camera), i.fx, i.fy, i.cx, i.cy)
-    distance = np.where(np.isfinite(depth), depth, 0.0)
-    world = T_world_camera[:3, 3] + distance[..., None] * ray
-    normal = _normals(p, index, world)
-    albedo = lit / (0.75 + 0.25 * normal[..., 2:])  # that is how ``shade_pixels`` lights what has no lamp
-    facing = np.clip(normal @ street.sun, 0, 1)[..., None] * _sunlit(street, world)[..., None]
-    light = _SKY_SHADE * (0.7 + 0.3 * normal[..., 2:]) * np.array([0.9, 0.97, 1.1]) + facing
-    haze = np.exp(-distance / _HAZE_M)[..., None]
-    return (haze * albedo * light + (1 - haze) * np.array(street.sky[0])).astype(np.float32)
-
-
-def _sunlit(street: Street, world: Float64) -> Float64:
-    """(H, W) 1 where the sun reaches, 0 in shadow; points outside the shadow map are lit."""
-    q = transform(invert_pose(street.T_world_sun), world.reshape(-1, 3))
-    middle = _SHADOW_SIZE / 2 - 0.5
-    uv = np.rint(q[:, :2] / q[:, 2:] * street.sun_focal + middle).astype(int)
-    inside = np.asarray(((uv >= 0) & (uv < _SHADOW_SIZE)).all(axis=1))
-    column, row = np.where(inside[:, None], uv, 0).T
-    shaded = inside & (street.shadow[row, column] <= q[:, 2] - _SHADOW_BIAS_M)
-    return (1.0 - shaded.astype(np.float64)).reshape(world.shape[:2])
-
-
-def _normals(p: Primitives, index: np.ndarray, world: Float64) -> Float64:
-    """Unit normals (H, W, 3) of the primitives ``index`` (H, W) at points (H, W, 3); any where nothing was hit."""
-    expect_shape(world, f"{index.shape[0]} {index.shape[1]} 3", "world")
-    rotation, half = p.rotation[index], p.half[index]
-    q = np.einsum("hwij,hwi->hwj", rotation, world - p.center[index]) / half
-    shape = p.shape[index][..., None]
-    face = np.abs(q) >= np.abs(q).max(axis=-1, keepdims=True)
-    flat = np.where(face, np.sign(q), 0.0)
-    lid = (np.abs(q[..., 2:]) > 0.999) & (shape != Shape.ELLIPSOID)
-    round_ = q / half
-    round_[..., 2] = np.where(shape[..., 0] == Shape.ELLIPSOID, round_[..., 2], 0.0)
-    top = np.zeros_like(q)
-    top[..., 2] = np.sign(q[..., 2])
-    own = np.where(shape == Shape.BOX, flat, np.where(lid, top, round_))
-    own /= np.maximum(np.linalg.norm(own, axis=-1, keepdims=True), 1e-9)
-    return np.einsum("hwij,hwj->hwi", rotation, own)

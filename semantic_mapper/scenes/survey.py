@@ -1,10 +1,11 @@
 """Look at the suite: contact sheets, how often each class is seen, how fast rooms are rendered.
 
-``python -m semantic_mapper.scenes.survey sheet --out rooms.png`` and likewise ``classes`` and ``speed``.
+``python -m semantic_mapper.scenes.survey sheet --out rooms.png`` and likewise ``classes``, ``speed`` and ``klevr``.
 """
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,7 +16,7 @@ import msgspec
 import numpy as np
 import typer
 
-from semantic_mapper.labels import ROOMS
+from semantic_mapper.labels import KLEVR, ROOMS
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.scenes.camera import camera_path
 from semantic_mapper.scenes.config import (
@@ -27,6 +28,7 @@ from semantic_mapper.scenes.config import (
     NoiseConfig,
     RoomConfig,
 )
+from semantic_mapper.scenes.klevr import klevr_camera, klevr_views
 from semantic_mapper.scenes.render import render_view
 from semantic_mapper.scenes.room import make_room
 from semantic_mapper.scenes.room_templates import ROOM_TEMPLATES
@@ -162,5 +164,26 @@ def speed(rooms: Rooms = 8, views: Views = 30, depth: Annotated[str, typer.Optio
     log.info("speed", depth=sensor, **{name: round(value, 2) for name, value in figures.items()})
 
 
+@app.command()
+def klevr(
+    out: Annotated[Path, typer.Option(help="PNG or JPEG to write")],
+    scenes: Annotated[int, typer.Option(help="how many of each variant")] = 8,
+    width: Annotated[int, typer.Option(help="pixels of a picture")] = 144,
+) -> None:
+    """Write pictures and labels of KLEVR scenes, upright and floating, and measure 100 views of 72x72 a scene."""
+    rows: list[UInt8] = []
+    for variant in ("upright", "float"):
+        views = [next(klevr_views(seed, [0], klevr_camera(width), variant=variant)) for seed in range(scenes)]
+        rows.append(np.concatenate([view.frame.rgb for view in views], 1))
+        rows.append(np.concatenate([KLEVR.colorize(view.rendered.label) for view in views], 1))
+    cv2.imwrite(str(out), np.ascontiguousarray(np.concatenate(rows, 0)[..., ::-1]))
+    started = time.process_time()
+    for seed in range(scenes):
+        for _ in klevr_views(seed, range(100), klevr_camera(72)):
+            pass
+    log.info("klevr_written", path=str(out), cpu_s_a_scene=round((time.process_time() - started) / scenes, 3))
+
+
 if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
     app()

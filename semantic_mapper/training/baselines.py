@@ -27,6 +27,7 @@ class UNetConfig(Config, frozen=True):
     """Budget and optimiser of the per-image U-Net."""
 
     seconds: float = 300.0
+    steps: int = 0  # this many instead of ``seconds``; 0 = seconds
     width: int = 320
     batch: int = 4
     learning_rate: float = 1e-3
@@ -55,7 +56,11 @@ class UNetBaseline:
         generator = torch.Generator().manual_seed(self.config.seed)
         optimiser = torch.optim.AdamW(self.net.parameters(), self.config.learning_rate, weight_decay=1e-4)
         began, steps = time.monotonic(), 0
-        while (fraction := (time.monotonic() - began) / self.config.seconds) < 1:
+
+        def spent() -> float:
+            return steps / self.config.steps if self.config.steps else (time.monotonic() - began) / self.config.seconds
+
+        while (fraction := spent()) < 1:
             span = self.config.learning_rate - self.config.final_learning_rate
             for group in optimiser.param_groups:
                 group["lr"] = self.config.final_learning_rate + span * 0.5 * (1 + float(np.cos(np.pi * fraction)))

@@ -53,12 +53,12 @@ def predictions(wrong: tuple[int, ...] = (), *, depth: bool = True, own_image: b
     current, truth = as_given(room.frames[QUERY], depth=depth), room.truth[QUERY]
     made = prediction_at(truth.exact_depth_m, given, current)
     return truth, baseline_predictions(
-        field, given, sensed, current, made, truth.exact_depth_m, truth.label, own_image=own_image
+        field, given, sensed, current, made, truth.exact_depth_m, truth.label, ROOMS, own_image=own_image
     )
 
 
 def prediction_at(depth_m: np.ndarray, given: list[PosedFrame], current: PosedFrame) -> Prediction:
-    made = predict_view(tiny_field(), given, current, tiny_suite().tier)
+    made = predict_view(tiny_field(), given, current, tiny_suite().tier, ROOMS)
     return replace(made, depth_m=depth_m)
 
 
@@ -101,7 +101,7 @@ def test_without_depth_the_vote_looks_where_the_field_says_the_surface_is() -> N
 def test_interior_pixels_are_more_than_two_pixels_from_another_label() -> None:
     label = np.full((12, 12), 3, np.uint8)
     label[:, 6:] = 4
-    inner = interior_truth(label)
+    inner = interior_truth(label, ROOMS.ignore_id)
     assert (inner[:, 4:8] == ROOMS.ignore_id).all()
     assert (inner[:, :4] == 3).all() and (inner[:, 8:] == 4).all()
 

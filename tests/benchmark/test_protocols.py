@@ -130,11 +130,11 @@ def test_labels_of_another_set_are_compared_by_name() -> None:
     frames = [as_given(room.frames[n], depth=True) for n in (5, 7)]
     query = as_given(room.frames[6], depth=True)
     wall = ROOMS.ids[ROOMS.names.index("wall")]
-    found = predict_view(field, frames, query, tiny_suite().tier)
+    found = predict_view(field, frames, query, tiny_suite().tier, ROOMS)
     assert set(np.unique(found.label[found.known])) == {wall}
     with torch.no_grad():
         field.classifier.bias.copy_(torch.tensor([9.0, -9.0]))
-    assert set(np.unique(predict_view(field, frames, query, tiny_suite().tier).label)) == {ROOMS.ignore_id}
+    assert set(np.unique(predict_view(field, frames, query, tiny_suite().tier, ROOMS).label)) == {ROOMS.ignore_id}
 
 
 def test_keyframes_are_no_queries_and_not_next_to_one() -> None:

@@ -27,7 +27,7 @@ def random_turns(rng: np.random.Generator, count: int) -> Float64:
     return q * np.linalg.det(q)[:, None, None]
 
 
-def random_scene(seed: int, count: int = 20) -> Scene:
+def random_scene(seed: int, count: int = 21) -> Scene:
     rng = np.random.default_rng(seed)
     primitives = Primitives(
         shape=np.arange(count) % len(Shape),

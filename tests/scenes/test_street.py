@@ -12,20 +12,21 @@ from benchmarks.street import T_CAMERA_SCANNER, camera_of_width, write_drive
 from semantic_mapper.replay.importers import import_recording
 from semantic_mapper.replay.importers.kitti360 import LABELS, depth_of_scan
 from semantic_mapper.replay.log.format import LogReader
+from semantic_mapper.scenes import Scene
 from semantic_mapper.scenes.config import NoiseConfig
 from semantic_mapper.scenes.shots import single_shot
-from semantic_mapper.scenes.street import CLASSES, MAX_RANGE_M, Street, drive, make_street, render_street, scan_street
+from semantic_mapper.scenes.street import CLASSES, MAX_RANGE_M, drive, make_street, render_street, scan_street
 
 ID = dict(zip(LABELS.names, LABELS.ids, strict=True))
 CAMERA = camera_of_width(352)
 
 
 @pytest.fixture(scope="module")
-def street() -> Street:
+def street() -> Scene:
     return make_street(3, 20.0, LABELS)
 
 
-def test_it_has_the_classes_of_a_street_and_a_sky_without_depth(street: Street):
+def test_it_has_the_classes_of_a_street_and_a_sky_without_depth(street: Scene):
     seen: set[int] = set()
     for pose in drive(street, 30)[::6]:
         view = render_street(street, CAMERA, pose, single_shot(0, NoiseConfig()), NoiseConfig(), 0)
@@ -37,7 +38,7 @@ def test_it_has_the_classes_of_a_street_and_a_sky_without_depth(street: Street):
     }
 
 
-def test_it_follows_from_the_seed(street: Street):
+def test_it_follows_from_the_seed(street: Scene):
     pose = drive(street, 2)[1]
     shot = single_shot(0, NoiseConfig())
     again = make_street(3, 20.0, LABELS)
@@ -47,19 +48,23 @@ def test_it_follows_from_the_seed(street: Street):
     assert (views[0].label != views[2].label).mean() > 0.05
 
 
-def test_things_cast_shadows_onto_some_of_the_road(street: Street):
+def test_things_cast_shadows_onto_some_of_the_road(street: Scene):
     """Against the same street with a sun that shines through everything, and with one that is covered."""
     pose, steady = drive(street, 2)[1], NoiseConfig(auto_exposure=0.0, read_noise=0.0, shot_noise=0.0)
-    shadows = (street.shadow, np.full_like(street.shadow, np.inf), np.zeros_like(street.shadow))
+    day = street.daylight
+    assert day is not None
+    shadows = (day.shadow, np.full_like(day.shadow, np.inf), np.zeros_like(day.shadow))
     cast, lit, covered = (
-        render_street(replace(street, shadow=s), CAMERA, pose, single_shot(0, steady), steady, 0).rgb.astype(int)
+        render_street(
+            replace(street, daylight=replace(day, shadow=s)), CAMERA, pose, single_shot(0, steady), steady, 0
+        ).rgb.astype(int)
         for s in shadows
     )
     assert (covered <= cast).all() and (cast <= lit).all()
     assert 0.02 < ((lit - cast).max(axis=-1) > 20).mean() < 0.7 and ((cast - covered).max(axis=-1) > 20).mean() > 0.02
 
 
-def test_the_scanner_measures_what_the_camera_sees(street: Street):
+def test_the_scanner_measures_what_the_camera_sees(street: Scene):
     pose = drive(street, 2)[1]
     exact = render_street(street, CAMERA, pose, single_shot(0, NoiseConfig()), NoiseConfig(), 0).exact_depth_m
     points = scan_street(street, pose @ T_CAMERA_SCANNER, 0)

@@ -14,6 +14,7 @@ import torch
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.scenes.config import NoiseConfig
+from semantic_mapper.scenes.daylight import lit_by_day
 from semantic_mapper.scenes.fast_cast import NEAR_M
 from semantic_mapper.scenes.fast_shade import (
     CORNER_DIM,
@@ -29,7 +30,9 @@ from semantic_mapper.scenes.shots import Shot
 from semantic_mapper.types import CameraIntrinsics, Float64
 from tests.scenes.torch_textures import albedo
 
-_PILLOW_STEPS, _PILLOW_ERROR = 10, 0.02  # as in fast_cast.h
+# As in fast_cast.h.
+_PILLOW_STEPS, _PILLOW_ERROR = 10, 0.02
+_TORUS_RING, _TORUS_STEPS, _TORUS_CLOSE, _TORUS_POLISH, _TORUS_ERROR = 0.7, 48, 1e-3, 5, 1e-6
 _RAYS_A_CHUNK = 8192
 _RAYS_A_CHUNK_GPU = 1 << 18  # about 2 GiB of temporaries with 150 primitives in float32
 
@@ -110,17 +113,23 @@ def render_views_torch(
     dtype = dtype or (torch.float64 if device.type == "cpu" else torch.float32)
     tensors = _to_device(scene, device, dtype)
     origins, rays = _camera_rays(intrinsics, torch.as_tensor(poses, device=device, dtype=dtype))
-    depths, indices, colors = [], [], []
+    depths, indices, colors, normals = [], [], [], []
     chunk = _RAYS_A_CHUNK if device.type == "cpu" else _RAYS_A_CHUNK_GPU
     for origin, ray in zip(origins.split(chunk), rays.split(chunk), strict=True):
         depth, index = first_hits(tensors, origin, ray)
         depths.append(depth)
         indices.append(index)
-        colors.append(shade_hits(tensors, origin, ray, depth, index, intrinsics.fx))
+        color, normal = shade_hits(tensors, origin, ray, depth, index, intrinsics.fx)
+        colors.append(color)
+        normals.append(normal)
     size = (len(poses), intrinsics.height, intrinsics.width)
     depth = torch.cat(depths).reshape(size).double().cpu().numpy()
     index = torch.cat(indices).reshape(size).int().cpu().numpy()
     linear = torch.cat(colors).reshape(*size, 3).float().cpu().numpy()
+    if scene.daylight is not None:
+        normal, ray = (x.reshape(*size, 3).double().cpu().numpy() for x in (torch.cat(normals), rays))
+        seen = zip(linear, normal, depth, ray, poses[:, :3, 3], strict=True)
+        linear = np.stack([lit_by_day(scene.daylight, *view) for view in seen])
     return [finish_view(scene, intrinsics, depth[k], index[k], linear[k], sensor) for k, sensor in enumerate(sensors)]
 
 
@@ -160,6 +169,8 @@ def first_hits(t: _Tensors, origins: torch.Tensor, rays: torch.Tensor) -> tuple[
         Shape.ELLIPSOID: sphere,
         Shape.FRUSTUM: (torch.maximum(cone[0], enter[..., 2]), torch.minimum(cone[1], leave[..., 2])),
         Shape.PILLOW: _interval_of_pillow(o, d, enter.amax(-1), leave.amin(-1)),
+        Shape.TORUS: _interval_of_torus(o, d, enter.amax(-1), leave.amin(-1)),
+        Shape.PRISM: _interval_of_prism(o, d, enter.amax(-1), leave.amin(-1)),
     }
     near, far = kinds[Shape.BOX]
     for shape, (first, last) in kinds.items():
@@ -194,6 +205,46 @@ def _interval_of_pillow(
     return torch.where(hit, t, torch.inf), torch.where(hit, torch.inf, -torch.inf)
 
 
+def _interval_of_torus(
+    o: torch.Tensor, d: torch.Tensor, near: torch.Tensor, far: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where rays enter the torus, and ``far``; ``near`` and ``far`` are those of the box round it."""
+    tube = 1 - _TORUS_RING
+    scale = torch.tensor([1.0, 1.0, tube], dtype=o.dtype, device=o.device)
+    o, d = o * scale, d * scale
+    speed, t = d.norm(dim=-1), near.clamp_min(0)
+    done, miss = ~(t <= far), ~(t <= far)
+    tracing, away = ~done, torch.full_like(t, torch.inf)
+    for k in range(_TORUS_STEPS + _TORUS_POLISH):
+        x = o + t[..., None] * d
+        radial = x[..., :2].norm(dim=-1)
+        out = radial - _TORUS_RING
+        length = torch.hypot(out, x[..., 2])
+        away = torch.where(done, away, length - tube)
+        if k == 0:
+            inside = away < -_TORUS_ERROR
+            miss, done = miss | inside, done | inside
+        tracing = tracing & (away > _TORUS_CLOSE) if k < _TORUS_STEPS else torch.zeros_like(tracing)
+        slope = (out / radial * (x[..., :2] * d[..., :2]).sum(-1) + x[..., 2] * d[..., 2]) / length
+        done = done | (~tracing & ~(slope < 0))
+        t = torch.where(done, t, t + torch.where(tracing, away / speed, -away / slope))
+        past = tracing & ~done & (t > far)
+        miss, done = miss | past, done | past
+    hit = ~miss & (away.abs() <= _TORUS_ERROR)
+    return torch.where(hit, t, torch.inf), torch.where(hit, torch.inf, -torch.inf)
+
+
+def _interval_of_prism(
+    o: torch.Tensor, d: torch.Tensor, near: torch.Tensor, far: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where rays are in x + y <= 0 and in the box round it, where they are from ``near`` to ``far``."""
+    above, climb = o[..., 0] + o[..., 1], d[..., 0] + d[..., 1]
+    t = -above / climb
+    near = torch.where(climb < 0, torch.maximum(near, t), near)
+    far = torch.where(climb > 0, torch.minimum(far, t), far)
+    return torch.where((climb == 0) & (above > 0), torch.inf, near), far
+
+
 def _interval_of_cone(o: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Where rays are inside the lower half of the cone of radius 0.8 - 0.2 z; see ``hit_frustum`` of fast_cast.h."""
     radius, slope = 0.8 - 0.2 * o[..., 2], -0.2 * d[..., 2]
@@ -210,9 +261,9 @@ def _interval_of_cone(o: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, t
 
 def shade_hits(
     t: _Tensors, origins: torch.Tensor, rays: torch.Tensor, depth: torch.Tensor, index: torch.Tensor, fx: float
-) -> torch.Tensor:
-    """Linear RGB (R, 3) of the hits; black where there is none. ``fx``: focal length in pixels."""
-    out = torch.zeros_like(rays)
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Linear RGB (R, 3) of the hits, black where there is none, and normals (R, 3). ``fx``: focal length in pixels."""
+    out, normals = torch.zeros_like(rays), torch.zeros_like(rays)
     hit = (index >= 0).nonzero()[:, 0]
     view, p = -rays[hit] * depth[hit, None], index[hit]
     world = origins[hit] - view
@@ -224,8 +275,8 @@ def shade_hits(
         seen = _reflected(t, world[shows], view[shows], normal[shows], way[shows], fx)
         fraction = mirror[shows, None]
         color[shows] = (1 - fraction) * color[shows] + fraction * seen
-    out[hit] = color
-    return out
+    out[hit], normals[hit] = color, normal
+    return out, normals
 
 
 def _reflected(
@@ -266,7 +317,7 @@ def _openness(t: _Tensors, world: torch.Tensor, normal: torch.Tensor) -> torch.T
     """Fraction of the ambient light that reaches points (N, 3); see ``openness`` of fast_shade.c."""
     low, high = world / CORNER_REACH_M, (t.room - world) / CORNER_REACH_M
     fraction = (1 - CORNER_DIM / (1 + low**2)) * (1 - CORNER_DIM / (1 + high**2))
-    return torch.where(normal.abs() < 0.7, fraction, 1.0).prod(-1)
+    return torch.where((normal.abs() < 0.7) & torch.isfinite(t.room), fraction, 1.0).prod(-1)
 
 
 def _own_normal(shape: torch.Tensor, local: torch.Tensor, half: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -280,12 +331,21 @@ def _own_normal(shape: torch.Tensor, local: torch.Tensor, half: torch.Tensor) ->
     gradient[:, 2] = torch.where(shape == int(Shape.ELLIPSOID), q[:, 2], 0.0)
     gradient[:, 2] = torch.where(shape == int(Shape.FRUSTUM), 0.2 * radius, gradient[:, 2])
     gradient = torch.where((shape == int(Shape.PILLOW))[:, None], q**3, gradient)
+    squeezed = (radial - _TORUS_RING) / (radial * (1 - _TORUS_RING) ** 2)
+    ring = torch.stack((q[:, 0] * squeezed, q[:, 1] * squeezed, q[:, 2]), -1)
+    gradient = torch.where((shape == int(Shape.TORUS))[:, None], ring, gradient)
     curved = torch.nn.functional.normalize(gradient / half, dim=-1)
     lid = (shape == int(Shape.CYLINDER)) & (q[:, 2].abs() >= radial)
     lid |= (shape == int(Shape.FRUSTUM)) & (1 - q[:, 2].abs() < (radial - radius).abs())
     top = torch.zeros_like(q)
     top[:, 2] = side[:, 2]
     own = torch.where((shape == int(Shape.BOX))[:, None], box.to(q.dtype), torch.where(lid[:, None], top, curved))
+    faces = torch.stack(((q[:, 0] + q[:, 1]).abs() * 0.5**0.5, 1 + q[:, 0], 1 + q[:, 1], 1 - q[:, 2].abs()), -1)
+    slant = torch.stack((1 / half[:, 0], 1 / half[:, 1], torch.zeros_like(half[:, 0])), -1)
+    x, y = torch.eye(3, dtype=q.dtype, device=q.device)[:2]
+    normals = torch.stack((torch.nn.functional.normalize(slant, dim=-1), -x.expand_as(q), -y.expand_as(q), top), 1)
+    prism = normals[torch.arange(len(q)), faces.abs().argmin(-1)]
+    own = torch.where((shape == int(Shape.PRISM))[:, None], prism, own)
     return own, own.abs().argmax(-1)
 
 

@@ -36,7 +36,7 @@ def albedo(
     x, y = _take(local, first), _take(local, second)
     place = torch.stack((x / scale_m, y / scale_m, y / _take(half, second), footprint / scale_m))  # 4 N
     blend, third = torch.zeros_like(x), torch.zeros_like(x)
-    for kind in Pattern:
+    for kind in _PATTERNS:
         mine = pattern == int(kind)
         if bool(mine.any()):
             found = _PATTERNS[kind](*place[:, mine], seed[mine])
@@ -46,6 +46,7 @@ def albedo(
         + 0.3 * (_noise(x / 0.45, y / 0.45, seed + 11) - 0.5)
         + 0.2 * _fine(x / 0.05, y / 0.05, seed + 12, footprint / 0.05)
     )
+    uneven = torch.where(pattern == int(Pattern.FLAT), 1.0, uneven)
     base = color_a * (1 - blend[:, None]) + color_b * blend[:, None]
     return uneven[:, None] * (base * (1 - third[:, None]) + third[:, None] * (0.5 * color_a.flip(-1) + 0.3 * color_b))
 

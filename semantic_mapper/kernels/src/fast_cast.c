@@ -104,7 +104,9 @@ KERNEL(cast_primitives, CastArguments) {
         case 1: cast_one(a, p, 1); break;
         case 2: cast_one(a, p, 2); break;
         case 3: cast_one(a, p, 3); break;
-        default: cast_one(a, p, 4);
+        case 4: cast_one(a, p, 4); break;
+        case 5: cast_one(a, p, 5); break;
+        default: cast_one(a, p, 6);
         }
     }
     return 0;

@@ -6,6 +6,11 @@
 #define NEAR_M 0.02 /* nothing nearer than this is seen */
 #define PILLOW_STEPS 10
 #define PILLOW_ERROR 0.02 /* of x^4 + y^4 + z^4 at a hit */
+#define TORUS_RING 0.7    /* radius of the tube's middle; that of the tube is 1 - TORUS_RING */
+#define TORUS_STEPS 48
+#define TORUS_CLOSE 1e-3 /* distance from which Newton's steps go on */
+#define TORUS_POLISH 5
+#define TORUS_ERROR 1e-6 /* distance at a hit */
 
 typedef struct {
     I64 shape;    /* (P,) primitives.Shape */
@@ -96,11 +101,60 @@ static inline double hit_pillow(const double *o, const double *d) {
     return fabs(f) <= PILLOW_ERROR && t > NEAR_M ? t : INFINITY;
 }
 
+/* A ring of round tube, drawn out in z so that it fills [-1, 1]^3. Sphere tracing comes near from outside, Newton's steps
+ * do the rest; a ray that is not at the surface then has gone past. */
+static inline double hit_torus(const double *o, const double *d) {
+    const double tube = 1.0 - TORUS_RING;
+    double near = -INFINITY, far = INFINITY;
+    for (int i = 0; i < 3; i++) {
+        double inverse = 1.0 / d[i], a = (-1.0 - o[i]) * inverse, b = (1.0 - o[i]) * inverse;
+        near = max_d(near, min_d(a, b)), far = min_d(far, max_d(a, b));
+    }
+    double t = max_d(near, 0.0), oz = tube * o[2], dz = tube * d[2], away = 0.0;
+    if (!(t <= far)) return INFINITY;
+    double speed = sqrt(d[0] * d[0] + d[1] * d[1] + dz * dz);
+    for (int k = 0; k < TORUS_STEPS + TORUS_POLISH; k++) {
+        double x = o[0] + t * d[0], y = o[1] + t * d[1], z = oz + t * dz;
+        double radial = sqrt(x * x + y * y), out = radial - TORUS_RING, length = sqrt(out * out + z * z);
+        away = length - tube;
+        if (k == 0 && away < -TORUS_ERROR) return INFINITY; /* starts inside */
+        if (k < TORUS_STEPS && away > TORUS_CLOSE) {
+            t += away / speed;
+            if (t > far) return INFINITY;
+            continue;
+        }
+        if (k < TORUS_STEPS) k = TORUS_STEPS;
+        double slope = (out / radial * (x * d[0] + y * d[1]) + z * dz) / length;
+        if (!(slope < 0.0)) break;
+        t -= away / slope;
+    }
+    return fabs(away) <= TORUS_ERROR && t > NEAR_M ? t : INFINITY;
+}
+
+/* Half of a box: x + y <= 0 of [-1, 1]^3. */
+static inline double hit_prism(const double *o, const double *d) {
+    double near = -INFINITY, far = INFINITY;
+    for (int i = 0; i < 3; i++) {
+        double inverse = 1.0 / d[i], a = (-1.0 - o[i]) * inverse, b = (1.0 - o[i]) * inverse;
+        near = max_d(near, min_d(a, b)), far = min_d(far, max_d(a, b));
+    }
+    double above = o[0] + o[1], climb = d[0] + d[1], t = -above / climb;
+    if (climb < 0.0)
+        near = max_d(near, t);
+    else if (climb > 0.0)
+        far = min_d(far, t);
+    else if (above > 0.0)
+        return INFINITY;
+    return entry(near, far);
+}
+
 static inline double hit_shape(int64_t shape, const double *o, const double *d) {
     if (shape == 0) return hit_box(o, d);
     if (shape == 1) return hit_cylinder(o, d);
     if (shape == 2) return hit_sphere(o, d);
-    return shape == 3 ? hit_frustum(o, d) : hit_pillow(o, d);
+    if (shape == 3) return hit_frustum(o, d);
+    if (shape == 4) return hit_pillow(o, d);
+    return shape == 5 ? hit_torus(o, d) : hit_prism(o, d);
 }
 
 /* Ray parameter (infinity = miss) of one ray, and the number of the primitive (-1 = miss). */

@@ -6,6 +6,7 @@
 #define LIGHT_RADIUS_SQ 0.5 /* softens the fall-off near a light, square metres */
 #define CORNER_DIM 0.3      /* fraction of the ambient light that a wall, floor or ceiling takes from what touches it */
 #define CORNER_REACH_M 0.18
+#define SOFT_RIM 0.999 /* by day, the last thousandth of a cylinder's side shines as its lid does */
 
 typedef struct {
     I64 pattern;                 /* (M,) materials.Pattern */
@@ -37,8 +38,9 @@ typedef struct {
 
 static double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
-/* Writes the unit normal in the primitive's own axes at the point `local`; returns its dominant axis. */
-static int own_normal(int64_t shape, const double *local, const double *half, double *own) {
+/* Writes the unit normal in the primitive's own axes at the point `local`; returns its dominant axis. A cylinder's lid
+ * begins at `rim`. */
+static int own_normal(int64_t shape, const double *local, const double *half, double rim, double *own) {
     own[0] = own[1] = own[2] = 0.0;
     double qx = local[0] / half[0], qy = local[1] / half[1], qz = local[2] / half[2];
     if (shape == 0) {
@@ -51,13 +53,22 @@ static int own_normal(int64_t shape, const double *local, const double *half, do
         return axis;
     }
     double radial = sqrt(qx * qx + qy * qy), radius = 0.8 - 0.2 * qz;
-    bool lid = (shape == 1 && fabs(qz) >= radial) || (shape == 3 && 1.0 - fabs(qz) < fabs(radial - radius));
+    bool lid = (shape == 1 && fabs(qz) >= radial * rim) || (shape == 3 && 1.0 - fabs(qz) < fabs(radial - radius));
     if (lid) {
         own[2] = local[2] > 0 ? 1.0 : -1.0;
         return 2;
     }
     double n[3] = {qx / half[0], qy / half[1], 0.0};
-    if (shape == 2)
+    if (shape == 6) { /* the nearest of five faces */
+        double slant = fabs(qx + qy) * 0.7071067811865476, x = fabs(1.0 + qx), y = fabs(1.0 + qy), z = fabs(1.0 - fabs(qz));
+        double least = min_d(min_d(slant, x), min_d(y, z));
+        n[0] = least == slant ? 1.0 / half[0] : least == x ? -1.0 : 0.0;
+        n[1] = least == slant ? 1.0 / half[1] : least == y && least != x ? -1.0 : 0.0;
+        n[2] = least == z && least != slant && least != x && least != y ? (local[2] > 0 ? 1.0 : -1.0) : 0.0;
+    } else if (shape == 5) {
+        double out = (radial - TORUS_RING) / (radial * (1.0 - TORUS_RING) * (1.0 - TORUS_RING));
+        n[0] *= out, n[1] *= out, n[2] = qz / half[2];
+    } else if (shape == 2)
         n[2] = qz / half[2];
     else if (shape == 3)
         n[2] = 0.2 * radius / half[2];
@@ -70,21 +81,24 @@ static int own_normal(int64_t shape, const double *local, const double *half, do
 }
 
 /* Writes the point `world` in primitive p's own axes, and the unit normal there; returns its dominant own axis. */
-static int normal_at(const Primitives *primitives, int64_t p, const double *world, double *local, double *normal) {
+static int normal_at(const Primitives *primitives, int64_t p, const double *world, double rim, double *local,
+                     double *normal) {
     const double *center = primitives->center.data + 3 * p, *rotation = primitives->rotation.data + 9 * p;
     double own[3];
     for (int i = 0; i < 3; i++) {
         local[i] = 0.0;
         for (int j = 0; j < 3; j++) local[i] += rotation[3 * j + i] * (world[j] - center[j]);
     }
-    int axis = own_normal(primitives->shape.data[p], local, primitives->half.data + 3 * p, own);
+    int axis = own_normal(primitives->shape.data[p], local, primitives->half.data + 3 * p, rim, own);
     for (int i = 0; i < 3; i++) normal[i] = dot(rotation + 3 * i, own);
     return axis;
 }
 
-/* Fraction of the ambient light that reaches a point: less near the room's walls, floor and ceiling. */
+/* Fraction of the ambient light that reaches a point: less near the room's walls, floor and ceiling. A room without end
+ * has none. */
 static double openness(const double *world, const double *normal, const double *room) {
     double fraction = 1.0;
+    if (isinf(room[0])) return fraction;
     for (int i = 0; i < 3; i++) {
         if (fabs(normal[i]) < 0.7) {
             double low = world[i] / CORNER_REACH_M, high = (room[i] - world[i]) / CORNER_REACH_M;
@@ -165,7 +179,7 @@ static void shade_point(const ShadeArguments *a, int64_t p, double *world, doubl
     double way = sqrt(dot(view, view)); /* of the light from there to the camera */
     for (int bounces = 0; bounces < 2 && p >= 0 && p < a->primitives.shape.shape[0]; bounces++) {
         double local[3], normal[3], albedo[3], light[3], ray[3];
-        int axis = normal_at(&a->primitives, p, world, local, normal);
+        int axis = normal_at(&a->primitives, p, world, 1.0, local, normal);
         int64_t m = a->material.data[p];
         texture(materials->pattern.data[m], materials->color_a.data + 3 * m, materials->color_b.data + 3 * m,
                 materials->scale.data[m], materials->seed.data[m], local, a->primitives.half.data + 3 * p, axis,
@@ -183,6 +197,30 @@ static void shade_point(const ShadeArguments *a, int64_t p, double *world, doubl
         for (int i = 0; i < 3; i++) world[i] = world[i] + t * ray[i], view[i] = -t * ray[i];
         way += t;
     }
+}
+
+typedef struct {
+    F64 depth; /* (H, W) along the camera's z */
+    I32 index; /* (H, W) number of the primitive, -1 = none */
+    F64 origin, camera_axes;
+    double fx, fy, cx, cy;
+    Primitives primitives;
+    F64 out; /* (H, W, 3) zeros */
+} NormalArguments;
+
+KERNEL(surface_normals, NormalArguments) {
+    int64_t height = a->depth.shape[0], width = a->depth.shape[1];
+    for (int64_t v = 0; v < height; v++) {
+        for (int64_t u = 0; u < width; u++) {
+            int64_t pixel = v * width + u, p = a->index.data[pixel];
+            if (p < 0) continue;
+            double z = a->depth.data[pixel], world[3], local[3];
+            double own[3] = {((double)u - a->cx) / a->fx * z, ((double)v - a->cy) / a->fy * z, z};
+            for (int i = 0; i < 3; i++) world[i] = a->origin.data[i] + dot(a->camera_axes.data + 3 * i, own);
+            normal_at(&a->primitives, p, world, SOFT_RIM, local, a->out.data + 3 * pixel);
+        }
+    }
+    return 0;
 }
 
 KERNEL(shade_hits, ShadeArguments) {

@@ -150,9 +150,13 @@ static inline double blend_at(int64_t pattern, double s, double t, double h, int
 
 /* Writes the albedo at the point `local` of a primitive. (s, t) are the two own axes across the normal, which is along
  * `axis`; for what has a grain t is the longer side. `footprint` is the width of a pixel there, metres. Every surface
- * is a little uneven: stains of half a metre, spots of some centimetres. */
+ * but those of pattern 16 is a little uneven: stains of half a metre, spots of some centimetres. */
 static inline void texture(int64_t pattern, const double *color_a, const double *color_b, double scale, int64_t seed,
                            const double *local, const double *half, int axis, double footprint, double *albedo) {
+    if (pattern == 16) {
+        for (int i = 0; i < 3; i++) albedo[i] = color_a[i];
+        return;
+    }
     int first = axis == 0 ? 1 : 0, second = axis == 2 ? 1 : 2;
     if ((pattern == 1 || pattern == 8 || pattern == 9 || pattern == 11) && half[first] > half[second]) {
         int longer = first;

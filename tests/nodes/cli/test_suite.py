@@ -130,7 +130,12 @@ def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Pat
         ("benchmark", "rooms", "--protocol", "finetune", "--baseline", "wide"),
         ("benchmark", "rooms", "--seconds", "3"),
         ("benchmark", "rooms", "--keyframes", "3"),
-        ("benchmark", "klevr"),
+        ("benchmark", "klevr", "--rooms", "3"),
+        ("benchmark", "klevr", "--map"),
+        ("benchmark", "klevr", "--arm", "nerf"),
+        ("benchmark", "klevr", "--tier", "gpu"),
+        ("benchmark", "rooms", "--claims"),
+        ("benchmark", "rooms", "--tier", "record"),
         ("benchmark", "rooms", "--protocol", "finetune", "--map"),
         ("benchmark", "rooms", "--views", "17"),
         ("benchmark", "rooms", "--depth", "computed", "--current", "hard"),
@@ -170,3 +175,35 @@ def test_an_unknown_setting_names_the_nearest_one(tmp_path: Path) -> None:
     done = run("benchmark", "rooms", "--config", path)
     assert done.returncode == 1
     assert "did you mean `views`" in error_line(done.stderr)
+
+
+KLEVR_CONFIG = """
+train_scenes = 2
+novel_scenes = 2
+width = 48
+views = 6
+train_views = 4
+label_maps = 2
+scored_views = 1
+mlp_steps = 5
+unet_steps = 2
+"""
+
+
+def test_klevr_shows_arms_and_claims_and_continues(tmp_path: Path) -> None:
+    config, out = tmp_path / "klevr.toml", tmp_path / "klevr.json"
+    config.write_text(KLEVR_CONFIG, encoding="utf-8")
+    common = ("benchmark", "klevr", "--config", config, "--claims", "--out", out)
+    first = run(*common, "--arm", "color")
+    assert first.returncode == 0, first.stderr
+    records = out.with_suffix(".jsonl").read_text().splitlines()
+    assert len(records) == 2 and "rotation augmentation" in first.stdout and "not run" in first.stdout
+    found = json.loads(out.read_text())
+    assert set(found["arms"]) == {"color"} and set(found["arms"]["color"]) == {"train cameras", "test cameras"}
+    assert [c["result"] for c in found["claims"]].count("not run") == len(found["claims"]) - 1
+    assert found["claims"][0]["result"] in ("accepted", "refused") and found["claims"][0]["scenes"] == 2
+    again = run(*common)
+    assert again.returncode == 0, again.stderr
+    lines = out.with_suffix(".jsonl").read_text().splitlines()
+    assert lines[:2] == records and len(lines) == 4
+    assert set(json.loads(out.read_text())["arms"]) == {"color", "unet"}
