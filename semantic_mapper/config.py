@@ -134,6 +134,14 @@ class SemanticNeRFConfig(Config, frozen=True):
     half_extent_m: float = 8.0  # half the side of the box
 
 
+class GridConfig(Config, frozen=True):
+    """The box of a scene grid: its vertices lie at ``origin_m`` + ``voxel_m`` * (i, j, k) in the world."""
+
+    origin_m: tuple[float, float, float] = (-4.0, -4.0, -1.0)
+    voxel_m: Positive = 0.1
+    shape: tuple[AtLeastTwo, AtLeastTwo, AtLeastTwo] = (81, 81, 41)  # vertices along x, y and z
+
+
 class SamplingConfig(Config, frozen=True):
     """Where a ray is sampled."""
 
