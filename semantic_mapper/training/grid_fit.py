@@ -72,6 +72,7 @@ class GridFitConfig(Config, frozen=True):
     density_variation: AtLeastZero = 1e-5  # weight of the total variation, a ray
     colour_variation: AtLeastZero = 1e-6
     point_colour: AtLeastZero = 0.1  # weight of the colour of each sample
+    opacity: AtLeastZero = 1e-3  # weight of what stops light: clears haze of the sky's colour
     depth: AtLeastZero = 0.1  # weight of the inverse depth, where frames have some
     start_from_depth: bool = True  # where frames have some
     exposure: bool = True  # a gain a frame and channel, for cameras whose exposure drifts
@@ -281,7 +282,7 @@ class _Fitter:
         inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
         colour = self.rays.rgb[pixels] / np.float32(255)
         results = RayResults(*(np.empty((len(pixels), 3), np.float32) for _ in range(3)))
-        loss = LossWeights(self.config.point_colour, self.config.depth)
+        loss = LossWeights(self.config.point_colour, self.config.opacity, self.config.depth)
         rays = self.grid.rays(batch, jitter).arrays()
         targets = TargetArrays(colour, inverse, gain, behind)
         photometric_rays(len(pixels), self.grid.arrays(), rays, targets, loss, self.samples, results)

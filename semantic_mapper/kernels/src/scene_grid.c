@@ -62,8 +62,9 @@ typedef struct {
 } Targets;
 
 typedef struct {
-    double point_colour, depth, huber; /* weights of two losses, and where the second turns linear, 1 / metres */
-    double faint;                      /* samples with less weight teach no colour */
+    double point_colour, opacity, depth; /* weights of three losses */
+    double huber;                        /* where that of inverse depth turns linear, 1 / metres */
+    double faint;                        /* samples with less weight teach no colour */
 } LossWeights;
 
 typedef struct {
@@ -102,9 +103,8 @@ static void photometric_ray(const PhotometricArguments *a, Sample *kept, int64_t
         if (k < 0) break;
         Sample *s = kept + n;
         const float depth = density_and_colour(g, read_voxel(&g->values, points + 3 * n), &s->slope, &s->colour);
-        s->after = light * expf(-depth);
         s->weight = -light * expm1f(-depth);
-        light = s->after;
+        light = s->after = light - s->weight;
         colour += s->weight * s->colour;
         gradient[4 * n] = 1.0f / z_of(&l, k);
         inverse_depth += s->weight * gradient[4 * n];
@@ -112,7 +112,7 @@ static void photometric_ray(const PhotometricArguments *a, Sample *kept, int64_t
     a->samples.count.data[r] = n;
 
     Voxel by_colour = 0, wanted = 0; /* of the loss by the composited colour */
-    float by_light = 0, by_depth = 0;
+    float by_light = -(float)a->loss.opacity * share, by_depth = 0;
     for (int c = 0; c < 3; c++) {
         const float seen = colour[c + 1] + light * sky[c], error = gain[c] * seen - target[c];
         const float slope = 2 * share / 3 * error;
@@ -232,7 +232,7 @@ KERNEL(march_grid, MarchArguments) {
             if ((k = next_sample(&a->grid, &l, k, p)) < 0) break;
             const float depth = optical_depth(&a->grid, read_density(&a->grid.values, p), &slope);
             const float w = -light * expm1f(-depth);
-            light *= expf(-depth);
+            light -= w;
             if (n == most) {
                 if (w <= weight[least]) continue;
                 memmove(z + least, z + least + 1, (size_t)(most - 1 - least) * sizeof *z);
@@ -273,7 +273,7 @@ KERNEL(march_gradient, MarchGradientArguments) {
         for (int64_t k = 0; n < most && light >= (float)a->grid.stop_below; k++, n++) {
             if ((k = next_sample(&a->grid, &l, k, points + 3 * n)) < 0) break;
             const float depth = optical_depth(&a->grid, read_density(&a->grid.values, points + 3 * n), slope + n);
-            weight[n] = -light * expm1f(-depth), after[n] = light *= expf(-depth);
+            weight[n] = -light * expm1f(-depth), after[n] = light -= weight[n];
             const bool is_kept = next < kept && z[next] == z_of(&l, k);
             by_weight[n] = is_kept ? given[next++] : 0.0f;
         }

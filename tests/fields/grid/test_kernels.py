@@ -23,7 +23,7 @@ from semantic_mapper.fields.grid.march import BIAS, STEP, GridRays, gather, marc
 
 SHAPE = (9, 14, 6)
 RAYS = 200
-LOSS = LossWeights(faint=0.0)
+LOSS = LossWeights(opacity=0.05, faint=0.0)
 
 
 def random_grid(seed: int = 0, channels: int = 4) -> tuple[torch.Tensor, torch.Tensor]:
@@ -122,7 +122,7 @@ def plain_loss(
     error = ((weight / z).sum(1) - inverse) * (inverse > 0)
     huber = torch.where(error.abs() < LOSS.huber, error.square() / (2 * LOSS.huber), error.abs() - LOSS.huber / 2)
     per_point = LOSS.point_colour * (weight.detach() * apart).sum() / RAYS
-    return (seen - wanted).square().mean() + per_point + LOSS.depth * huber.sum() / RAYS, seen
+    return (seen - wanted).square().mean() + per_point + LOSS.opacity * (1 - light).mean() + LOSS.depth * huber.sum() / RAYS, seen
 
 
 def test_the_photometric_step_has_the_gradients_of_plain_torch() -> None:
