@@ -142,6 +142,16 @@ class GridConfig(Config, frozen=True):
     shape: tuple[AtLeastTwo, AtLeastTwo, AtLeastTwo] = (81, 81, 41)  # vertices along x, y and z
 
 
+class GridFieldConfig(Config, frozen=True):
+    """A scene grid as a field."""
+
+    grid: GridConfig = GridConfig()
+    # Features a vertex of a grid of half the resolution, for colours that depend on the direction and for kinds that
+    # read classes from them; 0 = none
+    features: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0
+    trunk_width: Channels = 128  # of the MLP behind the features
+
+
 class SamplingConfig(Config, frozen=True):
     """Where a ray is sampled."""
 

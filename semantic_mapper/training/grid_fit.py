@@ -40,6 +40,7 @@ from semantic_mapper.fields.grid.march import most_samples
 from semantic_mapper.fields.grid.scene_grid import NOTHING, SceneGrid, at_resolution, grid_box, sky_texels
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
+from semantic_mapper.training.schedule import budget_fraction
 from semantic_mapper.training.grid_depth import depth_bounds, grid_of_depth
 from semantic_mapper.types import Float32, Float64, PosedFrame
 
@@ -76,6 +77,7 @@ class GridFitConfig(Config, frozen=True):
     depth: AtLeastZero = 0.1  # weight of the inverse depth, where frames have some
     start_from_depth: bool = True  # where frames have some
     exposure: bool = True  # a gain a frame and channel, for cameras whose exposure drifts
+    trunk_steps: NotNegative = 600  # of features and colours that depend on the direction, where a field has them
     held_out: NotNegative = 8  # every n-th frame is held out, for the PSNR; 0 = none
     seed: NotNegative = 0
 
@@ -115,6 +117,7 @@ def fit_grid(
     config: GridFitConfig = GridFitConfig(),
     on_progress: Callable[[GridFitProgress], None] | None = None,
     stopped: Callable[[], object] = bool,
+    box: GridConfig | None = None,
 ) -> GridFit:
     """Fit a grid to posed images.
 
@@ -123,6 +126,7 @@ def fit_grid(
         config: Budget, box and resolution.
         on_progress: Called after every step.
         stopped: Asked before every step; once it says so (anything true), the grid so far is the result.
+        box: Instead of the one that ``config`` describes.
 
     Raises:
         FrameError: too few frames, poses that only turn, or held-out views rendered worse than by their mean colour.
@@ -134,18 +138,20 @@ def fit_grid(
     seen = [f for i, f in enumerate(frames) if not config.held_out or (i + 1) % config.held_out]
     if len(seen) < MIN_FRAMES:
         raise FrameError(f"a grid needs at least {MIN_FRAMES} frames to fit besides held-out ones, got {len(seen)}")
-    box = scene_box(frames, config)
+    box = box or scene_box(frames, config)
     _check_parallax(frames, box)
     fitter = _Fitter(frame_rays(seen, config.width), box, config, seen)
     steps = 0
-    while steps < config.steps and not stopped() and not 0 < config.seconds < time.monotonic() - start:
-        loss = fitter.step(steps)
+    fraction = 0.0
+    while fraction < 1 and not stopped():
+        loss = fitter.step(steps, fraction)
         steps += 1
+        fraction = budget_fraction(steps, time.monotonic() - start, steps=config.steps, seconds=config.seconds)
         if on_progress is not None:
-            on_progress(GridFitProgress(steps, steps / config.steps, loss))
+            on_progress(GridFitProgress(steps, min(fraction, 1.0), loss))
     grid = fitter.finish()
     psnr, mean_psnr = held_out_psnr(grid, held_out, config)
-    if False:
+    if psnr < mean_psnr and fraction >= 1:
         raise FrameError(
             f"held-out views are rendered with {psnr:.1f} dB, worse than by their mean colour ({mean_psnr:.1f} dB): the "
             "poses do not fit the images. Poses are T_world_camera in metres, camera axes x right, y down, z forward; "
@@ -237,9 +243,8 @@ class _Fitter:
         self.samples = SampleLists.empty(self.config.rays, most_samples(self.values.shape), 4)
         self.rate, self.since = view_fraction(self.rays, self.grid.config, self.config.near_m), 0
 
-    def step(self, step: int) -> float:
-        """One step of Adam on a batch of rays; returns their mean squared error."""
-        fraction = step / self.config.steps
+    def step(self, step: int, fraction: float) -> float:
+        """One step of Adam on a batch of rays at a fraction of the budget; returns their mean squared error."""
         if self.stage + 1 < len(self.stages) and fraction >= self.stages[self.stage + 1][0]:
             self.stage += 1
             self.grid = self.grid.resampled(at_resolution(self.box, self._long_side(self.stage)))

@@ -74,9 +74,14 @@ class SceneGrid(nn.Module):
         texel, weight = sky_texels(direction)
         return (torch.sigmoid(self.sky.flatten(0, 1))[texel] * weight[..., None]).sum(1)
 
+    @staticmethod
+    def optical_depth(raw: torch.Tensor) -> torch.Tensor:
+        """Optical depth a voxel of raw densities."""
+        return functional.softplus(raw + BIAS)
+
     def alpha(self) -> torch.Tensor:
         """Opacity (X, Y, Z) of a voxel at each vertex."""
-        return -torch.expm1(-functional.softplus(self.values[..., 0] + BIAS))
+        return -torch.expm1(-self.optical_depth(self.values[..., 0]))
 
     def update_occupied(self) -> None:
         """Find the cells that rays may skip."""
