@@ -12,7 +12,7 @@ import torch
 from semantic_mapper.config import GridConfig
 from semantic_mapper.fields.grid.kernels import fuse_grid_depth
 from semantic_mapper.fields.grid.march import BIAS
-from semantic_mapper.fields.grid.scene_grid import NOTHING, SceneGrid
+from semantic_mapper.fields.grid.scene_grid import HAZE, NOTHING, SceneGrid
 from semantic_mapper.geometry import invert_pose, transform
 from semantic_mapper.imaging import resize_depth
 from semantic_mapper.training.frame_rays import FrameRays
@@ -28,15 +28,15 @@ EVERY = 7  # pixel, for the bounds of a box
 def grid_of_depth(rays: FrameRays, config: GridConfig) -> SceneGrid:
     """A grid whose density is that of the measured surface; colours are grey.
 
-    Density is Laplace-CDF(-distance) / beta with beta = half a voxel. What was not observed keeps the density that a
-    fit starts from: see ``distance_to_surface`` for where that is.
+    Density is Laplace-CDF(-distance) / beta with beta = half a voxel. What was not observed is haze, for images to
+    clear or fill: ``distance_to_surface`` says where that is.
     """
     distance, observed = distance_to_surface(rays, config)
     grid = SceneGrid(config)
     density = np.where(distance > 0, 0.5 * np.exp(-np.abs(distance) / BETA), 1 - 0.5 * np.exp(-np.abs(distance) / BETA))
     per_voxel = density / BETA
     raw = np.log(np.expm1(np.maximum(per_voxel, 1e-9))) - BIAS
-    values = np.where(observed, np.maximum(raw, NOTHING), 0.0).astype(np.float32)
+    values = np.where(observed, np.maximum(raw, NOTHING), HAZE).astype(np.float32)
     with torch.no_grad():
         grid.values[..., 0] = torch.from_numpy(values)
     grid.update_occupied()

@@ -57,7 +57,7 @@ _log = get_logger(__name__)
 class GridFitConfig(Config, frozen=True):
     """How a scene grid is fitted."""
 
-    steps: AtLeastOne = 1500
+    steps: AtLeastOne = 1200
     seconds: AtLeastZero = 0.0  # wall-clock bound; 0 = only steps count (then a run repeats bit for bit)
     rays: AtLeastOne = 2048  # a step
     width: AtLeastOne = 320  # working width of the images
@@ -68,12 +68,12 @@ class GridFitConfig(Config, frozen=True):
     box_m: tuple[float, float, float, float, float, float] | None = None
     near_m: AtLeastZero = 0.1
     far_m: Metres = 8.0
-    learning_rate: Positive = 0.1  # of density and colour at the start
-    final_rate: Fraction = 0.1  # what is left of it in the end
+    learning_rate: Positive = 0.2  # of density and colour at the start
+    final_rate: Fraction = 0.3  # what is left of it in the end
     density_variation: AtLeastZero = 1e-5  # weight of the total variation, a ray
     colour_variation: AtLeastZero = 1e-6
     point_colour: AtLeastZero = 0.1  # weight of the colour of each sample
-    opacity: AtLeastZero = 1e-3  # weight of what stops light: clears haze of the sky's colour
+    opacity: AtLeastZero = 1e-2  # weight of what stops light: clears haze of the sky's colour
     depth: AtLeastZero = 0.1  # weight of the inverse depth, where frames have some
     start_from_depth: bool = True  # where frames have some
     exposure: bool = True  # a gain a frame and channel, for cameras whose exposure drifts

@@ -20,7 +20,8 @@ from semantic_mapper.types import RayBatch
 
 MAX_VOXELS = 1 << 24
 SKY_ROWS, SKY_COLUMNS = 16, 32
-EMPTY_ALPHA = 1e-3  # a cell whose voxels are all less opaque is skipped
+EMPTY_ALPHA = 4e-3  # a cell whose voxels are all less opaque is skipped
+HAZE = 1.7  # raw density of what is not known: an opacity of 5e-3, which is not skipped
 NOTHING = -10.0  # raw density of what is empty: an opacity of 5e-8
 
 
@@ -86,7 +87,7 @@ class SceneGrid(nn.Module):
     def update_occupied(self) -> None:
         """Find the cells that rays may skip."""
         with torch.no_grad():
-            seen = (self.alpha() >= EMPTY_ALPHA * (1 - 1e-4)).float()  # what no ray has met yet is no emptier than it began
+            seen = (self.alpha() >= EMPTY_ALPHA).float()
             sides = [0 if (n - 1) % CELL == 0 else CELL - (n - 1) % CELL for n in seen.shape]
             padded = functional.pad(seen, (0, sides[2], 0, sides[1], 0, sides[0]))
             cells = functional.max_pool3d(padded[None, None], CELL + 1, CELL)[0, 0]
