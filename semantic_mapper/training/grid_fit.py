@@ -51,6 +51,7 @@ WARM_UP = 200  # steps before anything is pruned
 COARSE = ((0.0, 3), (0.3, 1.5), (0.6, 1))  # fraction of the steps, and how much coarser the grid is until the next
 MIN_PARALLAX = 1e-3  # distance of cameras as a fraction of the box, below which poses only turn
 MIN_FRAMES = 4
+MIN_GAIN_DB = 1.0  # over the mean colour; the sky's colours alone, with poses that mean nothing, gain half of it
 _log = get_logger(__name__)
 
 
@@ -129,7 +130,8 @@ def fit_grid(
         box: Instead of the one that ``config`` describes.
 
     Raises:
-        FrameError: too few frames, poses that only turn, or held-out views rendered worse than by their mean colour.
+        FrameError: too few frames, poses that only turn, or held-out views rendered hardly better than by their mean
+            colour.
         ConfigError: a box that cannot be.
     """
     start = time.monotonic()
@@ -151,11 +153,12 @@ def fit_grid(
             on_progress(GridFitProgress(steps, min(fraction, 1.0), loss))
     grid = fitter.finish()
     psnr, mean_psnr = held_out_psnr(grid, held_out, config)
-    if psnr < mean_psnr and fraction >= 1:
+    if psnr < mean_psnr + MIN_GAIN_DB and fraction >= 1:
         raise FrameError(
-            f"held-out views are rendered with {psnr:.1f} dB, worse than by their mean colour ({mean_psnr:.1f} dB): the "
-            "poses do not fit the images. Poses are T_world_camera in metres, camera axes x right, y down, z forward; "
-            "the scene must stand still, and the box must hold what is seen"
+            f"held-out views are rendered with {psnr:.1f} dB, hardly better than by their mean colour "
+            f"({mean_psnr:.1f} dB): poses do not fit the images, or the budget of {steps} steps is too small. Poses are "
+            "T_world_camera in metres, camera axes x right, y down, z forward; the scene must stand still, and the box "
+            "must hold what is seen"
         )
     return GridFit(grid, steps, time.monotonic() - start, psnr, mean_psnr, np.exp(fitter.log_gain).astype(np.float32))
 
