@@ -1,7 +1,7 @@
 """Fit scene grids: held-out PSNR, CPU time and memory, on one thread.
 
-objects: 70 views of 72x72 of matte objects before white. street: 48 views of 352x94, with a trunk. rooms: 40 frames with
-depth beside semantic_nerf at the same CPU time.
+objects: 70 views of 72x72 of matte objects before white. street: 48 views of 352x94, with a trunk. rooms: 40 frames
+with depth, beside semantic_nerf at the same CPU time.
 
 Example: python -m benchmarks.scene_grid objects --scenes 4 --out runs/grid
 """
@@ -70,7 +70,8 @@ def measure_street(seed: int, out: Path | None, settings: GridFitConfig) -> str:
     renders = [_render(field, f) for f in held_out]
     _picture(out, f"street-{seed}", held_out, renders)
     voxels = int(np.prod(field.config.grid.shape))
-    return f"| street {seed}, {voxels / 1e6:.1f} M voxels | {_psnr(held_out, renders, gain=True):.1f} | {seconds:.1f} | {_memory()} | |"
+    name, psnr = f"street {seed}, {voxels / 1e6:.1f} M voxels", _psnr(held_out, renders, gain=True)
+    return f"| {name} | {psnr:.1f} | {seconds:.1f} | {_memory()} | |"
 
 
 def measure_room(seed: int, out: Path | None, settings: GridFitConfig) -> list[str]:

@@ -67,11 +67,12 @@ def finetune(
     from semantic_mapper.nodes.cli.run_finetune import FinetuneRequest, finetune_log
     from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, mapper_config
     from semantic_mapper.training.finetune import FinetuneConfig
-
     from semantic_mapper.training.scene_fit import FITTERS
 
     if kind is not None and kind not in FITTERS:
-        raise typer.BadParameter(f"no kind '{kind}' is fitted to one scene; there is {', '.join(FITTERS)}", param_hint="--kind")
+        raise typer.BadParameter(
+            f"no kind '{kind}' is fitted to one scene; there is {', '.join(FITTERS)}", param_hint="--kind"
+        )
     given = {"seconds": seconds, "steps": steps, "seed": seed}
     settings = load_config(config, FinetuneConfig) if config is not None else FinetuneConfig()
     settings = msgspec.structs.replace(settings, **{name: v for name, v in given.items() if v is not None})

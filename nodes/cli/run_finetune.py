@@ -11,7 +11,13 @@ import structlog
 
 from semantic_mapper.config import DepthConfig
 from semantic_mapper.errors import FrameError, LabelError, LogError
-from semantic_mapper.fields.checkpoint import Checkpoint, anchor_from_frame, default_checkpoint_path, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.checkpoint import (
+    Checkpoint,
+    anchor_from_frame,
+    default_checkpoint_path,
+    load_checkpoint,
+    save_checkpoint,
+)
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import ROOMS, LabelSet

@@ -38,8 +38,8 @@ from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.frozen_encoder import encode_once, frozen_encoder_loss
-from semantic_mapper.training.images import ImageStepConfig, classifies_images, image_batch, images_loss
 from semantic_mapper.training.grid_fit import GridFitConfig
+from semantic_mapper.training.images import ImageStepConfig, classifies_images, image_batch, images_loss
 from semantic_mapper.training.linear_probe import fit_class_rows
 from semantic_mapper.training.losses import IGNORE, Loss, semantic_loss
 from semantic_mapper.training.optimiser import make_optimiser, set_rates

@@ -16,7 +16,6 @@ import torch
 
 from semantic_mapper.config import (
     AtLeastOne,
-    AtLeastTwo,
     AtLeastZero,
     Config,
     Fraction,
@@ -25,7 +24,7 @@ from semantic_mapper.config import (
     NotNegative,
     Positive,
 )
-from semantic_mapper.errors import ConfigError, FrameError
+from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.grid.kernels import (
     LossWeights,
     RayResults,
@@ -40,8 +39,8 @@ from semantic_mapper.fields.grid.march import most_samples
 from semantic_mapper.fields.grid.scene_grid import NOTHING, SceneGrid, at_resolution, grid_box, sky_texels
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
-from semantic_mapper.training.schedule import budget_fraction
 from semantic_mapper.training.grid_depth import depth_bounds, grid_of_depth
+from semantic_mapper.training.schedule import budget_fraction
 from semantic_mapper.types import Float32, Float64, PosedFrame
 
 BETA1, BETA2 = 0.9, 0.99
@@ -156,7 +155,7 @@ def fit_grid(
     if psnr < mean_psnr + MIN_GAIN_DB and fraction >= 1:
         raise FrameError(
             f"held-out views are rendered with {psnr:.1f} dB, hardly better than by their mean colour "
-            f"({mean_psnr:.1f} dB): poses do not fit the images, or the budget of {steps} steps is too small. Poses are "
+            f"({mean_psnr:.1f} dB): poses do not fit the images, or {steps} steps are too few. Poses are "
             "T_world_camera in metres, camera axes x right, y down, z forward; the scene must stand still, and the box "
             "must hold what is seen"
         )
@@ -176,7 +175,9 @@ def scene_box(frames: Sequence[PosedFrame], config: GridFitConfig) -> GridConfig
     box = grid_box(low, high, config.long_side, config.voxel_m)
     wanted = max(b - a for a, b in zip(low, high, strict=True)) / (config.long_side - 1)
     if config.voxel_m is None and box.voxel_m > wanted * (1 + 1e-9):
-        _log.warning("voxels_grown", wanted_m=round(wanted, 4), voxel_m=round(box.voxel_m, 4), reason="16 M voxels at most")
+        _log.warning(
+            "voxels_grown", wanted_m=round(wanted, 4), voxel_m=round(box.voxel_m, 4), reason="16 M voxels at most"
+        )
     return box
 
 
@@ -336,7 +337,9 @@ def view_fraction(rays: FrameRays, config: GridConfig, near_m: float) -> Float32
     for k, T in zip(rays.intrinsics, rays.T_world_camera.astype(np.float64), strict=True):
         # Camera coordinates are a sum of one term an axis.
         terms = [(a[:, None] - T[i, 3]) * T[i, :3] for i, a in enumerate(axes)]
-        x, y, z = (terms[0][:, None, None, c] + terms[1][None, :, None, c] + terms[2][None, None, :, c] for c in range(3))
+        x, y, z = (
+            terms[0][:, None, None, c] + terms[1][None, :, None, c] + terms[2][None, None, :, c] for c in range(3)
+        )
         inside = (z > near_m) & (np.abs(k.fx * x + (k.cx - k.width / 2 + 0.5) * z) <= k.width / 2 * z)
         count += inside & (np.abs(k.fy * y + (k.cy - k.height / 2 + 0.5) * z) <= k.height / 2 * z)
     return count / max(float(count.max()), 1.0)

@@ -169,7 +169,7 @@ def test_a_box_for_too_many_voxels_grows_them_and_says_so() -> None:
         box = scene_box(objects(), config)
     assert np.prod(box.shape) <= 1 << 24
     assert [entry["wanted_m"] for entry in logs if entry["event"] == "voxels_grown"] == [0.0083]
-    with pytest.raises(ConfigError, match="set voxel_m to 0.0197 or more"):
+    with pytest.raises(ConfigError, match=r"set voxel_m to 0\.0197 or more"):
         scene_box(objects(), msgspec.structs.replace(config, voxel_m=0.01))
 
 

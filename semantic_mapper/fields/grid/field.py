@@ -160,5 +160,3 @@ class GridField(LearnedField):
         before = torch.cumsum(depth, 1) - depth
         weight = torch.exp(-before) * -torch.expm1(-depth)
         return RaySamples(rays, points, z, weight, 1 - weight.sum(1))
-
-

@@ -1,4 +1,4 @@
-"""The compiled loops of the scene grid (``kernels/src/scene_grid.c``). ``reference.py`` holds the same in plain torch."""
+"""The compiled loops of the scene grid (``kernels/src/scene_grid.c``); ``reference.py`` has the same in plain torch."""
 
 from __future__ import annotations
 
@@ -72,7 +72,9 @@ class SampleLists(NamedTuple):
     def empty(cls, rays: int, most: int, channels: int) -> SampleLists:
         """Room for ``most`` samples a ray."""
         return cls(
-            np.empty((rays, most, 3), np.float32), np.empty((rays, most, channels), np.float32), np.zeros(rays, np.int64)
+            np.empty((rays, most, 3), np.float32),
+            np.empty((rays, most, channels), np.float32),
+            np.zeros(rays, np.int64),
         )
 
 

@@ -122,7 +122,9 @@ def plain_loss(
     error = ((weight / z).sum(1) - inverse) * (inverse > 0)
     huber = torch.where(error.abs() < LOSS.huber, error.square() / (2 * LOSS.huber), error.abs() - LOSS.huber / 2)
     per_point = LOSS.point_colour * (weight.detach() * apart).sum() / RAYS
-    return (seen - wanted).square().mean() + per_point + LOSS.opacity * (1 - light).mean() + LOSS.depth * huber.sum() / RAYS, seen
+    return (seen - wanted).square().mean() + per_point + LOSS.opacity * (
+        1 - light
+    ).mean() + LOSS.depth * huber.sum() / RAYS, seen
 
 
 def test_the_photometric_step_has_the_gradients_of_plain_torch() -> None:
@@ -166,7 +168,11 @@ def test_adam_steps_as_torch_does_and_leaves_what_has_no_gradient() -> None:
     values, _ = random_grid()
     gradient = np.random.default_rng(0).normal(size=(3, *values.shape)).astype(np.float32)
     gradient[:, :3] = 0
-    stepped, first, second = values.numpy().copy(), np.zeros(values.shape, np.float32), np.zeros(values.shape, np.float32)
+    stepped, first, second = (
+        values.numpy().copy(),
+        np.zeros(values.shape, np.float32),
+        np.zeros(values.shape, np.float32),
+    )
     leaf = values.clone().requires_grad_()
     optimiser = torch.optim.Adam([leaf], 0.1, betas=(0.9, 0.99), eps=1e-15)
     for step, g in enumerate(gradient, 1):
