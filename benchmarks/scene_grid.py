@@ -13,6 +13,7 @@ import hashlib
 import resource
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -22,11 +23,13 @@ import torch
 
 from benchmarks.grid_scenes import BOX_M, STREET_BOX_M, object_frames, objects_scene, street_frames
 from semantic_mapper.config import GridFieldConfig, SamplingConfig
+from semantic_mapper.fields.checkpoint import anchor_from_frame
 from semantic_mapper.fields.grid.field import GridField
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.peers.semantic_nerf import config_for_scene
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.fields.render import render_image
+from semantic_mapper.imaging import resize_depth
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.scenes import VALIDATION_SEEDS, NoiseConfig
 from semantic_mapper.scenes.sequence import room_views
@@ -39,7 +42,8 @@ from semantic_mapper.types import CameraIntrinsics, Float32, PosedFrame
 HELD_OUT_OBJECTS = 10
 ROOM_FRAMES, ROOM_EVERY = 40, 5  # one frame in five is held out
 ROOM_CAMERA = CameraIntrinsics(132.0, 132.0, 79.5, 59.5, 160, 120)
-FREE = SamplingConfig(mode="reference")  # no depth prior where a view is new
+HELD_OUT_WIDTH = 80
+FREE = SamplingConfig(mode="reference", coarse=32, fine=32)  # no depth prior where a view is new
 
 
 def measure_objects(seed: int, out: Path | None, settings: GridFitConfig) -> str:
@@ -77,17 +81,16 @@ def measure_street(seed: int, out: Path | None, settings: GridFitConfig) -> str:
 def measure_room(seed: int, out: Path | None, settings: GridFitConfig) -> list[str]:
     """Fit 32 of 40 frames with depth by a grid, then by semantic_nerf in as many CPU seconds."""
     views = list(room_views(seed, ROOM_FRAMES, ROOM_CAMERA, noise=NoiseConfig()))
-    frames = [v.frame for v in views]
-    exact = [v.rendered.exact_depth_m for v in views[ROOM_EVERY - 1 :: ROOM_EVERY]]
-    held_out = frames[ROOM_EVERY - 1 :: ROOM_EVERY]
-    seen = [f for i, f in enumerate(frames) if (i + 1) % ROOM_EVERY]
+    exact = [replace(v.frame, depth_m=v.rendered.exact_depth_m) for v in views[ROOM_EVERY - 1 :: ROOM_EVERY]]
+    held_out = [anchor_from_frame(f, HELD_OUT_WIDTH) for f in exact]
+    seen = [v.frame for i, v in enumerate(views) if (i + 1) % ROOM_EVERY]
     grid = msgspec.structs.replace(settings, held_out=0)
     began = time.process_time()
     fitted: LearnedField = fit_scene(
         seen, ROOMS, None, FinetuneConfig(seconds=0, steps=grid.steps, width=160, grid=grid)
     ).model
     seconds = time.process_time() - began
-    rows = [_room_row(f"grid, room {seed}", fitted, held_out, exact, seconds, out)]
+    rows = [_room_row(f"grid, room {seed}", fitted, held_out, seconds, out)]
     limit = time.process_time() + seconds
     config = FinetuneConfig(seconds=0, steps=10**6, width=160, patience=0, evaluations=1)
     box = config_for_scene(stack_sources([view_from_frame(f, ROOMS, 160) for f in seen]), 8.0)
@@ -95,7 +98,7 @@ def measure_room(seed: int, out: Path | None, settings: GridFitConfig) -> list[s
     nerf = finetune(
         seen, ROOMS, build_field("semantic_nerf", box, ROOMS), config, None, lambda: time.process_time() > limit
     ).model
-    rows.append(_room_row(f"semantic_nerf, room {seed}", nerf, held_out, exact, seconds, out))
+    rows.append(_room_row(f"semantic_nerf, room {seed}", nerf, held_out, seconds, out))
     return rows
 
 
@@ -103,12 +106,12 @@ def _room_row(
     name: str,
     field: LearnedField,
     held_out: Sequence[PosedFrame],
-    exact: Sequence[Float32],
     seconds: float,
     out: Path | None,
 ) -> str:
     renders = [_render(field, f) for f in held_out]
     _picture(out, name.replace(", ", "-").replace(" ", "-"), held_out, renders)
+    exact = [resize_depth(f, f.intrinsics) for f in held_out]
     errors = np.concatenate([np.abs(r[1] - d)[d > 0] for r, d in zip(renders, exact, strict=True)])
     figures = f"{_psnr(held_out, renders, gain=True):.1f} | {100 * np.median(errors):.1f} | {100 * errors.mean():.1f}"
     return f"| {name} | {figures} | {seconds:.1f} |"

@@ -101,7 +101,8 @@ class GridFit:
         seconds: Wall-clock time.
         psnr: Of held-out frames in dB, each with the gain that fits it best if exposure was fitted; NaN without.
         mean_colour_psnr: The same of images of their mean colour.
-        gains: (F, 3) exposure of the frames that it was fitted to.
+        frames: F frames that it was fitted to.
+        gains: (F, 3) their exposure.
     """
 
     grid: SceneGrid
@@ -109,6 +110,7 @@ class GridFit:
     seconds: float
     psnr: float
     mean_colour_psnr: float
+    frames: tuple[PosedFrame, ...]
     gains: Float32
 
 
@@ -159,7 +161,8 @@ def fit_grid(
             "T_world_camera in metres, camera axes x right, y down, z forward; the scene must stand still, and the box "
             "must hold what is seen"
         )
-    return GridFit(grid, steps, time.monotonic() - start, psnr, mean_psnr, np.exp(fitter.log_gain).astype(np.float32))
+    gains = np.exp(fitter.log_gain).astype(np.float32)
+    return GridFit(grid, steps, time.monotonic() - start, psnr, mean_psnr, tuple(seen), gains)
 
 
 def scene_box(frames: Sequence[PosedFrame], config: GridFitConfig) -> GridConfig:

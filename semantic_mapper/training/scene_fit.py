@@ -26,7 +26,7 @@ from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, finetune
-from semantic_mapper.training.frame_rays import FrameRays, frame_rays
+from semantic_mapper.training.frame_rays import frame_rays
 from semantic_mapper.training.grid_fit import GridFit, GridFitConfig, GridFitProgress, fit_grid, psnr_of
 from semantic_mapper.types import PosedFrame
 
@@ -105,15 +105,19 @@ def fit_scene(
     geometry = fit_geometry(GridField.kind, frames, label_set, start, config, on_progress, stopped)
     field = geometry.field
     if field.trunk is not None:
-        fit_trunk(field, field.trunk, frame_rays(frames, config.width), config.grid, stopped)
+        fit_trunk(field, field.trunk, geometry.fit, grid_settings(config), stopped)
     return scene_checkpoint(geometry, config, time.monotonic() - began, seen_stamps_ns)
 
 
 def fit_trunk(
-    field: GridField, trunk: Trunk, rays: FrameRays, config: GridFitConfig, stopped: Callable[[], object] = bool
+    field: GridField, trunk: Trunk, fit: GridFit, config: GridFitConfig, stopped: Callable[[], object] = bool
 ) -> float:
-    """Fit features, trunk and colour head to images; the geometry stays. Returns the PSNR of the last steps' rays."""
+    """Fit features, trunk and colour head to the frames of a grid's fit; the geometry stays.
+
+    Returns the PSNR of the last steps' rays in dB.
+    """
     rng = np.random.default_rng(config.seed)
+    rays = frame_rays(fit.frames, config.width)
     networks = [p for name, p in trunk.named_parameters() if name != "features"]
     groups = [{"params": [trunk.features], "lr": FEATURE_RATE}, {"params": networks, "lr": TRUNK_RATE}]
     optimiser = torch.optim.Adam(groups)
@@ -127,7 +131,8 @@ def fit_trunk(
             samples = field.march(batch, TRUNK_SAMPLES, torch.from_numpy(rng.random(len(pixels), np.float32)))
             behind = field.grid.sky_colour(batch.direction) * samples.light[:, None]
             weight = samples.weight * (samples.opacity / samples.weight.sum(1).clamp_min(1e-6))[:, None]
-        seen = (weight[..., None] * field.colour(samples)).sum(1) + behind
+        gain = torch.from_numpy(fit.gains[rays.frame_of(pixels)])
+        seen = gain * ((weight[..., None] * field.colour(samples)).sum(1) + behind)
         loss = nn.functional.mse_loss(seen, torch.from_numpy(rays.rgb[pixels] / np.float32(255)))
         optimiser.zero_grad()
         loss.backward()
