@@ -292,7 +292,7 @@ class _Fitter:
         behind = np.einsum("rt,rtc->rc", texel_weight, sky_colour[texel]).astype(np.float32)
         depth = self.rays.depth_m[pixels]
         inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
-        colour = self.rays.rgb[pixels] / np.float32(255)
+        colour = self.rays.rgb[pixels].astype(np.float32) / np.float32(255)
         results = RayResults(*(np.empty((len(pixels), 3), np.float32) for _ in range(3)))
         loss = LossWeights(self.config.point_colour, self.config.opacity, self.config.depth)
         rays = self.grid.rays(batch, jitter).arrays()
@@ -330,7 +330,7 @@ class _Adam:
 
 def _sums(index: np.ndarray, values: np.ndarray, count: int) -> Float64:
     """Sums (count, 3) of rows of ``values`` (N, 3) by ``index`` (N,)."""
-    return np.stack([np.bincount(index, values[:, c], count) for c in range(3)], axis=1)
+    return np.stack([np.bincount(index, values[:, c], count) for c in range(3)], axis=1).astype(np.float64)
 
 
 def view_fraction(rays: FrameRays, config: GridConfig, near_m: float) -> Float32:

@@ -83,7 +83,8 @@ class GridField(LearnedField):
         Override it, and ``known`` where opacity is not what decides. The base knows no classes.
         """
         count = len(samples.light)
-        return samples.z.new_zeros(count, len(self.label_set)), torch.zeros(count, dtype=torch.bool)
+        none = torch.zeros(count, dtype=torch.bool, device=samples.z.device)
+        return samples.z.new_zeros(count, len(self.label_set)), none
 
     def known(self, samples: RaySamples, *, sky: bool = False) -> torch.Tensor:
         """Where rays (R,) have met something; for kinds with a class for the sky, ``sky`` = those that leave, too."""

@@ -62,11 +62,11 @@ class LossWeights(NamedTuple):
 
 
 class SampleLists(NamedTuple):
-    """Samples of each ray: points (R, S, 3) in voxels, gradient (R, S, C), count (R,) of the S that are there."""
+    """Samples of each ray: points (R, S, 3) in voxels, gradient (R, S, C), counts (R,) of the S that are there."""
 
     points: Float32
     gradient: Float32
-    count: Int64
+    counts: Int64
 
     @classmethod
     def empty(cls, rays: int, most: int, channels: int) -> SampleLists:

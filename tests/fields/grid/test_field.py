@@ -115,7 +115,7 @@ def test_a_file_holds_the_grid_as_float16_and_gives_it_back(features: int, tmp_p
 
 
 def test_views_give_the_box_of_their_scene() -> None:
-    field = build_field("grid", {}, LABELS)
+    field = GridField(GridFieldConfig(), LABELS)
     box = field.scene_config(wall_sources(POSES), 5.0).grid
     high = [o + (n - 1) * box.voxel_m for o, n in zip(box.origin_m, box.shape, strict=True)]
     assert box.origin_m[2] <= 0 and high[2] >= WALL_M - 1e-4 and max(box.shape) == max(field.config.grid.shape)
