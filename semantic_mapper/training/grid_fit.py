@@ -49,7 +49,7 @@ PRUNE_EVERY = 200  # steps
 WARM_UP = 200  # steps before anything is pruned
 COARSE = ((0.0, 3), (0.3, 1.5), (0.6, 1))  # fraction of the steps, and how much coarser the grid is until the next
 MIN_PARALLAX = 1e-3  # distance of cameras as a fraction of the box, below which poses only turn
-MIN_FRAMES = 4
+MIN_FRAMES = 2
 MIN_GAIN_DB = 1.0  # over the mean colour; the sky's colours alone, with poses that mean nothing, gain half of it
 _log = get_logger(__name__)
 
