@@ -143,7 +143,7 @@ def fit_grid(
         raise FrameError(f"a grid needs at least {MIN_FRAMES} frames to fit besides held-out ones, got {len(seen)}")
     box = box or scene_box(frames, config)
     _check_parallax(frames, box)
-    fitter = _Fitter(frame_rays(seen, config.width), box, config, seen)
+    fitter = _Fitter(frame_rays(seen, config.width), box, config)
     steps = 0
     fraction = 0.0
     while fraction < 1 and not stopped():
@@ -222,23 +222,19 @@ def psnr_of(mean_square: float) -> float:
 class _Fitter:
     """The grid at its present resolution, and the state of Adam."""
 
-    def __init__(self, rays: FrameRays, box: GridConfig, config: GridFitConfig, frames: Sequence[PosedFrame]) -> None:
+    def __init__(self, rays: FrameRays, box: GridConfig, config: GridFitConfig) -> None:
         self.rays, self.box, self.config = rays, box, config
         self.rng = np.random.default_rng(config.seed)
         self.order = np.zeros(0, np.int64)
-        self.log_gain = np.zeros((len(frames), 3))
-        self.has_depth = bool((rays.depth_m > 0).any())
+        self.log_gain = np.zeros((len(rays.intrinsics), 3))
+        from_depth = config.start_from_depth and bool((rays.depth_m > 0).any())
         # A start from depth has nothing to gain from coarse grids.
-        self.stages = COARSE[-1:] if self._from_depth else COARSE
+        self.stages = COARSE[-1:] if from_depth else COARSE
         self.stage = 0
         first = at_resolution(box, self._long_side(0))
-        self.grid = grid_of_depth(rays, first) if self._from_depth else SceneGrid(first)
+        self.grid = grid_of_depth(rays, first) if from_depth else SceneGrid(first)
         self.gain_adam, self.sky_adam = _Adam(self.log_gain.shape), _Adam(tuple(self.grid.sky.shape))
         self._allocate()
-
-    @property
-    def _from_depth(self) -> bool:
-        return self.has_depth and self.config.start_from_depth
 
     def _long_side(self, stage: int) -> int:
         return max(round(max(self.box.shape) / self.stages[stage][1]), 8)
@@ -286,10 +282,7 @@ class _Fitter:
         batch, frame = self.rays.rays(pixels, self.config.near_m), self.rays.frame_of(pixels)
         jitter = torch.from_numpy(self.rng.random(len(pixels), np.float32))
         gain = np.exp(self.log_gain[frame]).astype(np.float32)
-        texel, texel_weight = (t.numpy() for t in sky_texels(batch.direction))
-        sky = self.grid.sky.detach().numpy().reshape(-1, 3)
-        sky_colour = 1 / (1 + np.exp(-sky))
-        behind = np.einsum("rt,rtc->rc", texel_weight, sky_colour[texel]).astype(np.float32)
+        behind = self.grid.sky_colour(batch.direction).detach().numpy()
         depth = self.rays.depth_m[pixels]
         inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
         colour = self.rays.rgb[pixels].astype(np.float32) / np.float32(255)
@@ -299,24 +292,26 @@ class _Fitter:
         targets = TargetArrays(colour, inverse, gain, behind)
         photometric_rays(len(pixels), self.grid.arrays(), rays, targets, loss, self.samples, results)
         scatter_grid(len(self.gradient), self.samples, self.gradient)
-        by_texel = texel_weight[..., None] * results.sky_gradient[:, None]
-        sky -= SKY_RATE * self.sky_adam.step(
-            (_sums(texel.ravel(), by_texel.reshape(-1, 3), len(sky)) * sky_colour * (1 - sky_colour)).reshape(
-                self.sky_adam.shape
-            )
-        ).reshape(-1, 3).astype(np.float32)
+        self._step_sky(batch.direction, results.sky_gradient)
         if self.config.exposure:
             gradient = _sums(frame, results.gain_gradient * gain, len(self.log_gain))
             self.log_gain -= GAIN_RATE * self.gain_adam.step(gradient)
             self.log_gain -= self.log_gain.mean(0)
         return float(np.square(results.colour - colour).mean())
 
+    def _step_sky(self, direction: torch.Tensor, gradient: Float32) -> None:
+        """One step of the sky, given the gradient (R, 3) by its colour in directions (R, 3)."""
+        texel, weight = (t.numpy() for t in sky_texels(direction))
+        sky = self.grid.sky.detach().numpy()
+        colour = 1 / (1 + np.exp(-sky))
+        by_texel = _sums(texel.ravel(), (weight[..., None] * gradient[:, None]).reshape(-1, 3), sky[..., 0].size)
+        sky -= SKY_RATE * self.sky_adam.step(by_texel.reshape(sky.shape) * colour * (1 - colour)).astype(np.float32)
+
 
 class _Adam:
     """Adam's direction for a small array."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        self.shape = shape
         self.first, self.second, self.count = np.zeros(shape), np.zeros(shape), 0
 
     def step(self, gradient: Float64) -> Float64:
