@@ -62,7 +62,7 @@ def seen_bounds(views: SourceViews, far_m: float) -> tuple[tuple[float, ...], tu
         points = (ray * reach[:, None]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
         corners += [points.amin(0), points.amax(0), T_world_camera[:3, 3]]
     low, high = torch.stack(corners).amin(0), torch.stack(corners).amax(0)
-    return tuple(low.tolist()), tuple(high.tolist())
+    return tuple(float(x) for x in low), tuple(float(x) for x in high)
 
 
 def scaled_camera(K: torch.Tensor, scale_x: float, scale_y: float) -> torch.Tensor:
