@@ -83,5 +83,5 @@ def street_frames(seed: int, count: int) -> list[PosedFrame]:
     frames: list[PosedFrame] = []
     for i, pose in enumerate(poses):
         view = render_street(street, k, pose, shots[i], noise, i)
-        frames.append(PosedFrame(i * 10**8, i, "street", view.rgb, None, view.label, k, pose))
+        frames.append(PosedFrame(i * 10**8, i, "street", view.rgb, None, None, k, pose))
     return frames
