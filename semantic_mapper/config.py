@@ -134,6 +134,24 @@ class SemanticNeRFConfig(Config, frozen=True):
     half_extent_m: float = 8.0  # half the side of the box
 
 
+class GridConfig(Config, frozen=True):
+    """The box of a scene grid: its vertices lie at ``origin_m`` + ``voxel_m`` * (i, j, k) in the world."""
+
+    origin_m: tuple[float, float, float] = (-4.0, -4.0, -1.0)
+    voxel_m: Positive = 0.1
+    shape: tuple[AtLeastTwo, AtLeastTwo, AtLeastTwo] = (81, 81, 41)  # vertices along x, y and z
+
+
+class GridFieldConfig(Config, frozen=True):
+    """A scene grid as a field."""
+
+    grid: GridConfig = GridConfig()
+    # Features a vertex of a grid of half the resolution, for colours that depend on the direction and for kinds that
+    # read classes from them; 0 = none
+    features: Annotated[int, msgspec.Meta(ge=0, le=64)] = 0
+    trunk_width: Channels = 128  # of the MLP behind the features
+
+
 class SamplingConfig(Config, frozen=True):
     """Where a ray is sampled."""
 

@@ -25,8 +25,10 @@ FinetuneDepthOption = Annotated[
 @verb
 def finetune(
     log: Annotated[Path, typer.Argument(help="Log with label images (.mcap).")],
-    keyframes: Annotated[int, typer.Option("--keyframes", min=2, help="How many labelled frames to use.")],
     out: Annotated[Path, typer.Option("--out", help="Weights file to write (.safetensors).")],
+    keyframes: Annotated[
+        int | None, typer.Option("--keyframes", min=2, help="How many labelled frames to use; none for --kind grid.")
+    ] = None,
     seconds: Annotated[
         float | None, typer.Option(min=0, help="Time for training [300]; 0 = only --steps counts.")
     ] = None,
@@ -39,6 +41,9 @@ def finetune(
         Path | None, typer.Option(help="Weights to start from; without it the small ones in the package.")
     ] = None,
     from_scratch: Annotated[bool, typer.Option("--from-scratch", help="Start from random weights.")] = False,
+    kind: Annotated[
+        str | None, typer.Option(help="Fit a field of this kind to the scene, from all frames; grid: no classes.")
+    ] = None,
     depth: FinetuneDepthOption = None,
 ) -> int:
     """Fit the field to a few labelled keyframes of a log.
@@ -52,6 +57,10 @@ def finetune(
     """
     if from_scratch and weights is not None:
         raise typer.BadParameter("goes with random weights only", param_hint="--weights")
+    if kind is not None and (weights is not None or from_scratch):
+        raise typer.BadParameter("starts from nothing; leave out --weights and --from-scratch", param_hint="--kind")
+    if (keyframes is None) != (kind == "grid"):
+        raise typer.BadParameter("how many labelled frames? Only --kind grid learns none", param_hint="--keyframes")
     output = Output.guarded()
     import msgspec
 
@@ -59,7 +68,12 @@ def finetune(
     from semantic_mapper.nodes.cli.run_finetune import FinetuneRequest, finetune_log
     from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, mapper_config
     from semantic_mapper.training.finetune import FinetuneConfig
+    from semantic_mapper.training.scene_fit import FITTERS
 
+    if kind is not None and kind not in FITTERS:
+        raise typer.BadParameter(
+            f"no kind '{kind}' is fitted to one scene; there is {', '.join(FITTERS)}", param_hint="--kind"
+        )
     given = {"seconds": seconds, "steps": steps, "seed": seed}
     settings = load_config(config, FinetuneConfig) if config is not None else FinetuneConfig()
     settings = msgspec.structs.replace(settings, **{name: v for name, v in given.items() if v is not None})
@@ -67,22 +81,27 @@ def finetune(
         raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
     keep_freed_memory()
     depths = mapper_config(None, None, depth=depth or "sensor", delay_frames=REPLAY_DELAY_FRAMES).depth
-    request = FinetuneRequest(log, keyframes, out, settings, weights, from_scratch, depths)
+    request = FinetuneRequest(log, keyframes or 0, out, settings, weights, from_scratch, depths, kind)
     with StopRequest() as stop, frame_progress("finetune", None, unit="%") as bar:
         checkpoint, chosen = finetune_log(request, stop, bar)
     recipe = checkpoint.recipe
-    output.print(f"{out}: finetuned on frames {', '.join(map(str, chosen))} of {log.name}")
-    output.print(
-        f"  {recipe['steps']} steps in {recipe['seconds']} s, best at step {recipe['best_step']}: held-out loss "
-        f"{recipe['held_out_loss']:.3f}, accuracy {recipe['held_out_accuracy'] * 100:.1f} %"
-    )
+    if chosen:
+        output.print(f"{out}: finetuned on frames {', '.join(map(str, chosen))} of {log.name}")
+    if "psnr" in recipe:
+        psnr = "no views held out" if recipe["psnr"] is None else f"held-out views {recipe['psnr']:.1f} dB"
+        output.print(f"{out}: grid of {log.name}, {recipe['steps']} steps in {recipe['seconds']} s, {psnr}")
+    else:
+        output.print(
+            f"  {recipe['steps']} steps in {recipe['seconds']} s, best at step {recipe['best_step']}: held-out loss "
+            f"{recipe['held_out_loss']:.3f}, accuracy {recipe['held_out_accuracy'] * 100:.1f} %"
+        )
     if pseudo := recipe.get("pseudo_labels"):
         by = f" that {pseudo['of']} has rendered" if pseudo["of"] else ""
         output.print(
             f"  {pseudo['keyframes']} of the {len(chosen)} keyframes have pseudo labels{by}: the figures above say how "
             "well these are learned, not how right they are"
         )
-    if own := recipe["own_view"]:
+    if own := recipe.get("own_view"):
         output.print(
             f"  a frame's own image counts {own['factor']:g} times among the views, "
             f"{own['factor_without_depth']:g} times where there is no depth"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,19 +11,28 @@ import structlog
 
 from semantic_mapper.config import DepthConfig
 from semantic_mapper.errors import FrameError, LabelError, LogError
-from semantic_mapper.fields.checkpoint import Checkpoint, default_checkpoint_path, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.checkpoint import (
+    Checkpoint,
+    anchor_from_frame,
+    default_checkpoint_path,
+    load_checkpoint,
+    save_checkpoint,
+)
+from semantic_mapper.fields.sray import SRay
 from semantic_mapper.geometry import check_pose
-from semantic_mapper.labels import LabelSet
+from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.nodes.cli.console import FrameProgress
 from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.log_depth import ComputedFrame, compute_depths
-from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, finetune
+from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress
+from semantic_mapper.training.scene_fit import FITTERS, fitter_of
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.types import PosedFrame
 
+MAX_SCENE_FRAMES = 300  # that a field of one scene is fitted to
 _log = structlog.get_logger(__name__)
 
 
@@ -30,7 +40,8 @@ _log = structlog.get_logger(__name__)
 class FinetuneRequest:
     """What the verb was requested; ``weights`` None = those in the package, ``from_scratch`` = random ones.
 
-    ``depth`` says where the frames' depth comes from.
+    ``depth`` says where the frames' depth comes from. ``kind`` names a kind of field that is fitted to one scene, from
+    nothing; None = that of the weights. ``keyframes`` is 0 for a kind that learns no classes.
     """
 
     log: Path
@@ -40,6 +51,7 @@ class FinetuneRequest:
     weights: Path | None
     from_scratch: bool
     depth: DepthConfig
+    kind: str | None = None
 
 
 def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress) -> tuple[Checkpoint, list[int]]:
@@ -53,24 +65,33 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
     """
     prepare_file(request.out)
     # First, so that a wrong path does not cost the reading of a log.
-    start = None if request.from_scratch else load_checkpoint(request.weights or default_checkpoint_path())
+    nothing = request.from_scratch or request.kind is not None
+    start = None if nothing else load_checkpoint(request.weights or default_checkpoint_path())
+    kind = request.kind or (SRay.kind if start is None else start.model.kind)
     with open_log(request.log) as log:
         label_set = log.info.label_set
-        if label_set is None:
+        if label_set is None and request.keyframes:
             raise LabelError(f"{request.log}: has no label images; finetuning needs labelled keyframes")
+        label_set = label_set or ROOMS
         computed = _compute_depths(log, request.depth, stop, bar)
-        frames = choose_labelled(log, label_set, request, computed, stop, bar)
+        frames = choose_labelled(log, label_set, request, computed, stop, bar) if request.keyframes else []
+        chosen = [f.seq for f in frames]
+        pseudo = sum(f.label_is_pseudo for f in frames)
+        if kind in FITTERS:
+            frames += read_unlabelled(log, frames, request, computed, stop, bar)
         note = read_note(log.attachments())
     seen = frozenset[int]() if start is None else start.train_stamps_ns
-    if (pseudo := sum(frame.label_is_pseudo for frame in frames)) and note is not None:
+    if pseudo and note is not None:
         seen |= frozenset(note.train_stamps_ns)  # who learns from a teacher has learned from its keyframes
     bar.start(100)
 
     def on_progress(progress: FinetuneProgress) -> None:
         note = f"step {progress.step} held-out loss {progress.held_out_loss:.3f}"
-        bar.set(int(progress.fraction * 100), f"{note} accuracy {progress.held_out_accuracy * 100:.1f} %")
+        if not math.isnan(progress.held_out_accuracy):
+            note += f" accuracy {progress.held_out_accuracy * 100:.1f} %"
+        bar.set(int(progress.fraction * 100), note)
 
-    checkpoint = finetune(
+    checkpoint = fitter_of(kind)(
         frames,
         label_set,
         None if start is None else start.model,
@@ -85,7 +106,7 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
     if pseudo:
         checkpoint.recipe["pseudo_labels"] = {"keyframes": pseudo, "of": "" if note is None else note.weights}
     save_checkpoint(checkpoint, request.out)
-    return checkpoint, [f.seq for f in frames]
+    return checkpoint, chosen
 
 
 def _compute_depths(
@@ -167,6 +188,43 @@ def choose_labelled(
         )
     chosen = choose_keyframes(candidates, request.keyframes, request.config.seed)
     return [_as_given(log.frame(numbers[i]), computed, request.depth) for i in chosen]
+
+
+def read_unlabelled(
+    log: Log,
+    labelled: list[PosedFrame],
+    request: FinetuneRequest,
+    computed: Mapping[tuple[str, int], ComputedFrame],
+    stop: StopRequest,
+    bar: FrameProgress,
+) -> list[PosedFrame]:
+    """The other frames of the log at working width, without labels: at most ``MAX_SCENE_FRAMES``, evenly spread.
+
+    Frames that cannot be read are left out and counted.
+
+    Raises:
+        KeyboardInterrupt: a stop request came.
+    """
+    known = {(f.camera_id, f.stamp_ns) for f in labelled}
+    every = -(-len(log) // MAX_SCENE_FRAMES)
+    frames: list[PosedFrame] = []
+    damaged = 0
+    bar.start(len(log))
+    for number in range(0, len(log), every):
+        bar.set(number + 1, "reading frames")
+        if stop:
+            raise KeyboardInterrupt
+        try:
+            frame = log.frame(number)
+        except (LogError, FrameError):
+            damaged += 1
+            continue
+        if (frame.camera_id, frame.stamp_ns) not in known:
+            given = replace(_as_given(frame, computed, request.depth), label=None)
+            frames.append(anchor_from_frame(given, request.config.width))
+    if damaged:
+        _log.warning("frames_left_out", count=damaged, reason="they cannot be read; `semantic-mapper recover` may help")
+    return frames
 
 
 def _check_size(frame: PosedFrame, size: tuple[int, int]) -> None:

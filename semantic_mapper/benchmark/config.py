@@ -26,6 +26,7 @@ from semantic_mapper.scenes import SUITE_VERSION, CameraPathConfig, RoomConfig
 from semantic_mapper.scenes.config import DepthSensorName
 from semantic_mapper.scenes.suite import ROOMS_SUITE
 from semantic_mapper.training.finetune import FinetuneConfig
+from semantic_mapper.training.grid_fit import GridFitConfig
 from semantic_mapper.training.step import StepConfig
 from semantic_mapper.types import CameraIntrinsics
 
@@ -207,6 +208,7 @@ def fit_config(suite: SuiteConfig, share: float) -> FinetuneConfig:
             known_labels=scene.labelled_sources,
         ),
         seed=suite.seed,
+        grid=GridFitConfig(held_out=0),  # all keyframes count; query views are others
     )
 
 

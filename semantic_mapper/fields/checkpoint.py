@@ -108,6 +108,7 @@ def checkpoint_bytes(checkpoint: Checkpoint, *, half: bool = False) -> bytes:
     Raises:
         SafetensorError: tensors that the format does not know.
     """
+    half = half or checkpoint.model.stored_in_half
     # Running variances span more powers of ten than float16 has.
     tensors = {
         f"model.{name}": _stored(t, half and "running_" not in name)

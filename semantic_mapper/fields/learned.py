@@ -35,6 +35,7 @@ class LearnedField(nn.Module, ABC):
     holds_scene: ClassVar[bool] = False  # whether its density is the geometry of the one scene that it was fitted to
     class_rows: ClassVar[tuple[str, ...]] = ()  # names of the parameters with one row a class, in channel order
     image_parts: ClassVar[tuple[str, ...]] = ()  # names of the modules that classify an image's features by themselves
+    stored_in_half: ClassVar[bool] = False  # whether files hold its weights as float16
     encoding_parts: ClassVar[tuple[str, ...]] = ()  # names of the modules that ``encode`` uses; none = not known
 
     def __init__(self, config: Config, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:

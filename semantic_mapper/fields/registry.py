@@ -9,6 +9,7 @@ import msgspec
 
 from semantic_mapper.config import (
     Config,
+    GridFieldConfig,
     MVSNeRFConfig,
     NeuRayConfig,
     SamplingConfig,
@@ -28,6 +29,7 @@ KINDS: dict[str, tuple[type[Config], str, str]] = {
     "neuray": (NeuRayConfig, "semantic_mapper.fields.peers.neuray", "NeuRay"),
     "mvsnerf": (MVSNeRFConfig, "semantic_mapper.fields.peers.mvsnerf", "MVSNeRF"),
     "semantic_nerf": (SemanticNeRFConfig, "semantic_mapper.fields.peers.semantic_nerf", "SemanticNeRF"),
+    "grid": (GridFieldConfig, "semantic_mapper.fields.grid.field", "GridField"),
 }
 
 # A name for some switches of a kind. The field built is of that kind, and so is its checkpoint: the switches are part

@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.geometry_net import GEOMETRY_CHANNELS
-from semantic_mapper.geometry import expect_shape, invert_pose_torch
+from semantic_mapper.geometry import expect_shape, invert_pose_torch, pixel_grid
 from semantic_mapper.types import SourceViews
 
 UNSURE_SPREAD = 0.10  # spread of computed depth, as a fraction of it, from which on it counts as a hole
@@ -43,6 +43,26 @@ def sure_depth(views: SourceViews, *, computed: bool) -> SourceViews:
     worst = UNSURE_SPREAD * views.depth_m if computed else torch.zeros_like(views.depth_m)
     sure = views.depth_sigma_m <= worst
     return replace(views, depth_m=views.depth_m * sure, depth_sigma_m=views.depth_sigma_m * sure)
+
+
+def seen_bounds(views: SourceViews, far_m: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Lower and upper corner (3,) in the world of what views of a scene can see, their cameras included.
+
+    Args:
+        far_m: How far pixels without measured depth may see.
+    """
+    corners: list[torch.Tensor] = []
+    height, width = views.rgb.shape[-2:]
+    pixels = pixel_grid(width, height, views.rgb.device)[:, :2].to(views.K.dtype)
+    for K, T_world_camera, depth in zip(views.K, views.T_world_camera, views.depth_m.flatten(1), strict=True):
+        ray = torch.stack(
+            ((pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[1, 1], torch.ones_like(pixels[:, 0])), -1
+        )
+        reach = torch.where(depth > 0, depth, far_m)
+        points = (ray * reach[:, None]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+        corners += [points.amin(0), points.amax(0), T_world_camera[:3, 3]]
+    low, high = torch.stack(corners).amin(0), torch.stack(corners).amax(0)
+    return tuple(float(x) for x in low), tuple(float(x) for x in high)
 
 
 def scaled_camera(K: torch.Tensor, scale_x: float, scale_y: float) -> torch.Tensor:

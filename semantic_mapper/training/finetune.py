@@ -38,6 +38,7 @@ from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.frozen_encoder import encode_once, frozen_encoder_loss
+from semantic_mapper.training.grid_fit import GridFitConfig
 from semantic_mapper.training.images import ImageStepConfig, classifies_images, image_batch, images_loss
 from semantic_mapper.training.linear_probe import fit_class_rows
 from semantic_mapper.training.losses import IGNORE, Loss, semantic_loss
@@ -109,6 +110,7 @@ class FinetuneConfig(Config, frozen=True):
     seed: NotNegative = 0
     device: DeviceName = "auto"
     step: StepConfig = StepConfig()
+    grid: GridFitConfig = GridFitConfig()  # of kinds that stand on a scene grid (``scene_fit``)
 
 
 @dataclass(frozen=True, slots=True)

@@ -255,6 +255,14 @@ def test_a_kind_for_one_scene_is_fitted_in_a_box_round_what_the_keyframes_see() 
     assert 0.5 * depth_m < box.half_extent_m
 
 
+def test_a_scene_grid_has_its_own_fitter_and_claims_no_class() -> None:
+    (entry,) = load_entries([], ["grid"])
+    scene = {"keyframes": 3, "guard": 1, "seconds": 0, "steps": 5, "shares": (1.0,)}
+    record = score(entry, tiny_suite(protocol="scratch", scene=scene)).record
+    assert record.curve[-1].steps == 5
+    assert from_rows(record.confusion).metrics().coverage == 0
+
+
 def test_a_fitting_that_is_stopped_gives_no_figures() -> None:
     steps: list[float] = []
     suite = tiny_suite(protocol="finetune", scene={"keyframes": 3, "guard": 1, "seconds": 0, "steps": 50})

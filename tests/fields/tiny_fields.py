@@ -9,6 +9,8 @@ import torch
 from semantic_mapper.config import (
     Config,
     EncoderConfig,
+    GridConfig,
+    GridFieldConfig,
     MVSNeRFConfig,
     NeuRayConfig,
     SamplingConfig,
@@ -35,6 +37,7 @@ TINY: dict[str, Config] = {
     "neuray": NeuRayConfig(feature_dim=16, encoder=COLOURS_ONLY),
     "mvsnerf": MVSNeRFConfig(feature_dim=8, encoder=COLOURS_ONLY, planes=8, volume_channels=4, width=16),
     "semantic_nerf": SemanticNeRFConfig(width=16, position_frequencies=4, half_extent_m=4.0),
+    "grid": GridFieldConfig(grid=GridConfig(origin_m=(-2.0, -2.0, -1.0), voxel_m=0.25, shape=(17, 17, 17))),
     "sray-paper": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
     "sray-none": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
     "sray-intra": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),

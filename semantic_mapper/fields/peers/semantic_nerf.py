@@ -21,9 +21,8 @@ from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.nerf_math import density_from, encode_frequencies, encoded_size, relu_layers
 from semantic_mapper.fields.ray_render import composite_render
-from semantic_mapper.fields.source_maps import check_views, encoded_views
+from semantic_mapper.fields.source_maps import check_views, encoded_views, seen_bounds
 from semantic_mapper.fields.volume import composite, compositing_weights, interval_lengths
-from semantic_mapper.geometry import pixel_grid
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 
@@ -109,17 +108,8 @@ def config_for_scene(
         far_m: How far pixels without measured depth may see.
         margin_m: Added on every side.
     """
-    corners: list[torch.Tensor] = []
-    height, width = views.rgb.shape[-2:]
-    pixels = pixel_grid(width, height, views.rgb.device)[:, :2].to(views.K.dtype)
-    for K, T_world_camera, depth in zip(views.K, views.T_world_camera, views.depth_m.flatten(1), strict=True):
-        ray = torch.stack(
-            ((pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[1, 1], torch.ones_like(pixels[:, 0])), -1
-        )
-        reach = torch.where(depth > 0, depth, far_m)
-        points = (ray * reach[:, None]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-        corners += [points.amin(0), points.amax(0), T_world_camera[:3, 3]]
-    low, high = torch.stack(corners).amin(0), torch.stack(corners).amax(0)
+    bounds = seen_bounds(views, far_m)
+    low, high = torch.tensor(bounds[0]), torch.tensor(bounds[1])
     centre = ((low + high) / 2).tolist()
     half = float((high - low).max()) / 2 + margin_m
     return msgspec.structs.replace(

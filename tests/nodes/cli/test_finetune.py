@@ -133,3 +133,32 @@ def test_labelled_frames_of_another_size_are_left_out(weights: Path, tmp_path: P
     done = run("finetune", mixed, *arguments, "--out", out)
     assert done.returncode == 0, done.stderr
     assert "48x36, but the first one is 96x72" in done.stderr and len(load_checkpoint(out).anchors) == 3
+
+
+def test_a_grid_of_a_scene_needs_no_labels_and_claims_none_in_a_replay(log: Path, tmp_path: Path) -> None:
+    out, settings = tmp_path / "grid.safetensors", tmp_path / "small.toml"
+    settings.write_text("width = 96\n[grid]\nlong_side = 32\nrays = 256\n")
+    arguments = ("--kind", "grid", "--steps", "20", "--seconds", "0", "--config", settings)
+    done = run("finetune", log, *arguments, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "grid of room.mcap, 20 steps" in done.stdout
+    checkpoint = load_checkpoint(out)
+    assert checkpoint.model.kind == "grid" and not checkpoint.train_stamps_ns
+    done = run("replay", log, "--weights", out, "--out", tmp_path / "replayed")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "replayed" / "summary.json").read_text())
+    assert summary["frames"]["fused"] == 6
+    assert summary["metrics"]["coverage"] == 0.0 and summary["map"]["unknown"] == 1.0  # no class is claimed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--kind", "grid", "--keyframes", "2"), "Only --kind grid learns none"),
+        (("--kind", "sray", "--keyframes", "2"), "there is grid"),
+        (("--kind", "grid", "--from-scratch"), "starts from nothing"),
+    ],
+)
+def test_options_that_do_not_go_with_a_kind_are_refused(arguments, said, log: Path, tmp_path: Path) -> None:
+    done = run("finetune", log, *arguments, "--out", tmp_path / "w.safetensors")
+    assert done.returncode == 2 and said in " ".join(done.stderr.split())
