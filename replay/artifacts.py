@@ -146,8 +146,8 @@ def nearly_empty(session: MapSession, points: int) -> str | None:
     if 2 * session.computed_depth >= mapped and 2 * session.fused <= session.computed_depth:
         return (
             f"{found}; depth computed from their pictures is too unsure in all but {session.fused} of them: the way of "
-            "the camera is too short, against the error of its poses, to tell lengths from it; move on sideways, by half "
-            "a metre or more"
+            "the camera is too short, against the error of its poses, to tell lengths from it; move on sideways, by "
+            "half a metre or more"
         )
     if 2 * session.computed_depth >= mapped:
         return (

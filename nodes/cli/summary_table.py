@@ -73,8 +73,8 @@ def notes(summary: Mapping[str, Any]) -> list[str]:
     )
     if unused and dig(summary, "depth.computed_fraction"):
         lines.append(
-            f"{counted(unused, 'frame')} added nothing to the map: no depth was computed, or it was too unsure, as at the "
-            "beginning of a walk"
+            f"{counted(unused, 'frame')} added nothing to the map: no depth was computed, or it was too unsure, as at "
+            "the beginning of a walk"
         )
     if summary.get("scale") == "unknown":
         lines.append(f"scale: unknown; lengths of this map are not metres, and what needs metres is refused: {MEND}")

@@ -7,7 +7,7 @@ import numpy as np
 from semantic_mapper.types import Float64
 
 _BINS = 60
-_SHARE = 0.2  # of the strongest layer below the camera: the lowest layer that is as strong is the floor
+_STRONG = 0.2  # of the strongest layer below the camera: the lowest layer that is as strong is the floor
 _LEAST_POINTS = 20
 _MOST_BELOW, _MARGIN = 0.03, 0.1  # fraction of the points further below it than this part of the camera's height
 
@@ -25,7 +25,7 @@ def floor_height(z: Float64, camera_z: float) -> float | None:
     low = float(np.percentile(below, 0.5))
     counts, edges = np.histogram(below, bins=_BINS, range=(low - 1e-6, camera_z))
     summed = np.convolve(counts, (1, 1, 1), mode="same")  # a layer lies across bins
-    strong = np.flatnonzero(summed >= max(_LEAST_POINTS, _SHARE * summed.max()))
+    strong = np.flatnonzero(summed >= max(_LEAST_POINTS, _STRONG * summed.max()))
     if not len(strong):
         return None
     at = int(strong[0])
