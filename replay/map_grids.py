@@ -1,53 +1,37 @@
-"""Maps with labelled hits, which ``refine`` learns from: procedural rooms or own labelled logs, mapped and kept.
+"""What ``refine`` learns from: procedural rooms or own labelled logs are mapped, and their surfaces and labels kept.
 
-Each map is a pair of files in one folder: ``NAME.npz``, the map as ``replay`` would save it, and ``NAME.hits.npz``, the
-voxels that rays of labelled pixels meet. Labels are those of the images: nothing in 3D is labelled by hand.
+Labels are those of the images, at the voxels that the rays of their pixels meet: nothing in 3D is labelled by hand.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.benchmark.config import MAP_WIDTH, SequenceConfig, camera_of_width
-from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.files import atomic_write
+from semantic_mapper.fields.sparse_conv import find_rows, pack_cells
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
+from semantic_mapper.mapping.refine import surface_voxels, up_frame
+from semantic_mapper.mapping.storage.block_index import KEY_LIMIT
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, room_frames
-from semantic_mapper.types import PosedFrame
+from semantic_mapper.training.nesf import TrainingMap
+from semantic_mapper.types import Float64, PosedFrame
 
 ROOM_FRAMES = 32
+UP = np.array((0.0, 0.0, 1.0))  # of procedural rooms
 AGREE_M = 0.1  # a hit farther from what the frame measured speaks of another surface
-HITS_SUFFIX = ".hits.npz"
 
 _log = get_logger(__name__)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LabelledHits:
-    """Where rays of labelled pixels meet a map.
-
-    Args:
-        voxel: (N, 3) int32, the voxel nearest to the hit.
-        channel: (N,) uint8 class channel of the map's label set; a voxel may come with several.
-        count: (N,) uint16 pixels.
-    """
-
-    voxel: NDArray[np.int32]
-    channel: NDArray[np.uint8]
-    count: NDArray[np.uint16]
 
 
 def make_room_maps(
@@ -69,10 +53,11 @@ def make_room_maps(
     paths: list[Path] = []
     for seed in seeds:
         path = folder / f"room-{seed}.npz"
-        if not path.with_suffix(HITS_SUFFIX).is_file():
+        if not path.is_file():
             walk = CameraPathConfig(step_m=SequenceConfig().step_m)
             views = room_frames(seed, frames, camera_of_width(MAP_WIDTH), path=walk, noise=NoiseConfig())
-            _map_frames(views, ROOMS, path, weights, MapperConfig())
+            voxel_map = _map_frames(views, seen := [], weights)
+            training_map(voxel_map, seen, ROOMS, UP).save(path)
         paths.append(path)
         on_room(seed)
     return paths
@@ -89,55 +74,56 @@ def make_log_maps(logs: Iterable[Path], folder: Path, weights: Path | None = Non
     left_out = 0
     for log in logs:
         path = folder / f"log-{log.stem}.npz"
-        if not path.with_suffix(HITS_SUFFIX).is_file():
-            with open_log(log) as reader:
-                labels, usable = reader.info.label_set, reader.info.scale_known
-                mapped = labels is not None and usable and _map_frames(iter(reader), labels, path, weights, MapperConfig())
-            if not mapped:
-                left_out += 1
-                _log.warning("log_left_out", log=str(log), reason="no labelled frames with depth")
-                continue
-        paths.append(path)
+        if path.is_file() or _map_log(log, path, weights):
+            paths.append(path)
+        else:
+            left_out += 1
+            _log.warning("log_left_out", log=str(log), reason="it has no labelled frames with depth in metres")
     if not paths:
-        raise ConfigError(f"none of {left_out} logs has labelled frames with depth; `semantic-mapper info` shows what has")
+        raise ConfigError(
+            f"none of {left_out} logs has labelled frames with depth; `semantic-mapper info` shows what has"
+        )
     return paths
 
 
-def read_hits(path: Path) -> LabelledHits:
-    """The hits that belong to the map in ``path``."""
-    with np.load(path.with_suffix(HITS_SUFFIX)) as stored:
-        return LabelledHits(stored["voxel"].astype(np.int32), stored["channel"], stored["count"])
+def _map_log(log: Path, path: Path, weights: Path | None) -> bool:
+    """Map a log and write its file; False, and no file, where it has no labelled frames with depth."""
+    with open_log(log) as reader:
+        labels = reader.info.label_set
+        if labels is None or not reader.info.scale_known:
+            return False
+        voxel_map = _map_frames(reader, seen := [], weights)
+    if not seen:
+        return False
+    training_map(voxel_map, seen, labels).save(path)
+    return True
 
 
-def _map_frames(
-    frames: Iterable[PosedFrame], labels: LabelSet, path: Path, weights: Path | None, config: MapperConfig
-) -> bool:
-    """Map frames with depth and write both files; False, and no files, where none of them has labels."""
-    pipeline = Mapper.load(weights, config).pipeline
-    seen: list[PosedFrame] = []
+def _map_frames(frames: Iterable[PosedFrame], seen: list[PosedFrame], weights: Path | None) -> VoxelMap:
+    """The map of the frames with depth; those of them with labels come into ``seen``."""
+    pipeline = Mapper.load(weights).pipeline
     for frame in frames:
         if frame.depth_m is None:
             continue
         pipeline.step(replace(frame, label=None))
         if frame.label is not None:
             seen.append(frame)
-    if not seen:
-        return False
-    hits = labelled_hits(pipeline.voxel_map, seen, labels)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pipeline.voxel_map.save(path)
-    with atomic_write(path.with_suffix(HITS_SUFFIX)) as file:
-        np.savez_compressed(file, voxel=hits.voxel.astype(np.int16), channel=hits.channel, count=hits.count)
-    return True
+    return pipeline.voxel_map
 
 
-def labelled_hits(voxel_map: VoxelMap, frames: Iterable[PosedFrame], labels: LabelSet) -> LabelledHits:
+def training_map(
+    voxel_map: VoxelMap, frames: Iterable[PosedFrame], labels: LabelSet, up: Float64 | None = None
+) -> TrainingMap:
     """Cast the labelled pixels of frames into a map.
 
     Args:
-        voxel_map: In the frames' world.
+        voxel_map: In the frames' world, of at least one block.
         frames: With labels, ids of ``labels``; where one has depth, hits that it contradicts do not count.
         labels: Their classes; taken over by name.
+        up: (3,) in the world; None = away from the floor.
+
+    Raises:
+        MapError: up cannot be found.
     """
     table = voxel_map.label_set.channel_map_from(labels)
     rows: list[NDArray[np.int64]] = []
@@ -152,6 +138,10 @@ def labelled_hits(voxel_map: VoxelMap, frames: Iterable[PosedFrame], labels: Lab
         voxel = np.rint(xyz / voxel_map.config.voxel_size_m).astype(np.int64)
         rows.append(np.column_stack((voxel, channel[hit])))
     found, count = np.unique(np.concatenate(rows), axis=0, return_counts=True)
-    return LabelledHits(
-        found[:, :3].astype(np.int32), found[:, 3].astype(np.uint8), np.minimum(count, 65535).astype(np.uint16)
-    )
+    every = np.full(3, KEY_LIMIT)
+    voxels = surface_voxels(voxel_map, up_frame(voxel_map, up), -every, every)
+    keys = pack_cells(voxels.voxel[voxels.core])
+    order = np.argsort(keys)
+    row = find_rows(keys[order], pack_cells(found[:, :3]))
+    on = row < len(keys)
+    return TrainingMap(voxels.points.rows(voxels.core), order[row[on]], found[on, 3], count[on].astype(np.float32))

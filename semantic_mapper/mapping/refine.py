@@ -134,7 +134,9 @@ def refine(
         voxels = surface_voxels(voxel_map, frame, low - _overlap(voxel_map), high + _overlap(voxel_map))
         own = ((voxels.key >= low) & (voxels.key < high)).all(axis=1)
         if voxels.core.any() and own.any():
-            waiting.append(_refined(voxel_map, weights.model, voxels, own, shared, fill, counts)._replace(column=column))
+            waiting.append(
+                _refined(voxel_map, weights.model, voxels, own, shared, fill, counts)._replace(column=column)
+            )
         on_tile(n + 1, len(tiles))
     for written in waiting:
         _write(voxel_map, written)
@@ -164,9 +166,7 @@ def check_refinable(voxel_map: VoxelMap) -> None:
         raise MapError("the map's lengths are not metres, which the network learned in; import the film with --scale")
 
 
-def shared_classes(
-    mine: LabelSet, theirs: LabelSet, *, by_name: bool
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def shared_classes(mine: LabelSet, theirs: LabelSet, *, by_name: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Channels (S,) of the map and of the network that mean the same class.
 
     Raises:
