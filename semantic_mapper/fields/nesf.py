@@ -81,8 +81,10 @@ class Cells(NamedTuple):
 
 
 class Near(NamedTuple):
-    """Where points lie among cells: rows (N, 8) of the cells round each, M = none, and their weights, which sum to 1 or,
-    where there is no cell, to 0."""
+    """Where points lie among M cells: rows (N, 8) of those round each, M = none, and their weights (N, 8).
+
+    Weights of a point sum to 1, or to 0 where there is no cell.
+    """
 
     rows: torch.Tensor
     weights: torch.Tensor
@@ -129,10 +131,10 @@ class Nesf(nn.Module):
         label_set: L classes, those of the maps it can refine.
     """
 
-    def __init__(self, label_set: LabelSet, config: NesfConfig = NesfConfig()) -> None:
+    def __init__(self, label_set: LabelSet, config: NesfConfig | None = None) -> None:
         super().__init__()
-        self.label_set, self.config = label_set, config
-        self.net = UNet3d(SHAPE_CHANNELS + len(label_set), len(label_set) + 1, config.width)
+        self.label_set, self.config = label_set, config or NesfConfig()
+        self.net = UNet3d(SHAPE_CHANNELS + len(label_set), len(label_set) + 1, self.config.width)
         nn.init.zeros_(self.net.head.weight)
         nn.init.zeros_(self.net.head.bias)
         self.temperature: torch.Tensor

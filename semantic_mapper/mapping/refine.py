@@ -1,8 +1,8 @@
 """Refining a map: a network that has seen many maps corrects what the votes say, and labels surface without votes.
 
-The map is read in tiles with overlap, so that memory does not grow with it: the network sees 0.8 m far, tiles overlap by
-more. What it answers is written back as evidence that reads as exactly that (``views/readout.py``). TSDF, colour and
-weights stay as they are, bit for bit.
+The map is read in tiles, so that memory does not grow with it. The network sees 0.8 m far, and tiles overlap by more.
+What it answers is written back as evidence that reads as exactly that (``views/readout.py``). TSDF, colour and weights
+stay as they are, bit for bit.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class RefineReport:
 
 
 class _Written(NamedTuple):
-    """New evidence of voxels, not yet in the map: place of the tile, and for each voxel block, voxel, evidence, votes."""
+    """New evidence of voxels, not yet in the map: place of their tile, and of each block, voxel, evidence and votes."""
 
     column: int
     key: NDArray[np.int32]
@@ -175,7 +175,7 @@ def shared_classes(mine: LabelSet, theirs: LabelSet, *, by_name: bool) -> tuple[
     if mine == theirs:
         return np.arange(len(mine)), np.arange(len(mine))
     pairs = [(mine.names.index(name), n) for n, name in enumerate(theirs.names) if name in mine.names]
-    sets = f"the map's are '{mine.name}' ({', '.join(mine.names)}), the weights' '{theirs.name}' ({', '.join(theirs.names)})"
+    sets = f"the map has '{mine.name}' ({', '.join(mine.names)}), they have '{theirs.name}' ({', '.join(theirs.names)})"
     if not by_name:
         raise WeightsError(
             f"weights of other classes than the map: {sets}. --by-name takes the {len(pairs)} that both name alike"
@@ -229,7 +229,7 @@ def surface_voxels(
 
 
 def evidence_of(log_p: Float32, votes: Float32, vote_discount: float, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Evidence (N, L) that reads as log-probabilities (N, L) at voxels with ``votes`` (N,); see ``views/readout.py``."""
+    """Evidence (N, L) that reads as log-probabilities (N, L) of voxels with ``votes`` (N,): ``views/readout.py``."""
     effective = _effective(votes, vote_discount)[:, None]
     if dtype == np.int16:
         return np.maximum(np.rint(log_p / effective * STEPS_PER_NAT), np.iinfo(np.int16).min).astype(np.int16)

@@ -60,9 +60,9 @@ class VoxelMap:
 
     ``frames`` counts what is fused; ``version`` grows with every change and never falls; ``epoch`` counts how often the
     whole map was replaced by another one (``take_over``): blocks may be gone then. ``scale_known`` says whether lengths
-    are metres; see ``note_scale``. ``refined`` is the digest of the weights that refined the map (``refine``), else empty.
-    ``cleared`` counts the voxels of surfaces that frames saw through, and that were
-    forgotten (``clear_free_space``), in this process.
+    are metres; see ``note_scale``. ``refined`` is the digest of the weights that refined the map (``refine``); empty
+    where none did. ``cleared`` counts the voxels of surfaces that frames saw through, and that were forgotten
+    (``clear_free_space``), in this process.
 
     Args:
         config: Voxel size, truncation, caps and limits.
