@@ -22,13 +22,13 @@ from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.refine import surface_voxels, up_frame
 from semantic_mapper.mapping.storage.block_index import KEY_LIMIT
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.replay.evaluate.room_map import UP
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, room_frames
 from semantic_mapper.training.nesf import TrainingMap
 from semantic_mapper.types import Float64, PosedFrame
 
 ROOM_FRAMES = 32
-UP = np.array((0.0, 0.0, 1.0))  # of procedural rooms
 AGREE_M = 0.1  # a hit farther from what the frame measured speaks of another surface
 
 _log = get_logger(__name__)

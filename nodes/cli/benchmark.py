@@ -37,6 +37,7 @@ def benchmark(
     seconds: suites.SecondsOption = None,
     steps: suites.StepsOption = None,
     maps: suites.MapOption = False,
+    refine: suites.RefineOption = None,
     config: suites.SuiteConfigOption = None,
     seed: SeedOption = None,
     out: OutOption = None,
@@ -60,4 +61,6 @@ def benchmark(
     given |= {"keyframes": keyframes, "steps": steps, "seconds": seconds, "seed": seed}
     settings = suites.suite_config(config, tier, given, maps)
     out, print_json = results_file(out, json)
-    return run_suite_verb(settings, weights or [], kind or [], maps, out, print_json=print_json)
+    if refine is not None and not maps:
+        raise typer.BadParameter("goes with --map", param_hint="--refine")
+    return run_suite_verb(settings, weights or [], kind or [], maps, out, print_json=print_json, refine=refine)

@@ -176,7 +176,8 @@ def train_nesf(
     while not stopped():
         progress.elapsed_s = time.monotonic() - began
         fraction = budget_fraction(progress.step, progress.elapsed_s, steps=config.steps, seconds=config.seconds)
-        if fraction >= 1:
+        progress.finished = fraction >= 1
+        if progress.finished:
             break
         rate = config.learning_rate * (config.final_learning_rate / config.learning_rate) ** fraction
         for group in optimiser.param_groups:
