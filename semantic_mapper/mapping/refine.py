@@ -132,7 +132,7 @@ def refine(
         while waiting and waiting[0].column < column - 1:  # no later tile reads them
             _write(voxel_map, waiting.popleft())
         voxels = surface_voxels(voxel_map, frame, low - _overlap(voxel_map), high + _overlap(voxel_map))
-        own = ((voxels.key >= low) & (voxels.key < high)).all(axis=1)
+        own = np.asarray(((voxels.key >= low) & (voxels.key < high)).all(axis=1), np.bool_)
         if voxels.core.any() and own.any():
             waiting.append(
                 _refined(voxel_map, weights.model, voxels, own, shared, fill, counts)._replace(column=column)

@@ -227,7 +227,7 @@ def _step(
     optimiser.zero_grad()
     total = 0.0
     for _ in range(config.crops):
-        loss = _crop_loss(model, maps[rng.integers(len(maps))], config, rng) / config.crops
+        loss = _crop_loss(model, maps[int(rng.integers(len(maps)))], config, rng) / config.crops
         loss.backward()
         total += float(loss.detach())
     if not np.isfinite(total):
