@@ -196,8 +196,13 @@ def load_nesf(path: Path) -> NesfWeights:
     """Read weights that ``save_nesf`` wrote.
 
     Raises:
-        WeightsError: no such file, damaged, or weights of another kind.
+        WeightsError: no such file, damaged, or weights of another kind; or none ship with the package.
     """
+    if path == default_nesf_path() and not path.is_file():
+        raise WeightsError(
+            "this package has no weights that refine maps; train some (`semantic-mapper train --config "
+            "recipes/nesf-rooms.toml --out nesf.safetensors`) and name them with --weights"
+        )
     tensors, metadata = open_weights(path)
     kind = metadata.get("field", "sray")
     if kind != MAP_KIND:
