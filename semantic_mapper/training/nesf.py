@@ -161,6 +161,7 @@ def train_nesf(
         raise ConfigError("training needs a budget: set steps or seconds")
     torch.manual_seed(config.seed)
     model = Nesf(label_set, config.field)
+    model.start_smoothed()
     optimiser = torch.optim.Adam(model.parameters(), lr=config.learning_rate, betas=(0.9, 0.99))
     identity = {k: v for k, v in to_plain(config).items() if k not in NEVER_STORED}
     progress = Progress(torch.zeros(len(LOSS_PARTS), dtype=torch.float64))
