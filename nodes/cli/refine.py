@@ -22,7 +22,8 @@ def refine(
     source: Annotated[Path, typer.Argument(metavar="MAP", help="Saved map, or a folder of results with one.")],
     out: Annotated[Path, typer.Option("--out", help="Map to write (.npz).")],
     weights: Annotated[
-        Path | None, typer.Option(help="From `train --kind nesf`; without it those in the package (rooms).")
+        Path | None,
+        typer.Option(help="From `train --kind nesf`; without it votes are smoothed over neighbouring surface."),
     ] = None,
     fill: Annotated[
         float,
@@ -42,13 +43,17 @@ def refine(
 ) -> None:
     """Relabel a saved map by its shape, colour and votes, and label surface that nothing voted for.
 
+    With --weights a network decides that has seen many maps. Without, votes are smoothed over surface of the same slope
+    within some 6 cm; nothing is learned then, and any classes will do.
+
     Writes a map like any other: query, export, merge it, or go on mapping into it. Geometry and colours are unchanged.
 
     Example: semantic-mapper refine runs/kitchen/map.npz --out refined.npz
+    Example: semantic-mapper refine runs/kitchen/map.npz --out refined.npz --weights nesf.safetensors
     """
     output = Output.guarded()
     output.quiet = json
-    from semantic_mapper.fields.nesf import default_nesf_path, load_nesf
+    from semantic_mapper.fields.nesf import load_nesf, smoothed_votes
     from semantic_mapper.mapping.refine import refine as refine_map
     from semantic_mapper.mapping.voxel_map import VoxelMap
     from semantic_mapper.nodes.cli.outputs import prepare_file
@@ -58,8 +63,9 @@ def refine(
     path, direction = map_path(source), parse_up(up)
     refuse_overwriting(out, path)
     prepare_file(out)
-    network = load_nesf(weights or default_nesf_path())
+    network = None if weights is None else load_nesf(weights)
     voxel_map = VoxelMap.load(path)
+    network = network or smoothed_votes(voxel_map.label_set)
     with frame_progress("refine", None, unit="tiles") as bar:
 
         def on_tile(done: int, total: int) -> None:
@@ -69,7 +75,9 @@ def refine(
         report = refine_map(voxel_map, network, fill=fill, up=direction, by_name=by_name, on_tile=on_tile)
     voxel_map.save(out)
     output.print(_table(report))
-    if not report.voted:
+    if weights is None:
+        output.print("no --weights: the votes were smoothed, nothing was learned")
+    elif not report.voted:
         output.print("the map had no votes: its classes are guessed from shape and colour")
     relabelled, filled = (100 * count / max(report.surface, 1) for count in (report.relabelled, report.filled))
     output.print(f"{out}: {relabelled:.1f} % of the surface relabelled, {filled:.1f} % filled")

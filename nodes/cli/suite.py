@@ -32,7 +32,7 @@ from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.sheet import draw_sheet
 from semantic_mapper.fields.checkpoint import default_checkpoint_path
-from semantic_mapper.fields.nesf import NesfWeights, load_nesf
+from semantic_mapper.fields.nesf import NesfWeights, load_nesf, smoothed_votes
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.cli.console import FrameProgress, Output, frame_progress, stderr_console
@@ -42,7 +42,6 @@ from semantic_mapper.nodes.cli.suite_table import difference_lines, map_rows_tab
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plots import cannot_draw, write_picture
 from semantic_mapper.replay.artifacts import write_json
-from semantic_mapper.replay.evaluate.smoothed_map import smoothed_votes
 
 PACKAGES = ("torch", "numpy")
 

@@ -76,17 +76,16 @@ COMPUTED_DEPTH = Path("rooms-computed-depth")  # names the weights that ship for
 
 def default_checkpoint_path() -> Path:
     """The small checkpoint that ships with the package."""
-    return shipped_weights() / "rooms.safetensors"
+    return _shipped() / "rooms.safetensors"
 
 
 def find_checkpoint(path: Path) -> Path:
     """The path itself, or that of weights which ship with the package under this name (``COMPUTED_DEPTH``)."""
-    named = shipped_weights() / f"{path}.safetensors"
+    named = _shipped() / f"{path}.safetensors"
     return named if not path.exists() and path.parent == Path() and named.exists() else path
 
 
-def shipped_weights() -> Path:
-    """The folder of the weights that ship with the package."""
+def _shipped() -> Path:
     return Path(str(resources.files("semantic_mapper"))) / "weights"
 
 

@@ -27,11 +27,11 @@ from semantic_mapper.fields.checkpoint import (
     FORMAT,
     MAP_KIND,
     VERSION,
+    find_checkpoint,
     label_set_from_plain,
     label_set_to_plain,
     open_weights,
     save_tensors,
-    shipped_weights,
 )
 from semantic_mapper.fields.sparse_conv import OFFSETS, CellLevel, cell_levels, find_rows, pack_cells
 from semantic_mapper.fields.unet3d import LEVELS, UNet3d
@@ -204,9 +204,11 @@ class NesfWeights:
     digest: str = ""
 
 
-def default_nesf_path() -> Path:
-    """The weights that ship with the package."""
-    return shipped_weights() / "nesf-rooms.safetensors"
+def smoothed_votes(label_set: LabelSet) -> NesfWeights:
+    """What stands in for weights where there are none, and what they have to beat: votes smoothed, nothing learned."""
+    model = Nesf(label_set, NesfConfig(width=1)).eval()
+    model.start_smoothed()
+    return NesfWeights(model, {}, hashlib.sha256(b"smoothed votes").hexdigest())
 
 
 def save_nesf(weights: NesfWeights, path: Path) -> None:
@@ -228,13 +230,9 @@ def load_nesf(path: Path) -> NesfWeights:
     """Read weights that ``save_nesf`` wrote.
 
     Raises:
-        WeightsError: no such file, damaged, or weights of another kind; or none ship with the package.
+        WeightsError: no such file, damaged, or weights of another kind.
     """
-    if path == default_nesf_path() and not path.is_file():
-        raise WeightsError(
-            "this package has no weights that refine maps; train some (`semantic-mapper train --config "
-            "recipes/nesf-rooms.toml --out nesf.safetensors`) and name them with --weights"
-        )
+    path = find_checkpoint(path)
     tensors, metadata = open_weights(path)
     kind = metadata.get("field", "sray")
     if kind != MAP_KIND:

@@ -51,6 +51,19 @@ def test_json_tells_classes_before_and_after(files: Path, tmp_path: Path) -> Non
     assert sum(found["before"].values()) == sum(found["after"].values()) == found["surface"]
 
 
+def test_without_weights_votes_are_smoothed_whatever_the_classes(tmp_path: Path) -> None:
+    make_map(NYU40).save(tmp_path / "map.npz")
+    done = run("refine", tmp_path / "map.npz", "--up", "z", "--out", tmp_path / "smooth.npz")
+    assert done.returncode == 0, done.stderr
+    assert "no --weights: the votes were smoothed" in done.stdout
+    before, after = (VoxelMap.load(tmp_path / name).mesh() for name in ("map.npz", "smooth.npz"))
+
+    def borders(labels: np.ndarray) -> float:
+        return float((labels[before.faces[:, 0]] != labels[before.faces[:, 1]]).mean())
+
+    assert borders(after.label) < 0.8 * borders(before.label), "chance votes become patches"
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
