@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.benchmark.config import MAP_WIDTH, SequenceConfig, camera_of_width
-from semantic_mapper.errors import ConfigError
+from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.fields.sparse_conv import find_rows, pack_cells
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS, LabelSet
@@ -64,39 +64,44 @@ def make_room_maps(
 
 
 def make_log_maps(logs: Iterable[Path], folder: Path, weights: Path | None = None) -> list[Path]:
-    """Map labelled logs with depth that are not yet in the folder; logs without labels or depth are left out.
+    """Map labelled logs with depth that are not yet in the folder; those that teach nothing are left out, and told.
 
     Raises:
         ConfigError: no log is left.
         LogError: a log cannot be read.
     """
     paths: list[Path] = []
-    left_out = 0
+    left_out: dict[str, str] = {}
     for log in logs:
         path = folder / f"log-{log.stem}.npz"
-        if path.is_file() or _map_log(log, path, weights):
-            paths.append(path)
+        reason = "" if path.is_file() else _map_log(log, path, weights)
+        if reason:
+            left_out[str(log)] = reason
+            _log.warning("log_left_out", log=str(log), reason=reason)
         else:
-            left_out += 1
-            _log.warning("log_left_out", log=str(log), reason="it has no labelled frames with depth in metres")
+            paths.append(path)
     if not paths:
-        raise ConfigError(
-            f"none of {left_out} logs has labelled frames with depth; `semantic-mapper info` shows what has"
-        )
+        told = "; ".join(f"{log}: {reason}" for log, reason in left_out.items())
+        raise ConfigError(f"none of {len(left_out)} logs can be learned from ({told})")
     return paths
 
 
-def _map_log(log: Path, path: Path, weights: Path | None) -> bool:
-    """Map a log and write its file; False, and no file, where it has no labelled frames with depth."""
+def _map_log(log: Path, path: Path, weights: Path | None) -> str:
+    """Map a log and write its file; or why it teaches nothing."""
     with open_log(log) as reader:
         labels = reader.info.label_set
-        if labels is None or not reader.info.scale_known:
-            return False
+        if labels is None:
+            return "it has no labels"
+        if not reader.info.scale_known:
+            return "its lengths are not metres"
         voxel_map = _map_frames(reader, seen := [], weights)
     if not seen:
-        return False
-    training_map(voxel_map, seen, labels).save(path)
-    return True
+        return "no labelled frame has depth"
+    try:
+        training_map(voxel_map, seen, labels).save(path)
+    except MapError as error:
+        return str(error)
+    return ""
 
 
 def _map_frames(frames: Iterable[PosedFrame], seen: list[PosedFrame], weights: Path | None) -> VoxelMap:
