@@ -39,6 +39,7 @@ def benchmark(
     maps: suites.MapOption = False,
     arms: suites.ArmOption = None,
     claims: suites.ClaimsOption = False,
+    refine: suites.RefineOption = None,
     config: suites.SuiteConfigOption = None,
     seed: SeedOption = None,
     out: OutOption = None,
@@ -67,10 +68,12 @@ def benchmark(
         from semantic_mapper.nodes.cli.klevr import klevr_configs, run_klevr_verb
 
         del given["seed"]
-        suites.refuse_given("klevr", given | {"weights": weights, "kind": kind, "map": maps or None})
+        suites.refuse_given("klevr", given | {"weights": weights, "kind": kind, "map": maps or None, "refine": refine})
         return run_klevr_verb(klevr_configs(config, tier, seed), arms or [], claims, out, print_json=print_json)
     from semantic_mapper.nodes.cli.suite import run_suite_verb
 
     suites.refuse_given("rooms", {"arm": arms, "claims": claims or None})
     settings = suites.suite_config(config, suites.room_tier(tier), given, maps)
-    return run_suite_verb(settings, weights or [], kind or [], maps, out, print_json=print_json)
+    if refine is not None and not maps:
+        raise typer.BadParameter("goes with --map", param_hint="--refine")
+    return run_suite_verb(settings, weights or [], kind or [], maps, out, print_json=print_json, refine=refine)

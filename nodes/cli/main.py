@@ -26,6 +26,7 @@ from semantic_mapper.nodes.cli import log as cli_log
 from semantic_mapper.nodes.cli import map as cli_map
 from semantic_mapper.nodes.cli import query as cli_query
 from semantic_mapper.nodes.cli import record as cli_record
+from semantic_mapper.nodes.cli import refine as cli_refine
 from semantic_mapper.nodes.cli import replay as cli_replay
 from semantic_mapper.nodes.cli import top as cli_top
 from semantic_mapper.nodes.cli import train as cli_train
@@ -58,6 +59,7 @@ for _function in (
     cli_log.recover,
     cli_export.export,
     cli_export.merge,
+    cli_refine.refine,
     cli_finetune.finetune,
     cli_autolabel.autolabel,
     cli_correct.correct,

@@ -14,6 +14,7 @@ from semantic_mapper.benchmark.entries import load_entries
 from semantic_mapper.benchmark.figures import (
     compare,
     compare_maps,
+    compare_surfaces,
     compare_with_baselines,
     comparison_rows,
     draw_fit_curves,
@@ -21,6 +22,7 @@ from semantic_mapper.benchmark.figures import (
     map_row_figures,
     row_figures,
     view_figures,
+    worst_room,
 )
 from semantic_mapper.benchmark.protocols import Entry
 from semantic_mapper.benchmark.records import MapRecord, RoomRecord
@@ -30,6 +32,7 @@ from semantic_mapper.config import to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.sheet import draw_sheet
 from semantic_mapper.fields.checkpoint import default_checkpoint_path
+from semantic_mapper.fields.nesf import NesfWeights, load_nesf, smoothed_votes
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.cli.console import FrameProgress, Output, frame_progress, stderr_console
 from semantic_mapper.nodes.cli.outputs import prepare_file
@@ -51,6 +54,7 @@ def run_suite_verb(
     json_file: Path | None,
     *,
     print_json: bool = False,
+    refine: Path | None = None,
 ) -> int:
     """Run what is missing, then print, write and draw what there is.
 
@@ -62,6 +66,7 @@ def run_suite_verb(
         kinds: Fields with random weights that are fitted to each room; protocol "scratch" only.
         json_file: Where to write; None = named after the suite.
         print_json: Print JSON, and nothing else.
+        refine: Weights that refine the maps of the first entry; with ``maps``.
 
     Returns:
         The exit code: 0, or that of the signal that ended the run.
@@ -80,6 +85,7 @@ def run_suite_verb(
     out = json_file or Path("runs") / f"{_file_stem(suite)}.json"
     prepare_file(out)
     entries = load_entries(paths, kinds)
+    refiner = None if refine is None else _Refiner(suite, load_nesf(refine), smoothed_votes(ROOMS))
     store, pictures = RecordStore(out.with_suffix(".jsonl")), out.with_suffix(".views")
     with StopRequest() as stop:
         with frame_progress("benchmark", None, unit="%") as bar:
@@ -87,8 +93,8 @@ def run_suite_verb(
             run_suite(suite, entries, store, pictures, lambda p: _show(bar, p), lambda: stop)
         if maps and not stop:
             with frame_progress("map the rooms", None, unit="maps") as bar:
-                _map_rooms(suite, entries, paths, store, bar, stop)
-        found = _collect(suite, entries, store, maps)
+                _map_rooms(suite, entries, paths, store, bar, stop, refiner)
+        found = _collect(suite, entries, store, maps, refiner)
         write_json(out, found)
         table, lines = suite_table(found), difference_lines(found)
         output.print(table)
@@ -98,6 +104,11 @@ def run_suite_verb(
             output.print(map_rows_table(found))
         for line in lines:
             output.print(line)
+        if (refined := found.get("refined")) is not None:
+            output.print(
+                f"refined, worst of {refined['rooms']} rooms: {refined['worst_change'] * 100:+.1f} mIoU points "
+                f"(room {refined['worst_room']})"
+            )
         output.print(f"written to {out}")
         if reason := cannot_draw():
             output.print(f"no pictures: {reason}")
@@ -149,17 +160,20 @@ def _map_rooms(
     store: RecordStore,
     bar: FrameProgress,
     stop: StopRequest,
+    refiner: _Refiner | None,
 ) -> None:
     """Make the map records that are missing; of fields that fuse views also those of each frame's own image alone."""
-    from semantic_mapper.replay.evaluate.room_map import (
-        map_room,  # loads the mapping pipeline, which the rest of a run does without
-    )
+    # Loads the mapping pipeline, which the rest of a run does without.
+    from semantic_mapper.replay.evaluate.room_map import map_room, refine_room
 
     seeds, alone = suite_seeds(suite), own_image_suite(suite)
     runs = [(suite, entry, path) for entry, path in zip(entries, paths, strict=True)]
     runs += [(alone, entry, path) for _, entry, path in runs if not entry.field.needs_own_view]
     bar.start(len(seeds) * len(runs))
     for seed in seeds:
+        if refiner is not None and not stop and refiner.missing(store, entries[0], seed):
+            for record in refine_room(seed, paths[0], entries[0].digest, suite, refiner.networks):
+                store.add(record)
         for how, entry, path in runs:
             if stop:
                 return
@@ -168,7 +182,9 @@ def _map_rooms(
             bar.advance()
 
 
-def _collect(suite: SuiteConfig, entries: Sequence[Entry], store: RecordStore, maps: bool) -> dict[str, Any]:
+def _collect(
+    suite: SuiteConfig, entries: Sequence[Entry], store: RecordStore, maps: bool, refiner: _Refiner | None
+) -> dict[str, Any]:
     """All figures of the run as plain data."""
     seeds = suite_seeds(suite)
     records = {c.name: room_records(suite, c, store) for c in entries}
@@ -193,6 +209,10 @@ def _collect(suite: SuiteConfig, entries: Sequence[Entry], store: RecordStore, m
     found["differences"] += more
     found["map_rows"], more = _map_rows(suite, entries, store) if maps else ({}, [])
     found["differences"] += more
+    if refiner is not None:
+        rows, more, found["refined"] = refiner.figures(store, entries[0])
+        found["map_rows"] |= rows
+        found["differences"] += more
     found["complete"] = all(len(r) == len(seeds) for r in records.values())
     found["versions"] = {"semantic_mapper": __version__} | {name: metadata.version(name) for name in PACKAGES}
     return found
@@ -240,6 +260,48 @@ def _map_rows(
         if (found := compare_maps(ours, records, seed=suite.seed)) is not None
     ]
     return rows, differences
+
+
+class _Refiner:
+    """Maps of the first entry refined by weights, and for comparison smoothed without any."""
+
+    def __init__(self, suite: SuiteConfig, weights: NesfWeights, smoothed: NesfWeights) -> None:
+        self._suite = suite
+        self._plain = settings_digest(suite, "map")
+        self._settings = {
+            "refined": f"{self._plain}-refined-{weights.digest[:16]}",
+            "smoothed": f"{self._plain}-smoothed",
+        }
+        self.networks = {self._settings["refined"]: weights, self._settings["smoothed"]: smoothed}
+
+    def missing(self, store: RecordStore, entry: Entry, seed: int) -> bool:
+        """Whether records of a room are still to be made."""
+        settings = (self._plain, *self.networks)
+        return any(store.find(MapRecord, s, entry.digest, seed) is None for s in settings)
+
+    def figures(
+        self, store: RecordStore, entry: Entry
+    ) -> tuple[dict[str, Any], list[dict[str, Any]], dict[str, Any] | None]:
+        """Rows of the table of maps, differences to the plain maps, and the worst room; of the rooms done so far."""
+        seeds = [seed for seed in suite_seeds(self._suite) if not self.missing(store, entry, seed)]
+        if not seeds:
+            return {}, [], None
+        plain, *others = (
+            [record for seed in seeds if (record := store.find(MapRecord, settings, entry.digest, seed)) is not None]
+            for settings in (self._plain, *self._settings.values())
+        )
+        rows: dict[str, Any] = {}
+        differences: list[dict[str, Any]] = []
+        for name, records in zip(self._settings, others, strict=True):
+            rows[name] = map_row_figures(records)
+            for where, found in (
+                ("points", compare_maps(records, plain, seed=self._suite.seed)),
+                ("true surface", compare_surfaces(records, plain, seed=self._suite.seed)),
+            ):
+                if found is not None:
+                    differences.append({"first": f"{name} ({where})", "second": "as mapped", **found})
+        room, change = worst_room(others[0], plain)
+        return rows, differences, {"rooms": len(seeds), "worst_room": room, "worst_change": change}
 
 
 def _map_records(suite: SuiteConfig, entry: Entry, store: RecordStore) -> list[MapRecord]:

@@ -65,6 +65,12 @@ SecondsOption = Annotated[
     typer.Option(min=0, help="finetune and scratch: training time a room.  [default: 120]"),
 ]
 MapOption = Annotated[bool, typer.Option("--map", help="generalize: also fuse each room and score the map.")]
+RefineOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--refine", metavar="WEIGHTS", help="With --map: also score the maps refined by these, and smoothed instead."
+    ),
+]
 SuiteConfigOption = Annotated[
     Path | None, typer.Option("--config", help="TOML file with a SuiteConfig; klevr: a KlevrConfig.")
 ]

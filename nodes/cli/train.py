@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,7 +26,9 @@ def train(
     seed: Annotated[int | None, typer.Option(help="Of everything that is drawn at random.")] = None,
     workers: Annotated[int | None, typer.Option(min=0, help="Processes that render rooms; 0 = none beside it.")] = None,
     weights: Annotated[Path | None, typer.Option(help="Weights to start from; without it random ones.")] = None,
-    kind: Annotated[str | None, typer.Option(help="Kind of field, sray or one of its peers.")] = None,
+    kind: Annotated[
+        str | None, typer.Option(help="Kind of field, sray or one of its peers; nesf refines maps.")
+    ] = None,
     encoder: Annotated[Path | None, typer.Option(help="Weights of any kind whose image encoder to take over.")] = None,
     half: Annotated[bool, typer.Option("--half", help="Store weights as float16, for shipping.")] = False,
 ) -> int:
@@ -36,16 +39,29 @@ def train(
     (curves.png). Ctrl-C saves the state and the weights kept so far (exit code 130); the same command with --resume
     goes on. A run in --out is never overwritten. Start it with torchrun to use several GPUs.
 
+    With --kind nesf, or a TOML file that says so, the network of `refine` is trained, on maps of procedural rooms or
+    of the labelled logs that the file names.
+
     Example: semantic-mapper train --config recipes/cpu-2h.toml --out runs/rooms --half
+    Example: semantic-mapper train --config recipes/nesf-rooms.toml --out runs/nesf
     """
     output = Output.guarded()
     from semantic_mapper.config import convert_config, load_config, to_plain
-    from semantic_mapper.fields.checkpoint import save_checkpoint
+    from semantic_mapper.errors import ConfigError
+    from semantic_mapper.fields.checkpoint import MAP_KIND, save_checkpoint
     from semantic_mapper.training.ranks import ranks_from_environment
     from semantic_mapper.training.train import WEIGHTS_FILE, TrainProgress
     from semantic_mapper.training.train import train as train_field
     from semantic_mapper.training.train_config import TrainConfig
 
+    if kind == MAP_KIND or (kind is None and config is not None and _kind_of(config) == MAP_KIND):
+        from semantic_mapper.nodes.cli.train_nesf import train_on_maps
+
+        if workers or weights or encoder:
+            raise ConfigError(
+                "--workers, --weights and --encoder are for fields; --kind nesf starts from random weights"
+            )
+        return train_on_maps(output, config, out, resume=resume, seconds=seconds, steps=steps, seed=seed)
     plain = to_plain(load_config(config, TrainConfig) if config else TrainConfig())
     start = None if weights is None else str(weights)
     given = {"seconds": seconds, "steps": steps, "seed": seed, "workers": workers, "start": start, "kind": kind}
@@ -74,6 +90,14 @@ def train(
             summary = f"stopped by {stop.name}; the state and {_kept(checkpoint.recipe)} are saved, --resume goes on"
             stderr_console().print(summary, style="yellow", soft_wrap=True)
     return stop.exit_code
+
+
+def _kind_of(config: Path) -> str:
+    """What a TOML file says; errors in it are told where it is read as settings."""
+    try:
+        return str(tomllib.loads(config.read_text(encoding="utf-8")).get("kind", ""))
+    except (OSError, ValueError):
+        return ""
 
 
 def _told(recipe: dict[str, Any]) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,11 +23,13 @@ from semantic_mapper.evaluation.metrics import (
     metrics_per_image,
     nearest_labels,
 )
+from semantic_mapper.fields.nesf import NesfWeights
 from semantic_mapper.geometry import invert_pose, project, transform, unproject
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.pipeline import MappingPipeline
+from semantic_mapper.mapping.refine import refine
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, RoomConfig, Scene, make_room, render_view, room_frames
 from semantic_mapper.training.computed_depth import DELAY_FRAMES
@@ -33,6 +37,7 @@ from semantic_mapper.types import Float32, Float64, PosedFrame, UInt8
 
 NEAR_M = 0.05  # a map point this near to the true surface speaks for it
 SEEN_M = 0.03  # a frame sees a map point that is this near, in depth, to where its ray meets the map
+UP = np.array((0.0, 0.0, 1.0))  # of procedural rooms
 UNSEEN = 255  # no id of ``ROOMS``
 TRUTH_VOXEL_M = 0.01  # the true surface is sampled this densely, where the camera saw it that densely
 
@@ -54,6 +59,15 @@ class _View:
     label: UInt8
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _FusedRoom:
+    """A room, its map, and the frames that it was made of."""
+
+    scene: Scene
+    voxel_map: VoxelMap
+    views: list[_View]
+
+
 def map_room(seed: int, weights: Path, digest: str, suite: SuiteConfig) -> MapRecord:
     """Fuse a room's sequence and compare the map's labels with those of the nearest true surface.
 
@@ -67,6 +81,31 @@ def map_room(seed: int, weights: Path, digest: str, suite: SuiteConfig) -> MapRe
         WeightsError: see ``Mapper.load``.
         MapError: the map came out empty.
     """
+    room = _fuse(seed, weights, suite)
+    return _compare(room, room.voxel_map, digest, settings_digest(suite, "map"), suite)
+
+
+def refine_room(
+    seed: int, weights: Path, digest: str, suite: SuiteConfig, networks: Mapping[str, NesfWeights]
+) -> list[MapRecord]:
+    """As ``map_room``, then with the map refined by each of ``networks``, by the settings that its record goes under.
+
+    Raises:
+        WeightsError: see ``Mapper.load``; or networks of other classes.
+        MapError: the map came out empty.
+    """
+    room = _fuse(seed, weights, suite)
+    records = [_compare(room, room.voxel_map, digest, settings_digest(suite, "map"), suite)]
+    with tempfile.TemporaryDirectory() as folder:
+        room.voxel_map.save(saved := Path(folder) / "map.npz")
+        for settings, network in networks.items():
+            refined = VoxelMap.load(saved)
+            refine(refined, network, up=UP)
+            records.append(_compare(room, refined, digest, settings, suite))
+    return records
+
+
+def _fuse(seed: int, weights: Path, suite: SuiteConfig) -> _FusedRoom:
     pipeline = Mapper.load(weights, msgspec.structs.replace(suite.mapper, depth=_depth(suite))).pipeline
     camera = camera_of_width(MAP_WIDTH)
     path = CameraPathConfig(step_m=suite.sequence.step_m)
@@ -77,7 +116,7 @@ def map_room(seed: int, weights: Path, digest: str, suite: SuiteConfig) -> MapRe
         ready = pipeline.prepare(as_given(frame, depth=suite.depth == "on", label=True))
         views += [_step(pipeline, waited) for waited in ready]
     views += [_step(pipeline, waited) for waited in pipeline.prepare_rest()]
-    return _compare(scene, pipeline.voxel_map, views, digest, suite)
+    return _FusedRoom(scene, pipeline.voxel_map, views)
 
 
 def _depth(suite: SuiteConfig) -> DepthConfig:
@@ -116,7 +155,8 @@ def true_surface(scene: Scene, poses: list[Float64]) -> TrueSurface:
     return TrueSurface(points[first], labels[first])
 
 
-def _compare(scene: Scene, voxel_map: VoxelMap, views: list[_View], digest: str, suite: SuiteConfig) -> MapRecord:
+def _compare(room: _FusedRoom, voxel_map: VoxelMap, digest: str, settings: str, suite: SuiteConfig) -> MapRecord:
+    scene, views = room.scene, room.views
     points = voxel_map.points()
     if not len(points.xyz):
         raise MapError(f"room {scene.seed}: none of its {suite.map_frames} frames could be fused; the map is empty")
@@ -132,7 +172,7 @@ def _compare(scene: Scene, voxel_map: VoxelMap, views: list[_View], digest: str,
     seen = np.where(one_frame == UNSEEN, ROOMS.ignore_id, truth)
     answered = (truth != ROOMS.ignore_id) & (label != ROOMS.ignore_id)
     return MapRecord(
-        settings=settings_digest(suite, "map"),
+        settings=settings,
         weights=digest,
         room=scene.seed,
         template=scene.template,

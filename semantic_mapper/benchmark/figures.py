@@ -120,6 +120,22 @@ def compare_maps(first: Sequence[MapRecord], second: Sequence[MapRecord], *, see
     return _compare(first, second, seed)
 
 
+def compare_surfaces(first: Sequence[MapRecord], second: Sequence[MapRecord], *, seed: int = 0) -> dict[str, Any]:
+    """Difference in mIoU at the true surface of the same rooms, as ``compare``."""
+    a, b = ([from_rows(r.surface_confusion) for r in side] for side in (first, second))
+    return _difference(a, b, seed)
+
+
+def worst_room(first: Sequence[MapRecord], second: Sequence[MapRecord]) -> tuple[int, float]:
+    """The room where ``first`` falls behind ``second`` the most, and the difference in mIoU of the maps' points."""
+    changes: list[tuple[float, int]] = []
+    for a, b in zip(first, second, strict=True):
+        one, other = (from_rows(r.confusion).metrics().miou for r in (a, b))
+        changes.append(((one or 0.0) - (other or 0.0), a.room))
+    change, room = min(changes)
+    return room, change
+
+
 def compare(first: Sequence[RoomRecord], second: Sequence[RoomRecord], *, seed: int = 0) -> dict[str, Any] | None:
     """Difference in data-set mIoU, ``first`` minus ``second``, over the rooms of both; None where they share none.
 

@@ -33,6 +33,7 @@ from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
 FORMAT = "semantic-mapper-weights"
 VERSION = 3
+MAP_KIND = "nesf"  # of weights that ``fields.nesf`` reads
 MESSAGE = 300  # characters of torch's message, which names every tensor
 NEW_ROW_SPREAD = 0.2
 MAX_WIDTH = 4096  # as ``render.encode_width``
@@ -119,7 +120,7 @@ def checkpoint_bytes(checkpoint: Checkpoint, *, half: bool = False) -> bytes:
         "version": str(VERSION),
         "field": checkpoint.model.kind,
         "model_config": json.dumps(to_plain(checkpoint.model.config)),
-        "label_set": json.dumps(_label_set_to_plain(checkpoint.label_set)),
+        "label_set": json.dumps(label_set_to_plain(checkpoint.label_set)),
         "recipe": json.dumps(checkpoint.recipe),
     }
     if checkpoint.anchors:
@@ -145,6 +146,35 @@ def load_checkpoint(path: Path) -> Checkpoint:
         WeightsError: missing, damaged, of another format or version, or weights that do not fit their own config.
     """
     path = find_checkpoint(path)
+    tensors, metadata = open_weights(path)
+    try:
+        label_set = label_set_from_plain(json.loads(metadata["label_set"]))
+        recipe = _checked_recipe(json.loads(metadata["recipe"]))
+        anchors = _unpack_anchors(tensors, json.loads(metadata["anchors"])) if "anchors" in metadata else ()
+        kind = metadata.get("field", SRay.kind)
+        if kind == MAP_KIND:
+            raise ValueError("they refine saved maps (`refine --weights`) and label no frames")
+        model = build_field(kind, _of_its_time(kind, json.loads(metadata["model_config"])), label_set)
+    except (KeyError, TypeError, ValueError, ArithmeticError, RuntimeError, SemanticMapperError) as error:
+        reason = " ".join(str(error).split())[:MESSAGE]
+        raise WeightsError(f"{path}: its metadata is damaged: {type(error).__name__}: {reason}") from error
+    weights = {n.removeprefix("model."): t.float() for n, t in tensors.items() if n.startswith("model.")}
+    try:
+        model.load_state_dict(weights)
+    except RuntimeError as error:
+        first = " ".join(str(error).split())[:MESSAGE]
+        raise WeightsError(f"{path}: weights do not fit their model config: {first}") from error
+    if not all(bool(torch.isfinite(t).all()) for t in weights.values()):
+        raise WeightsError(f"{path}: weights hold NaN or infinity; training diverged, train again")
+    return Checkpoint(model.eval(), anchors, recipe)
+
+
+def open_weights(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+    """Tensors and metadata of a weights file of this project, of any kind.
+
+    Raises:
+        WeightsError: missing, damaged, of another format or version.
+    """
     if path.exists() and not path.is_file():
         raise WeightsError(f"{path}: is no regular file; copy its content to one")
     if not path.exists():
@@ -161,24 +191,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         )
     if metadata.get("version") != str(VERSION):
         raise WeightsError(f"{path}: weights format {metadata.get('version')}, this version reads {VERSION}")
-    try:
-        label_set = _label_set_from_plain(json.loads(metadata["label_set"]))
-        recipe = _checked_recipe(json.loads(metadata["recipe"]))
-        anchors = _unpack_anchors(tensors, json.loads(metadata["anchors"])) if "anchors" in metadata else ()
-        kind = metadata.get("field", SRay.kind)
-        model = build_field(kind, _of_its_time(kind, json.loads(metadata["model_config"])), label_set)
-    except (KeyError, TypeError, ValueError, ArithmeticError, RuntimeError, SemanticMapperError) as error:
-        reason = " ".join(str(error).split())[:MESSAGE]
-        raise WeightsError(f"{path}: its metadata is damaged: {type(error).__name__}: {reason}") from error
-    weights = {n.removeprefix("model."): t.float() for n, t in tensors.items() if n.startswith("model.")}
-    try:
-        model.load_state_dict(weights)
-    except RuntimeError as error:
-        first = " ".join(str(error).split())[:MESSAGE]
-        raise WeightsError(f"{path}: weights do not fit their model config: {first}") from error
-    if not all(bool(torch.isfinite(t).all()) for t in weights.values()):
-        raise WeightsError(f"{path}: weights hold NaN or infinity; training diverged, train again")
-    return Checkpoint(model.eval(), anchors, recipe)
+    return tensors, metadata
 
 
 def _of_its_time(kind: str, config: dict[str, Any]) -> dict[str, Any]:
@@ -196,7 +209,7 @@ def check_same_shape(path: Path, like: Checkpoint) -> None:
     try:
         with safe_open(path, framework="pt") as stored:
             metadata = dict(stored.metadata() or {})
-        label_set = _label_set_from_plain(json.loads(metadata["label_set"]))
+        label_set = label_set_from_plain(json.loads(metadata["label_set"]))
         kind = metadata.get("field", SRay.kind)
         shape = kind, _of_its_time(kind, json.loads(metadata["model_config"]))
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError, SemanticMapperError) as error:
@@ -327,7 +340,8 @@ def _unpack_anchors(tensors: dict[str, torch.Tensor], described: list[dict[str, 
     return tuple(anchors)
 
 
-def _label_set_to_plain(label_set: LabelSet) -> dict[str, Any]:
+def label_set_to_plain(label_set: LabelSet) -> dict[str, Any]:
+    """Plain data, for the metadata of a weights file."""
     return {
         "name": label_set.name,
         "ids": list(label_set.ids),
@@ -337,6 +351,11 @@ def _label_set_to_plain(label_set: LabelSet) -> dict[str, Any]:
     }
 
 
-def _label_set_from_plain(data: dict[str, Any]) -> LabelSet:
+def label_set_from_plain(data: dict[str, Any]) -> LabelSet:
+    """What ``label_set_to_plain`` gave.
+
+    Raises:
+        KeyError, TypeError, ValueError, LabelError: it is something else.
+    """
     colors = tuple((int(r), int(g), int(b)) for r, g, b in data["colors"])
     return LabelSet(str(data["name"]), tuple(data["ids"]), tuple(data["names"]), colors, int(data["ignore_id"]))

@@ -60,8 +60,9 @@ class VoxelMap:
 
     ``frames`` counts what is fused; ``version`` grows with every change and never falls; ``epoch`` counts how often the
     whole map was replaced by another one (``take_over``): blocks may be gone then. ``scale_known`` says whether lengths
-    are metres; see ``note_scale``. ``cleared`` counts the voxels of surfaces that frames saw through, and that were
-    forgotten (``clear_free_space``), in this process.
+    are metres; see ``note_scale``. ``refined`` is the digest of the weights that refined the map (``refine``); empty
+    where none did. ``cleared`` counts the voxels of surfaces that frames saw through, and that were forgotten
+    (``clear_free_space``), in this process.
 
     Args:
         config: Voxel size, truncation, caps and limits.
@@ -81,6 +82,7 @@ class VoxelMap:
         self.epoch = 0
         self.last_stamp_ns = 0
         self.scale_known = True
+        self.refined = ""
         self.cleared = 0
         self._grid = BlockGrid(
             config.voxel_size_m,
@@ -265,6 +267,7 @@ class VoxelMap:
             self._grid = other._grid
             self.frames, self.last_stamp_ns = other.frames, other.last_stamp_ns
             self.note_scale(other.scale_known)
+            self.refined = other.refined
             self.version = self._grid.mark_all_changed(self.version + 1, BLOCKS_A_VERSION)
             self.epoch += 1
 
@@ -364,6 +367,7 @@ class VoxelMap:
                 frames=self.frames,
                 last_stamp_ns=self.last_stamp_ns,
                 scale=scale_name(self.scale_known),
+                refined=self.refined,
             )
             return MapSaving(self.locked, manifest)
 
@@ -396,6 +400,7 @@ class VoxelMap:
         loaded.frames = loaded.version = saved.frames
         loaded.last_stamp_ns = saved.last_stamp_ns
         loaded.note_scale(saved.scale_known)
+        loaded.refined = saved.refined
         return loaded
 
     def merged(self, other: VoxelMap, T_self_other: Float64) -> VoxelMap:
@@ -418,6 +423,7 @@ class VoxelMap:
         require_same_scale(self.scale_known, other.scale_known, "merge")
         joined = VoxelMap(self.config, self.label_set)
         joined.note_scale(self.scale_known)
+        joined.refined = self.refined or other.refined
         with _KERNEL_LOCK:
             joined.frames = joined.version = self.frames + other.frames
             joined.last_stamp_ns = max(self.last_stamp_ns, other.last_stamp_ns)

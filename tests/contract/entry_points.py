@@ -50,6 +50,7 @@ from semantic_mapper.scenes import VALIDATION_SEEDS, NoiseConfig, room_frames
 from semantic_mapper.testing import LogReplays
 from semantic_mapper.training.finetune import FinetuneConfig, finetune
 from semantic_mapper.training.keyframe_pool import Kept, KeyframePool
+from semantic_mapper.training.nesf import NesfTrainConfig
 from semantic_mapper.training.online import OnlineConfig
 from semantic_mapper.training.train_config import TrainConfig
 from semantic_mapper.transport import codec, pose_message, query_messages
@@ -89,6 +90,7 @@ __all__ = [
     "LogWriter",
     "MapUpdate",
     "MapperConfig",
+    "NesfTrainConfig",
     "NoiseConfig",
     "OnlineConfig",
     "PosedFrame",

@@ -49,6 +49,7 @@ class MapManifest(Config, frozen=True, kw_only=True):
         bounds_m: Lowest and highest corner of all blocks, metres in the world; None of an empty map.
         chunks: In the order of the file.
         scale: Whether lengths are metres; not written where they are, so older releases read such maps.
+        refined: Digest of the weights that refined the map; empty, and not written, where none did.
     """
 
     format: str = FORMAT
@@ -61,6 +62,7 @@ class MapManifest(Config, frozen=True, kw_only=True):
     bounds_m: tuple[Corner, Corner] | None = None
     chunks: tuple[MapChunk, ...] = ()
     scale: Literal["metres", "unknown"] = "metres"
+    refined: Digest | Literal[""] = ""
 
     @property
     def scale_known(self) -> bool:
@@ -73,6 +75,8 @@ def encode_manifest(manifest: MapManifest) -> bytes:
     plain: dict[str, Any] = msgspec.to_builtins(manifest)
     if manifest.scale_known:
         del plain["scale"]
+    if not manifest.refined:
+        del plain["refined"]
     return msgspec.json.format(msgspec.json.encode(plain), indent=1)
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
+from semantic_mapper.fields.nesf import Nesf, NesfConfig, NesfWeights, save_nesf
+from semantic_mapper.labels import ROOMS
 from tests.nodes.support import error_line, run
 from tests.small import tiny_field
 
@@ -71,10 +73,22 @@ def test_weights_side_by_side_with_maps_and_a_second_call_that_continues(
     assert list(found["map_rows"]) == ["sray map", "own image + votes", "unet + votes"]
     assert found["map_rows"]["own image + votes"]["map_miou"] is not None
     assert "own image + votes" in first.stdout and "vote of the views" in first.stdout
+    save_nesf(NesfWeights(Nesf(ROOMS, NesfConfig(width=1)).eval()), tmp_path / "nesf.safetensors")
+    refined = run(*common, "--weights", two[0], "--rooms", "1", "--map", "--refine", tmp_path / "nesf.safetensors")
+    assert refined.returncode == 0, refined.stderr
+    found = json.loads(out.read_text())
+    assert list(found["map_rows"]) == ["sray map", "own image + votes", "unet + votes", "refined", "smoothed"]
+    plain, same, smoothed = (found["map_rows"][name]["map_miou"] for name in ("sray map", "refined", "smoothed"))
+    assert same == pytest.approx(plain, abs=1e-3) and smoothed != plain, "an untrained network changes nothing"
+    assert "refined, worst of 1 rooms" in refined.stdout
+    lone = run(*common, "--weights", two[0], "--rooms", "1", "--refine", tmp_path / "nesf.safetensors")
+    assert lone.returncode == 2 and "--map" in lone.stderr
+    records = out.with_suffix(".jsonl").read_text().splitlines()
+    assert len(records) == 6, "the map again, refined, smoothed"
     both = run(*common, "--weights", two[0], "--weights", two[1], "--rooms", "2")
     assert both.returncode == 0, both.stderr
     lines = out.with_suffix(".jsonl").read_text().splitlines()
-    assert lines[:3] == records and len(lines) == 6
+    assert lines[:6] == records and len(lines) == 9
     assert "first minus second" in both.stdout and "95 % interval" in both.stdout
     found = json.loads(out.read_text())
     assert found["complete"] and list(found["weights"]) == ["first", "second"]

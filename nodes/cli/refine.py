@@ -1,0 +1,100 @@
+"""``semantic-mapper refine``: a network that has seen many maps corrects the classes of a saved one."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from semantic_mapper.nodes.cli.console import Output, frame_progress
+from semantic_mapper.nodes.cli.verb import verb
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from semantic_mapper.mapping.refine import RefineReport
+
+
+@verb
+def refine(
+    source: Annotated[Path, typer.Argument(metavar="MAP", help="Saved map, or a folder of results with one.")],
+    out: Annotated[Path, typer.Option("--out", help="Map to write (.npz).")],
+    weights: Annotated[
+        Path | None,
+        typer.Option(help="From `train --kind nesf`; without it votes are smoothed over neighbouring surface."),
+    ] = None,
+    fill: Annotated[
+        float,
+        typer.Option(
+            min=0.0, max=1.0, help="Surface without votes gets a class that is at least so likely; 1 = never."
+        ),
+    ] = 0.5,
+    up: Annotated[
+        str, typer.Option(help="Up in the world: x, -y, ..., or three numbers; auto = away from the floor.")
+    ] = "auto",
+    by_name: Annotated[
+        bool, typer.Option("--by-name", help="Weights of other classes: take those with the same name in both.")
+    ] = False,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print the outcome as JSON, and nothing else, on stdout.")
+    ] = False,
+) -> None:
+    """Relabel a saved map by its shape, colour and votes, and label surface that nothing voted for.
+
+    With --weights a network decides that has seen many maps. Without, votes are smoothed over surface of the same slope
+    within some 6 cm; nothing is learned then, and any classes will do.
+
+    Writes a map like any other: query, export, merge it, or go on mapping into it. Geometry and colours are unchanged.
+
+    Example: semantic-mapper refine runs/kitchen/map.npz --out refined.npz
+    Example: semantic-mapper refine runs/kitchen/map.npz --out refined.npz --weights nesf.safetensors
+    """
+    output = Output.guarded()
+    output.quiet = json
+    from semantic_mapper.fields.nesf import load_nesf, smoothed_votes
+    from semantic_mapper.mapping.refine import refine as refine_map
+    from semantic_mapper.mapping.voxel_map import VoxelMap
+    from semantic_mapper.nodes.cli.outputs import prepare_file
+    from semantic_mapper.nodes.cli.saved_maps import map_path, refuse_overwriting
+    from semantic_mapper.replay.exporters.map_files import parse_up
+
+    path, direction = map_path(source), parse_up(up)
+    refuse_overwriting(out, path)
+    prepare_file(out)
+    network = None if weights is None else load_nesf(weights)
+    voxel_map = VoxelMap.load(path)
+    network = network or smoothed_votes(voxel_map.label_set)
+    with frame_progress("refine", None, unit="tiles") as bar:
+
+        def on_tile(done: int, total: int) -> None:
+            bar.start(total)
+            bar.set(done)
+
+        report = refine_map(voxel_map, network, fill=fill, up=direction, by_name=by_name, on_tile=on_tile)
+    voxel_map.save(out)
+    output.print(_table(report))
+    if weights is None:
+        output.print("no --weights: the votes were smoothed, nothing was learned")
+    elif not report.voted:
+        output.print("the map had no votes: its classes are guessed from shape and colour")
+    relabelled, filled = (100 * count / max(report.surface, 1) for count in (report.relabelled, report.filled))
+    output.print(f"{out}: {relabelled:.1f} % of the surface relabelled, {filled:.1f} % filled")
+    if json:
+        output.json(asdict(report) | {"weights": network.digest, "out": str(out)})
+
+
+def _table(report: RefineReport) -> Table:
+    """Fraction of the surface by class; classes that it never has are left out."""
+    from rich.table import Table
+
+    table = Table(title="share of the surface", title_justify="left")
+    table.add_column("")
+    for column in ("before", "after"):
+        table.add_column(column, justify="right")
+    for name, before in report.before.items():
+        after = report.after[name]
+        if before or after:
+            table.add_row(name, *(f"{100 * count / max(report.surface, 1):.1f} %" for count in (before, after)))
+    return table

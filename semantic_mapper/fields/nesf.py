@@ -1,0 +1,254 @@
+"""NeSF on saved maps: a 3D network that has seen many maps corrects the class probabilities of this one.
+
+The map's surface is pooled to cells of ``CELL_M``; each cell tells the network its shape, colour, and what the votes
+there say. The answer is a *residual* on the map's log-probabilities: a vector, how much of the smoothed votes round the
+cell is added, and how much a voxel's own still count. All of it comes from a layer that starts at zero, so that an
+untrained network leaves the map as it is.
+"""
+
+from __future__ import annotations
+
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from semantic_mapper.config import AtLeastOne, Config, convert_config, to_plain
+from semantic_mapper.errors import SemanticMapperError, WeightsError
+from semantic_mapper.fields.checkpoint import (
+    FORMAT,
+    MAP_KIND,
+    VERSION,
+    find_checkpoint,
+    label_set_from_plain,
+    label_set_to_plain,
+    open_weights,
+    save_tensors,
+)
+from semantic_mapper.fields.sparse_conv import OFFSETS, CellLevel, cell_levels, find_rows, pack_cells
+from semantic_mapper.fields.unet3d import LEVELS, UNet3d
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.types import Float32
+
+CELL_M = 0.04
+SHAPE_CHANNELS = 9  # before those of the classes
+UP_CHANNEL, VOTES_CHANNEL = 2, 8
+SMOOTHED_ROUNDS = 2  # of a Gaussian over 3^3 cells, sigma one cell: together 1.4 cells, 6 cm
+SAME_SLOPE = 0.3  # cells whose normal . up differs by more belong to another surface
+LOG_SCALE = 0.25  # log-probabilities reach -12, other channels 1
+MOST_VOTES = 8.0  # further ones tell nothing new
+
+
+class NesfConfig(Config, frozen=True):
+    """Shape of the network."""
+
+    width: AtLeastOne = 16
+
+
+class SurfacePoints(NamedTuple):
+    """Voxels round a map's surface, with up along z.
+
+    Args:
+        xyz: (N, 3) float32 in cells.
+        rise: (N,) float32, normal . up.
+        height_m: (N,) float32 above the floor.
+        rgb: (N, 3) float32 0..1.
+        log_p: (N, L) float32 log-probabilities of the votes; zeros without votes.
+        votes: (N,) float32.
+    """
+
+    xyz: Float32
+    rise: Float32
+    height_m: Float32
+    rgb: Float32
+    log_p: Float32
+    votes: Float32
+
+    def rows(self, chosen: NDArray[Any]) -> SurfacePoints:
+        """Some of them, by mask or row."""
+        return SurfacePoints(*(values[chosen] for values in self))
+
+
+class Cells(NamedTuple):
+    """Pooled surface: cells (M, 3) int64 in lexicographic order, and their channels (M, C) float32."""
+
+    cells: NDArray[np.int64]
+    x: torch.Tensor
+
+
+class Near(NamedTuple):
+    """Where points lie among M cells: rows (N, 8) of those round each, M = none, and their weights (N, 8).
+
+    Weights of a point sum to 1, or to 0 where there is no cell.
+    """
+
+    rows: torch.Tensor
+    weights: torch.Tensor
+
+
+def pool(points: SurfacePoints) -> Cells:
+    """Mean of the points in each cell; log-probabilities count by their votes."""
+    cell = np.floor(points.xyz).astype(np.int64)
+    keys = pack_cells(cell)
+    order = np.argsort(keys, kind="stable")
+    starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    count = np.diff(starts, append=len(keys)).astype(np.float32)[:, None]
+    votes = np.minimum(points.votes, MOST_VOTES)[:, None]
+    centred = points.log_p - points.log_p.mean(axis=1, keepdims=True)
+    rise = points.rise[:, None]
+    seen = points.rgb.any(axis=1, keepdims=True)
+    shape = (np.abs(rise), rise, points.height_m[:, None], points.rgb, seen, votes / 4, centred * (LOG_SCALE * votes))
+    sums = np.add.reduceat(np.concatenate(shape, axis=1, dtype=np.float32)[order], starts, axis=0)
+    said = 4 * sums[:, 7:8]
+    pooled = np.concatenate((count / 8, sums[:, :8] / count, sums[:, 8:] / np.maximum(said, 1e-6)), axis=1)
+    return Cells(cell[order[starts]], torch.from_numpy(pooled))
+
+
+def near_cells(xyz: Float32, cells: NDArray[np.int64]) -> Near:
+    """Trilinear weights of points (N, 3) in cells, over those of the eight cells round each that there are."""
+    keys = pack_cells(cells)
+    low = np.floor(xyz - 0.5)
+    fraction = (xyz - 0.5 - low).astype(np.float32)
+    base = low.astype(np.int64)
+    rows = np.empty((len(xyz), 8), np.int64)
+    weights = np.empty((len(xyz), 8), np.float32)
+    for n, corner in enumerate(np.ndindex(2, 2, 2)):
+        rows[:, n] = find_rows(keys, pack_cells(base + corner))
+        weights[:, n] = np.prod(np.where(corner, fraction, 1 - fraction), axis=1)
+    weights[rows == len(keys)] = 0
+    weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-6)
+    return Near(torch.from_numpy(rows), torch.from_numpy(weights))
+
+
+def smoothed(cells: Cells, level: CellLevel) -> torch.Tensor:
+    """Log-probabilities (M, L) of cells, centred, averaged over the surface round them.
+
+    A neighbour counts by a Gaussian of its distance, by its votes, and only where the surface has the same slope.
+    """
+    table, distance = level.neighbours, torch.from_numpy((OFFSETS**2).sum(axis=1)).float()
+    rise, votes, said = cells.x[:, UP_CHANNEL], cells.x[:, VOTES_CHANNEL], cells.x[:, SHAPE_CHANNELS:] / LOG_SCALE
+    same = (_padded(rise[:, None])[table][..., 0] - rise[:, None]).abs() < SAME_SLOPE
+    kernel = torch.exp(-distance / 2) * same
+    for _ in range(SMOOTHED_ROUNDS):
+        weight = kernel * _padded(votes[:, None])[table][..., 0]
+        total = weight.sum(dim=1)
+        said = torch.einsum("nk,nkc->nc", weight, _padded(said)[table]) / total.clamp_min(1e-6)[:, None]
+        votes = total / kernel.sum(dim=1)
+    return said
+
+
+def _padded(x: torch.Tensor) -> torch.Tensor:
+    return torch.cat((x, x.new_zeros(1, x.shape[1])))
+
+
+class Nesf(nn.Module):
+    """The network, its classes, and the temperature of its answers.
+
+    Args:
+        label_set: L classes, those of the maps it can refine.
+    """
+
+    def __init__(self, label_set: LabelSet, config: NesfConfig | None = None) -> None:
+        super().__init__()
+        self.label_set, self.config = label_set, config or NesfConfig()
+        self.net = UNet3d(SHAPE_CHANNELS + len(label_set), len(label_set) + 2, self.config.width)
+        nn.init.zeros_(self.net.head.weight)
+        nn.init.zeros_(self.net.head.bias)
+        self.temperature: torch.Tensor
+        self.register_buffer("temperature", torch.ones(()))
+
+    def start_smoothed(self) -> None:
+        """Make untrained weights answer with the smoothed votes, which is where training starts."""
+        with torch.no_grad():
+            self.net.head.bias[-2], self.net.head.bias[-1] = 1.0, -1.0
+
+    def forward(self, cells: Cells) -> torch.Tensor:
+        """(M, L + 1) of each cell: residual, and how much more the map's log-probabilities count."""
+        levels = cell_levels(cells.cells, LEVELS)
+        said = self.net(cells.x, levels)
+        residual, smoothing, own = said.split((said.shape[1] - 2, 1, 1), dim=1)
+        return torch.cat((residual + smoothing * smoothed(cells, levels[0]), own), dim=1)
+
+    def logits(self, answer: torch.Tensor, near: Near, log_p: torch.Tensor) -> torch.Tensor:
+        """Logits (N, L) at points, before the temperature.
+
+        Args:
+            answer: Of ``forward``.
+            near: Of the points.
+            log_p: (N, L) what the map says there; zeros without votes.
+        """
+        here = torch.einsum("nkc,nk->nc", _padded(answer)[near.rows], near.weights)
+        return log_p * (1 + here[:, -1:]) + here[:, :-1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NesfWeights:
+    """A network with its provenance.
+
+    Args:
+        model: In evaluation mode.
+        recipe: How it was trained, plain data.
+        digest: SHA-256 of the file, empty before it is written.
+    """
+
+    model: Nesf
+    recipe: dict[str, Any] = field(default_factory=dict[str, Any])
+    digest: str = ""
+
+
+def smoothed_votes(label_set: LabelSet) -> NesfWeights:
+    """What stands in for weights where there are none, and what they have to beat: votes smoothed, nothing learned."""
+    model = Nesf(label_set, NesfConfig(width=1)).eval()
+    model.start_smoothed()
+    return NesfWeights(model, {}, hashlib.sha256(b"smoothed votes").hexdigest())
+
+
+def save_nesf(weights: NesfWeights, path: Path) -> None:
+    """Write weights as float16, whole or not at all."""
+    metadata = {
+        "format": FORMAT,
+        "version": str(VERSION),
+        "field": MAP_KIND,
+        "label_set": json.dumps(label_set_to_plain(weights.model.label_set)),
+        "model_config": json.dumps(to_plain(weights.model.config)),
+        "recipe": json.dumps(weights.recipe),
+    }
+    tensors = {name: t.detach().half().contiguous() for name, t in weights.model.state_dict().items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_tensors(tensors, path, metadata)
+
+
+def load_nesf(path: Path) -> NesfWeights:
+    """Read weights that ``save_nesf`` wrote.
+
+    Raises:
+        WeightsError: no such file, damaged, or weights of another kind.
+    """
+    path = find_checkpoint(path)
+    tensors, metadata = open_weights(path)
+    kind = metadata.get("field", "sray")
+    if kind != MAP_KIND:
+        raise WeightsError(
+            f"{path}: weights of kind '{kind}', which label frames (`replay --weights`); to refine maps takes weights "
+            f"of kind '{MAP_KIND}', from `train --kind {MAP_KIND}`"
+        )
+    try:
+        label_set = label_set_from_plain(json.loads(metadata["label_set"]))
+        config = convert_config(json.loads(metadata["model_config"]), NesfConfig, str(path))
+        recipe = dict(json.loads(metadata["recipe"]))
+        model = Nesf(label_set, config)
+        model.load_state_dict({name: t.float() for name, t in tensors.items()})
+    except (KeyError, TypeError, ValueError, RuntimeError, SemanticMapperError) as error:
+        reason = " ".join(str(error).split())[:300]
+        raise WeightsError(f"{path}: damaged: {type(error).__name__}: {reason}") from error
+    if not all(bool(torch.isfinite(t).all()) for t in model.state_dict().values()):
+        raise WeightsError(f"{path}: weights hold NaN or infinity; training diverged, train again")
+    return NesfWeights(model.eval(), recipe, hashlib.sha256(path.read_bytes()).hexdigest())

@@ -1,0 +1,388 @@
+"""Refining a map: a network that has seen many maps corrects what the votes say, and labels surface without votes.
+
+The map is read in tiles, so that memory does not grow with it. The network sees 0.8 m far, and tiles overlap by more.
+What it answers is written back as evidence that reads as exactly that (``views/readout.py``). TSDF, colour and weights
+stay as they are, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from semantic_mapper.errors import MapError, WeightsError
+from semantic_mapper.fields.nesf import CELL_M, Cells, Near, Nesf, NesfWeights, SurfacePoints, near_cells, pool
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.files.up_axis import find_up, turn_onto
+from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
+from semantic_mapper.mapping.fusion.evidence import PROBABILITY_FLOOR, STEPS_PER_NAT
+from semantic_mapper.mapping.storage.block_grid import BlockGrid
+from semantic_mapper.mapping.storage.block_index import find_blocks, pack_keys
+from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.types import Float32, Float64
+
+TILE_M = 6.0
+OVERLAP_M = 1.0
+LARGEST_VOXEL_M = 0.06  # the network knows cells of 4 cm
+BAND_VOXELS = 2.0  # voxels this near the surface are filled, as near as votes reach
+FILL_VOTES = 0.3  # of what is filled: later votes of frames outweigh it
+FILL = 0.5
+LEAST_LOG = np.float32(-30)  # of a probability that is written
+ANSWERED_AT_ONCE = 65_536
+LOW_PERCENT = 1.0  # of the surface's points that lie below the floor, by noise
+
+
+class UpFrame(NamedTuple):
+    """Where up is: R (3, 3) turns the world so that up is z; floor_m is the floor's height there."""
+
+    R: Float64
+    floor_m: float
+
+
+class SurfaceVoxels(NamedTuple):
+    """Voxels near the surface in some blocks.
+
+    Args:
+        key: (N, 3) int32 block of each.
+        at: (N,) int64 voxel in the block.
+        points: What the network takes of them.
+        core: (N,) bool: so near the surface that they make up the cells.
+    """
+
+    key: NDArray[np.int32]
+    at: NDArray[np.int64]
+    points: SurfacePoints
+    core: NDArray[np.bool_]
+
+    @property
+    def voxel(self) -> NDArray[np.int64]:
+        """(N, 3) coordinates in voxels."""
+        return _voxels(self.key, self.at)
+
+
+@dataclass(frozen=True, slots=True)
+class RefineReport:
+    """What became of the surface.
+
+    Args:
+        before, after: Voxels of the surface by class name; "unknown" last.
+        surface: Voxels of the surface.
+        relabelled: Of them, those with another class than before.
+        filled: Those that had no votes and have a class now.
+        voted: Whether anything had votes.
+    """
+
+    before: dict[str, int]
+    after: dict[str, int]
+    surface: int
+    relabelled: int
+    filled: int
+    voted: bool
+
+
+class _Written(NamedTuple):
+    """New evidence of voxels, not yet in the map: place of their tile, and of each block, voxel, evidence and votes."""
+
+    column: int
+    key: NDArray[np.int32]
+    at: NDArray[np.int64]
+    evidence: NDArray[Any]
+    votes: Float32
+
+
+def refine(
+    voxel_map: VoxelMap,
+    weights: NesfWeights,
+    *,
+    fill: float = FILL,
+    up: Float64 | None = None,
+    by_name: bool = False,
+    tile_m: float = TILE_M,
+    on_tile: Callable[[int, int], object] = lambda done, total: None,
+) -> RefineReport:
+    """Refine a map in place.
+
+    Args:
+        voxel_map: Not refined yet; others may read it meanwhile, but not integrate.
+        weights: Of the same classes.
+        fill: Surface without votes gets a class where it is at least so likely; 1 = never.
+        up: (3,) in the world; None = away from the floor.
+        by_name: Take classes that have the same name in both; the probability of the others stays as it is.
+        tile_m: Side of a tile.
+        on_tile: Called after each with tiles done and all tiles.
+
+    Raises:
+        MapError: an empty map, one already refined, voxels over 6 cm, lengths that are not metres, or no up is found.
+        WeightsError: weights of other classes.
+    """
+    check_refinable(voxel_map)
+    shared = shared_classes(voxel_map.label_set, weights.model.label_set, by_name=by_name)
+    frame = up_frame(voxel_map, up)
+    counts = _Counts(len(voxel_map.label_set))
+    waiting: deque[_Written] = deque()
+    tiles = list(_tiles(voxel_map, tile_m))
+    for n, (column, low, high) in enumerate(tiles):
+        while waiting and waiting[0].column < column - 1:  # no later tile reads them
+            _write(voxel_map, waiting.popleft())
+        voxels = surface_voxels(voxel_map, frame, low - _overlap(voxel_map), high + _overlap(voxel_map))
+        own = np.asarray(((voxels.key >= low) & (voxels.key < high)).all(axis=1), np.bool_)
+        if voxels.core.any() and own.any():
+            waiting.append(
+                _refined(voxel_map, weights.model, voxels, own, shared, fill, counts)._replace(column=column)
+            )
+        on_tile(n + 1, len(tiles))
+    for written in waiting:
+        _write(voxel_map, written)
+    voxel_map.refined = weights.digest
+    return counts.report(voxel_map.label_set)
+
+
+def check_refinable(voxel_map: VoxelMap) -> None:
+    """Refuse maps that the network cannot refine.
+
+    Raises:
+        MapError: says why.
+    """
+    if not voxel_map.block_count:
+        raise MapError("an empty map has nothing to refine; map a frame first")
+    if voxel_map.refined:
+        raise MapError(
+            f"the map is refined already, with weights of digest {voxel_map.refined[:12]}; refine the map that it was "
+            "made from"
+        )
+    if voxel_map.config.voxel_size_m > LARGEST_VOXEL_M:
+        raise MapError(
+            f"voxels of {voxel_map.config.voxel_size_m * 100:g} cm are too coarse to refine (at most "
+            f"{LARGEST_VOXEL_M * 100:g} cm); replay the log with a smaller --voxel-size"
+        )
+    if not voxel_map.scale_known:
+        raise MapError("the map's lengths are not metres, which the network learned in; import the film with --scale")
+
+
+def shared_classes(mine: LabelSet, theirs: LabelSet, *, by_name: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Channels (S,) of the map and of the network that mean the same class.
+
+    Raises:
+        WeightsError: other classes, and not ``by_name``; or none has the same name.
+    """
+    if mine == theirs:
+        return np.arange(len(mine)), np.arange(len(mine))
+    pairs = [(mine.names.index(name), n) for n, name in enumerate(theirs.names) if name in mine.names]
+    sets = f"the map has '{mine.name}' ({', '.join(mine.names)}), they have '{theirs.name}' ({', '.join(theirs.names)})"
+    if not by_name:
+        raise WeightsError(
+            f"weights of other classes than the map: {sets}. --by-name takes the {len(pairs)} that both name alike"
+        )
+    if not pairs:
+        raise WeightsError(f"weights and map name no class alike: {sets}; train with labels of the map's classes")
+    map_channels, net_channels = np.array(pairs).T
+    return map_channels, net_channels
+
+
+def up_frame(voxel_map: VoxelMap, up: Float64 | None = None) -> UpFrame:
+    """Which way is up, and where the floor is: nearly the lowest surface.
+
+    Raises:
+        MapError: the map has no surface, or ``up`` is None and cannot be found.
+    """
+    points = voxel_map.points()
+    if not len(points.xyz):
+        raise MapError("the map has no surface to refine")
+    R = turn_onto(find_up(points, voxel_map.label_set) if up is None else up, np.array((0.0, 0.0, 1.0)))
+    return UpFrame(R, float(np.percentile(points.xyz @ R[2].astype(np.float32), LOW_PERCENT)))
+
+
+def surface_voxels(
+    voxel_map: VoxelMap, frame: UpFrame, low: NDArray[np.int64], high: NDArray[np.int64]
+) -> SurfaceVoxels:
+    """Voxels near the surface in the blocks from ``low`` (3,) to before ``high`` (3,)."""
+    config = voxel_map.config
+    with voxel_map.locked() as whole:
+        keys = whole.keys_between(low, high - 1)
+        grid = whole.holding(pack_keys(keys))
+        buffers, blocks = grid.buffers(), find_blocks(grid.index, pack_keys(keys))
+        weight, sdf = buffers.weight[blocks], np.abs(buffers.tsdf[blocks]) * config.truncation_voxels  # in voxels
+        near = (weight >= SURFACE_WEIGHT) & (sdf <= BAND_VOXELS)
+        row, at = np.nonzero(near | ((buffers.votes[blocks] > 0) & (weight > 0)))
+        core = near[row, at] & (sdf[row, at] * config.voxel_size_m <= max(CELL_M / 2, config.voxel_size_m))
+        rise = _gradients(grid, keys, blocks, row, at) @ frame.R[2].astype(np.float32)
+        color, votes = buffers.color[blocks[row], at], buffers.votes[blocks[row], at]
+        log_p = _log_probabilities(buffers.evidence[blocks[row], at], votes, config.vote_discount)
+    xyz = _voxels(keys[row], at) * config.voxel_size_m @ frame.R.T
+    cell_m = max(CELL_M, config.voxel_size_m)
+    points = SurfacePoints(
+        xyz=((xyz + config.voxel_size_m / 2) / cell_m).astype(np.float32),
+        rise=rise,
+        height_m=(xyz[:, 2] - frame.floor_m).astype(np.float32),
+        rgb=color / np.float32(255),
+        log_p=log_p,
+        votes=votes,
+    )
+    return SurfaceVoxels(keys[row], at, points, core)
+
+
+def evidence_of(log_p: Float32, votes: Float32, vote_discount: float, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Evidence (N, L) that reads as log-probabilities (N, L) of voxels with ``votes`` (N,): ``views/readout.py``."""
+    effective = _effective(votes, vote_discount)[:, None]
+    if dtype == np.int16:
+        return np.maximum(np.rint(log_p / effective * STEPS_PER_NAT), np.iinfo(np.int16).min).astype(np.int16)
+    return (log_p * (votes[:, None] / effective)).astype(np.float32)
+
+
+class _Counts:
+    """Voxels of the surface by channel, before and after; -1 = unknown."""
+
+    def __init__(self, classes: int) -> None:
+        self.before, self.after = np.zeros(classes + 1, np.int64), np.zeros(classes + 1, np.int64)
+        self.relabelled = self.filled = self.voted = 0
+
+    def add(self, before: NDArray[np.int64], after: NDArray[np.int64]) -> None:
+        size = len(self.before)
+        self.before += np.bincount(before % size, minlength=size)
+        self.after += np.bincount(after % size, minlength=size)
+        self.relabelled += int(((before >= 0) & (after != before)).sum())
+        self.filled += int(((before < 0) & (after >= 0)).sum())
+        self.voted += int((before >= 0).sum())
+
+    def report(self, label_set: LabelSet) -> RefineReport:
+        names = (*label_set.names, "unknown")
+        before, after = (dict(zip(names, map(int, counts), strict=True)) for counts in (self.before, self.after))
+        return RefineReport(before, after, sum(before.values()), self.relabelled, self.filled, self.voted > 0)
+
+
+def _refined(
+    voxel_map: VoxelMap,
+    model: Nesf,
+    voxels: SurfaceVoxels,
+    own: NDArray[np.bool_],
+    shared: tuple[NDArray[np.int64], NDArray[np.int64]],
+    fill: float,
+    counts: _Counts,
+) -> _Written:
+    """New evidence of the ``own`` voxels of a tile."""
+    mine, theirs = shared
+    points = voxels.points
+    known = np.full((len(own), len(model.label_set)), 0, np.float32)
+    voted = points.votes > 0
+    if len(theirs) < len(model.label_set):
+        known[voted] = np.log(PROBABILITY_FLOOR)
+    known[:, theirs] = np.where(voted[:, None], points.log_p[:, mine], 0)
+    cells = pool(points._replace(log_p=known).rows(voxels.core))
+    near = near_cells(points.xyz[own], cells.cells)
+    before = points.log_p[own]
+    with torch.inference_mode():
+        said = _answers(model, cells, near, torch.from_numpy(known[own]), torch.from_numpy(theirs)).numpy()
+    voted, reached = voted[own], (near.weights.sum(1) > 0.5).numpy()
+    # What the classes have together that the network does not know stays; the rest it shares out.
+    together = np.zeros((len(said), 1), np.float32)
+    if len(mine) < before.shape[1]:
+        together[voted, 0] = np.log(np.exp(before[np.ix_(voted, mine)]).sum(axis=1) + np.float32(1e-9))
+    after = before.copy()
+    after[:, mine] = together + said
+    after[np.ix_(~voted, np.setdiff1d(np.arange(before.shape[1]), mine))] = np.log(PROBABILITY_FLOOR)
+    after = np.maximum(after, LEAST_LOG)
+    filled = ~voted & reached & (said.max(axis=1) >= np.log(fill)) & (fill < 1)
+    changed = (voted & reached) | filled
+    votes = np.where(voted, points.votes[own], np.float32(FILL_VOTES))[changed]
+    core = voxels.core[own]
+    old = np.where(voted, before.argmax(axis=1), -1)
+    counts.add(old[core], np.where(changed, after.argmax(axis=1), old)[core])
+    with voxel_map.locked() as grid:
+        dtype = grid.buffers().evidence.dtype
+    evidence = evidence_of(after[changed], votes, voxel_map.config.vote_discount, dtype)
+    return _Written(0, voxels.key[own][changed], voxels.at[own][changed], evidence, votes)
+
+
+def _answers(model: Nesf, cells: Cells, near: Near, log_p: torch.Tensor, channels: torch.Tensor) -> torch.Tensor:
+    """Log-probabilities (N, S) of some channels at points."""
+    answer = model(cells)
+    parts: list[torch.Tensor] = []
+    for start in range(0, len(log_p), ANSWERED_AT_ONCE):
+        rows = slice(start, start + ANSWERED_AT_ONCE)
+        logits = model.logits(answer, Near(near.rows[rows], near.weights[rows]), log_p[rows])
+        parts.append(torch.log_softmax(logits[:, channels] / model.temperature, dim=1))
+    return torch.cat(parts)
+
+
+def _write(voxel_map: VoxelMap, written: _Written) -> None:
+    packed, row = np.unique(pack_keys(written.key), return_inverse=True)
+    with voxel_map.locked() as grid:
+        for blocks in voxel_map.changing(packed):
+            buffers = grid.buffers()
+            place = np.full(len(packed), -1, np.int64)
+            place[np.searchsorted(packed, pack_keys(buffers.keys[blocks]))] = blocks
+            here = place[row] >= 0
+            where = place[row][here], written.at[here]
+            buffers.evidence[where] = written.evidence[here]
+            buffers.votes[where] = written.votes[here]
+
+
+def _tiles(voxel_map: VoxelMap, tile_m: float) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.int64]]]:
+    """Number along x, first block and end of boxes that together hold all blocks, in the order of x."""
+    with voxel_map.locked() as grid:
+        keys = grid.all_keys().astype(np.int64)
+    low, high = keys.min(axis=0), keys.max(axis=0) + 1
+    most = max(1, round(tile_m / (BLOCK_SIDE * voxel_map.config.voxel_size_m)))
+    count = -(-(high - low) // most)
+    side = -(-(high - low) // count)
+    for place in np.ndindex(*count):
+        start = low + side * place
+        end = np.minimum(start + side, high)
+        if ((keys >= start) & (keys < end)).all(axis=1).any():
+            yield place[0], start, end
+
+
+def _overlap(voxel_map: VoxelMap) -> int:
+    return int(np.ceil(OVERLAP_M / (BLOCK_SIDE * voxel_map.config.voxel_size_m)))
+
+
+def _voxels(key: NDArray[np.int32], at: NDArray[np.int64]) -> NDArray[np.int64]:
+    inside = np.stack((at % BLOCK_SIDE, at // BLOCK_SIDE % BLOCK_SIDE, at // BLOCK_SIDE**2), axis=1)
+    return key.astype(np.int64) * BLOCK_SIDE + inside
+
+
+def _gradients(
+    grid: BlockGrid, keys: NDArray[np.int32], blocks: NDArray[np.int32], row: NDArray[np.int64], at: NDArray[np.int64]
+) -> Float32:
+    """Unit normals (N, 3) of voxels, towards free space; zeros where neighbours say nothing."""
+    buffers = grid.buffers()
+    index = np.full(np.ptp(keys, axis=0) + 3, -1, np.int64)
+    inner = keys - keys.min(axis=0) + 1
+    index[tuple(inner.T)] = blocks
+    own = buffers.tsdf[blocks[row], at]
+    local = _voxels(inner[row], at)
+    normal = np.empty((len(row), 3), np.float32)
+    for axis in range(3):
+        sides: list[Float32] = []
+        for step in (-1, 1):
+            moved = local.copy()
+            moved[:, axis] += step
+            block = index[tuple((moved >> 3).T)]
+            x, y, z = (moved & 7).T
+            place = block, z * BLOCK_SIDE**2 + y * BLOCK_SIDE + x
+            sides.append(np.where((block >= 0) & (buffers.weight[place] > 0), buffers.tsdf[place], own))
+        normal[:, axis] = sides[1] - sides[0]
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.float32(1e-6))
+
+
+def _effective(votes: Float32, vote_discount: float) -> Float32:
+    return np.where(votes > 1, votes / (1 + vote_discount * (votes - 1)), 1).astype(np.float32)
+
+
+def _log_probabilities(evidence: NDArray[Any], votes: Float32, vote_discount: float) -> Float32:
+    """(N, L) that stored evidence reads as; zeros without votes."""
+    effective = _effective(votes, vote_discount)
+    if evidence.dtype == np.int16:
+        said = evidence.astype(np.float32) * (effective / np.float32(STEPS_PER_NAT))[:, None]
+    else:
+        said = evidence * (effective / np.maximum(votes, np.float32(1e-6)))[:, None]
+    said -= said.max(axis=1, keepdims=True)
+    said -= np.log(np.exp(said).sum(axis=1, keepdims=True))
+    return np.where(votes[:, None] > 0, said, 0).astype(np.float32)

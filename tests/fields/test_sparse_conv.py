@@ -1,0 +1,62 @@
+"""Sparse convolutions against torch's dense ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from semantic_mapper.fields.sparse_conv import SubmanifoldConv, cell_levels
+from semantic_mapper.fields.unet3d import LEVELS, UNet3d
+
+SIZE = (8, 4, 12)
+
+
+def _all_cells() -> np.ndarray:
+    return np.stack(np.meshgrid(*(np.arange(s) for s in SIZE), indexing="ij"), -1).reshape(-1, 3) - 4
+
+
+def test_unet_over_all_cells_is_the_dense_one() -> None:
+    torch.manual_seed(0)
+    net = UNet3d(5, 3, width=4)
+    x = torch.randn(len(_all_cells()), 5)
+    sparse = net(x, cell_levels(_all_cells(), LEVELS))
+    dense = net.dense(x.T.reshape(1, 5, *SIZE))[0].reshape(3, -1).T
+    assert sparse.abs().mean() > 0.01
+    torch.testing.assert_close(sparse, dense, atol=1e-5, rtol=1e-5)
+
+
+def test_gradients_are_those_of_the_dense_one() -> None:
+    torch.manual_seed(1)
+    net = UNet3d(2, 2, width=2)
+    x = torch.randn(len(_all_cells()), 2, requires_grad=True)
+    weight = torch.randn(len(_all_cells()), 2)
+    parameters = [x, *net.parameters()]
+    sparse = torch.autograd.grad((net(x, cell_levels(_all_cells(), LEVELS)) * weight).sum(), parameters)
+    dense_out = net.dense(x.T.reshape(1, 2, *SIZE))[0].reshape(2, -1).T
+    dense = torch.autograd.grad((dense_out * weight).sum(), parameters)
+    for mine, theirs in zip(sparse, dense, strict=True):
+        torch.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-4)
+
+
+def test_absent_cells_count_as_zeros() -> None:
+    torch.manual_seed(2)
+    rng = np.random.default_rng(0)
+    every = _all_cells()
+    kept = np.sort(rng.choice(len(every), len(every) // 3, replace=False))
+    conv = SubmanifoldConv(3, 4)
+    x = torch.zeros(len(every), 3)
+    x[kept] = torch.randn(len(kept), 3)
+    sparse = conv(x[kept], cell_levels(every[kept], 1)[0])
+    dense = conv.dense(x.T.reshape(1, 3, *SIZE))[0].reshape(4, -1).T[kept]
+    torch.testing.assert_close(sparse, dense, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("shift", [0, 3])
+def test_levels_name_children_and_parents(shift: int) -> None:
+    cells = _all_cells()[::7] + shift
+    fine, coarse = cell_levels(cells, 2)
+    assert (coarse.cells[fine.parent.numpy()] == cells >> 1).all()
+    corner = np.stack((fine.corner >> 2, fine.corner >> 1 & 1, fine.corner & 1), -1)
+    assert (2 * coarse.cells[fine.parent.numpy()] + corner == cells).all()
+    assert fine.parents == len(coarse.cells)

@@ -1,0 +1,119 @@
+"""``refine``, and ``train --kind nesf``, as commands."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semantic_mapper.fields.nesf import load_nesf, save_nesf
+from semantic_mapper.labels import NYU40, ROOMS
+from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.replay.map_grids import training_map
+from tests.mapping.test_refine import UP, make_map, random_weights
+from tests.nodes.support import error_line, run, write_weights
+from tests.small import tiny_frames
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with map.npz, weights that fit it, and some that do not."""
+    folder = tmp_path_factory.mktemp("refine")
+    make_map().save(folder / "map.npz")
+    save_nesf(random_weights(), folder / "nesf.safetensors")
+    save_nesf(random_weights(NYU40), folder / "nyu40.safetensors")
+    write_weights(folder / "field.safetensors")
+    return folder
+
+
+def test_a_refined_map_is_a_map_like_any_other(files: Path, tmp_path: Path) -> None:
+    out = tmp_path / "new" / "refined.npz"
+    done = run("refine", files, "--weights", files / "nesf.safetensors", "--up", "z", "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "of the surface relabelled" in done.stdout and "wall" in done.stdout
+    before, after = VoxelMap.load(files / "map.npz"), VoxelMap.load(out)
+    assert after.refined == load_nesf(files / "nesf.safetensors").digest
+    np.testing.assert_array_equal(before.block_state()["tsdf"], after.block_state()["tsdf"])
+    assert (before.points().label != after.points().label).any()
+    queried = run("query", out, "info", "--json")
+    assert queried.returncode == 0, queried.stderr
+
+
+def test_json_tells_classes_before_and_after(files: Path, tmp_path: Path) -> None:
+    out = tmp_path / "refined.npz"
+    weights = files / "nesf.safetensors"
+    done = run("refine", files, "--weights", weights, "--up", "z", "--out", out, "--fill", "1", "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["filled"] == 0 and found["relabelled"] > 0
+    assert sum(found["before"].values()) == sum(found["after"].values()) == found["surface"]
+
+
+def test_without_weights_votes_are_smoothed_whatever_the_classes(tmp_path: Path) -> None:
+    make_map(NYU40).save(tmp_path / "map.npz")
+    done = run("refine", tmp_path / "map.npz", "--up", "z", "--out", tmp_path / "smooth.npz")
+    assert done.returncode == 0, done.stderr
+    assert "no --weights: the votes were smoothed" in done.stdout
+    before, after = (VoxelMap.load(tmp_path / name).mesh() for name in ("map.npz", "smooth.npz"))
+
+    def borders(labels: np.ndarray) -> float:
+        return float((labels[before.faces[:, 0]] != labels[before.faces[:, 1]]).mean())
+
+    assert borders(after.label) < 0.8 * borders(before.label), "chance votes become patches"
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("map.npz", "--out", "map.npz"), "is the map itself"),
+        (("missing.npz", "--out", "out.npz"), "no such map"),
+        (("nesf.safetensors", "--out", "out.npz"), "not a map"),
+        (("map.npz", "--out", "out.npz", "--weights", "field.safetensors"), "weights of kind 'sray'"),
+        (("map.npz", "--out", "out.npz", "--weights", "missing.safetensors"), "no such weights file"),
+        (("map.npz", "--out", "out.npz", "--weights", "nyu40.safetensors", "--up", "z"), "--by-name"),
+        (("map.npz", "--out", "out.npz", "--weights", "nesf.safetensors", "--up", "sideways"), "--up sideways"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line_and_nothing_is_written(
+    files: Path, options: tuple[str, ...], said: str
+) -> None:
+    names = [files / word if "." in word else word for word in options]
+    if "--weights" not in options:
+        names += ["--weights", files / "nesf.safetensors"]
+    done = run("refine", *names)
+    assert done.returncode == 1, done.stdout
+    assert said in error_line(done.stderr)
+    assert not (files / "out.npz").exists()
+
+
+def test_weights_that_refine_maps_label_no_frames(files: Path, tmp_path: Path) -> None:
+    done = run("replay", tmp_path / "no.mcap", "--weights", files / "nesf.safetensors", "--out", tmp_path / "out")
+    assert done.returncode == 1
+    done = run("weights", files / "nesf.safetensors")
+    assert "refine" in done.stdout + done.stderr
+
+
+def test_training_on_maps_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    frames = tiny_frames()
+    for seed in (50_000, 50_001):
+        training_map(make_map(), frames, ROOMS, UP).save(tmp_path / "maps" / f"room-{seed}.npz")
+    recipe = tmp_path / "tiny.toml"
+    recipe.write_text(
+        f'kind = "nesf"\nrooms = 1\nvalidation_rooms = 1\nsteps = 4\nmaps = "{tmp_path / "maps"}"\n'
+        "hits = 500\nsmooth_points = 50\nvalidate_every = 2\n[field]\nwidth = 2\n",
+        encoding="utf-8",
+    )
+    out = tmp_path / "run"
+    done = run("train", "--config", recipe, "--out", out, "--steps", "2")
+    assert done.returncode == 0, done.stderr
+    assert "weights.safetensors: 2 steps on 1 maps" in done.stdout
+    done = run("train", "--config", recipe, "--out", out, "--resume")
+    assert done.returncode == 0, done.stderr
+    recipe_of = load_nesf(out / "weights.safetensors").recipe
+    assert recipe_of["steps"] == 4 and [line["step"] for line in recipe_of["history"]] == [0, 2, 4]
+    again = run("train", "--config", recipe, "--out", out)
+    assert again.returncode == 1 and "a run has finished here" in error_line(again.stderr)
+    done = run("train", "--config", recipe, "--out", tmp_path / "other", "--workers", "2")
+    assert done.returncode == 1 and "--workers" in error_line(done.stderr)

@@ -1,0 +1,91 @@
+"""Training the network that refines maps: a map with wrong votes is put right from labels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import ConfigError, WeightsError
+from semantic_mapper.fields.nesf import NesfConfig, load_nesf, save_nesf
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.replay.map_grids import training_map
+from semantic_mapper.training.nesf import NesfTrainConfig, TrainingMap, train_nesf, withhold
+from tests.mapping.test_refine import UP, make_map
+from tests.small import tiny_frames
+
+TINY = NesfTrainConfig(
+    steps=60,
+    field=NesfConfig(width=4),
+    crops=1,
+    hits=2000,
+    smooth_points=100,
+    validate_every=60,
+    learning_rate=1e-2,
+    final_learning_rate=1e-3,
+)
+
+
+@pytest.fixture(scope="module")
+def noisy() -> TrainingMap:
+    """A map whose votes are chance."""
+    return training_map(make_map(), tiny_frames(), ROOMS, UP)
+
+
+def test_hits_lie_on_the_surface_and_have_the_class_of_their_pixels(noisy: TrainingMap) -> None:
+    pixels = sum(int((f.label > 0).sum()) for f in tiny_frames())
+    assert 0.5 * pixels < noisy.count.sum() <= pixels
+    floor = noisy.channel == ROOMS.names.index("floor")
+    assert floor.sum() > 50
+    assert np.median(np.abs(noisy.points.height_m[noisy.row[floor]])) < 0.05
+    assert np.median(noisy.points.rise[noisy.row[floor]]) > 0.9
+
+
+def test_labels_of_images_teach_the_network(noisy: TrainingMap) -> None:
+    trained = train_nesf(TINY, ROOMS, [noisy], [noisy])
+    found = trained.recipe["validation"]
+    assert found["miou"] > found["map_miou"] + 0.05
+    assert trained.recipe["history"][0]["step"] == 0
+    assert 0.4 < float(trained.model.temperature) < 3.1
+
+
+def test_training_repeats_bit_for_bit(noisy: TrainingMap) -> None:
+    config = NesfTrainConfig(steps=3, field=NesfConfig(width=2), hits=200, smooth_points=20)
+    one, other = (train_nesf(config, ROOMS, [noisy], [noisy]).model.state_dict() for _ in range(2))
+    assert all((one[name] == other[name]).all() for name in one)
+
+
+def test_training_maps_and_weights_survive_their_files(noisy: TrainingMap, tmp_path: Path) -> None:
+    noisy.save(tmp_path / "map.npz")
+    again = TrainingMap.load(tmp_path / "map.npz")
+    np.testing.assert_array_equal(again.points.xyz, noisy.points.xyz)
+    np.testing.assert_allclose(again.points.log_p.astype(np.float32), noisy.points.log_p, atol=0.01)
+    np.testing.assert_allclose(again.points.rgb.astype(np.float32), noisy.points.rgb, atol=0.003)
+    np.testing.assert_array_equal(again.row, noisy.row)
+    (tmp_path / "other.npz").write_bytes(b"no map")
+    with pytest.raises(WeightsError, match="not a training map"):
+        TrainingMap.load(tmp_path / "other.npz")
+    trained = train_nesf(NesfTrainConfig(steps=1, field=NesfConfig(width=2)), ROOMS, [noisy], [noisy])
+    save_nesf(trained, tmp_path / "w.safetensors")
+    loaded = load_nesf(tmp_path / "w.safetensors")
+    assert loaded.model.label_set == ROOMS and loaded.recipe["steps"] == 1 and len(loaded.digest) == 64
+
+
+def test_votes_and_colours_are_withheld_as_often_as_asked(noisy: TrainingMap) -> None:
+    rng = np.random.default_rng(0)
+    config = NesfTrainConfig(no_votes=0.2, cubes=0.3, no_colour=0.4)
+    kept = [withhold(noisy.points, config, rng) for _ in range(200)]
+    had = (noisy.points.votes > 0).sum()
+    votes = np.array([(p.votes > 0).sum() / had for p in kept])
+    assert 0.1 < (votes == 0).mean() < 0.4
+    assert 0.1 < ((votes > 0) & (votes < 1)).mean() < 0.4
+    assert 0.3 < np.mean([not p.rgb.any() for p in kept]) < 0.5
+    assert all((p.log_p[p.votes == 0] == 0).all() for p in kept)
+
+
+def test_no_maps_and_no_budget_are_refused(noisy: TrainingMap) -> None:
+    with pytest.raises(ConfigError, match="at least one map"):
+        train_nesf(TINY, ROOMS, [], [noisy])
+    with pytest.raises(ConfigError, match="budget"):
+        train_nesf(NesfTrainConfig(steps=0), ROOMS, [noisy], [noisy])
