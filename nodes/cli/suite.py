@@ -85,7 +85,7 @@ def run_suite_verb(
     out = json_file or Path("runs") / f"{_file_stem(suite)}.json"
     prepare_file(out)
     entries = load_entries(paths, kinds)
-    refiner = None if refine is None else _Refiner(suite, load_nesf(refine), smoothed_votes(ROOMS))
+    refiner = None if refine is None else _Refiner(suite, load_nesf(refine), smoothed_votes(ROOMS_SUITE.label_set))
     store, pictures = RecordStore(out.with_suffix(".jsonl")), out.with_suffix(".views")
     with StopRequest() as stop:
         with frame_progress("benchmark", None, unit="%") as bar:
