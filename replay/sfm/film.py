@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ import cv2
 import numpy as np
 
 from semantic_mapper.errors import ImportSourceError
+from semantic_mapper.files import numeric_order
 from semantic_mapper.types import UInt8
 
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
@@ -149,7 +149,7 @@ class Film:
 def pictures_of(folder: Path) -> list[Path]:
     """Pictures of a folder by the numbers in their names, as people order them: 9 comes before 10."""
     files = [file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES and file.is_file()]
-    return sorted(files, key=lambda file: [int(w) if w.isdigit() else w for w in re.split(r"(\d+)", file.name)])
+    return sorted(files, key=lambda file: numeric_order(file.name))
 
 
 def focal_of_exif(file: Path, longer_px: int, shorter_px: int) -> float | None:
