@@ -197,3 +197,15 @@ def test_the_verb_makes_a_map_and_prints_the_report_last(tmp_path: Path, walked:
 def test_what_was_to_tell_the_scale_must_be_in_the_film(tmp_path: Path) -> None:
     with pytest.raises(ImportSourceError, match="no such film"):
         import_film(tmp_path / "none.mp4", tmp_path / "a.mcap", FilmOptions(), quiet)
+
+
+@pytest.mark.parametrize(
+    ("mark", "says"),
+    [(Mark(99.0, 5, 5), "last frame is at 2.87 s"), (Mark(1.0, 400, 5), "outside of the film's 320x240")],
+)
+def test_marks_outside_of_the_film_are_refused(
+    tmp_path: Path, walked: tuple[Path, Float64], mark: Mark, says: str
+) -> None:
+    hint = ScaleHint(distance=MarkedDistance(Mark(1.0, 5, 5), mark, 0.9))
+    with pytest.raises(ImportSourceError, match=says):
+        import_film(walked[0], tmp_path / "a.mcap", FilmOptions(scale=hint), quiet)
