@@ -31,6 +31,7 @@ from semantic_mapper.replay.sfm.film import Film, FilmFrame
 from semantic_mapper.replay.sfm.film_note import FilmNote
 from semantic_mapper.replay.sfm.refusals import (
     LEAST_ANGLE_DEG,
+    doubt_focal,
     refuse_features,
     refuse_look,
     refuse_outcome,
@@ -399,6 +400,10 @@ class _Import:
         refuse_outcome(self._film.path, outcome, times, spans)
         if _parallax_deg(models[0]) < LEAST_ANGLE_DEG:
             raise turning(self._film.path)
+        if outcome.focal is not None and self._lens.measured is not None:
+            given_px = self._lens.measured.fx * self._film.full_width / self._film.width
+            doubt = doubt_focal(self._film.path, self._options.calibration, given_px, outcome.focal)
+            self._notices += [doubt] if doubt else []
         tried = len(outcome.attempts)
         if tried > 1:
             priors = ", ".join(f"{a.focal_prior_px:.0f}" for a in outcome.attempts)
