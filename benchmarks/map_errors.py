@@ -1,4 +1,4 @@
-"""Maps beside a mesh, from above: each point of the surface in the colour of its distance from the mesh.
+"""Maps beside a mesh, from above: classes, and each point of the surface in the colour of its distance from the mesh.
 
 Example: python -m benchmarks.map_errors runs/sensor runs/computed --mesh redkitchen/mesh_labels.npz --out errors.png
 """
@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
+from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.plots import new_figure, put_title, rendered, write_picture
-from semantic_mapper.types import Float64
+from semantic_mapper.types import Float64, UInt8
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,36 +26,42 @@ WIDTH, HEIGHT = 460, 310  # of a panel, pixels
 
 
 class Cloud(NamedTuple):
-    """Points of a surface (N, 3) and how far each is from the other surface (N,), both in metres."""
+    """Points of a surface (N, 3) and how far each is from the other surface (N,), both in metres; and the colours of
+    their classes (N, 3) uint8, of a map."""
 
     name: str
     xyz: Float64
     off_m: Float64
+    rgb: UInt8 | None = None
 
 
-def compare(run: Path, vertices: Float64) -> tuple[Cloud, Cloud]:
+def compare(run: Path, vertices: Float64, min_weight: float) -> tuple[Cloud, Cloud]:
     """Points of a run's map with their distances from the mesh, and vertices of the mesh with theirs from the map."""
-    xyz = VoxelMap.load(run / "map.npz").points().xyz.astype(np.float64)
+    voxel_map = VoxelMap.load(run / "map.npz")
+    points = voxel_map.points(min_weight)
+    xyz = points.xyz.astype(np.float64)
     return (
-        Cloud(run.name, xyz, cKDTree(vertices).query(xyz)[0]),
+        Cloud(run.name, xyz, cKDTree(vertices).query(xyz)[0], voxel_map.label_set.colorize(points.label)),
         Cloud(run.name, vertices, cKDTree(xyz).query(vertices)[0]),
     )
 
 
 @rendered
 def draw(pairs: Sequence[tuple[Cloud, Cloud]], to_gravity: Float64) -> Figure:
-    """Upper row: points of the maps. Lower row: vertices of the mesh."""
-    figure = new_figure(WIDTH * len(pairs) + 90, 2 * HEIGHT + 70)
-    put_title(figure, "Distance of map and mesh, from above", "upper row: points of the map; lower row: the mesh")
-    width, height = WIDTH * len(pairs) + 90, 2 * HEIGHT + 70
+    """First row: classes of the maps. Then distances: of the points of the maps, and of the vertices of the mesh."""
+    width, height = WIDTH * len(pairs) + 110, 3 * HEIGHT + 70
+    figure = new_figure(width, height)
+    put_title(
+        figure, "Maps from above", "classes; distance of their points from the mesh; distance of the mesh from them"
+    )
     level = [cloud.xyz @ to_gravity[:3, :3].T for pair in pairs for cloud in pair]
     low, high = np.quantile(np.concatenate(level), (0.002, 0.998), axis=0)
     dots = None
     for column, pair in enumerate(pairs):
-        for row, cloud in enumerate(pair):
+        for row, cloud in enumerate((pair[0], *pair)):
             box = (
                 (column * WIDTH + 12) / width,
-                (1 - row) * HEIGHT / height,
+                (2 - row) * HEIGHT / height,
                 (WIDTH - 24) / width,
                 (HEIGHT - 30) / height,
             )
@@ -62,6 +69,11 @@ def draw(pairs: Sequence[tuple[Cloud, Cloud]], to_gravity: Float64) -> Figure:
             axes.set_axis_off()
             xyz = cloud.xyz @ to_gravity[:3, :3].T
             order = np.argsort(xyz[:, 2])
+            if row == 0:
+                assert cloud.rgb is not None
+                axes.scatter(*xyz[order, :2].T, c=cloud.rgb[order] / 255, s=0.4)
+                axes.set_title(cloud.name, fontsize=9)
+                continue
             dots = axes.scatter(
                 *xyz[order, :2].T, c=cloud.off_m[order] * 100, s=0.4, cmap="turbo", vmin=0, vmax=FARTHEST_M * 100
             )
@@ -70,7 +82,7 @@ def draw(pairs: Sequence[tuple[Cloud, Cloud]], to_gravity: Float64) -> Figure:
             )
             axes.set_title(f"{cloud.name}: {within}", fontsize=9)
     if dots is not None:
-        bar = figure.colorbar(dots, cax=figure.add_axes(((width - 70) / width, 0.2, 16 / width, 0.5)))
+        bar = figure.colorbar(dots, cax=figure.add_axes(((width - 90) / width, 0.2, 16 / width, 0.5)))
         bar.set_label("cm")
     return figure
 
@@ -81,10 +93,11 @@ def main() -> None:
     parser.add_argument("runs", type=Path, nargs="+", help="folders that replay wrote")
     parser.add_argument("--mesh", type=Path, required=True, help="NPZ with vertices (V, 3) and T_gravity (4, 4)")
     parser.add_argument("--out", type=Path, required=True, help="PNG to write")
+    parser.add_argument("--min-weight", type=float, default=SURFACE_WEIGHT, help="of a voxel of the surface")
     given = parser.parse_args()
     with np.load(given.mesh) as mesh:
         vertices, to_gravity = np.asarray(mesh["vertices"], np.float64), np.asarray(mesh["T_gravity"], np.float64)
-    pairs = [compare(run, vertices) for run in given.runs]
+    pairs = [compare(run, vertices, given.min_weight) for run in given.runs]
     for on_map, on_mesh in pairs:
         within = ", ".join(f"{(on_mesh.off_m < m).mean() * 100:.1f} % within {m * 100:.0f} cm" for m in (0.05, 0.10))
         print(f"{on_map.name}: {np.median(on_map.off_m) * 1e3:.1f} mm (median) from the mesh; of the mesh {within}")

@@ -151,6 +151,7 @@ class Rectifier:
     def __init__(self, measured: CameraIntrinsics) -> None:
         self.intrinsics = measured
         self._maps: tuple[np.ndarray, np.ndarray] | None = None
+        self._exact: tuple[np.ndarray, np.ndarray] | None = None
         if not any(measured.distortion):
             return
         K, distortion = camera_matrix(measured), np.array(measured.distortion, np.float64)
@@ -158,6 +159,8 @@ class Rectifier:
         ideal, _ = cv2.getOptimalNewCameraMatrix(K, distortion, size, 0)
         maps = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), ideal, size, cv2.CV_16SC2)
         self._maps = (np.asarray(maps[0]), np.asarray(maps[1]))
+        exact = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), ideal, size, cv2.CV_32FC1)
+        self._exact = (np.asarray(exact[0]), np.asarray(exact[1]))
         fx, fy, cx, cy = (float(v) for v in (ideal[0, 0], ideal[1, 1], ideal[0, 2], ideal[1, 2]))
         try:
             self.intrinsics = CameraIntrinsics(fx, fy, cx, cy, *size)
@@ -168,9 +171,10 @@ class Rectifier:
 
     def nearest(self, depth_m: Float32) -> Float32:
         """Depth (H, W) in the pixels of the lens -> in those of the rectified image, each from the nearest pixel."""
-        if self._maps is None:
+        if self._exact is None:
             return depth_m
-        return np.asarray(cv2.remap(depth_m, *self._maps, cv2.INTER_NEAREST), np.float32)
+        # The maps of integers, which are quicker, round down here.
+        return np.asarray(cv2.remap(depth_m, *self._exact, cv2.INTER_NEAREST), np.float32)
 
     def __call__(self, bgr: UInt8) -> UInt8:
         """(H, W, 3) BGR as OpenCV captures it -> rectified RGB of the same size."""

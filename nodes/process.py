@@ -28,6 +28,8 @@ def prepare_process(*, verbose: bool = False) -> None:
     """
     os.environ.setdefault("OMP_NUM_THREADS", str(min(usable_cores(), MAX_THREADS)))
     os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "2")  # s; a camera that has stalled hangs OpenCV for 10
+    if not verbose:  # damaged films: FFmpeg's own lines; what is wrong is said in an error or a note of ours
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     structlog.configure(
         processors=[
             structlog.contextvars.merge_contextvars,

@@ -206,3 +206,8 @@ def _sync(path: Path) -> None:
         os.fsync(fd)
     finally:
         os.close(fd)
+
+
+def numeric_order(name: str) -> list[str | int]:
+    """Key that sorts names by the numbers in them, as people order them: 9 comes before 10."""
+    return [int(part) if at % 2 else part for at, part in enumerate(re.split(r"(\d+)", name))]

@@ -58,8 +58,21 @@ def film_options(
     """Options of a film as the command line gives them; 0 and "" = not given.
 
     Raises:
-        ConfigError: values that cannot be, or several sources of scale.
+        typer.BadParameter: options that exclude each other.
+        ConfigError: values that cannot be.
     """
+    sources = {
+        "--scale": scale,
+        "--distance": distance,
+        "--square-mm": square_mm,
+        "--board": board,
+        "--camera-height": camera_height,
+    }
+    given = [name for name, value in sources.items() if value]
+    if len(given) > 1 and given != ["--square-mm", "--board"]:
+        raise typer.BadParameter(f"{' and '.join(given)}: the scale comes from one source only; leave out all but one")
+    if calibration is not None and focal_prior:
+        raise typer.BadParameter("--calibration and --focal-prior: the focal length is given or guessed, not both")
     from semantic_mapper.nodes.cli.calibrate import board_settings
     from semantic_mapper.replay.sfm.reconstruct import FilmOptions
     from semantic_mapper.replay.sfm.scale import ScaleHint, parse_distance
@@ -77,14 +90,14 @@ def recording_scale(options: FilmOptions) -> float | None:
     """Metres per unit, of a recording that has poses.
 
     Raises:
-        ConfigError: options were given that are for films alone.
+        typer.BadParameter: options were given that are for films alone.
     """
     hint = options.scale
     if any(
         value is not None
         for value in (options.calibration, options.focal_prior_px, hint.distance, hint.board, hint.camera_height_m)
     ):
-        raise ConfigError(
+        raise typer.BadParameter(
             "the recording has poses and intrinsics of its own; --calibration, --focal-prior, --distance, --square-mm, "
             "--board and --camera-height are for films"
         )

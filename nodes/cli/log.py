@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -22,13 +22,11 @@ from semantic_mapper.nodes.cli.film import (
     print_film,
     recording_scale,
 )
+from semantic_mapper.nodes.cli.imported import print_import
 from semantic_mapper.nodes.cli.verb import EXIT_FAILED, verb
 from semantic_mapper.plain_text import counted
 
-if TYPE_CHECKING:
-    from semantic_mapper.replay.importers import ImportReport
-
-LISTED = 10  # skipped files and damages that are shown one by one
+LISTED = 10  # damages that are shown one by one
 
 
 @verb
@@ -122,18 +120,7 @@ def import_(
         report = import_recording(
             source, log, format, on_progress, options=options, renames=renames, overwrite=overwrite
         )
-    labels = "no labels" if not report.labelled else f"{report.labelled} of them labelled"
-    output.print(
-        f"{log}: {counted(report.frames, 'frame')} ({labels}), {report.bytes / 1e6:.1f} MB, from a '{report.format}'"
-    )
-    output.print(f"  depth: {_depth_line(report)}")
-    for notice in report.notices:
-        output.print(f"  note: {notice}")
-    for skipped in report.skipped[:LISTED]:
-        what = "label left out" if skipped.label_only else "frame left out"
-        output.print(f"  {what}: frame {skipped.frame}: {skipped.file}: {skipped.reason}")
-    if len(report.skipped) > LISTED:
-        output.print(f"  and {len(report.skipped) - LISTED} more")
+    print_import(output, report, log)
 
 
 def _topics_by_role(texts: list[str]) -> dict[str, str]:
@@ -142,15 +129,6 @@ def _topics_by_role(texts: list[str]) -> dict[str, str]:
         if not equals or not name:
             raise typer.BadParameter(f"--topic {role}: write ROLE=NAME, such as image=/camera/color/image_raw")
     return {role: name for role, _, name in pairs}
-
-
-def _depth_line(report: ImportReport) -> str:
-    if not report.with_depth:
-        return "no frame has a depth image"
-    missing = report.frames - report.with_depth
-    without = f"; {missing} of {counted(report.frames, 'frame')} without a depth image" if missing else ""
-    median = f"; half of the first image is nearer than {report.median_depth_m:.2f} m" if report.median_depth_m else ""
-    return f"{report.depth_scale}{median}{without}"
 
 
 @verb

@@ -47,15 +47,16 @@ def map_(
 
     The folder gets the log (NAME.mcap), the report on the film (NAME.html), and what `replay` writes. Walk slowly,
     sideways, in good light; a camera that turns on the spot shows no depth. A film tells no metres: give one of
-    --scale, --distance, --square-mm, --camera-height. Films are mapped with weights that have learned from computed
-    depth (rooms-computed-depth). The last line is the path of the report.
+    --scale, --distance, --square-mm, --camera-height. Where no frame has depth, the weights are those that have
+    learned from computed depth (rooms-computed-depth). The last line is the path of the report.
 
     Example: semantic-mapper map film.mp4 --out runs/film
     Example: semantic-mapper map film.mp4 --out runs/film --calibration camera.toml --camera-height 1.5
     """
     output = Output.guarded()
-    from semantic_mapper.fields.checkpoint import COMPUTED_DEPTH
+    from semantic_mapper.fields.checkpoint import COMPUTED_DEPTH, load_checkpoint
     from semantic_mapper.nodes.cli.film import film_options, import_film_log, is_film, print_film, recording_scale
+    from semantic_mapper.nodes.cli.imported import print_import
     from semantic_mapper.nodes.cli.outputs import hold_folder
     from semantic_mapper.nodes.cli.report import REPORT_NAME
     from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, ReplayRequest, mapper_config, replay_log
@@ -66,19 +67,26 @@ def map_(
     options = film_options(
         calibration, focal_prior, scale, distance, square_mm, board, camera_height, int(rotate) // 90
     )
+    if weights is not None:
+        load_checkpoint(weights)  # what is wrong with them is said before the long work
     log = out / f"{source.resolve().stem}.mcap"
     with hold_folder(out):
         if is_film(source):
             report, page = import_film_log(source, log, options, overwrite=True)
             print_film(output, report, log)
             output.print(f"  {page}  (report on the film)")
+            with_depth = 0
         else:
+            plain = ImportOptions(quarters=int(rotate) // 90, scale=recording_scale(options))
             with frame_progress("import", None) as bar:
-                plain = ImportOptions(quarters=int(rotate) // 90, scale=recording_scale(options))
-                import_recording(source, log, on_progress=lambda done, _: bar.set(done), options=plain, overwrite=True)
+                found = import_recording(
+                    source, log, on_progress=lambda done, _: bar.set(done), options=plain, overwrite=True
+                )
+            print_import(output, found, log)
+            with_depth = found.with_depth
     with StopRequest() as stop:
         with frame_progress("replay", None) as bar:
-            chosen = weights or (COMPUTED_DEPTH if is_film(source) else None)
+            chosen = weights or (None if with_depth else COMPUTED_DEPTH)
             summary = replay_log(ReplayRequest(log, out, chosen, settings), stop, bar.start, bar.set)
         output.print(summary_table({out.name: summary}))
         for line in (*notes(summary), *result_lines(out), str(out / REPORT_NAME)):

@@ -89,6 +89,10 @@ class PosedPictures:
             self.notices.append(
                 "the scale is unknown: lengths of the log are not metres; give --scale, metres per unit of the poses"
             )
+        named = [picture.depth_file for picture in pictures if picture.depth_file is not None]
+        missing = [file for file in named if not file.exists()]
+        if missing:
+            self.notices.append(f"{len(missing)} of {len(named)} depth images are missing; the first: {missing[0]}")
         first = self._rectifier(pictures[0].intrinsics, pictures[0].file)
         self.info = StreamInfo(
             source=f"{source} {folder.resolve().name}",
@@ -127,15 +131,15 @@ class PosedPictures:
             seq=number,
             camera_id=self._options.camera_id,
             rgb=rectifier(np.ascontiguousarray(rgb[..., ::-1])) if changed else rgb,
-            depth_m=None if changed else self._depth(picture, (height, width)),
+            depth_m=self._depth(picture, rectifier, (height, width)),
             label=None,
             intrinsics=rectifier.intrinsics,
             T_world_camera=check_frame_pose(pose, picture.file),
         )
         return LoadedFrame(frame, None if changed else encoded)
 
-    def _depth(self, picture: PosedPicture, size: tuple[int, int]) -> Float32 | None:
-        """Depth image (H, W) in metres, brought to the size of the picture; None where there is none."""
+    def _depth(self, picture: PosedPicture, rectifier: Rectifier, size: tuple[int, int]) -> Float32 | None:
+        """Depth image (H, W) in metres, of the size and the lens of the picture; None where there is none."""
         if picture.depth_file is None or not picture.depth_file.exists():
             return None
         units = read_plane(picture.depth_file, "uint16", None, "depth").astype(np.uint16, copy=False)
@@ -144,7 +148,7 @@ class PosedPictures:
             units = np.where(confidence > 0, units, 0).astype(np.uint16)
         if units.shape != size:
             units = np.asarray(cv2.resize(units, size[::-1], interpolation=cv2.INTER_NEAREST), np.uint16)
-        return depth_from_uint16(units, self.depth_scale.units_per_m)
+        return rectifier.nearest(depth_from_uint16(units, self.depth_scale.units_per_m))
 
     def _rectifier(self, intrinsics: CameraIntrinsics, file: Path) -> Rectifier:
         if intrinsics not in self._rectifiers:

@@ -65,6 +65,7 @@ _MARKS = {
     "transforms": ("transforms.json",),
 }
 
+SCALED = ("transforms", "colmap")  # formats whose poses have a unit of their own
 LISTED = 5  # recordings that an error names
 _SEE = "replay/importers/ says what each format consists of"
 _VIDEO = "is a film, which has no poses: `semantic-mapper import` and `semantic-mapper map` find them"
@@ -190,6 +191,8 @@ def import_recording(
     name = format_name or detect_format(src)
     if name not in FORMATS:
         raise ImportSourceError(f"no format '{name}'; there are {', '.join(FORMATS)}")
+    if options.scale is not None and name not in SCALED:
+        raise ImportSourceError(f"{src}: poses of format '{name}' are in metres; --scale is for {' and '.join(SCALED)}")
     if not src.is_dir() and not (name == "rosbag" and src.is_file()):
         raise ImportSourceError(f"{src}: no such {'file or folder' if name == 'rosbag' else 'folder'}")
     recording = FORMATS[name](src, options)

@@ -4,6 +4,8 @@ The layout is that of https://docs.nerf.studio/quickstart/data_conventions.html:
 k2 k3 p1 p2`` (or ``camera_angle_x``) for all frames or in a frame, and ``frames`` with ``file_path`` and
 ``transform_matrix`` (camera to world). The first pixel's centre is at 0.5. With ``depth_file_path`` (16-bit PNG,
 millimetres unless ``depth_unit_scale_factor`` says otherwise) poses are in metres, otherwise in a unit of their own.
+A given scale makes metres of the poses alone: depth images have a unit that the file tells, and poses of structure from
+motion with the depth of a sensor are the case in which both differ.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import numpy as np
 
 from semantic_mapper.config import read_json
 from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
+from semantic_mapper.files import numeric_order
 from semantic_mapper.replay.importers.base import DepthScale, ImportOptions, read_rgb
 from semantic_mapper.replay.importers.posed import GL_AXES, PosedPicture, PosedPictures, inside
 from semantic_mapper.types import CameraIntrinsics
@@ -69,10 +72,16 @@ def open_transforms(folder: Path, options: ImportOptions) -> PosedPictures:
     if not 0 < found.depth_unit_scale_factor < 1e3:
         raise ImportSourceError(f"{file}: depth_unit_scale_factor {found.depth_unit_scale_factor:g} cannot be")
     pictures = [_picture(folder, found, frame, number) for number, frame in enumerate(found.frames)]
-    pictures.sort(key=lambda picture: picture.file.name)
+    pictures.sort(key=lambda picture: numeric_order(picture.file.name))
     scale = DepthScale(1 / found.depth_unit_scale_factor, file)
-    metric = any(picture.depth_file is not None for picture in pictures)
-    return PosedPictures("transforms", folder, pictures, options, depth_scale=scale, metric=metric)
+    measured = any(picture.depth_file is not None and picture.depth_file.is_file() for picture in pictures)
+    opened = PosedPictures("transforms", folder, pictures, options, depth_scale=scale, metric=measured)
+    if measured and options.scale is not None:
+        opened.notices.append(
+            f"--scale {options.scale:g} is of the poses; the depth images keep their own unit: {scale}; if depth has "
+            f"the unit of the poses, multiply depth_unit_scale_factor by {options.scale:g}, too"
+        )
+    return opened
 
 
 def _picture(folder: Path, all_frames: _Transforms, frame: _Frame, number: int) -> PosedPicture:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from semantic_mapper.errors import FrameError, ImportSourceError
-from semantic_mapper.files import read_regular
+from semantic_mapper.files import numeric_order, read_regular
 from semantic_mapper.geometry import invert_pose, pose_matrix
 from semantic_mapper.types import CameraIntrinsics, Float64, Int64
 
@@ -62,7 +62,7 @@ class ColmapModel:
 
     Args:
         cameras: By their ids; with distortion as OpenCV has it.
-        images: In the order of their names.
+        images: In the order of their names, by the numbers in these.
         points: (3,) of each point by its id.
         errors_px: Mean reprojection error of each point, by its id.
     """
@@ -95,7 +95,9 @@ def read_model(folder: Path) -> ColmapModel:
         if not file.exists():
             raise ImportSourceError(f"{file}: missing; a model has cameras, images and points3D, .bin or .txt")
     cameras = dict(_cameras_bin(files[0]) if binary else _cameras_txt(files[0]))
-    images = sorted(_images_bin(files[1]) if binary else _images_txt(files[1]), key=lambda image: image.name)
+    images = sorted(
+        _images_bin(files[1]) if binary else _images_txt(files[1]), key=lambda image: numeric_order(image.name)
+    )
     rows = () if not files[2].exists() else _points_bin(files[2]) if binary else _points_txt(files[2])
     points, errors = {}, {}
     for number, xyz, error in rows:

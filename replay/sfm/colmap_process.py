@@ -82,12 +82,25 @@ class Pair(msgspec.Struct, frozen=True):
     flat: float
 
 
+class FocalCheck(msgspec.Struct, frozen=True):
+    """What the pictures say of a given focal length.
+
+    Args:
+        factor: By which it has to be multiplied to fit them best.
+        sigmas: How sure that is: the difference over its own standard deviation.
+    """
+
+    factor: float
+    sigmas: float
+
+
 class Outcome(msgspec.Struct, frozen=True):
-    """All that the process tells."""
+    """All that the process tells; ``focal`` of the largest model of a calibrated camera."""
 
     attempts: list[Attempt]
     pairs: list[Pair]
     features: list[int]
+    focal: FocalCheck | None = None
 
 
 def main(folder: Path) -> None:
@@ -109,7 +122,9 @@ def main(folder: Path) -> None:
         if models and models[0].images >= ENOUGH * len(files):
             break
     counts = [len(rows) for rows in descriptors]
-    outcome = Outcome(attempts, _verified(pycolmap, folder / DATABASE, OVERLAP), counts)
+    models = attempts[0].models
+    focal = _check_focal(pycolmap, folder / models[0].folder) if camera.fixed is not None and models else None
+    outcome = Outcome(attempts, _verified(pycolmap, folder / DATABASE, OVERLAP), counts, focal)
     (folder / RESULT).write_bytes(msgspec.json.encode(outcome))
 
 
@@ -224,6 +239,29 @@ def _map(pycolmap: Any, folder: Path, number: int, camera: Camera, prior: float,
     size = max(camera.width, camera.height)
     models = [model for model in models if FOCAL_RANGE[0] < model.focal_px / size < FOCAL_RANGE[1]]
     return sorted(models, key=lambda model: (-model.images, model.error_px))
+
+
+def _check_focal(pycolmap: Any, folder: Path) -> FocalCheck:
+    """Adjust a model with its focal length as it is, then with a free one; the model on disk stays as it is.
+
+    What the squared errors lose, over their mean, is the square of the difference in standard deviations.
+    """
+    model = pycolmap.Reconstruction(folder)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_extra_params = options.print_summary = False
+    options.ceres.solver_options.num_threads = 1  # as above
+    errors, focal = list[float](), list[float]()
+    for free in (False, True):
+        options.refine_focal_length = free
+        pycolmap.bundle_adjustment(model, options)
+        model.update_point_3d_errors()
+        errors.append(sum(point.track.length() * point.error**2 for point in model.points3D.values()))
+        focal.append(float(next(iter(model.cameras.values())).mean_focal_length()))
+    seen = sum(point.track.length() for point in model.points3D.values())
+    free_values = 2 * seen - 6 * model.num_reg_images() - 3 * len(model.points3D)
+    if free_values <= 0 or errors[1] <= 0:
+        return FocalCheck(1.0, 0.0)
+    return FocalCheck(focal[1] / focal[0], (max(0.0, errors[0] - errors[1]) * free_values / errors[1]) ** 0.5)
 
 
 def _precision(camera: Camera) -> float:

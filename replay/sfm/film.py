@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,12 +11,14 @@ import cv2
 import numpy as np
 
 from semantic_mapper.errors import ImportSourceError
+from semantic_mapper.files import numeric_order
 from semantic_mapper.types import UInt8
 
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 MAX_SIDE_PX = 1280  # larger frames are made smaller: a map needs no more, and memory stays bounded
 PICTURE_HZ = 2.0  # at which the pictures of a folder count as taken
+MAX_FAILED = 1000  # reads one after the other: films may announce any number of frames
 DEFAULT_HZ = 30.0  # of a film that tells neither times nor a rate
 _TURNS = (None, cv2.ROTATE_90_CLOCKWISE, cv2.ROTATE_180, cv2.ROTATE_90_COUNTERCLOCKWISE)
 _FOCAL_35MM, _DIAGONAL_35MM = 0xA405, 43.27  # EXIF: FocalLengthIn35mmFilm; the diagonal of its picture in mm
@@ -49,6 +51,7 @@ class Film:
         full_width, full_height: Before they were made smaller.
         count: About how many there are; films may tell a wrong number.
         focal_px: Focal length by the picture's EXIF data, for the given size; None where nothing tells it.
+        unread: Of a film that was read to its end: announced frames that cannot be decoded, or are not there.
         odd_pictures: Of a folder: pictures that cannot be read or have another size, with the reason.
 
     Raises:
@@ -58,6 +61,7 @@ class Film:
     def __init__(self, path: Path, quarters: int = 0) -> None:
         self.path = path
         self.odd_pictures: dict[Path, str] = {}
+        self.unread = 0
         self.focal_px: float | None = None
         self._turn = _TURNS[quarters % 4]
         self._pictures = pictures_of(path) if path.is_dir() else []
@@ -80,17 +84,21 @@ class Film:
     def _iterate_film(self) -> Iterator[FilmFrame]:
         capture = self._open()
         try:
-            index, last_ns = 0, -1
-            while True:
+            last_ns, read, failed = -1, 0, 0
+            for index in itertools.count():
                 good, bgr = capture.read()
                 if not good or bgr is None:
-                    return
+                    failed += 1
+                    if index + 1 >= self.count or failed == MAX_FAILED:
+                        self.unread = max(0, self.count - read)
+                        return
+                    continue  # behind a damaged frame may be good ones
+                read, failed = read + 1, 0
                 stamp_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
                 if stamp_ns <= last_ns:  # containers without times
                     stamp_ns = last_ns + round(1e9 / self.hz)
                 last_ns = stamp_ns
                 yield FilmFrame(index, stamp_ns, self._as_given(np.asarray(bgr, np.uint8)))
-                index += 1
         finally:
             capture.release()
 
@@ -128,12 +136,13 @@ class Film:
     def _look(self) -> tuple[UInt8, int, float]:
         capture = self._open()
         try:
-            good, bgr = capture.read()
-            if not good or bgr is None:
-                raise ImportSourceError(f"{self.path}: holds no frame that can be decoded; copy or convert it again")
             hz = capture.get(cv2.CAP_PROP_FPS)
-            count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-            return np.asarray(bgr, np.uint8), max(count, 1), hz if 0.01 < hz < 1000 else DEFAULT_HZ
+            count = max(1, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+            for _ in range(min(count, MAX_FAILED)):
+                good, bgr = capture.read()
+                if good and bgr is not None:
+                    return np.asarray(bgr, np.uint8), count, hz if 0.01 < hz < 1000 else DEFAULT_HZ
+            raise ImportSourceError(f"{self.path}: holds no frame that can be decoded; copy or convert it again")
         finally:
             capture.release()
 
@@ -149,7 +158,7 @@ class Film:
 def pictures_of(folder: Path) -> list[Path]:
     """Pictures of a folder by the numbers in their names, as people order them: 9 comes before 10."""
     files = [file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES and file.is_file()]
-    return sorted(files, key=lambda file: [int(w) if w.isdigit() else w for w in re.split(r"(\d+)", file.name)])
+    return sorted(files, key=lambda file: numeric_order(file.name))
 
 
 def focal_of_exif(file: Path, longer_px: int, shorter_px: int) -> float | None:

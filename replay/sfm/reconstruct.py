@@ -31,6 +31,7 @@ from semantic_mapper.replay.sfm.film import Film, FilmFrame
 from semantic_mapper.replay.sfm.film_note import FilmNote
 from semantic_mapper.replay.sfm.refusals import (
     LEAST_ANGLE_DEG,
+    doubt_focal,
     refuse_features,
     refuse_look,
     refuse_outcome,
@@ -287,8 +288,16 @@ class _Import:
     def run(self, dst: Path, *, overwrite: bool) -> FilmReport:
         film = self._film
         look = look_through(film, lambda done: self._progress("look", done, max(done, film.count)))
+        if film.unread:
+            self._notices.append(
+                f"{film.count - film.unread} of the {film.count} frames that the film announces could be read; it is "
+                "damaged or cut off: copy or convert it again, if what is missing matters"
+            )
         rows = pick_frames(look)
         refuse_look(film.path, look, len(rows))
+        if self._options.scale.distance is not None:
+            for mark in (self._options.scale.distance.a, self._options.scale.distance.b):
+                self._check_mark(mark, look)
         board = None if self._options.scale.board is None else BoardScale(self._options.scale.board)
         picked = self._find_features(look, rows, board)
         outcome = self._run_colmap()
@@ -391,6 +400,10 @@ class _Import:
         refuse_outcome(self._film.path, outcome, times, spans)
         if _parallax_deg(models[0]) < LEAST_ANGLE_DEG:
             raise turning(self._film.path)
+        if outcome.focal is not None and self._lens.measured is not None:
+            given_px = self._lens.measured.fx * self._film.full_width / self._film.width
+            doubt = doubt_focal(self._film.path, self._options.calibration, given_px, outcome.focal)
+            self._notices += [doubt] if doubt else []
         tried = len(outcome.attempts)
         if tried > 1:
             priors = ", ".join(f"{a.focal_prior_px:.0f}" for a in outcome.attempts)
@@ -422,7 +435,7 @@ class _Import:
             self._notices.append("up is how the camera was held: too few upright edges are seen to tell it better")
         frames = _moved(frames, upright(frames[min(frames)].T_world_camera, guess if up is None else up), 1.0)
         placed = _Placed(_moved(frames, np.eye(4), UNSCALED_DEPTH_M / median_depth(list(frames.values()))), xy, seen)
-        factor, scale = self._scale(placed, board)
+        factor, scale = self._scale(placed, look, board)
         frames = _moved(placed.frames, np.eye(4), factor)
         floor = floor_under(list(frames.values()))
         down = np.eye(4)
@@ -445,7 +458,7 @@ class _Import:
             )
         return _Placed(frames, xy, seen), scale, height, others
 
-    def _scale(self, placed: _Placed, board: BoardScale | None) -> tuple[float, str]:
+    def _scale(self, placed: _Placed, look: FilmLook, board: BoardScale | None) -> tuple[float, str]:
         """Metres per unit, and how they were found; empty = they were not."""
         hint, frames = self._options.scale, placed.frames
         if hint.factor is not None:
@@ -462,8 +475,7 @@ class _Import:
             height = float(np.median([f.T_world_camera[2, 3] for f in frames.values()])) - floor
             return hint.camera_height_m / height, f"camera {hint.camera_height_m:g} m over the floor that was found"
         if hint.distance is not None:
-            marks = [self._given_mark(mark) for mark in (hint.distance.a, hint.distance.b)]
-            a, b = (self._marked_place(mark, placed) for mark in marks)
+            a, b = (self._marked_place(mark, placed, look) for mark in (hint.distance.a, hint.distance.b))
             found = float(np.linalg.norm(a - b))
             if found < 1e-6:
                 raise ImportSourceError("the two marked points are one; mark two that are far apart")
@@ -474,16 +486,39 @@ class _Import:
         )
         return 1.0, ""
 
-    def _given_mark(self, mark: Mark) -> Mark:
-        ratio = self._film.width / self._film.full_width
-        return Mark(mark.time_s, *self._lens.seen_pixel(mark.u * ratio, mark.v * ratio))
+    def _check_mark(self, mark: Mark, look: FilmLook) -> None:
+        """Refuse a mark outside of the film, before the long work begins."""
+        film, last_s = self._film, look.stamp_ns[-1] / 1e9
+        if mark.time_s > last_s + 0.5 / film.hz:
+            raise ImportSourceError(
+                f"{film.path}: --distance marks a point at {mark.time_s:g} s, and the last frame is at {last_s:.2f} s; "
+                "give times within the film"
+            )
+        if not (0 <= mark.u < film.full_width and 0 <= mark.v < film.full_height):
+            raise ImportSourceError(
+                f"{film.path}: --distance marks the pixel {mark.u:g},{mark.v:g}, outside of the film's "
+                f"{film.full_width}x{film.full_height}"
+            )
 
-    def _marked_place(self, mark: Mark, placed: _Placed) -> Float64:
+    def _marked_place(self, mark: Mark, placed: _Placed, look: FilmLook) -> Float64:
+        ratio = self._film.width / self._film.full_width
+        seen = Mark(mark.time_s, *self._lens.seen_pixel(mark.u * ratio, mark.v * ratio))
+        row = nearest_frame(mark.time_s, look.stamp_ns)
+        way = look.way
         order = sorted(placed.frames)
-        at = order.index(nearest_frame(mark, placed.frames, order))
-        chosen = set(order[max(0, at - NEIGHBOURS) : at + NEIGHBOURS + 1])
+        rows = np.searchsorted(look.index, order)
+        near = [_seconds(look, order[n]) for n in np.argsort(np.abs(rows - row), kind="stable")[:4]]
+        if np.abs(way[rows] - way[row]).min() > FOLLOWED:
+            raise ImportSourceError(
+                f"{self._film.path}: --distance marks a point at {mark.time_s:g} s, where the camera's place was not "
+                f"found; mark it at another time, such as {', '.join(f'{s:.2f}' for s in sorted(near))} s"
+            )
+        at = int(np.searchsorted(rows, row))
+        marked = int(look.index[row])
+        chosen = {marked, *order[max(0, at - NEIGHBOURS) : at + NEIGHBOURS + 1]}
         pictures = {f.index: _gray(self._lens.seen(f.bgr)) for f in self._frames(chosen)}
-        return marked_place(mark, pictures, placed.frames, placed.seen)
+        poses = {index: frame.T_world_camera for index, frame in placed.frames.items()}
+        return marked_place(seen, marked, pictures, poses, placed.seen)
 
     def _write(
         self,

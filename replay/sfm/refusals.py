@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.replay.sfm.colmap_process import Outcome, Pair
+from semantic_mapper.replay.sfm.colmap_process import FocalCheck, Outcome, Pair
 from semantic_mapper.replay.sfm.selection import STEP, FilmLook
 
 LEAST_PICKS = 8
@@ -20,6 +20,8 @@ LINK_MATCHES = 20
 FLAT = 0.93  # of the matches that one homography explains: nothing but a turn, or one plane
 LEAST_MODEL = 0.6  # of the picked frames in the largest model
 LEAST_ANGLE_DEG = 1.0  # between the rays to a point, the median: less is a camera that turns on the spot
+DOUBTED_FOCAL, WRONG_FOCAL = 0.05, 0.1  # of a given focal length: its difference from what the pictures say
+LEAST_SIGMAS = 10.0  # of this difference: rolling shutter and the like make a few
 _HOW = "film again: walk slowly, sideways past things with texture, in good light"
 
 
@@ -28,7 +30,8 @@ class FilmError(ImportSourceError):
 
     Args:
         film: Its name.
-        reason: "dark", "still", "short", "blurred", "no-matches", "turning" or "several-scenes".
+        reason: "dark", "still", "short", "blurred", "no-matches", "turning", "several-scenes" or
+            "calibration".
         text: What is wrong, and what to do.
     """
 
@@ -138,6 +141,31 @@ def turning(film: object) -> FilmError:
         "the camera only turns on the spot, or sees one flat surface: from one place nothing can be measured; "
         "walk while filming, a step or more to the side for each turn",
     )
+
+
+def doubt_focal(film: object, calibration: object, focal_px: float, check: FocalCheck) -> str:
+    """What is wrong with the focal length of a calibration; empty where nothing is, or the film does not tell.
+
+    Args:
+        film: Its name.
+        calibration: Its file.
+        focal_px: Given, in pixels of the film.
+        check: What the pictures say.
+
+    Raises:
+        FilmError: it is far off.
+    """
+    off = abs(check.factor - 1)
+    if off < DOUBTED_FOCAL or check.sigmas < LEAST_SIGMAS:
+        return ""
+    text = (
+        f"the focal length of {calibration} is {focal_px:.0f} px of the film, and its pictures fit "
+        f"{focal_px * check.factor:.0f} px better; calibrate in the mode (size, zoom, stabilisation) of the film, or "
+        "leave out --calibration to have the focal length found"
+    )
+    if off > WRONG_FOCAL:
+        raise FilmError(film, "calibration", text)
+    return text
 
 
 def flat_fraction(pairs: Sequence[Pair]) -> float:

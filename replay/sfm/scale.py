@@ -16,7 +16,7 @@ from semantic_mapper.drivers.poses.config import BoardPoses
 from semantic_mapper.errors import ConfigError, ImportSourceError
 from semantic_mapper.geometry import camera_matrix
 from semantic_mapper.replay.sfm.between import track
-from semantic_mapper.types import CameraIntrinsics, Float64, UInt8
+from semantic_mapper.types import CameraIntrinsics, Float64, Int64, UInt8
 
 UNSCALED_DEPTH_M = 2.0  # median depth of the points of a model whose scale nobody tells
 MIN_ANGLE_DEG = 2.0  # between the rays that a place is found by
@@ -65,9 +65,8 @@ class ScaleHint:
     camera_height_m: float | None = None
 
     def __post_init__(self) -> None:
-        given = [name for name in self.__slots__ if getattr(self, name) is not None]
-        if len(given) > 1:
-            raise ConfigError(f"the scale comes from one source only; leave out all but one of {', '.join(given)}")
+        if sum(getattr(self, name) is not None for name in self.__slots__) > 1:
+            raise ConfigError("the scale comes from one source only: a factor, a distance, a board or a height")
         for number in (self.factor, self.camera_height_m):
             if number is not None and not 1e-6 < number < 1e6:
                 raise ConfigError(f"a scale or height of {number:g} cannot be; give a number above 0")
@@ -218,14 +217,15 @@ class BoardScale:
 
 
 def marked_place(
-    mark: Mark, pictures: Mapping[int, UInt8], frames: Mapping[int, PlacedFrame], intrinsics: CameraIntrinsics
+    mark: Mark, marked: int, pictures: Mapping[int, UInt8], poses: Mapping[int, Float64], intrinsics: CameraIntrinsics
 ) -> Float64:
     """Where in the world (3,) what a mark shows is: it is followed into the frames around, and triangulated.
 
     Args:
         mark: The pixel.
-        pictures: (H, W) gray pictures of placed frames around its time, by their index.
-        frames: The placed frames, by their index.
+        marked: Index of the frame that it is a pixel of; one without a pose will do.
+        pictures: (H, W) gray pictures of this frame and of placed frames around it, by their index.
+        poses: T_world_camera (4, 4) of placed frames, by their index.
         intrinsics: Of all.
 
     Raises:
@@ -236,25 +236,27 @@ def marked_place(
             f"the mark {mark.u:g},{mark.v:g} lies outside of the {intrinsics.width}x{intrinsics.height} pictures"
         )
     order = sorted(pictures)
-    at = nearest_frame(mark, frames, order)
+    at = order.index(marked)
     rays: list[tuple[Float64, Float64]] = []
-    for way in (order[order.index(at) :], order[: order.index(at) + 1][::-1]):
+    for way in (order[at:], order[: at + 1][::-1]):
         xy = np.array([[[mark.u, mark.v]]], np.float32)
         for last, now in pairwise(way):
             xy, true = track(pictures[last], pictures[now], xy)
             if not true[0]:
                 break
-            rays.append(ray_of(frames[now].T_world_camera, xy[0, 0], intrinsics))
-    rays.append(ray_of(frames[at].T_world_camera, np.array((mark.u, mark.v)), intrinsics))
+            rays.append(ray_of(poses[now], xy[0, 0], intrinsics))
+    followed = len(rays)
+    if marked in poses:
+        rays.append(ray_of(poses[marked], np.array((mark.u, mark.v)), intrinsics))
     place = triangulate(rays)
     if place is None:
         raise ImportSourceError(
-            f"the mark {mark.time_s:g}:{mark.u:g},{mark.v:g} cannot be placed: it is followed into {len(rays) - 1} "
+            f"the mark {mark.time_s:g}:{mark.u:g},{mark.v:g} cannot be placed: it is followed into {followed} "
             "frames, from one side only; mark a corner with texture around it, at a time when the camera moves sideways"
         )
     return place
 
 
-def nearest_frame(mark: Mark, frames: Mapping[int, PlacedFrame], order: Sequence[int]) -> int:
-    """The frame of ``order`` that is nearest in time to a mark."""
-    return min(order, key=lambda index: abs(frames[index].stamp_ns - 1e9 * mark.time_s))
+def nearest_frame(time_s: float, stamps_ns: Int64) -> int:
+    """Row of the stamp (N,) that is nearest to a time within the film."""
+    return int(np.argmin(np.abs(stamps_ns - 1e9 * time_s)))

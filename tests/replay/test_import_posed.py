@@ -32,7 +32,7 @@ def poses(count: int = 3) -> list[Float64]:
 def write_pictures(folder: Path, names: list[str]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for n, name in enumerate(names):
-        picture = np.full((H, W, 3), 40 * n + 20, np.uint8)
+        picture = np.full((H, W, 3), (40 * n + 20) % 256, np.uint8)
         picture[H // 2 :, W // 4] = (0, 0, 255)
         assert cv2.imwrite(str(folder / name), picture)
 
@@ -44,11 +44,11 @@ def imported(src: Path, **options: Any) -> tuple[ImportReport, list[PosedFrame]]
         return report, list(log)
 
 
-def make_transforms(folder: Path, **more: Any) -> Path:
-    write_pictures(folder / "images", [f"frame_{n + 1:05d}.png" for n in range(3)])
+def make_transforms(folder: Path, form: str = "frame_{:05d}.png", count: int = 3, **more: Any) -> Path:
+    write_pictures(folder / "images", [form.format(n + 1) for n in range(count)])
     frames = [
-        {"file_path": f"images/frame_{n + 1:05d}.png", "transform_matrix": (T @ GL).tolist()}
-        for n, T in enumerate(poses())
+        {"file_path": f"images/{form.format(n + 1)}", "transform_matrix": (T @ GL).tolist()}
+        for n, T in enumerate(poses(count))
     ]
     given = {"fl_x": F, "fl_y": F, "cx": W / 2, "cy": H / 2, "w": W, "h": H, "frames": frames, **more}
     (folder / "transforms.json").write_text(json.dumps(given))
@@ -70,17 +70,65 @@ def test_a_given_scale_makes_metres(tmp_path: Path) -> None:
     assert np.allclose(frames[2].T_world_camera[:3, 3], 2.5 * poses()[2][:3, 3])
 
 
-def test_depth_of_transforms_json_is_read_and_makes_its_poses_metric(tmp_path: Path) -> None:
-    folder = make_transforms(tmp_path / "nerf")
+def test_numbers_in_names_order_the_frames(tmp_path: Path) -> None:
+    _, frames = imported(make_transforms(tmp_path / "nerf", "frame_{}.png", 11))
+    for frame, T in zip(frames, poses(11), strict=True):
+        assert np.allclose(frame.T_world_camera, T, atol=1e-12) and frame.stamp_ns == 500_000_000 * frame.seq
+
+
+def add_depth(folder: Path) -> Path:
+    """Depth images of half the size: 1.5 m and a millimetre more in each frame, without measurement above."""
     (folder / "depths").mkdir()
     found = json.loads((folder / "transforms.json").read_text())
     for n, frame in enumerate(found["frames"]):
-        cv2.imwrite(str(folder / "depths" / f"{n}.png"), np.full((H // 2, W // 2), 1500 + n, np.uint16))
+        units = np.full((H // 2, W // 2), 1500 + n, np.uint16)
+        units[: H // 4] = 0
+        cv2.imwrite(str(folder / "depths" / f"{n}.png"), units)
         frame["depth_file_path"] = f"depths/{n}.png"
     (folder / "transforms.json").write_text(json.dumps(found))
+    return folder
+
+
+@pytest.mark.parametrize("k1", [0.0, 0.3])
+def test_depth_of_transforms_json_is_read_and_makes_its_poses_metric(tmp_path: Path, k1: float) -> None:
+    report, frames = imported(add_depth(make_transforms(tmp_path / "nerf", k1=k1)))
+    assert report.info.scale_known and report.with_depth == 3 and not report.notices
+    depth = frames[1].depth_m
+    assert depth is not None and np.allclose(depth[H // 2 + 1 :], 1.501) and (depth[: H // 2 - 1] == 0).all()
+
+
+def test_depth_follows_its_picture_when_the_lens_is_undone(tmp_path: Path) -> None:
+    folder = add_depth(make_transforms(tmp_path / "nerf", k1=0.5))
+    picture, units = np.zeros((H, W, 3), np.uint8), np.full((H, W), 3000, np.uint16)
+    picture[8:20, 6:18], units[8:20, 6:18] = 255, 1000
+    cv2.imwrite(str(folder / "images" / "frame_00001.png"), picture)
+    cv2.imwrite(str(folder / "depths" / "0.png"), units)
+    frame = imported(folder)[1][0]
+    assert frame.depth_m is not None
+    white = frame.rgb[..., 0] > 127
+    assert (white != (picture[..., 0] > 127)).sum() > 40  # the square has moved
+    assert (white != (frame.depth_m < 2)).sum() < 30  # its depth with it, but for some of its edge
+
+
+def test_depth_images_that_are_missing_are_told_and_make_nothing_metric(tmp_path: Path) -> None:
+    folder = add_depth(make_transforms(tmp_path / "nerf"))
+    (folder / "depths" / "1.png").unlink()
     report, frames = imported(folder)
-    assert report.info.scale_known and report.with_depth == 3
-    assert frames[1].depth_m is not None and np.allclose(frames[1].depth_m, 1.501)
+    assert report.info.scale_known and report.with_depth == 2 and frames[1].depth_m is None
+    assert "1 of 3 depth images are missing" in " ".join(report.notices)
+    for n in (0, 2):
+        (folder / "depths" / f"{n}.png").unlink()
+    report, _ = imported(folder)
+    assert not report.info.scale_known and "3 of 3 depth images are missing" in " ".join(report.notices)
+
+
+def test_a_scale_makes_metres_of_poses_and_leaves_depth_alone(tmp_path: Path) -> None:
+    report, frames = imported(add_depth(make_transforms(tmp_path / "nerf")), scale=2.0)
+    assert frames[1].depth_m is not None and frames[1].depth_m.max() == pytest.approx(1.501)
+    assert np.allclose(frames[2].T_world_camera[:3, 3], 2 * poses()[2][:3, 3])
+    assert "depth images keep their own unit" in " ".join(report.notices)
+    with pytest.raises(ImportSourceError, match="in metres"):
+        imported(make_record3d(tmp_path / "phone"), scale=2.0)
 
 
 def test_a_field_of_view_names_without_suffix_and_a_lens_are_understood(tmp_path: Path) -> None:
@@ -184,6 +232,13 @@ def test_a_colmap_model_is_imported_upright(tmp_path: Path, kind: str) -> None:
         assert np.allclose(T[:3, 1], (0, 0, -1), atol=1e-9)  # image down is down
         assert np.allclose(T[:3, 3] - moved[0][:3, 3], 2 * (true[:3, 3] - poses()[0][:3, 3]), atol=1e-9)
     assert (frames[0].intrinsics.fx, frames[0].intrinsics.cx) == (F, 31.5)
+
+
+def test_images_of_a_model_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    folder = make_colmap(tmp_path / "scan", "txt")
+    images = folder / "sparse" / "0" / "images.txt"
+    images.write_text(images.read_text().replace(" 0.png", " 10.png"))
+    assert [image.name for image in read_model(images.parent).images] == ["1.png", "2.png", "10.png"]
 
 
 @pytest.mark.parametrize("kind", ["txt", "bin"])

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import typer
 
-from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.cli.film import film_options, is_film, write_film_report
 from semantic_mapper.replay.sfm.film_note import FilmNote, read_left_out
 from semantic_mapper.replay.sfm.reconstruct import FilmReport, LeftOut, OtherModel
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
-from tests.nodes.support import run
+from tests.nodes.support import run, run_process
 from tests.replay import recordings as rec
 
 
@@ -22,8 +23,10 @@ def test_options_become_one_source_of_scale() -> None:
     assert film_options(None, 500.0, 1.5, "", 0.0, None, 0.0, 1).scale.factor == 1.5
     board = film_options(None, 0.0, 0.0, "", 39.6, None, 0.0).scale.board
     assert board is not None and board.square_m == pytest.approx(0.0396)
-    with pytest.raises(ConfigError, match="one source"):
+    with pytest.raises(typer.BadParameter, match=r"--scale and --camera-height: .* one source"):
         film_options(None, 0.0, 1.5, "", 0.0, None, 1.2)
+    with pytest.raises(typer.BadParameter, match="--calibration and --focal-prior"):
+        film_options(Path("a.toml"), 500.0, 0.0, "", 0.0, None, 0.0)
 
 
 def test_a_folder_of_pictures_is_a_film_unless_it_is_a_recording(tmp_path: Path) -> None:
@@ -84,7 +87,7 @@ def test_the_report_says_what_was_left_out_and_that_lengths_are_no_metres(tmp_pa
 def test_options_of_films_are_refused_for_recordings(tmp_path: Path) -> None:
     folder = rec.make_folder(tmp_path / "kitchen")
     done = run("import", folder, tmp_path / "a.mcap", "--camera-height", "1.4")
-    assert done.returncode == 1 and "are for films" in done.stderr
+    assert done.returncode == 2 and "for films" in " ".join(done.stderr.split())
 
 
 def test_a_log_keeps_how_many_frames_of_its_film_it_lacks() -> None:
@@ -99,6 +102,26 @@ def test_a_stream_is_metric_unless_it_says_otherwise() -> None:
 
 def test_what_is_no_film_is_refused_by_the_verb(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(b"no film")
-    done = run("map", tmp_path / "a.mp4", "--out", tmp_path / "out")
+    done = run_process("map", tmp_path / "a.mp4", "--out", tmp_path / "out")
     assert done.returncode == 1 and "no film that OpenCV can decode" in done.stderr
+    assert done.stderr.startswith("error: ") and len(done.stderr.splitlines()) == 1  # FFmpeg's own lines are not shown
     assert not (tmp_path / "out" / "a.mcap").exists()
+
+
+def test_weights_that_are_not_there_are_told_before_the_film_is_read(tmp_path: Path) -> None:
+    done = run("map", tmp_path / "none.mp4", "--out", tmp_path / "out", "--weights", tmp_path / "nope.safetensors")
+    assert done.returncode == 1 and "nope.safetensors" in done.stderr
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_a_recording_without_any_depth_is_mapped_with_the_weights_for_computed_depth(
+    tmp_path: Path, depth: bool, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folder = rec.make_folder(tmp_path / "kitchen")
+    if not depth:
+        shutil.rmtree(folder / "depth")
+    (folder / "color" / sorted(file.name for file in (folder / "color").iterdir())[1]).write_bytes(b"damaged")
+    done = run("map", folder, "--out", tmp_path / "out")
+    said = done.stderr + capfd.readouterr().err
+    assert ("rooms-computed-depth.safetensors" in said) != depth and "mapping" in said
+    assert "frame left out: frame 1" in done.stdout  # what `import` says is not lost

@@ -58,7 +58,7 @@ def take(poses: Float64, seed: int = SEED, shutter: float = 0.0, bands: int = 6)
     return pictures
 
 
-def _box(data: bytes, *path: bytes) -> tuple[int, int]:
+def box(data: bytes, *path: bytes) -> tuple[int, int]:
     """Start and size of a box of an mp4 file; what is in it begins 8 bytes later."""
     start, end = 0, len(data)
     size = 0
@@ -79,14 +79,14 @@ def set_frame_times(film: Path, durations: Sequence[int]) -> int:
     """Give each frame of a film a duration of its own, as phones do; returns the units a second."""
     data = bytearray(film.read_bytes())
     way = (b"moov", b"trak", b"mdia")
-    header, _ = _box(data, *way, b"mdhd")
+    header, _ = box(data, *way, b"mdhd")
     units = struct.unpack(">I", data[header + 20 : header + 24])[0]
-    old, size = _box(data, *way, b"minf", b"stbl", b"stts")
+    old, size = box(data, *way, b"minf", b"stbl", b"stts")
     table = struct.pack(">II", 0, len(durations)) + b"".join(struct.pack(">II", 1, d) for d in durations)
     new = struct.pack(">I4s", 8 + len(table), b"stts") + table
     grown = len(new) - size
-    boxes = [_box(data, *(*way, b"minf", b"stbl")[:n])[0] for n in range(1, 6)]
-    assert all(at < old for at in boxes) and _box(data, b"mdat")[0] < boxes[0]  # offsets of frames stay true
+    boxes = [box(data, *(*way, b"minf", b"stbl")[:n])[0] for n in range(1, 6)]
+    assert all(at < old for at in boxes) and box(data, b"mdat")[0] < boxes[0]  # offsets of frames stay true
     for at in boxes:
         struct.pack_into(">I", data, at, struct.unpack_from(">I", data, at)[0] + grown)
     data[old : old + size] = new
@@ -99,7 +99,7 @@ def set_frame_times(film: Path, durations: Sequence[int]) -> int:
 def set_rotation(film: Path) -> None:
     """Mark a film as to be turned clockwise by a quarter for showing, as phones do that are held upright."""
     data = bytearray(film.read_bytes())
-    header, _ = _box(data, b"moov", b"trak", b"tkhd")
+    header, _ = box(data, b"moov", b"trak", b"tkhd")
     one = 0x10000
     struct.pack_into(">9i", data, header + 8 + 40, 0, one, 0, -one, 0, 0, 0, 0, 0x40000000)
     film.write_bytes(bytes(data))

@@ -70,6 +70,24 @@ def test_a_folder_of_pictures_is_a_film_in_the_order_of_its_numbers(tmp_path: Pa
     assert film.focal_px == pytest.approx(26 * 50 / 43.27)
 
 
+def test_a_damaged_film_is_read_past_its_damage_and_counts_what_is_lost(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    pictures = [rng.integers(0, 255, (96, 128, 3), np.uint8) for _ in range(12)]
+    path = films.write_film(tmp_path / "a.mp4", pictures)
+    whole = Film(path)
+    stamps = [frame.stamp_ns for frame in whole]
+    assert len(stamps) == 12 and whole.unread == 0
+    data = bytearray(path.read_bytes())
+    start, size = films.box(bytes(data), b"mdat")
+    middle = start + size // 2
+    data[middle : middle + size // 6] = bytes(size // 6)
+    path.write_bytes(bytes(data))
+    film = Film(path)
+    frames = list(film)
+    assert 6 <= len(frames) < 12 and film.unread == 12 - len(frames)
+    assert frames[-1].stamp_ns == stamps[-1] and {frame.stamp_ns for frame in frames} <= set(stamps)
+
+
 def test_what_is_no_film_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ImportSourceError, match="no such film"):
         Film(tmp_path / "none.mp4")

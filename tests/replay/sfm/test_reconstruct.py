@@ -149,7 +149,16 @@ def test_a_calibrated_film_gets_its_scale_from_two_marked_points_or_a_height(
     found = import_film(film, tmp_path / "a.mcap", FilmOptions(tmp_path / "camera.toml", scale=hint), quiet)
     error, scale = path_error_m(tmp_path / "a.mcap", poses)
     assert found.info.scale_known and error < 0.03 and scale == pytest.approx(1, abs=0.1)
-    assert found.focal_px == pytest.approx(films.CAMERA.fx)
+    assert found.focal_px == pytest.approx(films.CAMERA.fx) and not found.notices
+
+
+@pytest.mark.slow
+def test_a_calibration_that_the_pictures_contradict_is_refused(tmp_path: Path, walked: tuple[Path, Float64]) -> None:
+    wrong = dataclasses.replace(films.CAMERA, fx=0.475 * films.CAMERA.fx, fy=0.475 * films.CAMERA.fy)
+    save_calibration(tmp_path / "wrong.toml", wrong, None, {})
+    with pytest.raises(FilmError, match=r"is 129 px of the film, and its pictures fit (19|2\d)\d px") as caught:
+        import_film(walked[0], tmp_path / "a.mcap", FilmOptions(tmp_path / "wrong.toml"), quiet)
+    assert caught.value.reason == "calibration" and not list(tmp_path.glob("*.mcap*"))
 
 
 @pytest.mark.slow
@@ -197,3 +206,15 @@ def test_the_verb_makes_a_map_and_prints_the_report_last(tmp_path: Path, walked:
 def test_what_was_to_tell_the_scale_must_be_in_the_film(tmp_path: Path) -> None:
     with pytest.raises(ImportSourceError, match="no such film"):
         import_film(tmp_path / "none.mp4", tmp_path / "a.mcap", FilmOptions(), quiet)
+
+
+@pytest.mark.parametrize(
+    ("mark", "says"),
+    [(Mark(99.0, 5, 5), "last frame is at 2.87 s"), (Mark(1.0, 400, 5), "outside of the film's 320x240")],
+)
+def test_marks_outside_of_the_film_are_refused(
+    tmp_path: Path, walked: tuple[Path, Float64], mark: Mark, says: str
+) -> None:
+    hint = ScaleHint(distance=MarkedDistance(Mark(1.0, 5, 5), mark, 0.9))
+    with pytest.raises(ImportSourceError, match=says):
+        import_film(walked[0], tmp_path / "a.mcap", FilmOptions(scale=hint), quiet)

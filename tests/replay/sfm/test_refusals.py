@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from semantic_mapper.replay.sfm.colmap_process import Outcome, Pair
-from semantic_mapper.replay.sfm.refusals import FilmError, refuse_features, refuse_look, refuse_outcome
+from semantic_mapper.replay.sfm.colmap_process import FocalCheck, Outcome, Pair
+from semantic_mapper.replay.sfm.refusals import FilmError, doubt_focal, refuse_features, refuse_look, refuse_outcome
 from semantic_mapper.replay.sfm.selection import FilmLook
 
 
@@ -67,3 +67,14 @@ def test_what_does_not_hang_together_is_refused(found: Outcome, spans: list[rang
     with pytest.raises(FilmError, match=says) as caught:
         refuse_outcome("film.mp4", found, TIMES, spans)
     assert caught.value.reason == reason
+
+
+def test_a_calibration_is_doubted_where_the_pictures_are_sure() -> None:
+    def doubt(factor: float, sigmas: float) -> str:
+        return doubt_focal("film.mp4", "camera.toml", 500.0, FocalCheck(factor, sigmas))
+
+    assert doubt(1.02, 40.0) == doubt(1.5, 3.0) == ""
+    assert "camera.toml is 500 px" in doubt(1.08, 20.0) and "460 px" in doubt(0.92, 20.0)
+    with pytest.raises(FilmError, match=r"500 px .* 1000 px") as caught:
+        doubt(2.0, 50.0)
+    assert caught.value.reason == "calibration"

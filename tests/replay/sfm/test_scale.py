@@ -14,6 +14,7 @@ from semantic_mapper.replay.sfm.scale import (
     PlacedFrame,
     ScaleHint,
     floor_under,
+    marked_place,
     parse_distance,
     ray_of,
     triangulate,
@@ -128,3 +129,20 @@ def test_a_board_tells_the_scale() -> None:
     assert found == pytest.approx(scaled, rel=0.01) and "board" in how
     with pytest.raises(ImportSourceError, match="board tells no scale"):
         scale.metres_per_unit({0: poses[0]}, camera)
+
+
+def test_a_marked_pixel_counts_in_its_own_frame_also_where_that_has_no_pose(rng: np.random.Generator) -> None:
+    import cv2
+
+    camera = CameraIntrinsics(300.0, 300.0, 159.5, 119.5, 320, 240)
+    wall = cv2.resize(rng.integers(0, 255, (60, 120), np.uint8), (480, 240), interpolation=cv2.INTER_CUBIC)
+    step = 8  # pixels a frame, of a wall 3 m ahead
+    pictures = {n: np.ascontiguousarray(wall[:, step * n : step * n + 320]) for n in range(9)}
+    poses = {n: np.eye(4) for n in pictures if n != 4}
+    for n, pose in poses.items():
+        pose[0, 3] = n * step * 3.0 / 300.0
+    place = marked_place(Mark(0.4, 180.0, 100.0), 4, pictures, poses, camera)
+    true = ((180 - 159.5) / 100 + 4 * step * 0.01, (100 - 119.5) / 100, 3.0)
+    assert place == pytest.approx(true, abs=0.02)
+    with pytest.raises(ImportSourceError, match="cannot be placed"):
+        marked_place(Mark(0.4, 180.0, 100.0), 4, {4: pictures[4]}, poses, camera)
