@@ -87,7 +87,7 @@ def test_refined_poses_stay_where_given_ones_are_in_the_mean() -> None:
     given = np.array([f.T_world_camera for f in disturbed()])
     assert absolute_trajectory_error(np.array(anchored), truth()).rmse_m < 0.03
     before, after = relative_pose_error(given, truth()), relative_pose_error(np.array(anchored), truth())
-    assert after.rmse_m < 0.6 * before.rmse_m and after.rmse_deg < 0.6 * before.rmse_deg
+    assert after.rmse_m < 0.7 * before.rmse_m and after.rmse_deg < 0.7 * before.rmse_deg
 
 
 def test_the_scale_becomes_sure_as_the_camera_moves_and_given_poses_are_exact() -> None:

@@ -134,7 +134,7 @@ def test_a_large_map_is_thinned_out_evenly() -> None:
 
 def test_replays_and_logs_are_compared_on_a_page(run: Path, tmp_path: Path) -> None:
     summary = json.loads((run / "summary.json").read_text())
-    scores = {"methods": {}, "scored": 2, "excluded": 1, "notes": ["S-Ray is below U-Net"]}
+    scores = {"methods": {}, "scored": 2, "excluded": 1, "pseudo_labelled": 0, "notes": ["S-Ray is below U-Net"]}
     for name, miou in (("S-Ray", 0.5), ("U-Net", 0.25)):
         figures = dict.fromkeys(("miou", "total_accuracy", "average_accuracy", "coverage"), miou)
         scores["methods"][name] = {**figures, "per_class": {"wall": miou, "floor": None}}
