@@ -37,9 +37,10 @@ from semantic_mapper.replay.log.sequence import (
     parts_on_disk,
     read_part,
 )
+from semantic_mapper.replay.rendered_depth import rendered_depth
 from semantic_mapper.transport.codec import Envelope, decode_as, encode, with_computed_depth, with_label
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import Float32, MapUpdate, PosedFrame, UInt8
+from semantic_mapper.types import Float32, PosedFrame, UInt8
 
 RENDERED_SPREAD = 0.05  # one sigma of depth that a field of the scene renders, as a fraction of depth; assumed
 DEPTH_STEPS_PER_M = 1000.0  # computed depth and its spread are rounded to millimetres, which pack to a fifth
@@ -99,7 +100,8 @@ def autolabel(
 
     Source views of a frame are those that ``replay`` and ``eval`` choose: the frame itself and earlier keyframes, the
     frames that the weights were finetuned on among them. A label that is there stays, unless it is a pseudo label or
-    ``overwrite_labels`` says otherwise. A frame in which nothing is sure gets none.
+    ``overwrite_labels`` says otherwise. A frame in which nothing is sure gets none. Weights that know no classes leave
+    all labels as they are, and give depth.
 
     Args:
         request: What to do.
@@ -119,7 +121,9 @@ def autolabel(
         readers = log.logs if isinstance(log, LogSequence) else [log]
         _check_place(request, readers)
         bundle = _load(request)
-        label_set = _label_set(log, bundle.label_set, request)
+        label_set = log.info.label_set
+        if bundle.checkpoint.model.knows_classes:
+            label_set = _label_set(log, bundle.label_set, request)
         bundle.voxel_map.note_scale(log.info.scale_known)
         labeller = _Labeller(bundle, label_set, request)
         digest = hashlib.sha256(bundle.weights_path.read_bytes()).hexdigest()
@@ -181,12 +185,19 @@ def _load(request: AutolabelRequest) -> Mapper:
         WeightsError: missing, damaged, or they tell no classes apart.
     """
     bundle = Mapper.load(request.weights, request.config)
-    if len(bundle.label_set) < 2:
+    model = bundle.checkpoint.model
+    if model.knows_classes and len(bundle.label_set) < 2:
         raise WeightsError(
             f"{bundle.weights_path}: knows one class only ({bundle.label_set.names[0]}), so that there is nothing to "
             "label; give weights that were trained on labels"
         )
-    if request.depth and bundle.checkpoint.model.holds_scene and request.config.depth.source == "auto":
+    if not model.knows_classes and (request.overwrite_labels or not request.depth):
+        raise WeightsError(
+            f"{bundle.weights_path}: a field of kind '{model.kind}' knows no classes, so that it can label nothing; "
+            "with --depth, and without --overwrite-labels, it gives frames the depth that it renders. For labels give "
+            "weights that were trained on some"
+        )
+    if request.depth and model.holds_scene and request.config.depth.source == "auto":
         depth = msgspec.structs.replace(request.config.depth, source="sensor")  # else the field renders
         bundle = Mapper.load(request.weights, msgspec.structs.replace(request.config, depth=depth))
     return bundle
@@ -216,7 +227,7 @@ def _settings(request: AutolabelRequest) -> str:
     return f"{request.min_confidence} {request.overwrite_labels} {request.depth} {request.max_frames}"
 
 
-def _writer(reader: LogReader, path: Path, label_set: LabelSet, name: str) -> AbstractContextManager[LogWriter]:
+def _writer(reader: LogReader, path: Path, label_set: LabelSet | None, name: str) -> AbstractContextManager[LogWriter]:
     """A new log, or part of one, with what the old one keeps beside its messages."""
     kept = [a for a in reader.attachments().values() if a.name not in (PART_ATTACHMENT, AUTOLABEL_ATTACHMENT)]
     if (part := read_part(reader)) is not None:
@@ -224,11 +235,11 @@ def _writer(reader: LogReader, path: Path, label_set: LabelSet, name: str) -> Ab
     return atomic_log(path, _labelled_info(reader.info, label_set), attachments=kept)
 
 
-def _labelled_info(info: StreamInfo, label_set: LabelSet) -> StreamInfo:
+def _labelled_info(info: StreamInfo, label_set: LabelSet | None) -> StreamInfo:
     return msgspec.structs.replace(info, label_set=label_set)
 
 
-def _messages(reader: LogReader, label_set: LabelSet) -> Iterator[tuple[Envelope, list[bytes]]]:
+def _messages(reader: LogReader, label_set: LabelSet | None) -> Iterator[tuple[Envelope, list[bytes]]]:
     """Messages of a log but for the first stream information, which the writer has written; others name the classes."""
     first = True
     for envelope, parts in reader.messages():
@@ -267,15 +278,18 @@ class _Labeller:
 
     Args:
         bundle: What renders.
-        label_set: Of the labels to write.
+        label_set: Of the labels to write; None = there are none.
         request: What was asked for.
     """
 
-    def __init__(self, bundle: Mapper, label_set: LabelSet, request: AutolabelRequest) -> None:
+    def __init__(self, bundle: Mapper, label_set: LabelSet | None, request: AutolabelRequest) -> None:
         self._bundle = bundle
         self._pipeline: MappingPipeline = bundle.pipeline
         self._request = request
-        self._ids: UInt8 = label_set.to_ids(label_set.channel_map_from(bundle.label_set))
+        label_set = label_set or bundle.label_set
+        self._labels = bundle.checkpoint.model.knows_classes
+        if self._labels:
+            self._ids: UInt8 = label_set.to_ids(label_set.channel_map_from(bundle.label_set))
         self._ignore_id = label_set.ignore_id
         self._queue: deque[_Message] = deque()
         self._waiting: dict[tuple[str, int, int], deque[_Message]] = {}
@@ -315,7 +329,7 @@ class _Labeller:
             weights=self._bundle.weights_path.name,
             digest=digest,
             kind=checkpoint.model.kind,
-            classes=checkpoint.label_set.names,
+            classes=checkpoint.label_set.names if self._labels else (),
             min_confidence=request.min_confidence,
             overwrite_labels=request.overwrite_labels,
             depth=request.depth,
@@ -346,6 +360,9 @@ class _Labeller:
 
     def _render(self, frame: PosedFrame) -> None:
         message = self._taken((frame.camera_id, frame.stamp_ns, frame.seq))
+        if not self._labels:
+            self._add_only_depth(message, frame)
+            return
         try:
             update = self._pipeline.step(frame)
         except FrameError as error:
@@ -354,7 +371,16 @@ class _Labeller:
         self.rendered += 1
         self._label(message, self._ids[update.label], update.confidence)
         if self._request.depth and not message.envelope.has_depth:
-            self._add_depth(message, frame, update)
+            self._add_depth(message, frame, update.depth_m)
+
+    def _add_only_depth(self, message: _Message, frame: PosedFrame) -> None:
+        """What a field without classes gives."""
+        self.rendered += 1
+        self.kept += message.envelope.has_label
+        self.without += not message.envelope.has_label
+        if not message.envelope.has_depth:
+            checkpoint = self._bundle.checkpoint
+            self._add_depth(message, frame, rendered_depth(checkpoint.model, frame, checkpoint.width))
 
     def _taken(self, key: tuple[str, int, int], *, last: bool = False) -> _Message:
         """The message of a frame, which waits no more."""
@@ -367,6 +393,8 @@ class _Labeller:
 
     def _keeps(self, envelope: Envelope) -> bool:
         """Whether a frame has a label that stays."""
+        if not self._labels:
+            return envelope.has_label
         return envelope.has_label and not envelope.has_pseudo_label and not self._request.overwrite_labels
 
     def _label(self, message: _Message, label: UInt8, confidence: Float32) -> None:
@@ -395,11 +423,11 @@ class _Labeller:
         else:
             self._set_label(message, None)
 
-    def _add_depth(self, message: _Message, frame: PosedFrame, update: MapUpdate) -> None:
+    def _add_depth(self, message: _Message, frame: PosedFrame, rendered_m: Float32) -> None:
         if frame.depth_sigma_m is not None and frame.depth_m is not None:
             depth_m, sigma_m = frame.depth_m, frame.depth_sigma_m
         elif self._bundle.checkpoint.model.holds_scene:
-            depth_m, sigma_m = update.depth_m, np.float32(RENDERED_SPREAD) * update.depth_m
+            depth_m, sigma_m = rendered_m, np.float32(RENDERED_SPREAD) * rendered_m
         else:
             return
         if self._pipeline.voxel_map.scale_known:

@@ -53,6 +53,11 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
             raise LabelError(f"{request.log}: has no label images to score against")
         check_scorable(log)
         bundle = Mapper.load(request.weights, _frame_by_frame(mapper_config(request.config, None, request.seed)))
+        if not bundle.checkpoint.model.knows_classes:
+            raise WeightsError(
+                f"{bundle.weights_path}: a field of kind '{bundle.checkpoint.model.kind}' knows no classes, so that "
+                "there is nothing to score; give weights that were trained on labels"
+            )
         predictors = field_predictors(bundle)
         stamps = bundle.checkpoint.train_stamps_ns
         if request.baselines:

@@ -33,6 +33,7 @@ class LearnedField(nn.Module, ABC):
     kind: ClassVar[str]
     needs_own_view: ClassVar[bool] = False  # whether it can render only views whose image is among the sources
     holds_scene: ClassVar[bool] = False  # whether its density is the geometry of the one scene that it was fitted to
+    knows_classes: ClassVar[bool] = True  # whether it ever says a class; else there is nothing to label or to score
     class_rows: ClassVar[tuple[str, ...]] = ()  # names of the parameters with one row a class, in channel order
     image_parts: ClassVar[tuple[str, ...]] = ()  # names of the modules that classify an image's features by themselves
     stored_in_half: ClassVar[bool] = False  # whether files hold its weights as float16

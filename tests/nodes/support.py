@@ -17,11 +17,16 @@ from unittest.mock import patch
 
 from typer.testing import CliRunner
 
+from semantic_mapper.config import GridFieldConfig
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
+from semantic_mapper.fields.grid.field import GridField
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.nodes.cli import main as cli
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.replay.log.format import LogWriter
+from semantic_mapper.training.frame_rays import frame_rays
+from semantic_mapper.training.grid_depth import grid_of_depth
+from semantic_mapper.training.grid_fit import GridFitConfig, scene_box
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
 from tests.small import INTRINSICS, tiny_field, tiny_frames
@@ -60,6 +65,16 @@ def repeated_frames(count: int) -> list[PosedFrame]:
 def write_weights(path: Path, train_stamps_ns: Sequence[int] = ()) -> Path:
     recipe = {"kind": "test", "width": 96, "train_stamps_ns": list(train_stamps_ns)}
     save_checkpoint(Checkpoint(tiny_field(), (), recipe), path)
+    return path
+
+
+def write_grid(path: Path) -> Path:
+    """A scene grid of the depth of ``tiny_frames``."""
+    grid = grid_of_depth(frame_rays(tiny_frames(6), 96), scene_box(tiny_frames(6), GridFitConfig()))
+    field = GridField(GridFieldConfig(grid=grid.config), ROOMS)
+    field.grid.load_state_dict(grid.state_dict())
+    field.fitted_steps += 1
+    save_checkpoint(Checkpoint(field, (), {"width": 96}), path)
     return path
 
 

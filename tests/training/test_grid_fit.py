@@ -84,7 +84,7 @@ def test_a_fit_that_starts_from_depth_keeps_it_and_learns_colours() -> None:
     colour, depth = render_frame(fit.grid, rays, 2, config.near_m)
     truth = rays.rgb[rays.pixels_of(2)].reshape(colour.shape) / 255
     measured = rays.depth_m[rays.pixels_of(2)].reshape(depth.shape)
-    assert np.median(np.abs(depth - measured)[measured > 0]) < fit.grid.config.voxel_m
+    assert np.median(np.abs(depth - measured)[measured > 0]) < 0.6 * fit.grid.config.voxel_m
     assert np.square(colour - truth).mean() < 0.3 * np.square(truth - truth.mean((0, 1))).mean()
 
 

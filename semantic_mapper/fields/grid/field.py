@@ -62,8 +62,15 @@ class GridField(LearnedField):
     """
 
     kind: ClassVar[str] = "grid"
+    holds_scene = True
+    knows_classes = False
     stored_in_half = True
     fitted_steps: torch.Tensor
+
+    def __init_subclass__(cls) -> None:
+        """A kind that overrides ``classify`` knows classes."""
+        super().__init_subclass__()
+        cls.knows_classes = cls.classify is not GridField.classify
 
     def __init__(self, config: GridFieldConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
         super().__init__(config, label_set, sampling)

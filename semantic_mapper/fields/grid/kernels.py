@@ -51,13 +51,17 @@ class TargetArrays(NamedTuple):
 
 
 class LossWeights(NamedTuple):
-    """Of the colour of each sample, the opacity of the ray, and its inverse depth (linear beyond ``huber`` 1 / m),
-    against the MSE of colours; samples with less weight than ``faint`` teach no colour."""
+    """Of the colour of each sample, the opacity of the ray, and its depth, against the MSE of colours.
+
+    Where depth was measured, a sample costs its weight, as a fraction that grows with its distance from there up to 1
+    at ``reach`` (1 / m, of inverse depth); light that gets through costs all. Samples with less weight than ``faint``
+    teach no colour.
+    """
 
     point_colour: float = 0.1
     opacity: float = 1e-3
     depth: float = 0.1
-    huber: float = 0.05
+    reach: float = 0.05
     faint: float = 1e-4
 
 

@@ -63,7 +63,7 @@ typedef struct {
 
 typedef struct {
     double point_colour, opacity, depth; /* weights of three losses */
-    double huber;                        /* where that of inverse depth turns linear, 1 / metres */
+    double reach;                        /* a sample this far from the measured inverse depth costs all, 1 / metres */
     double faint;                        /* samples with less weight teach no colour */
 } LossWeights;
 
@@ -95,7 +95,7 @@ static void photometric_ray(const PhotometricArguments *a, Sample *kept, int64_t
     const float *sky = a->targets.sky.data + 3 * r, share = 1.0f / (float)a->rays.origin.shape[0];
     float *points = a->samples.points.data + 3 * most * r, *gradient = a->samples.gradient.data + 4 * most * r;
     const Lattice l = lattice_of(g, &a->rays, r);
-    float light = 1, inverse_depth = 0;
+    float light = 1;
     Voxel colour = 0;
     int64_t n = 0;
     for (int64_t k = 0; n < most && light >= (float)g->stop_below; k++, n++) {
@@ -107,12 +107,12 @@ static void photometric_ray(const PhotometricArguments *a, Sample *kept, int64_t
         light = s->after = light - s->weight;
         colour += s->weight * s->colour;
         gradient[4 * n] = 1.0f / z_of(&l, k);
-        inverse_depth += s->weight * gradient[4 * n];
     }
     a->samples.count.data[r] = n;
 
     Voxel by_colour = 0, wanted = 0; /* of the loss by the composited colour */
     float by_light = -(float)a->loss.opacity * share, by_depth = 0;
+    const float measured = a->targets.inverse_depth.data[r], nearness = 1.0f / (float)a->loss.reach;
     for (int c = 0; c < 3; c++) {
         const float seen = colour[c + 1] + light * sky[c], error = gain[c] * seen - target[c];
         const float slope = 2 * share / 3 * error;
@@ -121,16 +121,13 @@ static void photometric_ray(const PhotometricArguments *a, Sample *kept, int64_t
         a->results.sky_gradient.data[3 * r + c] = slope * gain[c] * light;
         by_colour[c + 1] = slope * gain[c], by_light += slope * gain[c] * sky[c], wanted[c + 1] = target[c] / gain[c];
     }
-    if (a->targets.inverse_depth.data[r] > 0) {
-        const float error = inverse_depth - a->targets.inverse_depth.data[r], huber = (float)a->loss.huber;
-        by_depth = (float)a->loss.depth * share * max_f(min_f(error / huber, 1), -1);
-    }
+    if (measured > 0) by_depth = (float)a->loss.depth * share, by_light += by_depth;
     const float per_point = 2 * (float)a->loss.point_colour * share;
     float behind = light * by_light; /* what the samples behind this one and the sky gain from its light */
     for (int64_t j = n - 1; j >= 0; j--) {
         const Sample *s = kept + j;
         const Voxel each = by_colour * s->colour;
-        const float by_weight = each[1] + each[2] + each[3] + by_depth * gradient[4 * j];
+        const float by_weight = each[1] + each[2] + each[3] + by_depth * min_f(fabsf(gradient[4 * j] - measured) * nearness, 1);
         Voxel out = 0;
         if (s->weight >= (float)a->loss.faint)
             out = s->weight * (by_colour + per_point * (s->colour - wanted)) * s->colour * (1.0f - s->colour);

@@ -119,12 +119,12 @@ def plain_loss(
     each = torch.sigmoid(reference.gather(values, torch.minimum(rays.points(z).clamp(min=0), top))[..., 1:])
     seen = gain * ((weight[..., None] * each).sum(1) + light[:, None] * sky)
     apart = (each - (wanted / gain)[:, None]).square().sum(-1)
-    error = ((weight / z).sum(1) - inverse) * (inverse > 0)
-    huber = torch.where(error.abs() < LOSS.huber, error.square() / (2 * LOSS.huber), error.abs() - LOSS.huber / 2)
+    cost = ((1 / z - inverse[:, None]).abs() / LOSS.reach).clamp(max=1)
+    depth = ((weight * cost).sum(1) + light) * (inverse > 0)
     per_point = LOSS.point_colour * (weight.detach() * apart).sum() / RAYS
     return (seen - wanted).square().mean() + per_point + LOSS.opacity * (
         1 - light
-    ).mean() + LOSS.depth * huber.sum() / RAYS, seen
+    ).mean() + LOSS.depth * depth.sum() / RAYS, seen
 
 
 def test_the_photometric_step_has_the_gradients_of_plain_torch() -> None:

@@ -37,7 +37,7 @@ from semantic_mapper.transport.codec import encode, encode_frame, read_envelope
 from semantic_mapper.transport.images import CodecOptions
 from semantic_mapper.transport.messages import Status, StreamInfo
 from semantic_mapper.types import PosedFrame
-from tests.nodes.support import Running, error_line, repeated_frames, run, write_log, write_weights
+from tests.nodes.support import Running, error_line, repeated_frames, run, write_grid, write_log, write_weights
 from tests.small import INTRINSICS, tiny_config, tiny_field, tiny_frames
 
 CALIBRATION = LogAttachment("calibration.json", "application/json", b'{"lens": 1}')
@@ -511,6 +511,20 @@ def test_weights_that_hold_a_scene_render_depth_with_an_assumed_spread(tmp_path:
             there = frame.depth_m > 0
             assert there.any()
             assert np.allclose(frame.depth_sigma_m[there], RENDERED_SPREAD * frame.depth_m[there], atol=2e-3)
+
+
+def test_a_grid_gives_depth_and_leaves_labels_as_they_are(tmp_path: Path) -> None:
+    frames = [dataclasses.replace(f, depth_m=None) for f in unlabelled(tiny_frames(3), 1)]
+    weights, plain = write_grid(tmp_path / "grid.safetensors"), write_log(tmp_path / "plain.mcap", frames)
+    report = relabelled(plain, tmp_path / "new.mcap", weights, depth=True)
+    assert (report.note.kept, report.note.labelled, report.note.unlabelled) == (1, 0, 2)
+    assert (report.note.classes, report.note.depth_written) == ((), 3)
+    with LogReader(tmp_path / "new.mcap") as log:
+        for frame, old, true in zip(log, frames, tiny_frames(3), strict=True):
+            assert frame.depth_m is not None and true.depth_m is not None and not is_measured(frame)
+            assert (frame.label is None) == (old.label is None) and not frame.label_is_pseudo
+            seen = (frame.depth_m > 0) & (true.depth_m > 0)
+            assert seen.mean() > 0.8 and np.median(np.abs(frame.depth_m - true.depth_m)[seen]) < 0.05
 
 
 def test_bench_takes_no_pseudo_labels_for_truth(new: Path) -> None:

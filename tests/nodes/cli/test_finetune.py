@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 
 from semantic_mapper.fields.checkpoint import load_checkpoint
+from semantic_mapper.fields.grid.field import GridField
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
-from tests.nodes.support import Running, error_line, run, write_log
+from tests.nodes.support import Running, error_line, run, write_grid, write_log
 from tests.small import INTRINSICS, tiny_frames
 
 
@@ -149,6 +150,29 @@ def test_a_grid_of_a_scene_needs_no_labels_and_claims_none_in_a_replay(log: Path
     summary = json.loads((tmp_path / "replayed" / "summary.json").read_text())
     assert summary["frames"]["fused"] == 6
     assert summary["metrics"]["coverage"] == 0.0 and summary["map"]["unknown"] == 1.0  # no class is claimed
+
+
+def test_eval_and_autolabel_say_that_a_grid_knows_no_classes(log: Path, tmp_path: Path) -> None:
+    weights = write_grid(tmp_path / "grid.safetensors")
+    done = run("eval", log, "--weights", weights)
+    assert done.returncode == 1 and "knows no classes, so that there is nothing to score" in error_line(done.stderr)
+    done = run("autolabel", log, "--weights", weights, "--out", tmp_path / "new.mcap")
+    assert done.returncode == 1 and "with --depth" in error_line(done.stderr)
+    assert not (tmp_path / "new.mcap").exists()
+
+
+def test_ctrl_c_keeps_the_grid_so_far(log: Path, tmp_path: Path) -> None:
+    out, settings = tmp_path / "early.safetensors", tmp_path / "small.toml"
+    settings.write_text("width = 96\n[grid]\nlong_side = 32\nrays = 256\n")
+    arguments = ("--kind", "grid", "--seconds", "600", "--config", settings, "--out", out)
+    with Running("finetune", log, *arguments) as running:
+        running.wait_for_line("step [1-9]")
+        running.process.send_signal(signal.SIGINT)
+        assert running.wait() == 130, running.text
+    checkpoint = load_checkpoint(out)
+    assert isinstance(checkpoint.model, GridField) and checkpoint.model.fitted
+    assert checkpoint.recipe["steps"] > 0 and checkpoint.recipe["seconds"] < 500
+    assert "the best weights so far" in running.text
 
 
 @pytest.mark.parametrize(
