@@ -36,8 +36,8 @@ class KlevrGridConfig(Config, frozen=True):
     checked_from: NotNegative = 70
     width: Annotated[int, msgspec.Meta(ge=16)] = 72
     variant: Variant = "upright"
-    long_side: Annotated[int, msgspec.Meta(ge=8)] = 96
-    steps: AtLeastOne = 800
+    long_side: Annotated[int, msgspec.Meta(ge=8)] = 64
+    steps: AtLeastOne = 600
 
 
 @dataclass(frozen=True, slots=True, eq=False)
