@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false
+import hashlib
+import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import torch
+from safetensors.torch import load_file, save
 
 from semantic_mapper.benchmark.klevr import (
     POINTS,
     TRAIN_CAMERAS,
+    VIEW_ARMS,
     Arm,
     KlevrConfig,
     SceneScores,
@@ -21,10 +27,12 @@ from semantic_mapper.benchmark.klevr import (
     scored_numbers,
     train_seeds,
 )
-from semantic_mapper.benchmark.klevr_grids import NEAR_M, KlevrGridConfig, SceneDensity, scene_densities
+from semantic_mapper.benchmark.klevr_grids import NEAR_M, KlevrGridConfig, SceneDensity, grid_digest, scene_densities
+from semantic_mapper.config import to_plain
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.fields.grid.scene_grid import SceneGrid
 from semantic_mapper.fields.grid_nesf import GridNesf, GridNesfConfig
+from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.scenes.suite import KLEVR_SUITE
 from semantic_mapper.training.frame_rays import frame_rays
@@ -33,8 +41,8 @@ from semantic_mapper.types import Float32, PosedFrame, UInt8
 
 _log = get_logger(__name__)
 
+VERSION = 1  # raised by a change of the training: older networks are left alone
 CURVE = (0.2, 0.4, 0.6, 0.8, 1.0)  # fractions of the steps after which the points of novel scenes are classified
-FEW_SCENES = (12, 6)  # of training and novel, for the arms that vary the views of a fit
 
 
 def nesf_arms(folder: Path) -> dict[str, Arm]:
@@ -42,26 +50,19 @@ def nesf_arms(folder: Path) -> dict[str, Arm]:
 
     def arm(*, rotate: bool = True, size: int = 48, maps: int | None = None, views: int | None = None) -> Arm:
         def run(config: KlevrConfig) -> SceneScores:
-            if maps is not None:
-                config = msgspec.structs.replace(config, label_maps=maps)
-            training = training_of(config, size=size, rotate=rotate)
-            if views is None:
-                return nesf_scores(config, training, folder)
-            few, novel = min(FEW_SCENES[0], config.train_scenes), min(FEW_SCENES[1], config.novel_scenes)
-            config = msgspec.structs.replace(config, train_scenes=few, novel_scenes=novel)
-            return nesf_scores(config, training, folder, views)
+            config = config if maps is None else msgspec.structs.replace(config, label_maps=maps)
+            return nesf_scores(config, training_of(config, size=size, rotate=rotate), folder, views)
 
         return run
 
-    return {
+    arms = {
         "nesf": arm(),
         "nesf-no-rotation": arm(rotate=False),
         "nesf-grid-32": arm(size=32),
         "nesf-grid-64": arm(size=64),
         "nesf-1-map": arm(maps=1),
-        "nesf-5-views": arm(views=5),
-        "nesf-25-views": arm(views=25),
     }
+    return arms | {name: arm(views=views) for name, views in VIEW_ARMS.items()}
 
 
 def training_of(config: KlevrConfig, *, size: int = 48, rotate: bool = True) -> GridNesfTraining:
@@ -105,25 +106,40 @@ def nesf_scores(
 def nesf_network(
     config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None = None
 ) -> GridNesf:
-    """The network of an arm. Its log tells the mIoU at points of novel scenes along the training."""
+    """The network of an arm: read from ``folder``, or trained and kept there.
+
+    The log of its training tells the mIoU at points of novel scenes and the mean cross-entropy of the last 200 steps.
+    """
     label_set = KLEVR_SUITE.label_set
-    grids = _grids(config, train_seeds(config), folder, views)
+    path = folder / f"nesf-{_network_digest(config, training, views)}.safetensors"
+    if path.exists():
+        model = GridNesf(label_set, training.network)
+        model.load_state_dict(load_file(path))
+        return model.eval()
     scenes = [
         labelled_scene(grid, scene_frames(config, s, label_map_numbers(config, s)), label_set, training)
-        for s, grid in grids.items()
+        for s, grid in _grids(config, train_seeds(config), folder, views).items()
     ]
     novel = {s: (g, *surface_points(config, s)) for s, g in _grids(config, novel_seeds(config), folder, views).items()}
     looks = {round(fraction * training.steps) for fraction in CURVE}
     entropies: list[float] = []
-    curve: list[tuple[int, float, float]] = []
 
     def look(step: int, entropy: float, model: GridNesf) -> None:
         entropies.append(entropy)
         if step in looks:
-            curve.append((step, round(_points_miou(model, novel), 4), round(float(np.mean(entropies[-200:])), 4)))
-            _log.info("nesf_trained", step=step, miou_points=curve[-1][1], cross_entropy=curve[-1][2])
+            miou, recent = _points_miou(model, novel), float(np.mean(entropies[-200:]))
+            _log.info("nesf_trained", step=step, miou_points=round(miou, 4), cross_entropy=round(recent, 4))
 
-    return train_grid_nesf(scenes, label_set, training, look)
+    model = train_grid_nesf(scenes, label_set, training, look)
+    write_bytes(path, save(model.state_dict()))
+    return model
+
+
+def _network_digest(config: KlevrConfig, training: GridNesfTraining, views: int | None) -> str:
+    grids = [grid_digest(grid_config(config, views), scene) for scene in train_seeds(config)]
+    maps = [label_map_numbers(config, scene) for scene in train_seeds(config)]
+    plain = [to_plain(training), grids, maps, VERSION]
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def surface_points(config: KlevrConfig, scene: int) -> tuple[Float32, UInt8]:
