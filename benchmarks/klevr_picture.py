@@ -19,7 +19,7 @@ from semantic_mapper.scenes.suite import KLEVR_SUITE
 from semantic_mapper.training.grid_nesf import SceneLabels
 from semantic_mapper.types import UInt8
 
-SIDE_PX, GAP_PX = 160, 4
+ENLARGED, GAP_PX = 2, 4
 
 
 def picture(config: KlevrConfig, folder: Path, columns: int) -> UInt8:
@@ -31,13 +31,13 @@ def picture(config: KlevrConfig, folder: Path, columns: int) -> UInt8:
         (frame,) = scene_frames(config, scene, scored_numbers(config, scene)[TEST_CAMERAS][:1])
         assert frame.label is not None
         shown = (frame.rgb, *(KLEVR_SUITE.label_set.colorize(ids) for ids in (frame.label, labels.frame(frame))))
-        tiles = [cv2.resize(p, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_NEAREST) for p in shown]
-        found.append(np.concatenate([_framed(tile) for tile in tiles]))
+        found.append(np.concatenate([_framed(tile) for tile in shown]))
     return np.concatenate(found, axis=1)
 
 
 def _framed(tile: UInt8) -> UInt8:
-    return np.pad(tile, ((GAP_PX, 0), (GAP_PX, 0), (0, 0)), constant_values=255)
+    enlarged = tile.repeat(ENLARGED, axis=0).repeat(ENLARGED, axis=1)
+    return np.pad(enlarged, ((GAP_PX, 0), (GAP_PX, 0), (0, 0)), constant_values=255)
 
 
 def main() -> None:

@@ -68,9 +68,7 @@ def nesf_arms(folder: Path) -> dict[str, Arm]:
 def training_of(config: KlevrConfig, *, size: int = 48, rotate: bool = True) -> GridNesfTraining:
     """How an arm's network is trained."""
     network = GridNesfConfig(size=size, width=config.nesf_width)
-    return GridNesfTraining(
-        network=network, steps=config.nesf_steps, rotate=rotate, near_m=NEAR_M, seed=config.seed
-    )
+    return GridNesfTraining(network=network, steps=config.nesf_steps, rotate=rotate, near_m=NEAR_M, seed=config.seed)
 
 
 def grid_config(config: KlevrConfig, views: int | None = None) -> KlevrGridConfig:
@@ -85,9 +83,7 @@ def grid_config(config: KlevrConfig, views: int | None = None) -> KlevrGridConfi
     )
 
 
-def nesf_scores(
-    config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None = None
-) -> SceneScores:
+def nesf_scores(config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None = None) -> SceneScores:
     """Train a network on the training scenes' label maps; score images and points of the novel scenes."""
     model = nesf_network(config, training, folder, views)
     found: dict[int, dict[str, ConfusionMatrix]] = {}
@@ -103,9 +99,7 @@ def nesf_scores(
     return found
 
 
-def nesf_network(
-    config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None = None
-) -> GridNesf:
+def nesf_network(config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None = None) -> GridNesf:
     """The network of an arm: read from ``folder``, or trained and kept there.
 
     The log of its training tells the mIoU at points of novel scenes and the mean cross-entropy of the last 200 steps.

@@ -1,7 +1,7 @@
 """NeSF (Vora et al. 2022): classes of a scene from its density alone, by a 3D network that has seen other scenes.
 
-A fitted density is resampled to n x n x n / 2 vertices. A sparse 3D U-Net gives features where something is; between them they are
-trilinear, and a small network makes logits of them. Those are composited along rays as colours are.
+A fitted density is resampled to n x n x n / 2 vertices. A sparse 3D U-Net gives features where something is; between
+them they are trilinear, and a small network makes logits of them. Those are composited along rays as colours are.
 """
 
 from __future__ import annotations
@@ -142,9 +142,7 @@ class GridNesf(nn.Module):
         self.label_set, self.config = label_set, config or GridNesfConfig()
         wide = self.config.decoder
         self.net = UNet3d(1, self.config.features, self.config.width)
-        self.decoder = nn.Sequential(
-            nn.Linear(self.config.features, wide), nn.ReLU(), nn.Linear(wide, wide), nn.ReLU()
-        )
+        self.decoder = nn.Sequential(nn.Linear(self.config.features, wide), nn.ReLU(), nn.Linear(wide, wide), nn.ReLU())
         self.head = nn.Linear(wide, len(label_set))
         self.nothing = nn.Parameter(torch.zeros(len(label_set)))
 

@@ -34,7 +34,7 @@ TINY = KlevrConfig(
     train_views=26,
     label_maps=6,
     scored_views=3,
-    grid_steps=250,
+    grid_steps=150,
     nesf_steps=120,
 )
 
@@ -71,7 +71,7 @@ def test_the_network_learns_more_than_the_background(tmp_path: Path) -> None:
             found += kinds[kind]
             plain.counts[:, background] += kinds[kind].counts.sum(1)
         assert (found.metrics().miou or 0) > (plain.metrics().miou or 0) + 0.03, kind
-    again = nesf_scores(TINY, training, tmp_path)  # with densities as they were kept
+    again = nesf_scores(TINY, training, tmp_path)  # of densities and a network as they were kept
     assert all(np.array_equal(again[s][k].counts, scores[s][k].counts) for s in scores for k in scores[s])
 
 
