@@ -59,7 +59,7 @@ class KlevrConfig(Config, frozen=True):
     unet_steps: AtLeastOne = 3000  # to begin with; doubled until a plateau is reached
     mlp_steps: AtLeastOne = 1500
     grid_steps: AtLeastOne = 600  # of the fit of a scene's density
-    nesf_steps: AtLeastOne = 2400  # of one scene each
+    nesf_steps: AtLeastOne = 1500  # of one scene each
     nesf_width: AtLeastOne = 8
     seed: NotNegative = 0
 

@@ -34,10 +34,10 @@ class GridNesfTraining(Config, frozen=True):
     """How the network is trained; a step sees one scene."""
 
     network: GridNesfConfig = GridNesfConfig()
-    steps: AtLeastOne = 2400
+    steps: AtLeastOne = 1500
     rays: AtLeastOne = 1024
-    first_rate: Positive = 1e-3
-    last_rate: Positive = 1e-5
+    first_rate: Positive = 3e-3
+    last_rate: Positive = 1e-4
     rotate: bool = True  # by any angle about z
     smoothness: AtLeastZero = 0.1  # weight of the squared distance of probabilities
     smooth_points: AtLeastOne = 1024
