@@ -23,6 +23,7 @@ from semantic_mapper.benchmark.klevr import (
     novel_seeds,
     run_klevr,
 )
+from semantic_mapper.benchmark.klevr_nesf import nesf_arms
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.config import convert_config, load_config, to_plain
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
@@ -61,20 +62,22 @@ def run_klevr_verb(
         configs: One a seed, otherwise the same.
         names: Of arms; none = all.
         claims: Print the table of claims.
-        out: JSON; None = named after the suite. The records lie beside it (``.jsonl``).
+        out: JSON; None = named after the suite. Beside it lie the records (``.jsonl``)
+            and fitted densities (``klevr-grids``).
         print_json: Print JSON, and nothing else.
 
     Raises:
         ConfigError: with what is wrong and the mend.
     """
-    if unknown := sorted(set(names) - ARMS.keys()):
-        raise typer.BadParameter(f"no arm {', '.join(unknown)}; there are {', '.join(ARMS)}", param_hint="--arm")
+    out = out or Path("runs") / f"klevr-{configs[0].variant}-{configs[0].width}.json"
+    every = ARMS | nesf_arms(out.parent / "klevr-grids")
+    if unknown := sorted(set(names) - every.keys()):
+        raise typer.BadParameter(f"no arm {', '.join(unknown)}; there are {', '.join(every)}", param_hint="--arm")
     output = Output.guarded()
     output.quiet = print_json
     keep_freed_memory()
-    out = out or Path("runs") / f"klevr-{configs[0].variant}-{configs[0].width}.json"
     prepare_file(out)
-    store, arms = RecordStore(out.with_suffix(".jsonl")), {name: ARMS[name] for name in names or ARMS}
+    store, arms = RecordStore(out.with_suffix(".jsonl")), {name: every[name] for name in names or every}
     with StopRequest() as stop:
         with frame_progress("benchmark klevr", None, unit="arms") as bar:
             bar.start(len(arms) * len(configs))

@@ -36,6 +36,9 @@ _log = get_logger(__name__)
 RECORD_VERSION = 1  # raised by a change of what a record means: older ones are made again
 TRAIN_CAMERAS, TEST_CAMERAS, POINTS = "train cameras", "test cameras", "points"
 
+VIEW_ARMS = {"nesf-5-views": 5, "nesf-25-views": 25}  # arms whose densities are fitted to fewer views
+FEW_SCENES = (12, 6)  # of training and novel, for these
+
 _MAPS_STREAM, _SCORED_STREAM = 11, 12
 _PLATEAU = 0.005  # of mIoU in the last fifth of the steps: with more, there are to be twice as many steps
 _MOST_DOUBLINGS = 3
@@ -55,6 +58,9 @@ class KlevrConfig(Config, frozen=True):
     variant: Variant = "upright"
     unet_steps: AtLeastOne = 3000  # to begin with; doubled until a plateau is reached
     mlp_steps: AtLeastOne = 1500
+    grid_steps: AtLeastOne = 600  # of the fit of a scene's density
+    nesf_steps: AtLeastOne = 1500  # of one scene each
+    nesf_width: AtLeastOne = 8
     seed: NotNegative = 0
 
 
@@ -91,6 +97,14 @@ def train_seeds(config: KlevrConfig) -> range:
 def novel_seeds(config: KlevrConfig) -> range:
     """Seeds of the novel scenes."""
     return KLEVR_SUITE.seeds["test"][: config.novel_scenes]
+
+
+def scenes_of_arm(config: KlevrConfig, name: str) -> KlevrConfig:
+    """The run as an arm sees it: ``VIEW_ARMS`` have fewer scenes."""
+    if name not in VIEW_ARMS:
+        return config
+    few = [min(few, count) for few, count in zip(FEW_SCENES, (config.train_scenes, config.novel_scenes), strict=True)]
+    return msgspec.structs.replace(config, train_scenes=few[0], novel_scenes=few[1])
 
 
 def label_map_numbers(config: KlevrConfig, scene: int) -> list[int]:
@@ -187,7 +201,7 @@ def _fit_unet(
     return unet, gain
 
 
-ARMS: dict[str, Arm] = {"color": color_arm, "unet": unet_arm}  # NeSF's arms join here under the names of ``CLAIMS``
+ARMS: dict[str, Arm] = {"color": color_arm, "unet": unet_arm}  # those of NeSF: ``klevr_nesf``
 
 _NESF: Score = ("nesf", POINTS)
 CLAIMS = (
@@ -235,12 +249,13 @@ def run_klevr(
     check_klevr(config)
     settings = klevr_digest(config)
     for name, arm in arms.items():
-        if all(store.find(SceneRecord, settings, name, scene) for scene in novel_seeds(config)):
+        own = scenes_of_arm(config, name)
+        if all(store.find(SceneRecord, settings, name, scene) for scene in novel_seeds(own)):
             continue
         if stopped():
             return
         yield name
-        for scene, confusions in arm(config).items():
+        for scene, confusions in arm(own).items():
             rows = {kind: as_rows(matrix) for kind, matrix in confusions.items()}
             store.add(SceneRecord(settings=settings, weights=name, room=scene, confusions=rows))
 

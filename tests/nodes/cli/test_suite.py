@@ -216,7 +216,7 @@ def test_klevr_shows_arms_and_claims_and_continues(tmp_path: Path) -> None:
     assert set(found["arms"]) == {"color"} and set(found["arms"]["color"]) == {"train cameras", "test cameras"}
     assert [c["result"] for c in found["claims"]].count("not run") == len(found["claims"]) - 1
     assert found["claims"][0]["result"] in ("accepted", "refused") and found["claims"][0]["scenes"] == 2
-    again = run(*common)
+    again = run(*common, "--arm", "color", "--arm", "unet")
     assert again.returncode == 0, again.stderr
     lines = out.with_suffix(".jsonl").read_text().splitlines()
     assert lines[:2] == records and len(lines) == 4

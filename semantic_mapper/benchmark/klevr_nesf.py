@@ -1,0 +1,175 @@
+"""NeSF's arms of the suite KLEVR: one network on fitted densities, and what is left of it without one of its parts."""
+
+from __future__ import annotations
+
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import torch
+from safetensors.torch import load_file, save
+
+from semantic_mapper.benchmark.klevr import (
+    POINTS,
+    TRAIN_CAMERAS,
+    VIEW_ARMS,
+    Arm,
+    KlevrConfig,
+    SceneScores,
+    label_map_numbers,
+    novel_seeds,
+    scene_frames,
+    scored_numbers,
+    train_seeds,
+)
+from semantic_mapper.benchmark.klevr_grids import NEAR_M, KlevrGridConfig, SceneDensity, grid_digest, scene_densities
+from semantic_mapper.config import to_plain
+from semantic_mapper.evaluation.metrics import ConfusionMatrix
+from semantic_mapper.fields.grid.scene_grid import SceneGrid
+from semantic_mapper.fields.grid_nesf import GridNesf, GridNesfConfig
+from semantic_mapper.files import write_bytes
+from semantic_mapper.log_events import get_logger
+from semantic_mapper.scenes.suite import KLEVR_SUITE
+from semantic_mapper.training.frame_rays import frame_rays
+from semantic_mapper.training.grid_nesf import GridNesfTraining, SceneLabels, labelled_scene, train_grid_nesf
+from semantic_mapper.types import Float32, PosedFrame, UInt8
+
+_log = get_logger(__name__)
+
+VERSION = 1  # raised by a change of the training: older networks are left alone
+CURVE = (0.2, 0.4, 0.6, 0.8, 1.0)  # fractions of the steps after which the points of novel scenes are classified
+
+
+def nesf_arms(folder: Path) -> dict[str, Arm]:
+    """Arms by name; densities are kept in ``folder``."""
+
+    def arm(*, rotate: bool = True, size: int = 48, maps: int | None = None, views: int | None = None) -> Arm:
+        def run(config: KlevrConfig) -> SceneScores:
+            config = config if maps is None else msgspec.structs.replace(config, label_maps=maps)
+            return nesf_scores(config, training_of(config, size=size, rotate=rotate), folder, views)
+
+        return run
+
+    arms = {
+        "nesf": arm(),
+        "nesf-no-rotation": arm(rotate=False),
+        "nesf-grid-32": arm(size=32),
+        "nesf-grid-64": arm(size=64),
+        "nesf-1-map": arm(maps=1),
+    }
+    return arms | {name: arm(views=views) for name, views in VIEW_ARMS.items()}
+
+
+def training_of(config: KlevrConfig, *, size: int = 48, rotate: bool = True) -> GridNesfTraining:
+    """How an arm's network is trained."""
+    network = GridNesfConfig(size=size, width=config.nesf_width)
+    return GridNesfTraining(network=network, steps=config.nesf_steps, rotate=rotate, near_m=NEAR_M, seed=config.seed)
+
+
+def grid_config(config: KlevrConfig, views: int | None = None) -> KlevrGridConfig:
+    """How densities are fitted; ``views``: by fewer than all train cameras."""
+    return KlevrGridConfig(
+        views=min(views or config.train_views, config.train_views),
+        checked_views=config.scored_views,
+        checked_from=config.train_views,
+        width=config.width,
+        variant=config.variant,
+        steps=config.grid_steps,
+    )
+
+
+def nesf_scores(config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None = None) -> SceneScores:
+    """Train a network on the training scenes' label maps; score images and points of the novel scenes."""
+    model = nesf_network(config, training, folder, views)
+    found: dict[int, dict[str, ConfusionMatrix]] = {}
+    for scene, grid in _grids(config, novel_seeds(config), folder, views).items():
+        labels = SceneLabels(model, grid, NEAR_M)
+        found[scene] = {
+            kind: _confusion(scene_frames(config, scene, numbers), labels.frame)
+            for kind, numbers in scored_numbers(config, scene).items()
+        }
+        xyz, truth = surface_points(config, scene)
+        matrix = found[scene][POINTS] = ConfusionMatrix(KLEVR_SUITE.label_set)
+        matrix.update(truth, labels.points(xyz), f"points of scene {scene}")
+    return found
+
+
+def nesf_network(config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None = None) -> GridNesf:
+    """The network of an arm: read from ``folder``, or trained and kept there.
+
+    The log of its training tells the mIoU at points of novel scenes and the mean cross-entropy of the last 200 steps.
+    """
+    label_set = KLEVR_SUITE.label_set
+    path = folder / f"nesf-{_network_digest(config, training, views)}.safetensors"
+    if path.exists():
+        model = GridNesf(label_set, training.network)
+        model.load_state_dict(load_file(path))
+        return model.eval()
+    scenes = [
+        labelled_scene(grid, scene_frames(config, s, label_map_numbers(config, s)), label_set, training)
+        for s, grid in _grids(config, train_seeds(config), folder, views).items()
+    ]
+    novel = {s: (g, *surface_points(config, s)) for s, g in _grids(config, novel_seeds(config), folder, views).items()}
+    looks = {round(fraction * training.steps) for fraction in CURVE}
+    entropies: list[float] = []
+
+    def look(step: int, entropy: float, model: GridNesf) -> None:
+        entropies.append(entropy)
+        if step in looks:
+            miou, recent = _points_miou(model, novel), float(np.mean(entropies[-200:]))
+            _log.info("nesf_trained", step=step, miou_points=round(miou, 4), cross_entropy=round(recent, 4))
+
+    model = train_grid_nesf(scenes, label_set, training, look)
+    write_bytes(path, save(model.state_dict()))
+    return model
+
+
+def _network_digest(config: KlevrConfig, training: GridNesfTraining, views: int | None) -> str:
+    grids = [grid_digest(grid_config(config, views), scene) for scene in train_seeds(config)]
+    maps = [label_map_numbers(config, scene) for scene in train_seeds(config)]
+    plain = [to_plain(training), grids, maps, VERSION]
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def surface_points(config: KlevrConfig, scene: int) -> tuple[Float32, UInt8]:
+    """Points (N, 3) of the surface with their true ids (N,): those that the scored train cameras see."""
+    frames = scene_frames(config, scene, scored_numbers(config, scene)[TRAIN_CAMERAS])
+    rays = frame_rays(frames, config.width)
+    hit = np.flatnonzero(rays.depth_m > 0)
+    batch = rays.rays(hit, 0.0)
+    xyz = batch.origin + batch.direction * torch.from_numpy(rays.depth_m[hit])[:, None]
+    return xyz.numpy(), np.concatenate([f.label.ravel() for f in frames if f.label is not None])[hit]
+
+
+def scene_grid(density: SceneDensity) -> SceneGrid:
+    """A grid of this density, grey everywhere."""
+    grid = SceneGrid(density.grid)
+    grid.values[..., 0] = torch.from_numpy(density.raw.astype(np.float32))
+    grid.update_occupied()
+    return grid
+
+
+def _grids(config: KlevrConfig, seeds: Sequence[int], folder: Path, views: int | None) -> dict[int, SceneGrid]:
+    densities = list(scene_densities(grid_config(config, views), seeds, folder))
+    _log.info("densities", scenes=len(seeds), psnr=round(float(np.mean([d.psnr for d in densities])), 1))
+    return {scene: scene_grid(density) for scene, density in zip(seeds, densities, strict=True)}
+
+
+def _points_miou(model: GridNesf, novel: Mapping[int, tuple[SceneGrid, Float32, UInt8]]) -> float:
+    total = ConfusionMatrix(KLEVR_SUITE.label_set)
+    for scene, (grid, xyz, truth) in novel.items():
+        total.update(truth, SceneLabels(model, grid, NEAR_M).points(xyz), f"points of scene {scene}")
+    return total.metrics().miou or 0.0
+
+
+def _confusion(frames: Sequence[PosedFrame], predict: Callable[[PosedFrame], UInt8]) -> ConfusionMatrix:
+    total = ConfusionMatrix(KLEVR_SUITE.label_set)
+    for frame in frames:
+        assert frame.label is not None
+        total.update(frame.label, predict(frame), f"frame {frame.seq}")
+    return total

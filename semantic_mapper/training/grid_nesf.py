@@ -1,0 +1,186 @@
+"""Train NeSF on fitted densities of many scenes and label images of them; nothing else says a class."""
+
+from __future__ import annotations
+
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn import functional
+
+from semantic_mapper.config import AtLeastOne, AtLeastZero, Config, NotNegative, Positive
+from semantic_mapper.errors import FrameError
+from semantic_mapper.fields.grid.scene_grid import SceneGrid
+from semantic_mapper.fields.grid_nesf import (
+    MIN_WEIGHT,
+    GridNesf,
+    GridNesfConfig,
+    Placement,
+    density_cells,
+    smooth_opacity,
+)
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.training.frame_rays import FrameRays, frame_rays
+from semantic_mapper.types import Float32, PosedFrame, UInt8
+
+
+class GridNesfTraining(Config, frozen=True):
+    """How the network is trained; a step sees one scene."""
+
+    network: GridNesfConfig = GridNesfConfig()
+    steps: AtLeastOne = 1500
+    rays: AtLeastOne = 1024
+    first_rate: Positive = 3e-3
+    last_rate: Positive = 1e-4
+    rotate: bool = True  # by any angle about z
+    smoothness: AtLeastZero = 0.1  # weight of the squared distance of probabilities
+    smooth_points: AtLeastOne = 1024
+    smooth_sigma: Positive = 0.05  # of half a side of the box
+    near_m: AtLeastZero = 1.0
+    seed: NotNegative = 0
+
+
+class Samples(NamedTuple):
+    """N samples on rays: points (N, 3) in the world, weights (N,) and the number (N,) of the ray."""
+
+    xyz: torch.Tensor
+    weight: torch.Tensor
+    ray: torch.Tensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelledScene:
+    """A density with label images.
+
+    Args:
+        grid: The density.
+        opacity: (X, Y, Z), from ``smooth_opacity``.
+        rays: Of the labelled frames.
+        pixels: (P,) that have a class.
+        channel: (P,) int64 which.
+    """
+
+    grid: SceneGrid
+    opacity: torch.Tensor
+    rays: FrameRays
+    pixels: NDArray[np.int64]
+    channel: torch.Tensor
+
+
+def labelled_scene(
+    grid: SceneGrid, frames: Sequence[PosedFrame], label_set: LabelSet, config: GridNesfTraining
+) -> LabelledScene:
+    """A scene to train on.
+
+    Raises:
+        FrameError: no frame has a label.
+    """
+    frames = [f for f in frames if f.label is not None]
+    channel = np.concatenate([label_set.to_channels(f.label).ravel() for f in frames if f.label is not None] or [[]])
+    pixels = np.flatnonzero(channel >= 0)
+    if not len(pixels):
+        raise FrameError("no frame of the scene has a labelled pixel")
+    rays = frame_rays(frames, max(f.intrinsics.width for f in frames))
+    if len(rays) != len(channel):
+        raise FrameError("labelled frames of one scene must have the same size")
+    opacity = smooth_opacity(grid, config.network.size)
+    return LabelledScene(grid, opacity, rays, pixels, torch.from_numpy(channel[pixels].astype(np.int64)))
+
+
+def marched(grid: SceneGrid, rays: FrameRays, pixels: NDArray[np.int64], near_m: float) -> Samples:
+    """The samples on rays that matter."""
+    with torch.no_grad():
+        batch = rays.rays(pixels, near_m)
+        march = grid.march(grid.rays(batch))
+        ray, column = (march.weight > MIN_WEIGHT).nonzero(as_tuple=True)
+        z = march.z[ray, column]
+        return Samples(batch.origin[ray] + z[:, None] * batch.direction[ray], march.weight[ray, column], ray)
+
+
+def train_grid_nesf(
+    scenes: Sequence[LabelledScene],
+    label_set: LabelSet,
+    config: GridNesfTraining,
+    on_step: Callable[[int, float, GridNesf], None] | None = None,
+) -> GridNesf:
+    """A network fitted to the label images of scenes.
+
+    Args:
+        on_step: Called after each with its number from 1 on, its cross-entropy and the network.
+    """
+    torch.manual_seed(config.seed)
+    rng = np.random.default_rng((config.seed, 21))
+    model = GridNesf(label_set, config.network)
+    optimiser = torch.optim.Adam(model.parameters(), config.first_rate)
+    decay = math.log(config.last_rate / config.first_rate)
+    order: list[int] = []
+    for step in range(config.steps):
+        order = order or [int(n) for n in rng.permutation(len(scenes))]
+        for group in optimiser.param_groups:
+            group["lr"] = config.first_rate * math.exp(decay * step / config.steps)
+        entropy, rough = _losses(model, scenes[order.pop()], config, rng)
+        optimiser.zero_grad()
+        (entropy + config.smoothness * rough).backward()
+        optimiser.step()
+        if on_step is not None:
+            on_step(step + 1, float(entropy.detach()), model)
+    return model.eval()
+
+
+def _losses(
+    model: GridNesf, scene: LabelledScene, config: GridNesfTraining, rng: np.random.Generator
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Cross-entropy of a batch of rays, and the squared distance of probabilities at points next to each other."""
+    angle = float(rng.uniform(0, 2 * np.pi)) if config.rotate else 0.0
+    seen = density_cells(scene.opacity, Placement(scene.grid.config, config.network.size, angle))
+    pick = rng.integers(len(scene.pixels), size=config.rays)
+    samples = marched(scene.grid, scene.rays, scene.pixels[pick], config.near_m)
+    count = len(samples.xyz)
+    chosen = torch.from_numpy(rng.integers(max(count, 1), size=min(config.smooth_points, count)))
+    half_side = torch.tensor([(n - 1) * scene.grid.config.voxel_m / 2 for n in scene.grid.config.shape])
+    noise = torch.from_numpy(rng.normal(size=(len(chosen), 3)).astype(np.float32)) * half_side * config.smooth_sigma
+    points = torch.cat((samples.xyz, samples.xyz[chosen] + noise))
+    logits = model.logits(model.features(seen), seen.near(points))
+    rendered = model.composite(logits[:count], samples.weight, samples.ray, config.rays)
+    entropy = functional.cross_entropy(rendered, scene.channel[pick])
+    here, beside = logits[:count][chosen].softmax(1), logits[count:].softmax(1)
+    rough = (here - beside).square().sum(1).mean() if len(chosen) else entropy.new_zeros(())
+    return entropy, rough
+
+
+class SceneLabels:
+    """Classes of one scene by a trained network: of pixels and of points.
+
+    Args:
+        model: Trained.
+        grid: The scene's density.
+        near_m: Where rays begin.
+    """
+
+    def __init__(self, model: GridNesf, grid: SceneGrid, near_m: float = 1.0) -> None:
+        self.model, self.grid, self.near_m = model, grid, near_m
+        size = model.config.size
+        with torch.inference_mode():
+            self.seen = density_cells(smooth_opacity(grid, size), Placement(grid.config, size))
+            self.features = model.features(self.seen)
+
+    def frame(self, frame: PosedFrame) -> UInt8:
+        """Ids (H, W) of a frame's pixels; only its camera is looked at."""
+        rays = frame_rays([frame], frame.intrinsics.width)
+        samples = marched(self.grid, rays, rays.pixels_of(0), self.near_m)
+        with torch.inference_mode():
+            logits = self.model.logits(self.features, self.seen.near(samples.xyz))
+            found = self.model.composite(logits, samples.weight, samples.ray, len(rays)).argmax(1).numpy()
+        return self.model.label_set.to_ids(found).reshape(rays.image_size(0))
+
+    def points(self, xyz: Float32) -> UInt8:
+        """Ids (N,) at points (N, 3) of the world."""
+        with torch.inference_mode():
+            found = self.model.logits(self.features, self.seen.near(torch.from_numpy(xyz))).argmax(1).numpy()
+        return self.model.label_set.to_ids(found)
