@@ -39,12 +39,15 @@ class LiveRefinement:
         path: Of its saved map.
         every_s: From the beginning of one refinement to the next.
         weights: From ``train --kind nesf``; None = votes are smoothed.
+        idle: Compute only while nobody else wants the processor; the last map never waits for that.
 
     Raises:
         WeightsError: they cannot be read, or are of other classes.
     """
 
-    def __init__(self, voxel_map: VoxelMap, path: Path, every_s: float, weights: Path | None) -> None:
+    def __init__(
+        self, voxel_map: VoxelMap, path: Path, every_s: float, weights: Path | None, *, idle: bool = True
+    ) -> None:
         if weights is not None:
             shared_classes(voxel_map.label_set, load_nesf(weights).model.label_set, by_name=False)
         config = voxel_map.config
@@ -55,6 +58,7 @@ class LiveRefinement:
         self._folder = path.parent / "refining"  # what one process reads and writes
         self._every_s = every_s
         self._weights = weights
+        self._idle = idle
         self._count = 0
         self._begun = time.monotonic()
         self._ending = ""  # why nothing further is begun
@@ -81,7 +85,7 @@ class LiveRefinement:
         if self._ending or time.monotonic() - self._begun < self._every_s:
             return
         if self._thread is None or not self._thread.is_alive():
-            self._begin(version, epoch, idle=True)
+            self._begin(version, epoch, idle=self._idle)
 
     def give_up(self, why: str) -> None:
         """End the process, and begin nothing further. Harmless when repeated."""
