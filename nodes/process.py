@@ -54,6 +54,18 @@ def usable_cores() -> int:
     return cores if quota == "max" else max(1, min(cores, round(int(quota) / int(period))))
 
 
+def run_when_idle() -> None:
+    """Let the calling thread, and those that it starts, compute only while nobody else wants the core.
+
+    The other threads of the process go on, so that messages are answered while learning gets no processor.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    except (AttributeError, OSError) as error:  # not Linux, or forbidden
+        niceness = os.getpriority(os.PRIO_PROCESS, 0)
+        structlog.get_logger(__name__).info("no_idle_scheduling", reason=str(error), niceness=niceness)
+
+
 class StopRequest:
     """SIGINT and SIGTERM as a request: while it is entered, the first one is only noted.
 

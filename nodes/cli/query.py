@@ -37,6 +37,7 @@ class Asked(NamedTuple):
     min_confidence: float = 0.0
     server: str = ""
     keys: Path | None = None
+    refined: bool = False
 
 
 @verb
@@ -58,6 +59,9 @@ def query(
     min_confidence: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="nearest: places less sure of the class do not count.")
     ] = 0.0,
+    refined: Annotated[
+        bool, typer.Option("--refined", help="Running mapper: the map as it was refined last (`refine_every_s`).")
+    ] = False,
     server: ServerOption = "",
     keys: KeysOption = None,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write the answer here, as JSON.")] = None,
@@ -74,9 +78,13 @@ def query(
     Example: semantic-mapper query runs/demo/map.npz nearest chair 0 0 1 --min-confidence 0.5
     Example: semantic-mapper query runs/demo/map.npz instances --up 0 0 1 --out things.json
     Example: semantic-mapper query live nearest chair 0 0 1 --json
+    Example: semantic-mapper query live nearest chair 0 0 1 --refined
     Example: semantic-mapper query tcp://robot:5570 info --server robot
     """
     class_name, point = _read_arguments(question, arguments or [])
+    endpoint = map_endpoint(source)
+    if refined and not endpoint:
+        raise typer.BadParameter("goes with a running mapper; name the refined file itself", param_hint="--refined")
     output = Output.guarded()
     from semantic_mapper.nodes.cli.map_answers import answer_table
     from semantic_mapper.replay.artifacts import write_json
@@ -84,9 +92,8 @@ def query(
     out, output.quiet = results_file(out, json)
     if out is not None:
         prepare_file(out)
-    endpoint = map_endpoint(source)
     ask = ask_mapper if endpoint else ask_file
-    asked = Asked(question, class_name, point, up, min_confidence, server, keys)
+    asked = Asked(question, class_name, point, up, min_confidence, server, keys, refined)
     found = {"map": source, **ask(endpoint or source, asked)}
     if out is not None:
         write_json(out, found)
@@ -134,7 +141,7 @@ def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
     from semantic_mapper.client import MapClient
     from semantic_mapper.nodes.cli import map_answers
 
-    with MapClient(source, identity=server_identity(asked.server, asked.keys)) as client:
+    with MapClient(source, identity=server_identity(asked.server, asked.keys), refined=asked.refined) as client:
         match asked.question:
             case Question.INFO:
                 return map_answers.describe_map(client.mirror().snapshot())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from concurrent.futures import CancelledError
@@ -11,6 +10,7 @@ import structlog
 
 from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.nodes.process import run_when_idle
 from semantic_mapper.training.finetune import FinetuneProgress
 from semantic_mapper.training.keyframe_pool import KeyframeSplit
 from semantic_mapper.training.online import OnlineConfig, OnlineResult, learn
@@ -97,14 +97,3 @@ class FinetuneRound:
         if self._cancelled.wait(worked_s / self._share - worked_s):
             raise CancelledError
         self._worked_from = self._clock()
-
-
-def run_when_idle() -> None:
-    """Let the calling thread, and those that it starts, compute only while nobody else wants the core.
-
-    The other threads of the process go on, so that messages are answered while learning gets no processor.
-    """
-    try:
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    except (AttributeError, OSError) as error:  # not Linux, or forbidden
-        _log.info("no_idle_scheduling", reason=str(error), niceness=os.getpriority(os.PRIO_PROCESS, 0))

@@ -75,16 +75,23 @@ class Answers:
         mirror: Of the map.
         correction: Takes corrected poses; without it they are refused.
         weights: Says which weights are in use, and exchanges them; without it such questions are refused.
+        refined: Mirror of the map as it was refined last; without it questions about that are refused.
     """
 
     def __init__(
-        self, mirror: MapMirror, correction: LiveCorrection | None = None, weights: LiveWeights | None = None
+        self,
+        mirror: MapMirror,
+        correction: LiveCorrection | None = None,
+        weights: LiveWeights | None = None,
+        refined: MapMirror | None = None,
     ) -> None:
         self.map_id = uuid.uuid4().hex
         self._mirror = mirror
         self._correction = correction
         self._weights = weights
-        self._tracked: dict[messages.Point, _Tracked] = {}  # by direction; the last one asked stands last
+        self._refined = refined
+        # By direction, and whether of the refined map; the last one asked stands last.
+        self._tracked: dict[tuple[messages.Point, bool], _Tracked] = {}
 
     def read(self, parts: Parts) -> Question:
         """Parts of a question -> what answers it."""
@@ -95,7 +102,7 @@ class Answers:
             refusal = encode_error(_to_error(error))
             return Question(lambda: refusal, messages.Request(), takes_long=False, about_map=False)
         beside = messages.CorrectPosesRequest | messages.CorrectionRequest | messages.WeightsRequest
-        about_map = not isinstance(request, beside)
+        about_map = not isinstance(request, beside) and not _of_refined(request)
         return Question(lambda: self._encoded(kind, request), request, takes_long, about_map)
 
     def _encoded(self, kind: str, request: messages.Request) -> list[bytes]:
@@ -108,7 +115,7 @@ class Answers:
             return encode_error(MapError(f"the mapper could not compute this: {error}"))
 
     def _answer(self, request: messages.Request) -> messages.Answer:
-        snapshot = self._mirror.snapshot()
+        snapshot = self._refined_snapshot() if _of_refined(request) else self._mirror.snapshot()
         match request:
             case messages.InfoRequest():
                 return self._describe(snapshot)
@@ -125,7 +132,7 @@ class Answers:
                 found = points_in_box(snapshot, request.lower, request.upper)
                 return self._plain(snapshot, messages.BoxAnswer, found)
             case messages.InstancesRequest():
-                return self._instances(snapshot, request.up)
+                return self._instances(snapshot, request)
             case messages.OccupancyRequest():
                 state = occupancy(snapshot, request.points)
                 return messages.OccupancyAnswer(**self._about(snapshot), state=state)
@@ -139,6 +146,14 @@ class Answers:
                 return self._exchange_weights(snapshot, request)
             case _:
                 raise MapError(f"{type(request).__name__}: cannot be answered")
+
+    def _refined_snapshot(self) -> MapSnapshot:
+        if self._refined is None:
+            raise MapError("this mapper refines nothing while it runs (option `refine_every_s`)")
+        snapshot = self._refined.snapshot()
+        if not snapshot.version:
+            raise MapError("the map has not been refined yet; ask again later (the mapper's status says if that fails)")
+        return snapshot
 
     def _correct(
         self,
@@ -191,12 +206,15 @@ class Answers:
             computed=hit is not None and not hit.measured,
         )
 
-    def _instances(self, snapshot: MapSnapshot, up: messages.Point) -> messages.Answer:
-        tracked = self._tracked.pop(up, None)  # out of here while it updates: one that fails half way is not used again
+    def _instances(self, snapshot: MapSnapshot, request: messages.InstancesRequest) -> messages.Answer:
+        up, which = request.up, (request.up, request.refined)
+        tracked = self._tracked.pop(
+            which, None
+        )  # out of here while it updates: one that fails half way is not used again
         if tracked is None or tracked.version != snapshot.version:
             tracker = tracked.tracker if tracked else InstanceTracker(up=up)
             tracked = _Tracked(tracker, snapshot.version, tracker.update(snapshot))
-        self._tracked[up] = tracked
+        self._tracked[which] = tracked
         for old in list(self._tracked)[:-_MAX_TRACKERS]:
             del self._tracked[old]
         return messages.InstancesAnswer(**self._about(snapshot), **_thing_arrays(tracked.things))
@@ -273,6 +291,10 @@ def _thing_arrays(things: Sequence[Instance]) -> dict[str, Any]:
         "voxels": np.concatenate([np.empty((0, 3), np.int32), *(t.voxels for t in things)]),
         "measured": np.array(measured) if min(measured, default=1.0) < 1 else None,
     }
+
+
+def _of_refined(request: messages.Request) -> bool:
+    return isinstance(request, messages.LabelsRequest) and request.refined
 
 
 def _takes_long(snapshot: MapSnapshot, request: messages.Request) -> bool:

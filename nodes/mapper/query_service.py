@@ -82,6 +82,7 @@ class QueryService:
         correction: Takes corrected poses; without it they are refused.
         weights: Takes other weights; without it requests about them are refused.
         keys: See ``QueryServer``.
+        refined: See ``Answers``.
 
     Raises:
         TransportError: the endpoint is taken or cannot be bound.
@@ -94,11 +95,12 @@ class QueryService:
         correction: LiveCorrection | None = None,
         keys: Keys | None = None,
         weights: LiveWeights | None = None,
+        refined: MapMirror | None = None,
     ) -> None:
         self._map = voxel_map
         config = voxel_map.config
         self._mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
-        self._answers = Answers(self._mirror, correction, weights)
+        self._answers = Answers(self._mirror, correction, weights, refined)
         self._copied_version = 0
         self._copy_again_at = 0.0
         self._last_request = -ASKED_LATELY_S  # never; monotonic seconds

@@ -14,7 +14,14 @@ from semantic_mapper.nodes.node import NodeContext
 
 _EARLIER, _UNSOUND = "earlier", "unsound"  # notes
 _NO_FILE = "none"
-_RESULTS = ("map.npz", "map.ply", "overview.png", "report.html", "summary.json")  # the map first: it is all that counts
+_RESULTS = (
+    "map.npz",
+    "refined.npz",
+    "map.ply",
+    "overview.png",
+    "report.html",
+    "summary.json",
+)  # the map first: it is all that counts
 
 _log = structlog.get_logger(__name__)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.client import MapClient
 from semantic_mapper.config import MapperConfig
-from semantic_mapper.errors import SemanticMapperError, TransportError
+from semantic_mapper.errors import MapError, SemanticMapperError, TransportError
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.voxel_map import VoxelMap
@@ -51,12 +51,14 @@ class Live:
         nodes: Endpoints of cameras and mappers, whatever else is among them; none shows the map alone.
         identity: Of a mapper that has keys.
         streams: How many of the nodes are cameras; it is over when all of their streams have ended.
+        refined: The map as its mapper refined it last is shown.
     """
 
     query: str
     nodes: tuple[str, ...] = ()
     identity: ServerIdentity | None = None
     streams: int = 1
+    refined: bool = False
 
 
 class _MapShow:
@@ -172,7 +174,7 @@ def show_live(live: Live, begin: Begin, refresh_s: float, stop: StopRequest, tel
     Raises:
         TransportError: an endpoint that is none.
     """
-    with MapClient(live.query, identity=live.identity, attempts=1) as client:
+    with MapClient(live.query, identity=live.identity, attempts=1, refined=live.refined) as client:
         stream = begin()
         snapshot = _first_snapshot(client, stop, tell)
         if snapshot is None:
@@ -202,7 +204,7 @@ def _first_snapshot(client: MapClient, stop: StopRequest, tell: Callable[[str], 
     while not stop:
         try:
             return client.mirror().snapshot()
-        except TransportError as error:
+        except (TransportError, MapError) as error:  # MapError: it has not been refined yet
             if not logged:
                 tell(f"waiting for the mapper: {error}")
             logged = True

@@ -108,6 +108,7 @@ _NOT_SENT_AS_0 = (
     "computed",
     "pseudo_label",
     "depth_sigma",
+    "refined",
 )  # came later: what does not need it is read by older releases, too
 _FRAME_BUFFERS = ("rgb", "depth", "label", "depth_sigma")  # fields of a frame's header, in the order of their buffers
 

@@ -91,6 +91,12 @@ class Request(Wire, frozen=True, kw_only=True):
     waits_s: Annotated[float, Meta(ge=0, le=MAX_WAIT_S)] = MAX_WAIT_S
 
 
+class LabelsRequest(Request, frozen=True, kw_only=True):
+    """Of every question whose answer tells of classes; ``refined``: of those that refining found (sent only then)."""
+
+    refined: bool = False
+
+
 class Answer(Wire, frozen=True, kw_only=True):
     """Of every answer: which state of which map it is about.
 
@@ -105,7 +111,7 @@ class Answer(Wire, frozen=True, kw_only=True):
     scale_unknown: bool = False
 
 
-class InfoRequest(Request, frozen=True, kw_only=True):
+class InfoRequest(LabelsRequest, frozen=True, kw_only=True):
     """What the map is."""
 
 
@@ -118,7 +124,7 @@ class InfoAnswer(Answer, frozen=True, kw_only=True):
     label_set: LabelSetForm
 
 
-class AtRequest(Request, frozen=True, kw_only=True):
+class AtRequest(LabelsRequest, frozen=True, kw_only=True):
     """What is at points."""
 
     points: Points
@@ -135,7 +141,7 @@ class AtAnswer(Answer, frozen=True, kw_only=True):
     computed: Computed = None
 
 
-class NearestRequest(Request, frozen=True, kw_only=True):
+class NearestRequest(LabelsRequest, frozen=True, kw_only=True):
     """Where the nearest surface of a class is."""
 
     class_name: Word
@@ -153,7 +159,7 @@ class NearestAnswer(Answer, frozen=True, kw_only=True):
     computed: bool = False  # no sensor measured it; sent only then
 
 
-class RaysRequest(Request, frozen=True, kw_only=True):
+class RaysRequest(LabelsRequest, frozen=True, kw_only=True):
     """What rays meet."""
 
     max_m: Finite
@@ -171,7 +177,7 @@ class RaysAnswer(Answer, frozen=True, kw_only=True):
     computed: Computed = None
 
 
-class BoxRequest(Request, frozen=True, kw_only=True):
+class BoxRequest(LabelsRequest, frozen=True, kw_only=True):
     """Surface points in a box."""
 
     lower: Point
@@ -188,7 +194,7 @@ class BoxAnswer(Answer, frozen=True, kw_only=True):
     computed: Computed = None
 
 
-class InstancesRequest(Request, frozen=True, kw_only=True):
+class InstancesRequest(LabelsRequest, frozen=True, kw_only=True):
     """Countable things."""
 
     up: Point
@@ -236,7 +242,7 @@ class DistanceAnswer(Answer, frozen=True, kw_only=True):
     state: Annotated[UInt8, ArrayForm("u1", free=3)]
 
 
-class ChangesRequest(Request, frozen=True, kw_only=True):
+class ChangesRequest(LabelsRequest, frozen=True, kw_only=True):
     """Blocks changed since a version of the map ``map_id``; of another map, all blocks are sent."""
 
     since: Count

@@ -20,11 +20,11 @@ from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import load_checkpoint, save_checkpoint
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.nodes.finetuner import finetune_round, finetuner
-from semantic_mapper.nodes.finetuner.finetune_round import FinetuneRound, run_when_idle
+from semantic_mapper.nodes.finetuner.finetune_round import FinetuneRound
 from semantic_mapper.nodes.finetuner.node import run_finetuner
 from semantic_mapper.nodes.node import NodeContext
 from semantic_mapper.nodes.options import FinetunerOptions, MapperOptions
-from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.nodes.process import StopRequest, run_when_idle
 from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.nodes.supervisor.launch_config import load_launch
 from semantic_mapper.training.finetune import FinetuneProgress
