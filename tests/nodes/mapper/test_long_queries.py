@@ -152,7 +152,7 @@ def test_what_nobody_waits_for_any_more_is_not_computed(
     monkeypatch.setattr(query_service, "GRACE_S", 0.0)
     computed: list[messages.Point] = []
     hang = Answers._instances
-    monkeypatch.setattr(Answers, "_instances", lambda self, s, up: computed.append(up) or hang(self, s, up))
+    monkeypatch.setattr(Answers, "_instances", lambda self, s, r: computed.append(r.up) or hang(self, s, r))
     with a_folder() as folder, answering(f"ipc://{folder / 'query'}", whole_map()) as service:
         sockets = [Stranger(service.endpoint) for _ in range(6)]
         under_way, under_way_again, first, second, again, silent = (s.socket for s in sockets)
@@ -181,10 +181,10 @@ def test_clients_that_time_out_are_answered_in_their_turn(client: MapClient, mon
     """An answer takes longer than a client waits each time; without turns kept, none would ever come."""
     answer, computed = Answers._instances, []
 
-    def slow(self: Answers, snapshot: MapSnapshot, up: messages.Point) -> messages.Answer:
-        computed.append(up)
+    def slow(self: Answers, snapshot: MapSnapshot, request: messages.InstancesRequest) -> messages.Answer:
+        computed.append(request.up)
         threading.Event().wait(0.4)
-        return answer(self, snapshot, up)
+        return answer(self, snapshot, request)
 
     client.instances()
     monkeypatch.setattr(Answers, "_instances", slow)
