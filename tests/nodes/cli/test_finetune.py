@@ -163,7 +163,7 @@ def test_eval_and_autolabel_say_that_a_grid_knows_no_classes(log: Path, tmp_path
 
 def test_ctrl_c_keeps_the_grid_so_far(log: Path, tmp_path: Path) -> None:
     out, settings = tmp_path / "early.safetensors", tmp_path / "small.toml"
-    settings.write_text("width = 96\n[grid]\nlong_side = 32\nrays = 256\n")
+    settings.write_text("width = 96\n[grid]\nlong_side = 32\nrays = 256\nsteps = 1_000_000\n")
     arguments = ("--kind", "grid", "--seconds", "600", "--config", settings, "--out", out)
     with Running("finetune", log, *arguments) as running:
         running.wait_for_line("step [1-9]")
