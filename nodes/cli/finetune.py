@@ -45,6 +45,14 @@ def finetune(
         str | None, typer.Option(help="Fit a field of this kind to the scene, from all frames; grid: no classes.")
     ] = None,
     depth: FinetuneDepthOption = None,
+    labels: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Label images NNNNNN.png in place of the log's, as `label --serve` writes them; all of them without "
+            "--keyframes. Unlabelled pixels count for nothing, so strokes will do.",
+        ),
+    ] = None,
 ) -> int:
     """Fit the field to a few labelled keyframes of a log.
 
@@ -54,12 +62,15 @@ def finetune(
     keyframes have depth computed from the log's pictures. Ctrl-C writes the best weights so far (exit code 130).
 
     Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors
+    Example: semantic-mapper finetune kitchen.mcap --labels kitchen-labels --out kitchen.safetensors
     """
     if from_scratch and weights is not None:
         raise typer.BadParameter("goes with random weights only", param_hint="--weights")
     if kind is not None and (weights is not None or from_scratch):
         raise typer.BadParameter("starts from nothing; leave out --weights and --from-scratch", param_hint="--kind")
-    if (keyframes is None) != (kind == "grid"):
+    if kind == "grid" and labels is not None:
+        raise typer.BadParameter("a grid learns no classes", param_hint="--labels")
+    if labels is None and (keyframes is None) != (kind == "grid"):
         raise typer.BadParameter("how many labelled frames? Only --kind grid learns none", param_hint="--keyframes")
     output = Output.guarded()
     import msgspec
@@ -81,7 +92,7 @@ def finetune(
         raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
     keep_freed_memory()
     depths = mapper_config(None, None, depth=depth or "sensor", delay_frames=REPLAY_DELAY_FRAMES).depth
-    request = FinetuneRequest(log, keyframes or 0, out, settings, weights, from_scratch, depths, kind)
+    request = FinetuneRequest(log, keyframes or 0, out, settings, weights, from_scratch, depths, kind, labels)
     with StopRequest() as stop, frame_progress("finetune", None, unit="%") as bar:
         checkpoint, chosen = finetune_log(request, stop, bar)
     recipe = checkpoint.recipe

@@ -1,7 +1,8 @@
-"""``semantic-mapper label``: send labelled keyframes to a finetuner that learns beside a mapper."""
+"""``semantic-mapper label``: label frames by hand, suggest which, or send labelled ones to a running finetuner."""
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +12,9 @@ from semantic_mapper.nodes.cli.console import Output, frame_progress
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.plain_text import counted
+
+FRAMES_TO_LABEL = 8  # that the page shows where nobody says how many
+POLL_S = 0.2
 
 
 @verb
@@ -26,7 +30,7 @@ def label(
         typer.Option(
             metavar="DIR",
             help="Label images NNNNNN.png (uint8 class ids), each named by the number of its frame, in place of the "
-            "log's own; with a labels.json, or in the log's classes.",
+            "log's own; with a labels.json, or in the log's classes. --suggest: what is labelled already.",
         ),
     ] = None,
     to: Annotated[
@@ -39,18 +43,139 @@ def label(
     ] = "",
     teacher: Annotated[str, typer.Option(help="Who has labelled them, for the log of the finetuner.")] = "",
     timeout: Annotated[float, typer.Option(min=0, help="How long the finetuner may take to be there, seconds.")] = 30.0,
-) -> None:
-    """Send labelled frames of a log to a running finetuner, which learns from them.
+    suggest: Annotated[
+        int | None,
+        typer.Option("--suggest", metavar="N", min=1, help="Say which N frames to label next, and send nothing."),
+    ] = None,
+    serve: Annotated[
+        bool,
+        typer.Option("--serve", help="Open a page on this machine to paint labels on suggested frames, until Ctrl-C."),
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="--serve: where labels are saved [LOG-labels, beside the log]."),
+    ] = None,
+    classes: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="--serve: a labels.json, or a text with a class a line. Else those of the folder, of --weights, of "
+            "the log, or of the weights in the package.",
+        ),
+    ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option(help="--suggest, --serve: weights whose keyframes count as labelled; also their classes."),
+    ] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="--serve: of the page; 0 = any that is free.")] = 9092,
+    json: Annotated[bool, typer.Option("--json", help="--suggest: print JSON, and nothing else, on stdout.")] = False,
+) -> int:
+    """Label frames of a log by hand (--serve), say which to label (--suggest), or send labelled ones to a finetuner.
 
-    Without further options those are sent that together show most of what the log shows. Frames must be in the world
-    that the mapper maps. `semantic-mapper top --once --json` tells what became of them, `semantic-mapper weights` which
-    weights came of it.
+    --suggest names the frames that show most surface which no labelled frame shows. --serve opens a page on which a few
+    strokes a class are painted on them, and saves each stroke at once; what is not painted is not learned from.
+    `finetune --labels DIR` learns from what was painted. The page is on this machine alone; to see it from another
+    one, tunnel its port.
 
+    Without these, labelled frames are sent to a running finetuner: those that together show most of what the log shows.
+    Frames must be in the world that the mapper maps. `semantic-mapper top --once --json` tells what became of them,
+    `semantic-mapper weights` which weights came of it.
+
+    Example: semantic-mapper label kitchen.mcap --suggest 8
+    Example: semantic-mapper label kitchen.mcap --serve --classes classes.txt --out kitchen-labels
     Example: semantic-mapper label kitchen.mcap --keyframes 12
     Example: semantic-mapper label kitchen.mcap --images corrected/ --to ipc:///run/robot/labels
     """
     numbers = _numbers(frames)
+    _check_options(suggest, serve, {"--out": out, "--classes": classes, "--weights": weights, "--json": json or None})
     output = Output.guarded()
+    if serve:
+        return _serve(output, log, numbers, suggest, out or log.with_name(f"{log.stem}-labels"), classes, weights, port)
+    if suggest is not None:
+        output.quiet = json
+        _suggest(output, log, suggest, images, weights, json)
+        return 0
+    _send(output, log, keyframes, numbers, images, to, teacher, timeout)
+    return 0
+
+
+def _check_options(suggest: int | None, serve: bool, given: dict[str, object]) -> None:
+    """Refuse options whose mode is not asked for.
+
+    Raises:
+        typer.BadParameter: naming the mode.
+    """
+    modes = {
+        "--out": (serve, "--serve"),
+        "--classes": (serve, "--serve"),
+        "--weights": (serve or suggest is not None, "--suggest or --serve"),
+        "--json": (suggest is not None and not serve, "--suggest"),
+    }
+    for name, value in given.items():
+        if value is not None and not modes[name][0]:
+            raise typer.BadParameter(f"goes with {modes[name][1]}", param_hint=name)
+
+
+def _suggest(output: Output, log: Path, count: int, images: Path | None, weights: Path | None, json: bool) -> None:
+    from semantic_mapper.nodes.cli.labelling_page import open_images, suggest_for_log, suggestion_table
+    from semantic_mapper.replay.log.sequence import open_log
+
+    with StopRequest() as stop, frame_progress("suggest", None) as bar, open_log(log) as opened:
+        found = suggest_for_log(opened, count, open_images(images, opened), weights, stop, bar)
+    if found.frames:
+        output.print(suggestion_table(found))
+    else:
+        output.print(f"{log.name}: its {counted(len(found.labelled), 'labelled frame')} show all that it shows")
+    if json:
+        output.json({"log": str(log), **found.plain()})
+
+
+def _serve(
+    output: Output,
+    log: Path,
+    frames: list[int],
+    suggest: int | None,
+    out: Path,
+    classes: Path | None,
+    weights: Path | None,
+    port: int,
+) -> int:
+    from semantic_mapper.errors import LogError
+    from semantic_mapper.nodes.cli.labelling_page import open_images, page_folder, page_order, suggest_for_log
+    from semantic_mapper.nodes.labeller.server import LabelServer
+    from semantic_mapper.nodes.labeller.session import LabelSession
+    from semantic_mapper.replay.log.sequence import open_log
+
+    with StopRequest() as stop, open_log(log) as opened:
+        folder = page_folder(opened, out, classes, weights)
+        if beyond := [n for n in frames if n >= len(opened)]:
+            raise LogError(f"{log}: has no frame {beyond[0]}; it has {len(opened)}")
+        chosen = frames
+        if not chosen:
+            with frame_progress("suggest", None) as bar:
+                images = open_images(out, opened)
+                found = suggest_for_log(opened, suggest or FRAMES_TO_LABEL, images, weights, stop, bar)
+            chosen = [frame.number for frame in found.frames]
+        order = page_order(chosen, folder.numbers()) or [0]
+        with LabelServer(LabelSession(opened, folder, order), port) as server:
+            output.print(f"label at {server.url}")
+            output.print(f"  saved to {out}: learn from it with `semantic-mapper finetune {log} --labels {out}`")
+            while not stop:
+                time.sleep(POLL_S)
+        output.print(f"{out}: {counted(len(folder.numbers()), 'labelled frame')} of {log.name}")
+    return 0
+
+
+def _send(
+    output: Output,
+    log: Path,
+    keyframes: int,
+    numbers: list[int],
+    images: Path | None,
+    to: str,
+    teacher: str,
+    timeout: float,
+) -> None:
     from semantic_mapper.nodes.cli.labelling import choose_keyframes, labels_endpoint, sending
     from semantic_mapper.transport.messages import LabelledKeyframe
 

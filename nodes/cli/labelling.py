@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,8 +13,7 @@ from semantic_mapper.nodes.cli.console import FrameProgress
 from semantic_mapper.nodes.cli.run_finetune import FinetuneRequest, choose_labelled
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.supervisor.running_launches import running_launches
-from semantic_mapper.replay.importers.base import BadFrameError, read_label
-from semantic_mapper.replay.importers.folder import read_label_set
+from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.training.finetune import FinetuneConfig
 from semantic_mapper.transport.codec import encode
@@ -49,13 +47,12 @@ def choose_keyframes(
         KeyboardInterrupt: a stop request came.
     """
     with open_log(path) as log:
-        label_set = log.info.label_set
-        if images is not None and (images / "labels.json").exists():
-            label_set = read_label_set(images / "labels.json")
+        folder = None if images is None else open_label_folder(images, log)
+        label_set = log.info.label_set if folder is None else folder.label_set
         if label_set is None:
             raise LabelError(f"{path}: has no label images; give --images with a folder that has labels.json")
-        numbers = sorted(set(frames)) or ([] if images is None else _numbered(images))
-        if images is None and not numbers:
+        numbers = sorted(set(frames)) or ([] if folder is None else folder.numbers())
+        if folder is None and not numbers:
             request = FinetuneRequest(path, count, path, FinetuneConfig(), None, False, DepthConfig(source="sensor"))
             return choose_labelled(log, label_set, request, {}, stop, bar), label_set
         bar.start(len(numbers))
@@ -65,7 +62,7 @@ def choose_keyframes(
                 raise KeyboardInterrupt
             if number >= len(log):
                 raise LogError(f"{path}: has no frame {number}; it has {len(log)}")
-            chosen.append(_labelled(log.frame(number), number, images, label_set, path))
+            chosen.append(_labelled(log.frame(number), number, folder, path))
             bar.advance()
     return chosen, label_set
 
@@ -115,23 +112,9 @@ def _wait(publisher: Publisher, seconds: float) -> None:
         return
 
 
-def _numbered(images: Path) -> list[int]:
-    numbers = sorted(int(file.stem) for file in images.glob("*.png") if file.stem.isdigit())
-    if not numbers:
-        raise LogError(f"{images}: has no label images; they are called by the number of their frame, 000012.png")
-    return numbers
-
-
-def _labelled(frame: PosedFrame, number: int, images: Path | None, label_set: LabelSet, path: Path) -> PosedFrame:
-    if images is None:
-        if frame.label is None:
-            raise LogError(f"{path}: frame {number} has no label image; give one in a folder with --images")
-        return frame
-    file = next((f for f in images.glob("*.png") if f.stem.isdigit() and int(f.stem) == number), None)
-    if file is None:
-        raise LogError(f"{images}: has no label image of frame {number}, {number:06d}.png")
-    try:
-        label = read_label(file, label_set, (frame.intrinsics.height, frame.intrinsics.width))
-    except BadFrameError as error:
-        raise LogError(str(error)) from error
-    return dataclasses.replace(frame, label=label, label_is_pseudo=False)
+def _labelled(frame: PosedFrame, number: int, folder: LabelFolder | None, path: Path) -> PosedFrame:
+    if folder is not None:
+        return folder.labelled(frame, number)
+    if frame.label is None:
+        raise LogError(f"{path}: frame {number} has no label image; give one in a folder with --images")
+    return frame

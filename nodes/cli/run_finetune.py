@@ -25,6 +25,7 @@ from semantic_mapper.nodes.cli.console import FrameProgress
 from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.autolabel_note import read_note
+from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.log_depth import ComputedFrame, compute_depths
 from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress
@@ -32,6 +33,7 @@ from semantic_mapper.training.scene_fit import FITTERS, fitter_of
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.types import PosedFrame
 
+LEAST_KEYFRAMES = 2
 MAX_SCENE_FRAMES = 300  # that a field of one scene is fitted to
 _log = structlog.get_logger(__name__)
 
@@ -41,7 +43,8 @@ class FinetuneRequest:
     """What the verb was requested; ``weights`` None = those in the package, ``from_scratch`` = random ones.
 
     ``depth`` says where the frames' depth comes from. ``kind`` names a kind of field that is fitted to one scene, from
-    nothing; None = that of the weights. ``keyframes`` is 0 for a kind that learns no classes.
+    nothing; None = that of the weights. ``labels`` is a folder of label images in place of the log's. ``keyframes`` is
+    0 for a kind that learns no classes, and for all frames that the folder has labels of.
     """
 
     log: Path
@@ -52,6 +55,7 @@ class FinetuneRequest:
     from_scratch: bool
     depth: DepthConfig
     kind: str | None = None
+    labels: Path | None = None
 
 
 def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress) -> tuple[Checkpoint, list[int]]:
@@ -69,12 +73,18 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
     start = None if nothing else load_checkpoint(request.weights or default_checkpoint_path())
     kind = request.kind or (SRay.kind if start is None else start.model.kind)
     with open_log(request.log) as log:
-        label_set = log.info.label_set
+        folder = None if request.labels is None else open_label_folder(request.labels, log)
+        label_set = log.info.label_set if folder is None else folder.label_set
         if label_set is None and request.keyframes:
-            raise LabelError(f"{request.log}: has no label images; finetuning needs labelled keyframes")
+            raise LabelError(
+                f"{request.log}: has no label images; finetuning needs labelled keyframes. Make some with "
+                "`semantic-mapper label LOG --serve`, and give their folder with --labels"
+            )
         label_set = label_set or ROOMS
         computed = _compute_depths(log, request.depth, stop, bar)
-        frames = choose_labelled(log, label_set, request, computed, stop, bar) if request.keyframes else []
+        frames: list[PosedFrame] = []
+        if request.keyframes or folder is not None:  # a folder without a number: all that it has
+            frames = choose_labelled(log, label_set, request, computed, stop, bar, folder)
         chosen = [f.seq for f in frames]
         pseudo = sum(f.label_is_pseudo for f in frames)
         if kind in FITTERS:
@@ -149,10 +159,12 @@ def choose_labelled(
     computed: Mapping[tuple[str, int], ComputedFrame],
     stop: StopRequest,
     bar: FrameProgress,
+    folder: LabelFolder | None = None,
 ) -> list[PosedFrame]:
     """The labelled frames that show most of what the log shows, with the depth that the request asks for.
 
-    Of a log whose depth is computed, frames that it could be computed for.
+    Of a log whose depth is computed, frames that it could be computed for. Labels of a ``folder`` go before those of
+    the log; without a number of keyframes, all of them are taken.
 
     Raises:
         LogError: fewer usable labelled frames than requested.
@@ -160,13 +172,14 @@ def choose_labelled(
     """
     candidates, numbers = [], []
     size: tuple[int, int] | None = None
-    bar.start(len(log))
-    for number in range(len(log)):
-        bar.set(number + 1, "choosing keyframes")
+    looked_at = range(len(log)) if folder is None else folder.numbers()
+    bar.start(len(looked_at))
+    for done, number in enumerate(looked_at):
+        bar.set(done + 1, "choosing keyframes")
         if stop:
             raise KeyboardInterrupt
         try:
-            frame = log.frame(number)
+            frame = log.frame(number) if folder is None else folder.labelled(log.frame(number), number)
             if frame.label is None or (computed and (frame.camera_id, frame.stamp_ns) not in computed):
                 continue
             check_pose(frame.T_world_camera, f"frame seq={frame.seq}")
@@ -181,13 +194,16 @@ def choose_labelled(
             continue
         candidates.append(candidate)
         numbers.append(number)
-    if len(candidates) < request.keyframes:
-        raise LogError(
-            f"{request.log}: {len(candidates)} of its {len(log)} frames have usable labels; "
-            f"--keyframes {request.keyframes} is more than that"
-        )
-    chosen = choose_keyframes(candidates, request.keyframes, request.config.seed)
-    return [_as_given(log.frame(numbers[i]), computed, request.depth) for i in chosen]
+    if len(candidates) < (request.keyframes or LEAST_KEYFRAMES):
+        more = f"--keyframes {request.keyframes} is more than that" if request.keyframes else "finetuning needs two"
+        where = request.log if folder is None else folder.path
+        raise LogError(f"{where}: {len(candidates)} of the {len(log)} frames have usable labels; {more}")
+    chosen = range(len(candidates))
+    if request.keyframes:
+        chosen = choose_keyframes(candidates, request.keyframes, request.config.seed)
+    frames = [(numbers[i], log.frame(numbers[i])) for i in chosen]
+    labelled = [frame if folder is None else folder.labelled(frame, number) for number, frame in frames]
+    return [_as_given(frame, computed, request.depth) for frame in labelled]
 
 
 def read_unlabelled(

@@ -10,6 +10,7 @@ import numpy as np
 from semantic_mapper.replay.exporters.base import ExportFrame, LeftOut, depth_units, quaternion, seconds, write_png
 from semantic_mapper.replay.importers.folder import COMPUTED_DEPTH, DEPTH_SIGMA, PSEUDO_LABEL
 from semantic_mapper.replay.importers.tum import DEPTH_SCALE
+from semantic_mapper.replay.label_folder import plain_labels
 from semantic_mapper.transport.messages import SCALE_KEY, SCALE_UNKNOWN, StreamInfo
 from semantic_mapper.types import CameraIntrinsics, PosedFrame
 
@@ -75,14 +76,7 @@ class FolderExporter:
         (self._folder / "timestamps.txt").write_text("\n".join(map(str, self._stamps)) + "\n", encoding="ascii")
         self._intrinsics.write(self._folder / "intrinsics.json", self._depth.scale)
         if self._labels is not None:
-            labels = self._labels
-            plain = {
-                "id_space": labels.name,
-                "classes": {str(i): name for i, name in zip(labels.ids, labels.names, strict=True)},
-                "ignore": labels.ignore_id,
-                "colors": {str(i): list(c) for i, c in zip(labels.ids, labels.colors, strict=True)},
-            }
-            text = json.dumps(plain, indent=1, ensure_ascii=False)
+            text = json.dumps(plain_labels(self._labels), indent=1, ensure_ascii=False)
             (self._folder / "labels.json").write_text(text, encoding="utf-8")
         if self._pseudo_labels:
             self.notices.append(

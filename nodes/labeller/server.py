@@ -1,0 +1,194 @@
+"""The labelling page, served to browsers of this machine that know the token in its address.
+
+The page is on loopback alone, and its policy lets it speak to nobody but this server. Other pages that a browser has
+open cannot reach it: they lack the token, and names that somebody has bound to this machine's address are refused.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import re
+import secrets
+import threading
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+from urllib.parse import urlsplit
+
+import structlog
+
+from semantic_mapper.errors import TransportError
+from semantic_mapper.nodes.labeller.session import SESSION_ERRORS, LabelSession
+
+HOST = "127.0.0.1"
+PORT = 9092
+TIMEOUT_S = 10.0  # of one read or write of a request
+_PAGE = Path(__file__).parent / "page"
+_FILES = {
+    "": ("index.html", "text/html; charset=utf-8"),
+    "page.js": ("page.js", "text/javascript; charset=utf-8"),
+    "strokes.js": ("strokes.js", "text/javascript; charset=utf-8"),
+    "page.css": ("page.css", "text/css; charset=utf-8"),
+}
+_FRAME = re.compile(r"frames/([0-9]{1,9})/(image|label)")
+_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
+_log = structlog.get_logger(__name__)
+
+
+class LabelServer:
+    """Serves one session, in threads of its own; a context manager.
+
+    Args:
+        session: What is labelled.
+        port: Of the page; 0 = any that is free.
+
+    Raises:
+        TransportError: the port is taken.
+    """
+
+    def __init__(self, session: LabelSession, port: int = PORT) -> None:
+        self._token = secrets.token_urlsafe(24)
+        try:
+            self._server = ThreadingHTTPServer((HOST, port), _make_handler(session, self._token))
+        except OSError as error:
+            raise TransportError(
+                f"port {port} cannot be had ({error.strerror}); give another one with --port, or 0 for any"
+            ) from error
+        self._server.daemon_threads = True
+        self._thread = threading.Thread(target=self._server.serve_forever, name="labelling page", daemon=True)
+
+    @property
+    def url(self) -> str:
+        """What to open in a browser."""
+        return f"http://{HOST}:{self._server.server_address[1]}/{self._token}/"
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()
+
+
+class _RefusedError(Exception):
+    """A request that is answered by a status and a sentence."""
+
+    def __init__(self, status: HTTPStatus, message: str) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHandler]:
+    class Handler(BaseHTTPRequestHandler):
+        """One request."""
+
+        timeout = TIMEOUT_S
+
+        def do_GET(self) -> None:
+            self._answer(self._get)
+
+        def do_PUT(self) -> None:
+            self._answer(self._put)
+
+        def _answer(self, method: Any) -> None:
+            try:
+                body, kind = method(self._path())
+                self._send(HTTPStatus.OK, body, kind)
+            except _RefusedError as error:
+                self._refuse(error.status, str(error))
+            except SESSION_ERRORS as error:
+                self._refuse(HTTPStatus.BAD_REQUEST, str(error))
+            except OSError as error:  # the browser has left
+                _log.debug("page_not_served", reason=str(error))
+
+        def _path(self) -> str:
+            """What is asked for, behind the token.
+
+            Raises:
+                _RefusedError: by somebody who may not.
+            """
+            _check_name(self.headers.get("Host", ""))
+            if (origin := self.headers.get("Origin")) is not None:
+                _check_name(urlsplit(origin).netloc)
+            given, _, path = self.path.removeprefix("/").partition("/")
+            if not hmac.compare_digest(given.encode(), token.encode()):
+                raise _RefusedError(HTTPStatus.FORBIDDEN, "open the address that `label --serve` has shown")
+            return path
+
+        def _get(self, path: str) -> tuple[bytes, str]:
+            if path in _FILES:
+                name, kind = _FILES[path]
+                return (_PAGE / name).read_bytes(), kind
+            if path == "session":
+                return json.dumps(session.describe()).encode(), "application/json"
+            number, what = _frame(path)
+            if what == "image":
+                return session.image(number), "image/jpeg"
+            return session.label(number), "application/octet-stream"
+
+        def _put(self, path: str) -> tuple[bytes, str]:
+            number, what = _frame(path)
+            if what != "label":
+                raise _RefusedError(HTTPStatus.METHOD_NOT_ALLOWED, "only labels can be written")
+            length = self.headers.get("Content-Length", "")
+            if not length.isascii() or not length.isdigit():
+                raise _RefusedError(HTTPStatus.LENGTH_REQUIRED, "say how long the label is")
+            if int(length) != (pixels := session.pixels(number)):
+                raise _RefusedError(HTTPStatus.BAD_REQUEST, f"frame {number} has {pixels} pixels, and got {length}")
+            session.save(number, self.rfile.read(int(length)))
+            return b"{}", "application/json"
+
+        def _refuse(self, status: HTTPStatus, message: str) -> None:
+            self.close_connection = True  # what it has sent is not read
+            self._send(status, json.dumps({"error": message}).encode(), "application/json")
+
+        def _send(self, status: HTTPStatus, body: bytes, kind: str) -> None:
+            try:
+                self.send_response(status)
+                for name, value in _HEADERS.items():
+                    self.send_header(name, value)
+                self.send_header("Content-Type", kind)
+                self.send_header("Content-Length", str(len(body)))
+                self.end_headers()
+                self.wfile.write(body)
+            except OSError as error:  # the browser has left
+                _log.debug("page_not_served", reason=str(error))
+
+        def log_message(self, format: str, *args: object) -> None:  # noqa: A002 (its name there)
+            _log.debug("page_served", request=(format % args).replace(token, "TOKEN"))
+
+    return Handler
+
+
+def _check_name(netloc: str) -> None:
+    """Refuse requests that came by another name than this machine's own: a tunnel may have another port.
+
+    Raises:
+        _RefusedError: they did.
+    """
+    if netloc.rpartition(":")[0] not in (HOST, "localhost"):
+        raise _RefusedError(HTTPStatus.FORBIDDEN, f"the page is at {HOST} or localhost")
+
+
+def _frame(path: str) -> tuple[int, str]:
+    found = _FRAME.fullmatch(path)
+    if found is None:
+        raise _RefusedError(HTTPStatus.NOT_FOUND, "no such page")
+    return int(found[1]), found[2]

@@ -1,0 +1,214 @@
+"""The labelling page over HTTP: who may, what it takes, what it writes."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import socket
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+import pytest
+
+from semantic_mapper.errors import TransportError
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.nodes.labeller.server import LabelServer
+from semantic_mapper.nodes.labeller.session import LabelSession
+from semantic_mapper.replay.label_folder import make_label_folder
+from semantic_mapper.replay.log.sequence import open_log
+
+HEIGHT, WIDTH = 72, 96
+WALL, FLOOR = ROOMS.id_of("wall"), ROOMS.id_of("floor")
+
+
+class Answer(NamedTuple):
+    status: int
+    body: bytes
+    headers: Mapping[str, str]
+
+    @property
+    def says(self) -> str:
+        return json.loads(self.body)["error"]
+
+
+class Page(NamedTuple):
+    url: str
+    out: Path
+
+    @property
+    def token(self) -> str:
+        return urlsplit(self.url).path.strip("/")
+
+    def ask(self, path: str, method: str = "GET", body: bytes | None = None, **headers: str) -> Answer:
+        """What is behind the token; a path that begins with / stands for itself."""
+        place = urlsplit(self.url)
+        connection = http.client.HTTPConnection(str(place.hostname), place.port, timeout=20)
+        try:
+            whole = path if path.startswith("/") else place.path + path
+            connection.putrequest(method, whole, skip_host="Host" in headers, skip_accept_encoding=True)
+            if body is not None and "Content_Length" not in headers:
+                headers["Content_Length"] = str(len(body))
+            for name, value in headers.items():
+                connection.putheader(name.replace("_", "-"), value)
+            connection.endheaders(body)
+            came = connection.getresponse()
+            return Answer(came.status, came.read(), dict(came.headers))
+        finally:
+            connection.close()
+
+
+@pytest.fixture
+def page(log: Path, tmp_path: Path) -> Iterator[Page]:
+    out = tmp_path / "labels"
+    with open_log(log) as opened:
+        folder = make_label_folder(out, opened, ROOMS)
+        with LabelServer(LabelSession(opened, folder, [4, 1]), 0) as server:
+            yield Page(server.url, out)
+
+
+def strokes() -> np.ndarray[Any, Any]:
+    label = np.full((HEIGHT, WIDTH), ROOMS.ignore_id, np.uint8)
+    label[10:20, 5:60], label[50:60, 5:60] = WALL, FLOOR
+    return label
+
+
+def test_the_page_and_its_parts_are_there_for_who_has_the_token(page: Page) -> None:
+    for path, kind, holds in (
+        ("", "text/html", b"page.js"),
+        ("page.js", "text/javascript", b"strokes.js"),
+        ("strokes.js", "text/javascript", b"class Strokes"),
+        ("page.css", "text/css", b"#stage"),
+        ("session", "application/json", b"wall"),
+    ):
+        answer = page.ask(path)
+        assert answer.status == 200 and holds in answer.body, path
+        assert answer.headers["Content-Type"].startswith(kind)
+        assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
+        assert answer.headers["Referrer-Policy"] == "no-referrer"
+    assert b"http" not in page.ask("").body + page.ask("page.css").body, "it fetches nothing from elsewhere"
+
+
+@pytest.mark.parametrize("path", ["/", "/session", "/x/", "/x/session", "//session", "/{cut}/session", "/{more}/"])
+def test_nothing_is_there_without_the_token(page: Page, path: str) -> None:
+    path = path.format(cut=page.token[:-1], more=page.token + "a")
+    for method, body in (("GET", None), ("PUT", strokes().tobytes())):
+        answer = page.ask(path, method, body)
+        assert answer.status == 403 and page.token.encode() not in answer.body
+    assert not list(page.out.glob("*.png"))
+
+
+def test_two_pages_have_two_tokens(log: Path, tmp_path: Path) -> None:
+    with open_log(log) as opened:
+        session = LabelSession(opened, make_label_folder(tmp_path / "labels", opened, ROOMS), [0])
+        with LabelServer(session, 0) as one, LabelServer(session, 0) as other:
+            tokens = [urlsplit(s.url).path.strip("/") for s in (one, other)]
+            assert tokens[0] != tokens[1] and min(map(len, tokens)) >= 32
+            with pytest.raises(TransportError, match="give another one with --port"):
+                LabelServer(session, int(urlsplit(one.url).port or 0))
+
+
+def test_it_listens_on_loopback_alone(page: Page) -> None:
+    port = urlsplit(page.url).port
+    four = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    listening = [row[1] for row in four if row[3] == "0A"]
+    assert f"0100007F:{port:04X}" in listening and f"00000000:{port:04X}" not in listening
+    if socket.has_ipv6:
+        six = [line.split()[1] for line in Path("/proc/net/tcp6").read_text().splitlines()[1:]]
+        assert not [place for place in six if place.endswith(f":{port:04X}")]
+
+
+def test_names_that_lead_here_from_elsewhere_are_refused(page: Page) -> None:
+    port = urlsplit(page.url).port
+    assert page.ask("session", Host=f"localhost:{port}").status == 200
+    assert page.ask("session", Host="127.0.0.1:1234").status == 200, "a tunnel has another port"
+    for name in (f"evil.example:{port}", f"127.0.0.1.evil.example:{port}", ""):
+        assert page.ask("session", Host=name).status == 403
+    assert page.ask("session", Origin="http://evil.example:80").status == 403
+    assert page.ask("session", Origin="null").status == 403
+
+
+def test_the_session_says_what_to_paint(page: Page) -> None:
+    session = json.loads(page.ask("session").body)
+    assert session["order"] == [4, 1] and session["labelled"] == [] and session["frames"] == 6
+    assert session["log"] == "room.mcap" and session["ignore"] == ROOMS.ignore_id
+    assert [c["name"] for c in session["classes"]] == list(ROOMS.names)
+    assert session["classes"][0] == {"id": WALL, "name": "wall", "color": list(ROOMS.colors[0])}
+
+
+def test_images_are_those_of_the_log(page: Page, log: Path) -> None:
+    answer = page.ask("frames/4/image")
+    assert answer.headers["Content-Type"] == "image/jpeg"
+    seen = cv2.cvtColor(cv2.imdecode(np.frombuffer(answer.body, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    with open_log(log) as opened:
+        rgb = opened.frame(4).rgb
+    assert np.abs(seen.astype(int) - rgb).mean() < 4
+
+
+def test_what_is_painted_is_a_label_image_and_comes_back(page: Page, log: Path) -> None:
+    nothing = page.ask("frames/1/label").body
+    assert nothing == bytes([ROOMS.ignore_id]) * (HEIGHT * WIDTH)
+    assert page.ask("frames/1/label", "PUT", strokes().tobytes()).status == 200
+    written = cv2.imread(str(page.out / "000001.png"), cv2.IMREAD_UNCHANGED)
+    assert written.dtype == np.uint8 and (written == strokes()).all()
+    assert page.ask("frames/1/label").body == strokes().tobytes()
+    assert json.loads(page.ask("session").body)["labelled"] == [1]
+    labels = json.loads((page.out / "labels.json").read_text())
+    assert labels["log"]["name"] == "room.mcap" and labels["log"]["frames"] == 6
+    assert labels["classes"][str(WALL)] == "wall" and labels["ignore"] == ROOMS.ignore_id
+    page.ask("frames/1/label", "PUT", nothing)
+    assert not (page.out / "000001.png").exists(), "all of it is erased"
+
+
+@pytest.mark.parametrize(
+    ("frame", "body", "status", "says"),
+    [
+        ("1", strokes()[:-1].tobytes(), 400, "has 6912 pixels"),
+        ("1", strokes().tobytes() + b"\0", 400, "has 6912 pixels"),
+        ("1", b"", 400, "has 6912 pixels"),
+        ("1", bytes([200]) * (HEIGHT * WIDTH), 400, "class ids [200] are not in label set"),
+        ("6", strokes().tobytes(), 400, "has no frame 6; it has 6"),
+        ("-1", strokes().tobytes(), 404, "no such page"),
+        ("1e0", strokes().tobytes(), 404, "no such page"),
+        ("%D9%A3", strokes().tobytes(), 404, "no such page"),
+        ("../1", strokes().tobytes(), 404, "no such page"),
+        ("..%2f1", strokes().tobytes(), 404, "no such page"),
+        ("1/../../x", strokes().tobytes(), 404, "no such page"),
+    ],
+)
+def test_bad_labels_are_refused_and_nothing_is_written(
+    page: Page, frame: str, body: bytes, status: int, says: str
+) -> None:
+    before = sorted(p.name for p in page.out.parent.rglob("*"))
+    answer = page.ask(f"frames/{frame}/label", "PUT", body)
+    assert (answer.status, says in answer.says) == (status, True), answer.body
+    assert sorted(p.name for p in page.out.parent.rglob("*")) == before
+
+
+@pytest.mark.parametrize("path", ["../labels.json", "..%2flabels.json", "frames/../../session.py", "page/page.js", "x"])
+def test_no_file_but_those_of_the_page_can_be_read(page: Page, path: str) -> None:
+    assert page.ask(path).status == 404
+
+
+@pytest.mark.parametrize("length", ["", "-1", "1e9", "999999999999", "\xb2"])
+def test_lengths_that_do_not_fit_are_refused_before_anything_is_read(page: Page, length: str) -> None:
+    answer = page.ask("frames/1/label", "PUT", b"x", Content_Length=length)
+    assert answer.status in (400, 411)
+    assert page.ask("session").status == 200
+
+
+def test_other_methods_write_nothing(page: Page) -> None:
+    assert page.ask("frames/1/label", "POST", strokes().tobytes()).status == 501
+    assert page.ask("frames/1/label", "DELETE").status == 501
+    assert page.ask("frames/1/image", "PUT", strokes().tobytes()).status == 405
+    assert not list(page.out.glob("*.png"))
+
+
+def test_a_damaged_label_image_is_named_and_left_alone(page: Page) -> None:
+    (page.out / "000004.png").write_bytes(b"no image")
+    answer = page.ask("frames/4/label")
+    assert answer.status == 400 and "000004.png" in answer.says
+    assert (page.out / "000004.png").read_bytes() == b"no image"
