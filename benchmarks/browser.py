@@ -14,6 +14,7 @@ import select
 import subprocess
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -116,6 +117,33 @@ class Browser:
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             self._order("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
+    def drag(self, places: Sequence[tuple[float, float]]) -> None:
+        """Press the left button at the first place, move over the others, and release it at the last."""
+        self._mouse("mouseMoved", places[0], 0)
+        self._mouse("mousePressed", places[0], 1)
+        for place in places[1:]:
+            self._mouse("mouseMoved", place, 1)
+        self._mouse("mouseReleased", places[-1], 0)
+
+    def swipe(self, places: Sequence[tuple[float, float]]) -> None:
+        """Touch the first place with a finger, move over the others, and lift it."""
+        self._order("Emulation.setTouchEmulationEnabled", enabled=True)
+        for kind, place in (("touchStart", places[0]), *(("touchMove", p) for p in places[1:])):
+            self._order("Input.dispatchTouchEvent", type=kind, touchPoints=[{"x": place[0], "y": place[1]}])
+        self._order("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
+    def press(self, *keys: str) -> None:
+        """Press and release keys, one after the other, by the names that a page gets ("a", "ArrowUp")."""
+        for key in keys:
+            text = {"text": key} if len(key) == 1 else {}
+            self._order("Input.dispatchKeyEvent", type="keyDown", key=key, **text)
+            self._order("Input.dispatchKeyEvent", type="keyUp", key=key)
+
+    def _mouse(self, kind: str, place: tuple[float, float], buttons: int) -> None:
+        button = "none" if kind == "mouseMoved" and not buttons else "left"
+        where = {"x": place[0], "y": place[1], "button": button, "buttons": buttons}
+        self._order("Input.dispatchMouseEvent", type=kind, clickCount=int(kind != "mouseMoved"), **where)
+
     def wait(self, seconds: float) -> None:
         """Let the page work on, and take in what it says."""
         deadline = time.monotonic() + seconds
@@ -156,6 +184,9 @@ class Browser:
                 self.requests[message["params"]["requestId"]] = message["params"]["request"]["url"]
             case "Network.loadingFailed" if message["params"].get("blockedReason") == "csp":
                 self.refused.add(message["params"]["requestId"])
+            case "Runtime.exceptionThrown":
+                details = message["params"]["exceptionDetails"]
+                self.messages.append(details.get("exception", {}).get("description", details["text"]))
             case "Runtime.consoleAPICalled":
                 words = (str(a.get("value", a.get("description", ""))) for a in message["params"]["args"])
                 self.messages.append(" ".join(words))

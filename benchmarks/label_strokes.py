@@ -1,0 +1,121 @@
+"""What strokes teach beside full masks: mIoU after the same finetuning on the same frames.
+
+Strokes are made from the true labels as a person would paint them: of each class in a frame, ``k`` lines inside of it,
+as wide as the labelling page's brush or as the class is there, and at most a sixth of the image long. Everything else
+is unlabelled. Frames are those that ``label --suggest`` names.
+
+Example: python -m benchmarks.label_strokes kitchen.mcap 0 1 --labels 4 --out runs/strokes.jsonl
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from benchmarks.label_suggestions import Choices, Scene, fit, log_scene, room_scene, score
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.types import UInt8
+
+BRUSH = 1 / 40  # of the image's width, across: the page's own
+LENGTH = 1 / 6  # of a stroke, at most
+LEAST_PX = 1.5  # from a stroke's middle to what is not of the class
+
+
+def paint_strokes(truth: UInt8, label_set: LabelSet, count: int, rng: np.random.Generator) -> tuple[UInt8, int]:
+    """A label image with strokes alone, and how many there are.
+
+    Args:
+        truth: (H, W) class ids.
+        label_set: Its classes.
+        count: Strokes a class.
+        rng: Draws places and directions.
+    """
+    painted = np.full_like(truth, label_set.ignore_id)
+    width, drawn = truth.shape[1], 0
+    for class_id in label_set.ids:
+        inside = cv2.distanceTransform(np.pad((truth == class_id).astype(np.uint8), 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
+        v, u = np.nonzero(inside >= LEAST_PX)
+        for _ in range(count if len(v) else 0):
+            first = int(rng.integers(len(v)))
+            _stroke(painted, inside, (float(u[first]), float(v[first])), class_id, width, rng)
+            drawn += 1
+    return painted, drawn
+
+
+def _stroke(
+    painted: UInt8,
+    inside: np.ndarray,
+    place: tuple[float, float],
+    class_id: int,
+    width: int,
+    rng: np.random.Generator,
+) -> None:
+    """A line in the best of some directions, until it comes to the edge of the class."""
+    best: list[tuple[float, float]] = []
+    for angle in rng.uniform(0, 2 * np.pi, 8):
+        line = [place]
+        for step in range(1, round(LENGTH * width)):
+            x, y = place[0] + step * np.cos(angle), place[1] + step * np.sin(angle)
+            if not (0 <= round(y) < inside.shape[0] and 0 <= round(x) < inside.shape[1]):
+                break
+            if inside[round(y), round(x)] < LEAST_PX:
+                break
+            line.append((x, y))
+        best = max(best, line, key=len)
+    rows, columns = np.mgrid[: painted.shape[0], : painted.shape[1]]
+    for x, y in best:
+        radius = min(BRUSH * width / 2, inside[round(y), round(x)] - 0.5)
+        painted[(columns - x) ** 2 + (rows - y) ** 2 <= radius**2] = class_id
+
+
+def with_strokes(scene: Scene, count: int, chosen: list[int], seed: int) -> tuple[Scene, int, float]:
+    """The scene with strokes in place of the chosen frames' labels, their number, and the fraction that they paint."""
+    rng = np.random.default_rng(seed)
+    pool, strokes, painted, labelled = list(scene.pool), 0, 0, 0
+    for i in chosen:
+        truth = pool[i].label
+        assert truth is not None
+        label, drawn = paint_strokes(truth, scene.label_set, count, rng)
+        pool[i] = replace(pool[i], label=label)
+        strokes += drawn
+        painted += int((label != scene.label_set.ignore_id).sum())
+        labelled += label.size
+    return replace(scene, pool=pool), strokes, painted / labelled
+
+
+def main() -> None:
+    """Print a row a scene and kind of label."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+", help="logs with labels; a number = that validation room")
+    parser.add_argument("--steps", type=int, default=40, help="of finetuning; 0 = class rows alone")
+    parser.add_argument("--labels", type=int, default=4, help="number of labelled frames")
+    parser.add_argument("--strokes", default="0,1,2", help="strokes a class and frame; 0 = full masks")
+    parser.add_argument("--out", type=Path, required=True, help="figures as JSON, a line each")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    for name in given.scenes:
+        scene = room_scene(int(name)) if name.isdigit() else log_scene(Path(name))
+        choices = Choices(scene)
+        chosen = choices.choose("suggested", given.labels, 0)
+        for count in map(int, given.strokes.split(",")):
+            painted, strokes, fraction = with_strokes(scene, count, chosen, 0) if count else (scene, 0, 1.0)
+            miou = score(scene, chosen, fit(painted, chosen, given.steps, 0), choices.candidates)
+            row = {"scene": scene.name, "strokes_a_class": count, "strokes": strokes, "painted": round(fraction, 4)}
+            with given.out.open("a") as file:
+                file.write(json.dumps({**row, "steps": given.steps, "miou": round(miou, 4)}) + "\n")
+            print(
+                f"{scene.name:>10} {count} strokes a class ({strokes} in all, {100 * fraction:.1f} % painted): "
+                f"{100 * miou:.1f} %",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
