@@ -41,8 +41,9 @@ test-all: $(READY)  ## run all tests
 test-v4l2: $(READY)  ## run the V4L2 driver against Debian's kernel with a virtual camera, in QEMU
 	.venv/bin/python -m benchmarks.v4l2_machine
 
-test-web: $(READY)  ## look at the viewer in a headless browser, and check the picture
+test-web: $(READY)  ## look at the viewer and the labelling page in a headless browser
 	.venv/bin/python -m benchmarks.web_viewer_check
+	OMP_NUM_THREADS=1 .venv/bin/python -m pytest tests/nodes/labeller/test_page.py
 
 check: $(READY)  ## formatting, lint, types, import contracts
 	.venv/bin/ruff format --check .

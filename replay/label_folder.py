@@ -117,11 +117,14 @@ class LabelFolder:
         """
         channels = self.label_set.to_channels(label, f"label image of frame {number}")
         there = self._files().get(number, self.path / f"{number:06d}.png")
-        if (channels < 0).all():
-            there.unlink(missing_ok=True)
+        if (channels >= 0).any():
+            _, data = cv2.imencode(".png", np.ascontiguousarray(label))
+            write_bytes(there, data.tobytes(), raises=LogError)
             return
-        _, data = cv2.imencode(".png", np.ascontiguousarray(label))
-        write_bytes(there, data.tobytes(), raises=LogError)
+        try:
+            there.unlink(missing_ok=True)
+        except OSError as error:
+            raise LogError(f"{there}: cannot be removed: {error.strerror or error}") from error
 
     def _files(self) -> dict[int, Path]:
         files = sorted(self.path.glob("*.png"))

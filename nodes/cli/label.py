@@ -87,7 +87,20 @@ def label(
     Example: semantic-mapper label kitchen.mcap --images corrected/ --to ipc:///run/robot/labels
     """
     numbers = _numbers(frames)
-    _check_options(suggest, serve, {"--out": out, "--classes": classes, "--weights": weights, "--json": json or None})
+    _check_options(
+        suggest is not None,
+        serve,
+        {
+            "--out": out,
+            "--classes": classes,
+            "--weights": weights,
+            "--json": json,
+            "--images": images,
+            "--frames": frames,
+            "--to": to,
+            "--teacher": teacher,
+        },
+    )
     output = Output.guarded()
     if serve:
         return _serve(output, log, numbers, suggest, out or log.with_name(f"{log.stem}-labels"), classes, weights, port)
@@ -99,21 +112,26 @@ def label(
     return 0
 
 
-def _check_options(suggest: int | None, serve: bool, given: dict[str, object]) -> None:
+def _check_options(suggest: bool, serve: bool, given: dict[str, object]) -> None:
     """Refuse options whose mode is not asked for.
 
     Raises:
         typer.BadParameter: naming the mode.
     """
+    send = not suggest and not serve
     modes = {
-        "--out": (serve, "--serve"),
-        "--classes": (serve, "--serve"),
-        "--weights": (serve or suggest is not None, "--suggest or --serve"),
-        "--json": (suggest is not None and not serve, "--suggest"),
+        "--out": (serve, "goes with --serve"),
+        "--classes": (serve, "goes with --serve"),
+        "--weights": (not send, "goes with --suggest or --serve"),
+        "--json": (suggest and not serve, "goes with --suggest"),
+        "--images": (not serve, "the page goes on with what is in --out"),
+        "--frames": (serve or send, "they are suggested"),
+        "--to": (send, "nothing is sent with --suggest and --serve"),
+        "--teacher": (send, "nothing is sent with --suggest and --serve"),
     }
     for name, value in given.items():
-        if value is not None and not modes[name][0]:
-            raise typer.BadParameter(f"goes with {modes[name][1]}", param_hint=name)
+        if value and not modes[name][0]:
+            raise typer.BadParameter(modes[name][1], param_hint=name)
 
 
 def _suggest(output: Output, log: Path, count: int, images: Path | None, weights: Path | None, json: bool) -> None:

@@ -107,7 +107,7 @@ function showPlace() {
   const done = session.order.filter((n) => session.labelled.includes(n)).length;
   const place = session.order.indexOf(number);
   $("place").textContent = place < 0 ? `frame ${number} is not among the suggested ones`
-    : `${place + 1} of ${session.order.length} frames to label; ${done} have labels`;
+    : `${place + 1} of ${session.order.length} frames to label, ${done} labelled`;
   $("previous").disabled = at <= 0;
   $("next").disabled = at >= session.order.length - 1;
 }

@@ -117,7 +117,7 @@ def test_what_was_saved_is_there_again_and_a_click_is_a_dot(page: Page) -> None:
     page.browser.press("p")
     assert page.eventually(lambda: page.shown(48, 30) == [*ROOMS.colors[CEILING - 1], 255])
     page.open()
-    assert page.eventually(lambda: "2 have labels" in page.browser.evaluate("place.textContent"))
+    assert page.eventually(lambda: "2 labelled" in page.browser.evaluate("place.textContent"))
     assert page.eventually(lambda: page.shown(48, 30) == [*ROOMS.colors[CEILING - 1], 255])
     labels = json.loads((page.out / "labels.json").read_text())
     assert labels["log"]["name"] == "room.mcap" and sorted(f.name for f in page.out.glob("*.png")) == [
