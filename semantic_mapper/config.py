@@ -152,7 +152,7 @@ class GridFieldConfig(Config, frozen=True):
     trunk_width: Channels = 128  # of the MLP behind the features
 
 
-IRTVariant = Literal["B", "RT", "RTT", "RTC", "RTTC"]
+IRTVariant = Literal["B", "BC", "RT", "RTT", "RTC", "RTTC"]
 
 
 class IRTConfig(GridFieldConfig, frozen=True):
@@ -161,7 +161,7 @@ class IRTConfig(GridFieldConfig, frozen=True):
     features: Annotated[int, msgspec.Meta(ge=1, le=64)] = 16
     trunk_width: Channels = 64
     # B: each point by itself. RT: the points of a ray attend to each other. RTT: with a token of the image's texture.
-    # RTC: texture beside the composited points. RTTC: both
+    # BC, RTC: texture beside the composited points. RTTC: token and texture
     variant: IRTVariant = "RTTC"
     texture: Literal["cnn", "colour"] = "cnn"  # what tells the texture: three convolutions, or the pixel's colour alone
     select: Literal["weight", "density"] = "weight"  # which points of a ray are looked at; the paper takes the densest

@@ -62,7 +62,7 @@ def finetune(
         typer.Option(min=0, help="--kind: how many frames without labels to use at most; 0 = all.  [default: 300]"),
     ] = None,
     variant: Annotated[
-        Literal["B", "RT", "RTT", "RTC", "RTTC"] | None,
+        Literal["B", "BC", "RT", "RTT", "RTC", "RTTC"] | None,
         typer.Option(help="--kind irt: what reads the classes.  [default: RTTC]"),
     ] = None,
     depth: FinetuneDepthOption = None,

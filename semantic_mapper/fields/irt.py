@@ -60,10 +60,10 @@ class IRT(GridField):
         self.shape = config
         assert self.trunk is not None
         width, classes = config.width, len(label_set)
-        has_token, joined = config.variant in ("RTT", "RTTC"), config.variant in ("RTC", "RTTC")
+        has_token, joined = config.variant in ("RTT", "RTTC"), config.variant in ("BC", "RTC", "RTTC")
         self.texture = TextureNet(config.texture) if has_token or joined else None
         self.image_head = nn.Linear(TEXTURE, classes) if self.texture is not None else None
-        self.points = PointNet(config) if config.variant == "B" else RayTransformer(config, token=has_token)
+        self.points = PointNet(config) if config.variant in ("B", "BC") else RayTransformer(config, token=has_token)
         self.beyond = nn.Parameter(torch.zeros(width))  # what light that no point stops stands for
         self.carried = CarriedLabels(config.carried, config.carried_size, classes) if config.carried else None
         self.vote = vote_layer(self.carried.channels, classes) if self.carried is not None else None

@@ -41,7 +41,7 @@ PRESETS: dict[str, tuple[str, dict[str, Any]]] = {
     "sray-paper": ("sray", _PAPER | {"intra_view_attention": True, "cross_view_attention": True}),
     "sray-none": ("sray", _PAPER | {"intra_view_attention": False, "cross_view_attention": False}),
     "sray-intra": ("sray", _PAPER | {"intra_view_attention": True, "cross_view_attention": False}),
-    **{f"irt-{name.lower()}": ("irt", {"variant": name}) for name in ("B", "RT", "RTT", "RTC")},
+    **{f"irt-{name.lower()}": ("irt", {"variant": name}) for name in ("B", "BC", "RT", "RTT", "RTC", "RTTC")},
     "irt-colour": ("irt", {"variant": "RTTC", "texture": "colour"}),
     "sray-cross": ("sray", _PAPER | {"intra_view_attention": False, "cross_view_attention": True}),
 }

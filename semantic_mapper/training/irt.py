@@ -113,7 +113,7 @@ def fit_irt(
     geometry = _fit_scene(frames, rays, label_set, start, config, on_progress, stopped)
     field = geometry.field
     assert isinstance(field, IRT)
-    fit = _ClassFit(field, rays, config)
+    fit = ClassFit(field, rays, config)
     best = fit.run(began, on_progress, stopped)
     checkpoint = scene_checkpoint(geometry, config, time.monotonic() - began, seen_stamps_ns, labelled)
     figures = {
@@ -199,7 +199,7 @@ class _Best:
     state: dict[str, torch.Tensor]
 
 
-class _ClassFit:
+class ClassFit:
     """The second part of a fit: what reads classes learns, all else stays as it is."""
 
     def __init__(self, field: IRT, data: LabelledRays, config: FinetuneConfig) -> None:

@@ -33,7 +33,7 @@ def rays_and_sources(field: IRT):
     return wall_rays(POSES[0]), field.encode(wall_sources(POSES[:2]))
 
 
-@pytest.mark.parametrize("variant", ["B", "RT", "RTT", "RTC", "RTTC"])
+@pytest.mark.parametrize("variant", ["B", "BC", "RT", "RTT", "RTC", "RTTC"])
 def test_points_that_cover_the_ray_give_what_all_samples_give(variant: str) -> None:
     every = fitted(variant=variant, points=17)  # 16, and one at the measured depth
     more = IRT(msgspec.structs.replace(every.shape, points=64), LABELS).eval()
@@ -57,7 +57,7 @@ def test_the_points_kept_are_those_of_greatest_weight_in_order() -> None:
     torch.testing.assert_close(kept.weight.sum(1), samples.weight.topk(3, dim=1).values.sum(1))
 
 
-@pytest.mark.parametrize("variant", ["RTT", "RTC", "RTTC"])
+@pytest.mark.parametrize("variant", ["BC", "RTT", "RTC", "RTTC"])
 def test_without_its_image_a_ray_is_answered_as_with_a_texture_of_zeros(variant: str) -> None:
     field = fitted(variant=variant)
     rays, sources = rays_and_sources(field)
@@ -106,7 +106,9 @@ def test_a_ray_with_measured_depth_ends_there() -> None:
 def test_rays_that_pass_by_the_box_are_unknown_even_with_their_image() -> None:
     field = fitted()
     rays, sources = rays_and_sources(field)
-    moved = msgspec.structs.replace(field.shape, grid=msgspec.structs.replace(field.shape.grid, origin_m=(50.0, 50, 50)))
+    moved = msgspec.structs.replace(
+        field.shape, grid=msgspec.structs.replace(field.shape.grid, origin_m=(50.0, 50, 50))
+    )
     other = IRT(moved, LABELS).eval()
     other.load_state_dict(field.state_dict())
     with torch.no_grad():

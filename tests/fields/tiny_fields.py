@@ -50,7 +50,7 @@ TINY: dict[str, Config] = {
     "semantic_nerf": SemanticNeRFConfig(width=16, position_frequencies=4, half_extent_m=4.0),
     "grid": GridFieldConfig(grid=GridConfig(origin_m=(-2.0, -2.0, -1.0), voxel_m=0.25, shape=(17, 17, 17))),
     "irt": TINY_IRT,
-    **{f"irt-{name}": TINY_IRT for name in ("b", "rt", "rtt", "rtc", "colour")},
+    **{f"irt-{name}": TINY_IRT for name in ("b", "bc", "rt", "rtt", "rtc", "rttc", "colour")},
     "sray-paper": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
     "sray-none": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
     "sray-intra": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
