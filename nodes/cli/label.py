@@ -86,7 +86,7 @@ def label(
     Example: semantic-mapper label kitchen.mcap --keyframes 12
     Example: semantic-mapper label kitchen.mcap --images corrected/ --to ipc:///run/robot/labels
     """
-    numbers = _numbers(frames)
+    numbers = frame_numbers(frames)
     _check_options(
         suggest is not None,
         serve,
@@ -233,7 +233,8 @@ def _refuse_without_finetuner(folder: Path) -> None:
         )
 
 
-def _numbers(text: str) -> list[int]:
+def frame_numbers(text: str) -> list[int]:
+    """Numbers of frames, as an option names them."""
     words = [word for word in text.replace(" ", "").split(",") if word]
     if not all(word.isdecimal() for word in words):
         raise typer.BadParameter(f"numbers with commas between them, got {text}", param_hint="--frames")

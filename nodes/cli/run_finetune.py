@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.log_depth import ComputedFrame, compute_depths
 from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress
-from semantic_mapper.training.scene_fit import FITTERS, fitter_of
+from semantic_mapper.training.fitters import FITTERS, fitter_of
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.types import PosedFrame
 
@@ -44,7 +44,8 @@ class FinetuneRequest:
 
     ``depth`` says where the frames' depth comes from. ``kind`` names a kind of field that is fitted to one scene, from
     nothing; None = that of the weights. ``labels`` is a folder of label images in place of the log's. ``keyframes`` is
-    0 for a kind that learns no classes, and for all frames that the folder has labels of.
+    0 for a kind that learns no classes, and for all frames that the folder has labels of. ``frames`` (numbers in the
+    log) names the labelled frames instead. ``unlabelled``: how many others a kind of one scene uses at most, 0 = all.
     """
 
     log: Path
@@ -56,6 +57,8 @@ class FinetuneRequest:
     depth: DepthConfig
     kind: str | None = None
     labels: Path | None = None
+    frames: Sequence[int] = ()
+    unlabelled: int = MAX_SCENE_FRAMES
 
 
 def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress) -> tuple[Checkpoint, list[int]]:
@@ -75,7 +78,7 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
     with open_log(request.log) as log:
         folder = None if request.labels is None else open_label_folder(request.labels, log)
         label_set = log.info.label_set if folder is None else folder.label_set
-        if label_set is None and request.keyframes:
+        if label_set is None and (request.keyframes or request.frames):
             raise LabelError(
                 f"{request.log}: has no label images; finetuning needs labelled keyframes. Make some with "
                 "`semantic-mapper label LOG --serve`, and give their folder with --labels"
@@ -83,7 +86,9 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
         label_set = label_set or ROOMS
         computed = _compute_depths(log, request.depth, stop, bar)
         frames: list[PosedFrame] = []
-        if request.keyframes or folder is not None:  # a folder without a number: all that it has
+        if request.frames:
+            frames = _named(log, request, computed, folder)
+        elif request.keyframes or folder is not None:  # a folder without a number: all that it has
             frames = choose_labelled(log, label_set, request, computed, stop, bar, folder)
         chosen = [f.seq for f in frames]
         pseudo = sum(f.label_is_pseudo for f in frames)
@@ -117,6 +122,28 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
         checkpoint.recipe["pseudo_labels"] = {"keyframes": pseudo, "of": "" if note is None else note.weights}
     save_checkpoint(checkpoint, request.out)
     return checkpoint, chosen
+
+
+def _named(
+    log: Log,
+    request: FinetuneRequest,
+    computed: Mapping[tuple[str, int], ComputedFrame],
+    folder: LabelFolder | None,
+) -> list[PosedFrame]:
+    """The labelled frames that the request names, with the depth that it asks for.
+
+    Raises:
+        LogError: the log has no such frame, or it has no label image.
+    """
+    frames: list[PosedFrame] = []
+    for number in sorted(set(request.frames)):
+        if number >= len(log):
+            raise LogError(f"{request.log}: has no frame {number}; it has {len(log)}")
+        frame = log.frame(number) if folder is None else folder.labelled(log.frame(number), number)
+        if frame.label is None:
+            raise LogError(f"{request.log}: frame {number} has no label image; give one in a folder with --labels")
+        frames.append(_as_given(frame, computed, request.depth))
+    return frames
 
 
 def _compute_depths(
@@ -214,7 +241,7 @@ def read_unlabelled(
     stop: StopRequest,
     bar: FrameProgress,
 ) -> list[PosedFrame]:
-    """The other frames of the log at working width, without labels: at most ``MAX_SCENE_FRAMES``, evenly spread.
+    """The other frames of the log at working width, without labels: as many as requested, evenly spread.
 
     Frames that cannot be read are left out and counted.
 
@@ -222,11 +249,11 @@ def read_unlabelled(
         KeyboardInterrupt: a stop request came.
     """
     known = {(f.camera_id, f.stamp_ns) for f in labelled}
-    every = -(-len(log) // MAX_SCENE_FRAMES)
+    count = min(request.unlabelled or len(log), len(log))
     frames: list[PosedFrame] = []
     damaged = 0
     bar.start(len(log))
-    for number in range(0, len(log), every):
+    for number in sorted({round(i * (len(log) - 1) / max(count - 1, 1)) for i in range(count)}):
         bar.set(number + 1, "reading frames")
         if stop:
             raise KeyboardInterrupt
