@@ -8,6 +8,7 @@ most make a function ``predict(frame) -> ids`` and hand it to ``score_episode``.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -55,10 +56,10 @@ class AerialConfig(Config, frozen=True):
     test_views: Annotated[int, msgspec.Meta(ge=2, le=_TEST_VIEWS)] = _TEST_VIEWS
     low_views: Annotated[int, msgspec.Meta(ge=2, le=LOW_RING)] = LOW_RING
     voxel_m: Positive = 0.75
-    grid_steps: AtLeastOne = 2000  # of the photometric fit of a town
-    nerf_steps: AtLeastOne = 600  # of logits that are trained jointly with the grid
-    unet_steps: AtLeastTwo = 400  # to begin with; doubled until a plateau is reached
-    mlp_steps: AtLeastOne = 1500
+    grid_steps: AtLeastOne = 800  # of the photometric fit of a town
+    nerf_steps: AtLeastOne = 300  # of logits that are trained jointly with the grid
+    unet_steps: AtLeastTwo = 200  # to begin with; doubled until a plateau is reached
+    mlp_steps: AtLeastOne = 600
     seed: NotNegative = 0  # of the first choice of labelled views, and of networks
 
 
@@ -115,10 +116,7 @@ def labelled_frames(config: AerialConfig, episode: Episode) -> list[PosedFrame]:
 
 def scored_views(config: AerialConfig, episode: Episode, kind: str) -> list[RoomView]:
     """Held-out views of the flight by day or in the dark, or those of the low ring."""
-    if kind == LOW:
-        numbers = _spread(low_numbers(), config.low_views)
-    else:
-        numbers = _spread(test_numbers(), config.test_views)
+    numbers = _spread(low_numbers(), config.low_views) if kind == LOW else _spread(test_numbers(), config.test_views)
     return town_views(config.width, episode.town, tuple(numbers), kind == DARK)
 
 
@@ -221,7 +219,7 @@ def aerial_table(config: AerialConfig, names: Sequence[str], store: RecordStore)
 def _agreements(views: Sequence[RoomView], said: Sequence[UInt8]) -> dict[int, Counts]:
     """Of each view and the next one of the same flight: how many pixels show one surface, and have one class."""
     found: dict[int, Counts] = {}
-    for k, (view, other) in enumerate(zip(views, views[1:], strict=False)):
+    for k, (view, other) in enumerate(itertools.pairwise(views)):
         depth = (view.rendered.exact_depth_m, view.T_world_camera)
         matches = matching_pixels(*depth, other.rendered.exact_depth_m, other.T_world_camera, view.frame.intrinsics)
         same = label_agreement(said[k], said[k + 1], matches, AERIAL_SUITE.label_set.ignore_id)

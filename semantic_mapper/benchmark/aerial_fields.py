@@ -21,7 +21,7 @@ from semantic_mapper.benchmark.aerial import (
     score_episode,
     training_frames,
 )
-from semantic_mapper.benchmark.aerial_grids import FIT_NEAR_M, NEAR_M, TownGrid, grid_depths, grid_settings, town_grid
+from semantic_mapper.benchmark.aerial_grids import FIT_NEAR_M, NEAR_M, TownGrid, grid_depths, town_grid
 from semantic_mapper.fields.grid.scene_grid import SceneGrid
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.scenes.suite import AERIAL_SUITE

@@ -65,6 +65,8 @@ def grid_settings(config: AerialConfig, town: int) -> GridFitConfig:
         voxel_m=config.voxel_m,
         box_m=(-x, -y, _LOW_M, x, y, _HIGH_M),
         near_m=FIT_NEAR_M,
+        opacity=0.0,
+        sky=False,
         exposure=False,
         held_out=0,
         seed=config.seed,

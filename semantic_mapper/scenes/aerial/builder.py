@@ -39,8 +39,8 @@ class TownBuilder:
         self.paving = self.material(Pattern.TILES, pale, scale_m=1.2, dim=0.6)
         self.square = self.paving if self.often(SHARED) else self.material(plain, pale, scale_m=2.0, dim=0.6)
         self.brick = self.material(Pattern.TILES, grey, scale_m=0.5, dim=0.7)
-        self.paint = self.material(plain, (pale[0], 0.06, 0.7), scale_m=0.8, dim=0.6)
-        self.zebra = self.material(Pattern.STRIPES, (pale[0], 0.06, 0.74), scale_m=1.1, dim=0.3)
+        self.paint = self.material(plain, (pale[0], 0.06, 0.66), scale_m=0.8, dim=0.6)
+        self.zebra = self.material(Pattern.STRIPES, (pale[0], 0.06, 0.7), scale_m=1.1, dim=0.3)
         green = (between(0.2, 0.27), between(0.42, 0.5), between(0.4, 0.46))
         self.grass = self.material(plain, green, scale_m=1.4, dim=0.4)
         self.leaves = [self.grass, self.material(plain, green, scale_m=0.6, dim=0.3)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 from semantic_mapper.scenes.aerial.builder import ROAD_M
@@ -76,5 +77,5 @@ class TownPlan:
         south = self.ys[self.river] + ROAD_M, self.river_y - RIVER_M - 1.0
         north = self.river_y + RIVER_M + 1.0, self.ys[self.river + 1] - ROAD_M
         aside = ROAD_M + 3.5  # of a bridge's middle line
-        pairs = list(zip(edges[:-1], edges[1:], strict=True))
+        pairs = list(itertools.pairwise(edges))
         return [Rectangle(x0 + aside, x1 - aside, *bank) for x0, x1 in pairs for bank in (south, north)]

@@ -15,7 +15,7 @@ _FAR_M = 700.0  # where the land ends
 _WATER_M = -1.6
 _STREET_TOP_M = 0.04
 _LINE_M, _LINE_TOP_M = 0.35, 0.05
-_ASPHALT_WALKS = 0.45  # of the blocks
+_ASPHALT_WALKS = 0.6  # of the blocks
 _LANE_M = 1.8  # middle of a lane off the middle of a street
 _PARKED_M = 3.4  # middle of a parked car
 
