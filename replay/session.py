@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from semantic_mapper.errors import FrameError, LabelError, SemanticMapperError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, ImageMeans, confusion_of
 from semantic_mapper.fields.checkpoint import Checkpoint
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
 
 _log = get_logger(__name__)
 
+MOSTLY = 0.5  # of a frame that weights of its scene know; of the frames that they do not, for a warning
 SNAPSHOTS = 8  # frames kept for the overview picture
 
 
@@ -81,6 +84,8 @@ class MapSession:
         self.unfinished_correction = ""  # what the map has not moved with, and why
         self.left_out = 0  # by the import that has made the log
         self.without_depth = 0  # their geometry was rendered, not measured
+        self.outside = 0  # that weights of one scene know less than half of
+        self._known: list[float] = []  # of each frame, the fraction that they know
         self.computed_depth = 0  # their geometry was computed from the pictures
         self.too_little_motion = 0  # of these, those whose camera had not moved enough to compute any
         # Frames that were not mapped, those that were but whose label image cannot be used, and stretches of a log in
@@ -136,6 +141,7 @@ class MapSession:
             self.stage_ms.setdefault(name, LatencyHistogram()).add(value)
         self.fused += int(update.fused)
         self._note_depth(frame)
+        self._note_scene(update)
         frame = self.pipeline.corrector.place(frame)  # where the map has it
         self._keep_snapshot(self._score(frame, update), update)
         if self._rerun is not None:
@@ -162,6 +168,27 @@ class MapSession:
                 _log.warning("depth_is_computed", seq=frame.seq, reason="the frame has no sensor depth")
             self.computed_depth += 1
             self.too_little_motion += not frame.depth_m.any()
+
+    def _note_scene(self, update: MapUpdate) -> None:
+        """How much of a frame weights of one scene know: weights of another scene cannot be told otherwise."""
+        known = float(np.mean(update.label != self.pipeline.label_set.ignore_id))
+        self._known.append(known)
+        self.outside += known < MOSTLY
+
+    def _scene_summary(self) -> dict[str, Any]:
+        """Of weights of one scene that know classes: what they know of the frames."""
+        model = self.bundle.checkpoint.model
+        mapped = len(self._known)
+        if not (model.holds_scene and model.knows_classes and mapped):
+            return {}
+        if self.outside > MOSTLY * mapped:
+            _log.warning(
+                "scene_unknown",
+                frames=self.outside,
+                of=mapped,
+                reason="the weights know less than half of these frames: made for another scene or world frame",
+            )
+        return {"scene": {"known": round(sum(self._known) / mapped, 4), "frames_outside": self.outside}}
 
     def refuse(self, seq: int, stamp_ns: int, reason: str) -> None:
         """Count a frame that was damaged before it could be processed."""
@@ -199,7 +226,7 @@ class MapSession:
             self.process_rest()
         except SemanticMapperError as error:  # the map is full, for one: what is in it is worth keeping
             _log.error("last_frames_not_mapped", reason=str(error))
-        return write_artifacts(self, out, self._rerun)
+        return {**write_artifacts(self, out, self._rerun), **self._scene_summary()}
 
     def _score(self, frame: PosedFrame, update: MapUpdate) -> PosedFrame:
         """Score a frame against its label; returns it without a label that is no truth, or cannot be read."""

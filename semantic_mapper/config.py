@@ -152,6 +152,29 @@ class GridFieldConfig(Config, frozen=True):
     trunk_width: Channels = 128  # of the MLP behind the features
 
 
+IRTVariant = Literal["B", "BC", "RT", "RTT", "RTC", "RTTC"]
+
+
+class IRTConfig(GridFieldConfig, frozen=True):
+    """Shape of an Implicit Ray-Transformer: a scene grid with features, and what reads classes from it."""
+
+    features: Annotated[int, msgspec.Meta(ge=1, le=64)] = 16
+    trunk_width: Channels = 64
+    # B: each point by itself. RT: the points of a ray attend to each other. RTT: with a token of the image's texture.
+    # BC, RTC: texture beside the composited points. RTTC: token and texture
+    variant: IRTVariant = "RTTC"
+    texture: Literal["cnn", "colour"] = "cnn"  # what tells the texture: three convolutions, or the pixel's colour alone
+    select: Literal["weight", "density"] = "weight"  # which points of a ray are looked at; the paper takes the densest
+    points: Annotated[int, msgspec.Meta(ge=1, le=64)] = 10  # of a ray
+    width: Channels = 64  # of points in the transformer
+    heads: Channels = 4
+    layers: Layers = 2
+    # Labelled frames whose labels are carried over to where their surface is seen again, and the size of their images;
+    # 0 = labels only teach
+    carried: NotNegative = 0
+    carried_size: tuple[AtLeastOne, AtLeastOne] = (1, 1)  # height and width
+
+
 class SamplingConfig(Config, frozen=True):
     """Where a ray is sampled."""
 

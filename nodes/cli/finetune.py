@@ -9,6 +9,7 @@ import typer
 
 from semantic_mapper.memory import keep_freed_memory
 from semantic_mapper.nodes.cli.console import Output, frame_progress, stderr_console
+from semantic_mapper.nodes.cli.label import frame_numbers
 from semantic_mapper.nodes.cli.verb import verb
 from semantic_mapper.nodes.process import StopRequest
 
@@ -42,7 +43,27 @@ def finetune(
     ] = None,
     from_scratch: Annotated[bool, typer.Option("--from-scratch", help="Start from random weights.")] = False,
     kind: Annotated[
-        str | None, typer.Option(help="Fit a field of this kind to the scene, from all frames; grid: no classes.")
+        str | None,
+        typer.Option(help="Fit a field of this kind to the scene, from all frames; irt: classes, grid: none."),
+    ] = None,
+    frames: Annotated[
+        str, typer.Option(metavar="N,N,...", help="Numbers of the labelled frames in the log, in place of --keyframes.")
+    ] = "",
+    labels: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Label images NNNNNN.png (uint8 class ids), each named by the number of its frame, in place of the "
+            "log's own; with a labels.json, or in the log's classes.",
+        ),
+    ] = None,
+    unlabelled: Annotated[
+        int | None,
+        typer.Option(min=0, help="--kind: how many frames without labels to use at most; 0 = all.  [default: 300]"),
+    ] = None,
+    variant: Annotated[
+        Literal["B", "BC", "RT", "RTT", "RTC", "RTTC"] | None,
+        typer.Option(help="--kind irt: what reads the classes.  [default: RTTC]"),
     ] = None,
     depth: FinetuneDepthOption = None,
 ) -> int:
@@ -54,21 +75,29 @@ def finetune(
     keyframes have depth computed from the log's pictures. Ctrl-C writes the best weights so far (exit code 130).
 
     Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors
+    Example: semantic-mapper finetune kitchen.mcap --kind irt --keyframes 4 --out kitchen.safetensors
     """
     if from_scratch and weights is not None:
         raise typer.BadParameter("goes with random weights only", param_hint="--weights")
     if kind is not None and (weights is not None or from_scratch):
         raise typer.BadParameter("starts from nothing; leave out --weights and --from-scratch", param_hint="--kind")
-    if (keyframes is None) != (kind == "grid"):
+    named = bool(frames or labels)
+    if (keyframes is None and not named) != (kind == "grid") or (kind == "grid" and named):
         raise typer.BadParameter("how many labelled frames? Only --kind grid learns none", param_hint="--keyframes")
+    if keyframes is not None and named:
+        raise typer.BadParameter("--frames or --labels already name the frames", param_hint="--keyframes")
+    if unlabelled is not None and kind is None:
+        raise typer.BadParameter("goes with --kind only", param_hint="--unlabelled")
+    if variant is not None and kind != "irt":
+        raise typer.BadParameter("goes with --kind irt only", param_hint="--variant")
     output = Output.guarded()
     import msgspec
 
     from semantic_mapper.config import load_config
-    from semantic_mapper.nodes.cli.run_finetune import FinetuneRequest, finetune_log
+    from semantic_mapper.nodes.cli.run_finetune import MAX_SCENE_FRAMES, FinetuneRequest, finetune_log
     from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, mapper_config
     from semantic_mapper.training.finetune import FinetuneConfig
-    from semantic_mapper.training.scene_fit import FITTERS
+    from semantic_mapper.training.fitters import FITTERS
 
     if kind is not None and kind not in FITTERS:
         raise typer.BadParameter(
@@ -77,11 +106,16 @@ def finetune(
     given = {"seconds": seconds, "steps": steps, "seed": seed}
     settings = load_config(config, FinetuneConfig) if config is not None else FinetuneConfig()
     settings = msgspec.structs.replace(settings, **{name: v for name, v in given.items() if v is not None})
+    if variant is not None:
+        settings = msgspec.structs.replace(settings, irt=msgspec.structs.replace(settings.irt, variant=variant))
     if settings.seconds == 0 and settings.steps == 0:
         raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
     keep_freed_memory()
     depths = mapper_config(None, None, depth=depth or "sensor", delay_frames=REPLAY_DELAY_FRAMES).depth
-    request = FinetuneRequest(log, keyframes or 0, out, settings, weights, from_scratch, depths, kind)
+    most = MAX_SCENE_FRAMES if unlabelled is None else unlabelled
+    request = FinetuneRequest(
+        log, keyframes or 0, out, settings, weights, from_scratch, depths, kind, frame_numbers(frames), labels, most
+    )
     with StopRequest() as stop, frame_progress("finetune", None, unit="%") as bar:
         checkpoint, chosen = finetune_log(request, stop, bar)
     recipe = checkpoint.recipe
@@ -89,8 +123,9 @@ def finetune(
         output.print(f"{out}: finetuned on frames {', '.join(map(str, chosen))} of {log.name}")
     if "psnr" in recipe:
         psnr = "no views held out" if recipe["psnr"] is None else f"held-out views {recipe['psnr']:.1f} dB"
-        output.print(f"{out}: grid of {log.name}, {recipe['steps']} steps in {recipe['seconds']} s, {psnr}")
-    else:
+        steps = recipe.get("grid_steps", recipe["steps"])
+        output.print(f"{out}: grid of {log.name}, {steps} steps in {recipe['seconds']} s, {psnr}")
+    if "held_out_loss" in recipe:
         output.print(
             f"  {recipe['steps']} steps in {recipe['seconds']} s, best at step {recipe['best_step']}: held-out loss "
             f"{recipe['held_out_loss']:.3f}, accuracy {recipe['held_out_accuracy'] * 100:.1f} %"
@@ -106,6 +141,8 @@ def finetune(
             f"  a frame's own image counts {own['factor']:g} times among the views, "
             f"{own['factor_without_depth']:g} times where there is no depth"
         )
+    if kind == "irt":
+        output.print(f"  {out.stat().st_size / 1e6:.1f} MB that show the scene: as private as the recording")
     if stop:
         stderr_console().print(f"stopped by {stop.name}; the best weights so far are in {out}", style="yellow")
     return stop.exit_code

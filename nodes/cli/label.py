@@ -49,7 +49,7 @@ def label(
     Example: semantic-mapper label kitchen.mcap --keyframes 12
     Example: semantic-mapper label kitchen.mcap --images corrected/ --to ipc:///run/robot/labels
     """
-    numbers = _numbers(frames)
+    numbers = frame_numbers(frames)
     output = Output.guarded()
     from semantic_mapper.nodes.cli.labelling import choose_keyframes, labels_endpoint, sending
     from semantic_mapper.transport.messages import LabelledKeyframe
@@ -90,7 +90,8 @@ def _refuse_without_finetuner(folder: Path) -> None:
         )
 
 
-def _numbers(text: str) -> list[int]:
+def frame_numbers(text: str) -> list[int]:
+    """Numbers of frames, as an option names them."""
     words = [word for word in text.replace(" ", "").split(",") if word]
     if not all(word.isdecimal() for word in words):
         raise typer.BadParameter(f"numbers with commas between them, got {text}", param_hint="--frames")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.log_depth import ComputedFrame, compute_depths
 from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress
-from semantic_mapper.training.scene_fit import FITTERS, fitter_of
+from semantic_mapper.training.fitters import FITTERS, fitter_of
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.types import PosedFrame
 
@@ -41,7 +41,9 @@ class FinetuneRequest:
     """What the verb was requested; ``weights`` None = those in the package, ``from_scratch`` = random ones.
 
     ``depth`` says where the frames' depth comes from. ``kind`` names a kind of field that is fitted to one scene, from
-    nothing; None = that of the weights. ``keyframes`` is 0 for a kind that learns no classes.
+    nothing; None = that of the weights. ``keyframes`` is 0 for a kind that learns no classes. ``frames`` (numbers in
+    the log) and ``labels`` (a folder of label images) name the labelled frames instead. ``unlabelled``: how many others
+    a kind of one scene uses at most, 0 = all.
     """
 
     log: Path
@@ -52,6 +54,9 @@ class FinetuneRequest:
     from_scratch: bool
     depth: DepthConfig
     kind: str | None = None
+    frames: Sequence[int] = ()
+    labels: Path | None = None
+    unlabelled: int = MAX_SCENE_FRAMES
 
 
 def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress) -> tuple[Checkpoint, list[int]]:
@@ -70,11 +75,19 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
     kind = request.kind or (SRay.kind if start is None else start.model.kind)
     with open_log(request.log) as log:
         label_set = log.info.label_set
+        named = bool(request.frames or request.labels)
         if label_set is None and request.keyframes:
-            raise LabelError(f"{request.log}: has no label images; finetuning needs labelled keyframes")
-        label_set = label_set or ROOMS
+            raise LabelError(
+                f"{request.log}: has no label images; finetuning needs labelled keyframes. Give them with --labels"
+            )
         computed = _compute_depths(log, request.depth, stop, bar)
-        frames = choose_labelled(log, label_set, request, computed, stop, bar) if request.keyframes else []
+        frames: list[PosedFrame] = []
+        if named:
+            given, label_set = _named_labels(request, stop, bar)
+            frames = [_as_given(frame, computed, request.depth) for frame in given]
+        elif request.keyframes and label_set is not None:
+            frames = choose_labelled(log, label_set, request, computed, stop, bar)
+        label_set = label_set or ROOMS
         chosen = [f.seq for f in frames]
         pseudo = sum(f.label_is_pseudo for f in frames)
         if kind in FITTERS:
@@ -107,6 +120,17 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
         checkpoint.recipe["pseudo_labels"] = {"keyframes": pseudo, "of": "" if note is None else note.weights}
     save_checkpoint(checkpoint, request.out)
     return checkpoint, chosen
+
+
+def _named_labels(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress) -> tuple[list[PosedFrame], LabelSet]:
+    """The labelled frames that the request names.
+
+    Raises:
+        LogError, LabelError, ImportSourceError: as of ``labelling.choose_keyframes``.
+    """
+    from semantic_mapper.nodes.cli.labelling import choose_keyframes as read_named  # it imports this module
+
+    return read_named(request.log, 0, request.frames, request.labels, stop, bar)
 
 
 def _compute_depths(
@@ -198,7 +222,7 @@ def read_unlabelled(
     stop: StopRequest,
     bar: FrameProgress,
 ) -> list[PosedFrame]:
-    """The other frames of the log at working width, without labels: at most ``MAX_SCENE_FRAMES``, evenly spread.
+    """The other frames of the log at working width, without labels: as many as requested, evenly spread.
 
     Frames that cannot be read are left out and counted.
 
@@ -206,11 +230,11 @@ def read_unlabelled(
         KeyboardInterrupt: a stop request came.
     """
     known = {(f.camera_id, f.stamp_ns) for f in labelled}
-    every = -(-len(log) // MAX_SCENE_FRAMES)
+    count = min(request.unlabelled or len(log), len(log))
     frames: list[PosedFrame] = []
     damaged = 0
     bar.start(len(log))
-    for number in range(0, len(log), every):
+    for number in sorted({round(i * (len(log) - 1) / max(count - 1, 1)) for i in range(count)}):
         bar.set(number + 1, "reading frames")
         if stop:
             raise KeyboardInterrupt

@@ -38,7 +38,7 @@ from semantic_mapper.fields.registry import build_field
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.baselines import WarpBaseline
 from semantic_mapper.training.finetune import FinetuneProgress
-from semantic_mapper.training.scene_fit import fitter_of
+from semantic_mapper.training.fitters import fitter_of
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import SourceViews
@@ -159,7 +159,7 @@ def _source_count(field: LearnedField, suite: SuiteConfig) -> int:
 
 def _shows_own(field: LearnedField, suite: SuiteConfig) -> bool:
     """Whether the query's own image is a source view."""
-    return field.needs_own_view or (suite.protocol == "generalize" and suite.own_image)
+    return field.needs_own_view or field.reads_own_view or (suite.protocol == "generalize" and suite.own_image)
 
 
 def _answer(

@@ -158,7 +158,11 @@ def load_checkpoint(path: Path) -> Checkpoint:
     except (KeyError, TypeError, ValueError, ArithmeticError, RuntimeError, SemanticMapperError) as error:
         reason = " ".join(str(error).split())[:MESSAGE]
         raise WeightsError(f"{path}: its metadata is damaged: {type(error).__name__}: {reason}") from error
-    weights = {n.removeprefix("model."): t.float() for n, t in tensors.items() if n.startswith("model.")}
+    weights = {
+        n.removeprefix("model."): t if t.dtype == torch.float64 else t.float()
+        for n, t in tensors.items()
+        if n.startswith("model.")
+    }
     try:
         model.load_state_dict(weights)
     except RuntimeError as error:
@@ -283,7 +287,8 @@ def _checked_recipe(recipe: Any) -> dict[str, Any]:
 
 def _stored(tensor: torch.Tensor, half: bool) -> torch.Tensor:
     tensor = tensor.detach().cpu().contiguous()
-    return tensor.half() if half and tensor.is_floating_point() else tensor
+    # Poses are float64, which float16 would move.
+    return tensor.half() if half and tensor.is_floating_point() and tensor.dtype != torch.float64 else tensor
 
 
 def _depth_to_units(depth_m: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:

@@ -32,6 +32,7 @@ class LearnedField(nn.Module, ABC):
 
     kind: ClassVar[str]
     needs_own_view: ClassVar[bool] = False  # whether it can render only views whose image is among the sources
+    reads_own_view: ClassVar[bool] = False  # whether it makes use of that image where it is there, and does without
     holds_scene: ClassVar[bool] = False  # whether its density is the geometry of the one scene that it was fitted to
     knows_classes: ClassVar[bool] = True  # whether it ever says a class; else there is nothing to label or to score
     class_rows: ClassVar[tuple[str, ...]] = ()  # names of the parameters with one row a class, in channel order

@@ -10,6 +10,7 @@ import msgspec
 from semantic_mapper.config import (
     Config,
     GridFieldConfig,
+    IRTConfig,
     MVSNeRFConfig,
     NeuRayConfig,
     SamplingConfig,
@@ -30,6 +31,7 @@ KINDS: dict[str, tuple[type[Config], str, str]] = {
     "mvsnerf": (MVSNeRFConfig, "semantic_mapper.fields.peers.mvsnerf", "MVSNeRF"),
     "semantic_nerf": (SemanticNeRFConfig, "semantic_mapper.fields.peers.semantic_nerf", "SemanticNeRF"),
     "grid": (GridFieldConfig, "semantic_mapper.fields.grid.field", "GridField"),
+    "irt": (IRTConfig, "semantic_mapper.fields.irt", "IRT"),
 }
 
 # A name for some switches of a kind. The field built is of that kind, and so is its checkpoint: the switches are part
@@ -39,6 +41,8 @@ PRESETS: dict[str, tuple[str, dict[str, Any]]] = {
     "sray-paper": ("sray", _PAPER | {"intra_view_attention": True, "cross_view_attention": True}),
     "sray-none": ("sray", _PAPER | {"intra_view_attention": False, "cross_view_attention": False}),
     "sray-intra": ("sray", _PAPER | {"intra_view_attention": True, "cross_view_attention": False}),
+    **{f"irt-{name.lower()}": ("irt", {"variant": name}) for name in ("B", "BC", "RT", "RTT", "RTC", "RTTC")},
+    "irt-colour": ("irt", {"variant": "RTTC", "texture": "colour"}),
     "sray-cross": ("sray", _PAPER | {"intra_view_attention": False, "cross_view_attention": True}),
 }
 

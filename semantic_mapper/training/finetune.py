@@ -22,6 +22,7 @@ from semantic_mapper.config import (
     AtLeastZero,
     Config,
     Fraction,
+    IRTVariant,
     NotNegative,
     Positive,
     SRayConfig,
@@ -72,6 +73,15 @@ OWN_VIEW_FACTOR = 4.0
 OWN_VIEW_FACTOR_WITHOUT_DEPTH = 1e3
 
 
+class IRTFitConfig(Config, frozen=True):
+    """What an Implicit Ray-Transformer is made of (``irt.fit_irt``)."""
+
+    variant: IRTVariant | None = None  # None = that of the weights to start from, else RTTC
+    carry_labels: bool = (
+        True  # to where the labelled frames' surface is seen again; False: labels only teach, as in the paper
+    )
+
+
 class FinetuneConfig(Config, frozen=True):
     """Budget and optimiser of a finetuning."""
 
@@ -111,6 +121,7 @@ class FinetuneConfig(Config, frozen=True):
     device: DeviceName = "auto"
     step: StepConfig = StepConfig()
     grid: GridFitConfig = GridFitConfig()  # of kinds that stand on a scene grid (``scene_fit``)
+    irt: IRTFitConfig = IRTFitConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -391,14 +402,19 @@ def _make_scene(views: Sequence[LabelledView], config: FinetuneConfig, generator
 def _split(view: LabelledView, share: float, generator: torch.Generator) -> tuple[LabelledView, LabelledView]:
     """The view for training (held-out blocks ignored) and for evaluation (all but held-out blocks ignored)."""
     height, width = view.channel.shape
-    rows, columns = -(-height // HELD_OUT_BLOCK), -(-width // HELD_OUT_BLOCK)
-    blocks = torch.rand(rows, columns, generator=generator) < share
-    mask = blocks.repeat_interleave(HELD_OUT_BLOCK, 0).repeat_interleave(HELD_OUT_BLOCK, 1)[:height, :width]
+    mask = held_out_blocks(height, width, share, generator)
     ignored = torch.full_like(view.channel, IGNORE)
     return (
         replace(view, channel=torch.where(mask, ignored, view.channel)),
         replace(view, channel=torch.where(mask, view.channel, ignored)),
     )
+
+
+def held_out_blocks(height: int, width: int, share: float, generator: torch.Generator) -> torch.Tensor:
+    """Mask (H, W) of blocks of an image that are held out."""
+    rows, columns = -(-height // HELD_OUT_BLOCK), -(-width // HELD_OUT_BLOCK)
+    blocks = torch.rand(rows, columns, generator=generator) < share
+    return blocks.repeat_interleave(HELD_OUT_BLOCK, 0).repeat_interleave(HELD_OUT_BLOCK, 1)[:height, :width]
 
 
 def _evaluate(model: LearnedField, scene: _Scene, config: FinetuneConfig) -> tuple[float, float]:

@@ -1,6 +1,6 @@
 """Fit fields of one scene: stage A the geometry, from all frames; stage B what the kind adds to it.
 
-``FITTERS`` names the fitter of each kind that has one of its own; all other kinds are finetuned.
+``fitters`` names the fitter of each kind that has one of its own.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.fields.grid.field import GridField
 from semantic_mapper.fields.grid.trunk import Trunk
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.registry import build_field
+from semantic_mapper.fields.registry import build_field, field_config
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, finetune
+from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress
 from semantic_mapper.training.frame_rays import frame_rays
 from semantic_mapper.training.grid_fit import GridFit, GridFitConfig, GridFitProgress, fit_grid, psnr_of
 from semantic_mapper.types import PosedFrame
@@ -79,13 +79,14 @@ def fit_geometry(
     Raises:
         FrameError, ConfigError: of ``fit_grid``.
     """
-    given = start.config if isinstance(start, GridField) else GridFieldConfig()
+    given = start.config if isinstance(start, GridField) else field_config(kind, {})
+    if not isinstance(given, GridFieldConfig):
+        raise ConfigError(f"a field of kind '{kind}' has no scene grid; kinds with one build on GridField")
     box = given.grid if start is not None and config.grid.box_m is None else None
     fit = fit_grid(frames, grid_settings(config), _told(on_progress), stopped, box)
     torch.manual_seed(config.seed)  # of what the kind draws
     field = build_field(kind, msgspec.structs.replace(given, grid=fit.grid.config), label_set)
-    if not isinstance(field, GridField):
-        raise ConfigError(f"a field of kind '{kind}' has no scene grid; kinds with one build on GridField")
+    assert isinstance(field, GridField)
     field.grid.load_state_dict(fit.grid.state_dict())
     field.fitted_steps += fit.steps
     return FittedGeometry(field, fit)
@@ -174,12 +175,3 @@ def _told(on_progress: OnProgress | None) -> Callable[[GridFitProgress], None] |
     if on_progress is None:
         return None
     return lambda p: on_progress(FinetuneProgress(p.step, p.fraction, p.loss, p.loss, float("nan"), False))
-
-
-# Kinds that are fitted to a scene in a way of their own. Kinds that build on GridField add a row.
-FITTERS: dict[str, Fitter] = {GridField.kind: fit_scene}
-
-
-def fitter_of(kind: str) -> Fitter:
-    """The fitter of a kind of field; ``finetune`` where it has none of its own."""
-    return FITTERS.get(kind, finetune)

@@ -189,13 +189,17 @@ def withhold_depth(sources: SourceViews, fraction: float, generator: torch.Gener
 
 def jitter_colours(sources: SourceViews, strength: float, generator: torch.Generator) -> SourceViews:
     """Random gain a view and channel, and gamma a view: exposure and white balance drift."""
-    count = len(sources.rgb)
+    return replace(sources, rgb=jittered(sources.rgb, strength, generator))
+
+
+def jittered(rgb: torch.Tensor, strength: float, generator: torch.Generator) -> torch.Tensor:
+    """Colours (m, 3, H, W) of ``jitter_colours``."""
+    count = len(rgb)
     gain = 1 + strength * (2 * torch.rand(count, 1, 1, 1, generator=generator) - 1)
     tint = 1 + 0.5 * strength * (2 * torch.rand(count, 3, 1, 1, generator=generator) - 1)
     gamma = 1 + strength * (2 * torch.rand(count, 1, 1, 1, generator=generator) - 1)
-    device = sources.rgb.device
-    rgb = (sources.rgb.clamp_min(1e-3) ** gamma.to(device)) * (gain * tint).to(device)
-    return replace(sources, rgb=rgb.clamp(0, 1))
+    rgb = (rgb.clamp_min(1e-3) ** gamma.to(rgb.device)) * (gain * tint).to(rgb.device)
+    return rgb.clamp(0, 1)
 
 
 def degrade_view(sources: SourceViews, index: int, generator: torch.Generator) -> SourceViews:

@@ -16,7 +16,8 @@ from tests.small import tiny_frames
 STEP = StepConfig(rays=32, views_min=2, views_max=2, samples_without_depth=4)
 
 
-TRAINED = [name for name in field_names() if name != "grid"]  # a plain grid learns no classes
+# A plain grid learns no classes; an IRT learns them in its own fit, not in steps of all kinds.
+TRAINED = [name for name in field_names() if name != "grid" and not name.startswith("irt")]
 
 
 def test_every_name_is_tested_here():
@@ -54,7 +55,8 @@ def test_every_kind_goes_through_a_checkpoint(name: str, tmp_path):
     loaded = load_checkpoint(tmp_path / "w.safetensors").model
     assert type(loaded) is type(field) and loaded.config == field.config
     for key, tensor in field.state_dict().items():
-        assert torch.equal(loaded.state_dict()[key], tensor)
+        half = field.stored_in_half and tensor.dtype == torch.float32
+        assert torch.equal(loaded.state_dict()[key], tensor.half().float() if half else tensor)
 
 
 @pytest.mark.parametrize("name", field_names())

@@ -11,6 +11,7 @@ from semantic_mapper.config import (
     EncoderConfig,
     GridConfig,
     GridFieldConfig,
+    IRTConfig,
     MVSNeRFConfig,
     NeuRayConfig,
     SamplingConfig,
@@ -26,6 +27,16 @@ from semantic_mapper.types import FieldRender, RayBatch, SourceViews
 from tests.fields.scene import pose_at, wall_rays, wall_sources
 from tests.small import SMALL_ENCODER
 
+TINY_IRT = IRTConfig(
+    grid=GridConfig(origin_m=(-2.0, -2.0, -1.0), voxel_m=0.25, shape=(17, 17, 17)),
+    features=4,
+    trunk_width=16,
+    width=16,
+    heads=2,
+    points=4,
+    carried=2,
+    carried_size=(6, 8),
+)
 LABELS = make_label_set("test", ["a", "b", "c"])
 POSES = [pose_at(-0.3), pose_at(-0.1, 0.1), pose_at(0.1), pose_at(0.3, -0.15)]
 AWAY = pose_at(0.0, 3.14159)
@@ -38,6 +49,8 @@ TINY: dict[str, Config] = {
     "mvsnerf": MVSNeRFConfig(feature_dim=8, encoder=COLOURS_ONLY, planes=8, volume_channels=4, width=16),
     "semantic_nerf": SemanticNeRFConfig(width=16, position_frequencies=4, half_extent_m=4.0),
     "grid": GridFieldConfig(grid=GridConfig(origin_m=(-2.0, -2.0, -1.0), voxel_m=0.25, shape=(17, 17, 17))),
+    "irt": TINY_IRT,
+    **{f"irt-{name}": TINY_IRT for name in ("b", "bc", "rt", "rtt", "rtc", "rttc", "colour")},
     "sray-paper": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
     "sray-none": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),
     "sray-intra": SRayConfig(feature_dim=16, heads=2, encoder=SMALL_ENCODER),

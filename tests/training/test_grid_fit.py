@@ -19,10 +19,11 @@ from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.imaging import resize_rgb
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.finetune import FinetuneConfig, finetune
+from semantic_mapper.training.fitters import fitter_of
 from semantic_mapper.training.frame_rays import frame_rays
 from semantic_mapper.training.grid_depth import distance_to_surface, grid_of_depth
 from semantic_mapper.training.grid_fit import GridFitConfig, fit_grid, render_frame, scene_box
-from semantic_mapper.training.scene_fit import fit_scene, fitter_of
+from semantic_mapper.training.scene_fit import fit_scene
 from semantic_mapper.types import PosedFrame
 from tests.small import tiny_frames
 

@@ -1,0 +1,376 @@
+"""Fit an Implicit Ray-Transformer to one scene: geometry and colours of all frames, then classes of the labelled ones.
+
+Steps draw pixels of all labelled frames at once. The texture of a pixel depends on the patch round it alone, so that a
+step looks at patches, not at whole images.
+"""
+
+from __future__ import annotations
+
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+import torch
+from torch.nn import functional
+
+from semantic_mapper.config import IRTConfig
+from semantic_mapper.errors import ConfigError, FrameError, WeightsError
+from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.fields.grid.field import RaySamples
+from semantic_mapper.fields.irt import IRT, RayTexture, at_measured, no_texture, surface
+from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.geometry import camera_matrix, invert_pose
+from semantic_mapper.imaging import resize_label
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, held_out_blocks
+from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
+from semantic_mapper.training.grid_fit import GridFitProgress, fit_grid
+from semantic_mapper.training.losses import IGNORE, RAREST, semantic_loss
+from semantic_mapper.training.scene_fit import FittedGeometry, fit_trunk, grid_settings, scene_checkpoint
+from semantic_mapper.training.schedule import budget_fraction, cosine_rate
+from semantic_mapper.training.views import jittered
+from semantic_mapper.types import PosedFrame
+
+RAYS = 512  # a step
+BALANCED = 0.5  # of them with all classes equally likely
+GRID_UNTIL, TRUNK_UNTIL = 0.35, 0.5  # fractions of the time for geometry and colours, then for features
+LEARNING_RATE, FINAL_RATE, WEIGHT_DECAY = 2e-3, 1e-4, 1e-4
+CLASS_BALANCE = 0.25  # a class counts by its fraction of the pixels to the power of minus this
+IMAGE_DROPPED = 0.2  # fraction of rays without the texture of their pixel
+DEPTH_USED = 0.7  # fraction of steps in which measured depth says where a ray ends
+LABELS_DROPPED = 0.5  # of the other frames' labels at most, drawn anew in every step
+IMAGE_LOSS = 1.0  # weight of what the texture says by itself
+COLOUR_JITTER = 0.25
+LOOK_RAYS = 4096
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelledRays:
+    """All pixels of the labelled frames, F of one size.
+
+    Args:
+        rays: Of the frames.
+        rgb: (F, 3, H + 2 margin, W + 2 margin) uint8, continued beyond the edges.
+        channel: (F H W,) int64, -1 = not labelled.
+        held_out: (F H W,) bool.
+    """
+
+    rays: FrameRays
+    rgb: torch.Tensor
+    channel: torch.Tensor
+    held_out: torch.Tensor
+
+    def patches(self, pixels: torch.Tensor, side: int) -> torch.Tensor:
+        """Colours (R, 3, side, side) in [0, 1] round pixels (R,)."""
+        height, width = self.rays.image_size(0)
+        margin = (self.rgb.shape[2] - height) // 2
+        frame, place = pixels // (height * width), pixels % (height * width)
+        steps = torch.arange(side) + margin - side // 2
+        row = (place // width)[:, None, None] + steps[None, :, None]
+        column = (place % width)[:, None, None] + steps[None, None, :]
+        return self.rgb[frame[:, None, None], :, row, column].permute(0, 3, 1, 2).float() / 255
+
+
+def fit_irt(
+    frames: Sequence[PosedFrame],
+    label_set: LabelSet,
+    start: LearnedField | None,
+    config: FinetuneConfig,
+    on_progress: Callable[[FinetuneProgress], None] | None = None,
+    stopped: Callable[[], object] = bool,
+    seen_stamps_ns: Iterable[int] = (),
+) -> Checkpoint:
+    """Fit an ``IRT``: geometry and texture from all frames, classes from those with labels.
+
+    Args:
+        frames: With poses; one of them labelled, at least.
+        label_set: Of the labels.
+        start: Gives config and box; its weights are not looked at.
+        config: ``seconds`` bounds the whole fit. ``steps``, if not 0, is the number of steps of each of its parts.
+        on_progress: Called after every step.
+        stopped: Asked before every step; once it says so (anything true), the best weights so far are the result.
+        seen_stamps_ns: Frames that ``start`` was fitted to.
+
+    Raises:
+        FrameError: no labelled frame, one class only, or what ``fit_grid`` refuses.
+        WeightsError: ``start`` has other classes.
+        ConfigError: no budget.
+    """
+    if config.seconds <= 0 and config.steps <= 0:
+        raise ConfigError("a fit needs a budget: set seconds, steps, or both")
+    if start is not None and start.label_set != label_set:
+        raise WeightsError(
+            f"the weights have label set '{start.label_set.name}', the labels '{label_set.name}'; fit anew without them"
+        )
+    began = time.monotonic()
+    labelled = [f for f in usable_frames(frames) if f.label is not None]
+    rays = labelled_rays(labelled, label_set, config)
+    geometry = _fit_scene(frames, rays, label_set, start, config, on_progress, stopped)
+    field = geometry.field
+    assert isinstance(field, IRT)
+    fit = ClassFit(field, rays, config)
+    best = fit.run(began, on_progress, stopped)
+    checkpoint = scene_checkpoint(geometry, config, time.monotonic() - began, seen_stamps_ns, labelled)
+    figures = {
+        "steps": fit.step,
+        "best_step": best.step,
+        "held_out_loss": best.loss,
+        "held_out_accuracy": best.accuracy,
+    }
+    recipe = checkpoint.recipe | {"grid_steps": geometry.fit.steps} | figures
+    return Checkpoint(checkpoint.model, (), recipe)
+
+
+def labelled_rays(frames: Sequence[PosedFrame], label_set: LabelSet, config: FinetuneConfig) -> LabelledRays:
+    """The pixels of labelled frames, some of them held out.
+
+    Raises:
+        FrameError: no labelled frame, frames of several sizes, or fewer than two classes.
+    """
+    if not frames:
+        raise FrameError("no frame has a label and a usable pose; give labelled keyframes (--keyframes)")
+    rays = frame_rays(frames, config.width)
+    if len({(k.width, k.height) for k in rays.intrinsics}) > 1:
+        raise FrameError("labelled frames have several sizes; give those of one camera")
+    channel = [
+        label_set.to_channels(resize_label(f.label, k), f"frame seq={f.seq}").ravel()
+        for f, k in zip(frames, rays.intrinsics, strict=True)
+        if f.label is not None
+    ]
+    flat = torch.from_numpy(np.concatenate(channel)).long()
+    if len(flat[flat >= 0].unique()) < 2:
+        raise FrameError("the labelled frames show fewer than two classes; there is nothing to tell apart")
+    height, width = rays.image_size(0)
+    generator = torch.Generator().manual_seed(config.seed)
+    masks = [held_out_blocks(height, width, config.held_out_fraction, generator).flatten() for _ in frames]
+    rgb = torch.from_numpy(rays.rgb.reshape(len(frames), height, width, 3)).permute(0, 3, 1, 2)
+    margin = 3
+    padded = functional.pad(rgb.float(), (margin,) * 4, mode="replicate").to(torch.uint8)
+    return LabelledRays(rays, padded, flat, torch.cat(masks) & (flat >= 0))
+
+
+def _fit_scene(
+    frames: Sequence[PosedFrame],
+    labelled: LabelledRays,
+    label_set: LabelSet,
+    start: LearnedField | None,
+    config: FinetuneConfig,
+    on_progress: Callable[[FinetuneProgress], None] | None,
+    stopped: Callable[[], object],
+) -> FittedGeometry:
+    """Geometry, colours and features of all frames; they stay as they are from then on."""
+    began = time.monotonic()
+    given = start.config if isinstance(start, IRT) else IRTConfig()
+    box = given.grid if isinstance(start, IRT) and start.fitted and config.grid.box_m is None else None
+    settings = msgspec.structs.replace(grid_settings(config), seconds=GRID_UNTIL * config.seconds)
+    if config.steps:
+        settings = msgspec.structs.replace(settings, trunk_steps=min(settings.trunk_steps, config.steps))
+
+    def tell(p: GridFitProgress) -> None:
+        if on_progress is not None:
+            on_progress(FinetuneProgress(p.step, GRID_UNTIL * p.fraction, p.loss, math.nan, math.nan, False))
+
+    fit = fit_grid(frames, settings, tell, stopped, box)
+    count, size = len(labelled.rays.intrinsics), labelled.rays.image_size(0)
+    carried = count if config.irt.carry_labels else 0
+    shape = msgspec.structs.replace(given, grid=fit.grid.config, carried=carried, carried_size=size)
+    if config.irt.variant is not None:
+        shape = msgspec.structs.replace(shape, variant=config.irt.variant)
+    torch.manual_seed(config.seed)
+    field = IRT(shape, label_set)
+    field.grid.load_state_dict(fit.grid.state_dict())
+    field.fitted_steps += fit.steps
+    assert field.trunk is not None
+    until = began + TRUNK_UNTIL * config.seconds if config.seconds else math.inf
+    fit_trunk(field, field.trunk, fit, settings, lambda: stopped() or time.monotonic() > until)
+    return FittedGeometry(field, fit)
+
+
+@dataclass(slots=True)
+class _Best:
+    loss: float
+    accuracy: float
+    step: int
+    state: dict[str, torch.Tensor]
+
+
+class ClassFit:
+    """The second part of a fit: what reads classes learns, all else stays as it is."""
+
+    def __init__(self, field: IRT, data: LabelledRays, config: FinetuneConfig) -> None:
+        self.field, self.data, self.config = field, data, config
+        self.generator = torch.Generator().manual_seed(config.seed)
+        for frozen in (field.grid, field.trunk):
+            assert frozen is not None
+            frozen.requires_grad_(False)
+        self.learned = {n: p for n, p in field.named_parameters() if p.requires_grad}
+        self.optimiser = torch.optim.AdamW(self.learned.values(), LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+        train = (data.channel >= 0) & ~data.held_out
+        self.pool = _Pool(torch.where(train, data.channel, IGNORE), len(field.label_set))
+        self.looked_at = data.held_out.nonzero()[:, 0]
+        if len(self.looked_at) > LOOK_RAYS:
+            order = torch.randperm(len(self.looked_at), generator=self.generator)
+            self.looked_at = self.looked_at[order[:LOOK_RAYS].sort().values]
+        self.step, self.fraction, self.look_s = 0, 0.0, 0.0
+        carry_labels(field, data.rays, torch.where(train, data.channel, IGNORE))
+
+    def run(
+        self, began: float, on_progress: Callable[[FinetuneProgress], None] | None, stopped: Callable[[], object]
+    ) -> _Best:
+        """Learn until the budget is spent; the field then has the weights that were best on what was held out."""
+        config, looks = self.config, 0
+        first = time.monotonic()
+        latest = best = _Best(math.inf, math.nan, 0, self._state())
+        seconds = max(config.seconds - (first - began), 0.05 * config.seconds)
+        while self.fraction < 1 and not stopped():
+            loss = self._learn()
+            self.step += 1
+            left = max(seconds - self.look_s, 1e-3) if seconds else 0.0
+            self.fraction = budget_fraction(self.step, time.monotonic() - first, steps=config.steps, seconds=left)
+            improved = False
+            if self.fraction * config.evaluations >= looks + 1 or self.fraction >= 1:
+                looks = int(self.fraction * config.evaluations)
+                latest = self._look()
+                improved = latest.loss < best.loss or not math.isfinite(latest.loss)
+                best = latest if improved else best
+            if on_progress is not None:
+                told = TRUNK_UNTIL + (1 - TRUNK_UNTIL) * min(self.fraction, 1.0)
+                on_progress(FinetuneProgress(self.step, told, loss, latest.loss, latest.accuracy, improved))
+        if stopped() and self.step > 0:
+            latest = self._look()
+            best = latest if latest.loss < best.loss or not math.isfinite(latest.loss) else best
+        self.field.load_state_dict(best.state, strict=False)
+        carry_labels(self.field, self.data.rays, self.data.channel)
+        return best
+
+    def _learn(self) -> float:
+        """One step."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = cosine_rate(min(self.fraction, 1.0), LEARNING_RATE, FINAL_RATE)
+        pixels, weight = self.pool.draw(RAYS, self.generator)
+        channel = self.data.channel[pixels]
+        with_depth = float(torch.rand(1, generator=self.generator)) < DEPTH_USED
+        jitter = torch.rand(len(pixels), generator=self.generator)
+        samples = self._samples(pixels, with_depth=with_depth, jitter=jitter)
+        texture = self._texture(pixels, samples, learning=True)
+        dropped = LABELS_DROPPED * torch.rand(1, generator=self.generator)
+        kept = torch.rand(len(self.data.rays.intrinsics), generator=self.generator) >= dropped
+        logits = self.field.logits(samples, texture, self._carried(pixels, samples, kept))
+        loss = semantic_loss(logits, channel, weight)
+        total = loss
+        if self.field.image_head is not None and bool(texture.there.any()):
+            by_image = self.field.image_head(texture.values[texture.there])
+            total = loss + IMAGE_LOSS * semantic_loss(by_image, channel[texture.there], weight[texture.there])
+        self.optimiser.zero_grad()
+        total.backward()
+        self.optimiser.step()
+        return float(loss.detach())
+
+    def _look(self) -> _Best:
+        """Loss and accuracy of what was held out, as a consumer with the frame's own image sees it."""
+        began = time.monotonic()
+        losses: list[float] = []
+        right = 0
+        everything = torch.ones(len(self.data.rays.intrinsics), dtype=torch.bool)
+        self.field.eval()
+        with torch.no_grad():
+            for pixels in self.looked_at.split(1024):
+                samples = self._samples(pixels, with_depth=True)
+                texture = self._texture(pixels, samples, learning=False)
+                logits = self.field.logits(samples, texture, self._carried(pixels, samples, everything))
+                channel = self.data.channel[pixels]
+                losses.append(float(functional.cross_entropy(logits, channel, reduction="sum")))
+                right += int((logits.argmax(1) == channel).sum())
+        self.field.train()
+        count = len(self.looked_at)
+        self.look_s = max(self.look_s, time.monotonic() - began)
+        if not count:
+            return _Best(math.inf, math.nan, self.step, self._state())
+        return _Best(sum(losses) / count, right / count, self.step, self._state())
+
+    def _state(self) -> dict[str, torch.Tensor]:
+        return {name: p.detach().clone() for name, p in self.learned.items()}
+
+    def _samples(self, pixels: torch.Tensor, *, with_depth: bool, jitter: torch.Tensor | None = None) -> RaySamples:
+        rays = self.data.rays.rays(pixels.numpy(), self.config.grid.near_m)
+        if with_depth:
+            rays = replace(rays, prior_depth_m=torch.from_numpy(self.data.rays.depth_m[pixels.numpy()]))
+        with torch.no_grad():
+            return at_measured(self.field.march(rays, jitter=jitter), self.field.config.grid)
+
+    def _texture(self, pixels: torch.Tensor, samples: RaySamples, *, learning: bool) -> RayTexture:
+        net = self.field.texture
+        if net is None:
+            return no_texture(samples.rays)
+        patches = self.data.patches(pixels, 2 * net.margin + 1)
+        there = torch.ones(len(pixels), dtype=torch.bool)
+        if learning:
+            patches = jittered(patches, COLOUR_JITTER, self.generator)
+            there = torch.rand(len(pixels), generator=self.generator) >= IMAGE_DROPPED
+        return RayTexture(net.of_patches(patches) * there[:, None], there)
+
+    def _carried(self, pixels: torch.Tensor, samples: RaySamples, kept: torch.Tensor) -> torch.Tensor | None:
+        """Labels of the other frames: a query's own are not known."""
+        if self.field.carried is None:
+            return None
+        own = torch.from_numpy(self.data.rays.frame_of(pixels.numpy()))
+        counted = kept[None] & (own[:, None] != torch.arange(len(kept)))
+        with torch.no_grad():
+            return self.field.carried(surface(samples), counted.float())
+
+
+class _Pool:
+    """Pixels to draw: partly as they come, partly with every class equally likely.
+
+    The weight of a drawn ray takes that back, and makes rare classes count somewhat more.
+    """
+
+    def __init__(self, channel: torch.Tensor, classes: int) -> None:
+        self.labelled = (channel >= 0).nonzero()[:, 0]
+        if len(self.labelled) == 0:
+            raise FrameError("no labelled pixel is left to learn from; lower held_out_fraction or label more")
+        counts = torch.bincount(channel[self.labelled], minlength=classes)
+        self.by_class = self.labelled[channel[self.labelled].argsort(stable=True)]
+        self.present = counts.nonzero()[:, 0]
+        self.first, self.counts = counts.cumsum(0) - counts, counts
+        fraction = counts / counts.sum()
+        drawn = (1 - BALANCED) * fraction + BALANCED * (counts > 0) / len(self.present)
+        wanted = fraction * (fraction + RAREST) ** -CLASS_BALANCE
+        self.weight = wanted / drawn.clamp_min(1e-9)
+        self.channel = channel
+
+    def draw(self, count: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+        """Pixels (count,) and what each counts."""
+        balanced = int(BALANCED * count)
+        uniform = self.labelled[torch.randint(len(self.labelled), (count - balanced,), generator=generator)]
+        of = self.present[torch.randint(len(self.present), (balanced,), generator=generator)]
+        place = (torch.rand(balanced, generator=generator) * self.counts[of]).long().clamp_max(self.counts[of] - 1)
+        pixels = torch.cat((uniform, self.by_class[self.first[of] + place]))
+        return pixels, self.weight[self.channel[pixels]]
+
+
+def carry_labels(field: IRT, rays: FrameRays, channel: torch.Tensor) -> None:
+    """Give a field the labels (F H W,) of frames, with the depth at which they are: measured, else rendered."""
+    carried = field.carried
+    if carried is None:
+        return
+    size = rays.image_size(0)
+    for i, k in enumerate(rays.intrinsics):
+        pixels = rays.pixels_of(i)
+        depth = torch.from_numpy(rays.depth_m[pixels])
+        blank = (depth == 0).nonzero()[:, 0]
+        with torch.no_grad():
+            for part in blank.split(4096):
+                samples = field.march(rays.rays(pixels[part.numpy()], 0.05))
+                met = samples.opacity > 0.5
+                z = (samples.weight * samples.z).sum(1) / samples.weight.sum(1).clamp_min(1e-6)
+                depth[part] = torch.where(met, z, torch.zeros_like(z))
+        carried.depth_m[i] = depth.view(size)
+        carried.channel[i] = channel[torch.from_numpy(pixels)].view(size).to(torch.int16)
+        carried.K[i] = torch.from_numpy(camera_matrix(k))
+        carried.T_camera_world[i] = torch.from_numpy(invert_pose(rays.T_world_camera[i].astype(np.float64)))
