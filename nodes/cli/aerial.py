@@ -37,6 +37,7 @@ from semantic_mapper.benchmark.aerial_claims import (
     figure,
 )
 from semantic_mapper.benchmark.aerial_fields import field_arms
+from semantic_mapper.benchmark.aerial_irt import irt_arms
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.config import convert_config, load_config, to_plain
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
@@ -67,7 +68,7 @@ def aerial_config(path: Path | None, tier: str | None, seed: int | None) -> Aeri
 
 def aerial_arms(folder: Path) -> dict[str, Arm]:
     """All arms by name; fitted grids are kept in ``folder``."""
-    return IMAGE_ARMS | field_arms(folder)
+    return IMAGE_ARMS | field_arms(folder) | irt_arms(folder)
 
 
 def run_aerial_verb(

@@ -29,9 +29,9 @@ from semantic_mapper.scenes.aerial.views import (
     LOW_RING,
     aerial_camera,
     aerial_views,
+    held_out_numbers,
     labelled_numbers,
     low_numbers,
-    test_numbers,
     training_numbers,
 )
 from semantic_mapper.scenes.sequence import RoomView
@@ -41,7 +41,7 @@ from semantic_mapper.types import PosedFrame, UInt8
 RECORD_VERSION = 1  # raised by a change of what a record means: older ones are made again
 DAY, DARK, LOW, AGREEMENT = "day", "dark", "low", "agreement"  # what is scored
 
-_TEST_VIEWS = len(test_numbers())
+_TEST_VIEWS = len(held_out_numbers())
 _TRAIN_VIEWS = len(training_numbers())
 
 
@@ -59,6 +59,8 @@ class AerialConfig(Config, frozen=True):
     grid_steps: AtLeastOne = 800  # of the photometric fit of a town
     nerf_steps: AtLeastOne = 300  # of logits that are trained jointly with the grid
     unet_steps: AtLeastTwo = 200  # to begin with; doubled until a plateau is reached
+    trunk_steps: AtLeastOne = 300  # of features on a town's grid
+    irt_steps: AtLeastOne = 500
     mlp_steps: AtLeastOne = 600
     seed: NotNegative = 0  # of the first choice of labelled views, and of networks
 
@@ -116,7 +118,9 @@ def labelled_frames(config: AerialConfig, episode: Episode) -> list[PosedFrame]:
 
 def scored_views(config: AerialConfig, episode: Episode, kind: str) -> list[RoomView]:
     """Held-out views of the flight by day or in the dark, or those of the low ring."""
-    numbers = _spread(low_numbers(), config.low_views) if kind == LOW else _spread(test_numbers(), config.test_views)
+    numbers = (
+        _spread(low_numbers(), config.low_views) if kind == LOW else _spread(held_out_numbers(), config.test_views)
+    )
     return town_views(config.width, episode.town, tuple(numbers), kind == DARK)
 
 

@@ -68,6 +68,7 @@ def grid_settings(config: AerialConfig, town: int) -> GridFitConfig:
         opacity=0.0,
         sky=False,
         exposure=False,
+        trunk_steps=config.trunk_steps,
         held_out=0,
         seed=config.seed,
     )
@@ -76,6 +77,7 @@ def grid_settings(config: AerialConfig, town: int) -> GridFitConfig:
 def grid_digest(config: AerialConfig, town: int) -> str:
     """What tells files apart that were made in another way: 16 hex digits."""
     plain = to_plain(grid_settings(config, town)) | {"town": town, "views": config.train_views}
+    del plain["trunk_steps"]
     plain |= {"suite_version": AERIAL_SUITE.version, "version": VERSION}
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
 

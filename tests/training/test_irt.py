@@ -131,7 +131,7 @@ def test_a_ray_never_sees_the_labels_of_its_own_frame_while_it_learns() -> None:
 
 
 def test_held_out_blocks_choose_the_weights_and_nothing_learns_from_them() -> None:
-    field, fit = small_field(2)
+    _field, fit = small_field(2)
     drawn = torch.cat([fit.pool.draw(2048, torch.Generator().manual_seed(i))[0] for i in range(5)])
     assert int(fit.data.held_out.sum()) > 0 and not bool(fit.data.held_out[drawn].any())
     told: list[FinetuneProgress] = []

@@ -134,7 +134,7 @@ def _square(b: TownBuilder, area: Rectangle, lacking: frozenset[str]) -> None:
     """A paved square with a fountain, parasols, kiosks, people and a few trees."""
     _floor(b, area, "ground", b.square)
     x, y = area.middle
-    rim = Assembly("static")
+    rim = Assembly("wall" if "static" in lacking else "static")
     rim.cylinder(b.metal[2], (0, 0, 0.35), (9.0, 9.0, 0.7))
     rim.cylinder(b.water, (0, 0, 0.4), (8.0, 8.0, 0.72), label="water")
     b.place(rim, x, y, z=_FLOOR_M)

@@ -59,7 +59,7 @@ def aerial_camera(width: int) -> CameraIntrinsics:
     return CameraIntrinsics(focal, focal, middle, middle, width, width)
 
 
-def test_numbers() -> list[int]:
+def held_out_numbers() -> list[int]:
     """Views of the flight that are held out."""
     return list(range(TEST_OFFSET, FLIGHT, TEST_EVERY))
 
