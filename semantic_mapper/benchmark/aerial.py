@@ -56,7 +56,7 @@ class AerialConfig(Config, frozen=True):
     test_views: Annotated[int, msgspec.Meta(ge=2, le=_TEST_VIEWS)] = _TEST_VIEWS
     low_views: Annotated[int, msgspec.Meta(ge=2, le=LOW_RING)] = LOW_RING
     voxel_m: Positive = 0.75
-    grid_steps: AtLeastOne = 800  # of the photometric fit of a town
+    grid_steps: AtLeastOne = 600  # of the photometric fit of a town
     nerf_steps: AtLeastOne = 300  # of logits that are trained jointly with the grid
     unet_steps: AtLeastTwo = 200  # to begin with; doubled until a plateau is reached
     trunk_steps: AtLeastOne = 300  # of features on a town's grid

@@ -66,7 +66,6 @@ def grid_settings(config: AerialConfig, town: int) -> GridFitConfig:
         box_m=(-x, -y, _LOW_M, x, y, _HIGH_M),
         near_m=FIT_NEAR_M,
         opacity=0.0,
-        sky=False,
         exposure=False,
         trunk_steps=config.trunk_steps,
         held_out=0,

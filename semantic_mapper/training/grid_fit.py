@@ -45,7 +45,6 @@ from semantic_mapper.types import Float32, Float64, PosedFrame
 
 BETA1, BETA2 = 0.9, 0.99
 SKY_RATE, GAIN_RATE = 0.02, 2e-3
-BLACK = -10.0  # raw colour of a sky that is none
 PRUNE_EVERY = 200  # steps
 WARM_UP = 200  # steps before anything is pruned
 COARSE = ((0.0, 3), (0.3, 1.5), (0.6, 1))  # fraction of the steps, and how much coarser the grid is until the next
@@ -77,7 +76,6 @@ class GridFitConfig(Config, frozen=True):
     opacity: AtLeastZero = 1e-2  # weight of what stops light: clears haze of the sky's colour
     depth: AtLeastZero = 0.1  # weight of what lies off the measured depth, where frames have some
     start_from_depth: bool = True  # where frames have some
-    sky: bool = True  # rays that leave the box see one; else they see black, so that all they meet must lie in the box
     exposure: bool = True  # a gain a frame and channel, for cameras whose exposure drifts
     trunk_steps: NotNegative = 600  # of features and colours that depend on the direction, where a field has them
     held_out: NotNegative = 8  # every n-th frame is held out, for the PSNR; 0 = none
@@ -235,9 +233,6 @@ class _Fitter:
         self.stage = 0
         first = at_resolution(box, self._long_side(0))
         self.grid = grid_of_depth(rays, first) if from_depth else SceneGrid(first)
-        if not config.sky:
-            with torch.no_grad():
-                self.grid.sky.fill_(BLACK)
         self.gain_adam, self.sky_adam = _Adam(self.log_gain.shape), _Adam(tuple(self.grid.sky.shape))
         self._allocate()
 
@@ -297,8 +292,7 @@ class _Fitter:
         targets = TargetArrays(colour, inverse, gain, behind)
         photometric_rays(len(pixels), self.grid.arrays(), rays, targets, loss, self.samples, results)
         scatter_grid(len(self.gradient), self.samples, self.gradient)
-        if self.config.sky:
-            self._step_sky(batch.direction, results.sky_gradient)
+        self._step_sky(batch.direction, results.sky_gradient)
         if self.config.exposure:
             gradient = _sums(frame, results.gain_gradient * gain, len(self.log_gain))
             self.log_gain -= GAIN_RATE * self.gain_adam.step(gradient)
