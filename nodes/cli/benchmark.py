@@ -1,4 +1,4 @@
-"""``semantic-mapper benchmark``: score weights on rooms, or arms on KLEVR, that nothing was trained on."""
+"""``semantic-mapper benchmark``: score weights on rooms, or arms on KLEVR or AERIAL, that nothing was trained on."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SeedOption = Annotated[int | None, typer.Option(min=0, help="Of everything that 
 
 @verb
 def benchmark(
-    suite: Annotated[Literal["rooms", "klevr"], typer.Argument(help="The suite.")] = "rooms",
+    suite: Annotated[Literal["rooms", "klevr", "aerial"], typer.Argument(help="The suite.")] = "rooms",
     weights: WeightsOption = None,
     protocol: suites.ProtocolOption = None,
     split: suites.SplitOption = None,
@@ -55,20 +55,29 @@ def benchmark(
     klevr: arms learn classes from the label maps of training scenes and are scored on novel scenes. Only --arm,
     --claims, --tier, --config, --seed, --out and --json go with it.
 
+    aerial: arms learn a town seen from a drone from 80 views, 4 of which have labels. The same options go with it.
+
     Example: semantic-mapper benchmark rooms --weights a.safetensors --weights b.safetensors --out runs/ab.json
     Example: semantic-mapper benchmark rooms --sources wide --depth off --rooms 5 --json
     Example: semantic-mapper benchmark rooms --protocol scratch --kind semantic_nerf --rooms 3 --seconds 600
     Example: semantic-mapper benchmark klevr --claims --out runs/klevr.json
+    Example: semantic-mapper benchmark aerial --claims --out runs/aerial.json
     """
     given = {"split": split, "rooms": rooms, "protocol": protocol, "views": views, "baseline": baseline, "depth": depth}
     given |= {"sources": sources, "own_image": own_image, "current": current}
     given |= {"keyframes": keyframes, "steps": steps, "seconds": seconds, "seed": seed}
     out, print_json = results_file(out, json)
+    if suite != "rooms":
+        del given["seed"]
+        suites.refuse_given(suite, given | {"weights": weights, "kind": kind, "map": maps or None, "refine": refine})
+    if suite == "aerial":
+        from semantic_mapper.nodes.cli.aerial import aerial_config, run_aerial_verb
+
+        settings = aerial_config(config, tier, seed)
+        return run_aerial_verb(settings, arms or [], claims, out, print_json=print_json)
     if suite == "klevr":
         from semantic_mapper.nodes.cli.klevr import klevr_configs, run_klevr_verb
 
-        del given["seed"]
-        suites.refuse_given("klevr", given | {"weights": weights, "kind": kind, "map": maps or None, "refine": refine})
         return run_klevr_verb(klevr_configs(config, tier, seed), arms or [], claims, out, print_json=print_json)
     from semantic_mapper.nodes.cli.suite import run_suite_verb
 

@@ -51,7 +51,7 @@ TierOption = Annotated[
     Literal["cpu", "gpu", "record"] | None,
     typer.Option(
         help="rooms: cpu = 160x120 and few samples, gpu = 320x240 and many. klevr: cpu = 52 scenes at 72x72, record = "
-        "120 at 256x256, three seeds.  [default: cpu]"
+        "120 at 256x256, three seeds. aerial: cpu = 2 towns at 192x192, record = 6 at 512x512.  [default: cpu]"
     ),
 ]
 KeyframesOption = Annotated[
@@ -72,10 +72,13 @@ RefineOption = Annotated[
     ),
 ]
 SuiteConfigOption = Annotated[
-    Path | None, typer.Option("--config", help="TOML file with a SuiteConfig; klevr: a KlevrConfig.")
+    Path | None,
+    typer.Option("--config", help="TOML file with a SuiteConfig; klevr: a KlevrConfig; aerial: an AerialConfig."),
 ]
-ArmOption = Annotated[list[str] | None, typer.Option("--arm", help="klevr: what to run; may repeat.  [default: all]")]
-ClaimsOption = Annotated[bool, typer.Option("--claims", help="klevr: judge the paper's claims.")]
+ArmOption = Annotated[
+    list[str] | None, typer.Option("--arm", help="klevr and aerial: what to run; may repeat.  [default: all]")
+]
+ClaimsOption = Annotated[bool, typer.Option("--claims", help="klevr and aerial: judge the paper's claims.")]
 
 
 def refuse_given(suite: str, given: Mapping[str, object]) -> None:

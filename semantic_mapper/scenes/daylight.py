@@ -22,7 +22,7 @@ class Daylight:
     """Sun and sky. The sun sends white light of strength 1.
 
     Args:
-        miss_label: Class of what rays that hit nothing see.
+        miss_label: Class of what rays that hit nothing see; None where the label set has none for the sky.
         sun: (3,) unit vector towards it.
         shadow: (S, S) float32 depth of the first surface as a camera in the sun sees it, from so far away that its rays
             are as good as parallel.
@@ -35,7 +35,7 @@ class Daylight:
         haze_m: Way after which 1/e of a surface's light is left; inf = no haze.
     """
 
-    miss_label: str
+    miss_label: str | None
     sun: Float64
     shadow: Float32
     T_world_sun: Float64

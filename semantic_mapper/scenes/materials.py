@@ -50,6 +50,7 @@ class Pattern(IntEnum):
     OUTSIDE = 14  # what is seen through a window: sky, trees, houses
     STAINS = 15  # worn paint: clouds, and streaks that run down
     FLAT = 16  # the first colour everywhere
+    WINDOWS = 17  # a front of the first colour with panes of the second
 
 
 @dataclass(frozen=True, slots=True)

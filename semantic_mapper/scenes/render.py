@@ -25,7 +25,8 @@ class RenderedView:
     Args:
         rgb: (H, W, 3) uint8.
         depth_m: (H, W) float32 z-depth in metres as the sensor gives it, 0 = no measurement.
-        label: (H, W) uint8 ids of the scene's label set; where nothing was hit that of the sky, indoors the ignore id.
+        label: (H, W) uint8 ids of the scene's label set; where nothing was hit that of the sky, if it has one, or the
+            ignore id.
         instance: (H, W) uint16, 0 where nothing was hit.
         exact_depth_m: (H, W) float32 the true z-depth, 0 = nothing hit; of a mirror, that of its surface.
     """
@@ -114,7 +115,8 @@ def camera_rays(intrinsics: CameraIntrinsics, T_world_camera: Float64) -> Float6
 
 def seen_labels(scene: Scene, index: np.ndarray) -> UInt8:
     """Ids (H, W) of the primitives ``index`` (H, W), -1 = nothing was hit."""
-    nothing = scene.label_set.ignore_id if scene.daylight is None else scene.label_set.id_of(scene.daylight.miss_label)
+    sky = None if scene.daylight is None else scene.daylight.miss_label
+    nothing = scene.label_set.ignore_id if sky is None else scene.label_set.id_of(sky)
     return np.append(scene.primitives.label, np.uint8(nothing))[index]  # index -1 is the appended entry
 
 

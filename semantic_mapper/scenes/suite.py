@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
-from semantic_mapper.labels import KLEVR, ROOMS, LabelSet
+from semantic_mapper.labels import CARLA, KLEVR, ROOMS, LabelSet
+from semantic_mapper.scenes.aerial.town import AERIAL_VERSION, make_town
+from semantic_mapper.scenes.aerial.views import aerial_views
 from semantic_mapper.scenes.config import SUITE_VERSION, TEST_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS
 from semantic_mapper.scenes.klevr import KLEVR_VERSION, klevr_views, make_klevr
 from semantic_mapper.scenes.room import make_room
@@ -52,4 +54,12 @@ KLEVR_SUITE = Suite(
     make_klevr,
     lambda seed, count, intrinsics: klevr_views(seed, range(count), intrinsics),
 )
-SUITES = {suite.name: suite for suite in (ROOMS_SUITE, KLEVR_SUITE)}
+AERIAL_SUITE = Suite(
+    "aerial",
+    AERIAL_VERSION,
+    CARLA,
+    {"train": range(1_000), "val": range(100_000, 100_020), "test": range(200_000, 200_020)},
+    lambda seed: make_town(seed).scene,
+    lambda seed, count, intrinsics: aerial_views(seed, range(count), intrinsics),
+)
+SUITES = {suite.name: suite for suite in (ROOMS_SUITE, KLEVR_SUITE, AERIAL_SUITE)}

@@ -1,6 +1,7 @@
 """Look at the suite: contact sheets, how often each class is seen, how fast rooms are rendered.
 
-``python -m semantic_mapper.scenes.survey sheet --out rooms.png`` and likewise ``classes``, ``speed`` and ``klevr``.
+``python -m semantic_mapper.scenes.survey sheet --out rooms.png`` and likewise ``classes``, ``speed``, ``klevr`` and
+``aerial``.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ import msgspec
 import numpy as np
 import typer
 
-from semantic_mapper.labels import KLEVR, ROOMS
+from semantic_mapper.labels import CARLA, KLEVR, ROOMS
 from semantic_mapper.log_events import get_logger
+from semantic_mapper.scenes.aerial.views import aerial_camera, aerial_views, cached_town
 from semantic_mapper.scenes.camera import camera_path
 from semantic_mapper.scenes.config import (
     TEST_SEEDS,
@@ -38,6 +40,7 @@ from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 CAMERA = CameraIntrinsics(220.6, 220.6, 159.5, 119.5, 320, 240)  # an OAK-D's colour camera, at a quarter of its width
 SPLITS = {"train": TRAIN_SEEDS, "validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
+AERIAL_SHOWN = (8, 47, 85, 104)  # numbers of views, from high to low
 SPREAD = CameraPathConfig(step_m=0.6)  # views that differ
 
 app = typer.Typer(add_completion=False, help=__doc__)
@@ -182,6 +185,28 @@ def klevr(
         for _ in klevr_views(seed, range(100), klevr_camera(72)):
             pass
     log.info("klevr_written", path=str(out), cpu_s_a_scene=round((time.process_time() - started) / scenes, 3))
+
+
+@app.command()
+def aerial(
+    out: Annotated[Path, typer.Option(help="PNG or JPEG to write")],
+    first: Annotated[int, typer.Option(help="seed of the first town")] = 200_000,
+    towns: Annotated[int, typer.Option(help="how many")] = 2,
+    width: Annotated[int, typer.Option(help="pixels of a picture")] = 256,
+) -> None:
+    """Write pictures and labels of towns from four heights, one in the dark, and measure views of 192x192."""
+    rows: list[UInt8] = []
+    for seed in range(first, first + towns):
+        views = list(aerial_views(seed, AERIAL_SHOWN, aerial_camera(width)))
+        dark = next(aerial_views(seed, AERIAL_SHOWN[:1], aerial_camera(width), dark=True))
+        rows.append(np.concatenate([v.frame.rgb for v in (*views, dark)], 1))
+        rows.append(np.concatenate([CARLA.colorize(v.rendered.label) for v in (*views, dark)], 1))
+    cv2.imwrite(str(out), np.ascontiguousarray(np.concatenate(rows, 0)[..., ::-1]))
+    started = time.process_time()
+    count = sum(1 for _ in aerial_views(first, range(0, 100, 10), aerial_camera(192)))
+    seconds = (time.process_time() - started) / count
+    primitives = [len(cached_town(seed).scene.primitives) for seed in range(first, first + towns)]
+    log.info("aerial_written", path=str(out), cpu_s_a_view=round(seconds, 3), primitives=primitives)
 
 
 if __name__ == "__main__":

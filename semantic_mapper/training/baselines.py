@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,9 +19,10 @@ from semantic_mapper.imaging import fill_holes, resize_depth
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.losses import IGNORE
 from semantic_mapper.training.views import jitter_colours, mirrored_view, stack_sources, view_from_frame
-from semantic_mapper.types import PosedFrame, UInt8
+from semantic_mapper.types import PosedFrame, SourceViews, UInt8
 
 WARP_TOLERANCE = 0.04  # fraction of z by which a keyframe's depth may disagree and still show the same surface
+_GAMMA = 2.2  # of the camera's pictures
 
 
 class UNetConfig(Config, frozen=True):
@@ -33,6 +35,7 @@ class UNetConfig(Config, frozen=True):
     learning_rate: float = 1e-3
     final_learning_rate: float = 5e-5
     colour_jitter: float = 0.2
+    darkest: float = 1.0  # images of a step are scaled by a number from this to 1, in linear light; 1 = they are not
     seed: int = 0
 
 
@@ -69,6 +72,8 @@ class UNetBaseline:
             if float(torch.rand(1, generator=generator)) < 0.5:
                 batch = [mirrored_view(v) for v in batch]
             sources = jitter_colours(stack_sources(batch), self.config.colour_jitter, generator)
+            if self.config.darkest < 1:
+                sources = _dimmed(sources, self.config.darkest, generator)
             channel = torch.stack([v.channel for v in batch])
             with self.net.encoder.batch_statistics():
                 logits = self.net.predict_image(sources)
@@ -103,6 +108,11 @@ class UNetBaseline:
             full = functional.interpolate(logits, size=frame.rgb.shape[:2], mode="bilinear", align_corners=False)
             channel = full[0].argmax(0)
         return self.label_set.to_ids(channel.numpy())
+
+
+def _dimmed(sources: SourceViews, darkest: float, generator: torch.Generator) -> SourceViews:
+    light = darkest + (1 - darkest) * torch.rand(len(sources.rgb), 1, 1, 1, generator=generator)
+    return replace(sources, rgb=sources.rgb * light ** (1 / _GAMMA))
 
 
 class WarpBaseline:

@@ -191,6 +191,11 @@ def _stains(s: T, t: T, h: T, p: T, seed: T) -> Weights:
     return (_clouds(s, t, seed, p) + 0.5 * n * n - 0.12).clamp(0, 1), torch.zeros_like(s)
 
 
+def _windows(s: T, t: T, h: T, p: T, seed: T) -> Weights:
+    pane = (_frac(s) > 0.28) & (_frac(s) < 0.72) & (_frac(t) > 0.3) & (_frac(t) < 0.8)
+    return 0.22 + _resolved(1.0, p) * (pane.to(s.dtype) - 0.22), torch.zeros_like(s)
+
+
 _GRAINED = (Pattern.WOOD, Pattern.PLANKS, Pattern.GRAIN, Pattern.BRUSHED)
 _PATTERNS = {
     Pattern.PLAIN: _plain,
@@ -209,6 +214,7 @@ _PATTERNS = {
     Pattern.PAGE: _page,
     Pattern.OUTSIDE: _outside,
     Pattern.STAINS: _stains,
+    Pattern.WINDOWS: _windows,
 }
 
 

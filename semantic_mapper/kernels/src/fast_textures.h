@@ -142,6 +142,9 @@ static inline double blend_at(int64_t pattern, double s, double t, double h, int
         return clip_unit(0.5 + 1.7 * n + 0.5 * fine_noise(14.0 * s, 14.0 * t, seed + 2, 14.0 * p));
     case 13: return page(s, t, seed, p, third);
     case 14: return outside(s, h, seed, p, third);
+    case 17:
+        sharp = s - floor(s) > 0.28 && s - floor(s) < 0.72 && t - floor(t) > 0.3 && t - floor(t) < 0.8 ? 1.0 : 0.0;
+        return 0.22 + resolved(1.0, p) * (sharp - 0.22);
     default: /* stains, and streaks that run down */
         n = value_noise(2.0 * s, 0.25 * t, seed + 4);
         return clip_unit(clouds(s, t, seed, p) + 0.5 * n * n - 0.12);

@@ -203,7 +203,7 @@ def test_a_field_of_one_scene_labels_its_log_and_maps_it(log: Path, tmp_path: Pa
     [
         (("--kind", "irt"), "how many labelled frames?"),
         (("--kind", "irt", "--frames", "1,x"), "numbers with commas"),
-        (("--kind", "irt", "--keyframes", "2", "--frames", "1,2"), "already name the frames"),
+        (("--kind", "irt", "--keyframes", "2", "--frames", "1,2"), "already names the frames"),
         (("--keyframes", "2", "--variant", "RT"), "goes with --kind irt only"),
         (("--keyframes", "2", "--unlabelled", "3"), "goes with --kind only"),
         (("--kind", "grid", "--keyframes", "2"), "Only --kind grid learns none"),

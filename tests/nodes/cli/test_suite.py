@@ -148,6 +148,9 @@ def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Pat
         ("benchmark", "klevr", "--map"),
         ("benchmark", "klevr", "--arm", "nerf"),
         ("benchmark", "klevr", "--tier", "gpu"),
+        ("benchmark", "aerial", "--rooms", "3"),
+        ("benchmark", "aerial", "--arm", "nerf"),
+        ("benchmark", "aerial", "--tier", "gpu"),
         ("benchmark", "rooms", "--claims"),
         ("benchmark", "rooms", "--tier", "record"),
         ("benchmark", "rooms", "--protocol", "finetune", "--map"),
@@ -221,3 +224,29 @@ def test_klevr_shows_arms_and_claims_and_continues(tmp_path: Path) -> None:
     lines = out.with_suffix(".jsonl").read_text().splitlines()
     assert lines[:2] == records and len(lines) == 4
     assert set(json.loads(out.read_text())["arms"]) == {"color", "unet"}
+
+
+AERIAL_CONFIG = """
+towns = 1
+choices = 1
+width = 32
+train_views = 8
+test_views = 2
+low_views = 2
+mlp_steps = 5
+"""
+
+
+def test_aerial_shows_arms_and_claims_and_continues(tmp_path: Path) -> None:
+    config, out = tmp_path / "aerial.toml", tmp_path / "aerial.json"
+    config.write_text(AERIAL_CONFIG, encoding="utf-8")
+    command = ("benchmark", "aerial", "--config", config, "--claims", "--out", out, "--arm", "color")
+    first = run(*command)
+    assert first.returncode == 0, first.stderr
+    records = out.with_suffix(".jsonl").read_bytes()
+    assert "above U-Net" in first.stdout and "not run" in first.stdout
+    found = json.loads(out.read_text())
+    assert set(found["arms"]) == {"color"} and found["arms"]["color"]["figures"]["mIoU"] > 0
+    assert found["claims"][0]["result"] in ("accepted", "refused") and found["claims"][1]["result"] == "not run"
+    again = run(*command)
+    assert again.returncode == 0 and out.with_suffix(".jsonl").read_bytes() == records

@@ -1,0 +1,1 @@
+"""Towns seen from a drone: the suite AERIAL."""
