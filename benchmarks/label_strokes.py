@@ -19,6 +19,8 @@ import numpy as np
 import torch
 
 from benchmarks.label_suggestions import Choices, Scene, fit, log_scene, room_scene, score
+from semantic_mapper.fields.checkpoint import adapt_model, default_checkpoint_path, load_checkpoint
+from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import UInt8
 
@@ -89,13 +91,17 @@ def with_strokes(scene: Scene, count: int, chosen: list[int], seed: int) -> tupl
     return replace(scene, pool=pool), strokes, painted / labelled
 
 
+def _as_shipped(scene: Scene) -> LearnedField:
+    return adapt_model(load_checkpoint(default_checkpoint_path()).model, scene.label_set)
+
+
 def main() -> None:
     """Print a row a scene and kind of label."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+", help="logs with labels; a number = that validation room")
     parser.add_argument("--steps", type=int, default=40, help="of finetuning; 0 = class rows alone")
     parser.add_argument("--labels", type=int, default=4, help="number of labelled frames")
-    parser.add_argument("--strokes", default="0,1,2", help="strokes a class and frame; 0 = full masks")
+    parser.add_argument("--strokes", default="0,1,2", help="a class and frame; 0 = full masks, -1 = learn nothing")
     parser.add_argument("--out", type=Path, required=True, help="figures as JSON, a line each")
     given = parser.parse_args()
     torch.set_num_threads(1)
@@ -105,8 +111,11 @@ def main() -> None:
         choices = Choices(scene)
         chosen = choices.choose("suggested", given.labels, 0)
         for count in map(int, given.strokes.split(",")):
-            painted, strokes, fraction = with_strokes(scene, count, chosen, 0) if count else (scene, 0, 1.0)
-            miou = score(scene, chosen, fit(painted, chosen, given.steps, 0), choices.candidates)
+            painted, strokes, fraction = scene, 0, float(count == 0)
+            if count > 0:
+                painted, strokes, fraction = with_strokes(scene, count, chosen, 0)
+            model = _as_shipped(scene) if count < 0 else fit(painted, chosen, given.steps, 0)
+            miou = score(scene, chosen, model, choices.candidates)
             row = {"scene": scene.name, "strokes_a_class": count, "strokes": strokes, "painted": round(fraction, 4)}
             with given.out.open("a") as file:
                 file.write(json.dumps({**row, "steps": given.steps, "miou": round(miou, 4)}) + "\n")

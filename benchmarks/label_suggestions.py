@@ -5,8 +5,7 @@ Every choice gets the same finetuning of the shipped weights, or (``--steps 0``)
 
 Choices: ``random``; ``spread`` evenly over time; ``coverage``, by which ``finetune --keyframes`` chooses; ``suggested``
 by ``label --suggest``; ``entropy`` and ``disagreement``, the same with each pixel weighted by the entropy of what the
-shipped weights say of it (rendered from other frames, and by its own image), or by how much these two differ;
-``repeated``, the same with a second view of a surface worth half of the first.
+shipped weights say of it (rendered from other frames, and by its own image), or by how much these two differ.
 
 Example: python -m benchmarks.label_suggestions kitchen.mcap rooms --steps 40 --out runs/suggestions.jsonl
 """
@@ -95,8 +94,6 @@ class Choices:
             return [int(i) for i in np.linspace(0, last, count + 2)[1:-1].round()]
         if who == "coverage":
             return choose_keyframes(self.candidates, count, seed)
-        if who == "repeated":
-            return sorted(_repeated(self.candidates, count))
         weights = None if who == "suggested" else self._doubt(who)
         return sorted(s.index for s in suggest_frames(self.candidates, count, (), weights))
 
@@ -104,20 +101,6 @@ class Choices:
         if not self._doubts:
             self._doubts = doubts(self._scene, self.candidates)
         return self._doubts[what]
-
-
-def _repeated(candidates: Sequence[Candidate], count: int) -> list[int]:
-    cells, owner = np.concatenate([c.cells for c in candidates]), [len(c.cells) for c in candidates]
-    _, cell = np.unique(cells, axis=0, return_inverse=True)
-    worth = np.bincount(cell.reshape(-1)).astype(np.float64)
-    pairs = np.unique(np.stack((np.repeat(np.arange(len(candidates)), owner), cell.reshape(-1)), axis=1), axis=0)
-    chosen: list[int] = []
-    while len(chosen) < count:
-        gain = np.bincount(pairs[:, 0], weights=worth[pairs[:, 1]], minlength=len(candidates))
-        gain[chosen] = 0
-        chosen.append(int(gain.argmax()))
-        worth[pairs[pairs[:, 0] == chosen[-1], 1]] *= 0.5
-    return chosen
 
 
 def doubts(scene: Scene, candidates: Sequence[Candidate]) -> dict[str, list[Float64]]:

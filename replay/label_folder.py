@@ -1,7 +1,7 @@
 """Label images of a log's frames in a folder: ``NNNNNN.png`` (uint8 class ids), each named by the number of its frame.
 
 ``labels.json`` beside them holds the classes, as in a sequence folder, and may name the log. A folder without it is in
-the classes of the log. Pixels of the ignore id are not labelled: a few strokes are a label image, too.
+the classes of the log. Pixels of the ignore id are not labelled: strokes are a label image, too.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ def finetune(
         typer.Option(
             metavar="DIR",
             help="Label images NNNNNN.png in place of the log's, as `label --serve` writes them; all of them without "
-            "--keyframes. Unlabelled pixels count for nothing, so strokes will do.",
+            "--keyframes. Unlabelled pixels count for nothing.",
         ),
     ] = None,
 ) -> int:

@@ -72,8 +72,8 @@ def label(
 ) -> int:
     """Label frames of a log by hand (--serve), say which to label (--suggest), or send labelled ones to a finetuner.
 
-    --suggest names the frames that show most surface which no labelled frame shows. --serve opens a page on which a few
-    strokes a class are painted on them, and saves each stroke at once; what is not painted is not learned from.
+    --suggest names the frames that show most surface which no labelled frame shows. --serve opens a page on which a person
+    paints on them, and saves each stroke at once; what is not painted is not learned from.
     `finetune --labels DIR` learns from what was painted. The page is on this machine alone; to see it from another
     one, tunnel its port.
 

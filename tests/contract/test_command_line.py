@@ -96,7 +96,7 @@ COMMANDS: dict[str, str] = {
     "correct a saved map": "correct {map} {corrections}",
     "label without a finetuner": "label {log} --to",
     "label suggests": "label {log} --suggest 2 --json",
-    "label serves no JSON": "label {log} --serve --json",
+    "label sends without weights": "label {log} --weights {weights}",
     "finetune with labels of nothing": "finetune {log} --labels {tmp}/none --out {tmp}/a.safetensors",
 }
 JSON_FILES = {"query at": "at", "query nearest": "nearest", "query instances": "instances"}
