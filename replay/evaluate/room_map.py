@@ -60,7 +60,7 @@ class TrueSurface:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _View:
+class RoomLook:
     """A frame of the sequence: pose, true labels (H, W) and those that the pipeline rendered, ids of ``ROOMS``."""
 
     T_world_camera: Float64
@@ -69,12 +69,12 @@ class _View:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _FusedRoom:
+class FusedRoom:
     """A room, its map, the frames that it was made of, and its true surface."""
 
     scene: Scene
     voxel_map: VoxelMap
-    views: list[_View]
+    views: list[RoomLook]
     surface: TrueSurface
 
 
@@ -91,7 +91,7 @@ def map_room(seed: int, weights: Path, digest: str, suite: SuiteConfig) -> MapRe
         WeightsError: see ``Mapper.load``.
         MapError: the map came out empty.
     """
-    room = _fuse(seed, weights, suite)
+    room = fuse_room(seed, weights, suite)
     return _compare(room, room.voxel_map, digest, settings_digest(suite, "map"), suite)
 
 
@@ -104,36 +104,49 @@ def refine_room(
         WeightsError: see ``Mapper.load``; or networks of other classes.
         MapError: the map came out empty.
     """
-    room = _fuse(seed, weights, suite)
-    return _refined_records(room, digest, suite, networks)
+    room = fuse_room(seed, weights, suite)
+    return refined_records(room, digest, suite, {settings_digest(suite, "map"): None, **networks})
 
 
-def _refined_records(
-    room: _FusedRoom, digest: str, suite: SuiteConfig, networks: Mapping[str, NesfWeights]
+def refined_records(
+    room: FusedRoom, digest: str, suite: SuiteConfig, networks: Mapping[str, NesfWeights | None]
 ) -> list[MapRecord]:
-    records = [_compare(room, room.voxel_map, digest, settings_digest(suite, "map"), suite)]
+    """A record of a map refined by each of ``networks``, by its settings; None = as it is."""
+    records: list[MapRecord] = []
     with tempfile.TemporaryDirectory() as folder:
         room.voxel_map.save(saved := Path(folder) / "map.npz")
         for settings, network in networks.items():
-            refined = VoxelMap.load(saved)
-            refine(refined, network, up=UP)
-            records.append(_compare(room, refined, digest, settings, suite))
+            voxel_map = VoxelMap.load(saved)
+            if network is not None:
+                refine(voxel_map, network, up=UP)
+            records.append(_compare(room, voxel_map, digest, settings, suite))
     return records
 
 
-def _fuse(seed: int, weights: Path, suite: SuiteConfig) -> _FusedRoom:
+def fuse_room(seed: int, weights: Path, suite: SuiteConfig, rendered: int = 1) -> FusedRoom:
+    """Map a room; only every so many-th of its frames is ``rendered``, the others are fused without classes.
+
+    Raises:
+        WeightsError: see ``Mapper.load``.
+    """
     pipeline = Mapper.load(weights, msgspec.structs.replace(suite.mapper, depth=_depth(suite))).pipeline
     camera = camera_of_width(MAP_WIDTH)
     path = CameraPathConfig(step_m=suite.sequence.step_m)
     furnished = RoomConfig(camouflage=suite.sequence.camouflage)
     scene = make_room(seed, furnished)
-    views: list[_View] = []
-    for frame in room_frames(seed, suite.map_frames, camera, room=furnished, path=path, noise=NoiseConfig()):
+    views: list[RoomLook] = []
+    poses: list[Float64] = []
+    frames = room_frames(seed, suite.map_frames, camera, room=furnished, path=path, noise=NoiseConfig())
+    for number, frame in enumerate(frames):
+        poses.append(frame.T_world_camera)
+        if number % rendered and frame.depth_m is not None:
+            pipeline.voxel_map.integrate(frame, frame.depth_m, None)
+            continue
         ready = pipeline.prepare(as_given(frame, depth=suite.depth == "on", label=True))
         views += [_step(pipeline, waited) for waited in ready]
     views += [_step(pipeline, waited) for waited in pipeline.prepare_rest()]
-    surface = true_surface(scene, [view.T_world_camera for view in views])
-    return _FusedRoom(scene, pipeline.voxel_map, views, surface)
+    surface = true_surface(scene, poses)
+    return FusedRoom(scene, pipeline.voxel_map, views, surface)
 
 
 def _depth(suite: SuiteConfig) -> DepthConfig:
@@ -145,10 +158,10 @@ def _depth(suite: SuiteConfig) -> DepthConfig:
     return msgspec.structs.replace(config, source="off" if suite.depth == "off" else config.source)
 
 
-def _step(pipeline: MappingPipeline, frame: PosedFrame) -> _View:
+def _step(pipeline: MappingPipeline, frame: PosedFrame) -> RoomLook:
     assert frame.label is not None
     label = in_rooms(pipeline.step(frame).label, pipeline.label_set)
-    return _View(frame.T_world_camera, frame.label, label)
+    return RoomLook(frame.T_world_camera, frame.label, label)
 
 
 def in_rooms(label: UInt8, label_set: LabelSet) -> UInt8:
@@ -174,7 +187,7 @@ def true_surface(scene: Scene, poses: list[Float64]) -> TrueSurface:
     return TrueSurface(points[first], labels[first], np.concatenate(instance)[first])
 
 
-def _compare(room: _FusedRoom, voxel_map: VoxelMap, digest: str, settings: str, suite: SuiteConfig) -> MapRecord:
+def _compare(room: FusedRoom, voxel_map: VoxelMap, digest: str, settings: str, suite: SuiteConfig) -> MapRecord:
     scene, views, surface = room.scene, room.views, room.surface
     points = voxel_map.points()
     if not len(points.xyz):
@@ -236,7 +249,7 @@ def _compare_instances(voxel_map: VoxelMap, surface: TrueSurface) -> InstanceRec
     return InstanceRecord(found=tuple(tuple(found) for found in matches.found), truth=matches.truth)
 
 
-def _label_of_one_frame(xyz: Float32, casts: list[MapView], views: list[_View], seed: int) -> UInt8:
+def _label_of_one_frame(xyz: Float32, casts: list[MapView], views: list[RoomLook], seed: int) -> UInt8:
     """For each map point (N, 3) what one of the frames that see it says, drawn at random; ``UNSEEN`` where none does.
 
     That is the map without fusion: the same points, each counting once, labelled by a single look.
@@ -261,7 +274,7 @@ def _label_of_one_frame(xyz: Float32, casts: list[MapView], views: list[_View], 
 
 
 def _seen_from_its_frames(
-    casts: list[MapView], label_set: LabelSet, views: list[_View]
+    casts: list[MapView], label_set: LabelSet, views: list[RoomLook]
 ) -> tuple[ConfusionMatrix, ConfusionMatrix]:
     """The finished map as its own frames see it, and their rendered labels, both at the pixels where it has a label.
 

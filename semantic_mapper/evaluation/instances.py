@@ -1,9 +1,9 @@
 """How well a map's instances are the true ones: average precision, as ScanNet reckons it.
 
 Everything is counted in surface voxels that have a truth. A found instance is right where its class is that of a true
-one and both overlap by more than ``iou`` of their union; of several that overlap one, the surest counts. Found instances
-of which most lies on true ones that are too small to count, or on voxels without a truth, are neither right nor wrong.
-Average precision is the area under precision over recall, found instances sorted by their confidence.
+one and both overlap by at least ``iou`` of their union; of several that overlap one, the surest counts. Found
+instances of which most lies on true ones that are too small to count, or on voxels without a truth, are neither right
+nor wrong. Average precision is the area under precision over recall, found instances sorted by their confidence.
 """
 
 from __future__ import annotations

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from semantic_mapper.memory import check_room_for_scipy
 from semantic_mapper.mapping.instance_layer import pack_voxels
+from semantic_mapper.memory import check_room_for_scipy
 from semantic_mapper.types import Float32, Float64
 
 AGREE_M = 0.06  # centres of neighbours that are farther apart belong to two things
@@ -20,7 +20,9 @@ _ROUNDS = 50
 _HALF_SPHERE = np.array([d for d in np.ndindex(3, 3, 3) if d > (1, 1, 1)]) - 1  # 13 of 26 neighbours
 
 
-def group_things(voxels: NDArray[np.int64], channel: NDArray[np.int64], way_m: Float32, voxel_m: float) -> NDArray[np.int64]:
+def group_things(
+    voxels: NDArray[np.int64], channel: NDArray[np.int64], way_m: Float32, voxel_m: float
+) -> NDArray[np.int64]:
     """The thing (N,) that each voxel belongs to, numbered from 0.
 
     Args:
@@ -43,7 +45,7 @@ def group_things(voxels: NDArray[np.int64], channel: NDArray[np.int64], way_m: F
 def _without_crumbs(
     piece: NDArray[np.int64], first: NDArray[np.int64], second: NDArray[np.int64], centre: Float64
 ) -> NDArray[np.int64]:
-    """Pieces (N,) where small ones that touch large ones, by the pairs ``first``, ``second``, have become part of them."""
+    """Pieces (N,); small ones that touch large ones, by the pairs ``first``, ``second``, are part of them now."""
     size = np.bincount(piece)
     middle = np.stack([np.bincount(piece, centre[:, axis]) for axis in range(3)], axis=1) / size[:, None]
     large = size >= LEAST_VOXELS

@@ -63,8 +63,8 @@ class VoxelMap:
     whole map was replaced by another one (``take_over``): blocks may be gone then. ``scale_known`` says whether lengths
     are metres; see ``note_scale``. ``refined`` is the digest of the weights that refined the map (``refine``); empty
     where none did. ``instances`` says which voxels belong to which thing, where that refinement found out; None
-    otherwise, and as soon as anything changes. ``cleared`` counts the voxels of surfaces that frames saw through, and that were forgotten
-    (``clear_free_space``), in this process.
+    otherwise, and as soon as anything changes. ``cleared`` counts the voxels of surfaces that frames saw through, and
+    that were forgotten (``clear_free_space``), in this process.
 
     Args:
         config: Voxel size, truncation, caps and limits.

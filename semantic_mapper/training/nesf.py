@@ -440,5 +440,7 @@ def _map_logits(model: Nesf, map_: TrainingMap) -> tuple[torch.Tensor, torch.Ten
     points = SurfacePoints(*(v.astype(np.float32) for v in map_.points))
     rows, channel, _ = map_.voxels
     cells = pool(points)
-    logits, _ = model.read(model(cells), near_cells(points.xyz[rows], cells.cells), torch.from_numpy(points.log_p[rows]))
+    logits, _ = model.read(
+        model(cells), near_cells(points.xyz[rows], cells.cells), torch.from_numpy(points.log_p[rows])
+    )
     return logits, torch.from_numpy(points.log_p[rows]), channel
