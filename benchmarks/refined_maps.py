@@ -1,7 +1,8 @@
-"""Maps before and after ``refine`` against the truth: mIoU, and a picture.
+"""Maps before and after ``refine`` against the truth: mIoU, and pictures of classes and of things.
 
 Example: python -m benchmarks.refined_maps runs/kitchen/map.npz refined.npz --truth redkitchen
-Example: python -m benchmarks.refined_maps room.npz refined.npz --truth 200000 --out refined.png
+Example: python -m benchmarks.refined_maps room.npz refined.npz --truth 100000 --out refined.jpg
+Example: python -m benchmarks.refined_maps map.npz refined.npz --truth redkitchen --log kitchen.mcap --out kitchen.jpg
 """
 
 from __future__ import annotations
@@ -13,15 +14,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from semantic_mapper.benchmark.config import SequenceConfig, camera_of_width
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, map_confusion
-from semantic_mapper.labels import NYU40, ROOMS, LabelSet
+from semantic_mapper.geometry import transform, unproject
+from semantic_mapper.labels import NYU40, ROOMS, STUFF_NAMES, LabelSet
+from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.plots import new_figure, rendered, write_picture
-from semantic_mapper.replay.evaluate.room_map import NEAR_M, in_rooms, true_surface
+from semantic_mapper.queries.instances import InstanceTracker
+from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.replay.evaluate.room_map import NEAR_M, true_surface
+from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.scenes import CameraPathConfig, make_room, room_frames
-from semantic_mapper.types import Float32, UInt8
+from semantic_mapper.scenes.sequence import room_views
+from semantic_mapper.types import Float32, PosedFrame, UInt8
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -72,16 +81,66 @@ def draw(rows: Sequence[Sequence[UInt8]], names: Sequence[str]) -> Figure:
     return figure
 
 
-def views(seed: int, numbers: Sequence[int], maps: Sequence[VoxelMap]) -> list[list[UInt8]]:
-    """A row for each frame of a room's walk: its colours, the classes of each map seen from there, the true ones."""
+class Seen(NamedTuple):
+    """A frame that maps are looked at from: with the true labels (H, W) and things (H, W), where they are known."""
+
+    frame: PosedFrame
+    label: UInt8 | None
+    instance: NDArray[np.int64] | None
+
+
+def room_looks(seed: int, numbers: Sequence[int]) -> list[Seen]:
+    """Frames of a room's walk."""
     walk = CameraPathConfig(step_m=SequenceConfig().step_m)
-    frames = list(room_frames(seed, max(numbers) + 1, camera_of_width(320), path=walk))
+    found = list(room_views(seed, max(numbers) + 1, camera_of_width(320), path=walk))
+    return [Seen(v.frame, v.frame.label, v.rendered.instance.astype(np.int64)) for v in (found[n] for n in numbers)]
+
+
+def log_looks(log: Path, numbers: Sequence[int]) -> list[Seen]:
+    """Frames of a log."""
+    with open_log(log) as reader:
+        return [Seen(frame, None, None) for n, frame in enumerate(reader) if n in numbers]
+
+
+class Things:
+    """The things of a map, as queries find them, to be seen from anywhere."""
+
+    def __init__(self, voxel_map: VoxelMap, up: tuple[float, float, float]) -> None:
+        found = InstanceTracker(up=up).update(MapMirror.of(voxel_map).snapshot())
+        self._voxel_m = voxel_map.config.voxel_size_m
+        self._tree = KDTree(np.concatenate([thing.voxels for thing in found]))
+        self._number = np.repeat([thing.id for thing in found], [len(thing.voxels) for thing in found])
+
+    def seen(self, view: MapView, frame: PosedFrame) -> UInt8:
+        """Picture (H, W, 3)."""
+        hit = view.depth_m > 0
+        xyz = transform(frame.T_world_camera, unproject(view.depth_m, frame.intrinsics)[hit])
+        _, nearest = self._tree.query(xyz / self._voxel_m, distance_upper_bound=2.0)
+        number = np.zeros(hit.shape, np.int64)
+        number[hit] = np.append(self._number, 0)[nearest]
+        return in_colours(number)
+
+
+def in_colours(number: NDArray[np.int64]) -> UInt8:
+    """Picture (H, W, 3) of numbers (H, W); 0 is grey."""
+    colours = np.random.default_rng(3).integers(40, 256, (4096, 3), np.uint8)
+    colours[0] = 90
+    return colours[number % 4096]
+
+
+def views(looks: Sequence[Seen], maps: Sequence[VoxelMap], up: tuple[float, float, float]) -> list[list[UInt8]]:
+    """Two rows for each frame: its colours, the classes of each map seen from there, the true ones; then the things."""
+    things = [Things(voxel_map, up) for voxel_map in maps]
     rows: list[list[UInt8]] = []
-    for frame in (frames[number] for number in numbers):
-        assert frame.label is not None
+    for frame, label, instance in looks:
         casts = [voxel_map.ray_cast(frame.T_world_camera, frame.intrinsics) for voxel_map in maps]
-        labels = [ROOMS.colorize(in_rooms(cast.label, m.label_set)) for cast, m in zip(casts, maps, strict=True)]
-        rows.append([frame.rgb, *labels, ROOMS.colorize(frame.label)])
+        classes = [m.label_set.colorize(cast.label) for cast, m in zip(casts, maps, strict=True)]
+        rows.append([frame.rgb, *classes])
+        rows.append([frame.rgb, *(found.seen(cast, frame) for found, cast in zip(things, casts, strict=True))])
+        if label is not None and instance is not None:
+            stuff = np.isin(label, ROOMS.thing_ids(STUFF_NAMES), invert=True)
+            rows[-2].append(ROOMS.colorize(label))
+            rows[-1].append(in_colours(np.where(stuff, 0, instance)))
     return rows
 
 
@@ -90,8 +149,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("maps", nargs="+", type=Path)
     parser.add_argument("--truth", required=True, help="seed of a room, or folder of a recording")
-    parser.add_argument("--frames", nargs="+", type=int, default=[5, 15, 25], help="of the room's walk, to draw")
-    parser.add_argument("--out", type=Path, help="picture, of rooms only")
+    parser.add_argument("--frames", nargs="+", type=int, default=[5, 25], help="of the room's walk or the log, to draw")
+    parser.add_argument("--log", type=Path, help="of a recording, to draw")
+    parser.add_argument("--up", nargs=3, type=float, default=(0.0, 0.0, 1.0))
+    parser.add_argument("--out", type=Path, help="picture")
     arguments = parser.parse_args()
     loaded = [VoxelMap.load(path) for path in arguments.maps]
     label_set = loaded[0].label_set
@@ -101,8 +162,12 @@ def main() -> None:
         found = score(Labelled(points.xyz, points.label), truth, label_set).metrics()
         print(f"{path}: mIoU {100 * (found.miou or 0):.1f} %, total accuracy {100 * (found.total_accuracy or 0):.1f} %")
     if arguments.out:
-        names = ("colour", *(path.stem for path in arguments.maps), "truth")
-        write_picture(arguments.out, draw(views(int(arguments.truth), arguments.frames, loaded), names))
+        if arguments.log:
+            looks = log_looks(arguments.log, arguments.frames)
+        else:
+            looks = room_looks(int(arguments.truth), arguments.frames)
+        names = ("colour", *(path.stem for path in arguments.maps), *([] if arguments.log else ["truth"]))
+        write_picture(arguments.out, draw(views(looks, loaded, tuple(arguments.up)), names))
 
 
 if __name__ == "__main__":

@@ -5,9 +5,10 @@ Labels are those of the images, at the voxels that the rays of their pixels meet
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from semantic_mapper.benchmark.config import MAP_WIDTH, SequenceConfig, camera_o
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.fields.sparse_conv import find_rows, pack_cells
 from semantic_mapper.geometry import transform, unproject
-from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.labels import ROOMS, STUFF_NAMES, LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.refine import surface_voxels, up_frame
@@ -24,7 +25,8 @@ from semantic_mapper.mapping.storage.block_index import KEY_LIMIT
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.evaluate.room_map import UP
 from semantic_mapper.replay.log.sequence import open_log
-from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, room_frames
+from semantic_mapper.scenes import CameraPathConfig, NoiseConfig
+from semantic_mapper.scenes.sequence import room_views
 from semantic_mapper.training.nesf import TrainingMap
 from semantic_mapper.types import Float64, PosedFrame
 
@@ -55,9 +57,10 @@ def make_room_maps(
         path = folder / f"room-{seed}.npz"
         if not path.is_file():
             walk = CameraPathConfig(step_m=SequenceConfig().step_m)
-            views = room_frames(seed, frames, camera_of_width(MAP_WIDTH), path=walk, noise=NoiseConfig())
-            voxel_map = _map_frames(views, seen := [], weights)
-            training_map(voxel_map, seen, ROOMS, UP).save(path)
+            views = list(room_views(seed, frames, camera_of_width(MAP_WIDTH), path=walk, noise=NoiseConfig()))
+            voxel_map = _map_frames((view.frame for view in views), seen := [], weights)
+            instances = [view.rendered.instance for view in views]
+            training_map(voxel_map, seen, ROOMS, UP, instances=instances).save(path)
         paths.append(path)
         on_room(seed)
     return paths
@@ -117,7 +120,12 @@ def _map_frames(frames: Iterable[PosedFrame], seen: list[PosedFrame], weights: P
 
 
 def training_map(
-    voxel_map: VoxelMap, frames: Iterable[PosedFrame], labels: LabelSet, up: Float64 | None = None
+    voxel_map: VoxelMap,
+    frames: Sequence[PosedFrame],
+    labels: LabelSet,
+    up: Float64 | None = None,
+    *,
+    instances: Sequence[NDArray[np.integer[Any]]] | None = None,
 ) -> TrainingMap:
     """Cast the labelled pixels of frames into a map.
 
@@ -126,13 +134,19 @@ def training_map(
         frames: With labels, ids of ``labels``; where one has depth, hits that it contradicts do not count.
         labels: Their classes; taken over by name.
         up: (3,) in the world; None = away from the floor.
+        instances: (H, W) of each frame, the same number where the same object is, 0 = none; None = not known.
 
     Raises:
         MapError: up cannot be found.
     """
+    things = np.isin(voxel_map.label_set.ids, voxel_map.label_set.thing_ids(STUFF_NAMES))
+    every = np.full(3, KEY_LIMIT)
+    voxels = surface_voxels(voxel_map, up_frame(voxel_map, up), -every, every)
+    keys = pack_cells(voxels.voxel[voxels.core])
+    order = np.argsort(keys)
     table = voxel_map.label_set.channel_map_from(labels)
-    rows: list[NDArray[np.int64]] = []
-    for frame in frames:
+    packed: list[NDArray[np.int64]] = []
+    for frame, instance in zip(frames, instances or [None] * len(frames), strict=True):
         assert frame.label is not None
         cast = voxel_map.ray_cast(frame.T_world_camera, frame.intrinsics)
         channel = table[frame.label]
@@ -140,13 +154,15 @@ def training_map(
         if frame.depth_m is not None:
             hit &= (frame.depth_m <= 0) | (np.abs(frame.depth_m - cast.depth_m) < AGREE_M)
         xyz = transform(frame.T_world_camera, unproject(cast.depth_m, frame.intrinsics)[hit])
-        voxel = np.rint(xyz / voxel_map.config.voxel_size_m).astype(np.int64)
-        rows.append(np.column_stack((voxel, channel[hit])))
-    found, count = np.unique(np.concatenate(rows), axis=0, return_counts=True)
-    every = np.full(3, KEY_LIMIT)
-    voxels = surface_voxels(voxel_map, up_frame(voxel_map, up), -every, every)
-    keys = pack_cells(voxels.voxel[voxels.core])
-    order = np.argsort(keys)
-    row = find_rows(keys[order], pack_cells(found[:, :3]))
-    on = row < len(keys)
-    return TrainingMap(voxels.points.rows(voxels.core), order[row[on]], found[on, 3], count[on].astype(np.float32))
+        row = find_rows(keys[order], pack_cells(np.rint(xyz / voxel_map.config.voxel_size_m).astype(np.int64)))
+        number = np.zeros(len(row), np.int64) if instance is None else instance[hit] * things[channel[hit]]
+        on = row < len(keys)
+        packed.append((order[row[on]] << 24) | (channel[hit][on] << 16) | number[on])
+    found, count = np.unique(np.concatenate(packed), return_counts=True)
+    return TrainingMap(
+        points=voxels.points.rows(voxels.core),
+        row=found >> 24,
+        channel=(found >> 16) & 255,
+        instance=found & 0xFFFF,
+        count=count.astype(np.float32),
+    )

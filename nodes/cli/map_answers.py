@@ -72,8 +72,11 @@ def answer_nearest(class_name: str, point: Sequence[float], hit: NearestSurface 
     return found
 
 
-def answer_instances(up: Sequence[float], instances: Sequence[Instance]) -> dict[str, Any]:
-    """The things in a map, as ``instances.InstanceTracker`` finds them."""
+CONNECTED, LEARNED = "connected pieces of one class", "what `refine` has learned"
+
+
+def answer_instances(up: Sequence[float], instances: Sequence[Instance], told_apart_by: str = "") -> dict[str, Any]:
+    """The things in a map, as ``instances.InstanceTracker`` finds them, and by which means; empty = not known."""
     things = [
         {
             "id": thing.id,
@@ -90,7 +93,8 @@ def answer_instances(up: Sequence[float], instances: Sequence[Instance]) -> dict
         }
         for thing in instances
     ]
-    return {"question": "instances", "up": list(up), "instances": things}
+    by = {"told_apart_by": told_apart_by} if told_apart_by else {}
+    return {"question": "instances", "up": list(up), **by, "instances": things}
 
 
 def answer_table(found: dict[str, Any], width: int) -> Table:
@@ -112,7 +116,8 @@ def answer_table(found: dict[str, Any], width: int) -> Table:
 
 
 def _instance_table(found: dict[str, Any], width: int) -> Table:
-    table = Table(title=found["map"], title_justify="left")
+    by = found.get("told_apart_by")
+    table = Table(title=f"{found['map']}, things by {by}" if by else found["map"], title_justify="left")
     rows = [
         (
             str(thing["id"]),

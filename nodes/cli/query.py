@@ -71,7 +71,8 @@ def query(
 
     info: size, classes and how much surface each has. at: class and confidence of the surface at a point, and whether
     the point is free, occupied or unknown. nearest: the surface of a class that is nearest to a point. instances: all
-    things, that is, connected pieces of one class that is not wall, floor or the like, with upright boxes.
+    things, that is, connected pieces of one class that is not wall, floor or the like, with upright boxes; of a map
+    that `refine` has told things apart in, those.
 
     Example: semantic-mapper query runs/demo info
     Example: semantic-mapper query runs/demo/map.npz at 1.2 -0.4 0.8
@@ -128,7 +129,8 @@ def ask_file(source: str, asked: Asked) -> dict[str, Any]:
             hit = nearest(snapshot, asked.class_name, asked.point, asked.min_confidence)
             return map_answers.answer_nearest(asked.class_name, asked.point, hit)
         case Question.INSTANCES:
-            return map_answers.answer_instances(asked.up, InstanceTracker(up=asked.up).update(snapshot))
+            by = map_answers.CONNECTED if snapshot.instances is None else map_answers.LEARNED
+            return map_answers.answer_instances(asked.up, InstanceTracker(up=asked.up).update(snapshot), by)
 
 
 def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:

@@ -53,7 +53,9 @@ def _plain_table(title: str, columns: Mapping[str, str], rows: Mapping[str, Any]
 def map_rows_table(found: Mapping[str, Any]) -> Table:
     """The fused map beside maps whose frames are classified one by one."""
     columns = {"points": "map_miou", "true surface": "surface_miou", "seen from frames": "cast_miou"}
-    return _plain_table("mIoU of the map", columns | {"its frames": "views_miou", "ECE": "ece"}, found["map_rows"])
+    columns |= {"its frames": "views_miou", "ECE": "ece", "instances AP50": "instance_ap50"}
+    columns |= {"found": "instance_recall", "right": "instance_precision"}
+    return _plain_table("mIoU of the map", columns, found["map_rows"])
 
 
 def difference_lines(found: Mapping[str, Any]) -> list[str]:
@@ -153,4 +155,7 @@ _MAP_ROWS: _Rows = (
     ("map: mIoU at the true surface", "map.surface_miou", percent),
     ("map: calibration error (ECE)", "map.ece", percent),
     ("map: points at the true surface", "map.on_surface", percent),
+    ("map: instances, AP50", "map.instance_ap50", percent),
+    ("map: true instances found", "map.instance_recall", percent),
+    ("map: found instances that are right", "map.instance_precision", percent),
 )

@@ -171,7 +171,7 @@ class LiveRefinement:
         if process.returncode:
             self._fail(_reason(process.returncode, said))
             return
-        self.mirror.apply(read_changes(job.changes, version, epoch))
+        self.mirror.apply(*read_changes(job.changes, version, epoch))
         job.refined.replace(self._path.with_name(REFINED_NAME))
         self._count += 1
         self.failure = ""

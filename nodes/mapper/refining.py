@@ -10,7 +10,7 @@ import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from semantic_mapper.errors import SemanticMapperError
 from semantic_mapper.nodes.process import prepare_process, run_when_idle
 
 if TYPE_CHECKING:
+    from semantic_mapper.mapping.instance_layer import InstanceLayer
     from semantic_mapper.mapping.storage.changes import BlockChanges
 
 REFINED_NAME = "refined.npz"
@@ -59,18 +60,20 @@ class Job:
         return cls(Path(source), Path(weights) if weights else None, priority == "idle")
 
 
-def read_changes(path: Path, version: int, epoch: int) -> BlockChanges:
-    """All blocks of a refined map, as of the version and epoch that was refined.
+def read_changes(path: Path, version: int, epoch: int) -> tuple[BlockChanges, InstanceLayer | None]:
+    """All blocks of a refined map, as of the version and epoch that was refined, and its instances if it has them.
 
     Raises:
         OSError: it cannot be read.
     """
+    from semantic_mapper.mapping.instance_layer import InstanceLayer
     from semantic_mapper.mapping.storage.changes import BlockChanges
 
     with np.load(path) as file:
         arrays = {name: file[name] for name in _ARRAYS if name in file}
         scale_known = bool(file["scale_known"])
-    return BlockChanges(0, version, version, epoch, scale_known=scale_known, **arrays)
+        layer = InstanceLayer(file["packed"], file["number"]) if "packed" in file else None
+    return BlockChanges(0, version, version, epoch, scale_known=scale_known, **arrays), layer
 
 
 def refine_job(job: Job) -> None:
@@ -87,7 +90,9 @@ def refine_job(job: Job) -> None:
     refine(voxel_map, load_nesf(job.weights) if job.weights else smoothed_votes(voxel_map.label_set))
     voxel_map.save(job.refined)
     found = voxel_map.changes(0)
-    arrays = {name: array for name in _ARRAYS if (array := getattr(found, name)) is not None}
+    arrays: dict[str, Any] = {name: array for name in _ARRAYS if (array := getattr(found, name)) is not None}
+    if voxel_map.instances is not None:
+        arrays |= {"packed": voxel_map.instances.packed, "number": voxel_map.instances.number}
     np.savez(job.changes, scale_known=np.bool_(found.scale_known), **arrays)
 
 

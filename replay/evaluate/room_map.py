@@ -9,28 +9,35 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from semantic_mapper.benchmark.config import MAP_WIDTH, SuiteConfig, camera_of_width, settings_digest
-from semantic_mapper.benchmark.records import MapRecord
+from semantic_mapper.benchmark.records import InstanceRecord, MapRecord
 from semantic_mapper.benchmark.rooms import as_given
 from semantic_mapper.benchmark.scoring import as_calibration, as_rows
 from semantic_mapper.config import DepthConfig
 from semantic_mapper.errors import MapError
+from semantic_mapper.evaluation.instances import FoundInstances, match_instances
 from semantic_mapper.evaluation.metrics import (
     ConfusionMatrix,
     confusion_of,
     map_confusion,
     metrics_per_image,
     nearest_labels,
+    nearest_points,
 )
 from semantic_mapper.fields.nesf import NesfWeights
 from semantic_mapper.geometry import invert_pose, project, transform, unproject
-from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.labels import ROOMS, STUFF_NAMES, LabelSet
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.refine import refine
+from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.queries.class_surface import class_surface
+from semantic_mapper.queries.instances import InstanceTracker
+from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, RoomConfig, Scene, make_room, render_view, room_frames
 from semantic_mapper.training.computed_depth import DELAY_FRAMES
 from semantic_mapper.types import Float32, Float64, PosedFrame, UInt8
@@ -44,14 +51,16 @@ TRUTH_VOXEL_M = 0.01  # the true surface is sampled this densely, where the came
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueSurface:
-    """Points of a room's true surface that its camera has seen: xyz (N, 3) float32 metres, ids (N,) of ``ROOMS``."""
+    """Points of a room's true surface that its camera has seen: xyz (N, 3) float32 metres, ids (N,) of ``ROOMS``, and
+    numbers (N,) of the objects they belong to."""
 
     xyz: Float32
     label: UInt8
+    instance: NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _View:
+class RoomLook:
     """A frame of the sequence: pose, true labels (H, W) and those that the pipeline rendered, ids of ``ROOMS``."""
 
     T_world_camera: Float64
@@ -60,12 +69,13 @@ class _View:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _FusedRoom:
-    """A room, its map, and the frames that it was made of."""
+class FusedRoom:
+    """A room, its map, the frames that it was made of, and its true surface."""
 
     scene: Scene
     voxel_map: VoxelMap
-    views: list[_View]
+    views: list[RoomLook]
+    surface: TrueSurface
 
 
 def map_room(seed: int, weights: Path, digest: str, suite: SuiteConfig) -> MapRecord:
@@ -81,7 +91,7 @@ def map_room(seed: int, weights: Path, digest: str, suite: SuiteConfig) -> MapRe
         WeightsError: see ``Mapper.load``.
         MapError: the map came out empty.
     """
-    room = _fuse(seed, weights, suite)
+    room = fuse_room(seed, weights, suite)
     return _compare(room, room.voxel_map, digest, settings_digest(suite, "map"), suite)
 
 
@@ -94,29 +104,49 @@ def refine_room(
         WeightsError: see ``Mapper.load``; or networks of other classes.
         MapError: the map came out empty.
     """
-    room = _fuse(seed, weights, suite)
-    records = [_compare(room, room.voxel_map, digest, settings_digest(suite, "map"), suite)]
+    room = fuse_room(seed, weights, suite)
+    return refined_records(room, digest, suite, {settings_digest(suite, "map"): None, **networks})
+
+
+def refined_records(
+    room: FusedRoom, digest: str, suite: SuiteConfig, networks: Mapping[str, NesfWeights | None]
+) -> list[MapRecord]:
+    """A record of a map refined by each of ``networks``, by its settings; None = as it is."""
+    records: list[MapRecord] = []
     with tempfile.TemporaryDirectory() as folder:
         room.voxel_map.save(saved := Path(folder) / "map.npz")
         for settings, network in networks.items():
-            refined = VoxelMap.load(saved)
-            refine(refined, network, up=UP)
-            records.append(_compare(room, refined, digest, settings, suite))
+            voxel_map = VoxelMap.load(saved)
+            if network is not None:
+                refine(voxel_map, network, up=UP)
+            records.append(_compare(room, voxel_map, digest, settings, suite))
     return records
 
 
-def _fuse(seed: int, weights: Path, suite: SuiteConfig) -> _FusedRoom:
+def fuse_room(seed: int, weights: Path, suite: SuiteConfig, rendered: int = 1) -> FusedRoom:
+    """Map a room; only every so many-th of its frames is ``rendered``, the others are fused without classes.
+
+    Raises:
+        WeightsError: see ``Mapper.load``.
+    """
     pipeline = Mapper.load(weights, msgspec.structs.replace(suite.mapper, depth=_depth(suite))).pipeline
     camera = camera_of_width(MAP_WIDTH)
     path = CameraPathConfig(step_m=suite.sequence.step_m)
     furnished = RoomConfig(camouflage=suite.sequence.camouflage)
     scene = make_room(seed, furnished)
-    views: list[_View] = []
-    for frame in room_frames(seed, suite.map_frames, camera, room=furnished, path=path, noise=NoiseConfig()):
+    views: list[RoomLook] = []
+    poses: list[Float64] = []
+    frames = room_frames(seed, suite.map_frames, camera, room=furnished, path=path, noise=NoiseConfig())
+    for number, frame in enumerate(frames):
+        poses.append(frame.T_world_camera)
+        if number % rendered and frame.depth_m is not None:
+            pipeline.voxel_map.integrate(frame, frame.depth_m, None)
+            continue
         ready = pipeline.prepare(as_given(frame, depth=suite.depth == "on", label=True))
         views += [_step(pipeline, waited) for waited in ready]
     views += [_step(pipeline, waited) for waited in pipeline.prepare_rest()]
-    return _FusedRoom(scene, pipeline.voxel_map, views)
+    surface = true_surface(scene, poses)
+    return FusedRoom(scene, pipeline.voxel_map, views, surface)
 
 
 def _depth(suite: SuiteConfig) -> DepthConfig:
@@ -128,10 +158,10 @@ def _depth(suite: SuiteConfig) -> DepthConfig:
     return msgspec.structs.replace(config, source="off" if suite.depth == "off" else config.source)
 
 
-def _step(pipeline: MappingPipeline, frame: PosedFrame) -> _View:
+def _step(pipeline: MappingPipeline, frame: PosedFrame) -> RoomLook:
     assert frame.label is not None
     label = in_rooms(pipeline.step(frame).label, pipeline.label_set)
-    return _View(frame.T_world_camera, frame.label, label)
+    return RoomLook(frame.T_world_camera, frame.label, label)
 
 
 def in_rooms(label: UInt8, label_set: LabelSet) -> UInt8:
@@ -144,23 +174,24 @@ def true_surface(scene: Scene, poses: list[Float64]) -> TrueSurface:
     camera = camera_of_width(MAP_WIDTH)
     xyz: list[Float32] = []
     label: list[UInt8] = []
+    instance: list[NDArray[np.int64]] = []
     for T_world_camera in poses:
         view = render_view(scene, camera, T_world_camera)
         hit = view.depth_m > 0
         xyz.append(transform(T_world_camera, unproject(view.depth_m, camera)[hit]).astype(np.float32))
         label.append(view.label[hit])
+        instance.append(view.instance[hit].astype(np.int64))
     points, labels = np.concatenate(xyz), np.concatenate(label)
     cell = np.floor(points / TRUTH_VOXEL_M).astype(np.int64)
     _, first = np.unique(cell @ np.array([1, 1 << 20, 1 << 40]), return_index=True)
-    return TrueSurface(points[first], labels[first])
+    return TrueSurface(points[first], labels[first], np.concatenate(instance)[first])
 
 
-def _compare(room: _FusedRoom, voxel_map: VoxelMap, digest: str, settings: str, suite: SuiteConfig) -> MapRecord:
-    scene, views = room.scene, room.views
+def _compare(room: FusedRoom, voxel_map: VoxelMap, digest: str, settings: str, suite: SuiteConfig) -> MapRecord:
+    scene, views, surface = room.scene, room.views, room.surface
     points = voxel_map.points()
     if not len(points.xyz):
         raise MapError(f"room {scene.seed}: none of its {suite.map_frames} frames could be fused; the map is empty")
-    surface = true_surface(scene, [view.T_world_camera for view in views])
     label = in_rooms(points.label, voxel_map.label_set)
     truth = nearest_labels(points.xyz, surface.xyz, surface.label, ROOMS, max_distance_m=NEAR_M)
     at_surface = map_confusion(surface.xyz, surface.label, points.xyz, label, ROOMS, max_distance_m=NEAR_M)
@@ -189,10 +220,36 @@ def _compare(room: _FusedRoom, voxel_map: VoxelMap, digest: str, settings: str, 
             confusion_of(seen, np.where(one_frame == UNSEEN, ROOMS.ignore_id, one_frame), ROOMS, "a frame")
         ),
         calibration=as_calibration(points.confidence[answered], label[answered] == truth[answered]),
+        instances=_compare_instances(voxel_map, surface),
     )
 
 
-def _label_of_one_frame(xyz: Float32, casts: list[MapView], views: list[_View], seed: int) -> UInt8:
+def _compare_instances(voxel_map: VoxelMap, surface: TrueSurface) -> InstanceRecord:
+    """The things that queries find in a map, against those of the true surface, at the map's surface voxels."""
+    snapshot = MapMirror.of(voxel_map).snapshot()
+    every = class_surface(snapshot, np.ones(256, np.bool_))
+    row = np.repeat(np.arange(len(every.packed)), np.diff(every.start))
+    nearest = nearest_points(every.point * snapshot.voxel_size_m, surface.xyz, max_distance_m=NEAR_M)
+    keys = (row << 9) | every.voxel  # ascending
+    things = InstanceTracker(up=UP).update(snapshot)
+    instance = np.full(len(keys), -1, np.int64)
+    for number, thing in enumerate(things):
+        block = np.searchsorted(every.packed, pack_keys(thing.voxels >> 3))
+        x, y, z = (thing.voxels & 7).T
+        instance[np.searchsorted(keys, (block << 9) | (z * 64 + y * 8 + x))] = number
+    class_id = in_rooms(np.array([thing.class_id for thing in things], np.uint8), snapshot.label_set)
+    confidence = np.array([thing.confidence for thing in things], np.float32)
+    matches = match_instances(
+        FoundInstances(instance, class_id, confidence),
+        np.append(surface.label, np.uint8(ROOMS.ignore_id))[nearest],
+        np.append(surface.instance, 0)[nearest],
+        ROOMS,
+        STUFF_NAMES,
+    )
+    return InstanceRecord(found=tuple(tuple(found) for found in matches.found), truth=matches.truth)
+
+
+def _label_of_one_frame(xyz: Float32, casts: list[MapView], views: list[RoomLook], seed: int) -> UInt8:
     """For each map point (N, 3) what one of the frames that see it says, drawn at random; ``UNSEEN`` where none does.
 
     That is the map without fusion: the same points, each counting once, labelled by a single look.
@@ -217,7 +274,7 @@ def _label_of_one_frame(xyz: Float32, casts: list[MapView], views: list[_View], 
 
 
 def _seen_from_its_frames(
-    casts: list[MapView], label_set: LabelSet, views: list[_View]
+    casts: list[MapView], label_set: LabelSet, views: list[RoomLook]
 ) -> tuple[ConfusionMatrix, ConfusionMatrix]:
     """The finished map as its own frames see it, and their rendered labels, both at the pixels where it has a label.
 

@@ -13,6 +13,7 @@ from semantic_mapper.benchmark.scoring import from_rows
 from semantic_mapper.evaluation.bootstrap import paired_bootstrap
 from semantic_mapper.evaluation.consistency import Agreement
 from semantic_mapper.evaluation.depth_error import DepthErrors
+from semantic_mapper.evaluation.instances import InstanceMatch, InstanceMatches, average_precision
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration_of_bins
 from semantic_mapper.plots import Curve, Panel, draw_panels
 from semantic_mapper.scenes.suite import ROOMS_SUITE
@@ -102,6 +103,7 @@ def map_figures(records: Sequence[MapRecord]) -> dict[str, Any]:
         "view_miou_mean_of_rooms": _mean([r.view_miou for r in records]),
         "on_surface": _mean([r.on_surface for r in records]),
         "ece": _ece(records),
+        **_instance_figures(records),
         "per_room": {
             str(r.room): {"map_miou": c.metrics().miou, "view_miou": r.view_miou}
             for r, c in zip(records, at_points, strict=True)
@@ -112,7 +114,26 @@ def map_figures(records: Sequence[MapRecord]) -> dict[str, Any]:
 def map_row_figures(records: Sequence[MapRecord]) -> dict[str, float | None]:
     """One row of the comparison of maps."""
     found = map_figures(records)
-    return {name: found[name] for name in ("map_miou", "surface_miou", "cast_miou", "views_miou", "ece")}
+    names = ("map_miou", "surface_miou", "cast_miou", "views_miou", "ece", "instance_ap50", "instance_recall")
+    return {name: found[name] for name in (*names, "instance_precision")}
+
+
+def _instance_figures(records: Sequence[MapRecord]) -> dict[str, Any]:
+    """Of instances with an IoU of half; None where some room has none recorded."""
+    matches = [
+        InstanceMatches(tuple(InstanceMatch(*found) for found in r.instances.found), r.instances.truth)
+        for r in records
+        if r.instances is not None
+    ]
+    if len(matches) < len(records):
+        return dict.fromkeys(("instance_ap50", "instance_recall", "instance_precision", "instance_ap50_by_class"))
+    figures = average_precision(matches, ROOMS_SUITE.label_set)
+    return {
+        "instance_ap50": figures.ap,
+        "instance_recall": figures.recall,
+        "instance_precision": figures.precision,
+        "instance_ap50_by_class": figures.per_class,
+    }
 
 
 def compare_maps(first: Sequence[MapRecord], second: Sequence[MapRecord], *, seed: int = 0) -> dict[str, Any] | None:

@@ -78,6 +78,13 @@ class RoomRecord(Config, frozen=True, tag_field="record", tag="views"):
     carried: Rows | None = None  # of the keyframes' labels carried over by depth alone
 
 
+class InstanceRecord(Config, frozen=True):
+    """``evaluation.instances.InstanceMatches`` as data; a found instance is as the fields of ``InstanceMatch``."""
+
+    found: tuple[tuple[int, float, float, int, bool], ...]
+    truth: tuple[int, ...]
+
+
 class MapRecord(Config, frozen=True, tag_field="record", tag="map"):
     """The fused map of one room by one weights file. Confusions are (L, L + 1) of the suite's classes."""
 
@@ -96,6 +103,7 @@ class MapRecord(Config, frozen=True, tag_field="record", tag="map"):
     seen_confusion: Rows  # at those of the map's points that some frame sees
     one_frame_confusion: Rows  # at the same points, of one frame each, drawn at random
     calibration: CalibrationRecord  # of the map's points with a label and a truth
+    instances: InstanceRecord | None = None  # as queries find them; older records have none
 
 
 class SceneRecord(Config, frozen=True, tag_field="record", tag="scene"):

@@ -195,20 +195,32 @@ def nearest_labels(
     Raises:
         ShapeError: not (N, 3), or as many labels as points.
     """
-    for name, xyz in (("at_xyz", at_xyz), ("from_xyz", from_xyz)):
-        if xyz.ndim != 2 or xyz.shape[1] != 3:
-            raise ShapeError(f"{name}: expected shape (N, 3), got {xyz.shape}")
     if from_label.shape != (len(from_xyz),):
         raise ShapeError(
             f"from_label: expected shape ({len(from_xyz)},) as from_xyz has points, got {from_label.shape}"
         )
+    nearest = nearest_points(at_xyz, from_xyz, max_distance_m=max_distance_m)
+    return np.append(from_label, np.uint8(label_set.ignore_id))[nearest]
+
+
+def nearest_points(
+    at_xyz: Float32 | Float64, from_xyz: Float32 | Float64, *, max_distance_m: float = 0.05
+) -> NDArray[np.int64]:
+    """Which (N,) of M points is nearest to each of N others, (N, 3) and (M, 3) in metres; M = none is near enough.
+
+    Raises:
+        ShapeError: not (N, 3).
+    """
+    for name, xyz in (("at_xyz", at_xyz), ("from_xyz", from_xyz)):
+        if xyz.ndim != 2 or xyz.shape[1] != 3:
+            raise ShapeError(f"{name}: expected shape (N, 3), got {xyz.shape}")
     if not len(from_xyz) or not len(at_xyz):
-        return np.full(len(at_xyz), label_set.ignore_id, np.uint8)
+        return np.full(len(at_xyz), len(from_xyz), np.int64)
     check_room_for_scipy()
     from scipy.spatial import KDTree  # a machine that only trains and renders has no SciPy
 
     _, nearest = KDTree(from_xyz).query(at_xyz, distance_upper_bound=max_distance_m, workers=-1)
-    return np.append(from_label, np.uint8(label_set.ignore_id))[nearest]  # no neighbour: index M
+    return nearest.astype(np.int64)
 
 
 def map_confusion(

@@ -1,6 +1,7 @@
 """NeSF on saved maps: a 3D network that has seen many maps corrects the class probabilities of this one.
 
-The map's surface is pooled to cells of ``CELL_M``; each cell tells the network its shape, colour, and what the votes
+It also says how to get from each point to the centre of the object there, by which a map's things are told apart. The
+map's surface is pooled to cells of ``CELL_M``; each cell tells the network its shape, colour, and what the votes
 there say. The answer is a *residual* on the map's log-probabilities: a vector, how much of the smoothed votes round the
 cell is added, and how much a voxel's own still count. All of it comes from a layer that starts at zero, so that an
 untrained network leaves the map as it is.
@@ -32,18 +33,21 @@ from semantic_mapper.fields.checkpoint import (
     label_set_to_plain,
     open_weights,
     save_tensors,
+    shipped_path,
 )
+from semantic_mapper.fields.map_unet import LEVELS, MapUNet
 from semantic_mapper.fields.sparse_conv import OFFSETS, CellLevel, cell_levels, find_rows, pack_cells
-from semantic_mapper.fields.unet3d import LEVELS, UNet3d
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Float32
 
+SHIPPED = "nesf-rooms"  # name of the weights in the package
 CELL_M = 0.04
 SHAPE_CHANNELS = 9  # before those of the classes
 UP_CHANNEL, VOTES_CHANNEL = 2, 8
 SMOOTHED_ROUNDS = 2  # of a Gaussian over 3^3 cells, sigma one cell: together 1.4 cells, 6 cm
 SAME_SLOPE = 0.3  # cells whose normal . up differs by more belong to another surface
 LOG_SCALE = 0.25  # log-probabilities reach -12, other channels 1
+FARTHEST_M = 0.3  # ways to the centre of an object are learned up to here
 MOST_VOTES = 8.0  # further ones tell nothing new
 
 
@@ -51,6 +55,7 @@ class NesfConfig(Config, frozen=True):
     """Shape of the network."""
 
     width: AtLeastOne = 16
+    centres: bool = True  # whether it has learned where the centres of objects are
 
 
 class SurfacePoints(NamedTuple):
@@ -159,26 +164,27 @@ class Nesf(nn.Module):
     def __init__(self, label_set: LabelSet, config: NesfConfig | None = None) -> None:
         super().__init__()
         self.label_set, self.config = label_set, config or NesfConfig()
-        self.net = UNet3d(SHAPE_CHANNELS + len(label_set), len(label_set) + 2, self.config.width)
-        nn.init.zeros_(self.net.head.weight)
-        nn.init.zeros_(self.net.head.bias)
+        self.net = MapUNet(SHAPE_CHANNELS + len(label_set), len(label_set) + 2 + 3, self.config.width)
         self.temperature: torch.Tensor
         self.register_buffer("temperature", torch.ones(()))
 
     def start_smoothed(self) -> None:
         """Make untrained weights answer with the smoothed votes, which is where training starts."""
         with torch.no_grad():
-            self.net.head.bias[-2], self.net.head.bias[-1] = 1.0, -1.0
+            self.net.head.bias[-5], self.net.head.bias[-4] = 1.0, -1.0
 
     def forward(self, cells: Cells) -> torch.Tensor:
-        """(M, L + 1) of each cell: residual, and how much more the map's log-probabilities count."""
+        """(M, L + 4) of each cell: residual, how much more the map's log-probabilities count, and the way to its
+        object's centre, in units of ``FARTHEST_M``."""
         levels = cell_levels(cells.cells, LEVELS)
         said = self.net(cells.x, levels)
-        residual, smoothing, own = said.split((said.shape[1] - 2, 1, 1), dim=1)
-        return torch.cat((residual + smoothing * smoothed(cells, levels[0]), own), dim=1)
+        residual, smoothing, rest = said.split((said.shape[1] - 5, 1, 4), dim=1)
+        return torch.cat((residual + smoothing * smoothed(cells, levels[0]), rest), dim=1)
 
-    def logits(self, answer: torch.Tensor, near: Near, log_p: torch.Tensor) -> torch.Tensor:
-        """Logits (N, L) at points, before the temperature.
+    def read(self, answer: torch.Tensor, near: Near, log_p: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Logits (N, L) at points, before the temperature, and the way (N, 3) to their objects' centres, metres.
+
+        The way is at most some ``FARTHEST_M`` long: it leads to the centre of what is small, and towards it elsewhere.
 
         Args:
             answer: Of ``forward``.
@@ -186,7 +192,7 @@ class Nesf(nn.Module):
             log_p: (N, L) what the map says there; zeros without votes.
         """
         here = torch.einsum("nkc,nk->nc", _padded(answer)[near.rows], near.weights)
-        return log_p * (1 + here[:, -1:]) + here[:, :-1]
+        return log_p * (1 + here[:, -4:-3]) + here[:, :-4], here[:, -3:] * FARTHEST_M
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -206,9 +212,20 @@ class NesfWeights:
 
 def smoothed_votes(label_set: LabelSet) -> NesfWeights:
     """What stands in for weights where there are none, and what they have to beat: votes smoothed, nothing learned."""
-    model = Nesf(label_set, NesfConfig(width=1)).eval()
+    model = Nesf(label_set, NesfConfig(width=1, centres=False)).eval()
     model.start_smoothed()
     return NesfWeights(model, {}, hashlib.sha256(b"smoothed votes").hexdigest())
+
+
+def shipped_nesf(label_set: LabelSet) -> NesfWeights | None:
+    """The weights that ship for maps of these classes; None where there are none.
+
+    Raises:
+        WeightsError: they are damaged.
+    """
+    path = shipped_path(SHIPPED)
+    found = load_nesf(path) if path.is_file() else None
+    return found if found is not None and found.model.label_set == label_set else None
 
 
 def save_nesf(weights: NesfWeights, path: Path) -> None:

@@ -1,15 +1,16 @@
 """Refining a map: a network that has seen many maps corrects what the votes say, and labels surface without votes.
 
-The map is read in tiles, so that memory does not grow with it. The network sees 0.8 m far, and tiles overlap by more.
+The map is read in tiles, so that memory does not grow with it. The network sees 1.9 m far, and tiles overlap by that.
 What it answers is written back as evidence that reads as exactly that (``views/readout.py``). TSDF, colour and weights
-stay as they are, bit for bit.
+stay as they are, bit for bit. Weights that know where centres of objects are also tell which voxels are one thing
+(``thing_grouping``): some 30 bytes for each voxel of a thing are held until the end for that.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,18 +19,20 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError, WeightsError
 from semantic_mapper.fields.nesf import CELL_M, Cells, Near, Nesf, NesfWeights, SurfacePoints, near_cells, pool
-from semantic_mapper.labels import LabelSet
+from semantic_mapper.labels import STUFF_NAMES, LabelSet
 from semantic_mapper.mapping.files.up_axis import find_up, turn_onto
 from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
 from semantic_mapper.mapping.fusion.evidence import PROBABILITY_FLOOR, STEPS_PER_NAT
+from semantic_mapper.mapping.instance_layer import InstanceLayer, instance_layer
 from semantic_mapper.mapping.storage.block_grid import BlockGrid
 from semantic_mapper.mapping.storage.block_index import find_blocks, pack_keys
 from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE
+from semantic_mapper.mapping.thing_grouping import group_things
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float32, Float64
 
-TILE_M = 6.0
-OVERLAP_M = 1.0
+TILE_M = 8.0
+OVERLAP_M = 1.9
 LARGEST_VOXEL_M = 0.06  # the network knows cells of 4 cm
 BAND_VOXELS = 2.0  # voxels this near the surface are filled, as near as votes reach
 FILL_VOTES = 0.3  # of what is filled: later votes of frames outweigh it
@@ -77,6 +80,7 @@ class RefineReport:
         relabelled: Of them, those with another class than before.
         filled: Those that had no votes and have a class now.
         voted: Whether anything had votes.
+        things: Instances that were told apart; None where the weights do not know about them.
     """
 
     before: dict[str, int]
@@ -85,16 +89,29 @@ class RefineReport:
     relabelled: int
     filled: int
     voted: bool
+    things: int | None = None
 
 
 class _Written(NamedTuple):
-    """New evidence of voxels, not yet in the map: place of their tile, and of each block, voxel, evidence and votes."""
+    """New evidence of voxels, not yet in the map: place of their tile, and of each block, voxel, evidence and votes.
+
+    And of the voxels that are things now: coordinates, channels, and the way to their centres, metres in the world.
+    """
 
     column: int
     key: NDArray[np.int32]
     at: NDArray[np.int64]
     evidence: NDArray[Any]
     votes: Float32
+    things: _Things
+
+
+class _Things(NamedTuple):
+    """Voxels (N, 3) of things, their channels (N,), and the way (N, 3) to their centres, metres along world axes."""
+
+    voxel: NDArray[np.int64]
+    channel: NDArray[np.int64]
+    way_m: Float32
 
 
 def refine(
@@ -127,6 +144,7 @@ def refine(
     frame = up_frame(voxel_map, up)
     counts = _Counts(len(voxel_map.label_set))
     waiting: deque[_Written] = deque()
+    things: list[_Things] = []
     tiles = list(_tiles(voxel_map, tile_m))
     for n, (column, low, high) in enumerate(tiles):
         while waiting and waiting[0].column < column - 1:  # no later tile reads them
@@ -134,14 +152,24 @@ def refine(
         voxels = surface_voxels(voxel_map, frame, low - _overlap(voxel_map), high + _overlap(voxel_map))
         own = np.asarray(((voxels.key >= low) & (voxels.key < high)).all(axis=1), np.bool_)
         if voxels.core.any() and own.any():
-            waiting.append(
-                _refined(voxel_map, weights.model, voxels, own, shared, fill, counts)._replace(column=column)
-            )
+            refined = _refined(voxel_map, weights.model, voxels, own, shared, fill, counts)
+            things.append(refined.things._replace(way_m=refined.things.way_m @ frame.R.astype(np.float32)))
+            waiting.append(refined._replace(column=column))
         on_tile(n + 1, len(tiles))
     for written in waiting:
         _write(voxel_map, written)
     voxel_map.refined = weights.digest
-    return counts.report(voxel_map.label_set)
+    report = counts.report(voxel_map.label_set)
+    if not weights.model.config.centres or not things:
+        return report
+    layer = _layer(things, voxel_map.config.voxel_size_m)
+    voxel_map.instances = layer
+    return replace(report, things=int(layer.number.max(initial=-1)) + 1)
+
+
+def _layer(things: Sequence[_Things], voxel_m: float) -> InstanceLayer:
+    voxel, channel, way = (np.concatenate(parts) for parts in zip(*things, strict=True))
+    return instance_layer(voxel, group_things(voxel, channel, way, voxel_m))
 
 
 def check_refinable(voxel_map: VoxelMap) -> None:
@@ -278,7 +306,8 @@ def _refined(
     near = near_cells(points.xyz[own], cells.cells)
     before = points.log_p[own]
     with torch.inference_mode():
-        said = _answers(model, cells, near, torch.from_numpy(known[own]), torch.from_numpy(theirs)).numpy()
+        answers = _answers(model, cells, near, torch.from_numpy(known[own]), torch.from_numpy(theirs))
+    said, way = (part.numpy() for part in answers)
     voted, reached = voted[own], (near.weights.sum(1) > 0.5).numpy()
     # What the classes have together that the network does not know stays; the rest it shares out.
     together = np.zeros((len(said), 1), np.float32)
@@ -293,22 +322,30 @@ def _refined(
     votes = np.where(voted, points.votes[own], np.float32(FILL_VOTES))[changed]
     core = voxels.core[own]
     old = np.where(voted, before.argmax(axis=1), -1)
-    counts.add(old[core], np.where(changed, after.argmax(axis=1), old)[core])
+    new = np.where(changed, after.argmax(axis=1), old)
+    counts.add(old[core], new[core])
     with voxel_map.locked() as grid:
         dtype = grid.buffers().evidence.dtype
     evidence = evidence_of(after[changed], votes, voxel_map.config.vote_discount, dtype)
-    return _Written(0, voxels.key[own][changed], voxels.at[own][changed], evidence, votes)
+    is_thing = np.append(np.isin(voxel_map.label_set.ids, voxel_map.label_set.thing_ids(STUFF_NAMES)), [False])
+    things = np.flatnonzero(core & is_thing[new])
+    found = _Things(voxels.voxel[own][things], new[things], way[things])
+    return _Written(0, voxels.key[own][changed], voxels.at[own][changed], evidence, votes, found)
 
 
-def _answers(model: Nesf, cells: Cells, near: Near, log_p: torch.Tensor, channels: torch.Tensor) -> torch.Tensor:
-    """Log-probabilities (N, S) of some channels at points."""
+def _answers(
+    model: Nesf, cells: Cells, near: Near, log_p: torch.Tensor, channels: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Log-probabilities (N, S) of some channels at points, and the way (N, 3) to the centre of what they belong to."""
     answer = model(cells)
     parts: list[torch.Tensor] = []
+    ways: list[torch.Tensor] = []
     for start in range(0, len(log_p), ANSWERED_AT_ONCE):
         rows = slice(start, start + ANSWERED_AT_ONCE)
-        logits = model.logits(answer, Near(near.rows[rows], near.weights[rows]), log_p[rows])
+        logits, way = model.read(answer, Near(near.rows[rows], near.weights[rows]), log_p[rows])
         parts.append(torch.log_softmax(logits[:, channels] / model.temperature, dim=1))
-    return torch.cat(parts)
+        ways.append(way)
+    return torch.cat(parts), torch.cat(ways)
 
 
 def _write(voxel_map: VoxelMap, written: _Written) -> None:

@@ -27,6 +27,7 @@ from semantic_mapper.mapping.fusion.depth_bounds import NO_BOUNDS, depth_bounds
 from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
 from semantic_mapper.mapping.fusion.frame_votes import check_depth, frame_votes, probability_table, trusted_depth
 from semantic_mapper.mapping.fusion.fuse import fuse_blocks, make_limits
+from semantic_mapper.mapping.instance_layer import InstanceLayer
 from semantic_mapper.mapping.map_scale import require_same_scale, scale_name
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints, MapView
 from semantic_mapper.mapping.storage.block_grid import BlockGrid
@@ -61,8 +62,9 @@ class VoxelMap:
     ``frames`` counts what is fused; ``version`` grows with every change and never falls; ``epoch`` counts how often the
     whole map was replaced by another one (``take_over``): blocks may be gone then. ``scale_known`` says whether lengths
     are metres; see ``note_scale``. ``refined`` is the digest of the weights that refined the map (``refine``); empty
-    where none did. ``cleared`` counts the voxels of surfaces that frames saw through, and that were forgotten
-    (``clear_free_space``), in this process.
+    where none did. ``instances`` says which voxels belong to which thing, where that refinement found out; None
+    otherwise, and as soon as anything changes. ``cleared`` counts the voxels of surfaces that frames saw through, and
+    that were forgotten (``clear_free_space``), in this process.
 
     Args:
         config: Voxel size, truncation, caps and limits.
@@ -83,6 +85,7 @@ class VoxelMap:
         self.last_stamp_ns = 0
         self.scale_known = True
         self.refined = ""
+        self.instances: InstanceLayer | None = None
         self.cleared = 0
         self._grid = BlockGrid(
             config.voxel_size_m,
@@ -247,6 +250,7 @@ class VoxelMap:
             MapError: see ``BlockGrid.batches``.
         """
         version = self.version + 1
+        self.instances = None
         for blocks in self._grid.batches(packed):
             yield blocks
             self._grid.mark_changed(blocks, version)
@@ -267,7 +271,7 @@ class VoxelMap:
             self._grid = other._grid
             self.frames, self.last_stamp_ns = other.frames, other.last_stamp_ns
             self.note_scale(other.scale_known)
-            self.refined = other.refined
+            self.refined, self.instances = other.refined, other.instances
             self.version = self._grid.mark_all_changed(self.version + 1, BLOCKS_A_VERSION)
             self.epoch += 1
 
@@ -369,7 +373,7 @@ class VoxelMap:
                 scale=scale_name(self.scale_known),
                 refined=self.refined,
             )
-            return MapSaving(self.locked, manifest)
+            return MapSaving(self.locked, manifest, self.instances)
 
     @classmethod
     def load(cls, path: Path, memory_mb: int | None = None) -> VoxelMap:
@@ -397,6 +401,7 @@ class VoxelMap:
                 with _KERNEL_LOCK:
                     blocks = loaded._grid.fill(pack_keys(keys), values)
                     loaded._grid.mark_changed(blocks, saved.frames)
+            loaded.instances = reader.instances()
         loaded.frames = loaded.version = saved.frames
         loaded.last_stamp_ns = saved.last_stamp_ns
         loaded.note_scale(saved.scale_known)

@@ -32,7 +32,21 @@ def find_components(surface: ClassSurface, min_voxels: int) -> Components:
     used = np.diff(surface.start) > 0
     node, first = np.full((int(used.sum()), 512), -1, np.int32), np.empty(count, np.int64)
     connect_voxels(surface.packed, surface.start, surface.voxel, surface.label, np.cumsum(used) - 1, node, first)
+    return _kept(first, min_voxels)
+
+
+def components_of(number: NDArray[np.int64], min_voxels: int) -> Components:
+    """Surface voxels (N,) of the same number, whether they touch or not; -1 belongs to none."""
+    _, index, inverse = np.unique(number, return_index=True, return_inverse=True)
+    return _kept(index[inverse.reshape(-1)], min_voxels, number >= 0)
+
+
+def _kept(first: NDArray[np.int64], min_voxels: int, wanted: NDArray[np.bool_] | None = None) -> Components:
+    """The components that are large enough, given the first voxel (N,) of each voxel's; of ``wanted`` (N,) ones."""
+    count = len(first)
     sizes = np.bincount(first, minlength=count)  # at the first voxel of each component
+    if wanted is not None:
+        sizes = sizes * wanted
     large = np.flatnonzero(sizes >= min_voxels)
     number = np.full(count, -1, np.int64)
     number[large] = np.arange(len(large))

@@ -18,7 +18,7 @@ from semantic_mapper.mapping.storage.block_index import unpack_keys
 from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_direction
 from semantic_mapper.queries.class_surface import ClassSurface, class_surface
-from semantic_mapper.queries.components import Components, find_components
+from semantic_mapper.queries.components import Components, components_of, find_components
 from semantic_mapper.queries.oriented_box import OrientedBox, upright_box
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.types import Float64, Int32, Int64
@@ -29,7 +29,7 @@ LEAST_OVERLAP = 0.1  # of an instance's voxels must be found again in what it be
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Instance:
-    """One thing: a connected piece of surface of one class.
+    """One thing: a connected piece of surface of one class, or what a refined map has as a thing of its own.
 
     Args:
         id: Above 0; stays with the thing from update to update, and is never given to another.
@@ -116,7 +116,7 @@ class InstanceTracker:
         with self._lock:
             last = self._last
             surface = class_surface(snapshot, wanted, last.surface if last else None)
-            found = find_components(surface, self._min_voxels)
+            found = _find_things(snapshot, surface, self._min_voxels)
             sizes = np.diff(found.ends, prepend=0)
             ids, same = np.zeros(len(sizes), np.int64), np.full(len(sizes), -1, np.int64)
             if last:
@@ -188,6 +188,17 @@ class InstanceTracker:
             unpack_keys(surface.packed[row[part]]) * 8 + within,
             float(snapshot.measured(snapshot.slots[row[part]].astype(np.int64), voxel.astype(np.int64)).mean()),
         )
+
+
+def _find_things(snapshot: MapSnapshot, surface: ClassSurface, min_voxels: int) -> Components:
+    """Connected pieces of one class; or, of a map that says itself which voxels belong to which thing, those things."""
+    if snapshot.instances is None:
+        return find_components(surface, min_voxels)
+    keys = np.repeat(surface.packed, np.diff(surface.start))
+    within = np.stack((surface.voxel & 7, (surface.voxel >> 3) & 7, surface.voxel >> 6), axis=1)
+    number = snapshot.instances.at(unpack_keys(keys).astype(np.int64) * 8 + within)
+    # A thing has one class; a voxel that reads as another since it is too unsure of its own belongs to none.
+    return components_of(np.where(number >= 0, number * 256 + surface.label, -1), min_voxels)
 
 
 @kernel

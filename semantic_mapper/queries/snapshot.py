@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.mapping.instance_layer import InstanceLayer
 from semantic_mapper.mapping.storage.block_index import BlockIndex, unpack_keys
 from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS, TSDF_STEPS, BlockChanges, oldest_first
 from semantic_mapper.types import Bool, Float32, UInt8
@@ -53,6 +54,7 @@ class MapSnapshot:
         index: The same as a table for compiled code.
         voxels: Memory shared with other snapshots; only ``slots`` of it belong to this one.
         scale_known: Whether lengths are metres.
+        instances: Which voxels belong to which thing; None = not known.
     """
 
     version: int
@@ -67,6 +69,7 @@ class MapSnapshot:
     index: BlockIndex
     voxels: BlockVoxels
     scale_known: bool = True
+    instances: InstanceLayer | None = None
 
     @property
     def block_count(self) -> int:

@@ -14,30 +14,43 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from semantic_mapper.config import AtLeastOne, Config, Fraction, NotNegative, Positive, to_plain
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, confusion_of
-from semantic_mapper.fields.nesf import CELL_M, Nesf, NesfConfig, NesfWeights, SurfacePoints, near_cells, pool
-from semantic_mapper.fields.sparse_conv import find_rows, pack_cells
+from semantic_mapper.fields.nesf import (
+    CELL_M,
+    FARTHEST_M,
+    Cells,
+    Nesf,
+    NesfConfig,
+    NesfWeights,
+    SurfacePoints,
+    near_cells,
+    pool,
+)
+from semantic_mapper.fields.sparse_conv import pack_cells
 from semantic_mapper.files import write_bytes
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.training.losses import RAREST, semantic_loss
+from semantic_mapper.training.losses import RAREST
 from semantic_mapper.training.recipe import provenance
 from semantic_mapper.training.schedule import budget_fraction
 from semantic_mapper.training.train_checks import check_nothing_is_overwritten
 from semantic_mapper.training.train_state import LOSS_PARTS, Progress, load_state, save_state
 
 STATE_FILE = "state.safetensors"
-MOST_COUNT = 4  # pixels that one voxel counts for
 CUBE_M = 1.0
 TEMPERATURES = np.geomspace(0.5, 3.0, 40)
 NEVER_STORED = ("seconds", "steps", "logs", "save_every_s")  # may differ when a run goes on
+WARM_UP = 0.03  # fraction of the budget over which the learning rate rises
+LAST_RATE = 0.02  # fraction of the learning rate that is left at the end
+LEAST_LABELLED = 100  # voxels of a crop that are worth a step
 
 
 class NesfTrainConfig(Config, frozen=True):
@@ -45,29 +58,41 @@ class NesfTrainConfig(Config, frozen=True):
 
     kind: str = "nesf"
     field: NesfConfig = NesfConfig()
-    rooms: NotNegative = 100  # procedural rooms to map, from ``first_seed`` on
-    validation_rooms: NotNegative = 10
+    rooms: NotNegative = 62  # procedural rooms to map, from ``first_seed`` on
+    validation_rooms: NotNegative = 8
     first_seed: NotNegative = 50_000  # S-Ray's weights were trained on rooms below: on those its votes are too sure
     logs: tuple[str, ...] = ()  # labelled logs with depth, in place of rooms; the last tenth of them validates
     maps: str = ""  # folder of the maps that are made of them; empty = "maps" in the run's folder
     weights: str = ""  # of the field that maps; empty = those that ship
     seconds: float = 0.0  # of training; 0 = only steps count
-    steps: NotNegative = 3000
-    crops: AtLeastOne = 2  # a step
-    crop_m: Positive = 3.2  # side of a crop, of full height
-    hits: AtLeastOne = 8192  # of a crop that are compared
-    learning_rate: Positive = 1e-3
-    final_learning_rate: Positive = 1e-5
-    balance: Fraction = 0.25  # a class counts by its fraction of the hits to the power of minus this
-    smoothness: Fraction = 0.1
-    smooth_points: AtLeastOne = 2048
-    smooth_m: Positive = 0.05
-    no_votes: Fraction = 0.15  # of crops that lose all votes
-    cubes: Fraction = 0.3  # of crops that lose those of half of their cubes of 1 m
+    steps: NotNegative = 2000  # of one map each
+    crop_voxels: AtLeastOne = 60_000  # of larger maps, those nearest to a point of theirs
+    labelled_voxels: AtLeastOne = 16_384  # of a crop that are compared
+    learning_rate: Positive = 3e-3
+    weight_decay: NotNegative = 0.01
+    balance: Fraction = 0.25  # a class counts by its fraction of all maps' voxels to the power of minus this
+    centres: NotNegative = 1.0  # weight of the distance to objects' centres, where maps have instances
+    no_votes: Fraction = 0.1  # of crops that lose all votes
+    cubes: Fraction = 0.3  # of crops that lose those of some of their cubes of 1 m
+    cubes_lost: Fraction = 0.3  # of the cubes
     no_colour: Fraction = 0.3
-    validate_every: AtLeastOne = 250  # steps
+    validate_every: AtLeastOne = 200  # steps
     save_every_s: Positive = 120.0
     seed: NotNegative = 0
+
+
+class VoxelLabels(NamedTuple):
+    """Labelled voxels of a map, each once, by most of its pixels.
+
+    Args:
+        row: (V,) int64 of the map's points.
+        channel: (V,) int64 class.
+        thing: (V,) int64 number of its object from 0; -1 = none is known.
+    """
+
+    row: NDArray[np.int64]
+    channel: NDArray[np.int64]
+    thing: NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,13 +103,25 @@ class TrainingMap:
         points: Voxels that make up the cells (``mapping.refine``).
         row: (H,) int64 of ``points`` that a labelled pixel's ray meets.
         channel: (H,) int64 its class; a voxel may stand here with several.
+        instance: (H,) int64 number of the pixel's object, from 1; 0 = not known, or no countable thing.
         count: (H,) float32 pixels.
     """
 
     points: SurfacePoints
     row: NDArray[np.int64]
     channel: NDArray[np.int64]
+    instance: NDArray[np.int64]
     count: NDArray[np.float32]
+
+    @property
+    def voxels(self) -> VoxelLabels:
+        """The labels of its voxels."""
+        order = np.lexsort((self.count, self.row))
+        last = order[np.append(np.diff(self.row[order]) > 0, [True])]
+        found = np.stack((self.channel, self.instance))[:, last]
+        _, number = np.unique(found, axis=1, return_inverse=True)
+        thing = np.where(found[1] > 0, number.reshape(-1), -1)
+        return VoxelLabels(self.row[last], found[0], thing)
 
     def save(self, path: Path) -> None:
         """Write to a compressed .npz, in half precision where that is enough; whole or not at all."""
@@ -100,6 +137,7 @@ class TrainingMap:
             votes=p.votes.astype(np.float16),
             row=self.row.astype(np.int32),
             channel=self.channel.astype(np.uint8),
+            instance=self.instance.astype(np.uint16),
             count=self.count.astype(np.float16),
         )
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -116,8 +154,8 @@ class TrainingMap:
             with np.load(path) as stored:
                 points = SurfacePoints(*(stored[name] for name in SurfacePoints._fields))
                 points = points._replace(rgb=(points.rgb / np.float32(255)).astype(np.float16))
-                row, channel = stored["row"].astype(np.int64), stored["channel"].astype(np.int64)
-                return cls(points, row, channel, stored["count"].astype(np.float32))
+                row, channel, instance = (stored[name].astype(np.int64) for name in ("row", "channel", "instance"))
+                return cls(points, row, channel, instance, stored["count"].astype(np.float32))
         except (KeyError, ValueError, OSError) as error:
             raise WeightsError(f"{path}: not a training map ({error}); delete it, and it is made again") from error
 
@@ -160,9 +198,14 @@ def train_nesf(
     if config.steps <= 0 and config.seconds <= 0:
         raise ConfigError("training needs a budget: set steps or seconds")
     torch.manual_seed(config.seed)
-    model = Nesf(label_set, config.field)
+    labels = [map_.voxels for map_ in maps]
+    centres = config.centres > 0 and any((found.thing >= 0).any() for found in labels)
+    model = Nesf(label_set, replace(config.field, centres=centres))
     model.start_smoothed()
-    optimiser = torch.optim.Adam(model.parameters(), lr=config.learning_rate, betas=(0.9, 0.99))
+    optimiser = torch.optim.AdamW(
+        model.parameters(), lr=config.learning_rate, betas=(0.9, 0.99), weight_decay=config.weight_decay
+    )
+    weight = _class_weights(labels, len(label_set), config.balance)
     identity = {k: v for k, v in to_plain(config).items() if k not in NEVER_STORED}
     progress = Progress(torch.zeros(len(LOSS_PARTS), dtype=torch.float64))
     state = None if folder is None else folder / STATE_FILE
@@ -180,10 +223,12 @@ def train_nesf(
         progress.finished = fraction >= 1
         if progress.finished:
             break
-        rate = config.learning_rate * (config.final_learning_rate / config.learning_rate) ** fraction
+        rate = config.learning_rate * (LAST_RATE + (1 - LAST_RATE) * (0.5 + 0.5 * np.cos(np.pi * fraction)))
         for group in optimiser.param_groups:
-            group["lr"] = rate * min(1.0, progress.step / 50 + 0.1)
-        loss = _step(model, optimiser, maps, config, progress.step)
+            group["lr"] = rate * min(1.0, 0.1 + fraction / WARM_UP)
+        number = _map_of_step(progress.step, len(maps), config.seed)
+        crop = _crop(maps[number].points, labels[number], config, np.random.default_rng((config.seed, progress.step)))
+        loss = _step(model, optimiser, crop, weight, config, progress.step)
         mean_loss += (loss - mean_loss) * max(0.02, 1 / (progress.step + 1))
         progress.step += 1
         if progress.step % config.validate_every == 0:
@@ -221,78 +266,126 @@ def _note_validation(progress: Progress, model: Nesf, validation: Sequence[Train
     return found["miou"]
 
 
+def _class_weights(labels: Sequence[VoxelLabels], classes: int, balance: float) -> torch.Tensor:
+    """(L,) what a voxel of each class counts; the mean over all voxels is 1."""
+    fraction = np.bincount(np.concatenate([found.channel for found in labels]), minlength=classes).astype(np.float64)
+    fraction /= max(fraction.sum(), 1)
+    weight = (fraction + RAREST) ** -balance
+    return torch.from_numpy(weight / max(float(fraction @ weight), 1e-9)).float()
+
+
+def _map_of_step(step: int, count: int, seed: int) -> int:
+    """Each map once, in an order drawn anew, then each again."""
+    return int(np.random.default_rng((seed, step // count, 1)).permutation(count)[step % count])
+
+
+class _Crop(NamedTuple):
+    """A part of a map, changed at random: cells, and of V voxels what the map says and what the labels say.
+
+    Args:
+        cells: Of all voxels of the part.
+        xyz: (V, 3) in cells.
+        log_p: (V, L).
+        channel: (V,).
+        way: (V, 3) float32 metres to their objects' centres, at most ``FARTHEST_M`` long.
+        share: (V,) float32 what each counts in the loss of that; 0 = its object is not known.
+    """
+
+    cells: Cells
+    xyz: NDArray[np.float32]
+    log_p: torch.Tensor
+    channel: torch.Tensor
+    way: torch.Tensor
+    share: torch.Tensor
+
+
+def _crop(
+    points: SurfacePoints, labels: VoxelLabels, config: NesfTrainConfig, rng: np.random.Generator
+) -> _Crop | None:
+    """A part of a map, turned about z, mirrored, stretched and shifted, some of it withheld; None: hardly a label."""
+    kept = _nearest_voxels(points.xyz, config.crop_voxels, rng)
+    row_here = np.full(len(points.xyz), -1, np.int64)
+    row_here[kept] = np.arange(len(kept))
+    inside = np.flatnonzero(row_here[labels.row] >= 0)
+    if len(inside) < LEAST_LABELLED:
+        return None
+    move = _random_move(rng)
+    stretch = float(np.linalg.norm(move[2]))
+    part = SurfacePoints(*(values[kept].astype(np.float32) for values in points))
+    xyz = (part.xyz @ move.T + rng.uniform(0, 2, 3)).astype(np.float32)
+    height = part.height_m * np.float32(stretch) + np.float32(rng.normal(0, 0.03))
+    part = withhold(_other_colours(part._replace(xyz=xyz, height_m=height), rng), config, rng)
+
+    centre, size = _centres(points.xyz[labels.row], labels.thing)  # of whole objects, whatever the part has of them
+    chosen = rng.choice(inside, min(config.labelled_voxels, len(inside)), replace=False)
+    rows = row_here[labels.row[chosen]]
+    way = (centre[chosen] - points.xyz[labels.row[chosen]].astype(np.float32)) @ move.T * CELL_M
+    length = np.linalg.norm(way, axis=1, keepdims=True)
+    way *= np.minimum(1, FARTHEST_M / np.maximum(length, 1e-6))
+    share = np.where(labels.thing[chosen] >= 0, np.maximum(size[chosen], 1) ** -0.5, 0)
+    return _Crop(
+        pool(part),
+        part.xyz[rows],
+        torch.from_numpy(part.log_p[rows]),
+        torch.from_numpy(labels.channel[chosen]),
+        torch.from_numpy(way.astype(np.float32)),
+        torch.from_numpy(share.astype(np.float32)),
+    )
+
+
+def _nearest_voxels(xyz: NDArray[Any], most: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """At most this many of the voxels: an upright square round one of them."""
+    if len(xyz) <= most:
+        return np.arange(len(xyz))
+    apart = np.abs(xyz[:, :2] - xyz[rng.integers(len(xyz)), :2]).max(axis=1)
+    return np.flatnonzero(apart <= np.partition(apart, most - 1)[most - 1])
+
+
+def _random_move(rng: np.random.Generator) -> NDArray[np.float64]:
+    """(3, 3): turned about z, mirrored half of the time, stretched by up to a tenth."""
+    angle = rng.uniform(0, 2 * np.pi)
+    c, s = np.cos(angle), np.sin(angle)
+    turned = np.array(((c, -s, 0), (s, c, 0), (0, 0, 1)))
+    return turned @ np.diag((rng.choice((-1.0, 1.0)), 1.0, 1.0)) * rng.uniform(0.9, 1.1)
+
+
+def _other_colours(points: SurfacePoints, rng: np.random.Generator) -> SurfacePoints:
+    """As under another light."""
+    seen = points.rgb.any(axis=1, keepdims=True)
+    rgb = points.rgb * (rng.uniform(0.7, 1.3) * rng.uniform(0.9, 1.1, 3)) + rng.uniform(-0.1, 0.1)
+    return points._replace(rgb=np.where(seen, np.clip(rgb, 1e-3, 1), 0).astype(np.float32))
+
+
+def _centres(xyz: NDArray[Any], thing: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Mean (V, 3) of the voxels of each voxel's object, and how many (V,) it has."""
+    size = np.bincount(thing + 1)
+    sums = np.stack([np.bincount(thing + 1, xyz[:, axis]) for axis in range(3)], axis=1)
+    return (sums / np.maximum(size, 1)[:, None])[thing + 1].astype(np.float32), size[thing + 1]
+
+
 def _step(
-    model: Nesf, optimiser: torch.optim.Optimizer, maps: Sequence[TrainingMap], config: NesfTrainConfig, step: int
+    model: Nesf,
+    optimiser: torch.optim.Optimizer,
+    crop: _Crop | None,
+    weight: torch.Tensor,
+    config: NesfTrainConfig,
+    step: int,
 ) -> float:
-    rng = np.random.default_rng((config.seed, step))
+    if crop is None:
+        return 0.0
     optimiser.zero_grad()
-    total = 0.0
-    for _ in range(config.crops):
-        loss = _crop_loss(model, maps[int(rng.integers(len(maps)))], config, rng) / config.crops
-        loss.backward()
-        total += float(loss.detach())
+    logits, way = model.read(model(crop.cells), near_cells(crop.xyz, crop.cells.cells), crop.log_p)
+    loss = torch.nn.functional.cross_entropy(logits, crop.channel, weight)
+    if config.centres > 0 and bool((crop.share > 0).any()):
+        apart = (way - crop.way).norm(dim=1)
+        loss = loss + config.centres * (apart * crop.share).sum() / crop.share.sum()
+    total = float(loss.detach())
     if not np.isfinite(total):
         raise WeightsError(f"the loss of step {step} is {total}: training has diverged; lower learning_rate")
-    torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_(model.parameters(), 5.0)
     optimiser.step()
     return total
-
-
-def _crop_loss(model: Nesf, map_: TrainingMap, config: NesfTrainConfig, rng: np.random.Generator) -> torch.Tensor:
-    """Loss of one crop, turned about z and shifted, some of it withheld."""
-    xyz = map_.points.xyz
-    centre = xyz[map_.row[rng.integers(len(map_.row))], :2]
-    kept = np.flatnonzero((np.abs(xyz[:, :2] - centre) < config.crop_m / 2 / CELL_M).all(axis=1))
-    points = withhold(SurfacePoints(*(v[kept].astype(np.float32) for v in map_.points)), config, rng)
-    upright = points.xyz  # as the map has it
-    turned = _turned(upright - np.append(centre, 0), rng.uniform(0, 2 * np.pi)) + rng.uniform(0, 1, 3)
-    points = points._replace(xyz=turned.astype(np.float32))
-    cells = pool(points)
-    answer = model(cells)
-
-    row_here = np.full(len(xyz), -1, np.int64)
-    row_here[kept] = np.arange(len(kept))
-    hits = np.flatnonzero(row_here[map_.row] >= 0)
-    hits = rng.choice(hits, min(config.hits, len(hits)), replace=False)
-    rows, channel = row_here[map_.row[hits]], torch.from_numpy(map_.channel[hits])
-    logits = _logits(model, answer, points, cells.cells, rows)
-    count = torch.from_numpy(np.minimum(map_.count[hits], MOST_COUNT))
-    fraction = torch.bincount(channel, count, len(model.label_set)) / count.sum()
-    weight = count * ((fraction + RAREST) ** -config.balance)[channel].float()
-    loss = semantic_loss(logits, channel, weight)
-    if config.smoothness <= 0:
-        return loss
-    return loss + config.smoothness * _roughness(model, answer, points, cells.cells, upright, rows, config, rng)
-
-
-def _roughness(
-    model: Nesf,
-    answer: torch.Tensor,
-    points: SurfacePoints,
-    cells: NDArray[np.int64],
-    upright: NDArray[np.float32],
-    rows: NDArray[np.int64],
-    config: NesfTrainConfig,
-    rng: np.random.Generator,
-) -> torch.Tensor:
-    """Squared distance of class probabilities at points and at others some centimetres off."""
-    here = rows[rng.integers(len(rows), size=config.smooth_points)]
-    moved = upright[here] + rng.normal(0, config.smooth_m / CELL_M, (len(here), 3))
-    keys = pack_cells(np.floor(2 * upright).astype(np.int64))
-    order = np.argsort(keys, kind="stable")
-    place = find_rows(keys[order], pack_cells(np.floor(2 * moved).astype(np.int64)))
-    there = place < len(keys)
-    if not there.any():
-        return answer.sum() * 0
-    first = torch.softmax(_logits(model, answer, points, cells, here[there]), dim=1)
-    second = torch.softmax(_logits(model, answer, points, cells, order[place[there]]), dim=1)
-    return ((first - second) ** 2).sum(dim=1).mean()
-
-
-def _logits(
-    model: Nesf, answer: torch.Tensor, points: SurfacePoints, cells: NDArray[np.int64], rows: NDArray[np.int64]
-) -> torch.Tensor:
-    return model.logits(answer, near_cells(points.xyz[rows], cells), torch.from_numpy(points.log_p[rows]))
 
 
 def withhold(points: SurfacePoints, config: NesfTrainConfig, rng: np.random.Generator) -> SurfacePoints:
@@ -307,14 +400,9 @@ def withhold(points: SurfacePoints, config: NesfTrainConfig, rng: np.random.Gene
         cube = np.floor(points.xyz / (CUBE_M / CELL_M) + rng.uniform(0, 1, 3)).astype(np.int64)
         _, member = np.unique(pack_cells(cube), return_inverse=True)
         member = member.reshape(-1)
-        gone = (rng.random(member.max(initial=0) + 1) < 0.5)[member]
+        gone = (rng.random(member.max(initial=0) + 1) < config.cubes_lost)[member]
     log_p = np.where(gone[:, None], np.float32(0), points.log_p)
     return points._replace(log_p=log_p, votes=np.where(gone, np.float32(0), points.votes))
-
-
-def _turned(xyz: NDArray[Any], angle: float) -> NDArray[Any]:
-    c, s = np.cos(angle), np.sin(angle)
-    return xyz @ np.array(((c, s, 0), (-s, c, 0), (0, 0, 1)))
 
 
 @torch.inference_mode()
@@ -350,10 +438,9 @@ def _temperature(model: Nesf, maps: Sequence[TrainingMap]) -> float:
 def _map_logits(model: Nesf, map_: TrainingMap) -> tuple[torch.Tensor, torch.Tensor, NDArray[np.int64]]:
     """Logits and the map's log-probabilities (V, L) at labelled voxels, and the class (V,) of most of their pixels."""
     points = SurfacePoints(*(v.astype(np.float32) for v in map_.points))
-    order = np.lexsort((map_.count, map_.row))
-    last = np.append(np.diff(map_.row[order]) > 0, [True])
-    rows, channel = map_.row[order][last], map_.channel[order][last]
+    rows, channel, _ = map_.voxels
     cells = pool(points)
-    answer = model(cells)
-    logits = _logits(model, answer, points, cells.cells, rows)
+    logits, _ = model.read(
+        model(cells), near_cells(points.xyz[rows], cells.cells), torch.from_numpy(points.log_p[rows])
+    )
     return logits, torch.from_numpy(points.log_p[rows]), channel

@@ -11,11 +11,14 @@ from msgspec.structs import replace
 
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.errors import MapError, WeightsError
-from semantic_mapper.fields.nesf import Nesf, NesfConfig, NesfWeights
+from semantic_mapper.fields.nesf import Nesf, NesfConfig, NesfWeights, smoothed_votes
 from semantic_mapper.labels import NYU40, ROOMS, LabelSet, make_label_set
+from semantic_mapper.mapping.instance_layer import instance_layer
 from semantic_mapper.mapping.refine import FILL_VOTES, check_refinable, evidence_of, refine
 from semantic_mapper.mapping.views.readout import decide
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.queries.instances import InstanceTracker
+from semantic_mapper.queries.mirror import MapMirror
 from tests.small import tiny_frames
 
 UP = np.array((0.0, 0.0, 1.0))
@@ -105,6 +108,8 @@ def test_tiles_give_what_the_whole_gives() -> None:
     a, b = whole.block_state(), tiled.block_state()
     np.testing.assert_array_equal(a["votes"], b["votes"])
     np.testing.assert_allclose(a["evidence"], b["evidence"], atol=1e-3)
+    assert whole.instances is not None and tiled.instances is not None
+    assert (np.isin(whole.instances.packed, tiled.instances.packed)).mean() > 0.99
 
 
 def test_a_map_with_blocks_on_disk_is_refined_alike() -> None:
@@ -120,12 +125,63 @@ def test_the_file_says_by_what_it_was_refined_and_other_files_say_nothing(tmp_pa
     voxel_map = make_map()
     voxel_map.save(tmp_path / "plain.npz")
     assert b"refined" not in (tmp_path / "plain.npz").read_bytes()
+    assert b"instances" not in (tmp_path / "plain.npz").read_bytes()
     refine(voxel_map, random_weights(), up=UP)
     voxel_map.save(tmp_path / "refined.npz")
     again = VoxelMap.load(tmp_path / "refined.npz")
     assert again.refined == "ab" * 32
     with pytest.raises(MapError, match="refined already, with weights of digest abababababab"):
         refine(again, random_weights(), up=UP)
+
+
+def test_things_of_a_refined_map_are_in_its_file_and_answer_queries(tmp_path: Path) -> None:
+    voxel_map = make_map()
+    report = refine(voxel_map, random_weights(), up=UP)
+    assert voxel_map.instances is not None and report.things == len(np.unique(voxel_map.instances.number)) > 3
+    voxel_map.save(tmp_path / "refined.npz")
+    again = VoxelMap.load(tmp_path / "refined.npz")
+    assert again.instances is not None
+    np.testing.assert_array_equal(again.instances.packed, voxel_map.instances.packed)
+    np.testing.assert_array_equal(again.instances.number, voxel_map.instances.number)
+
+    found = InstanceTracker(min_voxels=5).update(MapMirror.of(again).snapshot())
+    assert len(found) > 3
+    for thing in found:
+        numbers = again.instances.at(thing.voxels)
+        assert (numbers == numbers[0]).all() and numbers[0] >= 0
+        others = again.instances.at(np.concatenate([t.voxels for t in found if t is not thing]))
+        assert numbers[0] not in others
+
+
+def test_things_that_lie_apart_are_one_where_the_map_says_so() -> None:
+    voxel_map = make_map()
+    plain = InstanceTracker(min_voxels=1).update(MapMirror.of(voxel_map).snapshot())
+    chairs = [thing for thing in plain if thing.class_name == plain[0].class_name]
+    assert len(chairs) > 1
+    together = np.concatenate([thing.voxels for thing in chairs])
+    voxel_map.instances = instance_layer(together, np.zeros(len(together), np.int64))
+    (found,) = InstanceTracker(min_voxels=1).update(MapMirror.of(voxel_map).snapshot())
+    assert len(found.voxels) == len(together) and found.class_name == chairs[0].class_name
+
+
+def test_things_are_forgotten_when_the_map_changes_or_is_merged(tmp_path: Path) -> None:
+    voxel_map = make_map()
+    refine(voxel_map, random_weights(), up=UP)
+    mirror = MapMirror.of(voxel_map)
+    assert mirror.snapshot().instances is not None
+    assert voxel_map.merged(make_map(), np.eye(4)).instances is None
+    frame = tiny_frames()[0]
+    voxel_map.integrate(frame, frame.depth_m, None)
+    assert voxel_map.instances is None
+    assert mirror.apply(voxel_map.changes(mirror.version)).instances is None
+    voxel_map.save(tmp_path / "later.npz")
+    assert b"instances" not in (tmp_path / "later.npz").read_bytes()
+
+
+def test_weights_that_know_no_centres_leave_instances_to_queries() -> None:
+    voxel_map = make_map()
+    report = refine(voxel_map, smoothed_votes(ROOMS), up=UP)
+    assert report.things is None and voxel_map.instances is None
 
 
 def test_a_map_without_votes_is_labelled_and_the_report_says_so() -> None:

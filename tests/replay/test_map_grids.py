@@ -36,5 +36,6 @@ def test_rooms_become_training_maps(tmp_path: Path) -> None:
     found = TrainingMap.load(path)
     assert len(found.points.xyz) > 1000 and found.points.log_p.shape[1] == len(ROOMS)
     assert found.row.max() < len(found.points.xyz) and len(np.unique(found.channel)) > 3
+    assert len(np.unique(found.instance)) > 3 and (found.instance[found.channel == 0] == 0).all()
     floor = found.row[found.channel == ROOMS.names.index("floor")]
     assert np.abs(np.median(found.points.height_m[floor])) < 0.1

@@ -27,12 +27,14 @@ from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.files import atomic_write, open_regular
 from semantic_mapper.mapping.files.map_manifest import (
     MEND,
+    InstanceTable,
     MapChunk,
     MapManifest,
     digest,
     encode_manifest,
     parse_manifest,
 )
+from semantic_mapper.mapping.instance_layer import InstanceLayer
 from semantic_mapper.mapping.storage.block_index import KEY_LIMIT, pack_keys
 from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS, BlockValues
 from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE
@@ -55,17 +57,21 @@ _ARRAYS = {  # name -> dtype; in the order of the file
     "evidence": "<f4",  # (V, L); of ``voxel_map.evidence`` "int16" "<i2"
     "votes": "<f4",  # (V,)
 }
+_INSTANCES = {"packed": "<i8", "number": "<i4"}  # (N,) each, of ``InstanceLayer``; only where there is one
 _EVIDENCE = {"float32": "<f4", "int16": "<i2"}
 _UNREADABLE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError, OSError)
 
 
-def write_map(path: Path, manifest: MapManifest, parts: Iterable[BlockPart]) -> MapManifest:
+def write_map(
+    path: Path, manifest: MapManifest, parts: Iterable[BlockPart], instances: InstanceLayer | None = None
+) -> MapManifest:
     """Write a map, replacing a file of that name in one step.
 
     Args:
         path: The file.
         manifest: Its settings, classes and counters; what depends on the blocks is filled in here.
         parts: Blocks in lexicographic order, ``CHUNK_BLOCKS`` at a time and at last the rest.
+        instances: Of the map, if it has them.
 
     Returns:
         The manifest as written.
@@ -86,7 +92,10 @@ def write_map(path: Path, manifest: MapManifest, parts: Iterable[BlockPart]) -> 
                 corners += [keys.min(axis=0), keys.max(axis=0) + 1]
             blocks = sum(chunk.blocks for chunk in chunks)
             bounds = _bounds_m(corners, manifest.config.voxel_size_m)
-            manifest = msgspec.structs.replace(manifest, blocks=blocks, bounds_m=bounds, chunks=tuple(chunks))
+            table = None if instances is None else _write_instances(archive, instances)
+            manifest = msgspec.structs.replace(
+                manifest, blocks=blocks, bounds_m=bounds, chunks=tuple(chunks), instances=table
+            )
             content = encode_manifest(manifest)
             with archive.open(_MANIFEST, "w") as member:
                 member.write(content)
@@ -159,28 +168,46 @@ class MapReader:
             last = int(packed[-1])
             yield keys, values
 
+    def instances(self) -> InstanceLayer | None:
+        """Which voxels belong to which thing; None where the map does not say.
+
+        Raises:
+            MapError: what it says is damaged.
+        """
+        table = self.manifest.instances
+        if table is None:
+            return None
+        where = f"{self._path}: its instances"
+        shapes = dict.fromkeys(_INSTANCES, (table.voxels,))
+        layer = InstanceLayer(**self._read_arrays("instances", shapes, _INSTANCES, table.sha256, where))
+        if not layer.is_sound:
+            raise MapError(f"{where}: voxels are not in order, or numbers are negative. {MEND}")
+        return layer
+
     def _read_chunk(self, n: int, chunk: MapChunk, where: str) -> dict[str, NDArray[Any]]:
+        shapes = _shapes(chunk, len(self.manifest.label_set))
+        return self._read_arrays(f"{n:06d}", shapes, _dtypes(self.manifest), chunk.sha256, where)
+
+    def _read_arrays(
+        self, folder: str, shapes: dict[str, tuple[int, ...]], dtypes: dict[str, str], sha256: str, where: str
+    ) -> dict[str, NDArray[Any]]:
         arrays: dict[str, NDArray[Any]] = {}
-        hashed, dtypes = hashlib.sha256(), _dtypes(self.manifest)
-        for name, shape in _shapes(chunk, len(self.manifest.label_set)).items():
+        hashed = hashlib.sha256()
+        for name, shape in shapes.items():
             head = _npy_head(dtypes[name], shape)
             size = len(head) + int(np.prod(shape)) * np.dtype(dtypes[name]).itemsize
-            content = _read_member(self._archive, _member(n, name), size, f"{where}: {name}")
+            content = _read_member(self._archive, f"{folder}/{name}.npy", size, f"{where}: {name}")
             if not content.startswith(head):
                 raise MapError(f"{where}: {name} is not an array {dtypes[name]} of shape {shape}. {MEND}")
             hashed.update(content)
             arrays[name] = np.frombuffer(content, dtypes[name], offset=len(head)).reshape(shape)
-        if hashed.hexdigest() != chunk.sha256:
+        if hashed.hexdigest() != sha256:
             raise MapError(f"{where} is damaged: its SHA-256 is not the manifest's. {MEND}")
         return arrays
 
 
 def _dtypes(manifest: MapManifest) -> dict[str, str]:
     return {**_ARRAYS, "evidence": _EVIDENCE[manifest.config.evidence]}
-
-
-def _member(n: int, name: str) -> str:
-    return f"{n:06d}/{name}.npy"
 
 
 def _write_chunk(
@@ -197,14 +224,27 @@ def _write_chunk(
         "evidence": values.evidence[voted],
         "votes": values.votes[voted],
     }
+    found = _write_arrays(archive, f"{n:06d}", arrays, dtypes)
+    return MapChunk(blocks=len(keys), measured=int(measured.sum()), voted=int(voted.sum()), sha256=found)
+
+
+def _write_instances(archive: zipfile.ZipFile, layer: InstanceLayer) -> InstanceTable:
+    found = _write_arrays(archive, "instances", {"packed": layer.packed, "number": layer.number}, _INSTANCES)
+    return InstanceTable(voxels=len(layer.packed), sha256=found)
+
+
+def _write_arrays(
+    archive: zipfile.ZipFile, folder: str, arrays: dict[str, NDArray[Any]], dtypes: dict[str, str]
+) -> str:
+    """Write arrays in the order of ``dtypes``; returns their SHA-256."""
     hashed = hashlib.sha256()
     for name, dtype in dtypes.items():
         array = np.ascontiguousarray(arrays[name], dtype)
-        with archive.open(_member(n, name), "w") as member:
+        with archive.open(f"{folder}/{name}.npy", "w") as member:
             for content in (_npy_head(dtype, array.shape), array.reshape(-1).view(np.uint8).data):
                 hashed.update(content)
                 member.write(content)
-    return MapChunk(blocks=len(keys), measured=int(measured.sum()), voted=int(voted.sum()), sha256=hashed.hexdigest())
+    return hashed.hexdigest()
 
 
 def _unpack(arrays: dict[str, NDArray[Any]], chunk: MapChunk, where: str) -> BlockPart:
@@ -257,7 +297,9 @@ def _read_manifest(path: Path, file: BinaryIO, archive: zipfile.ZipFile) -> MapM
         raise MapError(f"{path}: damaged: it is cut off, or something stands behind its end. {MEND}")
     if archive.comment != _COMMENT + digest(content).encode():
         raise MapError(f"{where} is damaged: its SHA-256 is not the one at the end of the file. {MEND}")
-    if names != [*(_member(n, name) for n in range(len(manifest.chunks)) for name in _ARRAYS), _MANIFEST]:
+    expected = [f"{n:06d}/{name}.npy" for n in range(len(manifest.chunks)) for name in _ARRAYS]
+    expected += [] if manifest.instances is None else [f"instances/{name}.npy" for name in _INSTANCES]
+    if names != [*expected, _MANIFEST]:
         raise MapError(f"{path}: damaged: arrays are missing, or others are there. {MEND}")
     return manifest
 

@@ -37,6 +37,18 @@ class MapChunk(Config, frozen=True):
     sha256: Digest
 
 
+class InstanceTable(Config, frozen=True):
+    """The voxels that belong to things (``instance_layer``).
+
+    Args:
+        voxels: How many.
+        sha256: Of its arrays, in their order.
+    """
+
+    voxels: NotNegative
+    sha256: Digest
+
+
 class MapManifest(Config, frozen=True, kw_only=True):
     """What is known of a saved map without reading its blocks.
 
@@ -50,6 +62,7 @@ class MapManifest(Config, frozen=True, kw_only=True):
         chunks: In the order of the file.
         scale: Whether lengths are metres; not written where they are, so older releases read such maps.
         refined: Digest of the weights that refined the map; empty, and not written, where none did.
+        instances: Which voxels belong to which thing, of maps that were refined so; not written for others.
     """
 
     format: str = FORMAT
@@ -63,6 +76,7 @@ class MapManifest(Config, frozen=True, kw_only=True):
     chunks: tuple[MapChunk, ...] = ()
     scale: Literal["metres", "unknown"] = "metres"
     refined: Digest | Literal[""] = ""
+    instances: InstanceTable | None = None
 
     @property
     def scale_known(self) -> bool:
@@ -77,6 +91,8 @@ def encode_manifest(manifest: MapManifest) -> bytes:
         del plain["scale"]
     if not manifest.refined:
         del plain["refined"]
+    if manifest.instances is None:
+        del plain["instances"]
     return msgspec.json.format(msgspec.json.encode(plain), indent=1)
 
 

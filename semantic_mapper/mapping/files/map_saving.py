@@ -9,6 +9,7 @@ from pathlib import Path
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapping.files.map_file import BlockPart, write_map
 from semantic_mapper.mapping.files.map_manifest import CHUNK_BLOCKS, MapManifest
+from semantic_mapper.mapping.instance_layer import InstanceLayer
 from semantic_mapper.mapping.storage.block_grid import BlockGrid
 from semantic_mapper.mapping.storage.block_index import unpack_keys
 from semantic_mapper.mapping.storage.grid_snapshots import GridSnapshots
@@ -24,11 +25,18 @@ class MapSaving:
     Args:
         locked: Gives the storage of the map, alone; it is held while this is made.
         manifest: Settings, classes and counters of the map.
+        instances: Which voxels belong to which thing, if the map says so.
     """
 
-    def __init__(self, locked: Callable[[], AbstractContextManager[BlockGrid]], manifest: MapManifest) -> None:
+    def __init__(
+        self,
+        locked: Callable[[], AbstractContextManager[BlockGrid]],
+        manifest: MapManifest,
+        instances: InstanceLayer | None = None,
+    ) -> None:
         self._locked = locked
         self._manifest = manifest
+        self._instances = instances
         with locked() as grid:
             self._snapshots = GridSnapshots(grid)
 
@@ -43,7 +51,7 @@ class MapSaving:
             MapError: the file cannot be written; one that was there before is as it was.
         """
         try:
-            manifest = write_map(path, self._manifest, self._parts(between))
+            manifest = write_map(path, self._manifest, self._parts(between), self._instances)
         finally:
             with self._locked():
                 self._snapshots.close()

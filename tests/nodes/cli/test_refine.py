@@ -102,7 +102,7 @@ def test_training_on_maps_goes_on_where_it_stopped(tmp_path: Path) -> None:
     recipe = tmp_path / "tiny.toml"
     recipe.write_text(
         f'kind = "nesf"\nrooms = 1\nvalidation_rooms = 1\nsteps = 4\nmaps = "{tmp_path / "maps"}"\n'
-        "hits = 500\nsmooth_points = 50\nvalidate_every = 2\n[field]\nwidth = 2\n",
+        "labelled_voxels = 500\nvalidate_every = 2\n[field]\nwidth = 2\n",
         encoding="utf-8",
     )
     out = tmp_path / "run"
