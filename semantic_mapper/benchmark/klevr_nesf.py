@@ -41,8 +41,16 @@ from semantic_mapper.types import Float32, PosedFrame, UInt8
 
 _log = get_logger(__name__)
 
-VERSION = 1  # raised by a change of the training: older networks are left alone
-CURVE = (0.2, 0.4, 0.6, 0.8, 1.0)  # fractions of the steps after which the points of novel scenes are classified
+VERSION = 2  # raised by a change of the training: older networks are left alone
+LOOKS = 10  # at the points of novel scenes, spread evenly over the steps
+
+
+class CurvePoint(msgspec.Struct, frozen=True):
+    """The state of a training: mIoU at points of novel scenes, and mean cross-entropy of the last 200 steps."""
+
+    step: int
+    miou_points: float
+    cross_entropy: float
 
 
 def nesf_arms(folder: Path) -> dict[str, Arm]:
@@ -100,12 +108,9 @@ def nesf_scores(config: KlevrConfig, training: GridNesfTraining, folder: Path, v
 
 
 def nesf_network(config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None = None) -> GridNesf:
-    """The network of an arm: read from ``folder``, or trained and kept there.
-
-    The log of its training tells the mIoU at points of novel scenes and the mean cross-entropy of the last 200 steps.
-    """
+    """The network of an arm: read from ``folder``, or trained and kept there, its curve beside it."""
     label_set = KLEVR_SUITE.label_set
-    path = folder / f"nesf-{_network_digest(config, training, views)}.safetensors"
+    path = _network_path(config, training, folder, views)
     if path.exists():
         model = GridNesf(label_set, training.network)
         model.load_state_dict(load_file(path))
@@ -115,18 +120,32 @@ def nesf_network(config: KlevrConfig, training: GridNesfTraining, folder: Path, 
         for s, grid in _grids(config, train_seeds(config), folder, views).items()
     ]
     novel = {s: (g, *surface_points(config, s)) for s, g in _grids(config, novel_seeds(config), folder, views).items()}
-    looks = {round(fraction * training.steps) for fraction in CURVE}
+    looks = {round(k * training.steps / LOOKS) for k in range(1, LOOKS + 1)}
     entropies: list[float] = []
+    curve: list[CurvePoint] = []
 
     def look(step: int, entropy: float, model: GridNesf) -> None:
         entropies.append(entropy)
         if step in looks:
-            miou, recent = _points_miou(model, novel), float(np.mean(entropies[-200:]))
-            _log.info("nesf_trained", step=step, miou_points=round(miou, 4), cross_entropy=round(recent, 4))
+            curve.append(CurvePoint(step, _points_miou(model, novel), float(np.mean(entropies[-200:]))))
+            _log.info("nesf_trained", **{k: round(v, 4) for k, v in msgspec.structs.asdict(curve[-1]).items()})
 
     model = train_grid_nesf(scenes, label_set, training, look)
+    write_bytes(path.with_suffix(".json"), msgspec.json.encode(curve))
     write_bytes(path, save(model.state_dict()))
     return model
+
+
+def nesf_curve(
+    config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None = None
+) -> list[CurvePoint]:
+    """How the kept network of an arm was trained; empty where there is none."""
+    path = _network_path(config, training, folder, views).with_suffix(".json")
+    return msgspec.json.decode(path.read_bytes(), type=list[CurvePoint]) if path.exists() else []
+
+
+def _network_path(config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None) -> Path:
+    return folder / f"nesf-{_network_digest(config, training, views)}.safetensors"
 
 
 def _network_digest(config: KlevrConfig, training: GridNesfTraining, views: int | None) -> str:

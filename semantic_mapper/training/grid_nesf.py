@@ -34,11 +34,11 @@ class GridNesfTraining(Config, frozen=True):
     """How the network is trained; a step sees one scene."""
 
     network: GridNesfConfig = GridNesfConfig()
-    steps: AtLeastOne = 1500
+    steps: AtLeastOne = 2400
     rays: AtLeastOne = 384
     balanced: Fraction = 0.5  # of the rays: of a class that is drawn first; the others are of any pixel
-    first_rate: Positive = 3e-3
-    last_rate: Positive = 1e-4
+    first_rate: Positive = 6e-3
+    last_rate: Positive = 1e-4  # along half a cosine
     rotate: bool = True  # by any angle about z
     smoothness: AtLeastZero = 0.1  # weight of the squared distance of probabilities
     smooth_points: AtLeastOne = 256
@@ -140,12 +140,11 @@ def train_grid_nesf(
     rng = np.random.default_rng((config.seed, 21))
     model = GridNesf(label_set, config.network)
     optimiser = torch.optim.Adam(model.parameters(), config.first_rate, fused=True)
-    decay = math.log(config.last_rate / config.first_rate)
     order: list[int] = []
     for step in range(config.steps):
         order = order or [int(n) for n in rng.permutation(len(scenes))]
         for group in optimiser.param_groups:
-            group["lr"] = config.first_rate * math.exp(decay * step / config.steps)
+            group["lr"] = _rate(config, step / config.steps)
         entropy, rough = _losses(model, scenes[order.pop()], config, rng)
         optimiser.zero_grad()
         (entropy + config.smoothness * rough).backward()
@@ -153,6 +152,11 @@ def train_grid_nesf(
         if on_step is not None:
             on_step(step + 1, float(entropy.detach()), model)
     return model.eval()
+
+
+def _rate(config: GridNesfTraining, fraction: float) -> float:
+    high = (1 + math.cos(math.pi * fraction)) / 2
+    return config.last_rate + (config.first_rate - config.last_rate) * high
 
 
 def _losses(
