@@ -83,6 +83,14 @@ class LabelledScene:
             pick[n] = there[rng.integers(len(there))]
         return pick
 
+    def frequencies(self, count: int, balanced: float) -> NDArray[np.float64]:
+        """(count,) of the classes among rays that ``draw`` gives."""
+        of_all, equal = np.zeros(count), np.zeros(count)
+        for pixels in self.by_class:
+            channel = int(self.channel[pixels[0]])
+            of_all[channel], equal[channel] = len(pixels) / len(self.channel), 1 / len(self.by_class)
+        return (1 - balanced) * of_all + balanced * equal
+
     def on_rays(self, pixels: NDArray[np.int64]) -> Samples:
         """The samples of pixels (R,); their rays count from 0 in the order of ``pixels``."""
         start, counts = self.first[pixels], self.first[pixels + 1] - self.first[pixels]
@@ -151,7 +159,22 @@ def train_grid_nesf(
         optimiser.step()
         if on_step is not None:
             on_step(step + 1, float(entropy.detach()), model)
+    favour_by_frequency(model, scenes, config.balanced)
     return model.eval()
+
+
+def favour_by_frequency(model: GridNesf, scenes: Sequence[LabelledScene], balanced: float) -> None:
+    """Shift logits so that probabilities are those of pixels as they are, not as they were drawn to learn from.
+
+    Rays of solids are drawn more often than they are seen; without the shift, edges of solids spread over the floor.
+    """
+    classes = len(model.label_set)
+    true, drawn = (np.mean([s.frequencies(classes, share) for s in scenes], axis=0) for share in (0.0, balanced))
+    seen = drawn > 0
+    shift = torch.from_numpy(np.where(seen, np.log(np.maximum(true, 1e-9) / np.where(seen, drawn, 1)), 0)).float()
+    with torch.no_grad():
+        model.head.bias += shift
+        model.nothing += shift
 
 
 def _rate(config: GridNesfTraining, fraction: float) -> float:
