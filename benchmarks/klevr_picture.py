@@ -1,6 +1,7 @@
-"""Novel KLEVR scenes at test cameras: image, true classes, those of NeSF. After ``benchmark klevr --arm nesf``.
+"""Pictures of NeSF on KLEVR, after ``benchmark klevr``: novel scenes at test cameras (image, true classes, NeSF's), and
+how the networks of its arms learned.
 
-Example: python -m benchmarks.klevr_picture --config klevr.toml --folder runs/klevr-grids --out nesf.jpg
+Example: python -m benchmarks.klevr_picture --folder runs/klevr-grids --out nesf.jpg --curves curves.png
 """
 
 from __future__ import annotations
@@ -13,8 +14,16 @@ import numpy as np
 
 from semantic_mapper.benchmark.klevr import TEST_CAMERAS, KlevrConfig, novel_seeds, scene_frames, scored_numbers
 from semantic_mapper.benchmark.klevr_grids import NEAR_M, scene_density
-from semantic_mapper.benchmark.klevr_nesf import grid_config, nesf_network, scene_grid, training_of
+from semantic_mapper.benchmark.klevr_nesf import (
+    NESF_ARMS,
+    arm_settings,
+    grid_config,
+    nesf_curve,
+    nesf_network,
+    scene_grid,
+)
 from semantic_mapper.config import load_config
+from semantic_mapper.plots import Curve, Panel, draw_panels, write_picture
 from semantic_mapper.scenes.suite import KLEVR_SUITE
 from semantic_mapper.training.grid_nesf import SceneLabels
 from semantic_mapper.types import UInt8
@@ -24,7 +33,7 @@ ENLARGED, GAP_PX = 2, 4
 
 def picture(config: KlevrConfig, folder: Path, columns: int) -> UInt8:
     """A column for each scene."""
-    model = nesf_network(config, training_of(config), folder)
+    model = nesf_network(*arm_settings(config, "nesf"), folder)
     found: list[UInt8] = []
     for scene in novel_seeds(config)[:columns]:
         labels = SceneLabels(model, scene_grid(scene_density(grid_config(config), scene, folder)), NEAR_M)
@@ -33,6 +42,18 @@ def picture(config: KlevrConfig, folder: Path, columns: int) -> UInt8:
         shown = (frame.rgb, *(KLEVR_SUITE.label_set.colorize(ids) for ids in (frame.label, labels.frame(frame))))
         found.append(np.concatenate([_framed(tile) for tile in shown]))
     return np.concatenate(found, axis=1)
+
+
+def curves(config: KlevrConfig, folder: Path) -> UInt8:
+    """What the points of novel scenes, and the rays of training, say of each arm that was run."""
+    found = {name: nesf_curve(config, name, folder) for name in NESF_ARMS}
+    points = [Curve(n, [(p.step, 100 * p.miou_points) for p in c], True) for n, c in found.items() if c]
+    entropy = [Curve(n, [(p.step, p.cross_entropy) for p in c], True) for n, c in found.items() if c]
+    panels = [
+        Panel("points of novel scenes", "mIoU, %", "steps", points),
+        Panel("rays of training", "cross-entropy of balanced rays", "steps", entropy),
+    ]
+    return draw_panels("NeSF's arms while they learn", panels, size=(560, 400))
 
 
 def _framed(tile: UInt8) -> UInt8:
@@ -46,12 +67,15 @@ def main() -> None:
     parser.add_argument("--config", type=Path)
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--curves", type=Path)
     parser.add_argument("--columns", type=int, default=6)
     arguments = parser.parse_args()
     config = load_config(arguments.config, KlevrConfig) if arguments.config else KlevrConfig()
     image = picture(config, arguments.folder, arguments.columns)
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(arguments.out), image[..., ::-1])
+    if arguments.curves is not None:
+        write_picture(arguments.curves, curves(config, arguments.folder))
 
 
 if __name__ == "__main__":

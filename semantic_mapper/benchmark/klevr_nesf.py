@@ -7,7 +7,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -24,6 +26,7 @@ from semantic_mapper.benchmark.klevr import (
     label_map_numbers,
     novel_seeds,
     scene_frames,
+    scenes_of_arm,
     scored_numbers,
     train_seeds,
 )
@@ -41,28 +44,57 @@ from semantic_mapper.types import Float32, PosedFrame, UInt8
 
 _log = get_logger(__name__)
 
-VERSION = 1  # raised by a change of the training: older networks are left alone
-CURVE = (0.2, 0.4, 0.6, 0.8, 1.0)  # fractions of the steps after which the points of novel scenes are classified
+VERSION = 2  # raised by a change of the training: older networks are left alone
+LOOKS = 10  # at the points of novel scenes, spread evenly over the steps
+
+
+class NesfArm(NamedTuple):
+    """What an arm changes.
+
+    Args:
+        rotate: Turn training scenes about z.
+        size: Vertices along x and y.
+        maps: Label maps a training scene; None = those of the run.
+        views: That densities are fitted to; None = all train cameras.
+    """
+
+    rotate: bool = True
+    size: int = 48
+    maps: int | None = None
+    views: int | None = None
+
+
+NESF_ARMS = {
+    "nesf": NesfArm(),
+    "nesf-no-rotation": NesfArm(rotate=False),
+    "nesf-grid-32": NesfArm(size=32),
+    "nesf-grid-64": NesfArm(size=64),
+    "nesf-1-map": NesfArm(maps=1),
+} | {name: NesfArm(views=views) for name, views in VIEW_ARMS.items()}
+
+
+class TrainingPoint(msgspec.Struct, frozen=True):
+    """The state of a training: mIoU at points of novel scenes, and mean cross-entropy of the last 200 steps."""
+
+    step: int
+    miou_points: float
+    cross_entropy: float
 
 
 def nesf_arms(folder: Path) -> dict[str, Arm]:
-    """Arms by name; densities are kept in ``folder``."""
+    """Arms by name; densities and networks are kept in ``folder``."""
 
-    def arm(*, rotate: bool = True, size: int = 48, maps: int | None = None, views: int | None = None) -> Arm:
-        def run(config: KlevrConfig) -> SceneScores:
-            config = config if maps is None else msgspec.structs.replace(config, label_maps=maps)
-            return nesf_scores(config, training_of(config, size=size, rotate=rotate), folder, views)
+    def run(name: str, config: KlevrConfig) -> SceneScores:
+        return nesf_scores(*arm_settings(config, name), folder, NESF_ARMS[name].views)
 
-        return run
+    return {name: partial(run, name) for name in NESF_ARMS}
 
-    arms = {
-        "nesf": arm(),
-        "nesf-no-rotation": arm(rotate=False),
-        "nesf-grid-32": arm(size=32),
-        "nesf-grid-64": arm(size=64),
-        "nesf-1-map": arm(maps=1),
-    }
-    return arms | {name: arm(views=views) for name, views in VIEW_ARMS.items()}
+
+def arm_settings(config: KlevrConfig, name: str) -> tuple[KlevrConfig, GridNesfTraining]:
+    """The run of an arm, and how its network is trained."""
+    arm, own = NESF_ARMS[name], scenes_of_arm(config, name)
+    own = own if arm.maps is None else msgspec.structs.replace(own, label_maps=arm.maps)
+    return own, training_of(own, size=arm.size, rotate=arm.rotate)
 
 
 def training_of(config: KlevrConfig, *, size: int = 48, rotate: bool = True) -> GridNesfTraining:
@@ -100,12 +132,9 @@ def nesf_scores(config: KlevrConfig, training: GridNesfTraining, folder: Path, v
 
 
 def nesf_network(config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None = None) -> GridNesf:
-    """The network of an arm: read from ``folder``, or trained and kept there.
-
-    The log of its training tells the mIoU at points of novel scenes and the mean cross-entropy of the last 200 steps.
-    """
+    """The network of an arm: read from ``folder``, or trained and kept there, its curve beside it."""
     label_set = KLEVR_SUITE.label_set
-    path = folder / f"nesf-{_network_digest(config, training, views)}.safetensors"
+    path = _network_path(config, training, folder, views)
     if path.exists():
         model = GridNesf(label_set, training.network)
         model.load_state_dict(load_file(path))
@@ -115,18 +144,30 @@ def nesf_network(config: KlevrConfig, training: GridNesfTraining, folder: Path, 
         for s, grid in _grids(config, train_seeds(config), folder, views).items()
     ]
     novel = {s: (g, *surface_points(config, s)) for s, g in _grids(config, novel_seeds(config), folder, views).items()}
-    looks = {round(fraction * training.steps) for fraction in CURVE}
+    looks = {round(k * training.steps / LOOKS) for k in range(1, LOOKS + 1)}
     entropies: list[float] = []
+    curve: list[TrainingPoint] = []
 
     def look(step: int, entropy: float, model: GridNesf) -> None:
         entropies.append(entropy)
         if step in looks:
-            miou, recent = _points_miou(model, novel), float(np.mean(entropies[-200:]))
-            _log.info("nesf_trained", step=step, miou_points=round(miou, 4), cross_entropy=round(recent, 4))
+            curve.append(TrainingPoint(step, _points_miou(model, novel), float(np.mean(entropies[-200:]))))
+            _log.info("nesf_trained", **{k: round(v, 4) for k, v in msgspec.structs.asdict(curve[-1]).items()})
 
     model = train_grid_nesf(scenes, label_set, training, look)
+    write_bytes(path.with_suffix(".json"), msgspec.json.encode(curve))
     write_bytes(path, save(model.state_dict()))
     return model
+
+
+def nesf_curve(config: KlevrConfig, name: str, folder: Path) -> list[TrainingPoint]:
+    """How the kept network of an arm was trained; empty where there is none."""
+    path = _network_path(*arm_settings(config, name), folder, NESF_ARMS[name].views).with_suffix(".json")
+    return msgspec.json.decode(path.read_bytes(), type=list[TrainingPoint]) if path.exists() else []
+
+
+def _network_path(config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None) -> Path:
+    return folder / f"nesf-{_network_digest(config, training, views)}.safetensors"
 
 
 def _network_digest(config: KlevrConfig, training: GridNesfTraining, views: int | None) -> str:

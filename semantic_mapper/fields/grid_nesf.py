@@ -64,12 +64,12 @@ class Placement:
         return turned / torch.from_numpy(self.spacing()).to(xyz) + torch.from_numpy((self._shape() - 1) / 2).to(xyz)
 
     def world(self) -> torch.Tensor:
-        """Points (n, n, n / 2, 3) of the world at which the vertices lie."""
+        """Points (n, n, 2) of the world, x and y, over and under which the vertices lie."""
         axes = [
-            (torch.arange(int(n), dtype=torch.float32) - (int(n) - 1) / 2) * float(s)
-            for n, s in zip(self._shape(), self.spacing(), strict=True)
+            (torch.arange(self.size, dtype=torch.float32) - (self.size - 1) / 2) * float(s) for s in self.spacing()[:2]
         ]
-        return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1) @ self._rotation() + self._middle()
+        flat = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+        return flat @ self._rotation()[:2, :2] + self._middle()[:2]
 
     def _shape(self) -> NDArray[np.int64]:
         return np.array((self.size, self.size, self.size // 2))
@@ -91,7 +91,7 @@ class DensityCells:
 
     Args:
         placement: Of the vertices.
-        cells: (M, 3) int64 vertices where something is and those next to them, in lexicographic order.
+        cells: (M, 3) int64 vertices where something is, in lexicographic order.
         rho: (M, 1) float32 opacity of a voxel there.
     """
 
@@ -105,26 +105,27 @@ class DensityCells:
 
 
 def smooth_opacity(grid: SceneGrid, size: int) -> torch.Tensor:
-    """Opacity (X, Y, Z) of a grid's voxels, averaged over what one of ``size`` vertices a side stands for."""
+    """Opacity (n / 2, X, Y) of a grid's voxels in the network's layers, averaged over what a vertex stands for."""
     ratio = Placement(grid.config, size).spacing() / grid.config.voxel_m
     kernel = [2 * int(r / 2) + 1 for r in ratio]
     with torch.no_grad():
         alpha = grid.alpha()[None, None]
-        return functional.avg_pool3d(alpha, kernel, 1, [k // 2 for k in kernel], count_include_pad=False)[0, 0]
+        smooth = functional.avg_pool3d(alpha, kernel, 1, [k // 2 for k in kernel], count_include_pad=False)[0, 0]
+        return functional.interpolate(smooth, size // 2, mode="linear", align_corners=True).movedim(2, 0).contiguous()
 
 
 def density_cells(opacity: torch.Tensor, placement: Placement) -> DensityCells:
-    """The vertices of a placement at which something is, dilated once.
+    """The vertices of a placement at which something is.
 
     Args:
-        opacity: (X, Y, Z) at the vertices of ``placement.box``, from ``smooth_opacity``.
+        opacity: (n / 2, X, Y) at the vertices of ``placement.box`` in x and y, from ``smooth_opacity``.
     """
     box = placement.box
-    place = (placement.world() - torch.tensor(box.origin_m)) / box.voxel_m
-    unit = place / (torch.tensor(box.shape) - 1) * 2 - 1
-    rho = functional.grid_sample(opacity[None, None], unit.flip(-1)[None], align_corners=True)[0, 0]  # 0 outside
-    near = functional.max_pool3d((rho > DENSE).float()[None, None], 3, 1, 1)[0, 0] > 0
-    cells = near.nonzero()
+    place = (placement.world() - torch.tensor(box.origin_m[:2])) / box.voxel_m
+    unit = place / (torch.tensor(box.shape[:2]) - 1) * 2 - 1
+    layers = functional.grid_sample(opacity[None], unit.flip(-1)[None], align_corners=True)[0]  # 0 outside
+    rho = layers.movedim(0, 2)  # (n, n, n / 2)
+    cells = (rho > DENSE).nonzero()
     if not len(cells):
         cells = torch.full((1, 3), placement.size // 4)
     return DensityCells(placement, cells.numpy(), rho[tuple(cells.T)][:, None])
@@ -153,7 +154,7 @@ class GridNesf(nn.Module):
     def logits(self, features: torch.Tensor, near: Near) -> torch.Tensor:
         """Logits (N, L) at points; where no cell is, of features that are 0."""
         padded = torch.cat((features, features.new_zeros(1, features.shape[1])))
-        here = torch.einsum("nkc,nk->nc", padded[near.rows], near.weights)
+        here = functional.embedding_bag(near.rows, padded, mode="sum", per_sample_weights=near.weights)
         return self.head(self.decoder(here))
 
     def composite(self, logits: torch.Tensor, weight: torch.Tensor, ray: torch.Tensor, count: int) -> torch.Tensor:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -16,7 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-CHUNK_ROWS = 8192  # gathered at a time: 27 rows of features each
+CHUNK_ROWS = 1024  # gathered at a time: 27 rows of features each, which stay in the cache
+MAX_BOX = 100  # entries a cell of a table of all cells of a box
 OFFSETS = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)], np.int64)  # (27, 3)
 _BITS, _HALF = 21, 1 << 20  # a packed coordinate
 
@@ -74,6 +76,19 @@ def _unique_cells(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[
 
 
 def _neighbours(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows (N, 27) of the cells round each; looked up in a box round all cells where that is small, else searched."""
+    low = cells.min(0) - 1
+    shape = cells.max(0) - low + 2
+    if math.prod(map(int, shape)) > MAX_BOX * len(cells):
+        return _searched_neighbours(cells)
+    stride = np.array((shape[1] * shape[2], shape[2], 1))
+    place = (cells - low) @ stride
+    box = np.full(int(np.prod(shape)), len(cells), np.int64)
+    box[place] = np.arange(len(cells))
+    return box[place[:, None] + OFFSETS @ stride]
+
+
+def _searched_neighbours(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     keys, count = pack_cells(cells), len(cells)
     table = np.full((count, len(OFFSETS)), count, np.int64)
     middle = len(OFFSETS) // 2
@@ -99,11 +114,19 @@ class _Submanifold(torch.autograd.Function):
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         x, weight, table = ctx.saved_tensors
         gradient = gradients[0].contiguous()
-        of_x = _convolve(gradient, weight.flip(0).transpose(1, 2), table) if ctx.needs_input_grad[0] else None
-        of_weight = torch.zeros(weight.shape[0] * weight.shape[1], weight.shape[2], dtype=x.dtype)
-        for rows, gathered in _chunks(x, table):
-            of_weight.addmm_(gathered.t(), gradient[rows])
-        return of_x, of_weight.view_as(weight), None
+        places, channels_in, channels_out = weight.shape
+        if not ctx.needs_input_grad[0]:
+            of_weight = x.new_zeros(places * channels_in, channels_out)
+            for rows, gathered in _chunks(x, table):
+                of_weight.addmm_(gathered.t(), gradient[rows])
+            return None, of_weight.view_as(weight), None
+        # The table is symmetric: gradients gathered once serve the input and, mirrored, the weights.
+        mirrored = weight.flip(0).transpose(1, 2).reshape(-1, channels_in)
+        of_x, of_weight = torch.empty_like(x), x.new_zeros(channels_in, places * channels_out)
+        for rows, gathered in _chunks(gradient, table):
+            torch.mm(gathered, mirrored, out=of_x[rows])
+            of_weight.addmm_(x[rows].t(), gathered)
+        return of_x, of_weight.view(channels_in, places, channels_out).flip(1).transpose(0, 1), None
 
 
 def _convolve(x: torch.Tensor, weight: torch.Tensor, table: torch.Tensor) -> torch.Tensor:

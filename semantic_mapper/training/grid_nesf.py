@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
-from semantic_mapper.config import AtLeastOne, AtLeastZero, Config, NotNegative, Positive
+from semantic_mapper.config import AtLeastOne, AtLeastZero, Config, Fraction, NotNegative, Positive
 from semantic_mapper.errors import FrameError
 from semantic_mapper.fields.grid.scene_grid import SceneGrid
 from semantic_mapper.fields.grid_nesf import (
@@ -34,13 +34,14 @@ class GridNesfTraining(Config, frozen=True):
     """How the network is trained; a step sees one scene."""
 
     network: GridNesfConfig = GridNesfConfig()
-    steps: AtLeastOne = 1500
-    rays: AtLeastOne = 1024
-    first_rate: Positive = 3e-3
-    last_rate: Positive = 1e-4
+    steps: AtLeastOne = 2400
+    rays: AtLeastOne = 384
+    balanced: Fraction = 0.5  # of the rays: of a class that is drawn first; the others are of any pixel
+    first_rate: Positive = 6e-3
+    last_rate: Positive = 1e-4  # along half a cosine
     rotate: bool = True  # by any angle about z
     smoothness: AtLeastZero = 0.1  # weight of the squared distance of probabilities
-    smooth_points: AtLeastOne = 1024
+    smooth_points: AtLeastOne = 256
     smooth_sigma: Positive = 0.05  # of half a side of the box
     near_m: AtLeastZero = 1.0
     seed: NotNegative = 0
@@ -56,21 +57,46 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledScene:
-    """A density with label images.
+    """A density with the P pixels of its label images that have a class.
 
     Args:
         grid: The density.
-        opacity: (X, Y, Z), from ``smooth_opacity``.
-        rays: Of the labelled frames.
-        pixels: (P,) that have a class.
-        channel: (P,) int64 which.
+        opacity: From ``smooth_opacity``.
+        samples: On the rays of all pixels, in their order.
+        first: (P + 1,) number of each pixel's first sample.
+        channel: (P,) int64 class of a pixel.
+        by_class: Pixels of each class that there is.
     """
 
     grid: SceneGrid
     opacity: torch.Tensor
-    rays: FrameRays
-    pixels: NDArray[np.int64]
+    samples: Samples
+    first: NDArray[np.int64]
     channel: torch.Tensor
+    by_class: tuple[NDArray[np.int64], ...]
+
+    def draw(self, count: int, balanced: float, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Pixels (count,): a fraction of them of a class that is drawn first, the others any."""
+        pick = rng.integers(len(self.channel), size=count)
+        for n in range(round(balanced * count)):
+            there = self.by_class[n % len(self.by_class)]
+            pick[n] = there[rng.integers(len(there))]
+        return pick
+
+    def frequencies(self, count: int, balanced: float) -> NDArray[np.float64]:
+        """(count,) of the classes among rays that ``draw`` gives."""
+        of_all, equal = np.zeros(count), np.zeros(count)
+        for pixels in self.by_class:
+            channel = int(self.channel[pixels[0]])
+            of_all[channel], equal[channel] = len(pixels) / len(self.channel), 1 / len(self.by_class)
+        return (1 - balanced) * of_all + balanced * equal
+
+    def on_rays(self, pixels: NDArray[np.int64]) -> Samples:
+        """The samples of pixels (R,); their rays count from 0 in the order of ``pixels``."""
+        start, counts = self.first[pixels], self.first[pixels + 1] - self.first[pixels]
+        ray = np.repeat(np.arange(len(pixels)), counts)
+        rows = torch.from_numpy(np.arange(len(ray)) + (start - (counts.cumsum() - counts))[ray])
+        return Samples(self.samples.xyz[rows], self.samples.weight[rows], torch.from_numpy(ray))
 
 
 def labelled_scene(
@@ -89,12 +115,16 @@ def labelled_scene(
     rays = frame_rays(frames, max(f.intrinsics.width for f in frames))
     if len(rays) != len(channel):
         raise FrameError("labelled frames of one scene must have the same size")
+    channel = channel[pixels].astype(np.int64)
+    samples = marched(grid, rays, pixels, config.near_m)
+    first = np.searchsorted(samples.ray.numpy(), np.arange(len(pixels) + 1))
+    by_class = tuple(np.flatnonzero(channel == c) for c in np.unique(channel))
     opacity = smooth_opacity(grid, config.network.size)
-    return LabelledScene(grid, opacity, rays, pixels, torch.from_numpy(channel[pixels].astype(np.int64)))
+    return LabelledScene(grid, opacity, samples, first, torch.from_numpy(channel), by_class)
 
 
 def marched(grid: SceneGrid, rays: FrameRays, pixels: NDArray[np.int64], near_m: float) -> Samples:
-    """The samples on rays that matter."""
+    """The samples on rays that matter, ray by ray."""
     with torch.no_grad():
         batch = rays.rays(pixels, near_m)
         march = grid.march(grid.rays(batch))
@@ -117,20 +147,39 @@ def train_grid_nesf(
     torch.manual_seed(config.seed)
     rng = np.random.default_rng((config.seed, 21))
     model = GridNesf(label_set, config.network)
-    optimiser = torch.optim.Adam(model.parameters(), config.first_rate)
-    decay = math.log(config.last_rate / config.first_rate)
+    optimiser = torch.optim.Adam(model.parameters(), config.first_rate, fused=True)
     order: list[int] = []
     for step in range(config.steps):
         order = order or [int(n) for n in rng.permutation(len(scenes))]
         for group in optimiser.param_groups:
-            group["lr"] = config.first_rate * math.exp(decay * step / config.steps)
+            group["lr"] = _rate(config, step / config.steps)
         entropy, rough = _losses(model, scenes[order.pop()], config, rng)
         optimiser.zero_grad()
         (entropy + config.smoothness * rough).backward()
         optimiser.step()
         if on_step is not None:
             on_step(step + 1, float(entropy.detach()), model)
+    favour_by_frequency(model, scenes, config.balanced)
     return model.eval()
+
+
+def favour_by_frequency(model: GridNesf, scenes: Sequence[LabelledScene], balanced: float) -> None:
+    """Shift logits so that probabilities are those of pixels as they are, not as they were drawn to learn from.
+
+    Rays of solids are drawn more often than they are seen; without the shift, edges of solids spread over the floor.
+    """
+    classes = len(model.label_set)
+    true, drawn = (np.mean([s.frequencies(classes, share) for s in scenes], axis=0) for share in (0.0, balanced))
+    seen = drawn > 0
+    shift = torch.from_numpy(np.where(seen, np.log(np.maximum(true, 1e-9) / np.where(seen, drawn, 1)), 0)).float()
+    with torch.no_grad():
+        model.head.bias += shift
+        model.nothing += shift
+
+
+def _rate(config: GridNesfTraining, fraction: float) -> float:
+    high = (1 + math.cos(math.pi * fraction)) / 2
+    return config.last_rate + (config.first_rate - config.last_rate) * high
 
 
 def _losses(
@@ -139,8 +188,8 @@ def _losses(
     """Cross-entropy of a batch of rays, and the squared distance of probabilities at points next to each other."""
     angle = float(rng.uniform(0, 2 * np.pi)) if config.rotate else 0.0
     seen = density_cells(scene.opacity, Placement(scene.grid.config, config.network.size, angle))
-    pick = rng.integers(len(scene.pixels), size=config.rays)
-    samples = marched(scene.grid, scene.rays, scene.pixels[pick], config.near_m)
+    pick = scene.draw(config.rays, config.balanced, rng)
+    samples = scene.on_rays(pick)
     count = len(samples.xyz)
     chosen = torch.from_numpy(rng.integers(max(count, 1), size=min(config.smooth_points, count)))
     half_side = torch.tensor([(n - 1) * scene.grid.config.voxel_m / 2 for n in scene.grid.config.shape])

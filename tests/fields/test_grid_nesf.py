@@ -33,11 +33,32 @@ def some_points(count: int = 200) -> torch.Tensor:
 def test_vertices_lie_where_the_world_says_and_hold_the_box_however_it_is_turned(angle: float) -> None:
     placement = Placement(BOX, SIZE, angle)
     world = placement.world()
-    assert world.shape == (SIZE, SIZE, SIZE // 2, 3)
-    expected = torch.stack(torch.meshgrid(*(torch.arange(n) for n in world.shape[:3]), indexing="ij"), -1)
-    assert torch.allclose(placement.vertices(world), expected.float(), atol=1e-4)
+    assert world.shape == (SIZE, SIZE, 2)
+    expected = torch.stack(torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij"), -1)
+    found = placement.vertices(torch.cat((world, torch.zeros(SIZE, SIZE, 1)), 2))
+    assert torch.allclose(found[..., :2], expected.float(), atol=1e-4)
+    heights = torch.tensor(((0.0, 0.0, 0.0), (0.0, 0.0, 2.0)))  # of the box
+    assert torch.allclose(placement.vertices(heights)[:, 2], torch.tensor((0.0, SIZE / 2 - 1)), atol=1e-5)
     found = placement.vertices(some_points())
-    assert found.min() >= 0 and (found <= torch.tensor(world.shape[:3]) - 1).all()
+    assert found.min() >= 0 and (found <= torch.tensor((SIZE, SIZE, SIZE // 2)) - 1).all()
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7])
+def test_opacity_at_a_vertex_is_the_grid_s_between_its_voxels(angle: float) -> None:
+    grid, placement = some_grid(), Placement(BOX, 24, angle)  # vertices so close that nothing is averaged
+    seen = density_cells(smooth_opacity(grid, 24), placement)
+    for cell, rho in zip(seen.cells[::7], seen.rho[::7, 0], strict=True):
+        x, y = placement.world()[cell[0], cell[1]]
+        z = BOX.origin_m[2] + cell[2] * placement.spacing()[2]
+        place = (torch.tensor((float(x), float(y), float(z))) - torch.tensor(BOX.origin_m)) / BOX.voxel_m
+        low = place.floor().long()
+        expected = 0.0
+        for corner in np.ndindex(2, 2, 2):
+            at = low + torch.tensor(corner)
+            if ((at >= 0) & (at < torch.tensor(BOX.shape))).all():
+                weight = (1 - (place - at).abs()).clamp(min=0).prod()
+                expected += float(weight * grid.alpha()[tuple(at)])
+        assert float(rho) == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1.0])
@@ -55,7 +76,7 @@ def test_a_turned_scene_is_the_same_scene_seen_at_an_angle() -> None:
     model = GridNesf(KLEVR, GridNesfConfig(size=SIZE, width=4))
     opacity, points = smooth_opacity(some_grid(), SIZE), some_points()
     by_angle = density_cells(opacity, Placement(BOX, SIZE, np.pi / 2))
-    turned = density_cells(opacity.rot90(1, (0, 1)).contiguous(), Placement(BOX, SIZE))
+    turned = density_cells(opacity.rot90(1, (1, 2)).contiguous(), Placement(BOX, SIZE))
     quarter = torch.stack((-points[:, 1], points[:, 0], points[:, 2]), 1)
     with torch.no_grad():
         first = model.logits(model.features(by_angle), by_angle.near(points))

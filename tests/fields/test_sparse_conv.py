@@ -52,6 +52,36 @@ def test_absent_cells_count_as_zeros() -> None:
     torch.testing.assert_close(sparse, dense, atol=1e-5, rtol=1e-5)
 
 
+def test_gradients_of_absent_cells_are_those_of_zeros() -> None:
+    torch.manual_seed(3)
+    rng = np.random.default_rng(0)
+    every = _all_cells()
+    kept = np.sort(rng.choice(len(every), len(every) // 3, replace=False))
+    conv, weight = SubmanifoldConv(3, 4), torch.randn(len(kept), 4)
+    x = torch.randn(len(kept), 3, requires_grad=True)
+    sparse = conv(x, cell_levels(every[kept], 1)[0])
+    full = torch.zeros(len(every), 3).index_copy(0, torch.from_numpy(kept), x)
+    dense = conv.dense(full.T.reshape(1, 3, *SIZE))[0].reshape(4, -1).T[kept]
+    mine = torch.autograd.grad((sparse * weight).sum(), [x, conv.weight])
+    theirs = torch.autograd.grad((dense * weight).sum(), [x, conv.weight])
+    for a, b in zip(mine, theirs, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-4)
+    # Where the input wants no gradient, that of the weights is found in another way.
+    alone = torch.autograd.grad((conv(x.detach(), cell_levels(every[kept], 1)[0]) * weight).sum(), conv.weight)[0]
+    torch.testing.assert_close(alone, theirs[1], atol=1e-4, rtol=1e-4)
+
+
+def test_cells_far_apart_have_the_neighbours_of_cells_close_by() -> None:
+    rng = np.random.default_rng(0)
+    close = np.unique(rng.integers(0, 12, (300, 3)), axis=0)
+    near = cell_levels(close, 1)[0].neighbours
+    apart = np.concatenate((close, close[-1:] + 500_000))  # a box round them all would not fit into memory
+    far = cell_levels(apart, 1)[0].neighbours
+    assert (near < len(close)).sum() > 3 * len(close)
+    assert torch.equal(far[:-1], torch.where(near == len(close), len(apart), near))
+    assert far[-1].tolist() == [len(apart)] * 13 + [len(close)] + [len(apart)] * 13
+
+
 @pytest.mark.parametrize("shift", [0, 3])
 def test_levels_name_children_and_parents(shift: int) -> None:
     cells = _all_cells()[::7] + shift
