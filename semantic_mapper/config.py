@@ -162,10 +162,10 @@ class IRTConfig(GridFieldConfig, frozen=True):
     trunk_width: Channels = 64
     # B: each point by itself. RT: the points of a ray attend to each other. RTT: with a token of the image's texture.
     # BC, RTC: texture beside the composited points. RTTC: token and texture
-    variant: IRTVariant = "RTTC"
+    variant: IRTVariant = "BC"
     texture: Literal["cnn", "colour"] = "cnn"  # what tells the texture: three convolutions, or the pixel's colour alone
     select: Literal["weight", "density"] = "weight"  # which points of a ray are looked at; the paper takes the densest
-    points: Annotated[int, msgspec.Meta(ge=1, le=64)] = 10  # of a ray
+    points: Annotated[int, msgspec.Meta(ge=1, le=64)] = 6  # of a ray
     width: Channels = 64  # of points in the transformer
     heads: Channels = 4
     layers: Layers = 2

@@ -63,7 +63,7 @@ def finetune(
     ] = None,
     variant: Annotated[
         Literal["B", "BC", "RT", "RTT", "RTC", "RTTC"] | None,
-        typer.Option(help="--kind irt: what reads the classes.  [default: RTTC]"),
+        typer.Option(help="--kind irt: what reads the classes.  [default: BC]"),
     ] = None,
     depth: FinetuneDepthOption = None,
 ) -> int:

@@ -151,8 +151,10 @@ def surface(samples: RaySamples) -> torch.Tensor:
 
 
 def at_measured(samples: RaySamples, box: GridConfig) -> RaySamples:
-    """Rays whose depth was measured, inside the box, end there: samples elsewhere fade, and one more at that depth takes
-    the rest."""
+    """Rays whose depth was measured, inside the box, end there.
+
+    Samples elsewhere fade, and one more at that depth takes the rest.
+    """
     prior = samples.rays.prior_depth_m
     xyz = samples.rays.origin + prior[:, None] * samples.rays.direction
     point = (xyz - xyz.new_tensor(box.origin_m)) / box.voxel_m

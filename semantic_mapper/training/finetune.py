@@ -76,7 +76,7 @@ OWN_VIEW_FACTOR_WITHOUT_DEPTH = 1e3
 class IRTFitConfig(Config, frozen=True):
     """What an Implicit Ray-Transformer is made of (``irt.fit_irt``)."""
 
-    variant: IRTVariant | None = None  # None = that of the weights to start from, else RTTC
+    variant: IRTVariant | None = None  # None = that of the weights to start from, else BC
     carry_labels: bool = (
         True  # to where the labelled frames' surface is seen again; False: labels only teach, as in the paper
     )

@@ -165,7 +165,7 @@ def _fit_scene(
 ) -> FittedGeometry:
     """Geometry, colours and features of all frames; they stay as they are from then on."""
     began = time.monotonic()
-    given = start.config if isinstance(start, IRT) else IRTConfig()
+    given = start.shape if isinstance(start, IRT) else IRTConfig()
     box = given.grid if isinstance(start, IRT) and start.fitted and config.grid.box_m is None else None
     settings = msgspec.structs.replace(grid_settings(config), seconds=GRID_UNTIL * config.seconds)
     if config.steps:

@@ -103,7 +103,7 @@ def test_two_planes_of_one_texture_are_told_apart_by_height_which_a_picture_cann
 
 def small_field(labelled: int, **changes: object) -> tuple[IRT, ClassFit]:
     frames = [two_planes(i * 1.0, i, label=True) for i in range(labelled)]
-    config = msgspec.structs.replace(SMALL, steps=12, irt=IRTFitConfig(), **changes)
+    config = msgspec.structs.replace(SMALL, steps=12, irt=IRTFitConfig(variant="RTTC"), **changes)
     checkpoint = fit_irt([*frames, *scene()[1:4]], HEIGHTS, None, msgspec.structs.replace(config, steps=1))
     field = checkpoint.model
     assert isinstance(field, IRT)
@@ -131,7 +131,7 @@ def test_a_ray_never_sees_the_labels_of_its_own_frame_while_it_learns() -> None:
 
 
 def test_held_out_blocks_choose_the_weights_and_nothing_learns_from_them() -> None:
-    _field, fit = small_field(2)
+    _, fit = small_field(2)
     drawn = torch.cat([fit.pool.draw(2048, torch.Generator().manual_seed(i))[0] for i in range(5)])
     assert int(fit.data.held_out.sum()) > 0 and not bool(fit.data.held_out[drawn].any())
     told: list[FinetuneProgress] = []

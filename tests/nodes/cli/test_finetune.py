@@ -13,6 +13,7 @@ import pytest
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.grid.field import GridField
 from semantic_mapper.replay.log.format import LogWriter
+from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.transport.messages import StreamInfo
 from tests.nodes.support import Running, error_line, run, write_grid, write_log
 from tests.small import INTRINSICS, tiny_frames
@@ -175,11 +176,38 @@ def test_ctrl_c_keeps_the_grid_so_far(log: Path, tmp_path: Path) -> None:
     assert "the best weights so far" in running.text
 
 
+def test_a_field_of_one_scene_labels_its_log_and_maps_it(log: Path, tmp_path: Path) -> None:
+    out, settings = tmp_path / "irt.safetensors", tmp_path / "small.toml"
+    settings.write_text("width = 96\n[grid]\nlong_side = 32\nrays = 256\n")
+    arguments = ("--kind", "irt", "--steps", "40", "--seconds", "0", "--config", settings, "--variant", "RTTC")
+    done = run("finetune", log, *arguments, "--frames", "1,4", "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "finetuned on frames 1, 4 of room.mcap" in done.stdout
+    assert "grid of room.mcap, 40 steps" in done.stdout and "accuracy" in done.stdout
+    checkpoint = load_checkpoint(out)
+    assert checkpoint.model.kind == "irt" and len(checkpoint.train_stamps_ns) == 2
+    done = run("autolabel", log, "--weights", out, "--overwrite-labels", "--out", tmp_path / "labelled.mcap")
+    assert done.returncode == 0, done.stderr
+    with open_log(tmp_path / "labelled.mcap") as labelled:
+        assert all(f.label is not None and f.label_is_pseudo for f in labelled)
+    done = run("replay", log, "--weights", out, "--out", tmp_path / "replayed")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "replayed" / "summary.json").read_text())
+    assert summary["frames"]["excluded_from_scores"] == 2 and summary["frames"]["scored"] == 4  # never on its keyframes
+    assert summary["scene"]["known"] > 0.9 and summary["scene"]["frames_outside"] == 0
+    assert summary["metrics"]["total_accuracy"] > 0.5
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (("--kind", "irt"), "how many labelled frames?"),
+        (("--kind", "irt", "--frames", "1,x"), "numbers with commas"),
+        (("--kind", "irt", "--keyframes", "2", "--frames", "1,2"), "already name the frames"),
+        (("--keyframes", "2", "--variant", "RT"), "goes with --kind irt only"),
+        (("--keyframes", "2", "--unlabelled", "3"), "goes with --kind only"),
         (("--kind", "grid", "--keyframes", "2"), "Only --kind grid learns none"),
-        (("--kind", "sray", "--keyframes", "2"), "there is grid"),
+        (("--kind", "sray", "--keyframes", "2"), "there is grid, irt"),
         (("--kind", "grid", "--from-scratch"), "starts from nothing"),
     ],
 )
