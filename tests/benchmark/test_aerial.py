@@ -61,8 +61,8 @@ TINY = AerialConfig(
     nerf_steps=60,
     unet_steps=2,
     trunk_steps=30,
-    irt_steps=60,
-    mlp_steps=150,
+    irt_steps=40,
+    mlp_steps=120,
 )
 EPISODE = Episode(200_000, 0)
 TERRAIN = CARLA.id_of("terrain")
@@ -146,7 +146,7 @@ def test_settings_that_no_run_can_follow_are_refused(tmp_path: Path) -> None:
 
 def test_colours_say_little_and_nothing_in_the_dark() -> None:
     scores = color_arm(TINY, EPISODE)
-    assert 5.0 < miou(scores) < 30.0 and miou(scores, DARK) < miou(scores)
+    assert 3.0 < miou(scores) < 30.0 and miou(scores, DARK) < miou(scores)
 
 
 def test_patches_are_of_asphalt_and_as_many_as_it_has_pixels() -> None:
@@ -166,7 +166,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_grid_is_fitted_once_and_knows_depth(folder: Path) -> None:
     made = town_grid(TINY, EPISODE.town, folder)
-    assert made.psnr > 17.0 and made.depth_error < 0.05 and made.known > 0.9
+    assert made.psnr > 20.0 and made.depth_error < 0.05 and made.known > 0.5
     (path,) = folder.glob("aerial-*.npz")
     stamp = path.stat().st_mtime_ns
     again = town_grid(TINY, EPISODE.town, folder)
