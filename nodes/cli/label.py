@@ -72,10 +72,9 @@ def label(
 ) -> int:
     """Label frames of a log by hand (--serve), say which to label (--suggest), or send labelled ones to a finetuner.
 
-    --suggest names the frames that show most surface which no labelled frame shows. --serve opens a page on which a person
-    paints on them, and saves each stroke at once; what is not painted is not learned from.
-    `finetune --labels DIR` learns from what was painted. The page is on this machine alone; to see it from another
-    one, tunnel its port.
+    --suggest names the frames that show most surface which no labelled frame shows. --serve opens a page on which a
+    person paints on them, and saves each stroke at once; what is not painted is not learned from. `finetune --labels
+    DIR` learns from what was painted. The page is on this machine alone; to see it from another one, tunnel its port.
 
     Without these, labelled frames are sent to a running finetuner: those that together show most of what the log shows.
     Frames must be in the world that the mapper maps. `semantic-mapper top --once --json` tells what became of them,
