@@ -105,21 +105,13 @@ def refine_room(
         MapError: the map came out empty.
     """
     room = fuse_room(seed, weights, suite)
-    return refined_records(room, digest, suite, {settings_digest(suite, "map"): None, **networks})
-
-
-def refined_records(
-    room: FusedRoom, digest: str, suite: SuiteConfig, networks: Mapping[str, NesfWeights | None]
-) -> list[MapRecord]:
-    """A record of a map refined by each of ``networks``, by its settings; None = as it is."""
-    records: list[MapRecord] = []
+    records = [_compare(room, room.voxel_map, digest, settings_digest(suite, "map"), suite)]
     with tempfile.TemporaryDirectory() as folder:
         room.voxel_map.save(saved := Path(folder) / "map.npz")
         for settings, network in networks.items():
-            voxel_map = VoxelMap.load(saved)
-            if network is not None:
-                refine(voxel_map, network, up=UP)
-            records.append(_compare(room, voxel_map, digest, settings, suite))
+            refined = VoxelMap.load(saved)
+            refine(refined, network, up=UP)
+            records.append(_compare(room, refined, digest, settings, suite))
     return records
 
 
@@ -220,11 +212,11 @@ def _compare(room: FusedRoom, voxel_map: VoxelMap, digest: str, settings: str, s
             confusion_of(seen, np.where(one_frame == UNSEEN, ROOMS.ignore_id, one_frame), ROOMS, "a frame")
         ),
         calibration=as_calibration(points.confidence[answered], label[answered] == truth[answered]),
-        instances=_compare_instances(voxel_map, surface),
+        instances=compare_instances(voxel_map, surface),
     )
 
 
-def _compare_instances(voxel_map: VoxelMap, surface: TrueSurface) -> InstanceRecord:
+def compare_instances(voxel_map: VoxelMap, surface: TrueSurface) -> InstanceRecord:
     """The things that queries find in a map, against those of the true surface, at the map's surface voxels."""
     snapshot = MapMirror.of(voxel_map).snapshot()
     every = class_surface(snapshot, np.ones(256, np.bool_))

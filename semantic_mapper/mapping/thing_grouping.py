@@ -14,7 +14,7 @@ from semantic_mapper.mapping.instance_layer import pack_voxels
 from semantic_mapper.memory import check_room_for_scipy
 from semantic_mapper.types import Float32, Float64
 
-AGREE_M = 0.06  # centres of neighbours that are farther apart belong to two things
+AGREE_M = 0.09  # centres of neighbours that are farther apart belong to two things
 LEAST_VOXELS = 60  # of a piece that stands for itself where it touches others of its class
 _ROUNDS = 50
 _HALF_SPHERE = np.array([d for d in np.ndindex(3, 3, 3) if d > (1, 1, 1)]) - 1  # 13 of 26 neighbours
