@@ -3,7 +3,7 @@
 Maps are kept, so that other weights are scored in a fraction of the time. A run that ended early goes on where it was.
 
 Example: python -m benchmarks.refined_rooms --split val --refine nesf.safetensors
-Example: python -m benchmarks.refined_rooms --split test --refine nesf-rooms --rendered 4
+Example: python -m benchmarks.refined_rooms --split test --refine nesf.safetensors --rendered 4
 """
 
 from __future__ import annotations

@@ -23,13 +23,8 @@ def refine(
     out: Annotated[Path, typer.Option("--out", help="Map to write (.npz).")],
     weights: Annotated[
         Path | None,
-        typer.Option(
-            help="From `train --kind nesf`; without it those that ship, or of a map of other classes, smoothed votes."
-        ),
+        typer.Option(help="From `train --kind nesf`; without it votes are smoothed over neighbouring surface."),
     ] = None,
-    smooth: Annotated[
-        bool, typer.Option("--smooth", help="Smooth the votes over neighbouring surface; nothing is learned.")
-    ] = False,
     fill: Annotated[
         float,
         typer.Option(
@@ -48,8 +43,9 @@ def refine(
 ) -> None:
     """Relabel a saved map by its shape, colour and votes, and label surface that nothing voted for.
 
-    A network decides that has seen many maps, and tells things apart that touch (`query OUT instances`). Of maps with
-    other classes than its own, and with --smooth, votes are smoothed over surface of the same slope within some 6 cm.
+    With --weights a network decides that has seen many maps; it may tell things apart, too (`query OUT instances`).
+    Without, votes are smoothed over surface of the same slope within some 6 cm; nothing is learned then, and any
+    classes will do.
 
     Writes a map like any other: query, export, merge it, or go on mapping into it. Geometry and colours are unchanged.
 
@@ -58,7 +54,7 @@ def refine(
     """
     output = Output.guarded()
     output.quiet = json
-    from semantic_mapper.fields.nesf import load_nesf, shipped_nesf, smoothed_votes
+    from semantic_mapper.fields.nesf import load_nesf, smoothed_votes
     from semantic_mapper.mapping.refine import refine as refine_map
     from semantic_mapper.mapping.voxel_map import VoxelMap
     from semantic_mapper.nodes.cli.outputs import prepare_file
@@ -68,13 +64,8 @@ def refine(
     path, direction = map_path(source), parse_up(up)
     refuse_overwriting(out, path)
     prepare_file(out)
-    if smooth and weights is not None:
-        raise typer.BadParameter("goes without --weights", param_hint="--smooth")
     network = None if weights is None else load_nesf(weights)
     voxel_map = VoxelMap.load(path)
-    if network is None and not smooth:
-        network = shipped_nesf(voxel_map.label_set)
-    by_votes = network is None
     network = network or smoothed_votes(voxel_map.label_set)
     with frame_progress("refine", None, unit="tiles") as bar:
 
@@ -85,9 +76,8 @@ def refine(
         report = refine_map(voxel_map, network, fill=fill, up=direction, by_name=by_name, on_tile=on_tile)
     voxel_map.save(out)
     output.print(_table(report))
-    if by_votes:
-        why = "--smooth" if smooth else f"no weights ship for label set '{voxel_map.label_set.name}'"
-        output.print(f"{why}: the votes were smoothed, nothing was learned")
+    if weights is None:
+        output.print("no --weights: the votes were smoothed, nothing was learned")
     elif not report.voted:
         output.print("the map had no votes: its classes are guessed from shape and colour")
     relabelled, filled = (100 * count / max(report.surface, 1) for count in (report.relabelled, report.filled))

@@ -238,7 +238,8 @@ def compare_instances(voxel_map: VoxelMap, surface: TrueSurface) -> InstanceReco
         ROOMS,
         STUFF_NAMES,
     )
-    return InstanceRecord(found=tuple(tuple(found) for found in matches.found), truth=matches.truth)
+    found = tuple((m.class_id, m.confidence, m.iou, m.truth, m.neither) for m in matches.found)
+    return InstanceRecord(found=found, truth=matches.truth)
 
 
 def _label_of_one_frame(xyz: Float32, casts: list[MapView], views: list[RoomLook], seed: int) -> UInt8:

@@ -74,11 +74,6 @@ class Checkpoint:
 COMPUTED_DEPTH = Path("rooms-computed-depth")  # names the weights that ship for cameras without a depth sensor
 
 
-def shipped_path(name: str) -> Path:
-    """Where weights of this name ship with the package, or would."""
-    return _shipped() / f"{name}.safetensors"
-
-
 def default_checkpoint_path() -> Path:
     """The small checkpoint that ships with the package."""
     return _shipped() / "rooms.safetensors"

@@ -33,14 +33,12 @@ from semantic_mapper.fields.checkpoint import (
     label_set_to_plain,
     open_weights,
     save_tensors,
-    shipped_path,
 )
 from semantic_mapper.fields.map_unet import LEVELS, MapUNet
 from semantic_mapper.fields.sparse_conv import OFFSETS, CellLevel, cell_levels, find_rows, pack_cells
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Float32
 
-SHIPPED = "nesf-rooms"  # name of the weights in the package
 CELL_M = 0.04
 SHAPE_CHANNELS = 9  # before those of the classes
 UP_CHANNEL, VOTES_CHANNEL = 2, 8
@@ -215,17 +213,6 @@ def smoothed_votes(label_set: LabelSet) -> NesfWeights:
     model = Nesf(label_set, NesfConfig(width=1, centres=False)).eval()
     model.start_smoothed()
     return NesfWeights(model, {}, hashlib.sha256(b"smoothed votes").hexdigest())
-
-
-def shipped_nesf(label_set: LabelSet) -> NesfWeights | None:
-    """The weights that ship for maps of these classes; None where there are none.
-
-    Raises:
-        WeightsError: they are damaged.
-    """
-    path = shipped_path(SHIPPED)
-    found = load_nesf(path) if path.is_file() else None
-    return found if found is not None and found.model.label_set == label_set else None
 
 
 def save_nesf(weights: NesfWeights, path: Path) -> None:

@@ -36,7 +36,7 @@ def group_things(
     first, second = _neighbours(voxels)
     same = channel[first] == channel[second]
     first, second = first[same], second[same]
-    centre = voxels * voxel_m + way_m
+    centre = voxels.astype(np.float64) * voxel_m + way_m.astype(np.float64)
     agree = np.linalg.norm(centre[first] - centre[second], axis=1) < AGREE_M
     piece = _components(len(voxels), first[agree], second[agree])
     return _without_crumbs(piece, first, second, centre)

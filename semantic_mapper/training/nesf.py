@@ -21,7 +21,7 @@ import torch
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from semantic_mapper.config import AtLeastOne, Config, Fraction, NotNegative, Positive, to_plain
+from semantic_mapper.config import AtLeastOne, AtLeastZero, Config, Fraction, NotNegative, Positive, to_plain
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, confusion_of
 from semantic_mapper.fields.nesf import (
@@ -69,9 +69,9 @@ class NesfTrainConfig(Config, frozen=True):
     crop_voxels: AtLeastOne = 60_000  # of larger maps, those nearest to a point of theirs
     labelled_voxels: AtLeastOne = 16_384  # of a crop that are compared
     learning_rate: Positive = 3e-3
-    weight_decay: NotNegative = 0.01
+    weight_decay: AtLeastZero = 0.01
     balance: Fraction = 0.25  # a class counts by its fraction of all maps' voxels to the power of minus this
-    centres: NotNegative = 1.0  # weight of the distance to objects' centres, where maps have instances
+    centres: AtLeastZero = 1.0  # weight of the distance to objects' centres, where maps have instances
     no_votes: Fraction = 0.1  # of crops that lose all votes
     cubes: Fraction = 0.3  # of crops that lose those of some of their cubes of 1 m
     cubes_lost: Fraction = 0.3  # of the cubes

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semantic_mapper.fields.nesf import load_nesf, save_nesf, shipped_nesf
+from semantic_mapper.fields.nesf import load_nesf, save_nesf
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.map_grids import training_map
@@ -55,7 +55,7 @@ def test_without_weights_votes_are_smoothed_whatever_the_classes(tmp_path: Path)
     make_map(NYU40).save(tmp_path / "map.npz")
     done = run("refine", tmp_path / "map.npz", "--up", "z", "--out", tmp_path / "smooth.npz")
     assert done.returncode == 0, done.stderr
-    assert "no weights ship for label set 'nyu40': the votes were smoothed" in done.stdout
+    assert "no --weights: the votes were smoothed" in done.stdout
     before, after = (VoxelMap.load(tmp_path / name).mesh() for name in ("map.npz", "smooth.npz"))
 
     def borders(labels: np.ndarray) -> float:
@@ -64,19 +64,17 @@ def test_without_weights_votes_are_smoothed_whatever_the_classes(tmp_path: Path)
     assert borders(after.label) < 0.8 * borders(before.label), "chance votes become patches"
 
 
-def test_without_weights_those_that_ship_refine_maps_of_their_classes(files: Path, tmp_path: Path) -> None:
-    shipped = shipped_nesf(ROOMS)
-    assert shipped is not None and shipped.recipe["steps"] > 1000
-    done = run("refine", files, "--up", "z", "--out", tmp_path / "refined.npz")
-    assert done.returncode == 0, done.stderr
-    assert "told apart" in done.stdout
-    assert VoxelMap.load(tmp_path / "refined.npz").refined == shipped.digest
-    found = json.loads(run("query", tmp_path / "refined.npz", "instances", "--json").stdout)
-    assert found["told_apart_by"] == "what `refine` has learned"
-    done = run("refine", files, "--up", "z", "--out", tmp_path / "smooth.npz", "--smooth")
-    assert "--smooth: the votes were smoothed" in done.stdout
-    found = json.loads(run("query", tmp_path / "smooth.npz", "instances", "--json").stdout)
-    assert found["told_apart_by"] == "connected pieces of one class"
+def test_queries_say_how_things_were_told_apart(files: Path, tmp_path: Path) -> None:
+    ways = {"learned": ("--weights", files / "nesf.safetensors"), "smooth": ()}
+    for name, options in ways.items():
+        done = run("refine", files, "--up", "z", "--out", tmp_path / f"{name}.npz", *options)
+        assert done.returncode == 0, done.stderr
+        assert ("told apart" in done.stdout) == (name == "learned")
+    told = [
+        json.loads(run("query", tmp_path / f"{name}.npz", "instances", "--json").stdout)["told_apart_by"]
+        for name in ways
+    ]
+    assert told == ["what `refine` has learned", "connected pieces of one class"]
 
 
 @pytest.mark.parametrize(
