@@ -220,7 +220,7 @@ def nearest_points(
     from scipy.spatial import KDTree  # a machine that only trains and renders has no SciPy
 
     _, nearest = KDTree(from_xyz).query(at_xyz, distance_upper_bound=max_distance_m, workers=-1)
-    return nearest.astype(np.int64)
+    return np.asarray(nearest, np.int64)
 
 
 def map_confusion(

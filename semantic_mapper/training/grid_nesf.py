@@ -173,8 +173,8 @@ def favour_by_frequency(model: GridNesf, scenes: Sequence[LabelledScene], balanc
     seen = drawn > 0
     shift = torch.from_numpy(np.where(seen, np.log(np.maximum(true, 1e-9) / np.where(seen, drawn, 1)), 0)).float()
     with torch.no_grad():
-        model.head.bias += shift
-        model.nothing += shift
+        model.head.bias.add_(shift)
+        model.nothing.add_(shift)
 
 
 def _rate(config: GridNesfTraining, fraction: float) -> float:
