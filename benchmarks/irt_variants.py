@@ -95,7 +95,7 @@ def main() -> None:
                 (score(room, field, suite, own_image=True), score(room, field, suite, own_image=False), spent)
             )
     for variant, found in rows.items():
-        seen, blind = (sum_of([row[i] for row in found]) for i in (0, 1))
+        seen, blind = sum_of([row[0] for row in found]), sum_of([row[1] for row in found])
         cpu = np.mean([row[2] for row in found])
         print(f"| {variant} | {seen} | {blind} | {cpu:.0f} |", flush=True)
 
