@@ -153,7 +153,9 @@ def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
                 hit = client.nearest(asked.class_name, asked.point, asked.min_confidence)
                 return map_answers.answer_nearest(asked.class_name, asked.point, hit)
             case Question.INSTANCES:
-                return map_answers.answer_instances(asked.up, client.instances(asked.up))
+                # A map that grows has no things of its own; of a refined one the answer does not say.
+                by = "" if asked.refined else map_answers.CONNECTED
+                return map_answers.answer_instances(asked.up, client.instances(asked.up), by)
 
 
 def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tuple[float, ...]]:
