@@ -169,7 +169,9 @@ def make_label_folder(path: Path, log: Log, label_set: LabelSet) -> LabelFolder:
     """
     if (path / LABELS_FILE).exists():
         _check_log(path, log)
-        _check_classes(path, read_label_set(path / LABELS_FILE), label_set)
+        there = read_label_set(path / LABELS_FILE)
+        if LabelFolder(path, there).numbers():
+            _check_classes(path, there, label_set)
     elif LabelFolder(path, label_set).numbers():
         raise LogError(f"{path}: has images, but no labels.json that says what they are; choose another folder")
     identity = msgspec.to_builtins(log_identity(log))

@@ -134,9 +134,12 @@ def _check_options(suggest: bool, serve: bool, given: dict[str, object]) -> None
 
 
 def _suggest(output: Output, log: Path, count: int, images: Path | None, weights: Path | None, json: bool) -> None:
+    from semantic_mapper.errors import LogError
     from semantic_mapper.nodes.cli.labelling_page import open_images, suggest_for_log, suggestion_table
     from semantic_mapper.replay.log.sequence import open_log
 
+    if images is not None and not images.is_dir():
+        raise LogError(f"--images {images}: no such folder")
     with StopRequest() as stop, frame_progress("suggest", None) as bar, open_log(log) as opened:
         found = suggest_for_log(opened, count, open_images(images, opened), weights, stop, bar)
     if found.frames:

@@ -52,6 +52,8 @@ def refine(
     Example: semantic-mapper refine runs/kitchen/map.npz --out refined.npz
     Example: semantic-mapper refine runs/kitchen/map.npz --out refined.npz --weights nesf.safetensors
     """
+    if by_name and weights is None:
+        raise typer.BadParameter("goes with --weights; smoothed votes take any classes", param_hint="--by-name")
     output = Output.guarded()
     output.quiet = json
     from semantic_mapper.fields.nesf import load_nesf, smoothed_votes
@@ -92,7 +94,7 @@ def _table(report: RefineReport) -> Table:
     """Fraction of the surface by class; classes that it never has are left out."""
     from rich.table import Table
 
-    table = Table(title="share of the surface", title_justify="left")
+    table = Table(title="fraction of the surface", title_justify="left")
     table.add_column("")
     for column in ("before", "after"):
         table.add_column(column, justify="right")

@@ -10,7 +10,7 @@ from pathlib import Path
 import structlog
 
 from semantic_mapper.config import DepthConfig
-from semantic_mapper.errors import FrameError, LabelError, LogError
+from semantic_mapper.errors import ConfigError, FrameError, LabelError, LogError
 from semantic_mapper.fields.checkpoint import (
     Checkpoint,
     anchor_from_frame,
@@ -70,6 +70,10 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
     Raises:
         LogError, LabelError, FrameError, WeightsError, ConfigError: with what is wrong and the mend.
     """
+    if request.out.resolve() == request.log.resolve():
+        raise ConfigError(f"{request.out}: is the log itself; choose another name for the weights")
+    if request.out.exists() and request.out.suffix != ".safetensors":
+        raise ConfigError(f"{request.out}: is there, and no weights file; give --out a name that ends in .safetensors")
     prepare_file(request.out)
     # First, so that a wrong path does not cost the reading of a log.
     nothing = request.from_scratch or request.kind is not None
@@ -101,7 +105,9 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
     bar.start(100)
 
     def on_progress(progress: FinetuneProgress) -> None:
-        note = f"step {progress.step} held-out loss {progress.held_out_loss:.3f}"
+        note = f"step {progress.step}"
+        if math.isfinite(progress.held_out_loss):
+            note += f" held-out loss {progress.held_out_loss:.3f}"
         if not math.isnan(progress.held_out_accuracy):
             note += f" accuracy {progress.held_out_accuracy * 100:.1f} %"
         bar.set(int(progress.fraction * 100), note)

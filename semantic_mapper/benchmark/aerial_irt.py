@@ -129,7 +129,8 @@ def _load_trunk(config: AerialConfig, episode: Episode, field: IRT, start: TownG
     field.grid.load_state_dict(start.grid.state_dict())
     assert field.trunk is not None
     settings = grid_settings(config, episode.town)
-    plain = [grid_digest(config, episode.town), field.shape.features, field.shape.trunk_width, VERSION]
+    shape = (field.shape.features, field.shape.trunk_width)
+    plain = [grid_digest(config, episode.town), *shape, config.trunk_steps, VERSION]
     digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
     path = folder / f"trunk-{episode.town}-{digest}.safetensors"
     if path.exists():

@@ -193,6 +193,9 @@ class Nesf(nn.Module):
         return log_p * (1 + here[:, -4:-3]) + here[:, :-4], here[:, -3:] * FARTHEST_M
 
 
+SMOOTHED = hashlib.sha256(b"smoothed votes").hexdigest()  # in place of a digest of weights
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class NesfWeights:
     """A network with its provenance.
@@ -209,10 +212,10 @@ class NesfWeights:
 
 
 def smoothed_votes(label_set: LabelSet) -> NesfWeights:
-    """What stands in for weights where there are none, and what they have to beat: votes smoothed, nothing learned."""
+    """Used where no weights are given, and the baseline that weights have to beat: votes smoothed, nothing learned."""
     model = Nesf(label_set, NesfConfig(width=1, centres=False)).eval()
     model.start_smoothed()
-    return NesfWeights(model, {}, hashlib.sha256(b"smoothed votes").hexdigest())
+    return NesfWeights(model, {}, SMOOTHED)
 
 
 def save_nesf(weights: NesfWeights, path: Path) -> None:

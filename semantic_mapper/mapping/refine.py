@@ -18,7 +18,17 @@ import torch
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError, WeightsError
-from semantic_mapper.fields.nesf import CELL_M, Cells, Near, Nesf, NesfWeights, SurfacePoints, near_cells, pool
+from semantic_mapper.fields.nesf import (
+    CELL_M,
+    SMOOTHED,
+    Cells,
+    Near,
+    Nesf,
+    NesfWeights,
+    SurfacePoints,
+    near_cells,
+    pool,
+)
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
 from semantic_mapper.mapping.files.up_axis import find_up, turn_onto
 from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
@@ -181,10 +191,12 @@ def check_refinable(voxel_map: VoxelMap) -> None:
     if not voxel_map.block_count:
         raise MapError("an empty map has nothing to refine; map a frame first")
     if voxel_map.refined:
-        raise MapError(
-            f"the map is refined already, with weights of digest {voxel_map.refined[:12]}; refine the map that it was "
-            "made from"
+        how = (
+            "its votes were smoothed"
+            if voxel_map.refined == SMOOTHED
+            else f"weights of digest {voxel_map.refined[:12]}"
         )
+        raise MapError(f"the map is refined already ({how}); refine the map that it was made from")
     if voxel_map.config.voxel_size_m > LARGEST_VOXEL_M:
         raise MapError(
             f"voxels of {voxel_map.config.voxel_size_m * 100:g} cm are too coarse to refine (at most "
@@ -317,7 +329,7 @@ def _refined(
     after[:, mine] = together + said
     after[np.ix_(~voted, np.setdiff1d(np.arange(before.shape[1]), mine))] = np.log(PROBABILITY_FLOOR)
     after = np.maximum(after, LEAST_LOG)
-    filled = ~voted & reached & (said.max(axis=1) >= np.log(fill)) & (fill < 1)
+    filled = ~voted & reached & (np.exp(said.max(axis=1)) >= fill) & (fill < 1)
     changed = (voted & reached) | filled
     votes = np.where(voted, points.votes[own], np.float32(FILL_VOTES))[changed]
     core = voxels.core[own]

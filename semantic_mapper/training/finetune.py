@@ -217,7 +217,7 @@ def finetune(
     if len(frames) < 2 or not labelled:
         raise FrameError(
             f"finetuning needs at least 2 frames, one of them labelled, got {len(frames)} with {len(labelled)} "
-            "labelled; raise --keyframes"
+            "labelled; label more frames"
         )
     clock = _Clock(config)
     torch.manual_seed(config.seed)

@@ -130,8 +130,12 @@ def test_the_file_says_by_what_it_was_refined_and_other_files_say_nothing(tmp_pa
     voxel_map.save(tmp_path / "refined.npz")
     again = VoxelMap.load(tmp_path / "refined.npz")
     assert again.refined == "ab" * 32
-    with pytest.raises(MapError, match="refined already, with weights of digest abababababab"):
+    with pytest.raises(MapError, match=r"refined already \(weights of digest abababababab"):
         refine(again, random_weights(), up=UP)
+    smoothed = make_map()
+    refine(smoothed, smoothed_votes(ROOMS), up=UP, fill=0.0)
+    with pytest.raises(MapError, match="its votes were smoothed"):
+        refine(smoothed, random_weights(), up=UP)
 
 
 def test_things_of_a_refined_map_are_in_its_file_and_answer_queries(tmp_path: Path) -> None:

@@ -214,3 +214,14 @@ def test_a_field_of_one_scene_labels_its_log_and_maps_it(log: Path, tmp_path: Pa
 def test_options_that_do_not_go_with_a_kind_are_refused(arguments, said, log: Path, tmp_path: Path) -> None:
     done = run("finetune", log, *arguments, "--out", tmp_path / "w.safetensors")
     assert done.returncode == 2 and said in " ".join(done.stderr.split())
+
+
+def test_weights_never_replace_a_log_or_another_file(log: Path, tmp_path: Path) -> None:
+    before = log.read_bytes()
+    done = run("finetune", log, "--keyframes", "2", "--steps", "1", "--out", log)
+    assert done.returncode == 1 and "is the log itself" in error_line(done.stderr)
+    notes = tmp_path / "notes.txt"
+    notes.write_text("mine")
+    done = run("finetune", log, "--keyframes", "2", "--steps", "1", "--out", notes)
+    assert done.returncode == 1 and "no weights file" in error_line(done.stderr)
+    assert log.read_bytes() == before and notes.read_text() == "mine"

@@ -163,3 +163,8 @@ def test_label_folders_that_cannot_be_learned_from_are_refused(log: Path, weight
     done = run("finetune", log, "--kind", "grid", "--labels", one, "--out", tmp_path / "w.safetensors")
     assert done.returncode == 2 and "learns no classes" in done.stderr
     assert not (tmp_path / "w.safetensors").exists()
+
+
+def test_a_folder_of_labels_that_is_not_there_is_refused(log: Path, tmp_path: Path) -> None:
+    done = run("label", log, "--suggest", "2", "--images", tmp_path / "nowhere")
+    assert done.returncode == 1 and "no such folder" in error_line(done.stderr)

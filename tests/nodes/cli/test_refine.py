@@ -101,6 +101,11 @@ def test_bad_input_is_refused_in_one_line_and_nothing_is_written(
     assert not (files / "out.npz").exists()
 
 
+def test_classes_by_name_go_with_weights(files: Path) -> None:
+    done = run("refine", files / "map.npz", "--out", files / "out.npz", "--by-name")
+    assert done.returncode == 2 and "--weights" in done.stderr
+
+
 def test_weights_that_refine_maps_label_no_frames(files: Path, tmp_path: Path) -> None:
     done = run("replay", tmp_path / "no.mcap", "--weights", files / "nesf.safetensors", "--out", tmp_path / "out")
     assert done.returncode == 1
