@@ -72,7 +72,7 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
     """
     if request.out.resolve() == request.log.resolve():
         raise ConfigError(f"{request.out}: is the log itself; choose another name for the weights")
-    if request.out.exists() and request.out.suffix != ".safetensors":
+    if request.out.is_file() and request.out.suffix != ".safetensors":
         raise ConfigError(f"{request.out}: is there, and no weights file; give --out a name that ends in .safetensors")
     prepare_file(request.out)
     # First, so that a wrong path does not cost the reading of a log.
