@@ -29,7 +29,7 @@ from semantic_mapper.mapping.refine import refine
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.evaluate.room_map import NEAR_M, UP, TrueSurface, compare_instances, fuse_room, in_rooms
 
-RESAMPLES = 300  # of instances
+RESAMPLES = 100  # of instances
 
 
 class Scored(Config, frozen=True):
