@@ -3,7 +3,7 @@ import torch
 
 from semantic_mapper.config import SRayConfig
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.registry import PRESETS, build_field
+from semantic_mapper.fields.registry import build_field
 from semantic_mapper.fields.sray import SRay
 from tests.fields.scene import pose_at, wall_rays, wall_sources
 from tests.fields.tiny_fields import LABELS, POSES, TINY, assert_gradients_are_right, tiny
@@ -31,7 +31,7 @@ def test_the_switches_of_a_name_win_over_those_of_a_config():
     assert not build_field("sray-none", contrary, LABELS).config.cross_view_attention
 
 
-@pytest.mark.parametrize("name", list(PRESETS))
+@pytest.mark.parametrize("name", list(SWITCHES))
 def test_each_ablation_uses_the_attention_that_it_is_named_after(name: str):
     field = tiny(name).train()
     assert isinstance(field, SRay)
@@ -44,7 +44,7 @@ def test_each_ablation_uses_the_attention_that_it_is_named_after(name: str):
     assert used == SWITCHES[name]
 
 
-@pytest.mark.parametrize("name", list(PRESETS))
+@pytest.mark.parametrize("name", list(SWITCHES))
 def test_an_ablation_is_saved_as_s_ray_with_its_switches_and_loads_to_the_same_answers(name: str, tmp_path):
     field = tiny(name)
     save_checkpoint(Checkpoint(field), tmp_path / "w.safetensors")

@@ -88,5 +88,6 @@ def test_completion_of_bash_knows_verbs_and_options(tmp_path: Path) -> None:
     script = complete("", _SEMANTIC_MAPPER_COMPLETE="source_bash")
     assert "complete" in script and "semantic-mapper" in script
     home = {**os.environ, "HOME": str(tmp_path), "SHELL": "/bin/bash"}
-    subprocess.run([str(COMMAND), "--install-completion", "bash"], env=home, capture_output=True, check=True)
+    install = '"$0" --install-completion bash; exit $?'  # inside a shell, which it looks for among its parents
+    subprocess.run(["/bin/bash", "-c", install, str(COMMAND)], env=home, capture_output=True, check=True)
     assert "semantic-mapper" in (tmp_path / ".bashrc").read_text()
