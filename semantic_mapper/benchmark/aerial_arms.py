@@ -93,7 +93,7 @@ def patch_arm(config: AerialConfig, episode: Episode) -> EpisodeScores:
 def unet_arm(darkest: float = 1.0) -> Arm:
     """The per-image U-Net on the labelled views, past its plateau; ``darkest``: see ``UNetConfig``.
 
-    One block in eight of the labelled views is held out. The network is fitted anew with twice the steps until those
+    One block in eight of the labelled views is held out. The network is fitted again with twice the steps until those
     after four fifths of them bring less than half a point of mIoU there.
     """
 

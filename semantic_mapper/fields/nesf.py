@@ -1,6 +1,6 @@
 """NeSF on saved maps: a 3D network that has seen many maps corrects the class probabilities of this one.
 
-It also says how to get from each point to the centre of the object there, by which a map's things are told apart. The
+It also says how to get from each point to the centre of the object there, by which a map's instances are separated. The
 map's surface is pooled to cells of ``CELL_M``; each cell tells the network its shape, colour, and what the votes
 there say. The answer is a *residual* on the map's log-probabilities: a vector, how much of the smoothed votes round the
 cell is added, and how much a voxel's own still count. All of it comes from a layer that starts at zero, so that an

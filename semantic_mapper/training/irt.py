@@ -43,7 +43,7 @@ LEARNING_RATE, FINAL_RATE, WEIGHT_DECAY = 2e-3, 1e-4, 1e-4
 CLASS_BALANCE = 0.25  # a class counts by its fraction of the pixels to the power of minus this
 IMAGE_DROPPED = 0.2  # fraction of rays without the texture of their pixel
 DEPTH_USED = 0.7  # fraction of steps in which measured depth says where a ray ends
-LABELS_DROPPED = 0.5  # of the other frames' labels at most, drawn anew in every step
+LABELS_DROPPED = 0.5  # of the other frames' labels at most, drawn in every step
 IMAGE_LOSS = 1.0  # weight of what the texture says by itself
 COLOUR_JITTER = 0.25
 LOOK_RAYS = 4096
@@ -105,7 +105,7 @@ def fit_irt(
         raise ConfigError("a fit needs a budget: set seconds, steps, or both")
     if start is not None and start.label_set != label_set:
         raise WeightsError(
-            f"the weights have label set '{start.label_set.name}', the labels '{label_set.name}'; fit anew without them"
+            f"the weights have label set '{start.label_set.name}', the labels '{label_set.name}'; fit again without them"
         )
     began = time.monotonic()
     labelled = [f for f in usable_frames(frames) if f.label is not None]

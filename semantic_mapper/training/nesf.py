@@ -275,7 +275,7 @@ def _class_weights(labels: Sequence[VoxelLabels], classes: int, balance: float) 
 
 
 def _map_of_step(step: int, count: int, seed: int) -> int:
-    """Each map once, in an order drawn anew, then each again."""
+    """Each map once, in random order, then each again."""
     return int(np.random.default_rng((seed, step // count, 1)).permutation(count)[step % count])
 
 
