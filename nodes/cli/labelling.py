@@ -54,7 +54,7 @@ def choose_keyframes(
         numbers = sorted(set(frames)) or ([] if folder is None else folder.numbers())
         if folder is None and not numbers:
             request = FinetuneRequest(path, count, path, FinetuneConfig(), None, False, DepthConfig(source="sensor"))
-            return choose_labelled(log, label_set, request, {}, stop, bar), label_set
+            return list(choose_labelled(log, label_set, request, {}, stop, bar).values()), label_set
         bar.start(len(numbers))
         chosen: list[PosedFrame] = []
         for number in numbers:

@@ -65,7 +65,7 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
     """Finetune on keyframes of a log and write the weights: after a stop request, the best so far.
 
     Returns:
-        The weights, and the sequence numbers of the frames they were fitted to.
+        The weights, and the numbers in the log of the frames they were fitted to, as ``frames`` takes them.
 
     Raises:
         LogError, LabelError, FrameError, WeightsError, ConfigError: with what is wrong and the mend.
@@ -89,12 +89,12 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
             )
         label_set = label_set or ROOMS
         computed = _compute_depths(log, request.depth, stop, bar)
-        frames: list[PosedFrame] = []
+        by_number: dict[int, PosedFrame] = {}
         if request.frames:
-            frames = _named(log, request, computed, folder)
+            by_number = _named(log, request, computed, folder)
         elif request.keyframes or folder is not None:  # a folder without a number: all that it has
-            frames = choose_labelled(log, label_set, request, computed, stop, bar, folder)
-        chosen = [f.seq for f in frames]
+            by_number = choose_labelled(log, label_set, request, computed, stop, bar, folder)
+        frames, chosen = list(by_number.values()), list(by_number)
         pseudo = sum(f.label_is_pseudo for f in frames)
         if kind in FITTERS:
             frames += read_unlabelled(log, frames, request, computed, stop, bar)
@@ -135,20 +135,20 @@ def _named(
     request: FinetuneRequest,
     computed: Mapping[tuple[str, int], ComputedFrame],
     folder: LabelFolder | None,
-) -> list[PosedFrame]:
-    """The labelled frames that the request names, with the depth that it asks for.
+) -> dict[int, PosedFrame]:
+    """The labelled frames that the request names, by number in the log, with the depth that it asks for.
 
     Raises:
         LogError: the log has no such frame, or it has no label image.
     """
-    frames: list[PosedFrame] = []
+    frames: dict[int, PosedFrame] = {}
     for number in sorted(set(request.frames)):
         if number >= len(log):
             raise LogError(f"{request.log}: has no frame {number}; it has {len(log)}")
         frame = log.frame(number) if folder is None else folder.labelled(log.frame(number), number)
         if frame.label is None:
             raise LogError(f"{request.log}: frame {number} has no label image; give one in a folder with --labels")
-        frames.append(_as_given(frame, computed, request.depth))
+        frames[number] = _as_given(frame, computed, request.depth)
     return frames
 
 
@@ -193,8 +193,8 @@ def choose_labelled(
     stop: StopRequest,
     bar: FrameProgress,
     folder: LabelFolder | None = None,
-) -> list[PosedFrame]:
-    """The labelled frames that show most of what the log shows, with the depth that the request asks for.
+) -> dict[int, PosedFrame]:
+    """The labelled frames that show most of what the log shows, by number in it, with the depth that is asked for.
 
     Of a log whose depth is computed, frames that it could be computed for. Labels of a ``folder`` go before those of
     the log; without a number of keyframes, all of them are taken.
@@ -234,9 +234,11 @@ def choose_labelled(
     chosen = range(len(candidates))
     if request.keyframes:
         chosen = choose_keyframes(candidates, request.keyframes, request.config.seed)
-    frames = [(numbers[i], log.frame(numbers[i])) for i in chosen]
-    labelled = [frame if folder is None else folder.labelled(frame, number) for number, frame in frames]
-    return [_as_given(frame, computed, request.depth) for frame in labelled]
+    frames: dict[int, PosedFrame] = {}
+    for number in (numbers[i] for i in chosen):
+        frame = log.frame(number) if folder is None else folder.labelled(log.frame(number), number)
+        frames[number] = _as_given(frame, computed, request.depth)
+    return frames
 
 
 def read_unlabelled(

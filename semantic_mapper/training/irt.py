@@ -105,7 +105,7 @@ def fit_irt(
         raise ConfigError("a fit needs a budget: set seconds, steps, or both")
     if start is not None and start.label_set != label_set:
         raise WeightsError(
-            f"the weights have label set '{start.label_set.name}', the labels '{label_set.name}'; fit again without them"
+            f"the weights have label set '{start.label_set.name}', the labels '{label_set.name}'; fit without them"
         )
     began = time.monotonic()
     labelled = [f for f in usable_frames(frames) if f.label is not None]
