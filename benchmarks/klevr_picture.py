@@ -16,10 +16,9 @@ from semantic_mapper.benchmark.klevr import TEST_CAMERAS, KlevrConfig, novel_see
 from semantic_mapper.benchmark.klevr_grids import NEAR_M, scene_density
 from semantic_mapper.benchmark.klevr_nesf import (
     NESF_ARMS,
-    arm_settings,
+    arm_network,
     grid_config,
     nesf_curve,
-    nesf_network,
     scene_grid,
 )
 from semantic_mapper.config import load_config
@@ -33,7 +32,7 @@ ENLARGED, GAP_PX = 2, 4
 
 def picture(config: KlevrConfig, folder: Path, columns: int) -> UInt8:
     """A column for each scene."""
-    model = nesf_network(*arm_settings(config, "nesf"), folder)
+    model, _ = arm_network(config, "nesf", folder)
     found: list[UInt8] = []
     for scene in novel_seeds(config)[:columns]:
         labels = SceneLabels(model, scene_grid(scene_density(grid_config(config), scene, folder)), NEAR_M)
