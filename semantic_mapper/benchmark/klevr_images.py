@@ -83,13 +83,18 @@ def unet_arm(config: KlevrConfig, folder: Path) -> ArmScores:
     The plateau is looked for at test cameras of training scenes. Points take the class that most of the train cameras
     that see them say.
     """
-    unet, gain = fit_to_plateau(lambda steps: _fit_unet(config, folder, steps), config.unet_steps, MOST_DOUBLINGS)
+    unet, gain = unet_network(config, folder)
     found = score_images(config, unet.predict)
     for scene, matrices in found.items():
         xyz, truth = surface_points(config, scene)
         matrix = matrices[POINTS] = ConfusionMatrix(KLEVR_SUITE.label_set)
         matrix.update(truth, vote_at_points(config, scene, xyz, unet.predict), f"points of scene {scene}")
     return ArmScores(found, gain)
+
+
+def unet_network(config: KlevrConfig, folder: Path) -> tuple[UNetBaseline, float]:
+    """The U-Net of the arm, and the mIoU that the last fifth of its steps brought."""
+    return fit_to_plateau(lambda steps: _fit_unet(config, folder, steps), config.unet_steps, MOST_DOUBLINGS)
 
 
 def vote_at_points(config: KlevrConfig, scene: int, xyz: Float32, predict: Callable[[PosedFrame], UInt8]) -> UInt8:
