@@ -125,7 +125,7 @@ def scored_numbers(config: KlevrConfig, scene: int) -> dict[str, list[int]]:
     return {TRAIN_CAMERAS: sorted(map(int, train)), TEST_CAMERAS: sorted(map(int, test))}
 
 
-def scene_frames(config: KlevrConfig, scene: int, numbers: list[int] | range) -> list[PosedFrame]:
+def scene_frames(config: KlevrConfig, scene: int, numbers: Sequence[int]) -> list[PosedFrame]:
     """Frames of a scene with exact depth and labels."""
     views = klevr_views(scene, numbers, klevr_camera(config.width), variant=config.variant)
     return [view.frame for view in views]
@@ -208,9 +208,11 @@ def klevr_scores(
     return table, unfinished
 
 
-def surface_points(config: KlevrConfig, scene: int) -> tuple[Float32, UInt8]:
-    """Points (N, 3) of the surface with their true ids (N,): those that the scored train cameras see."""
-    frames = scene_frames(config, scene, scored_numbers(config, scene)[TRAIN_CAMERAS])
+def surface_points(config: KlevrConfig, scene: int, numbers: Sequence[int] | None = None) -> tuple[Float32, UInt8]:
+    """Points (N, 3) of the surface with their true ids (N,): what frames show, without numbers what the scored train
+    cameras of a novel scene do."""
+    numbers = scored_numbers(config, scene)[TRAIN_CAMERAS] if numbers is None else numbers
+    frames = scene_frames(config, scene, numbers)
     rays = frame_rays(frames, config.width)
     hit = np.flatnonzero(rays.depth_m > 0)
     batch = rays.rays(hit, 0.0)
