@@ -36,7 +36,6 @@ VIEW_ARMS = {"nesf-5-views": 5, "nesf-25-views": 25}  # arms whose densities are
 FEW_SCENES = (12, 6)  # of training and novel, for these
 
 _MAPS_STREAM, _SCORED_STREAM = 11, 12
-MOST_DOUBLINGS = 2  # of the steps of an arm, until its plateau
 
 
 class KlevrConfig(Config, frozen=True):
@@ -50,10 +49,11 @@ class KlevrConfig(Config, frozen=True):
     label_maps: AtLeastOne = 9  # of a training scene
     scored_views: AtLeastOne = 4  # of a novel scene, by train cameras, and as many by test cameras
     variant: Variant = "upright"
-    unet_steps: AtLeastOne = 6000  # to begin with; doubled until a plateau is reached
+    unet_steps: AtLeastOne = 6000  # to begin with
     mlp_steps: AtLeastOne = 1500
     grid_steps: AtLeastOne = 600  # of the fit of a scene's density
-    nesf_steps: AtLeastOne = 2400  # of one scene each; doubled in the same way
+    nesf_steps: AtLeastOne = 2400  # of one scene each, to begin with
+    doublings: NotNegative = 2  # at most, of the steps of an arm until its plateau; without one it is not judged
     nesf_width: AtLeastOne = 8
     seed: NotNegative = 0
 

@@ -18,7 +18,6 @@ from torch import nn
 from torch.nn import functional
 
 from semantic_mapper.benchmark.klevr import (
-    MOST_DOUBLINGS,
     POINTS,
     TEST_CAMERAS,
     Arm,
@@ -94,7 +93,7 @@ def unet_arm(config: KlevrConfig, folder: Path) -> ArmScores:
 
 def unet_network(config: KlevrConfig, folder: Path) -> tuple[UNetBaseline, float]:
     """The U-Net of the arm, and the mIoU that the last fifth of its steps brought."""
-    return fit_to_plateau(lambda steps: _fit_unet(config, folder, steps), config.unet_steps, MOST_DOUBLINGS)
+    return fit_to_plateau(lambda steps: _fit_unet(config, folder, steps), config.unet_steps, config.doublings)
 
 
 def vote_at_points(config: KlevrConfig, scene: int, xyz: Float32, predict: Callable[[PosedFrame], UInt8]) -> UInt8:

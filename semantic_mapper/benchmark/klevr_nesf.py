@@ -18,7 +18,6 @@ from safetensors.torch import load_file, save
 from torch.nn import functional
 
 from semantic_mapper.benchmark.klevr import (
-    MOST_DOUBLINGS,
     POINTS,
     VIEW_ARMS,
     Arm,
@@ -117,7 +116,7 @@ def arm_network(config: KlevrConfig, name: str, folder: Path) -> tuple[GridNesf,
         model = nesf_network(own, settings, folder, arm)
         return model, last_fifth(read_curve(own, settings, folder, arm))
 
-    return fit_to_plateau(fit, training.steps, MOST_DOUBLINGS)
+    return fit_to_plateau(fit, training.steps, config.doublings)
 
 
 def last_fifth(curve: Sequence[TrainingPoint]) -> float:
@@ -198,7 +197,7 @@ def nesf_curve(config: KlevrConfig, name: str, folder: Path) -> list[TrainingPoi
     own, training = arm_settings(config, name)
     curves = (
         read_curve(own, msgspec.structs.replace(training, steps=training.steps << k), folder, NESF_ARMS[name])
-        for k in reversed(range(MOST_DOUBLINGS + 1))
+        for k in reversed(range(config.doublings + 1))
     )
     return next(filter(None, curves), [])
 
