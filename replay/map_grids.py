@@ -42,6 +42,7 @@ def make_room_maps(
     weights: Path | None = None,
     frames: int = ROOM_FRAMES,
     on_room: Callable[[int], object] = lambda seed: None,
+    rendered: Sequence[int] = (1,),
 ) -> list[Path]:
     """Map procedural rooms that are not yet in the folder; returns the files of all of them.
 
@@ -51,17 +52,20 @@ def make_room_maps(
         weights: Of the field; None = those that ship.
         frames: Of 320x240 a room.
         on_room: Called after each.
+        rendered: Maps of each room: every so many-th frame is rendered, the others have no votes.
     """
     paths: list[Path] = []
     for seed in seeds:
-        path = folder / f"room-{seed}.npz"
-        if not path.is_file():
+        files = {every: folder / f"room-{seed}{'' if every == 1 else f'-every-{every}'}.npz" for every in rendered}
+        missing = {every: path for every, path in files.items() if not path.is_file()}
+        if missing:
             walk = CameraPathConfig(step_m=SequenceConfig().step_m)
             views = list(room_views(seed, frames, camera_of_width(MAP_WIDTH), path=walk, noise=NoiseConfig()))
-            voxel_map = _map_frames((view.frame for view in views), seen := [], weights)
             instances = [view.rendered.instance for view in views]
-            training_map(voxel_map, seen, ROOMS, UP, instances=instances).save(path)
-        paths.append(path)
+            for every, path in missing.items():
+                voxel_map = _map_frames((view.frame for view in views), seen := [], weights, every)
+                training_map(voxel_map, seen, ROOMS, UP, instances=instances).save(path)
+        paths += files.values()
         on_room(seed)
     return paths
 
@@ -107,13 +111,18 @@ def _map_log(log: Path, path: Path, weights: Path | None) -> str:
     return ""
 
 
-def _map_frames(frames: Iterable[PosedFrame], seen: list[PosedFrame], weights: Path | None) -> VoxelMap:
+def _map_frames(
+    frames: Iterable[PosedFrame], seen: list[PosedFrame], weights: Path | None, rendered: int = 1
+) -> VoxelMap:
     """The map of the frames with depth; those of them with labels come into ``seen``."""
     pipeline = Mapper.load(weights).pipeline
-    for frame in frames:
+    for number, frame in enumerate(frames):
         if frame.depth_m is None:
             continue
-        pipeline.step(replace(frame, label=None))
+        if number % rendered:
+            pipeline.voxel_map.integrate(frame, frame.depth_m, None)
+        else:
+            pipeline.step(replace(frame, label=None))
         if frame.label is not None:
             seen.append(frame)
     return pipeline.voxel_map

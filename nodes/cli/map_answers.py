@@ -76,7 +76,7 @@ CONNECTED, LEARNED = "connected pieces of one class", "what `refine` has learned
 
 
 def answer_instances(up: Sequence[float], instances: Sequence[Instance], told_apart_by: str = "") -> dict[str, Any]:
-    """The things in a map, as ``instances.InstanceTracker`` finds them, and by which means; empty = not known."""
+    """The things in a map, the surest first, and by which means they were told apart; empty = not known."""
     things = [
         {
             "id": thing.id,
@@ -91,7 +91,7 @@ def answer_instances(up: Sequence[float], instances: Sequence[Instance], told_ap
                 "R_world_box": np.round(thing.box.R_world_box, 6).tolist(),
             },
         }
-        for thing in instances
+        for thing in sorted(instances, key=lambda thing: -thing.rank)
     ]
     by = {"told_apart_by": told_apart_by} if told_apart_by else {}
     return {"question": "instances", "up": list(up), **by, "instances": things}

@@ -15,6 +15,8 @@ from semantic_mapper.training.folder_lock import sole_use_of
 from semantic_mapper.training.nesf import NesfProgress, NesfTrainConfig, TrainingMap, train_nesf
 
 WEIGHTS_FILE = "weights.safetensors"
+VALIDATION_SEED = 100_000  # rooms from here on have materials that none below has
+SELDOM = 4  # rooms are mapped once more with every so many-th frame rendered
 
 
 def train_on_maps(
@@ -81,14 +83,17 @@ def _maps(settings: NesfTrainConfig, folder: Path, weights: Path, stop: StopRequ
             raise ConfigError("training needs the maps of at least two logs, one of them to validate on")
         held_out = max(1, len(paths) // 10)
         return paths[:-held_out], paths[-held_out:]
-    count = settings.validation_rooms + settings.rooms
-    seeds = range(settings.first_seed, settings.first_seed + count)
-    paths: list[Path] = []
+    held_out = range(VALIDATION_SEED, VALIDATION_SEED + settings.validation_rooms)
+    seeds = range(settings.first_seed, settings.first_seed + settings.rooms)
+    paths: dict[int, list[Path]] = {}
     with frame_progress("map the rooms", None, unit="rooms") as bar:
-        bar.start(count)
-        for seed in seeds:
+        bar.start(len(held_out) + len(seeds))
+        for seed in (*held_out, *seeds):
             if stop:
                 break
-            paths += make_room_maps([seed], folder, weights)
+            rendered = (1,) if seed in held_out else (1, SELDOM)
+            paths[seed] = make_room_maps([seed], folder, weights, rendered=rendered)
             bar.advance()
-    return paths[settings.validation_rooms :], paths[: settings.validation_rooms]
+    return [path for seed in seeds for path in paths.get(seed, [])], [
+        path for seed in held_out for path in paths.get(seed, [])
+    ]

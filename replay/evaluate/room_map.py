@@ -230,7 +230,7 @@ def compare_instances(voxel_map: VoxelMap, surface: TrueSurface) -> InstanceReco
         x, y, z = (thing.voxels & 7).T
         instance[np.searchsorted(keys, (block << 9) | (z * 64 + y * 8 + x))] = number
     class_id = in_rooms(np.array([thing.class_id for thing in things], np.uint8), snapshot.label_set)
-    confidence = np.array([thing.confidence for thing in things], np.float32)
+    confidence = np.array([thing.rank for thing in things], np.float32)
     matches = match_instances(
         FoundInstances(instance, class_id, confidence),
         np.append(surface.label, np.uint8(ROOMS.ignore_id))[nearest],

@@ -224,6 +224,7 @@ def settings_digest(suite: SuiteConfig, part: Literal["views", "map"]) -> str:
         plain = {key: plain[key] for key in ("depth", "map_frames", "mapper")} | {"step_m": suite.sequence.step_m}
         if suite.sequence.camouflage != RoomConfig().camouflage:  # left out otherwise: older records stay valid
             plain["camouflage"] = suite.sequence.camouflage
+        plain["instances"] = "ranked by confidence and size"
     else:
         del plain["map_frames"], plain["mapper"]
         if suite.protocol == "generalize":

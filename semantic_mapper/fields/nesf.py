@@ -171,6 +171,15 @@ class Nesf(nn.Module):
         with torch.no_grad():
             self.net.head.bias[-5], self.net.head.bias[-4] = 1.0, -1.0
 
+    def trust(self, fraction: float) -> None:
+        """Blend the answers about classes with the smoothed votes: 1 = leave them as they are, 0 = smoothed votes."""
+        with torch.no_grad():
+            classes = slice(0, -3)
+            self.net.head.weight[classes] *= fraction
+            self.net.head.bias[classes] *= fraction
+            self.net.head.bias[-5] += 1 - fraction
+            self.net.head.bias[-4] -= 1 - fraction
+
     def forward(self, cells: Cells) -> torch.Tensor:
         """(M, L + 4) of each cell: residual, how much more the map's log-probabilities count, and the way to its
         object's centre, in units of ``FARTHEST_M``."""

@@ -24,6 +24,7 @@ from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.types import Float64, Int32, Int64
 
 MIN_VOXELS = 30  # 120 cm^2 of surface at 2 cm: less is mostly stray votes
+SURE_VOXELS = 200  # smaller things are wrong more often
 LEAST_OVERLAP = 0.1  # of an instance's voxels must be found again in what it became
 
 
@@ -49,6 +50,11 @@ class Instance:
     box: OrientedBox
     voxels: NDArray[np.int32]
     measured: float = 1.0
+
+    @property
+    def rank(self) -> float:
+        """How sure it is against others, 0..1: confidence times the root of its size, up to ``SURE_VOXELS``."""
+        return self.confidence * min(1.0, len(self.voxels) / SURE_VOXELS) ** 0.5
 
 
 class _Found(NamedTuple):

@@ -34,6 +34,7 @@ from semantic_mapper.fields.nesf import (
     SurfacePoints,
     near_cells,
     pool,
+    smoothed_votes,
 )
 from semantic_mapper.fields.sparse_conv import pack_cells
 from semantic_mapper.files import write_bytes
@@ -47,6 +48,8 @@ from semantic_mapper.training.train_state import LOSS_PARTS, Progress, load_stat
 STATE_FILE = "state.safetensors"
 CUBE_M = 1.0
 TEMPERATURES = np.geomspace(0.5, 3.0, 40)
+TRUSTED = np.linspace(0.1, 1.0, 10)
+FITTED = 200_000  # voxels are enough for two numbers
 NEVER_STORED = ("seconds", "steps", "logs", "save_every_s")  # may differ when a run goes on
 WARM_UP = 0.03  # fraction of the budget over which the learning rate rises
 LAST_RATE = 0.02  # fraction of the learning rate that is left at the end
@@ -59,7 +62,7 @@ class NesfTrainConfig(Config, frozen=True):
     kind: str = "nesf"
     field: NesfConfig = NesfConfig()
     rooms: NotNegative = 62  # procedural rooms to map, from ``first_seed`` on
-    validation_rooms: NotNegative = 8
+    validation_rooms: NotNegative = 12  # of other materials than those
     first_seed: NotNegative = 50_000  # S-Ray's weights were trained on rooms below: on those its votes are too sure
     logs: tuple[str, ...] = ()  # labelled logs with depth, in place of rooms; the last tenth of them validates
     maps: str = ""  # folder of the maps that are made of them; empty = "maps" in the run's folder
@@ -181,7 +184,7 @@ def train_nesf(
     on_progress: Callable[[NesfProgress], object] = lambda progress: None,
     stopped: Callable[[], object] = bool,
 ) -> NesfWeights:
-    """Train; returns the weights that were best on the validation maps, with a temperature fitted to them.
+    """Train; returns the weights that were best on the validation maps, with trust and temperature fitted to them.
 
     Args:
         label_set: Of the maps.
@@ -244,11 +247,12 @@ def train_nesf(
     if progress.best is not None:
         model.load_state_dict(progress.best)
     model.eval()
-    model.temperature.fill_(_temperature(model, validation))
+    trusted = _fit_to_validation(model, validation)
     recipe = {
         "config": to_plain(config),
         "steps": progress.step,
         "best_step": progress.best_step,
+        "trusted": round(trusted, 3),
         "maps": len(maps),
         "seconds": round(progress.elapsed_s, 1),
         "validation": _validate(model, validation),
@@ -426,15 +430,29 @@ def _validate(model: Nesf, maps: Sequence[TrainingMap]) -> dict[str, Any]:
 
 
 @torch.inference_mode()
-def _temperature(model: Nesf, maps: Sequence[TrainingMap]) -> float:
-    """That under which the labels of the maps are likeliest."""
+def _fit_to_validation(model: Nesf, maps: Sequence[TrainingMap]) -> float:
+    """Set how far the network is trusted against smoothed votes, and the temperature: labels of the maps are likeliest.
+
+    A network is too sure of what it learned where a scene differs from those it was trained on, and overrules votes
+    that are right. Returns how far it is trusted.
+    """
     answers = [_map_logits(model, map_) for map_ in maps]
-    logits = torch.cat([a[0] for a in answers])
-    channel = torch.from_numpy(np.concatenate([a[2] for a in answers]))
-    losses = [float(torch.nn.functional.cross_entropy(logits / t, channel)) for t in TEMPERATURES]
-    return float(TEMPERATURES[int(np.argmin(losses))])
+    some = slice(0, None, max(1, sum(len(a[2]) for a in answers) // FITTED))
+    logits, channel = torch.cat([a[0] for a in answers])[some], np.concatenate([a[2] for a in answers])[some]
+    start, channel = smoothed_votes(model.label_set).model, torch.from_numpy(channel)
+    votes = torch.cat([_map_logits(start, map_)[0] for map_ in maps])[some]
+    losses = {
+        (trusted, t): float(torch.nn.functional.cross_entropy(torch.lerp(votes, logits, trusted) / t, channel))
+        for trusted in TRUSTED.tolist()
+        for t in TEMPERATURES.tolist()
+    }
+    trusted, temperature = min(losses, key=losses.__getitem__)
+    model.trust(trusted)
+    model.temperature.fill_(temperature)
+    return trusted
 
 
+@torch.inference_mode()
 def _map_logits(model: Nesf, map_: TrainingMap) -> tuple[torch.Tensor, torch.Tensor, NDArray[np.int64]]:
     """Logits and the map's log-probabilities (V, L) at labelled voxels, and the class (V,) of most of their pixels."""
     points = SurfacePoints(*(v.astype(np.float32) for v in map_.points))

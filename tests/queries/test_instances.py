@@ -55,6 +55,14 @@ class Painting:
         return {tuple(thing.voxels[0][:2].tolist()): thing for thing in self.tracker.update(snapshot)}
 
 
+def test_of_equally_sure_things_the_larger_rank_higher_up_to_a_size() -> None:
+    plan = np.zeros((40, 40), np.uint8)
+    plan[2:5, 2:5], plan[8:20, 2:20], plan[22:40, 2:40] = TABLE, TABLE, TABLE
+    small, large, largest = sorted(Painting().paint(plan).values(), key=lambda thing: len(thing.voxels))
+    assert small.confidence == large.confidence == largest.confidence > 0
+    assert small.rank < large.rank == largest.rank == large.confidence
+
+
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), fraction=st.floats(0.1, 0.9), least=st.integers(1, 9))
 def test_components_are_those_of_scipy(seed: int, fraction: float, least: int) -> None:

@@ -32,8 +32,10 @@ def test_a_map_that_is_there_is_not_made_again(tmp_path: Path) -> None:
 
 def test_rooms_become_training_maps(tmp_path: Path) -> None:
     weights = write_weights(tmp_path / "tiny.safetensors")
-    (path,) = make_room_maps([7], tmp_path / "maps", weights, frames=2)
-    found = TrainingMap.load(path)
+    path, seldom = make_room_maps([7], tmp_path / "maps", weights, frames=2, rendered=(1, 2))
+    found, fewer = TrainingMap.load(path), TrainingMap.load(seldom)
+    assert len(fewer.points.xyz) == len(found.points.xyz), "the geometry is of all frames"
+    assert 0 < fewer.points.votes.sum() < found.points.votes.sum()
     assert len(found.points.xyz) > 1000 and found.points.log_p.shape[1] == len(ROOMS)
     assert found.row.max() < len(found.points.xyz) and len(np.unique(found.channel)) > 3
     assert len(np.unique(found.instance)) > 3 and (found.instance[found.channel == 0] == 0).all()

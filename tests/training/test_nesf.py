@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from msgspec.structs import replace
 
 from semantic_mapper.errors import ConfigError, WeightsError
-from semantic_mapper.fields.nesf import CELL_M, FARTHEST_M, NesfConfig, load_nesf, save_nesf
+from semantic_mapper.fields.nesf import CELL_M, FARTHEST_M, NesfConfig, load_nesf, pool, save_nesf, smoothed_votes
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.replay.map_grids import training_map
 from semantic_mapper.training.nesf import NesfTrainConfig, TrainingMap, VoxelLabels, _crop, train_nesf, withhold
@@ -47,6 +49,27 @@ def test_labels_of_images_teach_the_network(noisy: TrainingMap) -> None:
     assert found["loss"] < 0.8 * trained.recipe["history"][0]["loss"]
     assert trained.recipe["history"][0]["step"] == 0
     assert 0.4 < float(trained.model.temperature) < 3.1
+
+
+def test_a_network_that_overrules_right_votes_is_trusted_less(noisy: TrainingMap) -> None:
+    """It learns wrong labels, and is validated on a map of which the votes are right."""
+    rows, channel, _ = noisy.voxels
+    right = noisy.points.log_p.copy()
+    right[rows] = np.log(0.01)
+    right[rows, channel] = np.log(0.8)
+    sure = dataclasses.replace(noisy, points=noisy.points._replace(log_p=right))
+    wrong = dataclasses.replace(noisy, channel=(noisy.channel + 1) % len(ROOMS))
+    recipe = train_nesf(replace(TINY, steps=30), ROOMS, [wrong], [sure]).recipe
+    assert recipe["history"][-1]["miou"] < 0.9 * recipe["history"][-1]["map_miou"]
+    assert recipe["trusted"] <= 0.5 and recipe["validation"]["miou"] > recipe["history"][-1]["miou"]
+
+
+def test_an_untrusted_network_leaves_the_smoothed_votes(noisy: TrainingMap) -> None:
+    trained = train_nesf(replace(TINY, steps=5), ROOMS, [noisy], [noisy]).model
+    cells = pool(noisy.points)
+    trained.trust(0.0)
+    expected, found = smoothed_votes(ROOMS).model(cells), trained(cells)
+    torch.testing.assert_close(found[:, :-3], expected[:, :-3])
 
 
 def test_training_repeats_bit_for_bit(noisy: TrainingMap) -> None:

@@ -115,8 +115,8 @@ def test_weights_that_refine_maps_label_no_frames(files: Path, tmp_path: Path) -
 
 def test_training_on_maps_goes_on_where_it_stopped(tmp_path: Path) -> None:
     frames = tiny_frames()
-    for seed in (50_000, 50_001):
-        training_map(make_map(), frames, ROOMS, UP).save(tmp_path / "maps" / f"room-{seed}.npz")
+    for name in ("room-100000", "room-50000", "room-50000-every-4"):
+        training_map(make_map(), frames, ROOMS, UP).save(tmp_path / "maps" / f"{name}.npz")
     recipe = tmp_path / "tiny.toml"
     recipe.write_text(
         f'kind = "nesf"\nrooms = 1\nvalidation_rooms = 1\nsteps = 4\nmaps = "{tmp_path / "maps"}"\n'
@@ -126,7 +126,7 @@ def test_training_on_maps_goes_on_where_it_stopped(tmp_path: Path) -> None:
     out = tmp_path / "run"
     done = run("train", "--config", recipe, "--out", out, "--steps", "2")
     assert done.returncode == 0, done.stderr
-    assert "weights.safetensors: 2 steps on 1 maps" in done.stdout
+    assert "weights.safetensors: 2 steps on 2 maps" in done.stdout
     done = run("train", "--config", recipe, "--out", out, "--resume")
     assert done.returncode == 0, done.stderr
     recipe_of = load_nesf(out / "weights.safetensors").recipe
