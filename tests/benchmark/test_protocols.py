@@ -237,6 +237,9 @@ def test_scratch_starts_from_random_weights_whatever_the_file_holds() -> None:
     assert first.confusion == second.confusion
     tuned = [score(tiny_contestant(s), tiny_suite(protocol="finetune")).record for s in (0, 1)]
     assert tuned[0].curve[0].confusion != tuned[1].curve[0].confusion
+    (without_file,) = load_entries([], ["sray"])
+    beside = score(without_file, tiny_suite(protocol="finetune")).record
+    assert beside.curve[0].confusion == score(without_file, suite).record.curve[0].confusion  # as from scratch
 
 
 def test_a_kind_for_one_scene_is_fitted_in_a_box_round_what_the_keyframes_see() -> None:
