@@ -16,6 +16,7 @@ from semantic_mapper.benchmark.figures import (
     compare_maps,
     compare_surfaces,
     compare_with_baselines,
+    compare_with_carried,
     comparison_rows,
     draw_fit_curves,
     map_figures,
@@ -202,6 +203,11 @@ def _collect(
         {"first": a, "second": b, **difference}
         for a, b in pairs
         if (difference := compare(records[a], records[b], seed=suite.seed)) is not None
+    ]
+    found["differences"] += [
+        {"first": name, "second": "labels carried by depth", **difference}
+        for name, made in records.items()
+        if (difference := compare_with_carried(made, seed=suite.seed)) is not None
     ]
     found["rows"], more = _rows(suite, entries, records)
     found["differences"] += more
