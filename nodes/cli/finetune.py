@@ -51,11 +51,14 @@ def finetune(
     ] = "",
     unlabelled: Annotated[
         int | None,
-        typer.Option(min=0, help="--kind: how many frames without labels to use at most; 0 = all.  [default: 300]"),
+        typer.Option(
+            min=0,
+            help="--kind, or its weights: frames without labels to use at most; 0 = all.  [default: 300]",
+        ),
     ] = None,
     variant: Annotated[
         Literal["B", "BC", "RT", "RTT", "RTC", "RTTC"] | None,
-        typer.Option(help="--kind irt: what reads the classes.  [default: BC]"),
+        typer.Option(help="--kind irt, or its weights: what reads the classes.  [default: BC]"),
     ] = None,
     depth: FinetuneDepthOption = None,
     labels: Annotated[
@@ -78,25 +81,12 @@ def finetune(
     Example: semantic-mapper finetune kitchen.mcap --labels kitchen-labels --out kitchen.safetensors
     Example: semantic-mapper finetune kitchen.mcap --kind irt --keyframes 4 --out kitchen.safetensors
     """
-    if from_scratch and weights is not None:
-        raise typer.BadParameter("goes with random weights only", param_hint="--weights")
-    if kind is not None and (weights is not None or from_scratch):
-        raise typer.BadParameter("starts from nothing; leave out --weights and --from-scratch", param_hint="--kind")
-    if kind == "grid" and (frames or labels is not None):
-        raise typer.BadParameter("a grid learns no classes", param_hint="--frames" if frames else "--labels")
-    if not frames and labels is None and (keyframes is None) != (kind == "grid"):
-        raise typer.BadParameter("how many labelled frames? Only --kind grid learns none", param_hint="--keyframes")
-    if keyframes is not None and frames:
-        raise typer.BadParameter("--frames already names the frames", param_hint="--keyframes")
-    if unlabelled is not None and kind is None:
-        raise typer.BadParameter("goes with --kind only", param_hint="--unlabelled")
-    if variant is not None and kind != "irt":
-        raise typer.BadParameter("goes with --kind irt only", param_hint="--variant")
+    _refuse_mixed(weights, from_scratch, kind, keyframes, frames, labels, unlabelled, variant)
     output = Output.guarded()
     import msgspec
 
     from semantic_mapper.config import load_config
-    from semantic_mapper.nodes.cli.run_finetune import MAX_SCENE_FRAMES, FinetuneRequest, finetune_log
+    from semantic_mapper.nodes.cli.run_finetune import FinetuneRequest, finetune_lines, finetune_log
     from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, mapper_config
     from semantic_mapper.training.finetune import FinetuneConfig
     from semantic_mapper.training.fitters import FITTERS
@@ -114,37 +104,54 @@ def finetune(
         raise typer.BadParameter("give --seconds, --steps, or both", param_hint="--seconds")
     keep_freed_memory()
     depths = mapper_config(None, None, depth=depth or "sensor", delay_frames=REPLAY_DELAY_FRAMES).depth
-    most = MAX_SCENE_FRAMES if unlabelled is None else unlabelled
     request = FinetuneRequest(
-        log, keyframes or 0, out, settings, weights, from_scratch, depths, kind, labels, frame_numbers(frames), most
+        log,
+        keyframes or 0,
+        out,
+        settings,
+        weights,
+        from_scratch,
+        depths,
+        kind,
+        labels,
+        frame_numbers(frames),
+        unlabelled,
     )
     with StopRequest() as stop, frame_progress("finetune", None, unit="%") as bar:
         checkpoint, chosen = finetune_log(request, stop, bar)
-    recipe = checkpoint.recipe
-    if chosen:
-        output.print(f"{out}: finetuned on frames {', '.join(map(str, chosen))} of {log.name}")
-    if "psnr" in recipe:
-        psnr = "no views held out" if recipe["psnr"] is None else f"held-out views {recipe['psnr']:.1f} dB"
-        steps = recipe.get("grid_steps", recipe["steps"])
-        output.print(f"{out}: grid of {log.name}, {steps} steps in {recipe['seconds']} s, {psnr}")
-    if "held_out_loss" in recipe:
-        output.print(
-            f"  {recipe['steps']} steps in {recipe['seconds']} s, best at step {recipe['best_step']}: held-out loss "
-            f"{recipe['held_out_loss']:.3f}, accuracy {recipe['held_out_accuracy'] * 100:.1f} %"
-        )
-    if pseudo := recipe.get("pseudo_labels"):
-        by = f" that {pseudo['of']} has rendered" if pseudo["of"] else ""
-        output.print(
-            f"  {pseudo['keyframes']} of the {len(chosen)} keyframes have pseudo labels{by}: the figures above say how "
-            "well these are learned, not how right they are"
-        )
-    if own := recipe.get("own_view"):
-        output.print(
-            f"  a frame's own image counts {own['factor']:g} times among the views, "
-            f"{own['factor_without_depth']:g} times where there is no depth"
-        )
-    if kind == "irt":
-        output.print(f"  {out.stat().st_size / 1e6:.1f} MB that show the scene: as private as the recording")
+    for line in finetune_lines(checkpoint, chosen, request):
+        output.print(line)
     if stop:
         stderr_console().print(f"stopped by {stop.name}; the best weights so far are in {out}", style="yellow")
     return stop.exit_code
+
+
+def _refuse_mixed(
+    weights: Path | None,
+    from_scratch: bool,
+    kind: str | None,
+    keyframes: int | None,
+    frames: str,
+    labels: Path | None,
+    unlabelled: int | None,
+    variant: str | None,
+) -> None:
+    """Refuse options that do not go together.
+
+    Raises:
+        typer.BadParameter: which, and why.
+    """
+    if from_scratch and weights is not None:
+        raise typer.BadParameter("goes with random weights only", param_hint="--weights")
+    if kind is not None and (weights is not None or from_scratch):
+        raise typer.BadParameter("starts from nothing; leave out --weights and --from-scratch", param_hint="--kind")
+    if kind == "grid" and (frames or labels is not None):
+        raise typer.BadParameter("a grid learns no classes", param_hint="--frames" if frames else "--labels")
+    if not frames and labels is None and (keyframes is None) != (kind == "grid"):
+        raise typer.BadParameter("how many labelled frames? Only --kind grid learns none", param_hint="--keyframes")
+    if keyframes is not None and frames:
+        raise typer.BadParameter("--frames already names the frames", param_hint="--keyframes")
+    if unlabelled is not None and kind is None and weights is None:
+        raise typer.BadParameter("goes with --kind, or --weights of such a kind", param_hint="--unlabelled")
+    if variant is not None and kind != "irt" and (kind is not None or weights is None):
+        raise typer.BadParameter("goes with --kind irt, or --weights of it", param_hint="--variant")

@@ -18,6 +18,7 @@ from semantic_mapper.fields.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
+from semantic_mapper.fields.irt import IRT
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import ROOMS, LabelSet
@@ -45,7 +46,8 @@ class FinetuneRequest:
     ``depth`` says where the frames' depth comes from. ``kind`` names a kind of field that is fitted to one scene, from
     nothing; None = that of the weights. ``labels`` is a folder of label images in place of the log's. ``keyframes`` is
     0 for a kind that learns no classes, and for all frames that the folder has labels of. ``frames`` (numbers in the
-    log) names the labelled frames instead. ``unlabelled``: how many others a kind of one scene uses at most, 0 = all.
+    log) names the labelled frames instead. ``unlabelled``: how many others a kind of one scene uses at most, 0 = all,
+    None = 300.
     """
 
     log: Path
@@ -58,7 +60,7 @@ class FinetuneRequest:
     kind: str | None = None
     labels: Path | None = None
     frames: Sequence[int] = ()
-    unlabelled: int = MAX_SCENE_FRAMES
+    unlabelled: int | None = None
 
 
 def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress) -> tuple[Checkpoint, list[int]]:
@@ -79,6 +81,7 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
     nothing = request.from_scratch or request.kind is not None
     start = None if nothing else load_checkpoint(request.weights or default_checkpoint_path())
     kind = request.kind or (SRay.kind if start is None else start.model.kind)
+    _check_options(request, kind)
     with open_log(request.log) as log:
         folder = None if request.labels is None else open_label_folder(request.labels, log)
         label_set = log.info.label_set if folder is None else folder.label_set
@@ -128,6 +131,47 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
         checkpoint.recipe["pseudo_labels"] = {"keyframes": pseudo, "of": "" if note is None else note.weights}
     save_checkpoint(checkpoint, request.out)
     return checkpoint, chosen
+
+
+def finetune_lines(checkpoint: Checkpoint, chosen: Sequence[int], request: FinetuneRequest) -> list[str]:
+    """What was learned, for a reader."""
+    recipe, out, log = checkpoint.recipe, request.out, request.log.name
+    lines = [f"{out}: finetuned on frames {', '.join(map(str, chosen))} of {log}"] if chosen else []
+    if "psnr" in recipe:
+        psnr = "no views held out" if recipe["psnr"] is None else f"held-out views {recipe['psnr']:.1f} dB"
+        steps = recipe.get("grid_steps", recipe["steps"])
+        lines.append(f"{out}: grid of {log}, {steps} steps in {recipe['seconds']} s, {psnr}")
+    if "held_out_loss" in recipe:
+        lines.append(
+            f"  {recipe['steps']} steps in {recipe['seconds']} s, best at step {recipe['best_step']}: held-out loss "
+            f"{recipe['held_out_loss']:.3f}, accuracy {recipe['held_out_accuracy'] * 100:.1f} %"
+        )
+    if pseudo := recipe.get("pseudo_labels"):
+        by = f" that {pseudo['of']} has rendered" if pseudo["of"] else ""
+        lines.append(
+            f"  {pseudo['keyframes']} of the {len(chosen)} keyframes have pseudo labels{by}: the figures above say how "
+            "well these are learned, not how right they are"
+        )
+    if own := recipe.get("own_view"):
+        lines.append(
+            f"  a frame's own image counts {own['factor']:g} times among the views, "
+            f"{own['factor_without_depth']:g} times where there is no depth"
+        )
+    if checkpoint.model.holds_scene:
+        lines.append(f"  {out.stat().st_size / 1e6:.1f} MB that show the scene: as private as the recording")
+    return lines
+
+
+def _check_options(request: FinetuneRequest, kind: str) -> None:
+    """Refuse options that go with other weights.
+
+    Raises:
+        ConfigError: which.
+    """
+    if request.unlabelled is not None and kind not in FITTERS:
+        raise ConfigError(f"--unlabelled: weights of kind '{kind}' learn from labelled frames alone; leave it out")
+    if request.config.irt.variant is not None and kind != IRT.kind:
+        raise ConfigError(f"--variant (irt.variant): goes with weights of kind 'irt', not with '{kind}'; leave it out")
 
 
 def _named(
@@ -257,7 +301,8 @@ def read_unlabelled(
         KeyboardInterrupt: a stop request came.
     """
     known = {(f.camera_id, f.stamp_ns) for f in labelled}
-    count = min(request.unlabelled or len(log), len(log))
+    most = MAX_SCENE_FRAMES if request.unlabelled is None else request.unlabelled
+    count = min(most or len(log), len(log))
     frames: list[PosedFrame] = []
     damaged = 0
     bar.start(len(log))

@@ -144,6 +144,8 @@ def score_table(title: str, scores: Mapping[str, Any]) -> Table:
         ("average_accuracy", "average accuracy"),
         ("coverage", "coverage"),
         ("ece", "calibration error"),
+        ("sure", "confidence above 0.9"),
+        ("sure_right", "of these right"),
         ("open_set_auroc", "AUROC, classes it lacks"),
         ("open_set_unknown", "unknown, of classes it lacks"),
     ):

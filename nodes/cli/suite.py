@@ -16,6 +16,7 @@ from semantic_mapper.benchmark.figures import (
     compare_maps,
     compare_surfaces,
     compare_with_baselines,
+    compare_with_carried,
     comparison_rows,
     draw_fit_curves,
     map_figures,
@@ -63,7 +64,7 @@ def run_suite_verb(
 
     Args:
         weights: Files under test; the shipped ones where neither these nor ``kinds`` are given.
-        kinds: Fields with random weights that are fitted to each room; protocol "scratch" only.
+        kinds: Fields with random weights that are fitted to each room; not with protocol "generalize".
         json_file: Where to write; None = named after the suite.
         print_json: Print JSON, and nothing else.
         refine: Weights that refine the maps of the first entry; with ``maps``.
@@ -74,10 +75,8 @@ def run_suite_verb(
     Raises:
         WeightsError, ConfigError, MapError: with what is wrong and the mend.
     """
-    if kinds and suite.protocol != "scratch":
-        raise ConfigError(
-            f"--kind has random weights, which protocol '{suite.protocol}' does not fit; --protocol scratch"
-        )
+    if kinds and suite.protocol == "generalize":
+        raise ConfigError("--kind has random weights, which must be fitted; --protocol scratch, or finetune")
     output = Output.guarded()
     output.quiet = print_json
     keep_freed_memory()
@@ -204,6 +203,11 @@ def _collect(
         {"first": a, "second": b, **difference}
         for a, b in pairs
         if (difference := compare(records[a], records[b], seed=suite.seed)) is not None
+    ]
+    found["differences"] += [
+        {"first": name, "second": "labels carried by depth", **difference}
+        for name, made in records.items()
+        if (difference := compare_with_carried(made, seed=suite.seed)) is not None
     ]
     found["rows"], more = _rows(suite, entries, records)
     found["differences"] += more

@@ -23,7 +23,7 @@ ProtocolOption = Annotated[
 ]
 KindOption = Annotated[
     list[str] | None,
-    typer.Option("--kind", help="scratch: a kind of field with random weights, without a file; may repeat."),
+    typer.Option("--kind", help="scratch and finetune: a kind of field that starts from random weights; may repeat."),
 ]
 ViewsOption = Annotated[int | None, typer.Option(min=1, max=16, help="Source views of a query.  [default: 8]")]
 SourcesOption = Annotated[

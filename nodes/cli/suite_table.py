@@ -137,6 +137,8 @@ _VIEW_ROWS: _Rows = (
     ("depth, RMSE", "figures.depth_rmse_m", lambda v: f"{v:.3f} m"),
     ("mIoU, interior", "figures.interior_miou", percent),
     ("calibration error (ECE)", "figures.ece", percent),
+    ("confidence of 14/15 or more", "figures.sure", percent),
+    ("of these right", "figures.sure_right", percent),
     ("multi-view consistency", "figures.consistency", percent),
     ("distance of source views", "figures.baseline_m", lambda v: f"{v:.2f} m"),
     ("seen by some source view", "figures.seen", percent),

@@ -120,6 +120,12 @@ def _voxel_size(summary: Mapping[str, Any]) -> str:
     return "-" if size is None else voxel_size_text(size, summary.get("scale") != "unknown")
 
 
+def _scene_known(scene: Mapping[str, Any]) -> str:
+    """Pixels that weights of one scene know; those of another scene know few."""
+    known, outside = percent(scene["known"]), scene["frames_outside"]
+    return f"{known} of the pixels; {counted(outside, 'frame')} mostly unknown" if outside else f"{known} of the pixels"
+
+
 def _pose_figure(check: Mapping[str, Any], key: str) -> str:
     """A figure of the pose check, or that too few keyframes overlap for it."""
     value = check.get(key)
@@ -157,6 +163,7 @@ _ROWS: Sequence[tuple[str, str, Any]] = (
     ("voxel size", "", _voxel_size),
     ("blocks", "map.blocks", str),
     ("surface points", "map", lambda m: f"{m['surface_points']}{' (nearly empty)' if m.get('nearly_empty') else ''}"),
+    ("known to the weights", "scene", _scene_known),
     ("unknown surface", "map.unknown", percent),
     ("computed surface", "map.computed", percent),
     ("map memory", "map.memory_mb", lambda v: f"{v} MB"),

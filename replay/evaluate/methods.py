@@ -39,6 +39,7 @@ class Opinion:
     confidence: Float32 | None = None
 
 
+SURE = 0.9  # confidence of a pixel that a user would keep
 MAP = "points of the map"  # the method whose figures are those of the fused map
 
 Predictor = Callable[[PosedFrame], Opinion]
@@ -48,8 +49,9 @@ Predictor = Callable[[PosedFrame], Opinion]
 class Evaluation:
     """Metrics by method, and how many frames were scored, left out, and refused, or have pseudo labels.
 
-    Beside the figures of ``SegmentationMetrics`` a method has ``ece``, and ``open_set_auroc`` where some labels are of
-    classes that it cannot name; both None without confidences. The map also has ``open_set_unknown``: the fraction of
+    Beside the figures of ``SegmentationMetrics`` a method has ``ece``, ``sure`` (fraction of the pixels above a
+    confidence of 0.9), ``sure_right`` (of those), and ``open_set_auroc`` where some labels are of classes that it
+    cannot name; all None without confidences. The map also has ``open_set_unknown``: the fraction of
     its voted points of such classes that it calls unknown (``voxel_map.unknown_below``), None without such points.
     """
 
@@ -173,13 +175,17 @@ def evaluate_frames(
             rejected = float(found.mean()) if len(found) else None
             confidences[MAP].update(points.confidence[voted], (answer == truth)[voted], strange[voted])
     methods: dict[str, dict[str, Any]] = {
-        name: asdict(matrix.metrics())
-        | {"ece": confidences[name].calibration.ece, "open_set_auroc": confidences[name].open_set_auroc}
-        for name, matrix in confusions.items()
+        name: asdict(matrix.metrics()) | _of_confidence(confidences[name]) for name, matrix in confusions.items()
     }
     if MAP in methods:
         methods[MAP]["open_set_unknown"] = rejected
     return Evaluation(methods, scored, excluded, refused, pseudo)
+
+
+def _of_confidence(scores: ConfidenceScores) -> dict[str, float | None]:
+    sure, right = scores.above(SURE)
+    auroc = scores.open_set_auroc
+    return {"ece": scores.calibration.ece, "sure": sure, "sure_right": right, "open_set_auroc": auroc}
 
 
 def _with_current_view(config: MapperConfig, use: bool) -> MapperConfig:

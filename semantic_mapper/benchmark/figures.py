@@ -41,6 +41,7 @@ def view_figures(records: Sequence[RoomRecord]) -> dict[str, Any]:
         "depth_abs_rel": depth.abs_rel,
         "depth_rmse_m": depth.rmse_m,
         "ece": _ece(records),
+        **_surest(records),
         "consistency": agreement.fraction,
         "interior_miou": _summed([from_rows(r.interior) for r in records]).metrics().miou,
         "by_condition": {
@@ -81,6 +82,14 @@ def compare_with_baselines(records: Sequence[RoomRecord], *, seed: int = 0) -> d
         name: _difference(own, [from_rows(r.rows[name].confusion) for r in records], seed)
         for name in _common_rows(records)
     }
+
+
+def compare_with_carried(records: Sequence[RoomRecord], *, seed: int = 0) -> dict[str, Any] | None:
+    """Field minus the keyframes' labels carried over by depth, as ``compare``; None where any room has none."""
+    carried = [from_rows(r.carried) for r in records if r.carried is not None]
+    if not carried or len(carried) < len(records):
+        return None
+    return _difference([from_rows(r.confusion) for r in records], carried, seed)
 
 
 def _common_rows(records: Sequence[RoomRecord]) -> list[str]:
@@ -219,6 +228,14 @@ def _ece(records: Sequence[RoomRecord] | Sequence[MapRecord] | Sequence[Baseline
     confidence = np.array([r.calibration.confidence for r in records], np.float64)
     right = np.array([r.calibration.right for r in records], np.float64)
     return calibration_of_bins(count.sum(axis=0), confidence.sum(axis=0), right.sum(axis=0)).ece
+
+
+def _surest(records: Sequence[RoomRecord]) -> dict[str, float | None]:
+    """Fraction of the pixels in the last bin of confidence (14/15 and more), and how many of those are right."""
+    pixels = sum(sum(r.calibration.count) for r in records)
+    sure = sum(r.calibration.count[-1] for r in records)
+    right = sum(r.calibration.right[-1] for r in records)
+    return {"sure": sure / pixels if pixels else None, "sure_right": right / sure if sure else None}
 
 
 def _carried(records: Sequence[RoomRecord]) -> float | None:

@@ -201,7 +201,7 @@ def _fit_and_score(
     frames = [as_given(room.given[n], depth=True, label=True) for n in keyframes.labelled]
     frames += [as_given(room.given[n], depth=True) for n in keyframes.unlabelled]
     views = stack_sources([view_from_frame(frame, room.label_set, suite.tier.width) for frame in frames])
-    field = _start(entry.field, suite, views, room.label_set)
+    field = _start(entry, suite, views, room.label_set)
     fit = fitter_of(field.kind)
     answers = answer_from_keyframes(room, field.eval(), suite, keyframes)
     curve = [_curve_point(0.0, 0.0, 0, room_confusion(room, answers))]
@@ -210,10 +210,10 @@ def _fit_and_score(
         one_step = msgspec.structs.replace(
             fit_config(suite, 1.0), seconds=0, steps=1, linear_probe_steps=1, held_out_rays=64
         )
-        fit(frames, room.label_set, _start(entry.field, suite, views, room.label_set), one_step)
+        fit(frames, room.label_set, _start(entry, suite, views, room.label_set), one_step)
     spent, whole = 0.0, sum(suite.scene.shares)
     for share in sorted(suite.scene.shares):
-        start = _start(entry.field, suite, views, room.label_set)
+        start = _start(entry, suite, views, room.label_set)
         progress = _progress(on_fit, spent, share, whole)
         fitted = fit(frames, room.label_set, start, fit_config(suite, share), progress, stopped)
         if stopped():
@@ -232,15 +232,16 @@ def _progress(
     return None if on_fit is None else lambda p: on_fit((spent + p.fraction * share) / whole)
 
 
-def _start(field: LearnedField, suite: SuiteConfig, views: SourceViews, label_set: LabelSet) -> LearnedField:
-    """A copy to start from: the field's own weights in the classes of the rooms, or random ones of its shape.
+def _start(entry: Entry, suite: SuiteConfig, views: SourceViews, label_set: LabelSet) -> LearnedField:
+    """A copy to start from: the weights of a file in the classes of the rooms, or random ones of its shape.
 
     Args:
         views: Of the scene to be fitted; a kind for one scene alone takes its box from them.
         label_set: Of the scene.
     """
     torch.manual_seed(suite.seed)
-    if suite.protocol == "finetune":
+    field = entry.field
+    if suite.protocol == "finetune" and entry.file:
         return adapt_model(field, label_set)
     config = field.scene_config(views, suite.tier.guided.far_m)
     return build_field(field.kind, config, label_set, field.sampling).to(next(field.parameters()).device)

@@ -346,6 +346,13 @@ class ConfidenceScores:
 
         return calibration_of_bins(joined(self._count), joined(self._sum), joined(self._right))
 
+    def above(self, confidence: float) -> tuple[float | None, float | None]:
+        """Fraction of the pixels, of classes that can be predicted, that are surer than this; and how many of those
+        are right. None of nothing."""
+        first = round(confidence * len(self._count))
+        count, total = int(self._count[first:].sum()), int(self._count.sum())
+        return count / total if total else None, float(self._right[first:].sum()) / count if count else None
+
     @property
     def open_set_auroc(self) -> float | None:
         """Probability that a pixel of a class that can be predicted has more confidence than one of another class;

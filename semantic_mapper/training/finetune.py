@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import copy
 import math
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
 
@@ -38,6 +37,7 @@ from semantic_mapper.fields.sampling import sample_guided
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
+from semantic_mapper.training.budget import BestWeights, BudgetClock
 from semantic_mapper.training.frozen_encoder import encode_once, frozen_encoder_loss
 from semantic_mapper.training.grid_fit import GridFitConfig
 from semantic_mapper.training.images import ImageStepConfig, classifies_images, image_batch, images_loss
@@ -45,7 +45,7 @@ from semantic_mapper.training.linear_probe import fit_class_rows
 from semantic_mapper.training.losses import IGNORE, Loss, semantic_loss
 from semantic_mapper.training.optimiser import make_optimiser, set_rates
 from semantic_mapper.training.overlap import view_overlap
-from semantic_mapper.training.schedule import budget_fraction, cosine_rate
+from semantic_mapper.training.schedule import cosine_rate
 from semantic_mapper.training.step import StepConfig, pick_views, training_loss
 from semantic_mapper.training.uncertainty import with_uncertainty
 from semantic_mapper.training.views import (
@@ -151,41 +151,6 @@ class _Scene:
     overlap: torch.Tensor
 
 
-class _Clock:
-    """How much of a budget is used; from the time that is left, a last look at held-out rays is set aside."""
-
-    def __init__(self, config: FinetuneConfig) -> None:
-        self._config = config
-        self._began = time.monotonic()
-        self._look_s = 0.0
-
-    @property
-    def elapsed_s(self) -> float:
-        """Since the finetuning was called."""
-        return time.monotonic() - self._began
-
-    def used(self, step: int) -> float:
-        """Fraction of the budget that is used after ``step`` steps."""
-        seconds = self._config.seconds
-        left_for_steps = max(seconds - self._look_s, 1e-9) if seconds > 0 else 0.0
-        return budget_fraction(step, self.elapsed_s, steps=self._config.steps, seconds=left_for_steps)
-
-    @contextmanager
-    def looking(self) -> Iterator[None]:
-        """Round each look: the next one is expected to take as long."""
-        began = time.monotonic()
-        yield
-        self._look_s = time.monotonic() - began
-
-
-@dataclass(slots=True)
-class _Best:
-    loss: float
-    accuracy: float
-    step: int
-    state: dict[str, torch.Tensor]
-
-
 def finetune(
     frames: Sequence[PosedFrame],
     label_set: LabelSet,
@@ -219,7 +184,7 @@ def finetune(
             f"finetuning needs at least 2 frames, one of them labelled, got {len(frames)} with {len(labelled)} "
             "labelled; label more frames"
         )
-    clock = _Clock(config)
+    clock = BudgetClock(config.seconds, config.steps, config.evaluations)
     torch.manual_seed(config.seed)
     generator = torch.Generator().manual_seed(config.seed)
     model = SRay(SRayConfig(), label_set) if start is None else adapt_model(start, label_set)
@@ -250,11 +215,11 @@ def _run(
     model: LearnedField,
     scene: _Scene,
     config: FinetuneConfig,
-    clock: _Clock,
+    clock: BudgetClock,
     generator: torch.Generator,
     on_progress: Callable[[FinetuneProgress], None] | None,
     stopped: Callable[[], object],
-) -> tuple[_Best, int, dict[str, float]]:
+) -> tuple[BestWeights, int, dict[str, float]]:
     optimiser = make_optimiser(model, config.learning_rate, config.weight_decay)
     alive, norms = _prepare_norms(model, scene.train)
     if model.image_encoder is not None and not alive:
@@ -268,9 +233,9 @@ def _run(
 
     own_view = _weigh_own_view(model, scene, config)
     with clock.looking():
-        best = _Best(*look(), 0, copy.deepcopy(model.state_dict()))
+        best = BestWeights(*look(), 0, copy.deepcopy(model.state_dict()))
     images_from, images_until = config.frozen_encoder_fraction, _end_of_images(model, config)
-    step, evaluated, stale = 0, 0, 0
+    step, stale = 0, 0
     best, encoded = (best, None) if alive else _linear_probe(model, scene, config, best)
     latest = (best.loss, best.accuracy)
     doubts = config.step.hard_example_fraction > 0
@@ -295,14 +260,13 @@ def _run(
         optimiser.step()
         fraction = clock.used(step)
         improved = False
-        if fraction * config.evaluations >= evaluated + 1 or fraction >= 1:
-            evaluated = int(fraction * config.evaluations)
+        if clock.look_due(fraction):
             with clock.looking():
                 latest = look()
-            improved = latest[0] < best.loss or not math.isfinite(best.loss)
+            improved = best.beaten_by(latest[0])
             stale = 0 if improved or fraction < images_until else stale + 1
             if improved:
-                best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
+                best = BestWeights(*latest, step, copy.deepcopy(model.state_dict()))
             scene.train = with_uncertainty(model, scene.train) if doubts else scene.train
         if on_progress is not None:
             on_progress(FinetuneProgress(step, min(fraction, 1.0), float(loss.total.detach()), *latest, improved))
@@ -312,8 +276,8 @@ def _run(
         )
     if stopped() and step > 0:  # what was learned since the last look
         latest = look()
-        if latest[0] < best.loss or not math.isfinite(best.loss):
-            best = _Best(*latest, step, copy.deepcopy(model.state_dict()))
+        if best.beaten_by(latest[0]):
+            best = BestWeights(*latest, step, copy.deepcopy(model.state_dict()))
     return best, step, own_view
 
 
@@ -356,8 +320,8 @@ def _linear_probe(
     model: LearnedField,
     scene: _Scene,
     config: FinetuneConfig,
-    start: _Best,
-) -> tuple[_Best, EncodedViews | None]:
+    start: BestWeights,
+) -> tuple[BestWeights, EncodedViews | None]:
     """Fit the class rows alone, undone where held-out rays say that it did no good.
 
     Returns:
@@ -369,8 +333,8 @@ def _linear_probe(
     encoded = encode_once(model, scene.train, with_labels=config.step.known_labels)
     if not fit_class_rows(model, encoded, scene.train, config.linear_probe_steps):
         return start, encoded
-    after = _Best(*_evaluate(model, scene, config), 0, copy.deepcopy(model.state_dict()))
-    if after.loss < start.loss or not math.isfinite(start.loss):
+    after = BestWeights(*_evaluate(model, scene, config), 0, copy.deepcopy(model.state_dict()))
+    if start.beaten_by(after.loss):
         return after, encoded
     model.load_state_dict(start.state)
     return start, encoded

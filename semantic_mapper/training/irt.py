@@ -27,12 +27,19 @@ from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.geometry import camera_matrix, invert_pose
 from semantic_mapper.imaging import resize_label
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.training.budget import BestWeights, BudgetClock
 from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, held_out_blocks
 from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
-from semantic_mapper.training.grid_fit import GridFitProgress, fit_grid
 from semantic_mapper.training.losses import IGNORE, RAREST, semantic_loss
-from semantic_mapper.training.scene_fit import FittedGeometry, fit_trunk, grid_settings, scene_checkpoint
-from semantic_mapper.training.schedule import budget_fraction, cosine_rate
+from semantic_mapper.training.scene_fit import (
+    FittedGeometry,
+    fit_geometry,
+    fit_trunk,
+    grid_settings,
+    part_of,
+    scene_checkpoint,
+)
+from semantic_mapper.training.schedule import cosine_rate
 from semantic_mapper.training.views import jittered
 from semantic_mapper.types import PosedFrame
 
@@ -114,7 +121,7 @@ def fit_irt(
     field = geometry.field
     assert isinstance(field, IRT)
     fit = ClassFit(field, rays, config)
-    best = fit.run(began, on_progress, stopped)
+    best = fit.run(began, part_of(on_progress, TRUNK_UNTIL, 1.0), stopped)
     checkpoint = scene_checkpoint(geometry, config, time.monotonic() - began, seen_stamps_ns, labelled)
     figures = {
         "steps": fit.step,
@@ -165,38 +172,23 @@ def _fit_scene(
 ) -> FittedGeometry:
     """Geometry, colours and features of all frames; they stay as they are from then on."""
     began = time.monotonic()
-    given = start.shape if isinstance(start, IRT) else IRTConfig()
-    box = given.grid if isinstance(start, IRT) and start.fitted and config.grid.box_m is None else None
-    settings = msgspec.structs.replace(grid_settings(config), seconds=GRID_UNTIL * config.seconds)
+    count, size = len(labelled.rays.intrinsics), labelled.rays.image_size(0)
+    shape = start.shape if isinstance(start, IRT) else IRTConfig()
+    variant = config.irt.variant or shape.variant
+    carried = count if config.irt.carry_labels else 0
+    shape = msgspec.structs.replace(shape, variant=variant, carried=carried, carried_size=size)
+    known = start if isinstance(start, IRT) and start.fitted else None  # whose box is that of a scene
+    part = msgspec.structs.replace(config, seconds=GRID_UNTIL * config.seconds)
+    told = part_of(on_progress, 0, GRID_UNTIL)
+    geometry = fit_geometry(IRT.kind, frames, label_set, known, part, told, stopped, shape)
+    field, settings = geometry.field, grid_settings(part)
     if config.steps:
         settings = msgspec.structs.replace(settings, trunk_steps=min(settings.trunk_steps, config.steps))
-
-    def tell(p: GridFitProgress) -> None:
-        if on_progress is not None:
-            on_progress(FinetuneProgress(p.step, GRID_UNTIL * p.fraction, p.loss, math.nan, math.nan, False))
-
-    fit = fit_grid(frames, settings, tell, stopped, box)
-    count, size = len(labelled.rays.intrinsics), labelled.rays.image_size(0)
-    carried = count if config.irt.carry_labels else 0
-    shape = msgspec.structs.replace(given, grid=fit.grid.config, carried=carried, carried_size=size)
-    if config.irt.variant is not None:
-        shape = msgspec.structs.replace(shape, variant=config.irt.variant)
-    torch.manual_seed(config.seed)
-    field = IRT(shape, label_set)
-    field.grid.load_state_dict(fit.grid.state_dict())
-    field.fitted_steps += fit.steps
     assert field.trunk is not None
     until = began + TRUNK_UNTIL * config.seconds if config.seconds else math.inf
-    fit_trunk(field, field.trunk, fit, settings, lambda: stopped() or time.monotonic() > until)
-    return FittedGeometry(field, fit)
-
-
-@dataclass(slots=True)
-class _Best:
-    loss: float
-    accuracy: float
-    step: int
-    state: dict[str, torch.Tensor]
+    told = part_of(on_progress, GRID_UNTIL, TRUNK_UNTIL)
+    fit_trunk(field, field.trunk, geometry.fit, settings, lambda: stopped() or time.monotonic() > until, told)
+    return geometry
 
 
 class ClassFit:
@@ -216,34 +208,33 @@ class ClassFit:
         if len(self.looked_at) > LOOK_RAYS:
             order = torch.randperm(len(self.looked_at), generator=self.generator)
             self.looked_at = self.looked_at[order[:LOOK_RAYS].sort().values]
-        self.step, self.fraction, self.look_s = 0, 0.0, 0.0
+        self.step, self.fraction = 0, 0.0
         carry_labels(field, data.rays, torch.where(train, data.channel, IGNORE))
 
     def run(
         self, began: float, on_progress: Callable[[FinetuneProgress], None] | None, stopped: Callable[[], object]
-    ) -> _Best:
+    ) -> BestWeights:
         """Learn until the budget is spent; the field then has the weights that were best on what was held out."""
-        config, looks = self.config, 0
-        first = time.monotonic()
-        latest = best = _Best(math.inf, math.nan, 0, self._state())
-        seconds = max(config.seconds - (first - began), 0.05 * config.seconds)
+        config = self.config
+        left = max(config.seconds - (time.monotonic() - began), 0.05 * config.seconds)
+        clock = BudgetClock(left, config.steps, config.evaluations)
+        latest = best = BestWeights(math.inf, math.nan, 0, self._state())
         while self.fraction < 1 and not stopped():
             loss = self._learn()
             self.step += 1
-            left = max(seconds - self.look_s, 1e-3) if seconds else 0.0
-            self.fraction = budget_fraction(self.step, time.monotonic() - first, steps=config.steps, seconds=left)
+            self.fraction = clock.used(self.step)
             improved = False
-            if self.fraction * config.evaluations >= looks + 1 or self.fraction >= 1:
-                looks = int(self.fraction * config.evaluations)
-                latest = self._look()
-                improved = latest.loss < best.loss or not math.isfinite(latest.loss)
+            if clock.look_due(self.fraction):
+                with clock.looking():
+                    latest = self._look()
+                improved = best.beaten_by(latest.loss)
                 best = latest if improved else best
             if on_progress is not None:
-                told = TRUNK_UNTIL + (1 - TRUNK_UNTIL) * min(self.fraction, 1.0)
-                on_progress(FinetuneProgress(self.step, told, loss, latest.loss, latest.accuracy, improved))
+                done = min(self.fraction, 1.0)
+                on_progress(FinetuneProgress(self.step, done, loss, latest.loss, latest.accuracy, improved))
         if stopped() and self.step > 0:
             latest = self._look()
-            best = latest if latest.loss < best.loss or not math.isfinite(latest.loss) else best
+            best = latest if best.beaten_by(latest.loss) else best
         self.field.load_state_dict(best.state, strict=False)
         carry_labels(self.field, self.data.rays, self.data.channel)
         return best
@@ -271,9 +262,8 @@ class ClassFit:
         self.optimiser.step()
         return float(loss.detach())
 
-    def _look(self) -> _Best:
+    def _look(self) -> BestWeights:
         """Loss and accuracy of what was held out, as a consumer with the frame's own image sees it."""
-        began = time.monotonic()
         losses: list[float] = []
         right = 0
         everything = torch.ones(len(self.data.rays.intrinsics), dtype=torch.bool)
@@ -288,10 +278,9 @@ class ClassFit:
                 right += int((logits.argmax(1) == channel).sum())
         self.field.train()
         count = len(self.looked_at)
-        self.look_s = max(self.look_s, time.monotonic() - began)
         if not count:
-            return _Best(math.inf, math.nan, self.step, self._state())
-        return _Best(sum(losses) / count, right / count, self.step, self._state())
+            return BestWeights(math.inf, math.nan, self.step, self._state())
+        return BestWeights(sum(losses) / count, right / count, self.step, self._state())
 
     def _state(self) -> dict[str, torch.Tensor]:
         return {name: p.detach().clone() for name, p in self.learned.items()}

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import msgspec
@@ -69,12 +70,14 @@ def fit_geometry(
     config: FinetuneConfig,
     on_progress: OnProgress | None = None,
     stopped: Callable[[], object] = bool,
+    shape: GridFieldConfig | None = None,
 ) -> FittedGeometry:
     """Stage A: a field of ``kind`` (a ``GridField``) whose grid shows the frames.
 
     Args:
         start: Gives the kind's config, and the box unless ``config.grid`` names one; its weights are not looked at.
         config: ``seconds`` bounds the time and ``steps``, if not 0, is the number of steps.
+        shape: Config of the kind in place of ``start``'s, but for the box.
 
     Raises:
         FrameError, ConfigError: of ``fit_grid``.
@@ -85,7 +88,7 @@ def fit_geometry(
     box = given.grid if start is not None and config.grid.box_m is None else None
     fit = fit_grid(frames, grid_settings(config), _told(on_progress), stopped, box)
     torch.manual_seed(config.seed)  # of what the kind draws
-    field = build_field(kind, msgspec.structs.replace(given, grid=fit.grid.config), label_set)
+    field = build_field(kind, msgspec.structs.replace(shape or given, grid=fit.grid.config), label_set)
     assert isinstance(field, GridField)
     field.grid.load_state_dict(fit.grid.state_dict())
     field.fitted_steps += fit.steps
@@ -111,7 +114,12 @@ def fit_scene(
 
 
 def fit_trunk(
-    field: GridField, trunk: Trunk, fit: GridFit, config: GridFitConfig, stopped: Callable[[], object] = bool
+    field: GridField,
+    trunk: Trunk,
+    fit: GridFit,
+    config: GridFitConfig,
+    stopped: Callable[[], object] = bool,
+    on_progress: OnProgress | None = None,
 ) -> float:
     """Fit features, trunk and colour head to the frames of a grid's fit; the geometry stays.
 
@@ -123,7 +131,7 @@ def fit_trunk(
     groups = [{"params": [trunk.features], "lr": FEATURE_RATE}, {"params": networks, "lr": TRUNK_RATE}]
     optimiser = torch.optim.Adam(groups)
     errors: list[float] = []
-    for _ in range(config.trunk_steps):
+    for step in range(config.trunk_steps):
         if stopped():
             break
         pixels = rng.integers(0, len(rays), TRUNK_RAYS)
@@ -139,6 +147,9 @@ def fit_trunk(
         loss.backward()
         optimiser.step()
         errors.append(float(loss.detach()))
+        if on_progress is not None:
+            done = (step + 1) / config.trunk_steps
+            on_progress(FinetuneProgress(step + 1, done, errors[-1], math.nan, math.nan, False))
     return psnr_of(float(np.mean(errors[-50:]))) if errors else float("nan")
 
 
@@ -170,8 +181,15 @@ def grid_settings(config: FinetuneConfig) -> GridFitConfig:
     return msgspec.structs.replace(config.grid, steps=steps, seconds=seconds, width=config.width, seed=config.seed)
 
 
+def part_of(on_progress: OnProgress | None, first: float, last: float) -> OnProgress | None:
+    """Progress of a part of a fit, which takes it from the fraction ``first`` to ``last``."""
+    if on_progress is None:
+        return None
+    return lambda p: on_progress(replace(p, fraction=first + (last - first) * p.fraction))
+
+
 def _told(on_progress: OnProgress | None) -> Callable[[GridFitProgress], None] | None:
     """Progress of the grid in the words of a finetuning: held-out figures come at the end only."""
     if on_progress is None:
         return None
-    return lambda p: on_progress(FinetuneProgress(p.step, p.fraction, p.loss, p.loss, float("nan"), False))
+    return lambda p: on_progress(FinetuneProgress(p.step, p.fraction, p.loss, math.nan, math.nan, False))

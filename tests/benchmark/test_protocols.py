@@ -8,7 +8,7 @@ import torch
 
 from semantic_mapper.benchmark.config import SuiteConfig, check_suite, fit_config
 from semantic_mapper.benchmark.entries import load_entries
-from semantic_mapper.benchmark.figures import view_figures
+from semantic_mapper.benchmark.figures import compare_with_carried, view_figures
 from semantic_mapper.benchmark.predict import predict_view
 from semantic_mapper.benchmark.protocols import (
     Entry,
@@ -225,7 +225,14 @@ def test_labels_carried_by_depth_alone_stand_beside_what_was_fitted() -> None:
     metrics = from_rows(record.carried).metrics()
     assert metrics.total_accuracy is not None and metrics.total_accuracy > 0.3
     assert metrics.coverage is not None and metrics.coverage < 1, "nothing where no keyframe looked"
-    assert view_figures([record])["carried_miou"] == metrics.miou
+    figures = view_figures([record])
+    assert figures["carried_miou"] == metrics.miou
+    assert metrics.miou is not None and figures["data_set"]["miou"] is not None
+    difference = compare_with_carried([record])
+    assert difference is not None
+    assert difference["observed"] == pytest.approx(figures["data_set"]["miou"] - metrics.miou)
+    last, count = record.calibration.count[-1], sum(record.calibration.count)
+    assert figures["sure"] == last / count and (figures["sure_right"] is None) is (last == 0)
     assert score(tiny_contestant(), tiny_suite()).record.carried is None
     blind = {"keyframes": 3, "guard": 1, "seconds": 0, "steps": 1}
     assert score(tiny_contestant(), tiny_suite(protocol="finetune", depth=False, scene=blind)).record.carried is None
@@ -237,6 +244,9 @@ def test_scratch_starts_from_random_weights_whatever_the_file_holds() -> None:
     assert first.confusion == second.confusion
     tuned = [score(tiny_contestant(s), tiny_suite(protocol="finetune")).record for s in (0, 1)]
     assert tuned[0].curve[0].confusion != tuned[1].curve[0].confusion
+    (without_file,) = load_entries([], ["sray"])
+    beside = score(without_file, tiny_suite(protocol="finetune")).record
+    assert beside.curve[0].confusion == score(without_file, suite).record.curve[0].confusion  # as from scratch
 
 
 def test_a_kind_for_one_scene_is_fitted_in_a_box_round_what_the_keyframes_see() -> None:

@@ -34,4 +34,4 @@ def tiny_room(depth: str = "on") -> BenchmarkRoom:
 
 
 def tiny_contestant(seed: int = 0) -> Entry:
-    return Entry(f"tiny{seed}", f"digest{seed}", tiny_field(seed=seed))
+    return Entry(f"tiny{seed}", f"digest{seed}", tiny_field(seed=seed), file=f"tiny{seed}.safetensors")

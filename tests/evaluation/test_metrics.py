@@ -172,6 +172,15 @@ def test_confidences_of_several_images_add_up_to_the_calibration_of_all_and_stra
     assert np.array_equal(scores.calibration.count, whole.count)
 
 
+def test_of_pixels_above_a_confidence_it_is_known_how_many_there_are_and_how_many_are_right():
+    confidence = np.array([0.95, 0.92, 0.99, 0.9, 0.2, 0.99], np.float32)
+    right = np.array([True, False, True, True, True, False])
+    scores = ConfidenceScores()
+    scores.update(confidence, right, np.arange(6) == 5)
+    assert scores.above(0.9) == (3 / 5, 2 / 3)
+    assert scores.above(0.995) == (0.0, None) and ConfidenceScores().above(0.9) == (None, None)
+
+
 def test_open_set_auroc_is_how_often_a_known_pixel_is_surer_than_a_strange_one():
     confidence = np.array([0.9, 0.8, 0.4, 0.6, 0.3], np.float32)
     strange = np.array([False, False, False, True, True])

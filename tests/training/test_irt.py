@@ -161,7 +161,8 @@ def test_a_fit_repeats_bit_for_bit_and_comes_back_from_its_file(tmp_path) -> Non
 def test_a_stopped_fit_gives_the_best_so_far() -> None:
     told: list[FinetuneProgress] = []
     config = msgspec.structs.replace(SMALL, steps=60)
-    checkpoint = fit_irt(scene(), HEIGHTS, None, config, told.append, lambda: len(told) >= 70)
+    checkpoint = fit_irt(scene(), HEIGHTS, None, config, told.append, lambda: len(told) >= 130)
+    assert [round(told[i].fraction, 2) for i in (59, 119)] == [0.35, 0.5]  # geometry, then features
     assert 0 < checkpoint.recipe["steps"] < 60 and 0 <= checkpoint.recipe["held_out_accuracy"] <= 1
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.fields.grid.field import GridField
+from semantic_mapper.fields.irt import IRT
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.transport.messages import StreamInfo
@@ -196,6 +197,22 @@ def test_a_field_of_one_scene_labels_its_log_and_maps_it(log: Path, tmp_path: Pa
     assert summary["frames"]["excluded_from_scores"] == 2 and summary["frames"]["scored"] == 4  # never on its keyframes
     assert summary["scene"]["known"] > 0.9 and summary["scene"]["frames_outside"] == 0
     assert summary["metrics"]["total_accuracy"] > 0.5
+    assert "known to the weights" in done.stdout
+    again = ("--weights", out, "--keyframes", "3", "--unlabelled", "2", "--variant", "B", "--steps", "2")
+    done = run("finetune", log, *again, "--seconds", "0", "--config", settings, "--out", tmp_path / "again.safetensors")
+    assert done.returncode == 0, done.stderr
+    model = load_checkpoint(tmp_path / "again.safetensors").model
+    assert isinstance(model, IRT) and model.shape.variant == "B" and model.shape.carried == 3
+
+
+def test_options_of_a_field_of_one_scene_are_refused_with_other_weights(
+    log: Path, weights: Path, tmp_path: Path
+) -> None:
+    given = ("--keyframes", "2", "--weights", weights, "--out", tmp_path / "w.safetensors")
+    for option in (("--unlabelled", "3"), ("--variant", "RT")):
+        done = run("finetune", log, *given, *option)
+        assert done.returncode == 1 and f"{option[0]}" in error_line(done.stderr)
+        assert "kind 'sray'" in error_line(done.stderr)
 
 
 @pytest.mark.parametrize(
@@ -204,8 +221,8 @@ def test_a_field_of_one_scene_labels_its_log_and_maps_it(log: Path, tmp_path: Pa
         (("--kind", "irt"), "how many labelled frames?"),
         (("--kind", "irt", "--frames", "1,x"), "numbers with commas"),
         (("--kind", "irt", "--keyframes", "2", "--frames", "1,2"), "already names the frames"),
-        (("--keyframes", "2", "--variant", "RT"), "goes with --kind irt only"),
-        (("--keyframes", "2", "--unlabelled", "3"), "goes with --kind only"),
+        (("--keyframes", "2", "--variant", "RT"), "goes with --kind irt"),
+        (("--keyframes", "2", "--unlabelled", "3"), "goes with --kind, or --weights"),
         (("--kind", "grid", "--keyframes", "2"), "Only --kind grid learns none"),
         (("--kind", "sray", "--keyframes", "2"), "there is grid, irt"),
         (("--kind", "grid", "--from-scratch"), "starts from nothing"),
