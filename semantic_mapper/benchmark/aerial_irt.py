@@ -18,11 +18,14 @@ from semantic_mapper.benchmark.aerial import (
     AerialConfig,
     Arm,
     Episode,
-    EpisodeScores,
+    Fit,
+    Predict,
     labelled_frames,
-    score_episode,
+    scored,
+    thinned,
     training_frames,
 )
+from semantic_mapper.benchmark.aerial_fields import HELD_OUT_FRACTION
 from semantic_mapper.benchmark.aerial_grids import (
     NEAR_M,
     TownGrid,
@@ -51,7 +54,12 @@ _AT_ONCE = 4096  # rays of a picture
 
 
 def irt_arms(folder: Path) -> dict[str, Arm]:
-    """Arms by name; grids and trunks are kept in ``folder``."""
+    """``irt_fits`` as arms."""
+    return {name: scored(fit) for name, fit in irt_fits(folder).items()}
+
+
+def irt_fits(folder: Path) -> dict[str, Fit]:
+    """Fits by name; grids and trunks are kept in ``folder``."""
 
     def arm(
         variant: IRTVariant = "RTTC",
@@ -60,10 +68,10 @@ def irt_arms(folder: Path) -> dict[str, Arm]:
         points: int = 10,
         colour: bool = False,
         stage_1: bool = True,
-    ) -> Arm:
+    ) -> Fit:
         texture = "colour" if colour else "cnn"
 
-        def run(config: AerialConfig, episode: Episode) -> EpisodeScores:
+        def fit(config: AerialConfig, episode: Episode) -> Predict:
             start = town_grid(config, episode.town, folder)
             frames = labelled_frames(config, episode)
             shape = IRTConfig(
@@ -80,12 +88,12 @@ def irt_arms(folder: Path) -> dict[str, Arm]:
             if stage_1:
                 _load_trunk(config, episode, field, start, folder)
             fit_classes(config, episode, field, frames)
-            return score_episode(config, episode, lambda frame: predict(field, frame))
+            return lambda frame, every: predict(field, frame, every)
 
-        return run
+        return fit
 
     variants: dict[str, IRTVariant] = {"irt-b": "B", "irt-rt": "RT", "irt-rtt": "RTT", "irt-rtc": "RTC"}
-    arms = {"irt-rttc": arm(), "irt-carry": arm(carry=True)}
+    arms = {"irt-rttc": arm(), "irt-bc": arm("BC", carry=True, points=6), "irt-carry": arm(carry=True)}
     arms |= {name: arm(variant) for name, variant in variants.items()}
     return arms | {
         "irt-colour": arm(colour=True),
@@ -107,14 +115,20 @@ def finetune_settings(config: AerialConfig, town: int) -> FinetuneConfig:
     """How classes are learned."""
     grid = grid_settings(config, town)
     return FinetuneConfig(
-        seconds=0.0, steps=config.irt_steps, width=config.width, held_out_fraction=0.125, seed=config.seed, grid=grid
+        seconds=0.0,
+        steps=config.irt_steps,
+        width=config.width,
+        held_out_fraction=HELD_OUT_FRACTION,
+        seed=config.seed,
+        grid=grid,
     )
 
 
-def predict(field: IRT, frame: PosedFrame) -> UInt8:
-    """Ids (H, W) of a frame, whose own image is looked at."""
+def predict(field: IRT, frame: PosedFrame, every: int) -> UInt8:
+    """Ids of a frame's ``thinned`` pixels; its own image is looked at, the whole of it."""
     views = stack_sources([view_from_frame(frame, field.label_set, frame.intrinsics.width)], with_labels=False)
-    rays, found = frame_rays([frame], frame.intrinsics.width), list[NDArray[np.int64]]()
+    few = thinned(frame, every)
+    rays, found = frame_rays([few], few.intrinsics.width), list[NDArray[np.int64]]()
     with torch.inference_mode():
         encoded = field.encode(views)
         for first in range(0, len(rays), _AT_ONCE):
