@@ -27,6 +27,7 @@ from semantic_mapper.benchmark.aerial import (
     scored_views,
     thin,
 )
+from semantic_mapper.benchmark.plateau import fit_to_plateau
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.scenes.aerial.views import cached_town, primitives_seen
@@ -41,7 +42,6 @@ PATCH = 7  # pixels a side
 DARKEST = 0.15  # light of the U-Net's darkest pictures where it is trained with such
 
 _BATCH = 4096
-_PLATEAU = 0.005  # of mIoU in the last fifth of the steps: with more, there are to be twice as many steps
 _MOST_DOUBLINGS = 3
 _BLOCK = 16  # pixels a side of what is held out of labelled views
 _HELD_OUT = 8  # one block in so many
@@ -104,13 +104,11 @@ def unet_fit(darkest: float = 1.0) -> Fit:
     def run(config: AerialConfig, episode: Episode) -> Predict:
         frames = labelled_frames(config, episode)
         seen, held_out = _split(frames, np.random.default_rng((config.seed, episode.number, 3)))
-        steps = config.unet_steps
-        unet, gain = _fit_unet(config, seen, held_out, steps, darkest)
-        for _ in range(_MOST_DOUBLINGS):
-            if gain < _PLATEAU:
-                break
-            steps *= 2
-            unet, gain = _fit_unet(config, seen, held_out, steps, darkest)
+
+        def fit(steps: int) -> tuple[UNetBaseline, float]:
+            return _fit_unet(config, seen, held_out, steps, darkest)
+
+        unet, _ = fit_to_plateau(fit, config.unet_steps, _MOST_DOUBLINGS)
         return lambda frame, every: thin(unet.predict(frame), every)
 
     return run

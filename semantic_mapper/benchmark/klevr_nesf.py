@@ -6,7 +6,7 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -15,36 +15,49 @@ import msgspec
 import numpy as np
 import torch
 from safetensors.torch import load_file, save
+from torch.nn import functional
 
 from semantic_mapper.benchmark.klevr import (
+    MOST_DOUBLINGS,
     POINTS,
-    TRAIN_CAMERAS,
     VIEW_ARMS,
     Arm,
+    ArmScores,
     KlevrConfig,
     SceneScores,
+    confusion,
     label_map_numbers,
     novel_seeds,
     scene_frames,
     scenes_of_arm,
     scored_numbers,
+    surface_points,
     train_seeds,
 )
 from semantic_mapper.benchmark.klevr_grids import NEAR_M, KlevrGridConfig, SceneDensity, grid_digest, scene_densities
+from semantic_mapper.benchmark.plateau import fit_to_plateau
 from semantic_mapper.config import to_plain
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
-from semantic_mapper.fields.grid.scene_grid import SceneGrid
+from semantic_mapper.fields.grid.scene_grid import SceneGrid, grid_box
 from semantic_mapper.fields.grid_nesf import GridNesf, GridNesfConfig
 from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
+from semantic_mapper.scenes.klevr import BOX_HIGH_M, BOX_LOW_M
 from semantic_mapper.scenes.suite import KLEVR_SUITE
-from semantic_mapper.training.frame_rays import frame_rays
-from semantic_mapper.training.grid_nesf import GridNesfTraining, SceneLabels, labelled_scene, train_grid_nesf
-from semantic_mapper.types import Float32, PosedFrame, UInt8
+from semantic_mapper.training.grid_nesf import (
+    GridNesfTraining,
+    LabelledScene,
+    SceneLabels,
+    labelled_points,
+    labelled_scene,
+    train_grid_nesf,
+)
+from semantic_mapper.types import Float32, UInt8
 
 _log = get_logger(__name__)
 
 VERSION = 2  # raised by a change of the training: older networks are left alone
+_OPAQUE = 40.0  # raw density at which nothing passes a voxel; its negative lets all pass
 LOOKS = 10  # at the points of novel scenes, spread evenly over the steps
 
 
@@ -56,12 +69,14 @@ class NesfArm(NamedTuple):
         size: Vertices along x and y.
         maps: Label maps a training scene; None = those of the run.
         views: That densities are fitted to; None = all train cameras.
+        exact: The surface itself instead of densities, and classes of its points instead of label maps: an upper bound.
     """
 
     rotate: bool = True
     size: int = 48
     maps: int | None = None
     views: int | None = None
+    exact: bool = False
 
 
 NESF_ARMS = {
@@ -70,6 +85,7 @@ NESF_ARMS = {
     "nesf-grid-32": NesfArm(size=32),
     "nesf-grid-64": NesfArm(size=64),
     "nesf-1-map": NesfArm(maps=1),
+    "exact-points": NesfArm(exact=True),
 } | {name: NesfArm(views=views) for name, views in VIEW_ARMS.items()}
 
 
@@ -84,10 +100,30 @@ class TrainingPoint(msgspec.Struct, frozen=True):
 def nesf_arms(folder: Path) -> dict[str, Arm]:
     """Arms by name; densities and networks are kept in ``folder``."""
 
-    def run(name: str, config: KlevrConfig) -> SceneScores:
-        return nesf_scores(*arm_settings(config, name), folder, NESF_ARMS[name].views)
+    def run(name: str, config: KlevrConfig) -> ArmScores:
+        model, gain = arm_network(config, name, folder)
+        own, _ = arm_settings(config, name)
+        return ArmScores(nesf_scores(own, model, folder, NESF_ARMS[name]), gain)
 
     return {name: partial(run, name) for name in NESF_ARMS}
+
+
+def arm_network(config: KlevrConfig, name: str, folder: Path) -> tuple[GridNesf, float]:
+    """The network of an arm, its steps doubled until its plateau, and the mIoU that the last fifth of them brought."""
+    (own, training), arm = arm_settings(config, name), NESF_ARMS[name]
+
+    def fit(steps: int) -> tuple[GridNesf, float]:
+        settings = msgspec.structs.replace(training, steps=steps)
+        model = nesf_network(own, settings, folder, arm)
+        return model, last_fifth(read_curve(own, settings, folder, arm))
+
+    return fit_to_plateau(fit, training.steps, MOST_DOUBLINGS)
+
+
+def last_fifth(curve: Sequence[TrainingPoint]) -> float:
+    """mIoU that the last fifth of the steps brought; all of it where there are too few steps to tell."""
+    before = [p.miou_points for p in curve if p.step <= 0.8 * curve[-1].step]
+    return curve[-1].miou_points - (before[-1] if before else 0.0)
 
 
 def arm_settings(config: KlevrConfig, name: str) -> tuple[KlevrConfig, GridNesfTraining]:
@@ -115,15 +151,14 @@ def grid_config(config: KlevrConfig, views: int | None = None) -> KlevrGridConfi
     )
 
 
-def nesf_scores(config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None = None) -> SceneScores:
-    """Train a network on the training scenes' label maps; score images and points of the novel scenes."""
-    model = nesf_network(config, training, folder, views)
+def nesf_scores(config: KlevrConfig, model: GridNesf, folder: Path, arm: NesfArm) -> SceneScores:
+    """What a network says of images and points of the novel scenes; of points alone where it was given the surface."""
     found: dict[int, dict[str, ConfusionMatrix]] = {}
-    for scene, grid in _grids(config, novel_seeds(config), folder, views).items():
+    for scene, grid in _grids(config, novel_seeds(config), folder, arm).items():
         labels = SceneLabels(model, grid, NEAR_M)
+        kinds = {} if arm.exact else scored_numbers(config, scene)
         found[scene] = {
-            kind: _confusion(scene_frames(config, scene, numbers), labels.frame)
-            for kind, numbers in scored_numbers(config, scene).items()
+            kind: confusion(scene_frames(config, scene, numbers), labels.frame) for kind, numbers in kinds.items()
         }
         xyz, truth = surface_points(config, scene)
         matrix = found[scene][POINTS] = ConfusionMatrix(KLEVR_SUITE.label_set)
@@ -131,19 +166,17 @@ def nesf_scores(config: KlevrConfig, training: GridNesfTraining, folder: Path, v
     return found
 
 
-def nesf_network(config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None = None) -> GridNesf:
+def nesf_network(config: KlevrConfig, training: GridNesfTraining, folder: Path, arm: NesfArm) -> GridNesf:
     """The network of an arm: read from ``folder``, or trained and kept there, its curve beside it."""
     label_set = KLEVR_SUITE.label_set
-    path = _network_path(config, training, folder, views)
+    path = _network_path(config, training, folder, arm)
     if path.exists():
         model = GridNesf(label_set, training.network)
         model.load_state_dict(load_file(path))
         return model.eval()
-    scenes = [
-        labelled_scene(grid, scene_frames(config, s, label_map_numbers(config, s)), label_set, training)
-        for s, grid in _grids(config, train_seeds(config), folder, views).items()
-    ]
-    novel = {s: (g, *surface_points(config, s)) for s, g in _grids(config, novel_seeds(config), folder, views).items()}
+    grids = _grids(config, train_seeds(config), folder, arm)
+    scenes = [_training_scene(config, training, scene, grid, arm) for scene, grid in grids.items()]
+    novel = {s: (g, *surface_points(config, s)) for s, g in _grids(config, novel_seeds(config), folder, arm).items()}
     looks = {round(k * training.steps / LOOKS) for k in range(1, LOOKS + 1)}
     entropies: list[float] = []
     curve: list[TrainingPoint] = []
@@ -161,30 +194,40 @@ def nesf_network(config: KlevrConfig, training: GridNesfTraining, folder: Path, 
 
 
 def nesf_curve(config: KlevrConfig, name: str, folder: Path) -> list[TrainingPoint]:
-    """How the kept network of an arm was trained; empty where there is none."""
-    path = _network_path(*arm_settings(config, name), folder, NESF_ARMS[name].views).with_suffix(".json")
+    """How the kept network of an arm with the most steps was trained; empty where there is none."""
+    own, training = arm_settings(config, name)
+    curves = (
+        read_curve(own, msgspec.structs.replace(training, steps=training.steps << k), folder, NESF_ARMS[name])
+        for k in reversed(range(MOST_DOUBLINGS + 1))
+    )
+    return next(filter(None, curves), [])
+
+
+def read_curve(config: KlevrConfig, training: GridNesfTraining, folder: Path, arm: NesfArm) -> list[TrainingPoint]:
+    """How a kept network was trained; empty where there is none."""
+    path = _network_path(config, training, folder, arm).with_suffix(".json")
     return msgspec.json.decode(path.read_bytes(), type=list[TrainingPoint]) if path.exists() else []
 
 
-def _network_path(config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None) -> Path:
-    return folder / f"nesf-{_network_digest(config, training, views)}.safetensors"
+def _training_scene(
+    config: KlevrConfig, training: GridNesfTraining, scene: int, grid: SceneGrid, arm: NesfArm
+) -> LabelledScene:
+    numbers, label_set = label_map_numbers(config, scene), KLEVR_SUITE.label_set
+    if not arm.exact:
+        return labelled_scene(grid, scene_frames(config, scene, numbers), label_set, training)
+    xyz, ids = surface_points(config, scene, numbers)
+    return labelled_points(grid, xyz, label_set.to_channels(ids).astype(np.int64), training)
 
 
-def _network_digest(config: KlevrConfig, training: GridNesfTraining, views: int | None) -> str:
-    grids = [grid_digest(grid_config(config, views), scene) for scene in train_seeds(config)]
+def _network_path(config: KlevrConfig, training: GridNesfTraining, folder: Path, arm: NesfArm) -> Path:
+    return folder / f"nesf-{_network_digest(config, training, arm)}.safetensors"
+
+
+def _network_digest(config: KlevrConfig, training: GridNesfTraining, arm: NesfArm) -> str:
+    grids = [grid_digest(grid_config(config, arm.views), scene) for scene in train_seeds(config)]
     maps = [label_map_numbers(config, scene) for scene in train_seeds(config)]
-    plain = [to_plain(training), grids, maps, VERSION]
+    plain = [to_plain(training), ["exact"] if arm.exact else grids, maps, VERSION]
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def surface_points(config: KlevrConfig, scene: int) -> tuple[Float32, UInt8]:
-    """Points (N, 3) of the surface with their true ids (N,): those that the scored train cameras see."""
-    frames = scene_frames(config, scene, scored_numbers(config, scene)[TRAIN_CAMERAS])
-    rays = frame_rays(frames, config.width)
-    hit = np.flatnonzero(rays.depth_m > 0)
-    batch = rays.rays(hit, 0.0)
-    xyz = batch.origin + batch.direction * torch.from_numpy(rays.depth_m[hit])[:, None]
-    return xyz.numpy(), np.concatenate([f.label.ravel() for f in frames if f.label is not None])[hit]
 
 
 def scene_grid(density: SceneDensity) -> SceneGrid:
@@ -195,8 +238,26 @@ def scene_grid(density: SceneDensity) -> SceneGrid:
     return grid
 
 
-def _grids(config: KlevrConfig, seeds: Sequence[int], folder: Path, views: int | None) -> dict[int, SceneGrid]:
-    densities = list(scene_densities(grid_config(config, views), seeds, folder))
+def exact_grid(config: KlevrConfig, scene: int) -> SceneGrid:
+    """A grid that is opaque where the train cameras see the surface, and empty elsewhere.
+
+    Its voxels are smaller than the network's, so neighbours in x and y are opaque, too: no vertex misses the surface.
+    """
+    grid = SceneGrid(grid_box(BOX_LOW_M, BOX_HIGH_M, grid_config(config).long_side))
+    xyz, _ = surface_points(config, scene, range(config.train_views))
+    place = ((xyz - np.array(grid.config.origin_m, np.float32)) / grid.config.voxel_m).round().astype(np.int64)
+    place = place.clip(0, np.array(grid.config.shape) - 1)
+    opaque = torch.zeros(grid.config.shape)
+    opaque[tuple(torch.from_numpy(place).T)] = 1
+    opaque = functional.max_pool3d(opaque[None, None], (3, 3, 1), 1, (1, 1, 0))[0, 0]
+    grid.values[..., 0] = torch.where(opaque > 0, _OPAQUE, -_OPAQUE)
+    return grid
+
+
+def _grids(config: KlevrConfig, seeds: Sequence[int], folder: Path, arm: NesfArm) -> dict[int, SceneGrid]:
+    if arm.exact:
+        return {scene: exact_grid(config, scene) for scene in seeds}
+    densities = list(scene_densities(grid_config(config, arm.views), seeds, folder))
     _log.info("densities", scenes=len(seeds), psnr=round(float(np.mean([d.psnr for d in densities])), 1))
     return {scene: scene_grid(density) for scene, density in zip(seeds, densities, strict=True)}
 
@@ -206,11 +267,3 @@ def _points_miou(model: GridNesf, novel: Mapping[int, tuple[SceneGrid, Float32, 
     for scene, (grid, xyz, truth) in novel.items():
         total.update(truth, SceneLabels(model, grid, NEAR_M).points(xyz), f"points of scene {scene}")
     return total.metrics().miou or 0.0
-
-
-def _confusion(frames: Sequence[PosedFrame], predict: Callable[[PosedFrame], UInt8]) -> ConfusionMatrix:
-    total = ConfusionMatrix(KLEVR_SUITE.label_set)
-    for frame in frames:
-        assert frame.label is not None
-        total.update(frame.label, predict(frame), f"frame {frame.seq}")
-    return total

@@ -115,9 +115,19 @@ def labelled_scene(
     rays = frame_rays(frames, max(f.intrinsics.width for f in frames))
     if len(rays) != len(channel):
         raise FrameError("labelled frames of one scene must have the same size")
-    channel = channel[pixels].astype(np.int64)
-    samples = marched(grid, rays, pixels, config.near_m)
-    first = np.searchsorted(samples.ray.numpy(), np.arange(len(pixels) + 1))
+    return _labelled(grid, marched(grid, rays, pixels, config.near_m), channel[pixels].astype(np.int64), config)
+
+
+def labelled_points(
+    grid: SceneGrid, xyz: Float32, channel: NDArray[np.int64], config: GridNesfTraining
+) -> LabelledScene:
+    """A scene to train on by points (P, 3) of the world that have a class each, instead of pixels."""
+    samples = Samples(torch.from_numpy(xyz), torch.ones(len(xyz)), torch.arange(len(xyz)))
+    return _labelled(grid, samples, channel, config)
+
+
+def _labelled(grid: SceneGrid, samples: Samples, channel: NDArray[np.int64], config: GridNesfTraining) -> LabelledScene:
+    first = np.searchsorted(samples.ray.numpy(), np.arange(len(channel) + 1))
     by_class = tuple(np.flatnonzero(channel == c) for c in np.unique(channel))
     opacity = smooth_opacity(grid, config.network.size)
     return LabelledScene(grid, opacity, samples, first, torch.from_numpy(channel), by_class)
