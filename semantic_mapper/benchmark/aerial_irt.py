@@ -22,6 +22,7 @@ from semantic_mapper.benchmark.aerial import (
     Predict,
     labelled_frames,
     scored,
+    thin,
     thinned,
     training_frames,
 )
@@ -34,6 +35,7 @@ from semantic_mapper.benchmark.aerial_grids import (
     town_grid,
 )
 from semantic_mapper.config import IRTConfig, IRTVariant
+from semantic_mapper.fields.grid.field import RaySamples
 from semantic_mapper.fields.irt import IRT
 from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
@@ -59,7 +61,8 @@ def irt_arms(folder: Path) -> dict[str, Arm]:
 
 
 def irt_fits(folder: Path) -> dict[str, Fit]:
-    """Fits by name; grids and trunks are kept in ``folder``."""
+    """Fits by name; grids and trunks are kept in ``folder``, and in memory where the views' rays meet a grid."""
+    marched: dict[tuple[int, int, int], list[RaySamples]] = {}  # by town, view and distance of pixels
 
     def arm(
         variant: IRTVariant = "RTTC",
@@ -88,7 +91,15 @@ def irt_fits(folder: Path) -> dict[str, Fit]:
             if stage_1:
                 _load_trunk(config, episode, field, start, folder)
             fit_classes(config, episode, field, frames)
-            return lambda frame, every: predict(field, frame, every)
+            own: dict[tuple[int, int, int], list[RaySamples]] = marched if stage_1 else {}
+
+            def answer(frame: PosedFrame, every: int) -> UInt8:
+                key = episode.town, frame.seq, every
+                if key not in own:
+                    own[key] = march_frame(field, frame, every)
+                return predict(field, frame, every, own[key])
+
+            return answer
 
         return fit
 
@@ -124,18 +135,28 @@ def finetune_settings(config: AerialConfig, town: int) -> FinetuneConfig:
     )
 
 
-def predict(field: IRT, frame: PosedFrame, every: int) -> UInt8:
+def march_frame(field: IRT, frame: PosedFrame, every: int) -> list[RaySamples]:
+    """Where the rays of a frame's ``thinned`` pixels meet the grid, in batches."""
+    few = thinned(frame, every)
+    rays = frame_rays([few], few.intrinsics.width)
+    with torch.inference_mode():
+        return [field.march(rays.rays(part, NEAR_M)) for part in _batches(len(rays))]
+
+
+def predict(field: IRT, frame: PosedFrame, every: int, marched: list[RaySamples]) -> UInt8:
     """Ids of a frame's ``thinned`` pixels; its own image is looked at, the whole of it."""
     views = stack_sources([view_from_frame(frame, field.label_set, frame.intrinsics.width)], with_labels=False)
-    few = thinned(frame, every)
-    rays, found = frame_rays([few], few.intrinsics.width), list[NDArray[np.int64]]()
+    found: list[NDArray[np.int64]] = []
     with torch.inference_mode():
         encoded = field.encode(views)
-        for first in range(0, len(rays), _AT_ONCE):
-            pixels = np.arange(first, min(first + _AT_ONCE, len(rays)))
-            render = field.render(rays.rays(pixels, NEAR_M), encoded)
-            found.append(torch.where(render.known, render.logits.argmax(1), -1).numpy())
-    return field.label_set.to_ids(np.concatenate(found)).reshape(rays.image_size(0))
+        for samples in marched:
+            logits, known = field.classify(samples, encoded)
+            found.append(torch.where(known, logits.argmax(1), -1).numpy())
+    return field.label_set.to_ids(np.concatenate(found)).reshape(thin(frame.rgb[..., 0], every).shape)
+
+
+def _batches(count: int) -> list[NDArray[np.int64]]:
+    return [np.arange(first, min(first + _AT_ONCE, count)) for first in range(0, count, _AT_ONCE)]
 
 
 def _load_trunk(config: AerialConfig, episode: Episode, field: IRT, start: TownGrid, folder: Path) -> None:
