@@ -1,7 +1,7 @@
 """The suite AERIAL: arms learn one town from its training views, four of which have labels, and are scored on others.
 
 An *episode* is one town with one choice of labelled views. An arm is a function ``arm(config, episode) -> scores``;
-most make a function ``predict(frame) -> ids`` and hand it to ``score_episode``. Records are kept by episode, and
+most are a fit that gives a function ``predict(frame) -> ids``, scored by ``scored``. Records are kept by episode, and
 ``aerial_claims`` judges by them.
 """
 
@@ -10,13 +10,15 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from semantic_mapper.benchmark.claims import Counts, CountTable, Unit
 from semantic_mapper.benchmark.records import SceneRecord
@@ -36,10 +38,13 @@ from semantic_mapper.scenes.aerial.views import (
 )
 from semantic_mapper.scenes.sequence import RoomView
 from semantic_mapper.scenes.suite import AERIAL_SUITE
-from semantic_mapper.types import PosedFrame, UInt8
+from semantic_mapper.types import CameraIntrinsics, PosedFrame, UInt8
 
-RECORD_VERSION = 1  # raised by a change of what a record means: older ones are made again
+_T = TypeVar("_T", bound=np.generic)
+
+RECORD_VERSION = 2  # raised by a change of what a record means: older ones are made again
 DAY, DARK, LOW, AGREEMENT = "day", "dark", "low", "agreement"  # what is scored
+FIT = "fit"  # beside it: CPU time of the fit in milliseconds, and 1
 
 _TEST_VIEWS = len(held_out_numbers())
 _TRAIN_VIEWS = len(training_numbers())
@@ -55,6 +60,7 @@ class AerialConfig(Config, frozen=True):
     train_views: Annotated[int, msgspec.Meta(ge=2, le=_TRAIN_VIEWS)] = _TRAIN_VIEWS
     test_views: Annotated[int, msgspec.Meta(ge=2, le=_TEST_VIEWS)] = _TEST_VIEWS
     low_views: Annotated[int, msgspec.Meta(ge=2, le=LOW_RING)] = LOW_RING
+    score_every: AtLeastOne = 3  # pixels along each side of which one is scored
     voxel_m: Positive = 0.75
     grid_steps: AtLeastOne = 600  # of the photometric fit of a town
     nerf_steps: AtLeastOne = 300  # of logits that are trained jointly with the grid
@@ -90,7 +96,8 @@ class Episode:
 
 
 EpisodeScores = Mapping[str, Mapping[int, Counts]]  # by what is scored and by view
-Predict = Callable[[PosedFrame], UInt8]  # ids (H, W); only image, camera and pose may be looked at
+Predict = Callable[[PosedFrame, int], UInt8]  # ids of ``thinned`` frames, by image, camera and pose alone
+Fit = Callable[[AerialConfig, Episode], Predict]
 Arm = Callable[[AerialConfig, Episode], EpisodeScores]
 
 
@@ -127,20 +134,50 @@ def town_views(width: int, town: int, numbers: tuple[int, ...], dark: bool = Fal
     return list(aerial_views(town, numbers, aerial_camera(width), dark=dark))
 
 
+def thinned(frame: PosedFrame, every: int) -> PosedFrame:
+    """A frame of one pixel in ``every`` along each side, with their camera."""
+    i, first = frame.intrinsics, (every - 1) // 2
+    size = [len(range(first, side, every)) for side in (i.width, i.height)]
+    camera = CameraIntrinsics(i.fx / every, i.fy / every, (i.cx - first) / every, (i.cy - first) / every, *size)
+    label = None if frame.label is None else thin(frame.label, every)
+    return replace(frame, rgb=thin(frame.rgb, every), label=label, intrinsics=camera)
+
+
+def thin(image: NDArray[_T], every: int) -> NDArray[_T]:
+    """(H, W, ...) at the pixels of ``thinned``."""
+    first = (every - 1) // 2
+    return np.ascontiguousarray(image[first::every, first::every])
+
+
+def scored(fit: Fit) -> Arm:
+    """An arm that fits, then answers; its scores tell the CPU time of the fit."""
+
+    def run(config: AerialConfig, episode: Episode) -> EpisodeScores:
+        began = time.process_time()
+        predict = fit(config, episode)
+        milliseconds = round(1000 * (time.process_time() - began))
+        scores = score_episode(config, episode, predict)
+        return {**scores, FIT: {0: np.array([[milliseconds, 1]], np.int64)}}
+
+    return run
+
+
 def score_episode(config: AerialConfig, episode: Episode, predict: Predict) -> EpisodeScores:
     """Scores of an arm that says a class of every pixel: by day, in the dark, from low, and of views among each
     other."""
     found: dict[str, dict[int, Counts]] = {}
     for kind in (DAY, DARK, LOW):
         views = scored_views(config, episode, kind)
-        said = [predict(replace(view.frame, label=None)) for view in views]
+        said = [predict(replace(view.frame, label=None), config.score_every) for view in views]
         found[kind] = {}
         for view, ids in zip(views, said, strict=True):
             matrix = ConfusionMatrix(AERIAL_SUITE.label_set)
-            matrix.update(view.rendered.label, ids, f"town {episode.town}, view {view.frame.seq}")
+            matrix.update(
+                thin(view.rendered.label, config.score_every), ids, f"town {episode.town}, view {view.frame.seq}"
+            )
             found[kind][view.frame.seq] = matrix.counts
         if kind == DAY:
-            found[AGREEMENT] = _agreements(views, said)
+            found[AGREEMENT] = _agreements(views, said, config.score_every)
     return found
 
 
@@ -217,12 +254,13 @@ def aerial_table(config: AerialConfig, names: Sequence[str], store: RecordStore)
     return found
 
 
-def _agreements(views: Sequence[RoomView], said: Sequence[UInt8]) -> dict[int, Counts]:
+def _agreements(views: Sequence[RoomView], said: Sequence[UInt8], every: int) -> dict[int, Counts]:
     """Of each view and the next one of the same flight: how many pixels show one surface, and have one class."""
     found: dict[int, Counts] = {}
     for k, (view, other) in enumerate(itertools.pairwise(views)):
-        depth = (view.rendered.exact_depth_m, view.T_world_camera)
-        matches = matching_pixels(*depth, other.rendered.exact_depth_m, other.T_world_camera, view.frame.intrinsics)
+        camera = thinned(view.frame, every).intrinsics
+        depth, there = (thin(v.rendered.exact_depth_m, every) for v in (view, other))
+        matches = matching_pixels(depth, view.T_world_camera, there, other.T_world_camera, camera)
         same = label_agreement(said[k], said[k + 1], matches, AERIAL_SUITE.label_set.ignore_id)
         found[view.frame.seq] = np.array([[same.agreeing, same.compared]], np.int64)
     return found

@@ -20,10 +20,14 @@ from semantic_mapper.benchmark.aerial import (
     Counts,
     Episode,
     EpisodeScores,
+    Fit,
+    Predict,
     labelled_frames,
-    score_episode,
+    scored,
     scored_views,
+    thin,
 )
+from semantic_mapper.benchmark.plateau import fit_to_plateau
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.scenes.aerial.views import cached_town, primitives_seen
@@ -38,25 +42,25 @@ PATCH = 7  # pixels a side
 DARKEST = 0.15  # light of the U-Net's darkest pictures where it is trained with such
 
 _BATCH = 4096
-_PLATEAU = 0.005  # of mIoU in the last fifth of the steps: with more, there are to be twice as many steps
 _MOST_DOUBLINGS = 3
 _BLOCK = 16  # pixels a side of what is held out of labelled views
 _HELD_OUT = 8  # one block in so many
 
 
-def color_arm(config: AerialConfig, episode: Episode) -> EpisodeScores:
+def fit_color(config: AerialConfig, episode: Episode) -> Predict:
     """What the colour of a pixel alone says of its class: a small network on RGB."""
     frames, label_set = labelled_frames(config, episode), AERIAL_SUITE.label_set
     rgb = np.concatenate([_unit(f.rgb.reshape(-1, 3)) for f in frames])
     channel = np.concatenate([label_set.to_channels(f.label).ravel() for f in frames if f.label is not None])
     net = _fit_mlp(rgb[channel >= 0], channel[channel >= 0], len(label_set), config)
 
-    def predict(frame: PosedFrame) -> UInt8:
+    def predict(frame: PosedFrame, every: int) -> UInt8:
+        rgb = thin(frame.rgb, every)
         with torch.inference_mode():
-            found = net(torch.from_numpy(_unit(frame.rgb.reshape(-1, 3)))).argmax(1).numpy()
-        return label_set.to_ids(found).reshape(frame.rgb.shape[:2])
+            found = net(torch.from_numpy(_unit(rgb.reshape(-1, 3)))).argmax(1).numpy()
+        return label_set.to_ids(found).reshape(rgb.shape[:2])
 
-    return score_episode(config, episode, predict)
+    return predict
 
 
 def patch_arm(config: AerialConfig, episode: Episode) -> EpisodeScores:
@@ -90,34 +94,28 @@ def patch_arm(config: AerialConfig, episode: Episode) -> EpisodeScores:
     return found
 
 
-def unet_arm(darkest: float = 1.0) -> Arm:
+def unet_fit(darkest: float = 1.0) -> Fit:
     """The per-image U-Net on the labelled views, past its plateau; ``darkest``: see ``UNetConfig``.
 
     One block in eight of the labelled views is held out. The network is fitted again with twice the steps until those
     after four fifths of them bring less than half a point of mIoU there.
     """
 
-    def run(config: AerialConfig, episode: Episode) -> EpisodeScores:
+    def run(config: AerialConfig, episode: Episode) -> Predict:
         frames = labelled_frames(config, episode)
         seen, held_out = _split(frames, np.random.default_rng((config.seed, episode.number, 3)))
-        steps = config.unet_steps
-        unet, gain = _fit_unet(config, seen, held_out, steps, darkest)
-        for _ in range(_MOST_DOUBLINGS):
-            if gain < _PLATEAU:
-                break
-            steps *= 2
-            unet, gain = _fit_unet(config, seen, held_out, steps, darkest)
-        return score_episode(config, episode, unet.predict)
+
+        def fit(steps: int) -> tuple[UNetBaseline, float]:
+            return _fit_unet(config, seen, held_out, steps, darkest)
+
+        unet, _ = fit_to_plateau(fit, config.unet_steps, _MOST_DOUBLINGS)
+        return lambda frame, every: thin(unet.predict(frame), every)
 
     return run
 
 
-IMAGE_ARMS: dict[str, Arm] = {
-    "color": color_arm,
-    "patch": patch_arm,
-    "unet": unet_arm(),
-    "unet-dimmed": unet_arm(DARKEST),
-}
+IMAGE_FITS: dict[str, Fit] = {"color": fit_color, "unet": unet_fit(), "unet-dimmed": unet_fit(DARKEST)}
+IMAGE_ARMS: dict[str, Arm] = {"patch": patch_arm} | {name: scored(fit) for name, fit in IMAGE_FITS.items()}
 
 
 def _fit_unet(

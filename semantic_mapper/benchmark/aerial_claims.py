@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from semantic_mapper.benchmark.aerial import AGREEMENT, DARK, DAY, LOW
+from semantic_mapper.benchmark.aerial import AGREEMENT, DARK, DAY, FIT, LOW
 from semantic_mapper.benchmark.aerial_arms import BRIDGE, ROOF
 from semantic_mapper.benchmark.claims import Claim, Measure, miou_measure
 from semantic_mapper.evaluation.bootstrap import miou_of_counts
@@ -36,7 +36,8 @@ DARK_DROP = Measure("relative drop in the dark", (DAY, DARK), _drop)
 LOW_DROP = Measure("relative drop from low", (DAY, LOW), _drop)
 BRIDGE_PAIR = Measure("accuracy, bridge or road", (BRIDGE,), _accuracy)
 ROOF_PAIR = Measure("accuracy, roof or road", (ROOF,), _accuracy)
-MEASURES = (MIOU, IN_THE_DARK, FROM_LOW, CONSISTENCY, DARK_DROP, LOW_DROP, BRIDGE_PAIR, ROOF_PAIR)
+FIT_SECONDS = Measure("CPU seconds of a fit", (FIT,), lambda counts: counts[0][:, 0, 0] / counts[0][:, 0, 1] / 1000)
+MEASURES = (MIOU, IN_THE_DARK, FROM_LOW, CONSISTENCY, DARK_DROP, LOW_DROP, BRIDGE_PAIR, ROOF_PAIR, FIT_SECONDS)
 
 CLAIMS = (
     Claim("gate: the colour of a pixel says little", "", MIOU, "color", most=15.0),
@@ -49,6 +50,8 @@ CLAIMS = (
     Claim("RTT above RT", "57.5 / 53.9", MIOU, "irt-rtt", "irt-rt", least=0.0),
     Claim("RTC above RT", "56.8 / 53.9", MIOU, "irt-rtc", "irt-rt", least=0.0),
     Claim("above Color-NeRF", "58.7 / 56.8", MIOU, "irt-rttc", "irt-colour", least=0.0),
+    Claim("20 points are no better than 10", "51.2 / 51.1", MIOU, "irt-20-points", "irt-rttc", least=-1.0, most=1.0),
+    Claim("the default of finetune above carried labels", "", MIOU, "irt-bc", "warp", least=0.0),
     Claim("stage 1 brings", "a figure only", MIOU, "irt-rttc", "irt-no-stage-1", least=10.0),
     Claim("dark: half of the U-Net's drop", "18 / 81", DARK_DROP, "irt-rttc", "unet", most=0.0, factor=0.5),
     Claim(

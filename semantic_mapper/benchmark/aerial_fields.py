@@ -4,6 +4,7 @@ from __future__ import annotations
 
 # torch leaves parts of its interface untyped.
 # pyright: reportUnknownMemberType=false
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,9 +17,11 @@ from semantic_mapper.benchmark.aerial import (
     AerialConfig,
     Arm,
     Episode,
-    EpisodeScores,
+    Fit,
+    Predict,
     labelled_frames,
-    score_episode,
+    scored,
+    thinned,
     training_frames,
 )
 from semantic_mapper.benchmark.aerial_grids import FIT_NEAR_M, NEAR_M, TownGrid, grid_depths, town_grid
@@ -26,6 +29,7 @@ from semantic_mapper.fields.grid.scene_grid import SceneGrid
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.scenes.suite import AERIAL_SUITE
 from semantic_mapper.training.baselines import WarpBaseline
+from semantic_mapper.training.finetune import held_out_blocks
 from semantic_mapper.training.frame_rays import FrameRays, frame_rays
 from semantic_mapper.types import PosedFrame, UInt8
 
@@ -36,25 +40,35 @@ _FIRST_RATE, _LAST_RATE = 0.1, 0.01  # of logits
 _GRID_RATE = 0.01  # of density and colour
 _SURFACE = 0.02  # opacity of a voxel from which on it has logits, and those next to it
 _AT_ONCE = 8192  # rays of a picture
+_LOOKS, _LOOK_RAYS = 5, 4096
+HELD_OUT_FRACTION = 0.125  # of the labelled pixels, in blocks
 
 
 def field_arms(folder: Path) -> dict[str, Arm]:
-    """Arms by name; grids are kept in ``folder``."""
+    """``field_fits`` as arms."""
+    return {name: scored(fit) for name, fit in field_fits(folder).items()}
 
-    def warp(config: AerialConfig, episode: Episode) -> EpisodeScores:
+
+def field_fits(folder: Path) -> dict[str, Fit]:
+    """Fits by name; grids are kept in ``folder``."""
+
+    def warp(config: AerialConfig, episode: Episode) -> Predict:
         grid = town_grid(config, episode.town, folder).grid
         frames = labelled_frames(config, episode)
         depths = grid_depths(grid, frames)
         carried = WarpBaseline(
             AERIAL_SUITE.label_set, [replace(f, depth_m=d) for f, d in zip(frames, depths, strict=True)]
         )
-        return score_episode(
-            config, episode, lambda frame: carried.predict(replace(frame, depth_m=grid_depths(grid, [frame])[0]))
-        )
 
-    def semantic_nerf(config: AerialConfig, episode: Episode) -> EpisodeScores:
+        def predict(frame: PosedFrame, every: int) -> UInt8:
+            few = thinned(frame, every)
+            return carried.predict(replace(few, depth_m=grid_depths(grid, [few])[0]))
+
+        return predict
+
+    def semantic_nerf(config: AerialConfig, episode: Episode) -> Predict:
         field = fit_logits(config, episode, town_grid(config, episode.town, folder))
-        return score_episode(config, episode, field.predict)
+        return lambda frame, every: field.predict(thinned(frame, every))
 
     return {"warp": warp, "semantic-nerf": semantic_nerf}
 
@@ -107,19 +121,22 @@ class GridLogits:
 
 def fit_logits(config: AerialConfig, episode: Episode, start: TownGrid) -> GridLogits:
     """Semantic-NeRF on a grid: classes of the labelled views and colours of all views train logits, density and colour
-    jointly, from the town's fitted grid on."""
+    jointly, from the town's fitted grid on. One block in eight of the labelled views chooses among five states."""
     grid = SceneGrid(start.grid.config)
     grid.load_state_dict(start.grid.state_dict())
     grid.values.requires_grad_(True)
     field, label_set = GridLogits(grid), AERIAL_SUITE.label_set
     labelled, every = labelled_frames(config, episode), training_frames(config, episode)
     channel = np.concatenate([label_set.to_channels(f.label).ravel() for f in labelled if f.label is not None])
-    known = np.flatnonzero(channel >= 0)
+    held_out = _held_out(config, labelled) & (channel >= 0)
+    known, looked_at = np.flatnonzero((channel >= 0) & ~held_out), np.flatnonzero(held_out)
     of_labels, of_all = frame_rays(labelled, config.width), frame_rays(every, config.width)
     rng = np.random.default_rng((config.seed, episode.number, 5))
+    looked_at = rng.permutation(looked_at)[:_LOOK_RAYS]
+    best = math.inf, field.table.detach().clone(), grid.values.detach().clone()
     logits_adam = torch.optim.Adam([field.table], _FIRST_RATE)
     grid_adam = torch.optim.Adam([grid.values], _GRID_RATE)
-    losses: list[float] = []
+    every_look = max(config.nerf_steps // _LOOKS, 1)
     for step in range(config.nerf_steps):
         for group in logits_adam.param_groups:
             group["lr"] = _FIRST_RATE * (_LAST_RATE / _FIRST_RATE) ** (step / config.nerf_steps)
@@ -131,12 +148,32 @@ def fit_logits(config: AerialConfig, episode: Episode, start: TownGrid) -> GridL
         (entropy + colour).backward()
         logits_adam.step()
         grid_adam.step()
-        losses.append(float(entropy.detach()))
-        if step % 200 == 199:
-            _log.info("semantic_nerf", step=step + 1, cross_entropy=round(float(np.mean(losses[-50:])), 4))
+        if (step + 1) % every_look == 0:
+            loss = _look(field, of_labels, looked_at, channel)
+            _log.info("semantic_nerf", step=step + 1, held_out=round(loss, 4))
+            if loss < best[0]:
+                best = loss, field.table.detach().clone(), grid.values.detach().clone()
     grid.values.requires_grad_(False)
+    with torch.no_grad():
+        field.table.copy_(best[1])
+        grid.values.copy_(best[2])
     grid.update_occupied()
     return field
+
+
+def _held_out(config: AerialConfig, frames: list[PosedFrame]) -> NDArray[np.bool_]:
+    """The pixels (F H W,) of labelled frames that IRT holds out, too."""
+    generator = torch.Generator().manual_seed(config.seed)
+    height, width = frames[0].rgb.shape[:2]
+    masks = [held_out_blocks(height, width, HELD_OUT_FRACTION, generator).flatten() for _ in frames]
+    return torch.cat(masks).numpy()
+
+
+def _look(field: GridLogits, rays: FrameRays, pixels: NDArray[np.int64], channel: NDArray[np.int64]) -> float:
+    """Cross-entropy at pixels that nothing was learned from."""
+    with torch.no_grad():
+        logits = torch.cat([field.logits(rays, part, FIT_NEAR_M) for part in np.array_split(pixels, 4)])
+        return float(functional.cross_entropy(logits, torch.from_numpy(channel[pixels])))
 
 
 def _colour_loss(grid: SceneGrid, rays: FrameRays, pixels: NDArray[np.int64]) -> torch.Tensor:

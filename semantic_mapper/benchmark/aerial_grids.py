@@ -11,10 +11,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
 
+import msgspec
 import numpy as np
 import torch
 
-from semantic_mapper.benchmark.aerial import DAY, AerialConfig, Episode, scored_views, training_frames
+from semantic_mapper.benchmark.aerial import (
+    DAY,
+    AerialConfig,
+    Episode,
+    scored_views,
+    thin,
+    thinned,
+    training_frames,
+)
 from semantic_mapper.config import GridConfig, to_plain
 from semantic_mapper.fields.grid.scene_grid import SceneGrid
 from semantic_mapper.files import write_bytes
@@ -96,9 +105,12 @@ def town_grid(config: AerialConfig, town: int, folder: Path) -> TownGrid:
     seconds = time.process_time() - began
     grid = _rounded(fit.grid)
     views = scored_views(config, episode, DAY)
-    psnr, _ = held_out_psnr(grid, [v.frame for v in views], settings)
-    depths = grid_depths(grid, [v.frame for v in views])
-    pairs = [(d[d > 0], v.rendered.exact_depth_m[d > 0]) for d, v in zip(depths, views, strict=True)]
+    few = [thinned(v.frame, config.score_every) for v in views]
+    at_few = msgspec.structs.replace(settings, width=few[0].intrinsics.width)
+    psnr, _ = held_out_psnr(grid, few, at_few)
+    depths = grid_depths(grid, few)
+    exact = [thin(v.rendered.exact_depth_m, config.score_every) for v in views]
+    pairs = [(d[d > 0], true[d > 0]) for d, true in zip(depths, exact, strict=True)]
     off = np.concatenate([np.abs(z - true) for z, true in pairs])
     true = np.concatenate([t for _, t in pairs])
     known = off.size / sum(d.size for d in depths)

@@ -18,11 +18,15 @@ from semantic_mapper.benchmark.aerial import (
     AerialConfig,
     Arm,
     Episode,
-    EpisodeScores,
+    Fit,
+    Predict,
     labelled_frames,
-    score_episode,
+    scored,
+    thin,
+    thinned,
     training_frames,
 )
+from semantic_mapper.benchmark.aerial_fields import HELD_OUT_FRACTION
 from semantic_mapper.benchmark.aerial_grids import (
     NEAR_M,
     TownGrid,
@@ -31,6 +35,7 @@ from semantic_mapper.benchmark.aerial_grids import (
     town_grid,
 )
 from semantic_mapper.config import IRTConfig, IRTVariant
+from semantic_mapper.fields.grid.field import RaySamples
 from semantic_mapper.fields.irt import IRT
 from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
@@ -51,7 +56,13 @@ _AT_ONCE = 4096  # rays of a picture
 
 
 def irt_arms(folder: Path) -> dict[str, Arm]:
-    """Arms by name; grids and trunks are kept in ``folder``."""
+    """``irt_fits`` as arms."""
+    return {name: scored(fit) for name, fit in irt_fits(folder).items()}
+
+
+def irt_fits(folder: Path) -> dict[str, Fit]:
+    """Fits by name; grids and trunks are kept in ``folder``, and in memory where the views' rays meet a grid."""
+    marched: dict[tuple[int, int, int], list[RaySamples]] = {}  # by town, view and distance of pixels
 
     def arm(
         variant: IRTVariant = "RTTC",
@@ -60,10 +71,10 @@ def irt_arms(folder: Path) -> dict[str, Arm]:
         points: int = 10,
         colour: bool = False,
         stage_1: bool = True,
-    ) -> Arm:
+    ) -> Fit:
         texture = "colour" if colour else "cnn"
 
-        def run(config: AerialConfig, episode: Episode) -> EpisodeScores:
+        def fit(config: AerialConfig, episode: Episode) -> Predict:
             start = town_grid(config, episode.town, folder)
             frames = labelled_frames(config, episode)
             shape = IRTConfig(
@@ -80,12 +91,20 @@ def irt_arms(folder: Path) -> dict[str, Arm]:
             if stage_1:
                 _load_trunk(config, episode, field, start, folder)
             fit_classes(config, episode, field, frames)
-            return score_episode(config, episode, lambda frame: predict(field, frame))
+            own: dict[tuple[int, int, int], list[RaySamples]] = marched if stage_1 else {}
 
-        return run
+            def answer(frame: PosedFrame, every: int) -> UInt8:
+                key = episode.town, frame.seq, every
+                if key not in own:
+                    own[key] = march_frame(field, frame, every)
+                return predict(field, frame, every, own[key])
+
+            return answer
+
+        return fit
 
     variants: dict[str, IRTVariant] = {"irt-b": "B", "irt-rt": "RT", "irt-rtt": "RTT", "irt-rtc": "RTC"}
-    arms = {"irt-rttc": arm(), "irt-carry": arm(carry=True)}
+    arms = {"irt-rttc": arm(), "irt-bc": arm("BC", carry=True, points=6), "irt-carry": arm(carry=True)}
     arms |= {name: arm(variant) for name, variant in variants.items()}
     return arms | {
         "irt-colour": arm(colour=True),
@@ -107,21 +126,37 @@ def finetune_settings(config: AerialConfig, town: int) -> FinetuneConfig:
     """How classes are learned."""
     grid = grid_settings(config, town)
     return FinetuneConfig(
-        seconds=0.0, steps=config.irt_steps, width=config.width, held_out_fraction=0.125, seed=config.seed, grid=grid
+        seconds=0.0,
+        steps=config.irt_steps,
+        width=config.width,
+        held_out_fraction=HELD_OUT_FRACTION,
+        seed=config.seed,
+        grid=grid,
     )
 
 
-def predict(field: IRT, frame: PosedFrame) -> UInt8:
-    """Ids (H, W) of a frame, whose own image is looked at."""
+def march_frame(field: IRT, frame: PosedFrame, every: int) -> list[RaySamples]:
+    """Where the rays of a frame's ``thinned`` pixels meet the grid, in batches."""
+    few = thinned(frame, every)
+    rays = frame_rays([few], few.intrinsics.width)
+    with torch.inference_mode():
+        return [field.march(rays.rays(part, NEAR_M)) for part in _batches(len(rays))]
+
+
+def predict(field: IRT, frame: PosedFrame, every: int, marched: list[RaySamples]) -> UInt8:
+    """Ids of a frame's ``thinned`` pixels; its own image is looked at, the whole of it."""
     views = stack_sources([view_from_frame(frame, field.label_set, frame.intrinsics.width)], with_labels=False)
-    rays, found = frame_rays([frame], frame.intrinsics.width), list[NDArray[np.int64]]()
+    found: list[NDArray[np.int64]] = []
     with torch.inference_mode():
         encoded = field.encode(views)
-        for first in range(0, len(rays), _AT_ONCE):
-            pixels = np.arange(first, min(first + _AT_ONCE, len(rays)))
-            render = field.render(rays.rays(pixels, NEAR_M), encoded)
-            found.append(torch.where(render.known, render.logits.argmax(1), -1).numpy())
-    return field.label_set.to_ids(np.concatenate(found)).reshape(rays.image_size(0))
+        for samples in marched:
+            logits, known = field.classify(samples, encoded)
+            found.append(torch.where(known, logits.argmax(1), -1).numpy())
+    return field.label_set.to_ids(np.concatenate(found)).reshape(thin(frame.rgb[..., 0], every).shape)
+
+
+def _batches(count: int) -> list[NDArray[np.int64]]:
+    return [np.arange(first, min(first + _AT_ONCE, count)) for first in range(0, count, _AT_ONCE)]
 
 
 def _load_trunk(config: AerialConfig, episode: Episode, field: IRT, start: TownGrid, folder: Path) -> None:

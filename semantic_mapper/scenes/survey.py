@@ -193,16 +193,16 @@ def aerial(
     out: Annotated[Path, typer.Option(help="PNG or JPEG to write")],
     first: Annotated[int, typer.Option(help="seed of the first town")] = 200_000,
     towns: Annotated[int, typer.Option(help="how many")] = 2,
-    width: Annotated[int, typer.Option(help="pixels of a picture")] = 256,
+    width: Annotated[int, typer.Option(help="pixels of a picture")] = 230,
 ) -> None:
     """Write pictures and labels of towns from four heights, one in the dark, and measure views of 192x192."""
-    rows: list[UInt8] = []
+    rows: dict[str, list[UInt8]] = {}
     for seed in range(first, first + towns):
         views = list(aerial_views(seed, AERIAL_SHOWN, aerial_camera(width)))
-        dark = next(aerial_views(seed, AERIAL_SHOWN[:1], aerial_camera(width), dark=True))
-        rows.append(np.concatenate([v.frame.rgb for v in (*views, dark)], 1))
-        rows.append(np.concatenate([CARLA.colorize(v.rendered.label) for v in (*views, dark)], 1))
-    cv2.imwrite(str(out), np.ascontiguousarray(np.concatenate(rows, 0)[..., ::-1]))
+        views += aerial_views(seed, AERIAL_SHOWN[:1], aerial_camera(width), dark=True)
+        rows[f"town {seed}"] = [view.frame.rgb for view in views]
+        rows[f"{seed}: classes"] = [CARLA.colorize(view.rendered.label) for view in views]
+    cv2.imwrite(str(out), np.ascontiguousarray(draw_picture_rows(rows, CARLA, width)[..., ::-1]))
     started = time.process_time()
     count = sum(1 for _ in aerial_views(first, range(0, 100, 10), aerial_camera(192)))
     seconds = (time.process_time() - started) / count

@@ -8,6 +8,7 @@ from semantic_mapper.scenes.materials import Color, Material, Pattern, display_h
 from semantic_mapper.scenes.primitives import Assembly, Part, place_parts
 
 STOREY_M = 3.0
+ASPHALT_WALKS = 0.6  # of sidewalks and of the edges of flat roofs
 SHARED = 0.5  # probability that two classes of a pair share one material
 ROAD_M = 4.5  # half the width of a street
 WALK_M = 2.5  # width of a sidewalk
@@ -32,7 +33,7 @@ class TownBuilder:
         self.groups: list[list[Part]] = []
         plain, between = Pattern.PLAIN, self.between
         grey = (between(0.55, 0.6), between(0.08, 0.14), between(0.48, 0.54))
-        self.asphalt = self.material(plain, grey, scale_m=2.5, dim=0.55)
+        self.asphalt = self.material(plain, grey, scale_m=2.5, dim=0.65)
         self.water = self.material(plain, grey, scale_m=5.0, dim=0.6)
         self.parking = self.material(plain, grey, scale_m=3.5, dim=0.55)
         pale = (between(0.07, 0.11), between(0.06, 0.12), between(0.6, 0.66))
@@ -69,6 +70,10 @@ class TownBuilder:
     def pick(self, items: list[int]) -> int:
         """A random one."""
         return items[int(self.rng.integers(len(items)))]
+
+    def walk(self) -> int:
+        """What a sidewalk, or the edge of a flat roof, is paved with."""
+        return self.parking if self.often(ASPHALT_WALKS) else self.paving
 
     def material(self, pattern: Pattern, hsv: Color, *, scale_m: float, dim: float = 0.8) -> int:
         """A new material whose second colour is ``dim`` times the first; returns its number."""

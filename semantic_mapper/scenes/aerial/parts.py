@@ -8,26 +8,28 @@ from semantic_mapper.scenes.aerial.builder import KERB_M, STOREY_M, TownBuilder
 from semantic_mapper.scenes.primitives import Assembly, Shape
 
 _PARAPET_M = 0.7
+_EDGE_M = 1.6  # paved, along a parapet
 _GABLE_M = 0.35  # by which a roof stands out
 
 
 def flat_building(b: TownBuilder, x: float, y: float, wide: float, deep: float, storeys: int) -> None:
-    """A block under a roof of asphalt with a parapet, white seams and machines."""
-    house, wall, high = Assembly("building"), b.pick(b.walls), STOREY_M * storeys
+    """A block under a roof of asphalt with white seams and machines; along the parapet it is paved as sidewalks are."""
+    house, wall, walk, high = Assembly("building"), b.pick(b.walls), b.walk(), STOREY_M * storeys
     house.box(wall, (0, 0, high / 2), (wide, deep, high))
-    house.box(b.asphalt, (0, 0, high + 0.1), (wide - 0.4, deep - 0.4, 0.2))
+    house.box(walk, (0, 0, high + 0.05), (wide - 0.4, deep - 0.4, 0.1))
+    house.box(b.asphalt, (0, 0, high + 0.1), (wide - 2 * _EDGE_M, deep - 2 * _EDGE_M, 0.2))
     for side in (-1, 1):
-        house.box(b.metal[1], (side * (wide - 0.4) / 2, 0, high + _PARAPET_M / 2), (0.4, deep, _PARAPET_M))
-        house.box(b.metal[1], (0, side * (deep - 0.4) / 2, high + _PARAPET_M / 2), (wide, 0.4, _PARAPET_M))
+        house.box(walk, (side * (wide - 0.4) / 2, 0, high + _PARAPET_M / 2), (0.4, deep, _PARAPET_M))
+        house.box(walk, (0, side * (deep - 0.4) / 2, high + _PARAPET_M / 2), (wide, 0.4, _PARAPET_M))
     for _ in range(2):  # seams as wide as the lines on the streets
         if b.often(0.5):
-            house.box(b.paint, (b.between(-0.3, 0.3) * wide, 0, high + 0.2), (0.35, deep - 0.9, 0.04))
+            house.box(b.paint, (b.between(-0.3, 0.3) * wide, 0, high + 0.2), (0.35, deep - 2 * _EDGE_M, 0.04))
         else:
-            house.box(b.paint, (0, b.between(-0.3, 0.3) * deep, high + 0.2), (wide - 0.9, 0.35, 0.04))
+            house.box(b.paint, (0, b.between(-0.3, 0.3) * deep, high + 0.2), (wide - 2 * _EDGE_M, 0.35, 0.04))
     for _ in range(int(b.rng.integers(1, 4))):
         size = (b.between(1.2, 3.5), b.between(1.2, 3.0), b.between(1.0, 2.6))
         place = (b.between(-0.35, 0.35) * wide, b.between(-0.35, 0.35) * deep, high + 0.2 + size[2] / 2)
-        house.box(b.pick([*b.metal, wall]), place, size)
+        house.box(b.pick([*b.metal, *b.lacquers]), place, size)
     b.place(house, x, y, z=KERB_M)
 
 

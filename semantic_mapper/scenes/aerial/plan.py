@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from semantic_mapper.scenes.aerial.builder import ROAD_M
 
-RIVER_ROW_M = 74.0  # depth of the row that the river takes, with both its streets' halves
+RIVER_ROW_M = 84.0  # depth of the row that the river takes, with both its streets' halves
 RIVER_M = 11.0  # half the width of the water
 DECK_M = 5.0  # height of a bridge above the streets
 

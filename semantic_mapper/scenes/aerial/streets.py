@@ -15,7 +15,6 @@ _FAR_M = 700.0  # where the land ends
 _WATER_M = -1.6
 _STREET_TOP_M = 0.04
 _LINE_M, _LINE_TOP_M = 0.35, 0.05
-_ASPHALT_WALKS = 0.6  # of the blocks
 _LANE_M = 1.8  # middle of a lane off the middle of a street
 _PARKED_M = 3.4  # middle of a parked car
 
@@ -60,13 +59,24 @@ def lay_streets(b: TownBuilder, plan: TownPlan) -> None:
     for row in plan.block_rows():
         for column in range(len(plan.xs) - 1):
             block = plan.block(column, row)
-            surface = b.parking if b.often(_ASPHALT_WALKS) else b.paving
-            walks.box(surface, (*block.middle, KERB_M - 0.25), (*block.size, 0.5))
+            walks.box(b.walk(), (*block.middle, KERB_M - 0.25), (*block.size, 0.5))
     for bank in (-1, 1):
         y = plan.ys[plan.river] if bank < 0 else plan.ys[plan.river + 1]
         walks.box(b.paving, (0, y - bank * (ROAD_M + WALK_M / 2), KERB_M - 0.25), (x1 - x0, WALK_M, 0.5))
+    _outer_walks(b, plan, walks)
     for assembly in (roads, lines, walks):
         b.place(assembly, 0, 0)
+
+
+def _outer_walks(b: TownBuilder, plan: TownPlan, walks: Assembly) -> None:
+    """Sidewalks on the far sides of the outermost streets."""
+    x0, x1, y0, y1 = plan.xs[0], plan.xs[-1], plan.ys[0], plan.ys[-1]
+    aside, z = ROAD_M + WALK_M / 2, KERB_M - 0.25
+    banks = (y0 + ROAD_M, plan.ys[plan.river] + ROAD_M), (plan.ys[plan.river + 1] - ROAD_M, y1 + ROAD_M)
+    for side, x, y in ((-1, x0, y0), (1, x1, y1)):
+        walks.box(b.walk(), (0, y + side * aside, z), (x1 - x0 + 2 * ROAD_M, WALK_M, 0.5))
+        for low, high in banks:
+            walks.box(b.walk(), (x + side * aside, (low + high) / 2, z), (WALK_M, high - low, 0.5))
 
 
 def build_bridges(b: TownBuilder, plan: TownPlan) -> None:
@@ -76,7 +86,7 @@ def build_bridges(b: TownBuilder, plan: TownPlan) -> None:
     ramp, wide = foot - flat, 2 * (ROAD_M + WALK_M)
     slope, slant = float(np.arctan2(DECK_M, ramp)), float(np.hypot(DECK_M, ramp))
     for number in plan.bridges:
-        bridge = Assembly("bridge")
+        bridge, walks = Assembly("bridge"), {-1: b.walk(), 1: b.walk()}
         bridge.box(b.asphalt, (0, 0, DECK_M - 0.5), (2 * ROAD_M, 2 * flat, 1.0))
         bridge.box(b.paint, (0, 0, DECK_M), (_LINE_M, 2 * flat, 0.04), label="roadline")
         for end in (-1, 1):
@@ -86,12 +96,12 @@ def build_bridges(b: TownBuilder, plan: TownPlan) -> None:
             bridge.box(b.paint, (0, middle, DECK_M / 2 + 0.02), (_LINE_M, slant, 0.04), label="roadline", tilt=tilt)
             for side in (-1, 1):
                 x = side * (ROAD_M + WALK_M / 2)
-                bridge.box(b.paving, (x, middle, DECK_M / 2 + KERB_M - 0.5), (WALK_M, slant, 1.0), tilt=tilt)
+                bridge.box(walks[side], (x, middle, DECK_M / 2 + KERB_M - 0.5), (WALK_M, slant, 1.0), tilt=tilt)
                 rail = (side * wide / 2, middle, DECK_M / 2 + 0.4)
                 bridge.box(b.metal[1], rail, (0.3, slant, 1.6), tilt=tilt)
         for side in (-1, 1):
             x = side * (ROAD_M + WALK_M / 2)
-            bridge.box(b.paving, (x, 0, DECK_M + KERB_M - 0.5), (WALK_M, 2 * flat, 1.0))
+            bridge.box(walks[side], (x, 0, DECK_M + KERB_M - 0.5), (WALK_M, 2 * flat, 1.0))
             bridge.box(b.metal[1], (side * wide / 2, 0, DECK_M + 0.4), (0.3, 2 * flat, 1.6))
             bridge.box(b.metal[2], (0, side * RIVER_M * 0.45, DECK_M / 2 - 1.5), (wide - 3, 1.6, DECK_M + 1))
         b.place(bridge, plan.xs[number], plan.river_y)
@@ -114,7 +124,13 @@ def fill_streets(b: TownBuilder, plan: TownPlan, lacking: frozenset[str]) -> Non
         elif "trafficsign" not in lacking and b.often(0.35):
             parts.traffic_sign(b, *corner, yaw)
     for number in plan.bridges:
-        parts.car(b, plan.xs[number] + _LANE_M, plan.river_y + b.between(-5, 5), np.pi / 2, z=DECK_M + 0.02)
+        for side in (-1, 1):
+            for at in (-8.0, 0.0, 8.0):
+                for aside in (_LANE_M, _PARKED_M):
+                    if b.often(0.24 * b.crowd):
+                        place = plan.xs[number] + side * aside, plan.river_y + at + b.between(-1, 1)
+                        parts.car(b, *place, side * np.pi / 2, z=DECK_M + 0.02)
+                        break
 
 
 def segments(plan: TownPlan) -> Iterator[tuple[float, float, bool, float]]:

@@ -19,7 +19,7 @@ from semantic_mapper.scenes.materials import display_hsv, material_table
 from semantic_mapper.scenes.primitives import pack
 from semantic_mapper.scenes.scene import NO_LAMPS, Scene
 
-AERIAL_VERSION = 1  # part of every seed: a change that alters a town raises it
+AERIAL_VERSION = 2  # part of every seed: a change that alters a town raises it
 AERIAL_CODE = 2207  # tells the random streams of this suite from those of others
 MAY_LACK = ("truck", "bus", "fence", "static", "dynamic", "pedestrian", "trafficsign", "trafficlight")
 
@@ -66,7 +66,7 @@ def make_town(seed: int) -> Town:
     blocks.fill_blocks(b, plan, lacking)
     streets.fill_streets(b, plan, lacking)
     primitives = pack(b.groups, CARLA)
-    sun, T_world_sun = sun_camera(np.zeros(3), b.between(0, 2 * np.pi), np.radians(b.between(48, 62)), _SUN_M)
+    sun, T_world_sun = sun_camera(np.zeros(3), b.between(0, 2 * np.pi), np.radians(b.between(62, 74)), _SUN_M)
     focal = _SHADOW_SIZE / 2 * _SUN_M / (plan.reach_m + 40.0)
     shadow = shadow_map(primitives, T_world_sun, focal, _SHADOW_SIZE)
     sky = display_hsv(0.57, 0.12, 0.97), display_hsv(0.6, 0.45, 0.85)
