@@ -24,6 +24,7 @@ from semantic_mapper.replay.importers.base import (
 from semantic_mapper.replay.importers.colmap import open_colmap
 from semantic_mapper.replay.importers.folder import FolderRecording
 from semantic_mapper.replay.importers.kitti360 import Kitti360Recording
+from semantic_mapper.replay.importers.opensfm import find_opensfm, open_opensfm
 from semantic_mapper.replay.importers.polycam import open_polycam
 from semantic_mapper.replay.importers.record3d import open_record3d
 from semantic_mapper.replay.importers.replica import ReplicaRecording
@@ -51,6 +52,7 @@ FORMATS: dict[str, Callable[[Path, ImportOptions], Recording]] = {
     "record3d": open_record3d,
     "transforms": open_transforms,
     "colmap": open_colmap,
+    "opensfm": open_opensfm,
 }
 
 # What a folder of each format has, and no other.
@@ -65,7 +67,7 @@ _MARKS = {
     "transforms": ("transforms.json",),
 }
 
-SCALED = ("transforms", "colmap")  # formats whose poses have a unit of their own
+SCALED = ("transforms", "colmap", "opensfm")  # formats whose poses have a unit of their own
 LISTED = 5  # recordings that an error names
 _SEE = "replay/importers/ says what each format consists of"
 _VIDEO = "is a film, which has no poses: `semantic-mapper import` and `semantic-mapper map` find them"
@@ -95,6 +97,8 @@ def detect_format(src: Path) -> str:
             return name
     if find_model(src) is not None:
         return "colmap"
+    if find_opensfm(src) is not None:
+        return "opensfm"
     if src.resolve().parent.name == "data_2d_raw":
         return "kitti360"
     raise ImportSourceError(f"{src}: {_what_folder(src)}")
@@ -192,7 +196,7 @@ def import_recording(
     if name not in FORMATS:
         raise ImportSourceError(f"no format '{name}'; there are {', '.join(FORMATS)}")
     if options.scale is not None and name not in SCALED:
-        raise ImportSourceError(f"{src}: poses of format '{name}' are in metres; --scale is for {' and '.join(SCALED)}")
+        raise ImportSourceError(f"{src}: poses of format '{name}' are in metres; --scale is for {', '.join(SCALED)}")
     if not src.is_dir() and not (name == "rosbag" and src.is_file()):
         raise ImportSourceError(f"{src}: no such {'file or folder' if name == 'rosbag' else 'folder'}")
     recording = FORMATS[name](src, options)
