@@ -13,6 +13,7 @@ import numpy as np
 from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LabelError, LogError
 from semantic_mapper.image_rotation import rotate_frame, rotate_intrinsics
 from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.autolabel_note import AUTOLABEL_ATTACHMENT, read_note
 from semantic_mapper.replay.importers.base import (
     BadFrameError,
     ImportOptions,
@@ -20,6 +21,7 @@ from semantic_mapper.replay.importers.base import (
     LoadedFrame,
     Recording,
     Skipped,
+    read_bytes,
 )
 from semantic_mapper.replay.importers.colmap import open_colmap
 from semantic_mapper.replay.importers.folder import FolderRecording
@@ -35,6 +37,7 @@ from semantic_mapper.replay.importers.transforms import open_transforms
 from semantic_mapper.replay.importers.tum import TumRecording
 from semantic_mapper.replay.log.atomic_log import atomic_log
 from semantic_mapper.replay.log.format import LogReader, LogWriter
+from semantic_mapper.replay.log.reader import LogAttachment
 from semantic_mapper.replay.log.sequence import SUFFIX as LOG_SUFFIX
 from semantic_mapper.replay.sfm.colmap_model import find_model
 from semantic_mapper.transport.images import CodecOptions
@@ -205,6 +208,8 @@ def import_recording(
     packing = codec or CodecOptions(depth_scale=recording.depth_scale.units_per_m)
 
     with atomic_log(dst, info, options=packing, overwrite=overwrite) as writer:
+        if name == "folder" and (src / AUTOLABEL_ATTACHMENT).is_file():
+            _attach_note(src / AUTOLABEL_ATTACHMENT, writer)
         keep_files = codec is None and options.quarters % 4 == 0
         tally = _copy(recording, writer, total, changed, on_progress, keep_files=keep_files)
         frames = writer.frames
@@ -224,6 +229,21 @@ def import_recording(
         info=info,
         bytes=dst.stat().st_size,
     )
+
+
+def _attach_note(file: Path, writer: LogWriter) -> None:
+    """Who has rendered a folder's pseudo labels, and from which frames' labels: these must not be scored.
+
+    Raises:
+        ImportSourceError: it cannot be read, or is no such note.
+    """
+    try:
+        note = LogAttachment(file.name, "application/json", read_bytes(file))
+    except OSError as error:
+        raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
+    if read_note({file.name: note}) is None:
+        raise ImportSourceError(f"{file}: does not say who rendered the pseudo labels; export the log again")
+    writer.attach(note)
 
 
 def _changes(
