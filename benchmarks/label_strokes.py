@@ -4,6 +4,8 @@ Strokes are made from the true labels as a person would paint them: of each clas
 as wide as the labelling page's brush or as the class is there, and at most a sixth of the image long. Everything else
 is unlabelled. Frames are those that ``label --suggest`` names.
 
+``--kind irt`` fits an Implicit Ray-Transformer instead: geometry and colours of all frames, labels of the chosen ones.
+
 Example: python -m benchmarks.label_strokes kitchen.mcap 0 1 --labels 4 --out runs/strokes.jsonl
 """
 
@@ -11,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,10 +21,12 @@ import cv2
 import numpy as np
 import torch
 
-from benchmarks.label_suggestions import Choices, Scene, fit, log_scene, room_scene, score
+from benchmarks.label_suggestions import WIDTH, Choices, Scene, fit, log_scene, room_scene, score
 from semantic_mapper.fields.checkpoint import adapt_model, default_checkpoint_path, load_checkpoint
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.labels import LabelSet
+from semantic_mapper.training.finetune import FinetuneConfig
+from semantic_mapper.training.irt import fit_irt
 from semantic_mapper.types import UInt8
 
 BRUSH = 1 / 40  # of the image's width, across: the page's own
@@ -91,6 +96,15 @@ def with_strokes(scene: Scene, count: int, chosen: list[int], seed: int) -> tupl
     return replace(scene, pool=pool), strokes, painted / labelled
 
 
+def fit_scene_irt(scene: Scene, chosen: list[int], steps: int) -> LearnedField:
+    """An IRT of the scene: all of its frames, labels of the chosen ones alone."""
+    labelled = [scene.pool[i] for i in chosen]
+    others = [frame for i, frame in enumerate(scene.pool) if i not in chosen] + scene.scored
+    frames = labelled + [replace(frame, label=None) for frame in others]
+    config = FinetuneConfig(seconds=0, steps=steps, width=WIDTH)
+    return fit_irt(frames, scene.label_set, None, config).model
+
+
 def _as_shipped(scene: Scene) -> LearnedField:
     return adapt_model(load_checkpoint(default_checkpoint_path()).model, scene.label_set)
 
@@ -101,6 +115,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+", help="logs with labels; a number = that validation room")
     parser.add_argument("--steps", type=int, default=40, help="of finetuning; 0 = class rows alone")
     parser.add_argument("--labels", type=int, default=4, help="number of labelled frames")
+    parser.add_argument("--kind", choices=("sray", "irt"), default="sray")
     parser.add_argument("--strokes", default="0,1,2", help="a class and frame; 0 = full masks, -1 = learn nothing")
     parser.add_argument("--out", type=Path, required=True, help="figures as JSON, a line each")
     given = parser.parse_args()
@@ -114,14 +129,29 @@ def main() -> None:
             painted, strokes, fraction = scene, 0, float(count == 0)
             if count > 0:
                 painted, strokes, fraction = with_strokes(scene, count, chosen, 0)
-            model = _as_shipped(scene) if count < 0 else fit(painted, chosen, given.steps, 0)
+            began = time.process_time()
+            if count < 0:
+                model = _as_shipped(scene)
+            elif given.kind == "irt":
+                model = fit_scene_irt(painted, chosen, given.steps)
+            else:
+                model = fit(painted, chosen, given.steps, 0)
+            cpu_s = time.process_time() - began
             miou = score(scene, chosen, model, choices.candidates)
-            row = {"scene": scene.name, "strokes_a_class": count, "strokes": strokes, "painted": round(fraction, 4)}
+            row = {
+                "scene": scene.name,
+                "kind": given.kind,
+                "strokes_a_class": count,
+                "strokes": strokes,
+                "painted": round(fraction, 4),
+            }
             with given.out.open("a") as file:
-                file.write(json.dumps({**row, "steps": given.steps, "miou": round(miou, 4)}) + "\n")
+                file.write(
+                    json.dumps({**row, "steps": given.steps, "miou": round(miou, 4), "cpu_s": round(cpu_s)}) + "\n"
+                )
             print(
                 f"{scene.name:>10} {count} strokes a class ({strokes} in all, {100 * fraction:.1f} % painted): "
-                f"{100 * miou:.1f} %",
+                f"{100 * miou:.1f} %, {cpu_s:.0f} CPU s",
                 flush=True,
             )
 

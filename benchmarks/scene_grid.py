@@ -43,6 +43,7 @@ HELD_OUT_OBJECTS = 10
 ROOM_FRAMES, ROOM_EVERY = 40, 5  # one frame in five is held out
 ROOM_CAMERA = CameraIntrinsics(132.0, 132.0, 79.5, 59.5, 160, 120)
 HELD_OUT_WIDTH = 80
+PICTURE_PX, HEADING_PX = 200, 30  # of a picture's width, about, and of a line of text
 FREE = SamplingConfig(mode="reference", coarse=32, fine=32)  # no depth prior where a view is new
 
 
@@ -151,15 +152,23 @@ def _memory() -> str:
 def _picture(
     out: Path | None, name: str, frames: Sequence[PosedFrame], renders: Sequence[tuple[Float32, Float32]]
 ) -> None:
-    """Truth, render and depth of up to four views, as PNG."""
+    """Up to four views, two in a row, each as truth, render and depth; as PNG."""
     if out is None:
         return
     out.mkdir(parents=True, exist_ok=True)
-    rows = []
+    views = []
     for frame, (colour, depth) in list(zip(frames, renders, strict=True))[:4]:
-        grey = np.repeat((255 * depth / max(float(depth.max()), 1e-3)).astype(np.uint8)[..., None], 3, 2)
-        rows.append(np.hstack((frame.rgb, (np.clip(colour, 0, 1) * 255).astype(np.uint8), grey)))
-    cv2.imwrite(str(out / f"{name}.png"), np.vstack(rows)[..., ::-1])
+        near = np.clip(1 - depth / max(float(depth.max()), 1e-3), 0, 1)  # near is bright, nothing is black
+        grey = np.repeat((255 * np.where(depth > 0, 0.1 + 0.9 * near, 0)).astype(np.uint8)[..., None], 3, 2)
+        parts = (frame.rgb, (np.clip(colour, 0, 1) * 255).astype(np.uint8), grey)
+        scale = max(1, round(PICTURE_PX / frame.rgb.shape[1]))
+        views.append(np.hstack([np.kron(part, np.ones((scale, scale, 1), np.uint8)) for part in parts]))
+    rows = [np.hstack(views[n : n + 2]) for n in range(0, len(views) - 1, 2)]
+    heading = np.full((HEADING_PX, rows[0].shape[1], 3), 255, np.uint8)
+    for n, text in enumerate((f"{name}: truth", "render", "depth", "truth", "render", "depth")):
+        place = (n * rows[0].shape[1] // 6 + 6, HEADING_PX - 10)
+        cv2.putText(heading, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 1, cv2.LINE_AA)
+    cv2.imwrite(str(out / f"{name}.png"), np.vstack((heading, *rows))[..., ::-1])
 
 
 def main() -> None:

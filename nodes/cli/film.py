@@ -27,7 +27,9 @@ FocalPriorOption = Annotated[
 ScaleOption = Annotated[
     float,
     typer.Option(
-        "--scale", min=0, help="Film, transforms, colmap: metres per unit of its map without scale. 0 = not known."
+        "--scale",
+        min=0,
+        help="Film, transforms, colmap, opensfm: metres per unit of its map without scale. 0 = by GPS, if any.",
     ),
 ]
 DistanceOption = Annotated[

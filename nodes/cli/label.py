@@ -124,7 +124,7 @@ def _check_options(suggest: bool, serve: bool, given: dict[str, object]) -> None
         "--weights": (not send, "goes with --suggest or --serve"),
         "--json": (suggest and not serve, "goes with --suggest"),
         "--images": (not serve, "the page goes on with what is in --out"),
-        "--frames": (serve or send, "they are suggested"),
+        "--frames": (not suggest, "frames are named or suggested, not both"),
         "--to": (send, "nothing is sent with --suggest and --serve"),
         "--teacher": (send, "nothing is sent with --suggest and --serve"),
     }
@@ -203,15 +203,12 @@ def _send(
     if "://" not in to:
         _refuse_without_finetuner(Path(endpoint.removeprefix("ipc://")).parent)
     with StopRequest() as stop, frame_progress("label", None) as bar:
-        chosen, label_set = choose_keyframes(log, keyframes, numbers, images, stop, bar)
+        found, label_set = choose_keyframes(log, keyframes, numbers, images, stop, bar)
         with sending(endpoint, timeout, stop) as send:
-            for frame in chosen:
+            for frame in found.values():
                 send(LabelledKeyframe(frame, label_set, teacher or f"log {log.name}"))
-    output.print(
-        f"{counted(len(chosen), 'labelled keyframe')} sent: frames {', '.join(str(f.seq) for f in chosen)} "
-        f"of {log.name}"
-    )
-    if pseudo := sum(frame.label_is_pseudo for frame in chosen):
+    output.print(f"{counted(len(found), 'labelled keyframe')} sent: frames {', '.join(map(str, found))} of {log.name}")
+    if pseudo := sum(frame.label_is_pseudo for frame in found.values()):
         output.print(f"  {pseudo} of them have pseudo labels (`autolabel`): what weights have rendered, right or wrong")
 
 

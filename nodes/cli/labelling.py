@@ -28,8 +28,8 @@ SLICE_S = 0.2
 
 def choose_keyframes(
     path: Path, count: int, frames: Iterable[int], images: Path | None, stop: StopRequest, bar: FrameProgress
-) -> tuple[list[PosedFrame], LabelSet]:
-    """Frames of a log with their labels.
+) -> tuple[dict[int, PosedFrame], LabelSet]:
+    """Frames of a log with their labels, by their number in it.
 
     Args:
         path: The log.
@@ -54,15 +54,15 @@ def choose_keyframes(
         numbers = sorted(set(frames)) or ([] if folder is None else folder.numbers())
         if folder is None and not numbers:
             request = FinetuneRequest(path, count, path, FinetuneConfig(), None, False, DepthConfig(source="sensor"))
-            return list(choose_labelled(log, label_set, request, {}, stop, bar).values()), label_set
+            return choose_labelled(log, label_set, request, {}, stop, bar), label_set
         bar.start(len(numbers))
-        chosen: list[PosedFrame] = []
+        chosen: dict[int, PosedFrame] = {}
         for number in numbers:
             if stop:
                 raise KeyboardInterrupt
             if number >= len(log):
                 raise LogError(f"{path}: has no frame {number}; it has {len(log)}")
-            chosen.append(_labelled(log.frame(number), number, folder, path))
+            chosen[number] = _labelled(log.frame(number), number, folder, path)
             bar.advance()
     return chosen, label_set
 

@@ -72,11 +72,12 @@ def import_(
     camera_height: HeightOption = 0.0,
 ) -> None:
     """Make a log of a recording: sequence folder, TUM RGB-D, exported ScanNet, Replica (Semantic-NeRF), KITTI-360, ROS
-    bag, Polycam raw data, Record3D (EXR + RGB), transforms.json (nerfstudio, instant-ngp), COLMAP model with images.
+    bag, Polycam raw data, Record3D (EXR + RGB), transforms.json (nerfstudio, instant-ngp), COLMAP model with images,
+    OpenSfM or OpenDroneMap project.
 
     Of a film or a folder of pictures without poses these are found (structure from motion), and a report is written
-    beside the log (LOG with .html). Without one of --scale, --distance, --square-mm, --camera-height the lengths of its
-    map are not metres.
+    beside the log (LOG with .html). Without GPS positions in the pictures, or one of --scale, --distance, --square-mm,
+    --camera-height, the lengths of its map are not metres.
 
     Frames that cannot be used are left out, each with its file and the reason. --rotate is for cameras that are mounted
     on their side: the weights know upright rooms. Poses and intrinsics turn with the images. Of a ROS bag (1 or 2),

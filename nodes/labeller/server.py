@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 import structlog
 
 from semantic_mapper.errors import TransportError
-from semantic_mapper.nodes.labeller.session import SESSION_ERRORS, LabelSession
+from semantic_mapper.nodes.labeller.session import SESSION_ERRORS, ChangedElsewhereError, LabelSession, revision_of
 
 HOST = "127.0.0.1"
 PORT = 9092
@@ -109,10 +109,11 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
 
         def _answer(self, method: Any) -> None:
             try:
-                body, kind = method(self._path())
-                self._send(HTTPStatus.OK, body, kind)
+                self._send(HTTPStatus.OK, *method(self._path()))
             except _RefusedError as error:
                 self._refuse(error.status, str(error))
+            except ChangedElsewhereError as error:
+                self._refuse(HTTPStatus.PRECONDITION_FAILED, str(error))
             except SESSION_ERRORS as error:
                 self._refuse(HTTPStatus.BAD_REQUEST, str(error))
             except OSError as error:  # the browser has left
@@ -132,7 +133,7 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
                 raise _RefusedError(HTTPStatus.FORBIDDEN, "open the address that `label --serve` has shown")
             return path
 
-        def _get(self, path: str) -> tuple[bytes, str]:
+        def _get(self, path: str) -> tuple[bytes, str] | tuple[bytes, str, str]:
             if path in _FILES:
                 name, kind = _FILES[path]
                 return (_PAGE / name).read_bytes(), kind
@@ -141,9 +142,10 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
             number, what = _frame(path)
             if what == "image":
                 return session.image(number), "image/jpeg"
-            return session.label(number), "application/octet-stream"
+            label = session.label(number)
+            return label, "application/octet-stream", revision_of(label)
 
-        def _put(self, path: str) -> tuple[bytes, str]:
+        def _put(self, path: str) -> tuple[bytes, str, str]:
             number, what = _frame(path)
             if what != "label":
                 raise _RefusedError(HTTPStatus.METHOD_NOT_ALLOWED, "only labels can be written")
@@ -152,20 +154,23 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
                 raise _RefusedError(HTTPStatus.LENGTH_REQUIRED, "say how long the label is")
             if int(length) != (pixels := session.pixels(number)):
                 raise _RefusedError(HTTPStatus.BAD_REQUEST, f"frame {number} has {pixels} pixels, and got {length}")
-            session.save(number, self.rfile.read(int(length)))
-            return b"{}", "application/json"
+            label, seen = self.rfile.read(int(length)), self.headers.get("If-Match")
+            session.save(number, label, None if seen is None else seen.strip('"'))
+            return b"{}", "application/json", revision_of(label)
 
         def _refuse(self, status: HTTPStatus, message: str) -> None:
             self.close_connection = True  # what it has sent is not read
             self._send(status, json.dumps({"error": message}).encode(), "application/json")
 
-        def _send(self, status: HTTPStatus, body: bytes, kind: str) -> None:
+        def _send(self, status: HTTPStatus, body: bytes, kind: str, revision: str = "") -> None:
             try:
                 self.send_response(status)
                 for name, value in _HEADERS.items():
                     self.send_header(name, value)
                 self.send_header("Content-Type", kind)
                 self.send_header("Content-Length", str(len(body)))
+                if revision:
+                    self.send_header("ETag", f'"{revision}"')
                 self.end_headers()
                 self.wfile.write(body)
             except OSError as error:  # the browser has left

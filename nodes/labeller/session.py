@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections.abc import Sequence
 from typing import Any
@@ -15,6 +16,15 @@ from semantic_mapper.replay.log.sequence import Log
 from semantic_mapper.types import PosedFrame
 
 JPEG_QUALITY = 95
+
+
+class ChangedElsewhereError(LabelError):
+    """A label image is no longer what it was when the page showed it."""
+
+
+def revision_of(label: bytes) -> str:
+    """Tells one state of a label image from another."""
+    return hashlib.sha256(label).hexdigest()[:32]
 
 
 class LabelSession:
@@ -63,15 +73,24 @@ class LabelSession:
             LogError, FrameError: no such frame, a damaged one, or a damaged label image.
         """
         with self._lock:
-            size = self._size(number)
-            if number in self._folder.numbers():
-                return self._folder.read(number, size).tobytes()
-            return np.full(size, self._folder.label_set.ignore_id, np.uint8).tobytes()
+            return self._label(number)
 
-    def save(self, number: int, data: bytes) -> None:
+    def _label(self, number: int) -> bytes:
+        size = self._size(number)
+        if number in self._folder.numbers():
+            return self._folder.read(number, size).tobytes()
+        return np.full(size, self._folder.label_set.ignore_id, np.uint8).tobytes()
+
+    def save(self, number: int, data: bytes, revision: str | None = None) -> None:
         """Write what ``label`` gives, as changed by a person.
 
+        Args:
+            number: Of the frame.
+            data: Class ids.
+            revision: ``revision_of`` what the person changed; None = whatever is there is replaced.
+
         Raises:
+            ChangedElsewhereError: somebody else has changed it since.
             LabelError: not a byte a pixel, or an id that is no class.
             LogError, FrameError: no such frame, or it cannot be written.
         """
@@ -81,6 +100,8 @@ class LabelSession:
                 raise LabelError(
                     f"frame {number}: {len(data):,} bytes came for {width}x{height} pixels; send one class id a pixel"
                 )
+            if revision is not None and revision != revision_of(self._label(number)):
+                raise ChangedElsewhereError(f"frame {number} was changed elsewhere, in another tab or by a program")
             self._folder.write(number, np.frombuffer(data, np.uint8).reshape(height, width))
 
     def pixels(self, number: int) -> int:

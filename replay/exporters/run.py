@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from semantic_mapper.errors import CodecError, ConfigError, LogError
-from semantic_mapper.files import atomic_folder, atomic_path
+from semantic_mapper.files import atomic_folder, atomic_path, write_bytes
 from semantic_mapper.mapping.map_scale import require_metres
+from semantic_mapper.replay.autolabel_note import AUTOLABEL_ATTACHMENT
 from semantic_mapper.replay.exporters.base import Exporter, ExportFrame, LeftOut, encoded
 from semantic_mapper.replay.exporters.folder import FolderExporter, TrajectoryExporter, TumExporter
 from semantic_mapper.replay.log.sequence import Log
@@ -110,6 +111,9 @@ def export_log(log: Log, out: Path, request: LogExportRequest, on_frame: Callabl
     frames = 0
     with (atomic_folder if is_folder else atomic_path)(out, raises=LogError) as place:
         exporter = _exporter(place, log.info, request.format)
+        note = log.attachments().get(AUTOLABEL_ATTACHMENT)
+        if request.format == "folder" and note is not None:
+            write_bytes(place / AUTOLABEL_ATTACHMENT, note.data, raises=LogError)
         for envelope, parts in _frames(log, camera, request.max_frames):
             on_frame()
             try:

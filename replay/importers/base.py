@@ -38,7 +38,7 @@ class ImportOptions:
         topics: ROS bags: topics by role ("image", "depth", "info", "pose"), where several fit; depth "none" = without.
         world: ROS bags: frame of tf in which poses are; empty = map, world or odom.
         body: ROS bags: frame whose pose the topic of poses tells; empty = as its messages say.
-        scale: Metres per unit of poses whose unit is their own (transforms, colmap); None = not known.
+        scale: Metres per unit of poses whose unit is their own (transforms, colmap, opensfm); None = not known.
     """
 
     camera_id: str = "camera"

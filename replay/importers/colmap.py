@@ -1,7 +1,7 @@
 """COLMAP's models, text and binary, with their pictures in ``images`` beside ``sparse`` (or beside the model).
 
-Poses become OpenCV's camera to world with z up, by how the camera was held. Their unit is their own, unless a scale is
-given; without one, the median depth of the points becomes 2 units.
+Where the pictures have GPS positions, these tell scale, up and north. Otherwise up is how the camera was held, and the
+unit is the model's own, unless a scale is given; without one, the median depth of the points becomes 2 units.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from semantic_mapper.errors import ImportSourceError
-from semantic_mapper.evaluation.upright import camera_up
-from semantic_mapper.replay.importers.base import DepthScale, ImportOptions
+from semantic_mapper.replay.importers.base import ImportOptions
+from semantic_mapper.replay.importers.placed import place_model
 from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures, inside
 from semantic_mapper.replay.sfm.colmap_model import ColmapModel, find_model, read_model
-from semantic_mapper.replay.sfm.scale import UNSCALED_DEPTH_M, PlacedFrame, median_depth, upright
+from semantic_mapper.replay.sfm.scale import PlacedFrame, median_depth
 
 
 def open_colmap(folder: Path, options: ImportOptions) -> PosedPictures:
@@ -36,19 +36,15 @@ def open_colmap(folder: Path, options: ImportOptions) -> PosedPictures:
     if root is None:
         raise ImportSourceError(f"{folder}: the pictures of the model are missing; '{first}' is not in {roots[0]}")
     poses = np.stack([image.T_world_camera for image in model.images])
-    T = upright(poses[0], camera_up(poses))
-    factor = 1.0 if options.scale is not None or not model.points else _unscaled(model)
-    pictures: list[PosedPicture] = []
-    for image in model.images:
-        pose = T @ image.T_world_camera
-        pose[:3, 3] *= factor
-        pictures.append(PosedPicture(inside(root, image.name), model.cameras[image.camera_id], pose))
-    scale = DepthScale(1000.0, convention="a COLMAP model has no depth images")
-    return PosedPictures("colmap", folder, pictures, options, depth_scale=scale, metric=False)
+    pictures = [
+        PosedPicture(inside(root, image.name), model.cameras[image.camera_id], image.T_world_camera)
+        for image in model.images
+    ]
+    return place_model(poses, pictures, options, lambda: _depth(model)).pictures("colmap", folder, pictures, options)
 
 
-def _unscaled(model: ColmapModel) -> float:
-    """What makes the median depth of the points ``UNSCALED_DEPTH_M``."""
+def _depth(model: ColmapModel) -> float:
+    """Median depth of the points as the images see them; 0 = none sees any."""
     frames = [
         PlacedFrame(
             0,
@@ -57,5 +53,4 @@ def _unscaled(model: ColmapModel) -> float:
         )
         for image in model.images
     ]
-    depth = median_depth(frames) if any(len(frame.xyz) for frame in frames) else 0.0
-    return UNSCALED_DEPTH_M / depth if depth > 0 else 1.0
+    return median_depth(frames) if any(len(frame.xyz) for frame in frames) else 0.0

@@ -13,6 +13,7 @@ import numpy as np
 from semantic_mapper.errors import CodecError, FrameError, ImportSourceError, LabelError, LogError
 from semantic_mapper.image_rotation import rotate_frame, rotate_intrinsics
 from semantic_mapper.plain_text import counted
+from semantic_mapper.replay.autolabel_note import AUTOLABEL_ATTACHMENT, read_note
 from semantic_mapper.replay.importers.base import (
     BadFrameError,
     ImportOptions,
@@ -20,10 +21,12 @@ from semantic_mapper.replay.importers.base import (
     LoadedFrame,
     Recording,
     Skipped,
+    read_bytes,
 )
 from semantic_mapper.replay.importers.colmap import open_colmap
 from semantic_mapper.replay.importers.folder import FolderRecording
 from semantic_mapper.replay.importers.kitti360 import Kitti360Recording
+from semantic_mapper.replay.importers.opensfm import find_opensfm, open_opensfm
 from semantic_mapper.replay.importers.polycam import open_polycam
 from semantic_mapper.replay.importers.record3d import open_record3d
 from semantic_mapper.replay.importers.replica import ReplicaRecording
@@ -34,6 +37,7 @@ from semantic_mapper.replay.importers.transforms import open_transforms
 from semantic_mapper.replay.importers.tum import TumRecording
 from semantic_mapper.replay.log.atomic_log import atomic_log
 from semantic_mapper.replay.log.format import LogReader, LogWriter
+from semantic_mapper.replay.log.reader import LogAttachment
 from semantic_mapper.replay.log.sequence import SUFFIX as LOG_SUFFIX
 from semantic_mapper.replay.sfm.colmap_model import find_model
 from semantic_mapper.transport.images import CodecOptions
@@ -51,6 +55,7 @@ FORMATS: dict[str, Callable[[Path, ImportOptions], Recording]] = {
     "record3d": open_record3d,
     "transforms": open_transforms,
     "colmap": open_colmap,
+    "opensfm": open_opensfm,
 }
 
 # What a folder of each format has, and no other.
@@ -65,7 +70,7 @@ _MARKS = {
     "transforms": ("transforms.json",),
 }
 
-SCALED = ("transforms", "colmap")  # formats whose poses have a unit of their own
+SCALED = ("transforms", "colmap", "opensfm")  # formats whose poses have a unit of their own
 LISTED = 5  # recordings that an error names
 _SEE = "replay/importers/ says what each format consists of"
 _VIDEO = "is a film, which has no poses: `semantic-mapper import` and `semantic-mapper map` find them"
@@ -95,6 +100,8 @@ def detect_format(src: Path) -> str:
             return name
     if find_model(src) is not None:
         return "colmap"
+    if find_opensfm(src) is not None:
+        return "opensfm"
     if src.resolve().parent.name == "data_2d_raw":
         return "kitti360"
     raise ImportSourceError(f"{src}: {_what_folder(src)}")
@@ -192,7 +199,7 @@ def import_recording(
     if name not in FORMATS:
         raise ImportSourceError(f"no format '{name}'; there are {', '.join(FORMATS)}")
     if options.scale is not None and name not in SCALED:
-        raise ImportSourceError(f"{src}: poses of format '{name}' are in metres; --scale is for {' and '.join(SCALED)}")
+        raise ImportSourceError(f"{src}: poses of format '{name}' are in metres; --scale is for {', '.join(SCALED)}")
     if not src.is_dir() and not (name == "rosbag" and src.is_file()):
         raise ImportSourceError(f"{src}: no such {'file or folder' if name == 'rosbag' else 'folder'}")
     recording = FORMATS[name](src, options)
@@ -201,6 +208,8 @@ def import_recording(
     packing = codec or CodecOptions(depth_scale=recording.depth_scale.units_per_m)
 
     with atomic_log(dst, info, options=packing, overwrite=overwrite) as writer:
+        if name == "folder" and (src / AUTOLABEL_ATTACHMENT).is_file():
+            _attach_note(src / AUTOLABEL_ATTACHMENT, writer)
         keep_files = codec is None and options.quarters % 4 == 0
         tally = _copy(recording, writer, total, changed, on_progress, keep_files=keep_files)
         frames = writer.frames
@@ -220,6 +229,21 @@ def import_recording(
         info=info,
         bytes=dst.stat().st_size,
     )
+
+
+def _attach_note(file: Path, writer: LogWriter) -> None:
+    """Who has rendered a folder's pseudo labels, and from which frames' labels: these must not be scored.
+
+    Raises:
+        ImportSourceError: it cannot be read, or is no such note.
+    """
+    try:
+        note = LogAttachment(file.name, "application/json", read_bytes(file))
+    except OSError as error:
+        raise ImportSourceError(f"{file}: cannot be read ({error.strerror or error})") from error
+    if read_note({file.name: note}) is None:
+        raise ImportSourceError(f"{file}: does not say who rendered the pseudo labels; export the log again")
+    writer.attach(note)
 
 
 def _changes(

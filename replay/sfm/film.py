@@ -12,6 +12,7 @@ import numpy as np
 
 from semantic_mapper.errors import ImportSourceError
 from semantic_mapper.files import numeric_order
+from semantic_mapper.replay.sfm.gps import GpsPosition, read_position
 from semantic_mapper.types import UInt8
 
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
@@ -76,6 +77,10 @@ class Film:
         self.width, self.height = (max(1, round(side * self._ratio)) for side in (self.full_width, self.full_height))
         if self.focal_px is not None:
             self.focal_px *= self._ratio
+
+    def position(self, index: int) -> GpsPosition | None:
+        """Where a picture of a folder was taken by its EXIF data; None of a film, or where that tells nothing."""
+        return read_position(self._pictures[index]) if self._pictures else None
 
     def __iter__(self) -> Iterator[FilmFrame]:
         """All frames from the first one; pictures that cannot be used are left out (``odd_pictures``)."""

@@ -29,6 +29,7 @@ from semantic_mapper.replay.sfm.colmap_model import ColmapModel, read_model
 from semantic_mapper.replay.sfm.features import FeatureFinder
 from semantic_mapper.replay.sfm.film import Film, FilmFrame
 from semantic_mapper.replay.sfm.film_note import FilmNote
+from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsFit, place_by_gps
 from semantic_mapper.replay.sfm.refusals import (
     LEAST_ANGLE_DEG,
     doubt_focal,
@@ -185,7 +186,8 @@ def import_film(
     """Write the log ``dst`` of a film, or of a folder of pictures, without poses; it is there once it is complete.
 
     The world of the log has z up, by how the camera was held, and begins at the first camera, on the floor where one is
-    found. Deterministic: the same film, options and machine give the same poses.
+    found. Pictures with GPS positions place it instead, unless a scale is given: x is east, y north, z up, in
+    metres from the first one's position. Deterministic: the same film, options and machine give the same poses.
 
     Args:
         src: Film file, or folder of pictures.
@@ -284,6 +286,7 @@ class _Import:
         self._progress = on_progress
         self._notices: list[str] = []
         self._edges: dict[int, Float64] = {}  # of some of the picked frames
+        self._gps: GpsFit | None = None
 
     def run(self, dst: Path, *, overwrite: bool) -> FilmReport:
         film = self._film
@@ -435,13 +438,23 @@ class _Import:
             self._notices.append("up is how the camera was held: too few upright edges are seen to tell it better")
         frames = _moved(frames, upright(frames[min(frames)].T_world_camera, guess if up is None else up), 1.0)
         placed = _Placed(_moved(frames, np.eye(4), UNSCALED_DEPTH_M / median_depth(list(frames.values()))), xy, seen)
-        factor, scale = self._scale(placed, look, board)
-        frames = _moved(placed.frames, np.eye(4), factor)
+        self._gps = self._place_by_gps(placed)
+        if self._gps is not None:
+            fit, scale = self._gps, str(self._gps)
+            T_world_model = fit.T_world_model.copy()
+            T_world_model[:3, 3] /= fit.scale
+            frames = _moved(placed.frames, T_world_model, fit.scale)
+        else:
+            factor, scale = self._scale(placed, look, board)
+            frames = _moved(placed.frames, np.eye(4), factor)
         floor = floor_under(list(frames.values()))
-        down = np.eye(4)
-        down[2, 3] = 0.0 if floor is None else -floor
-        frames = _moved(frames, down, 1.0)
-        height = None if floor is None else float(np.median([f.T_world_camera[2, 3] for f in frames.values()]))
+        height = None
+        if floor is not None:
+            height = float(np.median([f.T_world_camera[2, 3] for f in frames.values()])) - floor
+        if floor is not None and self._gps is None:
+            down = np.eye(4)
+            down[2, 3] = -floor
+            frames = _moved(frames, down, 1.0)
         others = tuple(
             OtherModel(
                 len(m.images),
@@ -457,6 +470,17 @@ class _Import:
                 "hang together with the rest and is left out; import it as a film of its own"
             )
         return _Placed(frames, xy, seen), scale, height, others
+
+    def _place_by_gps(self, placed: _Placed) -> GpsFit | None:
+        """Where the pictures' positions put the model, unless the scale is told otherwise; None = they tell nothing."""
+        if self._options.scale != ScaleHint():
+            return None
+        poses = np.stack([frame.T_world_camera for frame in placed.frames.values()])
+        try:
+            return place_by_gps(poses, [self._film.position(index) for index in placed.frames])
+        except ImportSourceError as error:
+            self._notices.append(f"GPS is not used: {error}")
+            return None
 
     def _scale(self, placed: _Placed, look: FilmLook, board: BoardScale | None) -> tuple[float, str]:
         """Metres per unit, and how they were found; empty = they were not."""
@@ -545,7 +569,8 @@ class _Import:
                 "poses": "structure from motion",
                 SCALE_KEY: scale or SCALE_UNKNOWN,
                 "stamps": "time within the film",
-            },
+            }
+            | ({} if self._gps is None else {ORIGIN_KEY: str(self._gps.origin)}),
         )
         written = _Written(info)
         shown = set(np.linspace(0, len(look.index) - 1, 14).astype(int)[1:-1].tolist())

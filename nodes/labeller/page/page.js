@@ -15,6 +15,7 @@ let size = 16;  // pixels of the frame, across
 // ---- saving: one request at a time, the newest state last
 
 const unsaved = new Map();  // frames and their ids that the server does not have yet
+const revisions = new Map();  // of frames, as the server has given them: what has changed there since is not replaced
 let saving = null;
 
 function changed() {
@@ -34,8 +35,16 @@ async function sendAll() {
     unsaved.delete(frame);
     say("saving");
     try {
-      await request(`frames/${frame}/label`, { method: "PUT", body: ids.slice() });
+      const headers = { "If-Match": revisions.get(frame) };
+      const answer = await request(`frames/${frame}/label`, { method: "PUT", body: ids.slice(), headers });
+      revisions.set(frame, answer.headers.get("ETag"));
     } catch (error) {
+      if (error.status === 412) {
+        unsaved.delete(frame);
+        if (frame === number) await show(frame);
+        say(`${error.message}; shown as it is now, without the last stroke`, true);
+        return;
+      }
       if (!unsaved.has(frame)) unsaved.set(frame, ids);
       say(`not saved: ${error.message}`, true);
       return;
@@ -54,7 +63,10 @@ async function request(path, options) {
   } catch {
     throw new Error("`label --serve` does not answer; is it still running?");
   }
-  if (!answer.ok) throw new Error((await answer.json().catch(() => ({}))).error ?? answer.statusText);
+  if (!answer.ok) {
+    const { error } = await answer.json().catch(() => ({}));
+    throw Object.assign(new Error(error ?? answer.statusText), { status: answer.status });
+  }
   return answer;
 }
 
@@ -70,13 +82,19 @@ addEventListener("beforeunload", (event) => { if (unsaved.size || saving) event.
 
 let showing = 0;
 
+async function load(wanted) {
+  const answer = await request(`frames/${wanted}/label`);
+  const ids = new Uint8Array(await answer.arrayBuffer());
+  revisions.set(wanted, answer.headers.get("ETag"));
+  return ids;
+}
+
 async function show(wanted) {
   const mine = ++showing;
   endStroke();
   say("loading");
   try {
-    const ids = unsaved.get(wanted) ??
-      new Uint8Array(await (await request(`frames/${wanted}/label`)).arrayBuffer());
+    const ids = unsaved.get(wanted) ?? await load(wanted);
     const picture = new Image();
     picture.src = `frames/${wanted}/image`;
     await picture.decode();

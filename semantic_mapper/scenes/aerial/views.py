@@ -117,7 +117,7 @@ def aerial_views(
     town = cached_town(seed)
     for number in numbers:
         pose = aerial_pose(town, number)
-        view = _render(town, intrinsics, pose, number, dark)
+        view = render_town(town, intrinsics, pose, number, dark=dark)
         frame = PosedFrame(
             stamp_ns=(number + 1) * FRAME_NS,
             seq=number,
@@ -144,7 +144,10 @@ def primitives_seen(seed: int, number: int, intrinsics: CameraIntrinsics) -> np.
     return cast_view(town.scene, intrinsics, aerial_pose(town, number))[1]
 
 
-def _render(town: Town, intrinsics: CameraIntrinsics, pose: Float64, number: int, dark: bool) -> RenderedView:
+def render_town(
+    town: Town, intrinsics: CameraIntrinsics, pose: Float64, number: int, *, dark: bool = False
+) -> RenderedView:
+    """A picture from anywhere over a town; ``number`` draws its noise."""
     scene, i, n = town.scene, intrinsics, _FINER
     depth, index = cast_view(scene, i, pose)
     exact = np.where(index >= 0, depth, 0.0).astype(np.float32)

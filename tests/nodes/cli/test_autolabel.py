@@ -239,6 +239,8 @@ def test_export_and_import_keep_pseudo_labels_apart(new: Path, tmp_path: Path) -
     assert [f.name for f in sorted((tmp_path / "folder" / "label").iterdir())] == ["000000.png", "000001.png"]
     assert len(list((tmp_path / "folder" / "pseudo_label").iterdir())) == 4
     back = import_recording(tmp_path / "folder", tmp_path / "back.mcap")
+    with LogReader(new) as one, LogReader(tmp_path / "back.mcap") as other:
+        assert read_note(other.attachments()) == read_note(one.attachments()) is not None
     assert back.labelled == 2 and any("4 frames with pseudo labels" in notice for notice in back.notices)
     with LogReader(new) as one, LogReader(tmp_path / "back.mcap") as other:
         for a, b in zip(one, other, strict=True):
@@ -535,6 +537,6 @@ def test_bench_takes_no_pseudo_labels_for_truth(new: Path) -> None:
 def test_label_images_of_a_person_take_the_mark_away(new: Path, tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "000003.png"), np.full((72, 96), ROOMS.ids[0], np.uint8))
     with StopRequest() as stop, frame_progress("label", None) as bar:
-        (own,), _ = choose_keyframes(new, 1, [], tmp_path, stop, bar)
-        (pseudo,), _ = choose_keyframes(new, 1, [3], None, stop, bar)
+        (own,) = choose_keyframes(new, 1, [], tmp_path, stop, bar)[0].values()
+        (pseudo,) = choose_keyframes(new, 1, [3], None, stop, bar)[0].values()
     assert not own.label_is_pseudo and pseudo.label_is_pseudo

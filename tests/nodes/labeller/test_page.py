@@ -158,7 +158,24 @@ def test_a_stroke_that_cannot_be_saved_is_said_kept_and_saved_later(page: Page) 
     page.browser.drag(page.on((10, 50), (80, 50)))
     status = "document.getElementById('status').textContent"
     assert page.eventually(lambda: str(page.browser.evaluate(status)).startswith("not saved: "))
-    assert page.shown(40, 50)[3] == 255 and page.browser.evaluate("document.getElementById('again').hidden") is False
+    assert page.shown(40, 50)[3] == 255
+    hidden = "document.getElementById('again').hidden"  # it is while the page tries by itself
+    assert page.eventually(lambda: page.browser.evaluate(hidden) is False)
     moved.rename(page.out)
     assert page.saved(4, lambda label: bool((label[50, 10:81] == FLOOR).all()))
     assert (page.out / "labels.json").read_bytes() == labels
+
+
+def test_what_was_painted_elsewhere_is_shown_and_not_overwritten(page: Page) -> None:
+    page.browser.press("2")
+    page.browser.drag(page.on((10, 50), (80, 50)))
+    assert page.saved(4, lambda label: bool((label[50, 10:81] == FLOOR).all()))
+    elsewhere = np.full((HEIGHT, WIDTH), ROOMS.ignore_id, np.uint8)
+    elsewhere[5:15] = CEILING
+    cv2.imwrite(str(page.out / "000004.png"), elsewhere)
+    page.browser.drag(page.on((10, 30), (80, 30)))
+    status = "document.getElementById('status').textContent"
+    assert page.eventually(lambda: "frame 4 was changed elsewhere" in str(page.browser.evaluate(status)))
+    assert page.shown(40, 10) == [*ROOMS.colors[CEILING - 1], 255] and page.shown(40, 30)[3] == 0
+    page.browser.drag(page.on((10, 60), (80, 60)))
+    assert page.saved(4, lambda label: bool((label[60, 10:81] == FLOOR).all() and (label[5:15] == CEILING).all()))

@@ -212,3 +212,16 @@ def test_a_damaged_label_image_is_named_and_left_alone(page: Page) -> None:
     answer = page.ask("frames/4/label")
     assert answer.status == 400 and "000004.png" in answer.says
     assert (page.out / "000004.png").read_bytes() == b"no image"
+
+
+def test_what_was_changed_in_another_tab_is_not_overwritten(page: Page) -> None:
+    first, second = page.ask("frames/1/label"), page.ask("frames/1/label")
+    one, other = strokes(), strokes()
+    one[30:40] = WALL
+    saved = page.ask("frames/1/label", "PUT", one.tobytes(), If_Match=first.headers["ETag"])
+    assert saved.status == 200
+    late = page.ask("frames/1/label", "PUT", other.tobytes(), If_Match=second.headers["ETag"])
+    assert late.status == 412 and "frame 1 was changed elsewhere" in late.says
+    assert page.ask("frames/1/label").body == one.tobytes()
+    again = page.ask("frames/1/label", "PUT", other.tobytes(), If_Match=saved.headers["ETag"])
+    assert again.status == 200 and page.ask("frames/1/label").headers["ETag"] == again.headers["ETag"]

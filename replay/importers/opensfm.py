@@ -1,0 +1,188 @@
+"""OpenSfM's ``reconstruction.json``, as OpenDroneMap makes it, too, with the pictures in ``images``.
+
+The layout is that of https://opensfm.org/docs/dataset.html. Pixels count from the picture's middle, divided by its
+longer side. Poses are world to camera, rotations as axis times angle, camera axes are OpenCV's. With a
+``reference_lla`` that is not zero OpenSfM has placed the model by GPS: then x is east, y north, z up, and lengths are
+metres. Without, the model is placed as one of COLMAP.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import msgspec
+import numpy as np
+
+from semantic_mapper.config import read_json
+from semantic_mapper.errors import ConfigError, FrameError, ImportSourceError
+from semantic_mapper.files import numeric_order
+from semantic_mapper.geometry import invert_pose
+from semantic_mapper.replay.importers.base import ImportOptions
+from semantic_mapper.replay.importers.placed import PlacedModel, place_model
+from semantic_mapper.replay.importers.posed import PosedPicture, PosedPictures, inside
+from semantic_mapper.replay.sfm.gps import ORIGIN_KEY, GpsPosition
+from semantic_mapper.replay.sfm.scale import PlacedFrame, median_depth
+from semantic_mapper.types import CameraIntrinsics, Float64
+
+FILE, REFERENCE = "reconstruction.json", "reference_lla.json"
+MAX_BYTES = 1 << 31
+MODELS = ("perspective", "simple_radial", "radial", "brown")  # of lenses that OpenCV's pinhole model has
+_LOOKED_AT, _POINTS = 20, 5000  # cameras and points whose depth is looked at
+
+ReadT = TypeVar("ReadT")
+Vector = tuple[float, float, float]
+
+
+class _Camera(msgspec.Struct):
+    width: int
+    height: int
+    projection_type: str = "perspective"
+    focal: float | None = None
+    focal_x: float | None = None
+    focal_y: float | None = None
+    c_x: float = 0.0
+    c_y: float = 0.0
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+
+class _Shot(msgspec.Struct):
+    rotation: Vector
+    translation: Vector
+    camera: str
+
+
+class _Reference(msgspec.Struct):
+    latitude: float
+    longitude: float
+    altitude: float
+
+
+class _Model(msgspec.Struct):
+    cameras: dict[str, _Camera]
+    shots: dict[str, _Shot]
+    reference_lla: _Reference | None = None
+
+
+class _Point(msgspec.Struct):
+    coordinates: Vector
+
+
+class _Points(msgspec.Struct):
+    points: dict[str, _Point] = {}
+
+
+def find_opensfm(folder: Path) -> Path | None:
+    """The file of a reconstruction: here, or below ``opensfm``; None = none."""
+    return next((f for f in (folder / FILE, folder / "opensfm" / FILE) if f.is_file()), None)
+
+
+def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
+    """The largest reconstruction of a folder, opened.
+
+    Raises:
+        ImportSourceError: none, one that cannot be read, no folder of pictures, or a lens that is no pinhole camera's.
+    """
+    file = find_opensfm(folder)
+    if file is None:
+        raise ImportSourceError(f"{folder}: no {FILE} in it, or below opensfm/")
+    models = _read(file, list[_Model])
+    number = max(range(len(models)), key=lambda n: len(models[n].shots), default=-1)
+    if number < 0 or not models[number].shots:
+        raise ImportSourceError(f"{file}: holds no posed picture")
+    model = models[number]
+    names = sorted(model.shots, key=numeric_order)
+    root = _root(folder, file, names[0])
+    cameras = {name: _intrinsics(camera, f"{file}, camera '{name}'") for name, camera in model.cameras.items()}
+    pictures = [_picture(root, name, model.shots[name], cameras, file) for name in names]
+    poses = np.stack([picture.T_world_camera for picture in pictures])
+    reference = model.reference_lla or _reference_beside(file)
+    if reference is None or not (reference.latitude or reference.longitude):
+        placed = place_model(poses, pictures, options, lambda: _depth(file, number, pictures))
+    elif options.scale is not None:
+        raise ImportSourceError(f"{file}: is in metres already, by GPS; leave out --scale")
+    else:
+        origin = GpsPosition(reference.latitude, reference.longitude, reference.altitude)
+        said = ["scale, up and north are those that OpenSfM found by GPS"]
+        placed = PlacedModel(poses, True, said, {ORIGIN_KEY: str(origin)})
+    opened = placed.pictures("opensfm", folder, pictures, options)
+    if len(models) > 1:
+        others = ", ".join(str(len(m.shots)) for n, m in enumerate(models) if n != number)
+        opened.notices.append(
+            f"the reconstruction fell into {len(models)} parts; the largest is imported, those of {others} "
+            "pictures are not"
+        )
+    return opened
+
+
+def _read(file: Path, kind: type[ReadT]) -> ReadT:
+    try:
+        return read_json(file, kind, MAX_BYTES)
+    except ConfigError as error:
+        raise ImportSourceError(str(error)) from error
+
+
+def _reference_beside(file: Path) -> _Reference | None:
+    """Older versions keep it in a file of its own."""
+    beside = file.with_name(REFERENCE)
+    return _read(beside, _Reference) if beside.is_file() else None
+
+
+def _root(folder: Path, file: Path, first: str) -> Path:
+    roots = (file.parent / "images", folder / "images", file.parent.parent / "images", file.parent)
+    for root in roots:
+        if inside(root, first).is_file():
+            return root
+    raise ImportSourceError(f"{folder}: the pictures are missing; '{first}' is not in {roots[0]}")
+
+
+def _picture(root: Path, name: str, shot: _Shot, cameras: dict[str, CameraIntrinsics], file: Path) -> PosedPicture:
+    if shot.camera not in cameras:
+        raise ImportSourceError(f"{file}: '{name}' has camera '{shot.camera}', which is missing")
+    T_camera_world = np.eye(4)
+    T_camera_world[:3, :3] = cv2.Rodrigues(np.array(shot.rotation))[0]
+    T_camera_world[:3, 3] = shot.translation
+    return PosedPicture(inside(root, name), cameras[shot.camera], invert_pose(T_camera_world))
+
+
+def _intrinsics(camera: _Camera, where: str) -> CameraIntrinsics:
+    if camera.projection_type not in MODELS:
+        raise ImportSourceError(
+            f"{where}: the lens model '{camera.projection_type}' is not read, but {', '.join(MODELS)}; run `opensfm "
+            "undistort` and import the folder undistorted"
+        )
+    fx = camera.focal if camera.focal_x is None else camera.focal_x
+    fy = fx if camera.focal_y is None else camera.focal_y
+    if fx is None or fy is None:
+        raise ImportSourceError(f"{where}: has no focal length: focal, or focal_x and focal_y")
+    size = max(camera.width, camera.height)
+    cx, cy = camera.c_x * size + camera.width / 2 - 0.5, camera.c_y * size + camera.height / 2 - 0.5
+    lens = (camera.k1, camera.k2, camera.p1, camera.p2, camera.k3)
+    try:
+        return CameraIntrinsics(fx * size, fy * size, cx, cy, camera.width, camera.height, lens if any(lens) else ())
+    except FrameError as error:
+        raise ImportSourceError(f"{where}: {error}") from error
+
+
+def _depth(file: Path, number: int, pictures: list[PosedPicture]) -> float:
+    """Median depth of the points in front of some cameras and within their pictures; 0 = there are none."""
+    points = _read(file, list[_Points])[number].points.values()
+    xyz = np.array([point.coordinates for point in points], np.float64).reshape(-1, 3)
+    xyz = xyz[:: max(1, len(xyz) // _POINTS)]
+    step = max(1, len(pictures) // _LOOKED_AT)
+    frames = [PlacedFrame(0, p.T_world_camera, _seen(xyz, p)) for p in pictures[::step]]
+    return median_depth(frames) if any(len(frame.xyz) for frame in frames) else 0.0
+
+
+def _seen(xyz: Float64, picture: PosedPicture) -> Float64:
+    T_camera_world, k = invert_pose(picture.T_world_camera), picture.intrinsics
+    p = xyz @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+    z = np.maximum(p[:, 2], 1e-9)
+    inside_x = np.abs(k.fx * p[:, 0] / z + k.cx - k.width / 2) < k.width / 2
+    inside_y = np.abs(k.fy * p[:, 1] / z + k.cy - k.height / 2) < k.height / 2
+    return xyz[(p[:, 2] > 0) & inside_x & inside_y]
