@@ -106,17 +106,19 @@ class PanopticCounts:
         hit, on_void = overlap[1:, 1:], overlap[0, 1:]
         union = true[:, None] + (seen - on_void)[None] - hit
         iou = np.where(true_class[:, None] == seen_class[None], hit / np.maximum(union, 1), 0.0)
-        right = iou > MATCH_IOU
-        wrong = ~right.any(axis=0) & (on_void <= MOSTLY_VOID * seen)
-        best = iou.max(axis=1, initial=0.0)
-        rows: tuple[tuple[NDArray[np.int64], Float64], ...] = (
-            (true_class, np.where(right, iou, 0.0).sum(axis=1)),
-            (true_class, right.any(axis=1).astype(np.float64)),
-            (seen_class, wrong.astype(np.float64)),
-            (true_class, (~right.any(axis=1)).astype(np.float64)),
-            (true_class, np.where(self._thing[true_class], 0.0, best)),
+        match = iou > MATCH_IOU
+        right, wrong = match.any(axis=1), ~match.any(axis=0) & (on_void <= MOSTLY_VOID * seen)
+        best = np.where(self._thing[true_class], 0.0, iou.max(axis=1, initial=0.0))
+        self.sums += (
+            self._by_class(true_class, np.where(match, iou, 0.0).sum(axis=1)),
+            self._by_class(true_class, right),
+            self._by_class(seen_class, wrong),
+            self._by_class(true_class, ~right),
+            self._by_class(true_class, best),
         )
-        self.sums += [np.bincount(of, weights=values, minlength=len(self.label_set)) for of, values in rows]
+
+    def _by_class(self, channel: NDArray[np.int64], values: Any) -> Float64:
+        return np.bincount(channel, weights=values, minlength=len(self.label_set))
 
     def __add__(self, other: PanopticCounts) -> PanopticCounts:
         if (other.label_set.names, other.stuff) != (self.label_set.names, self.stuff):

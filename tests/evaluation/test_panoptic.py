@@ -107,4 +107,4 @@ def test_images_of_other_sizes_and_unknown_ids_are_refused() -> None:
     with pytest.raises(LabelError):
         metrics(image((CAR, 1, 4)), image((99, 1, 4)))
     with pytest.raises(ShapeError, match="cannot be added"):
-        PanopticCounts(LABELS, STUFF) + PanopticCounts(LABELS, ())
+        _ = PanopticCounts(LABELS, STUFF) + PanopticCounts(LABELS, ())
