@@ -118,7 +118,7 @@ class PanopticCounts:
         )
 
     def _by_class(self, channel: NDArray[np.int64], values: Any) -> Float64:
-        return np.bincount(channel, weights=values, minlength=len(self.label_set))
+        return np.bincount(channel, weights=values, minlength=len(self.label_set)).astype(np.float64)
 
     def __add__(self, other: PanopticCounts) -> PanopticCounts:
         if (other.label_set.names, other.stuff) != (self.label_set.names, self.stuff):
