@@ -54,7 +54,7 @@ def map_rows_table(found: Mapping[str, Any]) -> Table:
     """The fused map beside maps whose frames are classified one by one."""
     columns = {"points": "map_miou", "true surface": "surface_miou", "seen from frames": "cast_miou"}
     columns |= {"its frames": "views_miou", "ECE": "ece", "instances AP50": "instance_ap50"}
-    columns |= {"found": "instance_recall", "right": "instance_precision"}
+    columns |= {"found": "instance_recall", "right": "instance_precision", "PQ": "pq", "PQ things": "pq_things"}
     return _plain_table("mIoU of the map", columns, found["map_rows"])
 
 
@@ -160,4 +160,9 @@ _MAP_ROWS: _Rows = (
     ("map: instances, AP50", "map.instance_ap50", percent),
     ("map: true instances found", "map.instance_recall", percent),
     ("map: found instances that are right", "map.instance_precision", percent),
+    ("map: panoptic quality (PQ) seen from its frames", "map.pq", percent),
+    ("map: SQ", "map.sq", percent),
+    ("map: RQ", "map.rq", percent),
+    ("map: PQ+", "map.pq_plus", percent),
+    ("map: PQ of things", "map.pq_things", percent),
 )

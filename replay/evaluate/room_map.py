@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from semantic_mapper.benchmark.config import MAP_WIDTH, SuiteConfig, camera_of_width, settings_digest
 from semantic_mapper.benchmark.records import InstanceRecord, MapRecord
 from semantic_mapper.benchmark.rooms import as_given
-from semantic_mapper.benchmark.scoring import as_calibration, as_rows
+from semantic_mapper.benchmark.scoring import as_calibration, as_panoptic, as_rows
 from semantic_mapper.config import DepthConfig
 from semantic_mapper.errors import MapError
 from semantic_mapper.evaluation.instances import FoundInstances, match_instances
@@ -26,6 +26,7 @@ from semantic_mapper.evaluation.metrics import (
     nearest_labels,
     nearest_points,
 )
+from semantic_mapper.evaluation.panoptic import PanopticCounts, PanopticImage
 from semantic_mapper.fields.nesf import NesfWeights
 from semantic_mapper.geometry import invert_pose, project, transform, unproject
 from semantic_mapper.labels import ROOMS, STUFF_NAMES, LabelSet
@@ -33,11 +34,8 @@ from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.map_types import MapView
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.refine import refine
-from semantic_mapper.mapping.storage.block_index import pack_keys
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.queries.class_surface import class_surface
-from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.replay.evaluate.thing_surface import ThingSurface
 from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, RoomConfig, Scene, make_room, render_view, room_frames
 from semantic_mapper.training.computed_depth import DELAY_FRAMES
 from semantic_mapper.types import Float32, Float64, PosedFrame, UInt8
@@ -213,26 +211,31 @@ def _compare(room: FusedRoom, voxel_map: VoxelMap, digest: str, settings: str, s
         ),
         calibration=as_calibration(points.confidence[answered], label[answered] == truth[answered]),
         instances=compare_instances(voxel_map, surface),
+        panoptic=as_panoptic(_compare_panoptic(room, voxel_map, casts)),
     )
+
+
+def _compare_panoptic(room: FusedRoom, voxel_map: VoxelMap, casts: list[MapView]) -> PanopticCounts:
+    """The finished map with its things, as its own frames see it, against what they show."""
+    camera, counts = camera_of_width(MAP_WIDTH), PanopticCounts(ROOMS)
+    seen = ThingSurface(voxel_map, up=UP)
+    for view, cast in zip(room.views, casts, strict=True):
+        true = render_view(room.scene, camera, view.T_world_camera)
+        found = seen.panoptic(cast, view.T_world_camera, camera)
+        found = PanopticImage(in_rooms(found.label, voxel_map.label_set), found.instance)
+        counts.update(PanopticImage(true.label, true.instance), found, f"room {room.scene.seed}")
+    return counts
 
 
 def compare_instances(voxel_map: VoxelMap, surface: TrueSurface) -> InstanceRecord:
     """The things that queries find in a map, against those of the true surface, at the map's surface voxels."""
-    snapshot = MapMirror.of(voxel_map).snapshot()
-    every = class_surface(snapshot, np.ones(256, np.bool_))
-    row = np.repeat(np.arange(len(every.packed)), np.diff(every.start))
-    nearest = nearest_points(every.point * snapshot.voxel_size_m, surface.xyz, max_distance_m=NEAR_M)
-    keys = (row << 9) | every.voxel  # ascending
-    things = InstanceTracker(up=UP).update(snapshot)
-    instance = np.full(len(keys), -1, np.int64)
-    for number, thing in enumerate(things):
-        block = np.searchsorted(every.packed, pack_keys(thing.voxels >> 3))
-        x, y, z = (thing.voxels & 7).T
-        instance[np.searchsorted(keys, (block << 9) | (z * 64 + y * 8 + x))] = number
-    class_id = in_rooms(np.array([thing.class_id for thing in things], np.uint8), snapshot.label_set)
+    seen = ThingSurface(voxel_map, up=UP)
+    nearest = nearest_points(seen.xyz, surface.xyz, max_distance_m=NEAR_M)
+    things = seen.things
+    class_id = in_rooms(np.array([thing.class_id for thing in things], np.uint8), voxel_map.label_set)
     confidence = np.array([thing.rank for thing in things], np.float32)
     matches = match_instances(
-        FoundInstances(instance, class_id, confidence),
+        FoundInstances(seen.number, class_id, confidence),
         np.append(surface.label, np.uint8(ROOMS.ignore_id))[nearest],
         np.append(surface.instance, 0)[nearest],
         ROOMS,

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from semantic_mapper.benchmark.records import BaselineRecord, CurvePoint, ImageRecord, MapRecord, RoomRecord
-from semantic_mapper.benchmark.scoring import from_rows
+from semantic_mapper.benchmark.scoring import as_counts, from_rows
 from semantic_mapper.evaluation.bootstrap import paired_bootstrap
 from semantic_mapper.evaluation.consistency import Agreement
 from semantic_mapper.evaluation.depth_error import DepthErrors
 from semantic_mapper.evaluation.instances import InstanceMatch, InstanceMatches, average_precision
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration_of_bins
+from semantic_mapper.evaluation.panoptic import PanopticCounts, PanopticMetrics
 from semantic_mapper.plots import Curve, Panel, draw_panels
 from semantic_mapper.scenes.suite import ROOMS_SUITE
 from semantic_mapper.types import UInt8
@@ -113,6 +114,7 @@ def map_figures(records: Sequence[MapRecord]) -> dict[str, Any]:
         "on_surface": _mean([r.on_surface for r in records]),
         "ece": _ece(records),
         **_instance_figures(records),
+        **_panoptic_figures(records),
         "per_room": {
             str(r.room): {"map_miou": c.metrics().miou, "view_miou": r.view_miou}
             for r, c in zip(records, at_points, strict=True)
@@ -124,7 +126,7 @@ def map_row_figures(records: Sequence[MapRecord]) -> dict[str, float | None]:
     """One row of the comparison of maps."""
     found = map_figures(records)
     names = ("map_miou", "surface_miou", "cast_miou", "views_miou", "ece", "instance_ap50", "instance_recall")
-    return {name: found[name] for name in (*names, "instance_precision")}
+    return {name: found[name] for name in (*names, "instance_precision", "pq", "pq_things")}
 
 
 def _instance_figures(records: Sequence[MapRecord]) -> dict[str, Any]:
@@ -143,6 +145,16 @@ def _instance_figures(records: Sequence[MapRecord]) -> dict[str, Any]:
         "instance_precision": figures.precision,
         "instance_ap50_by_class": figures.per_class,
     }
+
+
+def _panoptic_figures(records: Sequence[MapRecord]) -> dict[str, Any]:
+    """Panoptic quality over all frames of all rooms; None where some room has none recorded."""
+    kept = [as_counts(r.panoptic) for r in records if r.panoptic is not None]
+    known = len(kept) == len(records)
+    figures = sum(kept, PanopticCounts(ROOMS_SUITE.label_set)).metrics() if known else PanopticMetrics()
+    names = ("pq", "sq", "rq", "pq_plus", "pq_things", "pq_stuff")
+    per_class = {name: of.pq for name, of in figures.per_class.items()} if known else None
+    return {name: getattr(figures, name) for name in names} | {"pq_by_class": per_class}
 
 
 def compare_maps(first: Sequence[MapRecord], second: Sequence[MapRecord], *, seed: int = 0) -> dict[str, Any] | None:

@@ -85,6 +85,12 @@ class InstanceRecord(Config, frozen=True):
     truth: tuple[int, ...]
 
 
+class PanopticRecord(Config, frozen=True):
+    """``evaluation.panoptic.PanopticCounts`` as data: ``sums``, (5, L) of the suite's classes."""
+
+    sums: tuple[tuple[float, ...], ...]
+
+
 class MapRecord(Config, frozen=True, tag_field="record", tag="map"):
     """The fused map of one room by one weights file. Confusions are (L, L + 1) of the suite's classes."""
 
@@ -104,6 +110,7 @@ class MapRecord(Config, frozen=True, tag_field="record", tag="map"):
     one_frame_confusion: Rows  # at the same points, of one frame each, drawn at random
     calibration: CalibrationRecord  # of the map's points with a label and a truth
     instances: InstanceRecord | None = None  # as queries find them; older records have none
+    panoptic: PanopticRecord | None = None  # of the finished map with its instances, cast into its frames; as above
 
 
 class SceneRecord(Config, frozen=True, tag_field="record", tag="scene"):

@@ -11,13 +11,20 @@ from numpy.typing import NDArray
 
 from semantic_mapper.benchmark.baselines import BaselinePrediction
 from semantic_mapper.benchmark.predict import Prediction
-from semantic_mapper.benchmark.records import BaselineRecord, CalibrationRecord, DepthRecord, ImageRecord
+from semantic_mapper.benchmark.records import (
+    BaselineRecord,
+    CalibrationRecord,
+    DepthRecord,
+    ImageRecord,
+    PanopticRecord,
+)
 from semantic_mapper.benchmark.rooms import BenchmarkRoom
 from semantic_mapper.benchmark.views import Sources
 from semantic_mapper.evaluation.colour import match_colours, psnr, ssim
 from semantic_mapper.evaluation.consistency import Agreement, label_agreement, matching_pixels
 from semantic_mapper.evaluation.depth_error import depth_errors
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, calibration, confusion_of
+from semantic_mapper.evaluation.panoptic import PanopticCounts
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.scenes import RenderedView
 from semantic_mapper.scenes.suite import ROOMS_SUITE
@@ -153,6 +160,18 @@ def room_agreement(room: BenchmarkRoom, answers: Mapping[int, Answer]) -> Agreem
 def as_rows(confusion: ConfusionMatrix) -> tuple[tuple[int, ...], ...]:
     """Counts as plain data."""
     return tuple(tuple(int(n) for n in row) for row in confusion.counts)
+
+
+def as_panoptic(counts: PanopticCounts) -> PanopticRecord:
+    """Sums as plain data."""
+    return PanopticRecord(sums=tuple(tuple(row) for row in counts.sums.tolist()))
+
+
+def as_counts(record: PanopticRecord) -> PanopticCounts:
+    """The reverse of ``as_panoptic``."""
+    counts = PanopticCounts(ROOMS_SUITE.label_set)
+    counts.sums = np.array(record.sums, np.float64).reshape(counts.sums.shape)
+    return counts
 
 
 def from_rows(rows: Sequence[Sequence[int]], label_set: LabelSet = ROOMS_SUITE.label_set) -> ConfusionMatrix:
