@@ -71,16 +71,20 @@ class Panoptic(GridField):
 
     kind = "panoptic"
     class_rows = ("classifier.weight", "classifier.bias")
+    channel_of_box: torch.Tensor  # (P,) int64
+    thing: torch.Tensor  # (P,) bool
+    outside: torch.Tensor  # (L,) 1 where a class may be outside of all boxes
 
     def __init__(self, config: PanopticConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
         super().__init__(config, label_set, sampling)
         self.shape = config
         self.primitives = PrimitiveSet([primitive_of(b) for b in config.boxes])
         channel = {name: i for i, name in enumerate(label_set.names)}
-        self.channel_of_box = torch.tensor([_channel(channel, b.class_name) for b in config.boxes], dtype=torch.long)
-        self.thing = torch.tensor([b.thing for b in config.boxes], dtype=torch.bool)
+        of_boxes = torch.tensor([_channel(channel, b.class_name) for b in config.boxes], dtype=torch.long)
+        self.register_buffer("channel_of_box", of_boxes, persistent=False)
+        self.register_buffer("thing", torch.tensor([b.thing for b in config.boxes], dtype=torch.bool), persistent=False)
+        self.register_buffer("outside", torch.tensor(self._allowed_outside(label_set)).float(), persistent=False)
         self.sky = channel.get(SKY)
-        self.outside = torch.tensor(self._allowed_outside(label_set), dtype=torch.float32)
         self.head = relu_layers(config.trunk_width, config.head_width, 1)
         self.classifier = nn.Linear(config.head_width, len(label_set))
 
@@ -113,20 +117,21 @@ class Panoptic(GridField):
 
     def boxes_on(self, samples: RaySamples) -> BoxesOnRays:
         """What boxes hold samples."""
-        found = trimmed(self.primitives.intervals(samples.rays))
+        found = trimmed(self.primitives.intervals(samples.rays)).to(samples.z.device)
         inside = found.inside(samples.z.detach())
         none, classes = found.index < 0, len(self.label_set)
         channel = torch.where(none, classes, self._channels(found.index))
-        allowed = torch.zeros(*samples.z.shape, classes + 1)
+        allowed = torch.zeros(*samples.z.shape, classes + 1, device=samples.z.device)
         allowed.scatter_add_(2, channel[:, None].expand(inside.shape), inside.float())
         allowed = (allowed[..., :classes] > 0).float()
-        on_ray = torch.zeros(len(channel), classes + 1, dtype=torch.bool).scatter_(1, channel, value=True)[:, :classes]
+        on_ray = torch.zeros(len(channel), classes + 1, dtype=torch.bool, device=channel.device)
+        on_ray = on_ray.scatter_(1, channel, value=True)[:, :classes]
         if self.shape.uncovered == "stuff":
             outside = ~inside.any(-1)
             allowed = torch.where(outside[..., None], self.outside, allowed)
             on_ray = on_ray | (self.outside > 0)
         if self.sky is not None:
-            on_ray = on_ray.index_fill(1, torch.tensor([self.sky]), True)
+            on_ray[:, self.sky] = True
         return BoxesOnRays(inside, found.index, allowed, on_ray)
 
     def instances(self, rays: RayBatch, label: torch.Tensor) -> torch.Tensor:
@@ -142,14 +147,14 @@ class Panoptic(GridField):
             return torch.zeros_like(label)
         fits = self.thing[index] & (self._channels(boxes.index) == label[:, None]) & ~none
         inside = boxes.box & fits[:, None]
-        centre = torch.tensor(np.stack([p.T_world_box[:3, 3] for p in self.primitives.primitives]), dtype=torch.float32)
+        centre = rays.origin.new_tensor(np.stack([p.T_world_box[:3, 3] for p in self.primitives.primitives]))
         xyz = rays.origin[:, None] + samples.z[..., None] * rays.direction[:, None]
         away = (xyz[:, :, None] - centre[index][:, None]).norm(dim=-1).masked_fill(~inside, torch.inf)
         nearest = torch.zeros_like(inside).scatter_(2, away.argmin(-1, keepdim=True), value=True) & inside
         weight = (ray_share(samples)[..., None] * nearest).sum(1)  # R M
-        by_box = torch.zeros(len(label), len(self.primitives)).scatter_add_(1, index, weight)
+        by_box = weight.new_zeros(len(label), len(self.primitives)).scatter_add_(1, index, weight)
         most, box = by_box.max(1)
-        ids = torch.tensor([b.id for b in self.shape.boxes])
+        ids = torch.tensor([b.id for b in self.shape.boxes], device=box.device)
         return torch.where(most > 0, ids[box], 0)
 
     def solid(self) -> torch.Tensor:

@@ -28,14 +28,14 @@ from semantic_mapper.types import PosedFrame, RayBatch
 from tests.training.test_irt import two_planes
 
 SET = make_label_set("deck", ["floor", "table", "lamp", "sky"])
-FLOOR, TABLE, LAMP = 0, 1, 2
+FLOOR, TABLE, LAMP, SKY = 0, 1, 2, 3
 SMALL = FinetuneConfig(
     seconds=0,
-    steps=60,
+    steps=40,
     width=64,
     device="cpu",
-    grid=GridFitConfig(long_side=40, rays=512, held_out=0, exposure=False),
-    panoptic=PanopticFitConfig(rays=256),
+    grid=GridFitConfig(long_side=40, rays=256, held_out=0, exposure=False),
+    panoptic=PanopticFitConfig(rays=128),
 )
 
 
@@ -89,7 +89,9 @@ def test_boxes_outvote_wrong_labels_and_tell_which_thing_it_is() -> None:
     assert frame.label is not None
     truth = torch.from_numpy(np.where(frame.label.ravel() == 2, TABLE, FLOOR))
     said, rays = answers(field, frame)
-    assert (said == truth).float().mean() > 0.95
+    seen = said != SKY  # its corners look where no frame has looked
+    assert seen.float().mean() > 0.9
+    assert (said == truth)[seen].float().mean() > 0.96
     assert (said == LAMP).float().mean() < 0.01  # a fifth of the pseudo labels
     things = field.instances(rays, said)
     assert set(things.unique().tolist()) == {0, 7}
@@ -100,7 +102,8 @@ def test_boxes_outvote_wrong_labels_and_tell_which_thing_it_is() -> None:
 def test_the_recipe_says_what_boxes_cover_and_no_frame_is_held_to_be_seen() -> None:
     figures = fitted().recipe["panoptic"]
     assert (figures["boxes"], figures["seen"], figures["labelled_frames"]) == (1, 1, 8)
-    assert 0.05 < figures["covered"] < 0.95 and 0.5 < figures["matched"] < 1
+    assert 0.05 < figures["covered"] < 0.95 and 0.95 < figures["matched"] <= 1  # lamps may be outside
+    assert figures["ambiguous"] == 0
     assert fitted().train_stamps_ns == frozenset()  # pseudo labels are no truth
 
 
@@ -117,7 +120,9 @@ def test_weights_keep_boxes(tmp_path: Path) -> None:
     assert (answers(loaded, scene()[1])[0] == answers(fitted().model, scene()[1])[0]).float().mean() > 0.99
 
 
-def gradients(field: Panoptic, origin: tuple[float, float, float], channel: int) -> tuple[torch.Tensor, torch.Tensor]:
+def gradients(
+    field: Panoptic, origin: tuple[float, float, float], channel: int, learned: float = 1.0
+) -> tuple[torch.Tensor, torch.Tensor | None]:
     """Gradient of the density, and of the classifier, by one pseudo label on a ray straight down."""
     with torch.no_grad():
         field.grid.values[..., 0] = 5.0
@@ -127,13 +132,12 @@ def gradients(field: Panoptic, origin: tuple[float, float, float], channel: int)
     rays = RayBatch(torch.tensor([origin]), torch.tensor([(0.0, 0.0, -1.0)]), 0.1 * one, torch.inf * one, none)
     samples = field.march(rays)
     boxes = field.boxes_on(samples)
-    weights = PanopticFitConfig(points=0.0)
+    weights = PanopticFitConfig(points=0.0, learned=learned)
     group = merged_classes(SET, field.shape.merge)
     loss = semantic_losses(field, samples, boxes, field.learned(samples), torch.tensor([channel]), group, weights)
     loss.backward()
-    density, head = field.grid.values.grad, field.classifier.weight.grad
-    assert density is not None and head is not None
-    return density, head
+    assert field.grid.values.grad is not None
+    return field.grid.values.grad, field.classifier.weight.grad
 
 
 @pytest.mark.parametrize("uncovered", ["stuff", "empty"])
@@ -141,22 +145,24 @@ def test_a_pseudo_label_off_every_primitive_has_no_gradient(uncovered: str) -> N
     away, through = (-1.0, 0.0, 2.0), (0.8, 0.0, 2.0)
     for origin, moves in ((away, False), (through, True)):
         for gradient in gradients(empty_field(DECK, uncovered=uncovered), origin, TABLE):
-            assert bool((gradient != 0).any()) == moves
+            assert gradient is not None and bool((gradient != 0).any()) == moves
     # Of a class without any box: it may be outside, where anything may be.
     for gradient in gradients(empty_field(DECK, uncovered=uncovered), away, LAMP):
-        assert bool((gradient != 0).any()) == (uncovered == "stuff")
+        assert gradient is not None and bool((gradient != 0).any()) == (uncovered == "stuff")
 
 
 def test_a_pseudo_label_moves_density_into_its_box() -> None:
-    density, _ = gradients(empty_field(DECK), (0.8, 0.0, 2.0), TABLE)
+    density, _ = gradients(empty_field(DECK), (0.8, 0.0, 2.0), TABLE, learned=0.0)
     column = density[28, 20, :, 0]  # x = 0.8, y = 0; vertices from z = -0.5 on, 0.1 apart
-    assert (column[11:15] < 0).all() and (column[18:25] > 0).all()
+    assert (column[11:15] < 0).all() and (column[18:23] > 0).all()
 
 
 def test_merged_classes_share_a_pseudo_label() -> None:
     merged = empty_field(DECK, merge={"lamp": ("table",)}, uncovered="empty")
-    assert all((g != 0).any() for g in gradients(merged, (0.8, 0.0, 2.0), LAMP))
-    assert not any((g != 0).any() for g in gradients(empty_field(DECK, uncovered="empty"), (0.8, 0.0, 2.0), LAMP))
+    apart = empty_field(DECK, uncovered="empty")
+    for field, moves in ((merged, True), (apart, False)):
+        density, _ = gradients(field, (0.8, 0.0, 2.0), LAMP)
+        assert bool((density != 0).any()) == moves
 
 
 def test_what_boxes_say_is_shared_where_they_overlap() -> None:
