@@ -293,7 +293,10 @@ def _from_kitti360(text: bytes, path: Path) -> BoxFile:
 
 
 def _from_node(node: ElementTree.Element) -> Primitive:
-    """One object. Its transform may scale, so that its vertices become the world's, round their middle."""
+    """One object. Its transform may scale, so that its vertices become the world's, round their middle.
+
+    Stamps of those that move are numbers of frames, as the file has them.
+    """
     transform = _matrix(node, "transform")
     if transform.shape != (4, 4):
         raise _BadBoxError(f"transform must be 4 x 4, got shape {transform.shape}")

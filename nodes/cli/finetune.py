@@ -44,7 +44,10 @@ def finetune(
     from_scratch: Annotated[bool, typer.Option("--from-scratch", help="Start from random weights.")] = False,
     kind: Annotated[
         str | None,
-        typer.Option(help="Fit a field of this kind to the scene, from all frames; irt: classes, grid: none."),
+        typer.Option(
+            help="Fit a field of this kind to the scene, from all frames; irt: classes of keyframes, panoptic: of "
+            "boxes and pseudo labels, grid: none."
+        ),
     ] = None,
     frames: Annotated[
         str, typer.Option(metavar="N,N,...", help="Numbers of the labelled frames in the log, in place of --keyframes.")
@@ -59,6 +62,28 @@ def finetune(
     variant: Annotated[
         Literal["B", "BC", "RT", "RTT", "RTC", "RTTC"] | None,
         typer.Option(help="--kind irt, or its weights: what reads the classes.  [default: BC]"),
+    ] = None,
+    boxes: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="--kind panoptic: boxes.json, the JSON of `query MAP instances`, or XML of KITTI-360.",
+        ),
+    ] = None,
+    pseudo: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR|WEIGHTS",
+            help="--kind panoptic: pseudo labels, a folder of NNNNNN.png or weights that make them; without it the "
+            "log's own label images, else the small weights in the package.",
+        ),
+    ] = None,
+    uncovered: Annotated[
+        Literal["stuff", "empty"] | None,
+        typer.Option(
+            help="--kind panoptic: what is outside of all boxes. stuff: classes that are no things, or that no box "
+            "has. empty: nothing.  [default: stuff]"
+        ),
     ] = None,
     depth: FinetuneDepthOption = None,
     labels: Annotated[
@@ -80,8 +105,9 @@ def finetune(
     Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors
     Example: semantic-mapper finetune kitchen.mcap --labels kitchen-labels --out kitchen.safetensors
     Example: semantic-mapper finetune kitchen.mcap --kind irt --keyframes 4 --out kitchen.safetensors
+    Example: semantic-mapper finetune yard.mcap --kind panoptic --boxes boxes.json --out yard.safetensors
     """
-    _refuse_mixed(weights, from_scratch, kind, keyframes, frames, labels, unlabelled, variant)
+    _refuse_mixed(weights, from_scratch, kind, keyframes, frames, labels, unlabelled, variant, boxes, pseudo, uncovered)
     output = Output.guarded()
     import msgspec
 
@@ -116,6 +142,9 @@ def finetune(
         labels,
         frame_numbers(frames),
         unlabelled,
+        boxes,
+        pseudo,
+        uncovered or "stuff",
     )
     with StopRequest() as stop, frame_progress("finetune", None, unit="%") as bar:
         checkpoint, chosen = finetune_log(request, stop, bar)
@@ -135,6 +164,9 @@ def _refuse_mixed(
     labels: Path | None,
     unlabelled: int | None,
     variant: str | None,
+    boxes: Path | None,
+    pseudo: Path | None,
+    uncovered: str | None,
 ) -> None:
     """Refuse options that do not go together.
 
@@ -147,7 +179,15 @@ def _refuse_mixed(
         raise typer.BadParameter("starts from nothing; leave out --weights and --from-scratch", param_hint="--kind")
     if kind == "grid" and (frames or labels is not None):
         raise typer.BadParameter("a grid learns no classes", param_hint="--frames" if frames else "--labels")
-    if not frames and labels is None and (keyframes is None) != (kind == "grid"):
+    if kind == "panoptic" and (keyframes is not None or frames or labels is not None):
+        raise typer.BadParameter("learns from all frames' pseudo labels; give them with --pseudo", param_hint="--kind")
+    if (boxes is not None) != (kind == "panoptic"):
+        raise typer.BadParameter("--kind panoptic and --boxes FILE go together", param_hint="--boxes")
+    if (pseudo is not None or uncovered is not None) and kind != "panoptic":
+        raise typer.BadParameter(
+            "goes with --kind panoptic only", param_hint="--uncovered" if pseudo is None else "--pseudo"
+        )
+    if not frames and labels is None and (keyframes is None) != (kind in ("grid", "panoptic")):
         raise typer.BadParameter("how many labelled frames? Only --kind grid learns none", param_hint="--keyframes")
     if keyframes is not None and frames:
         raise typer.BadParameter("--frames already names the frames", param_hint="--keyframes")

@@ -120,6 +120,10 @@ class Intervals:
         """Whether samples at z (R, K) are in intervals: (R, K, M) bool."""
         return (z[..., None] >= self.enter[:, None]) & (z[..., None] <= self.leave[:, None])
 
+    def to(self, device: torch.device) -> Intervals:
+        """The same on a device."""
+        return Intervals(*(t.to(device) for t in (self.enter, self.leave, self.index, self.count)))
+
 
 class PrimitiveSet:
     """Primitives that stand still, ready for rays.
