@@ -157,7 +157,7 @@ class Assembly:
                     self.add(Shape.PRISM, material, center, size, yaw=yaw)
 
     def wedge(self, material: int, size: Vector, z: float, turn: float, *, start: float = 0.0) -> None:
-        """Add a turned wedge (long, reach, rise): full height at y = ``start``, down to ``z`` at ``reach`` from there."""
+        """Add a turned wedge (long, reach, rise): full height at y = ``start``, down to ``z`` at ``reach`` from it."""
         long, reach, rise = size
         away = start + reach / 2
         middle = (-float(np.sin(turn)) * away, float(np.cos(turn)) * away, z + rise / 2)

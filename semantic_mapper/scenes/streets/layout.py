@@ -202,12 +202,13 @@ def _ordered(side: float, near: float, far: float) -> tuple[float, float]:
 
 def _gardens(b: _Layout, side: float, front: float, along: tuple[float, float]) -> None:
     """Plots with a house, a driveway, and what closes the garden towards the sidewalk."""
-    kinds = [str(k) for k in b.rng.permutation(["wall", "fence", "hedge", "wall", "fence", "open"])]
-    s, number = along[0], int(b.rng.integers(6))
+    rest = ["hedge", "open"][int(b.rng.integers(2))]
+    kinds = [str(k) for k in b.rng.permutation(["wall", "fence", rest])]  # so three plots in a row show them all
+    s, number = along[0], 0
     while s < along[1] - 6:
         wide = min(b.between(13, 18), along[1] - s)
         if wide > 10 and s < b.length:
-            _plot(b, side, front, (s, s + wide), kinds[number % 6])
+            _plot(b, side, front, (s, s + wide), kinds[number % 3])
         elif s < b.length + 20:
             for _ in range(2):
                 _tree(b, s + b.between(0, wide), side * (front + b.between(2, 9)))
@@ -283,9 +284,9 @@ def _vehicles(b: _Layout, side: float, left: float, along: tuple[float, float], 
 
 def _vehicle(b: _Layout, s: float, left: float, turn: float, z: float = 0.02) -> None:
     kind = float(b.rng.uniform())
-    if kind < 0.14:
+    if kind < 0.1:
         thing = parts.caravan(b, b.caravan)
-    elif kind < 0.3:
+    elif kind < 0.24:
         thing = parts.trailer(b, b.trailer)
     else:
         thing = parts.car(b, b.pick(b.lacquers))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semantic_mapper.scenes.primitives import Assembly
+from semantic_mapper.scenes.streets.parts import House
 from semantic_mapper.types import Float64
 
 
@@ -77,4 +78,4 @@ def tree_outlines(growth: Assembly) -> tuple[Outline, ...]:
     low, high = replace(growth, parts=growth.parts[1:]).bounds()
     T = np.eye(4)
     T[:3, 3] = (low + high) / 2
-    return Outline("vegetation", 0, "ellipsoid", T, (high - low) * 1.12), *boxes_round(trunk)
+    return Outline("vegetation", 0, "ellipsoid", T, (high - low) * 1.2), *boxes_round(trunk)
