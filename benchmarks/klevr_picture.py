@@ -1,5 +1,5 @@
-"""Pictures of NeSF on KLEVR, after ``benchmark klevr``: novel scenes at test cameras (image, true classes, NeSF's), and
-how the networks of its arms learned.
+"""Pictures of NeSF on KLEVR, after ``benchmark klevr``: novel scenes at test cameras (image, true classes,
+NeSF's, the U-Net's), and how the networks of its arms learned.
 
 Example: python -m benchmarks.klevr_picture --folder runs/klevr-grids --out nesf.jpg --curves curves.png
 """
@@ -10,38 +10,40 @@ import argparse
 from pathlib import Path
 
 import cv2
-import numpy as np
 
 from semantic_mapper.benchmark.klevr import TEST_CAMERAS, KlevrConfig, novel_seeds, scene_frames, scored_numbers
 from semantic_mapper.benchmark.klevr_grids import NEAR_M, scene_density
+from semantic_mapper.benchmark.klevr_images import unet_network
 from semantic_mapper.benchmark.klevr_nesf import (
     NESF_ARMS,
-    arm_settings,
+    arm_network,
     grid_config,
     nesf_curve,
-    nesf_network,
     scene_grid,
 )
 from semantic_mapper.config import load_config
-from semantic_mapper.plots import Curve, Panel, draw_panels, write_picture
+from semantic_mapper.plots import Curve, Panel, draw_panels, draw_picture_rows, write_picture
 from semantic_mapper.scenes.suite import KLEVR_SUITE
 from semantic_mapper.training.grid_nesf import SceneLabels
 from semantic_mapper.types import UInt8
 
-ENLARGED, GAP_PX = 2, 4
+WIDTH = 216  # of a picture, pixels
 
 
 def picture(config: KlevrConfig, folder: Path, columns: int) -> UInt8:
     """A column for each scene."""
-    model = nesf_network(*arm_settings(config, "nesf"), folder)
-    found: list[UInt8] = []
+    model, _ = arm_network(config, "nesf", folder)
+    unet, _ = unet_network(config, folder)
+    label_set = KLEVR_SUITE.label_set
+    rows: dict[str, list[UInt8]] = {"image": [], "true classes": [], "NeSF": [], "U-Net": []}
     for scene in novel_seeds(config)[:columns]:
         labels = SceneLabels(model, scene_grid(scene_density(grid_config(config), scene, folder)), NEAR_M)
         (frame,) = scene_frames(config, scene, scored_numbers(config, scene)[TEST_CAMERAS][:1])
         assert frame.label is not None
-        shown = (frame.rgb, *(KLEVR_SUITE.label_set.colorize(ids) for ids in (frame.label, labels.frame(frame))))
-        found.append(np.concatenate([_framed(tile) for tile in shown]))
-    return np.concatenate(found, axis=1)
+        said = (frame.label, labels.frame(frame), unet.predict(frame))
+        for row, shown in zip(rows.values(), (frame.rgb, *map(label_set.colorize, said)), strict=True):
+            row.append(shown)
+    return draw_picture_rows(rows, label_set, WIDTH)
 
 
 def curves(config: KlevrConfig, folder: Path) -> UInt8:
@@ -54,11 +56,6 @@ def curves(config: KlevrConfig, folder: Path) -> UInt8:
         Panel("rays of training", "cross-entropy of balanced rays", "steps", entropy),
     ]
     return draw_panels("NeSF's arms while they learn", panels, size=(560, 400))
-
-
-def _framed(tile: UInt8) -> UInt8:
-    enlarged = tile.repeat(ENLARGED, axis=0).repeat(ENLARGED, axis=1)
-    return np.pad(enlarged, ((GAP_PX, 0), (GAP_PX, 0), (0, 0)), constant_values=255)
 
 
 def main() -> None:

@@ -403,3 +403,24 @@ def put_legend(figure: Figure, box: Box, rows: Sequence[LegendRow], columns: int
         if fraction is not None:
             share = f"{100 * fraction:.1f} %" if fraction else "–"  # noqa: RUF001
             put_text(axes, (x + width, y), share, color=DIM_TEXT, ha="right", fontsize=size_pt)
+
+
+@rendered
+def draw_picture_rows(rows: Mapping[str, Sequence[UInt8]], label_set: LabelSet, width: int = 180) -> Figure:
+    """Rows of pictures (h, w, 3) of one size by caption, each ``width`` pixels wide, and all classes below them."""
+    gap, caption, class_width = 6, 150, 150
+    columns = max(map(len, rows.values()))
+    h, w = next(iter(rows.values()))[0].shape[:2]
+    height = round(width * h / w)
+    classes: list[LegendRow] = [(n, color, None) for n, color in zip(label_set.names, label_set.colors, strict=True)]
+    across = max(columns * width // class_width, 1)
+    legend = 27 * -(-len(classes) // across) + 2 * gap
+    whole = (caption + columns * (width + gap), gap + len(rows) * (height + gap) + legend)
+    figure = new_figure(*whole)
+    for r, (name, pictures) in enumerate(rows.items()):
+        top = gap + r * (height + gap)
+        put_text(place(figure, (12, top, caption - 18, height)), (0, height / 2), cut(name, caption - 18, TEXT_PT))
+        for c, picture in enumerate(pictures):
+            put_picture(figure, (caption + c * (width + gap), top, width, height), picture, "")
+    put_legend(figure, (caption, whole[1] - legend, columns * width, legend - gap), classes, across)
+    return figure

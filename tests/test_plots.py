@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import SemanticMapperError
-from semantic_mapper.labels import ROOMS
+from semantic_mapper.labels import KLEVR, ROOMS
 from semantic_mapper.plots import (
     UNKNOWN,
     Bar,
@@ -24,6 +24,7 @@ from semantic_mapper.plots import (
     draw_bars,
     draw_panels,
     draw_paths,
+    draw_picture_rows,
     text_width,
     write_picture,
 )
@@ -158,3 +159,15 @@ def test_unknown_is_grey_and_the_last_of_the_legend() -> None:
     labels = np.array([unknown, unknown, wall, unknown], np.uint8)
     rows = class_rows(labels, ROOMS, [np.full((2, 2), bed, np.uint8)])
     assert [(name, fraction) for name, _, fraction in rows] == [("wall", 0.25), ("bed", 0.0), ("unknown", 0.75)]
+
+
+def test_rows_of_pictures_have_captions_and_all_classes_below() -> None:
+    tiles = [KLEVR.colorize(np.full((8, 12), number, np.uint8)) for number in KLEVR.ids[:3]]
+    rows = {"image": tiles, "true classes": tiles[:2], "U-Net": tiles}
+    figure = figure_of(draw_picture_rows, rows, KLEVR, 180)
+    assert misplaced_texts(figure) == []
+    texts = [text.get_text() for axes in figure.axes for text in axes.texts if text.get_text()]
+    assert sorted(texts) == sorted((*rows, *KLEVR.names))
+    picture = draw_picture_rows(rows, KLEVR, 180)
+    for color in KLEVR.colors[:3]:
+        assert (picture == color).all(-1).sum() >= 2 * 180 * 120

@@ -71,14 +71,15 @@ def benchmark(
         del given["seed"]
         suites.refuse_given(suite, given | {"weights": weights, "kind": kind, "map": maps or None, "refine": refine})
     if suite == "aerial":
-        from semantic_mapper.nodes.cli.aerial import aerial_config, run_aerial_verb
+        from semantic_mapper.nodes.cli.aerial import aerial_suite
+        from semantic_mapper.nodes.cli.arm_suite import run_arm_suite
 
-        settings = aerial_config(config, tier, seed)
-        return run_aerial_verb(settings, arms or [], claims, out, print_json=print_json)
+        return run_arm_suite(aerial_suite(config, tier, seed), arms or [], claims, out, print_json=print_json)
     if suite == "klevr":
-        from semantic_mapper.nodes.cli.klevr import klevr_configs, run_klevr_verb
+        from semantic_mapper.nodes.cli.arm_suite import run_arm_suite
+        from semantic_mapper.nodes.cli.klevr import klevr_suite
 
-        return run_klevr_verb(klevr_configs(config, tier, seed), arms or [], claims, out, print_json=print_json)
+        return run_arm_suite(klevr_suite(config, tier, seed), arms or [], claims, out, print_json=print_json)
     from semantic_mapper.nodes.cli.suite import run_suite_verb
 
     suites.refuse_given("rooms", {"arm": arms, "claims": claims or None})

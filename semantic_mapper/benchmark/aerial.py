@@ -17,8 +17,8 @@ from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from semantic_mapper.benchmark.claims import Counts, CountTable, Unit
 from semantic_mapper.benchmark.records import SceneRecord
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.config import AtLeastOne, AtLeastTwo, Config, NotNegative, Positive, to_plain
@@ -89,12 +89,9 @@ class Episode:
         return self.town * 1000 + self.choice
 
 
-Unit = tuple[int, int]  # town and view: what a bootstrap draws
-Counts = NDArray[np.int64]  # (L, L + 1) of a confusion matrix, or (1, 2) agreeing and compared pixels
 EpisodeScores = Mapping[str, Mapping[int, Counts]]  # by what is scored and by view
 Predict = Callable[[PosedFrame], UInt8]  # ids (H, W); only image, camera and pose may be looked at
 Arm = Callable[[AerialConfig, Episode], EpisodeScores]
-Table = Mapping[tuple[str, str], Mapping[Unit, Counts]]  # by arm and by what is scored
 
 
 def episodes(config: AerialConfig) -> list[Episode]:
@@ -199,7 +196,7 @@ def run_aerial(
             store.add(SceneRecord(settings=settings, weights=name, room=episode.number, confusions=rows))
 
 
-def aerial_table(config: AerialConfig, names: Sequence[str], store: RecordStore) -> Table:
+def aerial_table(config: AerialConfig, names: Sequence[str], store: RecordStore) -> CountTable:
     """Counts of all records that there are, by town and view; those of several choices of labels add up.
 
     Arms that lack an episode are left out: a part of the choices is no score.

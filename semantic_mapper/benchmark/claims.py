@@ -1,83 +1,164 @@
-"""Claims of a paper as relative checks: the difference of two scores, its interval over scenes, and the result."""
+"""Claims of a paper as relative checks: the difference of two figures, its interval, and the result.
+
+Confusion matrices are kept by *unit*: a scene or view, in a group of such. A bootstrap draws units, each group's among
+themselves; both sides of a claim get the same ones.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from semantic_mapper.evaluation.bootstrap import paired_bootstrap
-from semantic_mapper.evaluation.metrics import ConfusionMatrix
+from semantic_mapper.evaluation.bootstrap import miou_of_counts
+from semantic_mapper.types import Float64
 
-Result = Literal["accepted", "refused", "not run"]
+RESAMPLES = 2000
 
-Score = tuple[str, str]  # arm, and what of it is scored
-Scores = Mapping[Score, Mapping[int, ConfusionMatrix]]  # by scene
+Result = Literal["accepted", "refused", "not judged", "not run"]
+
+Unit = tuple[int, int]  # group and number: what a bootstrap draws
+Counts = NDArray[np.int64]  # (L, L + 1) of a confusion matrix, or (1, 2) agreeing and compared pixels
+CountTable = Mapping[tuple[str, str], Mapping[Unit, Counts]]  # by arm and by what is scored
+
+_Draws = Mapping[Unit, Float64]  # how often each unit was drawn, (B,)
+
+
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """A figure of an arm, in points.
+
+    Args:
+        name: As text.
+        kinds: What has to be scored for it.
+        value: (B,) from the summed counts (B, L, L + 1) of each kind.
+    """
+
+    name: str
+    kinds: tuple[str, ...]
+    value: Callable[[Sequence[Float64]], Float64]
+
+
+def miou_measure(name: str, kind: str) -> Measure:
+    """mIoU of one kind."""
+    return Measure(name, (kind,), lambda counts: 100 * miou_of_counts(counts[0]))
 
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """``first`` minus ``factor`` times ``second``, in points of mIoU, lies between ``least`` and ``most``.
+    """``measure`` of ``first`` minus ``factor`` times that of ``second`` lies between ``least`` and ``most``.
 
     Args:
         name: What is claimed.
         paper: Its figures, as text; empty for a check of the suite itself.
-        first: Score.
-        second: Score; None = 0.
-        least, most: Bounds in points. A bound above 0 from below is a gain: its interval must lie above 0, too.
+        measure: Figure.
+        first: Arm.
+        second: Arm; None = 0.
+        second_measure: Figure of ``second``; None = ``measure``.
+        least, most: Bounds in points. A bound of 0 or above from below is a gain: its interval must lie above 0, too.
         factor: Of ``second``.
     """
 
     name: str
     paper: str
-    first: Score
-    second: Score | None = None
+    measure: Measure
+    first: str
+    second: str | None = None
+    second_measure: Measure | None = None
     least: float = -np.inf
     most: float = np.inf
     factor: float = 1.0
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """Whose figures it needs."""
+        return (self.first,) if self.second is None else (self.first, self.second)
 
     @property
     def accepted_if(self) -> str:
         """The bounds as text."""
         if np.isinf(self.least):
             return f"<= {self.most:g}"
-        return f">= {self.least:g}" if np.isinf(self.most) else f"{self.least:g} to {self.most:g}"
+        if np.isinf(self.most):
+            return "> 0" if self.least == 0 else f">= {self.least:g}"
+        return f"{self.least:g} to {self.most:g}"
 
 
 @dataclass(frozen=True, slots=True)
 class ClaimResult:
-    """What came of a claim; figures in points of mIoU, None where it was not run or has fewer than 2 scenes."""
+    """What came of a claim; figures in points, None where it was not run."""
 
     claim: Claim
     result: Result
     difference: float | None = None
     low: float | None = None
     high: float | None = None
-    scenes: int = 0
+    units: int = 0
+    unfinished: tuple[str, ...] = ()  # arms that are not at their plateau: why it is not judged
 
 
-def check_claim(claim: Claim, scores: Scores, *, seed: int = 0) -> ClaimResult:
-    """Judge a claim by the scenes that both scores have, with a 95 % bootstrap interval over them.
+def figure(table: CountTable, arm: str, measure: Measure) -> float | None:
+    """A figure of an arm in points; None where it was not scored."""
+    kinds = [table.get((arm, kind)) for kind in measure.kinds]
+    if any(not units for units in kinds):
+        return None
+    return float(measure.value([_sum(units, None) for units in kinds if units])[0])
+
+
+def check_claim(claim: Claim, table: CountTable, *, unfinished: Collection[str] = (), seed: int = 0) -> ClaimResult:
+    """Judge a claim by the units that both sides have been scored on, with a 95 % bootstrap interval over them.
 
     Args:
         claim: What to judge.
-        scores: Confusion matrices by score and scene.
+        table: Counts by arm, by what is scored, and by unit.
+        unfinished: Arms that are not at their plateau; claims on them are not judged.
         seed: Of the bootstrap.
     """
-    first = scores.get(claim.first, {})
-    second = first if claim.second is None else scores.get(claim.second, {})
-    scenes = sorted(first.keys() & second.keys())
-    if len(scenes) < 2:
-        return ClaimResult(claim, "not run", scenes=len(scenes))
-    factor = 0.0 if claim.second is None else claim.factor
-    found = paired_bootstrap([first[s] for s in scenes], [second[s] for s in scenes], factor=factor, seed=seed)
-    difference, low, high = (100 * x for x in (found.observed, found.low, found.high))
-    right = claim.least <= difference <= claim.most and not (claim.least > 0 >= low)
-    return ClaimResult(claim, "accepted" if right else "refused", difference, low, high, len(scenes))
+    measures = (claim.measure, claim.second_measure or claim.measure)
+    sides = list(zip(claim.arms, measures, (1.0, -claim.factor), strict=False))  # the second may be missing
+    shared = [
+        sorted(set.intersection(*(set(table.get((arm, measure.kinds[k]), {})) for arm, measure, _ in sides)))
+        for k in range(len(claim.measure.kinds))
+    ]
+    count = min(map(len, shared))
+    if count < 2:
+        return ClaimResult(claim, "not run", units=count)
+    draws = [_draws(units, np.random.default_rng((seed, k))) for k, units in enumerate(shared)]
+    observed, drawn = np.zeros(1), np.zeros(RESAMPLES)
+    for arm, measure, sign in sides:
+        counts = [{u: table[arm, kind][u] for u in units} for kind, units in zip(measure.kinds, shared, strict=True)]
+        observed = observed + sign * measure.value([_sum(c, None) for c in counts])
+        drawn = drawn + sign * measure.value([_sum(c, d) for c, d in zip(counts, draws, strict=True)])
+    low, high = (float(x) for x in np.nanpercentile(drawn, (2.5, 97.5)))
+    difference = float(observed[0])
+    right = claim.least <= difference <= claim.most and not (claim.least >= 0 >= low)
+    open_arms = tuple(arm for arm in dict.fromkeys(claim.arms) if arm in unfinished)
+    result: Result = "not judged" if open_arms else "accepted" if right else "refused"
+    return ClaimResult(claim, result, difference, low, high, count, open_arms)
 
 
-def check_claims(claims: Sequence[Claim], scores: Scores, *, seed: int = 0) -> list[ClaimResult]:
+def check_claims(
+    claims: Sequence[Claim], table: CountTable, *, unfinished: Collection[str] = (), seed: int = 0
+) -> list[ClaimResult]:
     """``check_claim`` of each."""
-    return [check_claim(claim, scores, seed=seed) for claim in claims]
+    return [check_claim(claim, table, unfinished=unfinished, seed=seed) for claim in claims]
+
+
+def _draws(units: Sequence[Unit], rng: np.random.Generator) -> dict[Unit, Float64]:
+    """How often each unit is drawn (RESAMPLES,), each group's among themselves."""
+    found: dict[Unit, Float64] = {}
+    for group in sorted({group for group, _ in units}):
+        own = [unit for unit in units if unit[0] == group]
+        times = rng.multinomial(len(own), np.full(len(own), 1 / len(own)), size=RESAMPLES).astype(np.float64)
+        found |= dict(zip(own, times.T, strict=True))
+    return found
+
+
+def _sum(counts: Mapping[Unit, Counts], draws: _Draws | None) -> Float64:
+    """(B, L, L + 1) counts of all units, as often as each was drawn; B = 1 without draws."""
+    stack: NDArray[np.float64] = np.stack([counts[unit] for unit in counts]).astype(np.float64)
+    times = np.ones((1, len(counts))) if draws is None else np.stack([draws[unit] for unit in counts], axis=1)
+    return np.einsum("bs,slc->blc", times, stack, optimize=True)

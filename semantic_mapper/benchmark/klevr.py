@@ -1,48 +1,42 @@
 """The suite KLEVR: arms that learn classes from the labelled views of training scenes, scored on novel scenes.
 
-An arm is a function ``arm(config) -> {scene: {score: ConfusionMatrix}}``. ``ARMS`` names them; its records are kept by
-scene, and the claims are judged by them.
+An arm is a function ``arm(config) -> ArmScores``, found in ``klevr_images`` and ``klevr_nesf``. Its records are kept by
+scene, and ``klevr_claims`` are judged by them.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from itertools import product
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 import numpy as np
 import torch
-from torch import nn
-from torch.nn import functional
 
-from semantic_mapper.benchmark.claims import Claim, Score, Scores
+from semantic_mapper.benchmark.claims import Counts, CountTable, Unit
+from semantic_mapper.benchmark.plateau import PLATEAU
 from semantic_mapper.benchmark.records import SceneRecord
-from semantic_mapper.benchmark.scoring import as_rows, from_rows
+from semantic_mapper.benchmark.scoring import as_rows
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.config import AtLeastOne, AtLeastTwo, Config, NotNegative, to_plain
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
-from semantic_mapper.log_events import get_logger
 from semantic_mapper.scenes.klevr import Variant, klevr_camera, klevr_views
 from semantic_mapper.scenes.suite import KLEVR_SUITE
-from semantic_mapper.training.baselines import UNetBaseline, UNetConfig
-from semantic_mapper.types import PosedFrame, UInt8
+from semantic_mapper.training.frame_rays import frame_rays
+from semantic_mapper.types import Float32, PosedFrame, UInt8
 
-_log = get_logger(__name__)
-
-RECORD_VERSION = 2  # raised by a change of what a record means: older ones are made again
+RECORD_VERSION = 3  # raised by a change of what a record means: older ones are made again
 TRAIN_CAMERAS, TEST_CAMERAS, POINTS = "train cameras", "test cameras", "points"
 
 VIEW_ARMS = {"nesf-5-views": 5, "nesf-25-views": 25}  # arms whose densities are fitted to fewer views
 FEW_SCENES = (12, 6)  # of training and novel, for these
 
 _MAPS_STREAM, _SCORED_STREAM = 11, 12
-_PLATEAU = 0.005  # of mIoU in the last fifth of the steps: with more, there are to be twice as many steps
-_MOST_DOUBLINGS = 2
-_CHECKED_SCENES = 8  # of training, at test cameras: where the plateau is looked for
+MOST_DOUBLINGS = 2  # of the steps of an arm, until its plateau
 
 
 class KlevrConfig(Config, frozen=True):
@@ -56,10 +50,10 @@ class KlevrConfig(Config, frozen=True):
     label_maps: AtLeastOne = 9  # of a training scene
     scored_views: AtLeastOne = 4  # of a novel scene, by train cameras, and as many by test cameras
     variant: Variant = "upright"
-    unet_steps: AtLeastOne = 3000  # to begin with; doubled until a plateau is reached
+    unet_steps: AtLeastOne = 6000  # to begin with; doubled until a plateau is reached
     mlp_steps: AtLeastOne = 1500
     grid_steps: AtLeastOne = 600  # of the fit of a scene's density
-    nesf_steps: AtLeastOne = 2400  # of one scene each
+    nesf_steps: AtLeastOne = 2400  # of one scene each; doubled in the same way
     nesf_width: AtLeastOne = 8
     seed: NotNegative = 0
 
@@ -72,7 +66,17 @@ KLEVR_TIERS: dict[Literal["cpu", "record"], KlevrConfig] = {
 KLEVR_SEEDS = {"cpu": 1, "record": 3}  # of a run
 
 SceneScores = Mapping[int, Mapping[str, ConfusionMatrix]]  # by seed of the novel scene and by what is scored
-Arm = Callable[[KlevrConfig], SceneScores]
+
+
+class ArmScores(NamedTuple):
+    """What an arm says of the novel scenes, and the mIoU that the last fifth of its steps brought; None = no steps that
+    are doubled until a plateau."""
+
+    scenes: SceneScores
+    last_fifth: float | None = None
+
+
+Arm = Callable[[KlevrConfig], ArmScores]
 
 
 def check_klevr(config: KlevrConfig) -> None:
@@ -132,98 +136,13 @@ def labelled_frames(config: KlevrConfig) -> list[PosedFrame]:
     return [f for s in train_seeds(config) for f in scene_frames(config, s, label_map_numbers(config, s))]
 
 
-def score_images(config: KlevrConfig, predict: Callable[[PosedFrame], UInt8]) -> SceneScores:
-    """Scores of an arm that classifies single images: ``predict`` gives ids (H, W)."""
+def score_images(config: KlevrConfig, predict: Callable[[PosedFrame], UInt8]) -> dict[int, dict[str, ConfusionMatrix]]:
+    """Scores of the images of novel scenes: ``predict`` gives ids (H, W)."""
     found: dict[int, dict[str, ConfusionMatrix]] = {}
     for scene in novel_seeds(config):
         numbers = scored_numbers(config, scene)
-        found[scene] = {kind: _confusion(scene_frames(config, scene, n), predict) for kind, n in numbers.items()}
+        found[scene] = {kind: confusion(scene_frames(config, scene, n), predict) for kind, n in numbers.items()}
     return found
-
-
-def color_arm(config: KlevrConfig) -> SceneScores:
-    """What the colour of a pixel alone says of its class: a small network on RGB."""
-    frames, label_set = labelled_frames(config), KLEVR_SUITE.label_set
-    torch.manual_seed(config.seed)
-    net = nn.Sequential(nn.Linear(3, 64), nn.ReLU(), nn.Linear(64, 64), nn.ReLU(), nn.Linear(64, len(label_set)))
-    rgb = np.concatenate([f.rgb.reshape(-1, 3) for f in frames])
-    channel = np.concatenate([label_set.to_channels(f.label).ravel() for f in frames if f.label is not None])
-    rng, optimiser = np.random.default_rng(config.seed), torch.optim.Adam(net.parameters(), 3e-3)
-    for _ in range(config.mlp_steps):
-        pick = rng.integers(len(rgb), size=8192)
-        loss = functional.cross_entropy(net(_color_input(rgb[pick])), torch.from_numpy(channel[pick]))
-        optimiser.zero_grad()
-        loss.backward()  # pyright: ignore[reportUnknownMemberType]
-        optimiser.step()
-
-    def predict(frame: PosedFrame) -> UInt8:
-        with torch.inference_mode():
-            found = net(_color_input(frame.rgb.reshape(-1, 3))).argmax(1).numpy()
-        return label_set.to_ids(found).reshape(frame.rgb.shape[:2])
-
-    return score_images(config, predict)
-
-
-def unet_arm(config: KlevrConfig) -> SceneScores:
-    """The per-image U-Net on the same label maps, past its plateau.
-
-    It is fitted anew with twice the steps until those after four fifths of them bring less than half a point of mIoU at
-    test cameras of training scenes.
-    """
-    frames, steps = labelled_frames(config), config.unet_steps
-    checked = [f for s in train_seeds(config)[:_CHECKED_SCENES] for f in _held_out(config, s)]
-    unet, gain = _fit_unet(config, frames, checked, steps)
-    for _ in range(_MOST_DOUBLINGS):
-        if gain < _PLATEAU:
-            break
-        steps *= 2
-        unet, gain = _fit_unet(config, frames, checked, steps)
-    return score_images(config, unet.predict)
-
-
-def _fit_unet(
-    config: KlevrConfig, frames: list[PosedFrame], checked: list[PosedFrame], steps: int
-) -> tuple[UNetBaseline, float]:
-    """A U-Net fitted to ``frames``, and what the last fifth of the steps brought at ``checked``."""
-    unet = UNetBaseline(KLEVR_SUITE.label_set, UNetConfig(steps=steps, width=config.width, seed=config.seed))
-    before: list[float] = []
-
-    def look(fraction: float) -> None:
-        if fraction >= 0.8 and not before:
-            unet.net.eval()
-            before.append(_miou(checked, unet.predict))
-            unet.net.train()
-
-    unet.fit(frames, look)
-    reached = _miou(checked, unet.predict)
-    gain = reached - (before[0] if before else 0.0)  # a handful of steps has no last fifth
-    _log.info("unet_fitted", steps=steps, last_fifth=round(gain, 4), miou=round(reached, 4))
-    return unet, gain
-
-
-ARMS: dict[str, Arm] = {"color": color_arm, "unet": unet_arm}  # those of NeSF: ``klevr_nesf``
-
-_NESF: Score = ("nesf", POINTS)
-CLAIMS = (
-    Claim("gate: the colour of a pixel says little", "", ("color", TRAIN_CAMERAS), most=30.0),
-    Claim("rotation augmentation", "3D 75.5 -> 97.1", _NESF, ("nesf-no-rotation", POINTS), least=5.0),
-    Claim("3D above 2D", "97.8 / 92.7", _NESF, ("nesf", TRAIN_CAMERAS), least=2.0),
-    Claim(
-        "grid 32 -> 64", "2D 87.5 -> 91.7", ("nesf-grid-64", TRAIN_CAMERAS), ("nesf-grid-32", TRAIN_CAMERAS), least=2.0
-    ),
-    Claim("one label map a scene: 90 % of nine", "figure", ("nesf-1-map", POINTS), _NESF, least=0.0, factor=0.9),
-    Claim(
-        "views 5 -> 25",
-        "5 -> 100: 52.2 -> 92.0",
-        ("nesf-25-views", TRAIN_CAMERAS),
-        ("nesf-5-views", TRAIN_CAMERAS),
-        least=10.0,
-    ),
-    Claim(
-        "not far below an image network", "97.1 / 92.7", ("nesf", TRAIN_CAMERAS), ("unet", TRAIN_CAMERAS), least=-8.0
-    ),
-    Claim("the same at test cameras", "", ("nesf", TEST_CAMERAS), ("nesf", TRAIN_CAMERAS), least=-1.0, most=1.0),
-)
 
 
 def klevr_digest(config: KlevrConfig) -> str:
@@ -239,7 +158,7 @@ def run_klevr(
 
     Args:
         config: What to run.
-        arms: By name, from ``ARMS``.
+        arms: By name.
         store: Records that are there are kept and not made again.
         stopped: Asked before each arm; once it says so (anything true), the run ends.
 
@@ -255,40 +174,54 @@ def run_klevr(
         if stopped():
             return
         yield name
-        for scene, confusions in arm(own).items():
+        scores = arm(own)
+        for scene, confusions in scores.scenes.items():
             rows = {kind: as_rows(matrix) for kind, matrix in confusions.items()}
-            store.add(SceneRecord(settings=settings, weights=name, room=scene, confusions=rows))
+            record = SceneRecord(
+                settings=settings, weights=name, room=scene, confusions=rows, last_fifth=scores.last_fifth
+            )
+            store.add(record)
 
 
-def klevr_scores(configs: Sequence[KlevrConfig], store: RecordStore) -> Scores:
-    """All scores of the records that there are, by arm and what of it is scored; those of several seeds add up."""
-    found: dict[Score, dict[int, ConfusionMatrix]] = {}
-    names = {arm for claim in CLAIMS for arm, _ in (claim.first, claim.second or claim.first)} | ARMS.keys()
-    for name, config in product(sorted(names), configs):
+def klevr_scores(
+    configs: Sequence[KlevrConfig], names: Sequence[str], store: RecordStore
+) -> tuple[CountTable, Collection[str]]:
+    """Counts of the records that there are, and the arms that are not at their plateau.
+
+    Args:
+        configs: One a seed; what they say of a scene adds up.
+        names: Of arms.
+        store: Records.
+    """
+    table: dict[tuple[str, str], dict[Unit, Counts]] = {}
+    unfinished: set[str] = set()
+    for name, config in product(names, configs):
         for scene in novel_seeds(config):
             record = store.find(SceneRecord, klevr_digest(config), name, scene)
-            for kind, rows in ({} if record is None else record.confusions).items():
-                total = found.setdefault((name, kind), {})
-                matrix = from_rows(rows, KLEVR_SUITE.label_set)
-                total[scene] = total[scene] + matrix if scene in total else matrix
-    return found
+            if record is None:
+                continue
+            if record.last_fifth is not None and record.last_fifth >= PLATEAU:
+                unfinished.add(name)
+            for kind, rows in record.confusions.items():
+                units = table.setdefault((name, kind), {})
+                units[0, scene] = units.get((0, scene), 0) + np.array(rows, np.int64)
+    return table, unfinished
 
 
-def _confusion(frames: list[PosedFrame], predict: Callable[[PosedFrame], UInt8]) -> ConfusionMatrix:
+def surface_points(config: KlevrConfig, scene: int) -> tuple[Float32, UInt8]:
+    """Points (N, 3) of the surface with their true ids (N,): those that the scored train cameras see."""
+    frames = scene_frames(config, scene, scored_numbers(config, scene)[TRAIN_CAMERAS])
+    rays = frame_rays(frames, config.width)
+    hit = np.flatnonzero(rays.depth_m > 0)
+    batch = rays.rays(hit, 0.0)
+    xyz = batch.origin + batch.direction * torch.from_numpy(rays.depth_m[hit])[:, None]
+    return xyz.numpy(), np.concatenate([f.label.ravel() for f in frames if f.label is not None])[hit]
+
+
+def confusion(frames: Sequence[PosedFrame], predict: Callable[[PosedFrame], UInt8]) -> ConfusionMatrix:
+    """Of all pixels of the frames; ``predict`` gives ids (H, W)."""
     total = ConfusionMatrix(KLEVR_SUITE.label_set)
     for frame in frames:
         assert frame.label is not None
         total.update(frame.label, predict(frame), f"frame {frame.seq}")
     return total
-
-
-def _miou(frames: list[PosedFrame], predict: Callable[[PosedFrame], UInt8]) -> float:
-    return _confusion(frames, predict).metrics().miou or 0.0
-
-
-def _held_out(config: KlevrConfig, scene: int) -> list[PosedFrame]:
-    return scene_frames(config, scene, scored_numbers(config, scene)[TEST_CAMERAS])
-
-
-def _color_input(rgb: UInt8) -> torch.Tensor:
-    return torch.from_numpy(rgb.astype(np.float32) / 255)

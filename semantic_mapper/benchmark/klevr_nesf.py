@@ -6,7 +6,7 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -17,20 +17,24 @@ import torch
 from safetensors.torch import load_file, save
 
 from semantic_mapper.benchmark.klevr import (
+    MOST_DOUBLINGS,
     POINTS,
-    TRAIN_CAMERAS,
     VIEW_ARMS,
     Arm,
+    ArmScores,
     KlevrConfig,
     SceneScores,
+    confusion,
     label_map_numbers,
     novel_seeds,
     scene_frames,
     scenes_of_arm,
     scored_numbers,
+    surface_points,
     train_seeds,
 )
 from semantic_mapper.benchmark.klevr_grids import NEAR_M, KlevrGridConfig, SceneDensity, grid_digest, scene_densities
+from semantic_mapper.benchmark.plateau import fit_to_plateau
 from semantic_mapper.config import to_plain
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.fields.grid.scene_grid import SceneGrid
@@ -38,9 +42,8 @@ from semantic_mapper.fields.grid_nesf import GridNesf, GridNesfConfig
 from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.scenes.suite import KLEVR_SUITE
-from semantic_mapper.training.frame_rays import frame_rays
 from semantic_mapper.training.grid_nesf import GridNesfTraining, SceneLabels, labelled_scene, train_grid_nesf
-from semantic_mapper.types import Float32, PosedFrame, UInt8
+from semantic_mapper.types import Float32, UInt8
 
 _log = get_logger(__name__)
 
@@ -84,10 +87,30 @@ class TrainingPoint(msgspec.Struct, frozen=True):
 def nesf_arms(folder: Path) -> dict[str, Arm]:
     """Arms by name; densities and networks are kept in ``folder``."""
 
-    def run(name: str, config: KlevrConfig) -> SceneScores:
-        return nesf_scores(*arm_settings(config, name), folder, NESF_ARMS[name].views)
+    def run(name: str, config: KlevrConfig) -> ArmScores:
+        model, gain = arm_network(config, name, folder)
+        own, _ = arm_settings(config, name)
+        return ArmScores(nesf_scores(own, model, folder, NESF_ARMS[name].views), gain)
 
     return {name: partial(run, name) for name in NESF_ARMS}
+
+
+def arm_network(config: KlevrConfig, name: str, folder: Path) -> tuple[GridNesf, float]:
+    """The network of an arm, its steps doubled until its plateau, and the mIoU that the last fifth of them brought."""
+    (own, training), views = arm_settings(config, name), NESF_ARMS[name].views
+
+    def fit(steps: int) -> tuple[GridNesf, float]:
+        settings = msgspec.structs.replace(training, steps=steps)
+        model = nesf_network(own, settings, folder, views)
+        return model, last_fifth(read_curve(own, settings, folder, views))
+
+    return fit_to_plateau(fit, training.steps, MOST_DOUBLINGS)
+
+
+def last_fifth(curve: Sequence[TrainingPoint]) -> float:
+    """mIoU that the last fifth of the steps brought; all of it where there are too few steps to tell."""
+    before = [p.miou_points for p in curve if p.step <= 0.8 * curve[-1].step]
+    return curve[-1].miou_points - (before[-1] if before else 0.0)
 
 
 def arm_settings(config: KlevrConfig, name: str) -> tuple[KlevrConfig, GridNesfTraining]:
@@ -115,14 +138,13 @@ def grid_config(config: KlevrConfig, views: int | None = None) -> KlevrGridConfi
     )
 
 
-def nesf_scores(config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None = None) -> SceneScores:
-    """Train a network on the training scenes' label maps; score images and points of the novel scenes."""
-    model = nesf_network(config, training, folder, views)
+def nesf_scores(config: KlevrConfig, model: GridNesf, folder: Path, views: int | None = None) -> SceneScores:
+    """What a network says of images and points of the novel scenes."""
     found: dict[int, dict[str, ConfusionMatrix]] = {}
     for scene, grid in _grids(config, novel_seeds(config), folder, views).items():
         labels = SceneLabels(model, grid, NEAR_M)
         found[scene] = {
-            kind: _confusion(scene_frames(config, scene, numbers), labels.frame)
+            kind: confusion(scene_frames(config, scene, numbers), labels.frame)
             for kind, numbers in scored_numbers(config, scene).items()
         }
         xyz, truth = surface_points(config, scene)
@@ -161,8 +183,20 @@ def nesf_network(config: KlevrConfig, training: GridNesfTraining, folder: Path, 
 
 
 def nesf_curve(config: KlevrConfig, name: str, folder: Path) -> list[TrainingPoint]:
-    """How the kept network of an arm was trained; empty where there is none."""
-    path = _network_path(*arm_settings(config, name), folder, NESF_ARMS[name].views).with_suffix(".json")
+    """How the kept network of an arm with the most steps was trained; empty where there is none."""
+    own, training = arm_settings(config, name)
+    curves = (
+        read_curve(own, msgspec.structs.replace(training, steps=training.steps << k), folder, NESF_ARMS[name].views)
+        for k in reversed(range(MOST_DOUBLINGS + 1))
+    )
+    return next(filter(None, curves), [])
+
+
+def read_curve(
+    config: KlevrConfig, training: GridNesfTraining, folder: Path, views: int | None = None
+) -> list[TrainingPoint]:
+    """How a kept network was trained; empty where there is none."""
+    path = _network_path(config, training, folder, views).with_suffix(".json")
     return msgspec.json.decode(path.read_bytes(), type=list[TrainingPoint]) if path.exists() else []
 
 
@@ -175,16 +209,6 @@ def _network_digest(config: KlevrConfig, training: GridNesfTraining, views: int 
     maps = [label_map_numbers(config, scene) for scene in train_seeds(config)]
     plain = [to_plain(training), grids, maps, VERSION]
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def surface_points(config: KlevrConfig, scene: int) -> tuple[Float32, UInt8]:
-    """Points (N, 3) of the surface with their true ids (N,): those that the scored train cameras see."""
-    frames = scene_frames(config, scene, scored_numbers(config, scene)[TRAIN_CAMERAS])
-    rays = frame_rays(frames, config.width)
-    hit = np.flatnonzero(rays.depth_m > 0)
-    batch = rays.rays(hit, 0.0)
-    xyz = batch.origin + batch.direction * torch.from_numpy(rays.depth_m[hit])[:, None]
-    return xyz.numpy(), np.concatenate([f.label.ravel() for f in frames if f.label is not None])[hit]
 
 
 def scene_grid(density: SceneDensity) -> SceneGrid:
@@ -206,11 +230,3 @@ def _points_miou(model: GridNesf, novel: Mapping[int, tuple[SceneGrid, Float32, 
     for scene, (grid, xyz, truth) in novel.items():
         total.update(truth, SceneLabels(model, grid, NEAR_M).points(xyz), f"points of scene {scene}")
     return total.metrics().miou or 0.0
-
-
-def _confusion(frames: Sequence[PosedFrame], predict: Callable[[PosedFrame], UInt8]) -> ConfusionMatrix:
-    total = ConfusionMatrix(KLEVR_SUITE.label_set)
-    for frame in frames:
-        assert frame.label is not None
-        total.update(frame.label, predict(frame), f"frame {frame.seq}")
-    return total

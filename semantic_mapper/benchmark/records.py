@@ -113,6 +113,7 @@ class SceneRecord(Config, frozen=True, tag_field="record", tag="scene"):
     weights: str  # name of the arm
     room: int  # seed of the scene
     confusions: dict[str, Rows]
+    last_fifth: float | None = None  # mIoU that the last fifth of the arm's steps brought, where looked for
 
 
 Record = RoomRecord | MapRecord | SceneRecord

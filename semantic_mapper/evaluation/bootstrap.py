@@ -77,11 +77,11 @@ def paired_bootstrap(
 
 def _difference(counts: Float64, times: Float64, factor: float) -> Float64:
     """(2, S, L, L + 1) counts, (B, S) how often each scene was drawn -> (B,) difference in mIoU."""
-    first, second = (_miou(np.einsum("bs,slc->blc", times, c, optimize=True)) for c in counts)
+    first, second = (miou_of_counts(np.einsum("bs,slc->blc", times, c, optimize=True)) for c in counts)
     return first - factor * second
 
 
-def _miou(counts: NDArray[np.float64]) -> Float64:
+def miou_of_counts(counts: NDArray[np.float64]) -> Float64:
     """(B, L, L + 1) -> (B,), the rules of ``ConfusionMatrix.iou``: means over classes in the truth, NaN for none."""
     hits = np.diagonal(counts, axis1=1, axis2=2)
     occurring = counts.sum(axis=2)

@@ -19,6 +19,7 @@ import typer
 
 from semantic_mapper.labels import CARLA, KLEVR, ROOMS
 from semantic_mapper.log_events import get_logger
+from semantic_mapper.plots import draw_picture_rows
 from semantic_mapper.scenes.aerial.views import aerial_camera, aerial_views, cached_town
 from semantic_mapper.scenes.camera import camera_path
 from semantic_mapper.scenes.config import (
@@ -170,16 +171,16 @@ def speed(rooms: Rooms = 8, views: Views = 30, depth: Annotated[str, typer.Optio
 @app.command()
 def klevr(
     out: Annotated[Path, typer.Option(help="PNG or JPEG to write")],
-    scenes: Annotated[int, typer.Option(help="how many of each variant")] = 8,
-    width: Annotated[int, typer.Option(help="pixels of a picture")] = 144,
+    scenes: Annotated[int, typer.Option(help="how many of each variant")] = 6,
+    width: Annotated[int, typer.Option(help="pixels of a picture")] = 180,
 ) -> None:
     """Write pictures and labels of KLEVR scenes, upright and floating, and measure 100 views of 72x72 a scene."""
-    rows: list[UInt8] = []
+    rows: dict[str, list[UInt8]] = {}
     for variant in ("upright", "float"):
         views = [next(klevr_views(seed, [0], klevr_camera(width), variant=variant)) for seed in range(scenes)]
-        rows.append(np.concatenate([view.frame.rgb for view in views], 1))
-        rows.append(np.concatenate([KLEVR.colorize(view.rendered.label) for view in views], 1))
-    cv2.imwrite(str(out), np.ascontiguousarray(np.concatenate(rows, 0)[..., ::-1]))
+        rows[variant] = [view.frame.rgb for view in views]
+        rows[f"{variant}: classes"] = [KLEVR.colorize(view.rendered.label) for view in views]
+    cv2.imwrite(str(out), np.ascontiguousarray(draw_picture_rows(rows, KLEVR, width)[..., ::-1]))
     started = time.process_time()
     for seed in range(scenes):
         for _ in klevr_views(seed, range(100), klevr_camera(72)):

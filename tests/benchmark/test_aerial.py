@@ -16,10 +16,8 @@ from semantic_mapper.benchmark.aerial import (
     DAY,
     LOW,
     AerialConfig,
-    Counts,
     Episode,
     EpisodeScores,
-    Unit,
     aerial_digest,
     aerial_table,
     episodes,
@@ -30,18 +28,11 @@ from semantic_mapper.benchmark.aerial import (
     training_frames,
 )
 from semantic_mapper.benchmark.aerial_arms import BRIDGE, PATCH, color_arm, patch_arm
-from semantic_mapper.benchmark.aerial_claims import (
-    CONSISTENCY,
-    DARK_DROP,
-    MIOU,
-    AerialClaim,
-    check_aerial_claim,
-    check_aerial_claims,
-    figure,
-)
+from semantic_mapper.benchmark.aerial_claims import CLAIMS, CONSISTENCY, DARK_DROP, MIOU
 from semantic_mapper.benchmark.aerial_fields import field_arms
 from semantic_mapper.benchmark.aerial_grids import town_grid
 from semantic_mapper.benchmark.aerial_irt import irt_arms
+from semantic_mapper.benchmark.claims import Claim, Counts, Unit, check_claim, check_claims, figure
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.labels import CARLA
@@ -206,21 +197,21 @@ def table_of(values: dict[str, list[int]], kind: str = DAY) -> dict[tuple[str, s
 
 def test_claims_are_accepted_refused_and_not_run() -> None:
     table = table_of({"a": [90, 80, 85, 95], "b": [60, 50, 55, 65]})
-    gain = check_aerial_claim(AerialClaim("gain", "", MIOU, "a", "b", least=5.0), table)
-    assert gain.result == "accepted" and gain.views == 4
+    gain = check_claim(Claim("gain", "", MIOU, "a", "b", least=5.0), table)
+    assert gain.result == "accepted" and gain.units == 4
     assert gain.low is not None and gain.difference is not None and gain.high is not None
     assert 0 < gain.low <= gain.difference <= gain.high
-    assert check_aerial_claim(AerialClaim("too much", "", MIOU, "a", "b", least=60.0), table).result == "refused"
-    assert check_aerial_claim(AerialClaim("reversed", "", MIOU, "b", "a", least=0.0), table).result == "refused"
-    assert check_aerial_claim(AerialClaim("a gate", "", MIOU, "a", most=15.0), table).result == "refused"
-    missing = check_aerial_claim(AerialClaim("none", "", MIOU, "a", "c", least=1.0), table)
+    assert check_claim(Claim("too much", "", MIOU, "a", "b", least=60.0), table).result == "refused"
+    assert check_claim(Claim("reversed", "", MIOU, "b", "a", least=0.0), table).result == "refused"
+    assert check_claim(Claim("a gate", "", MIOU, "a", most=15.0), table).result == "refused"
+    missing = check_claim(Claim("none", "", MIOU, "a", "c", least=1.0), table)
     assert (missing.result, missing.difference) == ("not run", None)
-    assert {r.result for r in check_aerial_claims(table)} == {"not run"}
+    assert {r.result for r in check_claims(CLAIMS, table)} == {"not run"}
 
 
 def test_a_gain_that_is_not_sure_is_refused() -> None:
     table = table_of({"a": [99, 50, 51, 50], "b": [50, 52, 50, 52]})
-    found = check_aerial_claim(AerialClaim("one lucky view", "", MIOU, "a", "b", least=0.0), table)
+    found = check_claim(Claim("one lucky view", "", MIOU, "a", "b", least=0.0), table)
     assert found.difference is not None and found.low is not None
     assert found.difference > 0 >= found.low and found.result == "refused"
 
@@ -230,11 +221,11 @@ def test_drops_are_relative_and_compared_with_a_factor() -> None:
     drop = {arm: figure(table, arm, DARK_DROP) for arm in ("a", "b")}
     iou = {n: 100 * n / (200 - n) for n in (90, 80, 50)}
     assert drop["a"] == pytest.approx(100 * (1 - iou[80] / iou[90]))
-    claim = AerialClaim("half", "", DARK_DROP, "a", "b", most=0.0, factor=0.5)
-    found = check_aerial_claim(claim, table)
+    claim = Claim("half", "", DARK_DROP, "a", "b", most=0.0, factor=0.5)
+    found = check_claim(claim, table)
     assert drop["b"] is not None and drop["a"] is not None
     assert found.difference == pytest.approx(drop["a"] - 0.5 * drop["b"]) and found.result == "accepted"
-    assert check_aerial_claim(replace(claim, first="b", second="a"), table).result == "refused"
+    assert check_claim(replace(claim, first="b", second="a"), table).result == "refused"
 
 
 def test_consistency_is_the_fraction_that_agrees() -> None:

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from semantic_mapper.benchmark.klevr import (
-    CLAIMS,
     POINTS,
     TEST_CAMERAS,
     TRAIN_CAMERAS,
@@ -18,9 +17,18 @@ from semantic_mapper.benchmark.klevr import (
     KlevrConfig,
     novel_seeds,
     scenes_of_arm,
+    surface_points,
 )
+from semantic_mapper.benchmark.klevr_claims import CLAIMS
 from semantic_mapper.benchmark.klevr_grids import KlevrGridConfig, grid_digest, scene_density
-from semantic_mapper.benchmark.klevr_nesf import nesf_arms, nesf_scores, surface_points, training_of
+from semantic_mapper.benchmark.klevr_nesf import (
+    TrainingPoint,
+    last_fifth,
+    nesf_arms,
+    nesf_network,
+    nesf_scores,
+    training_of,
+)
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.labels import KLEVR
 from semantic_mapper.scenes.klevr import BOX_HIGH_M, BOX_LOW_M
@@ -62,7 +70,7 @@ def test_the_digest_tells_all_that_a_fit_depends_on() -> None:
 def test_the_network_learns_more_than_the_background(tmp_path: Path) -> None:
     training = msgspec.structs.replace(training_of(TINY, size=32), first_rate=6e-3, last_rate=1e-3)
     torch.set_num_threads(1)
-    scores = nesf_scores(TINY, training, tmp_path)
+    scores = nesf_scores(TINY, nesf_network(TINY, training, tmp_path), tmp_path)
     assert set(scores) == set(novel_seeds(TINY))
     background = KLEVR.names.index("background")
     for kind in (TRAIN_CAMERAS, TEST_CAMERAS, POINTS):
@@ -71,7 +79,9 @@ def test_the_network_learns_more_than_the_background(tmp_path: Path) -> None:
             found += kinds[kind]
             plain.counts[:, background] += kinds[kind].counts.sum(1)
         assert (found.metrics().miou or 0) > (plain.metrics().miou or 0) + 0.03, kind
-    again = nesf_scores(TINY, training, tmp_path)  # of densities and a network as they were kept
+    again = nesf_scores(
+        TINY, nesf_network(TINY, training, tmp_path), tmp_path
+    )  # of densities and a network as they were kept
     assert all(np.array_equal(again[s][k].counts, scores[s][k].counts) for s in scores for k in scores[s])
 
 
@@ -85,7 +95,7 @@ def test_points_lie_on_the_surface_with_the_class_of_their_pixel() -> None:
 
 
 def test_every_arm_that_a_claim_names_exists_and_few_scenes_serve_those_of_few_views(tmp_path: Path) -> None:
-    named = {arm for claim in CLAIMS for arm, _ in (claim.first, claim.second or claim.first)}
+    named = {arm for claim in CLAIMS for arm in claim.arms}
     assert named - {"color", "unet"} == nesf_arms(tmp_path).keys() and VIEW_ARMS.keys() <= named
     few = scenes_of_arm(KlevrConfig(), "nesf-5-views")
     assert (few.train_scenes, few.novel_scenes) == (12, 6)
@@ -98,3 +108,8 @@ def test_arms_differ_in_one_thing(name: str) -> None:
     other = training_of(TINY, rotate=False) if "rotation" in name else training_of(TINY, size=32)
     changed = {f for f in plain.__struct_fields__ if getattr(plain, f) != getattr(other, f)}
     assert changed == ({"rotate"} if "rotation" in name else {"network"})
+
+
+def test_the_last_fifth_is_what_the_steps_after_four_fifths_brought() -> None:
+    curve = [TrainingPoint(step, miou, 0.0) for step, miou in ((30, 0.2), (80, 0.5), (90, 0.7), (100, 0.6))]
+    assert last_fifth(curve) == pytest.approx(0.1) and last_fifth(curve[3:]) == 0.6

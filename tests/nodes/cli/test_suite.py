@@ -216,9 +216,9 @@ def test_klevr_shows_arms_and_claims_and_continues(tmp_path: Path) -> None:
     records = out.with_suffix(".jsonl").read_text().splitlines()
     assert len(records) == 2 and "rotation augmentation" in first.stdout and "not run" in first.stdout
     found = json.loads(out.read_text())
-    assert set(found["arms"]) == {"color"} and set(found["arms"]["color"]) == {"train cameras", "test cameras"}
+    assert set(found["arms"]) == {"color"} and "mIoU, test cameras" in found["arms"]["color"]["figures"]
     assert [c["result"] for c in found["claims"]].count("not run") == len(found["claims"]) - 1
-    assert found["claims"][0]["result"] in ("accepted", "refused") and found["claims"][0]["scenes"] == 2
+    assert found["claims"][0]["result"] in ("accepted", "refused") and found["claims"][0]["units"] == 2
     again = run(*common, "--arm", "color", "--arm", "unet")
     assert again.returncode == 0, again.stderr
     lines = out.with_suffix(".jsonl").read_text().splitlines()

@@ -1,0 +1,40 @@
+"""The claims of NeSF as checks on KLEVR, and the figures of an arm that they are about."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from semantic_mapper.benchmark.claims import Claim, Measure, miou_measure
+from semantic_mapper.benchmark.klevr import POINTS, TEST_CAMERAS, TRAIN_CAMERAS
+from semantic_mapper.scenes.suite import KLEVR_SUITE
+from semantic_mapper.types import Float64
+
+_BACKGROUND = KLEVR_SUITE.label_set.names.index("background")
+
+
+def _background(counts: Sequence[Float64]) -> Float64:
+    """What the background's IoU adds to the mean, in points."""
+    c = counts[0]
+    hits, occurring = c[:, _BACKGROUND, _BACKGROUND], c.sum(axis=2)
+    union = occurring[:, _BACKGROUND] + c[:, :, _BACKGROUND].sum(axis=1) - hits
+    return 100 * hits / np.maximum(union, 1) / np.maximum((occurring > 0).sum(axis=1), 1)
+
+
+TRAIN_MIOU = miou_measure(f"mIoU, {TRAIN_CAMERAS}", TRAIN_CAMERAS)
+TEST_MIOU = miou_measure(f"mIoU, {TEST_CAMERAS}", TEST_CAMERAS)
+POINTS_MIOU = miou_measure(f"mIoU, {POINTS}", POINTS)
+BACKGROUND = Measure(f"of it background, {TRAIN_CAMERAS}", (TRAIN_CAMERAS,), _background)
+MEASURES = (TRAIN_MIOU, BACKGROUND, TEST_MIOU, POINTS_MIOU)
+
+CLAIMS = (
+    Claim("gate: the colour of a pixel says little", "", TRAIN_MIOU, "color", most=30.0),
+    Claim("rotation augmentation", "3D 75.5 -> 97.1", POINTS_MIOU, "nesf", "nesf-no-rotation", least=5.0),
+    Claim("3D above 2D", "97.8 / 92.7", POINTS_MIOU, "nesf", "nesf", TRAIN_MIOU, least=2.0),
+    Claim("grid 32 -> 64", "2D 87.5 -> 91.7", TRAIN_MIOU, "nesf-grid-64", "nesf-grid-32", least=2.0),
+    Claim("one label map a scene: 90 % of nine", "figure", POINTS_MIOU, "nesf-1-map", "nesf", least=0.0, factor=0.9),
+    Claim("views 5 -> 25", "5 -> 100: 52.2 -> 92.0", TRAIN_MIOU, "nesf-25-views", "nesf-5-views", least=10.0),
+    Claim("not far below an image network", "97.1 / 92.7", TRAIN_MIOU, "nesf", "unet", least=-8.0),
+    Claim("the same at test cameras", "", TEST_MIOU, "nesf", "nesf", TRAIN_MIOU, least=-1.0, most=1.0),
+)
