@@ -1,0 +1,338 @@
+"""Boxes, ellipsoids, prisms and meshes in the world that say of what class their inside is, and rays through them.
+
+All shapes become closed triangle meshes; a compiled loop gives the intervals of a ray inside each.
+"""
+
+from __future__ import annotations
+
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.kernels import parallel_kernel
+from semantic_mapper.types import Float64, Int32, Int64, RayBatch
+
+ShapeName = Literal["box", "ellipsoid", "prism", "mesh"]
+SHAPES: tuple[ShapeName, ...] = ("box", "ellipsoid", "prism", "mesh")
+AROUND, RINGS = 20, 10  # of the triangles of an ellipsoid
+MAX_INTERVALS = 32  # of a ray; those behind are dropped
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Primitive:
+    """One annotated piece of space.
+
+    Args:
+        id: 1 to 65535, of this primitive alone.
+        class_name: Of the label set.
+        shape: What it is; its axes and centre are those of ``T_world_box``.
+        T_world_box: (4, 4) float64 pose; of one that moves, its first.
+        size: (3,) metres, the sides of a box, the diameters of an ellipsoid, the bounds of a prism or a mesh.
+        thing: Whether it is one countable thing, or part of some stuff.
+        polygon: (N, 2) metres, outline of a prism in x and y; it reaches from -size[2] / 2 to size[2] / 2 in z.
+        vertices, faces: (V, 3) float64 metres in the box's axes and (F, 3) int64, of a mesh.
+        stamps: Of one that moves: (ns, (4, 4) pose) at each time that is known; None = it stands still.
+    """
+
+    id: int
+    class_name: str
+    shape: ShapeName
+    T_world_box: Float64
+    size: Float64
+    thing: bool
+    polygon: Float64 | None = None
+    vertices: Float64 | None = None
+    faces: Int64 | None = None
+    stamps: tuple[tuple[int, Float64], ...] | None = None
+
+    @property
+    def moves(self) -> bool:
+        """Whether it is at different places at different times."""
+        return self.stamps is not None
+
+    def mesh(self) -> tuple[Float64, Int64]:
+        """Vertices (V, 3) float64 world metres and faces (F, 3) int64 of its closed surface, facing outwards.
+
+        Raises:
+            ConfigError: the surface is open, or has no volume.
+        """
+        vertices, faces = _local_mesh(self)
+        vertices, faces = closed_mesh(vertices, faces)
+        return vertices @ self.T_world_box[:3, :3].T + self.T_world_box[:3, 3], faces
+
+    def corners(self) -> Float64:
+        """The 8 corners (8, 3) of its box, world metres; the last axis changes fastest."""
+        signs = np.stack(np.meshgrid(*(3 * [(-0.5, 0.5)]), indexing="ij"), -1).reshape(8, 3)
+        return (signs * self.size) @ self.T_world_box[:3, :3].T + self.T_world_box[:3, 3]
+
+
+class Meshes(NamedTuple):
+    """Closed meshes as kernels take them: vertices (V, 3), faces (F, 3), first face of each (P + 1,), bounds (P, 3)."""
+
+    vertices: Float64
+    faces: Int64
+    first: Int64
+    low: Float64
+    high: Float64
+
+
+@parallel_kernel(chunks_per_thread=4)
+def ray_intervals(
+    count: int,
+    meshes: Meshes,
+    origin: Float64,
+    direction: Float64,
+    near: Float64,
+    far: Float64,
+    enter: Float64,
+    leave: Float64,
+    mesh: Int32,
+    found: Int64,
+    /,
+) -> None:
+    """Where ``count`` rays are inside which mesh."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Intervals:
+    """Where R rays are inside of primitives: at most M intervals each, by ascending ``enter``.
+
+    Args:
+        enter, leave: (R, M) float32 metres of z; infinite where there is none.
+        index: (R, M) int64 position of the primitive; -1 where there is none.
+        count: (R,) int64 how many there are; those beyond M are left out.
+    """
+
+    enter: torch.Tensor
+    leave: torch.Tensor
+    index: torch.Tensor
+    count: torch.Tensor
+
+    def inside(self, z: torch.Tensor) -> torch.Tensor:
+        """Whether samples at z (R, K) are in intervals: (R, K, M) bool."""
+        return (z[..., None] >= self.enter[:, None]) & (z[..., None] <= self.leave[:, None])
+
+
+class PrimitiveSet:
+    """Primitives that stand still, ready for rays.
+
+    Args:
+        primitives: P of them, none of which moves.
+
+    Raises:
+        ConfigError: a mesh is open or has no volume, naming its box.
+    """
+
+    def __init__(self, primitives: Sequence[Primitive]) -> None:
+        self.primitives = tuple(primitives)
+        vertices: list[Float64] = []
+        faces: list[Int64] = []
+        for primitive in self.primitives:
+            try:
+                v, f = primitive.mesh()
+            except ConfigError as error:
+                raise ConfigError(f"box {primitive.id} ({primitive.class_name}): {error}") from error
+            faces.append(f + sum(map(len, vertices)))
+            vertices.append(v)
+        self.meshes = Meshes(
+            np.ascontiguousarray(np.concatenate(vertices or [np.zeros((0, 3))])),
+            np.ascontiguousarray(np.concatenate(faces or [np.zeros((0, 3), np.int64)])),
+            np.cumsum([0, *map(len, faces)], dtype=np.int64),
+            np.array([v.min(0) for v in vertices]).reshape(-1, 3),
+            np.array([v.max(0) for v in vertices]).reshape(-1, 3),
+        )
+
+    def __len__(self) -> int:
+        return len(self.primitives)
+
+    def intervals(self, rays: RayBatch, most: int = MAX_INTERVALS) -> Intervals:
+        """Where rays (R,) are inside, from their near bound on, however far."""
+        far = np.full(len(rays.near_m), np.inf)
+        return self._intervals(_array(rays.origin), _array(rays.direction), _array(rays.near_m), far, most)
+
+    def inside(self, points: Float64) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
+        """Which points (N, 3) world metres are inside which primitive: (N, P) bool."""
+        origin = np.ascontiguousarray(points, np.float64)
+        # Out to beyond all of them, in a direction that no face of a box is likely to have.
+        along = np.tile((0.8217, 0.4463, 0.3541), (len(origin), 1))
+        found = self._intervals(origin, along, np.zeros(len(origin)), np.full(len(origin), np.inf), max(len(self), 1))
+        result = np.zeros((len(origin), len(self)), np.bool_)
+        here = (found.index >= 0) & (found.enter <= 0)
+        row, column = here.nonzero(as_tuple=True)
+        result[row.numpy(), found.index[row, column].numpy()] = True
+        return result
+
+    def _intervals(self, origin: Float64, direction: Float64, near: Float64, far: Float64, most: int) -> Intervals:
+        count = len(origin)
+        enter, leave = np.empty((count, most)), np.empty((count, most))
+        mesh, found = np.empty((count, most), np.int32), np.empty(count, np.int64)
+        ray_intervals(count, self.meshes, origin, direction, near, far, enter, leave, mesh, found)
+        return Intervals(
+            torch.from_numpy(enter).float(),
+            torch.from_numpy(leave).float(),
+            torch.from_numpy(mesh).long(),
+            torch.from_numpy(found),
+        )
+
+
+def closed_mesh(vertices: Float64, faces: Int64) -> tuple[Float64, Int64]:
+    """A mesh with each place once and all triangles facing outwards; polygons of 4 corners become triangles.
+
+    Raises:
+        ConfigError: a face with a vertex that is not there, edges that belong to one triangle alone or to more than
+            two, or no volume.
+    """
+    if faces.size == 0 or faces.min() < 0 or faces.max() >= len(vertices):
+        raise ConfigError(f"faces must name vertices 0 to {len(vertices) - 1}")
+    extent = float(np.ptp(vertices, axis=0).max())
+    places, place_of = np.unique(np.round(vertices / max(extent * 1e-9, 1e-12)), axis=0, return_inverse=True)
+    first = np.zeros(len(places), np.int64)
+    first[place_of.ravel()] = np.arange(len(vertices))
+    faces = place_of.ravel()[faces]
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    used = Counter(tuple(sorted(edge)) for face in faces.tolist() for edge in _edges(face))
+    odd = sum(n != 2 for n in used.values())
+    if odd or not used:
+        raise ConfigError(
+            f"the surface is open: {odd} of {len(used)} edges do not join exactly two triangles; close the mesh"
+        )
+    vertices = vertices[first]
+    faces = _facing_outwards(vertices, faces)
+    return vertices, faces
+
+
+def _edges(face: Sequence[int]) -> list[tuple[int, int]]:
+    return [(face[0], face[1]), (face[1], face[2]), (face[2], face[0])]
+
+
+def _facing_outwards(vertices: Float64, faces: Int64) -> Int64:
+    """The same triangles, turned so that each connected surface has its front outside."""
+    of_edge: dict[tuple[int, int], list[int]] = {}
+    for number, face in enumerate(faces.tolist()):
+        for a, b in _edges(face):
+            of_edge.setdefault((min(a, b), max(a, b)), []).append(number)
+    turned = faces.copy()
+    seen = np.zeros(len(faces), np.bool_)
+    for start in range(len(faces)):
+        if seen[start]:
+            continue
+        piece, seen[start] = [start], True
+        for number in piece:
+            for a, b in _edges(turned[number].tolist()):
+                for other in of_edge[min(a, b), max(a, b)]:
+                    if seen[other]:
+                        continue
+                    if (a, b) in _edges(turned[other].tolist()):
+                        turned[other] = turned[other][::-1]
+                    seen[other] = True
+                    piece.append(other)
+        a, b, c = (vertices[turned[piece, i]] - vertices[turned[start, 0]] for i in range(3))
+        volume = float((a * np.cross(b, c)).sum())
+        if volume == 0:
+            raise ConfigError("the surface has no volume; give a solid")
+        if volume < 0:
+            turned[piece] = turned[piece, ::-1]
+    return turned
+
+
+def _local_mesh(primitive: Primitive) -> tuple[Float64, Int64]:
+    """Vertices in the box's axes, and faces."""
+    match primitive.shape:
+        case "box":
+            square = np.array(((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)))
+            return _prism(square * primitive.size[:2], float(primitive.size[2]))
+        case "prism":
+            assert primitive.polygon is not None
+            return _prism(primitive.polygon, float(primitive.size[2]))
+        case "ellipsoid":
+            vertices, faces = _sphere()
+            return vertices * primitive.size, faces
+        case "mesh":
+            assert primitive.vertices is not None and primitive.faces is not None
+            return primitive.vertices, primitive.faces
+
+
+def _prism(polygon: Float64, height: float) -> tuple[Float64, Int64]:
+    n = len(polygon)
+    if _area(polygon) < 0:
+        polygon = polygon[::-1]
+    low, high = (np.c_[polygon, np.full(n, z)] for z in (-height / 2, height / 2))
+    cap = triangulate(polygon)
+    i, j = np.arange(n), (np.arange(n) + 1) % n
+    sides = np.concatenate((np.stack((i, j, j + n), 1), np.stack((i, j + n, i + n), 1)))
+    return np.concatenate((low, high)), np.concatenate((cap[:, ::-1], cap + n, sides))
+
+
+def _sphere() -> tuple[Float64, Int64]:
+    """A sphere of diameter 1 as wide as the round one has volume."""
+    theta = np.pi * np.arange(1, RINGS) / RINGS
+    phi = 2 * np.pi * np.arange(AROUND) / AROUND
+    ring = np.stack(
+        (
+            np.outer(np.sin(theta), np.cos(phi)),
+            np.outer(np.sin(theta), np.sin(phi)),
+            np.outer(np.cos(theta), 1 + 0 * phi),
+        ),
+        -1,
+    )
+    vertices = 0.5 * np.concatenate(([(0, 0, 1)], ring.reshape(-1, 3), [(0, 0, -1)]))
+    i, j = np.arange(AROUND), (np.arange(AROUND) + 1) % AROUND
+    last = len(vertices) - 1
+    faces = [np.stack((0 * i, 1 + i, 1 + j), 1), np.stack((0 * i + last, last - AROUND + j, last - AROUND + i), 1)]
+    for k in range(RINGS - 2):
+        a, b = 1 + k * AROUND, 1 + (k + 1) * AROUND
+        faces += [np.stack((a + i, b + i, b + j), 1), np.stack((a + i, b + j, a + j), 1)]
+    faces = np.concatenate(faces)
+    volume = float((vertices[faces[:, 0]] * np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]])).sum()) / 6
+    return vertices * (math.pi / 6 / volume) ** (1 / 3), faces
+
+
+def triangulate(polygon: Float64) -> Int64:
+    """Triangles (N - 2, 3) of a simple polygon (N, 2) whose corners go round anticlockwise.
+
+    Raises:
+        ConfigError: it crosses itself, or its corners lie on a line.
+    """
+    left = list(range(len(polygon)))
+    triangles: list[tuple[int, int, int]] = []
+    while len(left) > 3:
+        for k in range(len(left)):
+            a, b, c = left[k - 1], left[k], left[(k + 1) % len(left)]
+            if _cross(polygon, a, b, c) <= 0:
+                continue
+            others = [p for p in left if p not in (a, b, c)]
+            if not any(_in_triangle(polygon, p, a, b, c) for p in others):
+                triangles.append((a, b, c))
+                del left[k]
+                break
+        else:
+            raise ConfigError("the outline crosses itself or has corners on a line; give a simple polygon")
+    if len(left) < 3 or _cross(polygon, *left) <= 0:
+        raise ConfigError("the outline has no area; give a simple polygon of at least 3 corners")
+    return np.array([*triangles, tuple(left)], np.int64)
+
+
+def _cross(polygon: Float64, a: int, b: int, c: int) -> float:
+    ab, ac = polygon[b] - polygon[a], polygon[c] - polygon[a]
+    return float(ab[0] * ac[1] - ab[1] * ac[0])
+
+
+def _in_triangle(polygon: Float64, p: int, a: int, b: int, c: int) -> bool:
+    return all(_cross(polygon, i, j, p) >= 0 for i, j in ((a, b), (b, c), (c, a)))
+
+
+def _area(polygon: Float64) -> float:
+    x, y = polygon.T
+    return 0.5 * float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())
+
+
+def _array(tensor: torch.Tensor) -> Float64:
+    return np.ascontiguousarray(tensor.detach().cpu().numpy(), np.float64)
