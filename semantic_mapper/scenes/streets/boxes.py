@@ -16,7 +16,7 @@ THINGS = ("building", "car", "trailer", "caravan", "box")
 
 _BOX_STREAM = 5
 _GROWTH = (0.05, 0.15)  # of each side
-_GROWTH_M, _GROUND_GROWTH_M = (0.5, 1.6), (1.1, 1.6)  # but between these
+_GROWTH_M, _GROUND_GROWTH_M = (0.5, 1.6), (1.3, 1.9)  # but between these
 _SHIFT_M, _YAW_DEG = (0.03, 0.10), 3.0
 _END_M = 0.05  # by which yaw may move an end, at least; else by what the growth leaves beside the shift
 
@@ -62,7 +62,7 @@ def street_boxes(street: Street, frames: int) -> list[StreetBox]:
     """The boxes of a street: each side 5 to 15 % too long, turned by up to 3 degrees, and 3 to 10 cm off.
 
     Sides grow by 50 cm at least, so that what is thin stays inside, and by 1.6 m at most; long things turn less. Slabs
-    of the ground reach 15 cm above and below it, and grow by 1.1 to 1.6 m.
+    of the ground reach 15 cm above and below it, and grow by 1.3 to 1.9 m.
 
     Args:
         street: From ``make_streets_street``.
