@@ -15,15 +15,18 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import CodecError, ConfigError, FrameError, LabelError, LogError, WeightsError
+from semantic_mapper.fields.panoptic import Panoptic
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.autolabel_note import AUTOLABEL_ATTACHMENT, AutolabelNote
+from semantic_mapper.replay.instance_images import InstanceImages
 from semantic_mapper.replay.log.atomic_log import atomic_log
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.replay.log.reader import LogReader
@@ -40,7 +43,7 @@ from semantic_mapper.replay.log.sequence import (
 from semantic_mapper.replay.rendered_depth import rendered_depth
 from semantic_mapper.transport.codec import Envelope, decode_as, encode, with_computed_depth, with_label
 from semantic_mapper.transport.messages import StreamInfo
-from semantic_mapper.types import Float32, PosedFrame, UInt8
+from semantic_mapper.types import Float32, MapUpdate, PosedFrame, UInt8
 
 RENDERED_SPREAD = 0.05  # one sigma of depth that a field of the scene renders, as a fraction of depth; assumed
 DEPTH_STEPS_PER_M = 1000.0  # computed depth and its spread are rounded to millimetres, which pack to a fifth
@@ -61,6 +64,7 @@ class AutolabelRequest:
         min_confidence: Pixels that are less sure are unknown.
         overwrite_labels: Replace labels that are there, too.
         max_frames: 0 = all.
+        instances: Folder for images of things, of weights that have boxes.
     """
 
     logs: tuple[Path, ...]
@@ -71,6 +75,7 @@ class AutolabelRequest:
     min_confidence: float = 0.0
     overwrite_labels: bool = False
     max_frames: int = 0
+    instances: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +148,8 @@ def autolabel(
                 labeller.push(_Message(writers[-1], envelope, parts))
                 on_frame(labeller.frames)
         labeller.finish()
+        if labeller.instances is not None:
+            labeller.instances.finish()
         note = labeller.note(digest)
         if not labeller.rendered:
             why = labeller.unlabelled[0] if labeller.unlabelled else "none can be read"
@@ -196,6 +203,11 @@ def _load(request: AutolabelRequest) -> Mapper:
             f"{bundle.weights_path}: a field of kind '{model.kind}' knows no classes, so that it can label nothing; "
             "with --depth, and without --overwrite-labels, it gives frames the depth that it renders. For labels give "
             "weights that were trained on some"
+        )
+    if request.instances is not None and not isinstance(model, Panoptic):
+        raise WeightsError(
+            f"{bundle.weights_path}: a field of kind '{model.kind}' has no boxes, so that it tells no things apart; "
+            "--instances goes with weights of `finetune --kind panoptic`"
         )
     if request.depth and model.holds_scene and request.config.depth.source == "auto":
         depth = msgspec.structs.replace(request.config.depth, source="sensor")  # else the field renders
@@ -260,12 +272,14 @@ class _Message:
         writer: Of the part that it belongs to.
         envelope, parts: Of the message.
         waits: For its rendering, or that of a frame before it.
+        number: Of a frame in the log.
     """
 
     writer: LogWriter
     envelope: Envelope
     parts: list[bytes]
     waits: bool = False
+    number: int = -1
 
     @property
     def key(self) -> tuple[str, int, int]:
@@ -291,12 +305,20 @@ class _Labeller:
         if self._labels:
             self._ids: UInt8 = label_set.to_ids(label_set.channel_map_from(bundle.label_set))
         self._ignore_id = label_set.ignore_id
+        self._no_class = np.uint8(bundle.label_set.ignore_id)
         self._queue: deque[_Message] = deque()
         self._waiting: dict[tuple[str, int, int], deque[_Message]] = {}
         self._pixels, self._confidence = 0, 0.0
         self.frames = self.rendered = self.labelled = self.kept = self.replaced = self.depth_written = 0
         self.without = 0
         self.unlabelled: list[str] = []
+        model = bundle.checkpoint.model
+        # An image a frame is written as it is rendered; the list of things, when the log is whole.
+        self.instances = (
+            None
+            if request.instances is None or not isinstance(model, Panoptic)
+            else InstanceImages(request.instances, model)
+        )
 
     def push(self, message: _Message) -> None:
         """Take a message.
@@ -307,6 +329,7 @@ class _Labeller:
         """
         self._queue.append(message)
         if message.envelope.topic == "frame":
+            message.number = self.frames
             self.frames += 1
             self._push_frame(message)
         self._write_ready()
@@ -370,6 +393,8 @@ class _Labeller:
             return
         self.rendered += 1
         self._label(message, self._ids[update.label], update.confidence)
+        if self.instances is not None:
+            self.instances.add(message.number, frame, np.where(self._sure(update), update.label, self._no_class))
         if self._request.depth and not message.envelope.has_depth:
             self._add_depth(message, frame, update.depth_m)
 
@@ -406,6 +431,9 @@ class _Labeller:
         self._set_label(message, found if sure.any() else None)
         self._pixels += int(sure.sum())
         self._confidence += float(confidence[sure].sum(dtype=np.float64))
+
+    def _sure(self, update: MapUpdate) -> NDArray[np.bool_]:
+        return update.confidence >= self._request.min_confidence
 
     def _set_label(self, message: _Message, label: UInt8 | None) -> None:
         envelope = message.envelope

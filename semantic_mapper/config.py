@@ -175,6 +175,33 @@ class IRTConfig(GridFieldConfig, frozen=True):
     carried_size: tuple[AtLeastOne, AtLeastOne] = (1, 1)  # height and width
 
 
+class BoxConfig(Config, frozen=True):
+    """A primitive that a field was fitted with (``fields.primitives.Primitive``)."""
+
+    id: Annotated[int, msgspec.Meta(ge=1, le=65535)]
+    class_name: str
+    shape: Literal["box", "ellipsoid", "prism", "mesh"]
+    T_world_box: tuple[tuple[float, float, float, float], ...]
+    size: tuple[float, float, float]
+    thing: bool
+    polygon: tuple[tuple[float, float], ...] | None = None
+    vertices: tuple[tuple[float, float, float], ...] | None = None
+    faces: tuple[tuple[int, int, int], ...] | None = None
+
+
+class PanopticConfig(GridFieldConfig, frozen=True):
+    """Shape of a Panoptic NeRF: a scene grid with features, a head for classes, and boxes."""
+
+    features: Annotated[int, msgspec.Meta(ge=1, le=64)] = 16
+    trunk_width: Channels = 64
+    head_width: Channels = 64
+    # What may be outside of all boxes. stuff: the classes that are no things, and those that no box has. empty: nothing
+    uncovered: Literal["stuff", "empty"] = "stuff"
+    classes: Literal["learned", "fixed"] = "learned"  # what is rendered; fixed: what the boxes say, as an ablation
+    boxes: tuple[BoxConfig, ...] = ()
+    merge: dict[str, tuple[str, ...]] = {}  # by class of the pseudo labels: those that they cannot tell from it
+
+
 class SamplingConfig(Config, frozen=True):
     """Where a ray is sampled."""
 

@@ -35,6 +35,15 @@ def autolabel(
     overwrite_labels: Annotated[
         bool, typer.Option("--overwrite-labels", help="Replace labels that are there, too; without it they stay.")
     ] = False,
+    instances: Annotated[
+        Path | None,
+        typer.Option(
+            "--instances",
+            metavar="DIR",
+            help="Weights with boxes (`finetune --kind panoptic`): also write CAMERA/NNNNNN.png, ids of boxes in 16 "
+            "bits, and instances.json.",
+        ),
+    ] = None,
     max_frames: MaxFramesOption = 0,
     json: Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else, on stdout.")] = False,
 ) -> int:
@@ -58,7 +67,9 @@ def autolabel(
 
     prepare_file(out)
     config = mapper_config(None, None, delay_frames=REPLAY_DELAY_FRAMES)
-    request = AutolabelRequest(tuple(log), out, weights, config, depth, min_confidence, overwrite_labels, max_frames)
+    request = AutolabelRequest(
+        tuple(log), out, weights, config, depth, min_confidence, overwrite_labels, max_frames, instances
+    )
     with StopRequest() as stop, frame_progress("autolabel", None) as bar:
         report = autolabel_log(request, lambda: stop, bar.start, bar.set)
     found: dict[str, Any] = {
@@ -68,6 +79,8 @@ def autolabel(
         "damage": list(report.damage),
     }
     output.print(", ".join(found["files"]))
+    if instances is not None:
+        output.print(f"  things: {instances}")
     for name, text in autolabel_rows(found):
         output.print(f"  {name}: {text}")
     for what, lines in (("without a rendering", report.unlabelled), ("damaged, left out", report.damage)):

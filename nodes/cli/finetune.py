@@ -44,7 +44,10 @@ def finetune(
     from_scratch: Annotated[bool, typer.Option("--from-scratch", help="Start from random weights.")] = False,
     kind: Annotated[
         str | None,
-        typer.Option(help="Fit a field of this kind to the scene, from all frames; irt: classes, grid: none."),
+        typer.Option(
+            help="Fit a field of this kind to the scene, from all frames; irt: classes of keyframes, panoptic: of "
+            "boxes and pseudo labels, grid: none."
+        ),
     ] = None,
     frames: Annotated[
         str, typer.Option(metavar="N,N,...", help="Numbers of the labelled frames in the log, in place of --keyframes.")
@@ -56,6 +59,28 @@ def finetune(
     variant: Annotated[
         Literal["B", "BC", "RT", "RTT", "RTC", "RTTC"] | None,
         typer.Option(help="--kind irt: what reads the classes.  [default: BC]"),
+    ] = None,
+    boxes: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="--kind panoptic: boxes.json, the JSON of `query MAP instances`, or XML of KITTI-360.",
+        ),
+    ] = None,
+    pseudo: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR|WEIGHTS",
+            help="--kind panoptic: pseudo labels, a folder of NNNNNN.png or weights that make them; without it the "
+            "log's own label images, else the small weights in the package.",
+        ),
+    ] = None,
+    uncovered: Annotated[
+        Literal["stuff", "empty"] | None,
+        typer.Option(
+            help="--kind panoptic: what is outside of all boxes. stuff: classes that are no things, or that no box "
+            "has. empty: nothing.  [default: stuff]"
+        ),
     ] = None,
     depth: FinetuneDepthOption = None,
     labels: Annotated[
@@ -77,6 +102,7 @@ def finetune(
     Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors
     Example: semantic-mapper finetune kitchen.mcap --labels kitchen-labels --out kitchen.safetensors
     Example: semantic-mapper finetune kitchen.mcap --kind irt --keyframes 4 --out kitchen.safetensors
+    Example: semantic-mapper finetune yard.mcap --kind panoptic --boxes boxes.json --out yard.safetensors
     """
     if from_scratch and weights is not None:
         raise typer.BadParameter("goes with random weights only", param_hint="--weights")
@@ -84,7 +110,15 @@ def finetune(
         raise typer.BadParameter("starts from nothing; leave out --weights and --from-scratch", param_hint="--kind")
     if kind == "grid" and (frames or labels is not None):
         raise typer.BadParameter("a grid learns no classes", param_hint="--frames" if frames else "--labels")
-    if not frames and labels is None and (keyframes is None) != (kind == "grid"):
+    if kind == "panoptic" and (keyframes is not None or frames or labels is not None):
+        raise typer.BadParameter("learns from all frames' pseudo labels; give them with --pseudo", param_hint="--kind")
+    if (boxes is not None) != (kind == "panoptic"):
+        raise typer.BadParameter("--kind panoptic and --boxes FILE go together", param_hint="--boxes")
+    if (pseudo is not None or uncovered is not None) and kind != "panoptic":
+        raise typer.BadParameter(
+            "goes with --kind panoptic only", param_hint="--uncovered" if pseudo is None else "--pseudo"
+        )
+    if not frames and labels is None and (keyframes is None) != (kind in ("grid", "panoptic")):
         raise typer.BadParameter("how many labelled frames? Only --kind grid learns none", param_hint="--keyframes")
     if keyframes is not None and frames:
         raise typer.BadParameter("--frames already names the frames", param_hint="--keyframes")
@@ -116,7 +150,20 @@ def finetune(
     depths = mapper_config(None, None, depth=depth or "sensor", delay_frames=REPLAY_DELAY_FRAMES).depth
     most = MAX_SCENE_FRAMES if unlabelled is None else unlabelled
     request = FinetuneRequest(
-        log, keyframes or 0, out, settings, weights, from_scratch, depths, kind, labels, frame_numbers(frames), most
+        log,
+        keyframes or 0,
+        out,
+        settings,
+        weights,
+        from_scratch,
+        depths,
+        kind,
+        labels,
+        frame_numbers(frames),
+        most,
+        boxes,
+        pseudo,
+        uncovered or "stuff",
     )
     with StopRequest() as stop, frame_progress("finetune", None, unit="%") as bar:
         checkpoint, chosen = finetune_log(request, stop, bar)
@@ -143,8 +190,21 @@ def finetune(
             f"  a frame's own image counts {own['factor']:g} times among the views, "
             f"{own['factor_without_depth']:g} times where there is no depth"
         )
-    if kind == "irt":
+    if boxed := recipe.get("panoptic"):
+        output.print(
+            f"  {boxed['seen']} of {boxed['boxes']} boxes seen; pixels that meet one {_per_cent(boxed['covered'])}, "
+            f"with a surface in boxes of several classes {_per_cent(boxed['ambiguous'])}; pseudo labels "
+            f"({boxed['pseudo']}) of {boxed['labelled_frames']} of {boxed['frames']} frames, matched "
+            f"{_per_cent(boxed['matched'])}"
+        )
+        if boxed["moving"] or boxed["left_out"]:
+            output.print(f"  left out: {boxed['moving']} boxes that move, {boxed['left_out']} of no class")
+    if kind in ("irt", "panoptic"):
         output.print(f"  {out.stat().st_size / 1e6:.1f} MB that show the scene: as private as the recording")
     if stop:
         stderr_console().print(f"stopped by {stop.name}; the best weights so far are in {out}", style="yellow")
     return stop.exit_code
+
+
+def _per_cent(fraction: float) -> str:
+    return f"{100 * fraction:.1f} %"

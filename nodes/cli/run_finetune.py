@@ -18,13 +18,17 @@ from semantic_mapper.fields.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
+from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.panoptic import Panoptic
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.nodes.cli.console import FrameProgress
 from semantic_mapper.nodes.cli.outputs import prepare_file
+from semantic_mapper.nodes.cli.pseudo_labels import boxed_field, open_pseudo_labels, read_pseudo_labelled
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.autolabel_note import read_note
+from semantic_mapper.replay.boxes import BoxFile, load_boxes
 from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.log_depth import ComputedFrame, compute_depths
@@ -46,6 +50,7 @@ class FinetuneRequest:
     nothing; None = that of the weights. ``labels`` is a folder of label images in place of the log's. ``keyframes`` is
     0 for a kind that learns no classes, and for all frames that the folder has labels of. ``frames`` (numbers in the
     log) names the labelled frames instead. ``unlabelled``: how many others a kind of one scene uses at most, 0 = all.
+    ``boxes``, ``pseudo`` (folder or weights) and ``uncovered`` are of the kind "panoptic".
     """
 
     log: Path
@@ -59,6 +64,9 @@ class FinetuneRequest:
     labels: Path | None = None
     frames: Sequence[int] = ()
     unlabelled: int = MAX_SCENE_FRAMES
+    boxes: Path | None = None
+    pseudo: Path | None = None
+    uncovered: str = "stuff"
 
 
 def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress) -> tuple[Checkpoint, list[int]]:
@@ -75,6 +83,8 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
     if request.out.is_file() and request.out.suffix != ".safetensors":
         raise ConfigError(f"{request.out}: is there, and no weights file; give --out a name that ends in .safetensors")
     prepare_file(request.out)
+    if request.boxes is not None:
+        return _finetune_boxes(request, load_boxes(request.boxes), stop, bar), []
     # First, so that a wrong path does not cost the reading of a log.
     nothing = request.from_scratch or request.kind is not None
     start = None if nothing else load_checkpoint(request.weights or default_checkpoint_path())
@@ -102,6 +112,28 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
     seen = frozenset[int]() if start is None else start.train_stamps_ns
     if pseudo and note is not None:
         seen |= frozenset(note.train_stamps_ns)  # who learns from a teacher has learned from its keyframes
+    checkpoint = _fit(kind, frames, label_set, None if start is None else start.model, seen, request, stop, bar)
+    if pseudo:
+        checkpoint.recipe["pseudo_labels"] = {"keyframes": pseudo, "of": "" if note is None else note.weights}
+    save_checkpoint(checkpoint, request.out)
+    return checkpoint, chosen
+
+
+def _fit(
+    kind: str,
+    frames: list[PosedFrame],
+    label_set: LabelSet,
+    start: LearnedField | None,
+    seen: frozenset[int],
+    request: FinetuneRequest,
+    stop: StopRequest,
+    bar: FrameProgress,
+) -> Checkpoint:
+    """Fit, with progress.
+
+    Raises:
+        KeyboardInterrupt: a stop request came before anything was learned: no reason to touch the file.
+    """
     bar.start(100)
 
     def on_progress(progress: FinetuneProgress) -> None:
@@ -112,22 +144,41 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
             note += f" accuracy {progress.held_out_accuracy * 100:.1f} %"
         bar.set(int(progress.fraction * 100), note)
 
-    checkpoint = fitter_of(kind)(
-        frames,
-        label_set,
-        None if start is None else start.model,
-        request.config,
-        on_progress,
-        lambda: stop,
-        seen,
-    )
-    if stop and not checkpoint.recipe["steps"]:  # nothing learned: no reason to touch the file
+    checkpoint = fitter_of(kind)(frames, label_set, start, request.config, on_progress, lambda: stop, seen)
+    if stop and not checkpoint.recipe["steps"]:
         raise KeyboardInterrupt
     checkpoint.recipe["source"] = request.log.name
-    if pseudo:
-        checkpoint.recipe["pseudo_labels"] = {"keyframes": pseudo, "of": "" if note is None else note.weights}
+    return checkpoint
+
+
+def _finetune_boxes(request: FinetuneRequest, boxes: BoxFile, stop: StopRequest, bar: FrameProgress) -> Checkpoint:
+    """Fit a field of kind "panoptic" and write the weights.
+
+    Raises:
+        LogError, LabelError, FrameError, WeightsError, ConfigError: with what is wrong and the mend.
+    """
+    assert request.boxes is not None
+    with open_log(request.log) as log:
+        labels = open_pseudo_labels(log, request.pseudo)
+        start, moving = boxed_field(boxes, request.boxes, labels.label_set, request.uncovered)
+        computed = _compute_depths(log, request.depth, stop, bar)
+        frames = read_pseudo_labelled(
+            log,
+            labels,
+            lambda frame: _as_given(frame, computed, request.depth),
+            request.unlabelled,
+            request.config.width,
+            stop,
+            bar,
+        )
+        note = read_note(log.attachments())
+    seen = labels.train_stamps_ns
+    if note is not None and any(f.label_is_pseudo for f in frames):
+        seen |= frozenset(note.train_stamps_ns)
+    checkpoint = _fit(Panoptic.kind, frames, labels.label_set, start, seen, request, stop, bar)
+    checkpoint.recipe["panoptic"] |= {"moving": moving, "left_out": boxes.left_out, "pseudo": labels.source}
     save_checkpoint(checkpoint, request.out)
-    return checkpoint, chosen
+    return checkpoint
 
 
 def _named(

@@ -13,6 +13,7 @@ from semantic_mapper.config import (
     IRTConfig,
     MVSNeRFConfig,
     NeuRayConfig,
+    PanopticConfig,
     SamplingConfig,
     SemanticNeRFConfig,
     SRayConfig,
@@ -32,6 +33,7 @@ KINDS: dict[str, tuple[type[Config], str, str]] = {
     "semantic_nerf": (SemanticNeRFConfig, "semantic_mapper.fields.peers.semantic_nerf", "SemanticNeRF"),
     "grid": (GridFieldConfig, "semantic_mapper.fields.grid.field", "GridField"),
     "irt": (IRTConfig, "semantic_mapper.fields.irt", "IRT"),
+    "panoptic": (PanopticConfig, "semantic_mapper.fields.panoptic", "Panoptic"),
 }
 
 # A name for some switches of a kind. The field built is of that kind, and so is its checkpoint: the switches are part

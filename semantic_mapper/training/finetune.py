@@ -82,6 +82,17 @@ class IRTFitConfig(Config, frozen=True):
     )
 
 
+class PanopticFitConfig(Config, frozen=True):
+    """How a Panoptic NeRF learns beyond its geometry (``panoptic.fit_panoptic``); 0 leaves a loss out."""
+
+    rays: AtLeastOne = 1024  # a step
+    semantics: AtLeastZero = 0.05  # weight of all that follows, against the colours'
+    fixed: AtLeastZero = 1.0  # of pseudo labels against what boxes say (Eq. 5): moves density
+    learned: AtLeastZero = 1.0  # of pseudo labels against what is learned (Eq. 6)
+    points: AtLeastZero = 1.0  # of what is learned at points against what boxes say there (Eq. 6)
+    depth: AtLeastZero = 0.1  # of rendered depth against the frames', apart from ``semantics``
+
+
 class FinetuneConfig(Config, frozen=True):
     """Budget and optimiser of a finetuning."""
 
@@ -122,6 +133,7 @@ class FinetuneConfig(Config, frozen=True):
     step: StepConfig = StepConfig()
     grid: GridFitConfig = GridFitConfig()  # of kinds that stand on a scene grid (``scene_fit``)
     irt: IRTFitConfig = IRTFitConfig()
+    panoptic: PanopticFitConfig = PanopticFitConfig()
 
 
 @dataclass(frozen=True, slots=True)

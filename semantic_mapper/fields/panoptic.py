@@ -1,0 +1,239 @@
+"""Panoptic NeRF (Fu et al. 2022): coarse boxes and noisy label images become classes and instances of every view.
+
+Two semantic fields stand on one scene grid. The fixed one says what the boxes at a point say; through it, label images
+move the density. The learned one is a head on the grid's features; it decides where boxes overlap or end. Which thing a
+point is, the boxes say.
+"""
+
+from __future__ import annotations
+
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import nn
+
+from semantic_mapper.config import BoxConfig, PanopticConfig, SamplingConfig
+from semantic_mapper.errors import LabelError
+from semantic_mapper.fields.base import EncodedViews
+from semantic_mapper.fields.grid.field import GridField, RaySamples
+from semantic_mapper.fields.irt import at_measured
+from semantic_mapper.fields.nerf_math import relu_layers
+from semantic_mapper.fields.primitives import Intervals, Primitive, PrimitiveSet
+from semantic_mapper.labels import STUFF_NAMES, LabelSet
+from semantic_mapper.types import Int64, RayBatch
+
+LEAST = 1e-6  # of a rendered probability
+SKY = "sky"  # class of light that leaves the grid, where the label set has it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoxesOnRays:
+    """What boxes hold the K samples of R rays.
+
+    Args:
+        box: (R, K, M) bool, whether the sample is in the interval.
+        index: (R, M) int64 number of the box of each interval, -1 = none.
+        classes: (R, K, L) what the boxes allow: 0 or 1.
+        on_ray: (R, L) bool, classes that are anywhere on the ray.
+    """
+
+    box: torch.Tensor
+    index: torch.Tensor
+    classes: torch.Tensor
+    on_ray: torch.Tensor
+
+    @property
+    def fixed(self) -> torch.Tensor:
+        """The fixed field (R, K, L): equal shares of what is allowed."""
+        return self.classes / self.classes.sum(-1, keepdim=True).clamp_min(1)
+
+    @property
+    def covered(self) -> torch.Tensor:
+        """Whether samples (R, K) are in any box."""
+        return self.box.any(-1)
+
+
+class Panoptic(GridField):
+    """Classes and instances of one scene from its boxes, its geometry and what label images taught.
+
+    Args:
+        config: The grid's box, sizes, and the boxes; those that move are left out.
+        label_set: Classes of the logits.
+        sampling: As of ``GridField``.
+
+    Raises:
+        LabelError: a box of a class that the label set lacks.
+    """
+
+    kind = "panoptic"
+    class_rows = ("classifier.weight", "classifier.bias")
+
+    def __init__(self, config: PanopticConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
+        super().__init__(config, label_set, sampling)
+        self.shape = config
+        self.primitives = PrimitiveSet([primitive_of(b) for b in config.boxes])
+        channel = {name: i for i, name in enumerate(label_set.names)}
+        self.channel_of_box = torch.tensor([_channel(channel, b.class_name) for b in config.boxes], dtype=torch.long)
+        self.thing = torch.tensor([b.thing for b in config.boxes], dtype=torch.bool)
+        self.sky = channel.get(SKY)
+        self.outside = torch.tensor(self._allowed_outside(label_set), dtype=torch.float32)
+        self.head = relu_layers(config.trunk_width, config.head_width, 1)
+        self.classifier = nn.Linear(config.head_width, len(label_set))
+
+    def classify(self, samples: RaySamples, sources: EncodedViews) -> tuple[torch.Tensor, torch.Tensor]:
+        """Log probabilities (R, L), and where they are known (R,): where a ray meets something, or sees the sky.
+
+        A ray whose depth was measured ends there.
+        """
+        samples = at_measured(samples, self.grid.config)
+        boxes = self.boxes_on(samples)
+        points = boxes.fixed if self.shape.classes == "fixed" else self.learned(samples)
+        rendered = self.composited(samples, points)
+        sky = (rendered.argmax(1) == self.sky) if self.sky is not None else torch.zeros_like(rendered[:, 0]).bool()
+        return torch.log(rendered.clamp_min(LEAST)), self.known(samples) | (sky & self.fitted)
+
+    def learned(self, samples: RaySamples, r: torch.Tensor | None = None) -> torch.Tensor:
+        """The learned field (R, K, L) at samples; ``r`` (R, K, W) is what the trunk says there, if it is known."""
+        assert self.trunk is not None
+        r = self.trunk(samples.points) if r is None else r
+        return torch.softmax(self.classifier(self.head(r)), -1)
+
+    def composited(self, samples: RaySamples, points: torch.Tensor) -> torch.Tensor:
+        """Probabilities (R, L) of rays, of those of points (R, K, L); what gets through is sky, if that is a class."""
+        rendered = (ray_share(samples)[..., None] * points).sum(1)
+        if self.sky is None:
+            return rendered
+        light = torch.zeros_like(rendered)
+        light[:, self.sky] = samples.light
+        return rendered + light
+
+    def boxes_on(self, samples: RaySamples) -> BoxesOnRays:
+        """What boxes hold samples."""
+        found = trimmed(self.primitives.intervals(samples.rays))
+        inside = found.inside(samples.z.detach())
+        none, classes = found.index < 0, len(self.label_set)
+        channel = torch.where(none, classes, self._channels(found.index))
+        allowed = torch.zeros(*samples.z.shape, classes + 1)
+        allowed.scatter_add_(2, channel[:, None].expand(inside.shape), inside.float())
+        allowed = (allowed[..., :classes] > 0).float()
+        on_ray = torch.zeros(len(channel), classes + 1, dtype=torch.bool).scatter_(1, channel, value=True)[:, :classes]
+        if self.shape.uncovered == "stuff":
+            outside = ~inside.any(-1)
+            allowed = torch.where(outside[..., None], self.outside, allowed)
+            on_ray = on_ray | (self.outside > 0)
+        if self.sky is not None:
+            on_ray = on_ray.index_fill(1, torch.tensor([self.sky]), True)
+        return BoxesOnRays(inside, found.index, allowed, on_ray)
+
+    def instances(self, rays: RayBatch, label: torch.Tensor) -> torch.Tensor:
+        """Which thing rays (R,) see (Eq. 8): ids (R,) of boxes of the class (R,), a channel; 0 where there is none.
+
+        Where boxes of one class overlap, a point is of the one whose centre is nearer.
+        """
+        samples = at_measured(self.march(rays), self.grid.config)
+        boxes = self.boxes_on(samples)
+        none = boxes.index < 0
+        index = boxes.index.clamp_min(0)
+        if not len(self.primitives):
+            return torch.zeros_like(label)
+        fits = self.thing[index] & (self._channels(boxes.index) == label[:, None]) & ~none
+        inside = boxes.box & fits[:, None]
+        centre = torch.tensor(np.stack([p.T_world_box[:3, 3] for p in self.primitives.primitives]), dtype=torch.float32)
+        xyz = rays.origin[:, None] + samples.z[..., None] * rays.direction[:, None]
+        away = (xyz[:, :, None] - centre[index][:, None]).norm(dim=-1).masked_fill(~inside, torch.inf)
+        nearest = torch.zeros_like(inside).scatter_(2, away.argmin(-1, keepdim=True), value=True) & inside
+        weight = (ray_share(samples)[..., None] * nearest).sum(1)  # R M
+        by_box = torch.zeros(len(label), len(self.primitives)).scatter_add_(1, index, weight)
+        most, box = by_box.max(1)
+        ids = torch.tensor([b.id for b in self.shape.boxes])
+        return torch.where(most > 0, ids[box], 0)
+
+    def solid(self) -> torch.Tensor:
+        """Vertices of the grid (X, Y, Z) that are in a box or next to one that is: where density may be."""
+        grid = self.grid.config
+        x, y = torch.meshgrid(*(torch.arange(float(n)) for n in grid.shape[:2]), indexing="ij")
+        start = torch.stack((x, y, torch.full_like(x, -1.0)), -1).view(-1, 3)
+        origin = start * grid.voxel_m + torch.tensor(grid.origin_m)
+        up = torch.tensor((0.0, 0.0, grid.voxel_m)).expand(len(origin), 3)
+        nothing = torch.zeros(len(origin))
+        found = trimmed(self.primitives.intervals(RayBatch(origin, up, nothing, nothing + torch.inf, nothing)))
+        z = torch.arange(float(grid.shape[2])) + 1
+        inside = found.inside(z.expand(len(origin), -1)).any(-1).view(grid.shape)
+        grown = nn.functional.max_pool3d(inside[None, None].float(), 3, 1, 1)[0, 0]
+        return grown > 0
+
+    def _channels(self, index: torch.Tensor) -> torch.Tensor:
+        return self.channel_of_box[index.clamp_min(0)] if len(self.channel_of_box) else torch.zeros_like(index)
+
+    def _allowed_outside(self, label_set: LabelSet) -> list[bool]:
+        named = {b.class_name for b in self.shape.boxes}
+        return [n != SKY and (n in STUFF_NAMES or n not in named) for n in label_set.names]
+
+
+def ray_share(samples: RaySamples) -> torch.Tensor:
+    """What samples (R, K) count, as if none had been left out."""
+    return samples.weight * (samples.opacity / samples.weight.sum(1).clamp_min(1e-6))[:, None]
+
+
+def trimmed(found: Intervals) -> Intervals:
+    """Without columns that no ray needs; one at least."""
+    most = max(int((found.index >= 0).sum(1).max()) if len(found.index) else 0, 1)
+    return replace(found, enter=found.enter[:, :most], leave=found.leave[:, :most], index=found.index[:, :most])
+
+
+def merged_classes(label_set: LabelSet, merge: Mapping[str, Sequence[str]]) -> torch.Tensor:
+    """(L, L) which classes (columns) a pseudo label (rows) may stand for."""
+    group = torch.eye(len(label_set))
+    for name, others in merge.items():
+        for other in others:
+            group[label_set.names.index(name), label_set.names.index(other)] = 1
+    return group
+
+
+def box_config(primitive: Primitive) -> BoxConfig:
+    """A primitive as a field keeps it."""
+
+    def rows(array: np.ndarray | None) -> tuple[tuple[float, ...], ...] | None:
+        return None if array is None else tuple(map(tuple, array.tolist()))
+
+    return BoxConfig(
+        id=primitive.id,
+        class_name=primitive.class_name,
+        shape=primitive.shape,
+        T_world_box=rows(primitive.T_world_box),  # type: ignore[arg-type]
+        size=tuple(primitive.size.tolist()),
+        thing=primitive.thing,
+        polygon=rows(primitive.polygon),  # type: ignore[arg-type]
+        vertices=rows(primitive.vertices),  # type: ignore[arg-type]
+        faces=rows(primitive.faces),  # type: ignore[arg-type]
+    )
+
+
+def primitive_of(box: BoxConfig) -> Primitive:
+    """The primitive that a field keeps."""
+
+    def floats(value: object) -> np.ndarray | None:
+        return None if value is None else np.array(value, np.float64)
+
+    faces: Int64 | None = None if box.faces is None else np.array(box.faces, np.int64)
+    return Primitive(
+        id=box.id,
+        class_name=box.class_name,
+        shape=box.shape,
+        T_world_box=np.array(box.T_world_box, np.float64),
+        size=np.array(box.size, np.float64),
+        thing=box.thing,
+        polygon=floats(box.polygon),
+        vertices=floats(box.vertices),
+        faces=faces,
+    )
+
+
+def _channel(channels: Mapping[str, int], name: str) -> int:
+    if name not in channels:
+        raise LabelError(f"a box is of class '{name}', which the label set lacks; it has {', '.join(channels)}")
+    return channels[name]

@@ -1,0 +1,374 @@
+"""Fit a Panoptic NeRF to one scene: geometry first, then density, colours and classes together, guided by boxes."""
+
+from __future__ import annotations
+
+# torch leaves parts of its interface untyped.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import msgspec
+import numpy as np
+import torch
+from torch.nn import functional
+
+from semantic_mapper.errors import ConfigError, FrameError, WeightsError
+from semantic_mapper.fields.checkpoint import Checkpoint
+from semantic_mapper.fields.grid.field import RaySamples
+from semantic_mapper.fields.grid.kernels import adam_grid
+from semantic_mapper.fields.grid.scene_grid import NOTHING
+from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.panoptic import BoxesOnRays, Panoptic, merged_classes, ray_share
+from semantic_mapper.imaging import resize_label
+from semantic_mapper.labels import LabelSet
+from semantic_mapper.log_events import get_logger
+from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, PanopticFitConfig
+from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
+from semantic_mapper.training.grid_fit import BETA1, BETA2, GridFit, GridFitProgress, fit_grid, view_fraction
+from semantic_mapper.training.scene_fit import (
+    FEATURE_RATE,
+    TRUNK_RATE,
+    FittedGeometry,
+    grid_settings,
+    scene_checkpoint,
+)
+from semantic_mapper.training.schedule import budget_fraction
+from semantic_mapper.types import PosedFrame
+
+GRID_UNTIL = 0.35  # fraction of the time for geometry and colours alone
+SAMPLES = 8  # of a ray, those of greatest weight
+DENSITY_RATE = 0.05
+FINAL_RATE = 0.1  # what is left of all rates in the end
+LEAST = 1e-4  # of the probability that a pseudo label has: below, it has no gradient
+POINT_WEIGHT = 0.05  # from which on a sample says what is there
+DEPTH_REACH = 0.05  # 1 / m, of inverse depth: a larger error counts linearly
+SURVEYED = 20000  # rays that say how much of the images boxes cover
+FEW_COVERED = 0.01  # fraction of pixels that meet a box, below which the log is warned about
+FORGET = 50  # steps between two looks at which cells are empty
+_log = get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PseudoRays:
+    """All pixels of F frames with their pseudo labels.
+
+    Args:
+        rays: Of the frames.
+        channel: (P,) int64, -1 = none.
+        gain: (F, 3) exposure of the frames.
+    """
+
+    rays: FrameRays
+    channel: torch.Tensor
+    gain: torch.Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What boxes and pseudo labels have to do with each other.
+
+    Args:
+        boxes: That stand still.
+        seen: Of these, boxes that any surveyed ray meets.
+        covered: Fraction of pixels whose ray meets a box.
+        matched: Fraction of pixels with a pseudo label whose class is possible on their ray.
+        ambiguous: Fraction of pixels whose surface is in boxes of several classes.
+    """
+
+    boxes: int
+    seen: int
+    covered: float
+    matched: float
+    ambiguous: float = math.nan
+
+
+def fit_panoptic(
+    frames: Sequence[PosedFrame],
+    label_set: LabelSet,
+    start: LearnedField | None,
+    config: FinetuneConfig,
+    on_progress: Callable[[FinetuneProgress], None] | None = None,
+    stopped: Callable[[], object] = bool,
+    seen_stamps_ns: Iterable[int] = (),
+) -> Checkpoint:
+    """Fit a ``Panoptic``.
+
+    Args:
+        frames: With poses; their label images are the pseudo labels.
+        label_set: Of these and of the boxes.
+        start: A ``Panoptic`` with the boxes; its weights are not looked at.
+        config: ``seconds`` bounds the whole fit. ``steps``, if not 0, is the number of steps of each of its two parts.
+        on_progress: Called after every step.
+        stopped: Asked before every step; once it says so (anything true), the field so far is the result.
+        seen_stamps_ns: Frames whose true labels those who made the pseudo labels have learned from.
+
+    Raises:
+        ConfigError: no boxes, none of them in view, no class in common with the pseudo labels, or no budget.
+        FrameError: no pseudo label, or what ``fit_grid`` refuses.
+        WeightsError: ``start`` has other classes.
+    """
+    if config.seconds <= 0 and config.steps <= 0:
+        raise ConfigError("a fit needs a budget: set seconds, steps, or both")
+    if not isinstance(start, Panoptic) or not start.shape.boxes:
+        raise ConfigError("a field of kind 'panoptic' needs boxes that stand still; give a file of them (--boxes)")
+    if start.label_set != label_set:
+        raise WeightsError(f"the boxes are of label set '{start.label_set.name}', the labels of '{label_set.name}'")
+    began = time.monotonic()
+    usable = usable_frames(frames)
+    everything = pseudo_rays(usable, label_set, config.width)
+    survey = survey_boxes(start, everything, config)
+    fit = _fit_grid(frames, start, config, on_progress, stopped)
+    shape = msgspec.structs.replace(start.shape, grid=fit.grid.config)
+    torch.manual_seed(config.seed)
+    field = Panoptic(shape, label_set)
+    field.grid.load_state_dict(fit.grid.state_dict())
+    field.fitted_steps += fit.steps
+    data = replace(pseudo_rays(fit.frames, label_set, config.width), gain=torch.from_numpy(fit.gains))
+    joint = JointFit(field, data, config)
+    joint.run(began, on_progress, stopped)
+    survey = replace(survey, ambiguous=ambiguous_fraction(field, everything, config))
+    taught = [f for f in usable if f.label is not None and not f.label_is_pseudo]
+    geometry = FittedGeometry(field, fit)
+    checkpoint = scene_checkpoint(geometry, config, time.monotonic() - began, seen_stamps_ns, taught)
+    figures: dict[str, Any] = {name: getattr(survey, name) for name in ("boxes", "seen")}
+    figures |= {name: round(getattr(survey, name), 4) for name in ("covered", "matched", "ambiguous")}
+    figures["labelled_frames"] = sum(f.label is not None for f in usable)
+    figures["frames"] = len(usable)
+    recipe = checkpoint.recipe | {"grid_steps": fit.steps, "steps": joint.step, "panoptic": figures}
+    return Checkpoint(checkpoint.model, (), recipe)
+
+
+def pseudo_rays(frames: Sequence[PosedFrame], label_set: LabelSet, width: int) -> PseudoRays:
+    """The pixels of frames with their label images.
+
+    Raises:
+        FrameError: no frame has one.
+    """
+    rays = frame_rays(frames, width)
+    if all(f.label is None for f in frames):
+        raise FrameError("no frame has a pseudo label; give a folder of them or weights that make some (--pseudo)")
+    channel = [
+        np.full(k.width * k.height, -1)
+        if f.label is None
+        else label_set.to_channels(resize_label(f.label, k), f"frame seq={f.seq}").ravel()
+        for f, k in zip(frames, rays.intrinsics, strict=True)
+    ]
+    return PseudoRays(rays, torch.from_numpy(np.concatenate(channel)).long(), torch.ones(len(frames), 3))
+
+
+def survey_boxes(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> Survey:
+    """How many pixels meet boxes.
+
+    Raises:
+        ConfigError: no pixel does, or boxes and pseudo labels have no class in common.
+    """
+    pixels = _some_pixels(data, config.seed)
+    rays = data.rays.rays(pixels, config.grid.near_m)
+    found = field.primitives.intervals(rays)
+    covered = (found.count > 0).float().mean().item()
+    names = field.label_set.names
+    if covered == 0:
+        low, high = field.primitives.meshes.low.min(0), field.primitives.meshes.high.max(0)
+        cameras = data.rays.T_world_camera[:, :3, 3]
+        raise ConfigError(
+            f"no box is in view of any frame: boxes lie from {_metres(low)} to {_metres(high)}, cameras from "
+            f"{_metres(cameras.min(0))} to {_metres(cameras.max(0))}. Are the boxes in the log's world frame?"
+        )
+    if covered < FEW_COVERED:
+        _log.warning("few_boxes_in_view", covered=round(covered, 4), reason="are they in the log's world frame?")
+    group = merged_classes(field.label_set, field.shape.merge)
+    said = data.channel[data.channel >= 0].unique()
+    boxed = field.channel_of_box.unique()
+    if not (group[said][:, boxed] > 0).any():
+        raise ConfigError(
+            f"pseudo labels and boxes have no class in common: labels say {', '.join(names[i] for i in said)}, boxes "
+            f"{', '.join(names[i] for i in boxed)}. `merge` of boxes.json says which stand for others"
+        )
+    channel = data.channel[torch.from_numpy(pixels)]
+    none = torch.zeros(len(pixels), 1)
+    boxes = field.boxes_on(RaySamples(rays, none[..., None].expand(-1, 1, 3), none, none, none[:, 0]))
+    matched = possible(boxes, group, channel)[channel >= 0].float().mean().item()
+    return Survey(len(field.primitives), len(found.index[found.index >= 0].unique()), covered, matched)
+
+
+def ambiguous_fraction(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> float:
+    """Fraction of pixels whose surface is in boxes of more than one class."""
+    rays = data.rays.rays(_some_pixels(data, config.seed), config.grid.near_m)
+    with torch.no_grad():
+        samples = field.march(rays, 1)
+        boxes = field.boxes_on(samples)
+        several = boxes.covered[:, 0] & (boxes.classes[:, 0].sum(-1) > 1)
+    return float((several & (samples.opacity > 0.5)).float().mean())
+
+
+def possible(boxes: BoxesOnRays, group: torch.Tensor, channel: torch.Tensor) -> torch.Tensor:
+    """u(r) (R,): whether what a pseudo label (R,) may stand for is anywhere on the ray; False without a label."""
+    return ((group[channel.clamp_min(0)] > 0) & boxes.on_ray).any(1) & (channel >= 0)
+
+
+def semantic_losses(
+    field: Panoptic,
+    samples: RaySamples,
+    boxes: BoxesOnRays,
+    learned: torch.Tensor,
+    channel: torch.Tensor,
+    group: torch.Tensor,
+    weights: PanopticFitConfig,
+) -> torch.Tensor:
+    """Eq. 5 and 6: the pseudo labels against the fixed field and the learned one, and this one against the boxes.
+
+    Args:
+        samples: R rays; weights differentiable by the density.
+        boxes: What holds them.
+        learned: (R, K, L) the learned field.
+        channel: (R,) pseudo labels, -1 = none.
+        group: (L, L) of ``merged_classes``.
+        weights: Of the three terms.
+    """
+    there = channel >= 0
+    stands_for = group[channel.clamp_min(0)]
+    count = there.sum().clamp_min(1)
+    fixed = (field.composited(samples, boxes.fixed) * stands_for).sum(1)
+    seen = (field.composited(samples, learned) * stands_for).sum(1)
+    by_fixed = -(torch.log(fixed.clamp_min(LEAST)) * there).sum() / count
+    by_learned = -(torch.log(seen.clamp_min(LEAST)) * possible(boxes, group, channel)).sum() / count
+    # Where one class is allowed this is the paper's cross-entropy; where there are several, one of them has to be it.
+    allowed = (learned * boxes.classes).sum(-1)
+    surface = (samples.weight.detach() > POINT_WEIGHT) & (boxes.classes.sum(-1) > 0)
+    by_points = -(torch.log(allowed.clamp_min(LEAST)) * surface).sum() / surface.sum().clamp_min(1)
+    return weights.fixed * by_fixed + weights.learned * by_learned + weights.points * by_points
+
+
+class JointFit:
+    """The second part of a fit: density, features, colours and classes from one batch of rays a step."""
+
+    def __init__(self, field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> None:
+        self.field, self.data, self.config = field, data, config
+        self.rng = np.random.default_rng(config.seed)
+        self.group = merged_classes(field.label_set, field.shape.merge)
+        assert field.trunk is not None
+        networks = [p for name, p in field.trunk.named_parameters() if name != "features"]
+        networks += [*field.head.parameters(), *field.classifier.parameters()]
+        groups = [{"params": [field.trunk.features], "lr": FEATURE_RATE}, {"params": networks, "lr": TRUNK_RATE}]
+        self.optimiser = torch.optim.Adam(groups)
+        self.rates = [FEATURE_RATE, TRUNK_RATE]
+        field.grid.values.requires_grad_(True)
+        values = field.grid.values.detach().numpy()
+        self.first, self.second = np.zeros_like(values), np.zeros_like(values)
+        self.rate = view_fraction(data.rays, field.grid.config, config.grid.near_m)
+        self.solid = field.solid() if field.shape.uncovered == "empty" else None
+        self.step = 0
+        self._forget()
+
+    def run(
+        self, began: float, on_progress: Callable[[FinetuneProgress], None] | None, stopped: Callable[[], object]
+    ) -> None:
+        """Learn until the budget is spent."""
+        first, fraction = time.monotonic(), 0.0
+        seconds = self.config.seconds
+        left = max(seconds - (first - began), 0.05 * seconds)
+        while fraction < 1 and not stopped():
+            loss = self.learn(fraction)
+            fraction = budget_fraction(self.step, time.monotonic() - first, steps=self.config.steps, seconds=left)
+            if on_progress is not None:
+                told = GRID_UNTIL + (1 - GRID_UNTIL) * min(fraction, 1.0)
+                on_progress(FinetuneProgress(self.step, told, loss, math.nan, math.nan, False))
+        self._forget()
+        self.field.grid.values.requires_grad_(False)
+        self.field.eval()
+
+    def learn(self, fraction: float) -> float:
+        """One step at a fraction of the budget; returns the loss."""
+        field, config = self.field, self.config
+        left = FINAL_RATE**fraction
+        for group, rate in zip(self.optimiser.param_groups, self.rates, strict=True):
+            group["lr"] = rate * left
+        pixels = self.rng.integers(0, len(self.data.rays), config.panoptic.rays)
+        batch = self.data.rays.rays(pixels, config.grid.near_m)
+        samples = field.march(batch, SAMPLES, torch.from_numpy(self.rng.random(len(pixels), np.float32)))
+        assert field.trunk is not None
+        r = field.trunk(samples.points)
+        share = ray_share(samples)
+        behind = field.grid.sky_colour(batch.direction) * samples.light[:, None]
+        colour = (share[..., None] * field.trunk.colour(r, batch.direction)).sum(1) + behind
+        gain = self.data.gain[torch.from_numpy(self.data.rays.frame_of(pixels))]
+        truth = torch.from_numpy(self.data.rays.rgb[pixels] / np.float32(255))
+        loss = functional.mse_loss(gain * colour, truth)
+        loss = loss + config.panoptic.depth * self._depth_loss(samples, share, pixels)
+        channel = self.data.channel[torch.from_numpy(pixels)]
+        boxes = field.boxes_on(samples)
+        learned = field.learned(samples, r)
+        semantics = semantic_losses(field, samples, boxes, learned, channel, self.group, config.panoptic)
+        loss = loss + config.panoptic.semantics * semantics
+        self.optimiser.zero_grad()
+        field.grid.values.grad = None
+        loss.backward()
+        self.optimiser.step()
+        self._step_density(DENSITY_RATE * left)
+        return float(loss.detach())
+
+    def _depth_loss(self, samples: RaySamples, share: torch.Tensor, pixels: np.ndarray) -> torch.Tensor:
+        """Huber of inverse depth, where depth is known, in units of its reach."""
+        measured = torch.from_numpy(self.data.rays.depth_m[pixels])
+        known = (measured > 0) & (samples.opacity.detach() > 0.5)
+        z = (share * samples.z).sum(1) / samples.opacity.clamp_min(1e-6)
+        error = (1 / z.clamp_min(1e-3) - 1 / measured.clamp_min(1e-3)) / DEPTH_REACH
+        return (functional.huber_loss(error, torch.zeros_like(error), reduction="none") * known).mean()
+
+    def _step_density(self, rate: float) -> None:
+        self.step += 1
+        grid = self.field.grid
+        gradient = grid.values.grad
+        assert gradient is not None
+        adam_grid(
+            len(self.rate),
+            grid.values.detach().numpy(),
+            gradient.contiguous().numpy(),
+            self.first,
+            self.second,
+            self.rate,
+            rate,
+            0.0,
+            BETA1,
+            BETA2,
+            1 - BETA1**self.step,
+            1 - BETA2**self.step,
+        )
+        if self.step % FORGET == 0:
+            self._forget()
+
+    def _forget(self) -> None:
+        """Empty what lies outside of all boxes, where nothing may be there, and find the cells that rays may skip."""
+        with torch.no_grad():
+            if self.solid is not None:
+                self.field.grid.values[..., 0].masked_fill_(~self.solid, NOTHING)
+            self.field.grid.update_occupied()
+
+
+def _fit_grid(
+    frames: Sequence[PosedFrame],
+    start: Panoptic,
+    config: FinetuneConfig,
+    on_progress: Callable[[FinetuneProgress], None] | None,
+    stopped: Callable[[], object],
+) -> GridFit:
+    """Geometry and colours of all frames."""
+    box = start.shape.grid if start.fitted and config.grid.box_m is None else None
+    settings = msgspec.structs.replace(grid_settings(config), seconds=GRID_UNTIL * config.seconds)
+
+    def tell(p: GridFitProgress) -> None:
+        if on_progress is not None:
+            on_progress(FinetuneProgress(p.step, GRID_UNTIL * p.fraction, p.loss, math.nan, math.nan, False))
+
+    return fit_grid(frames, settings, tell, stopped, box)
+
+
+def _some_pixels(data: PseudoRays, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, len(data.rays), SURVEYED)
+
+
+def _metres(xyz: np.ndarray) -> str:
+    return "(" + ", ".join(f"{x:.2f}" for x in xyz) + ") m"

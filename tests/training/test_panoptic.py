@@ -1,0 +1,221 @@
+"""Panoptic NeRF: what boxes and pseudo labels teach, what they do not, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from semantic_mapper.config import BoxConfig, GridConfig, PanopticConfig
+from semantic_mapper.errors import ConfigError, FrameError, LabelError, WeightsError
+from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.panoptic import Panoptic, box_config, merged_classes, primitive_of
+from semantic_mapper.fields.primitives import Primitive
+from semantic_mapper.fields.source_maps import encoded_views
+from semantic_mapper.labels import make_label_set
+from semantic_mapper.training.finetune import FinetuneConfig, PanopticFitConfig
+from semantic_mapper.training.fitters import fitter_of
+from semantic_mapper.training.frame_rays import frame_rays
+from semantic_mapper.training.grid_fit import GridFitConfig
+from semantic_mapper.training.panoptic import fit_panoptic, semantic_losses
+from semantic_mapper.training.views import stack_sources, view_from_frame
+from semantic_mapper.types import PosedFrame, RayBatch
+from tests.training.test_irt import two_planes
+
+SET = make_label_set("deck", ["floor", "table", "lamp", "sky"])
+FLOOR, TABLE, LAMP = 0, 1, 2
+SMALL = FinetuneConfig(
+    seconds=0,
+    steps=60,
+    width=64,
+    device="cpu",
+    grid=GridFitConfig(long_side=40, rays=512, held_out=0, exposure=False),
+    panoptic=PanopticFitConfig(rays=256),
+)
+
+
+def box(number: int, name: str, centre: tuple[float, float, float], size: tuple[float, float, float]) -> BoxConfig:
+    T = np.eye(4)
+    T[:3, 3] = centre
+    return box_config(Primitive(number, name, "box", T, np.array(size), thing=name != "floor"))
+
+
+# The deck is flat at 0.8 m; the box is coarse, as people draw them.
+DECK = box(7, "table", (0.8, 0.0, 0.75), (1.7, 1.7, 0.5))
+
+
+@cache
+def scene(labelled: bool = True) -> tuple[PosedFrame, ...]:
+    """Views of a deck above the ground, with pseudo labels: half of the left side of each is called a lamp."""
+    frames: list[PosedFrame] = []
+    for n, azimuth in enumerate(np.linspace(0, 2 * np.pi, 8, endpoint=False)):
+        frame = two_planes(azimuth, n, label=True)
+        assert frame.label is not None
+        label = np.where(frame.label == 2, SET.ids[TABLE], SET.ids[FLOOR]).astype(np.uint8)
+        label[::2, :20] = SET.ids[LAMP]
+        frames.append(replace(frame, label=label if labelled else None, label_is_pseudo=labelled))
+    return tuple(frames)
+
+
+def empty_field(*boxes: BoxConfig, **changes: object) -> Panoptic:
+    grid = GridConfig(origin_m=(-2.0, -2.0, -0.5), voxel_m=0.1, shape=(41, 41, 31))
+    return Panoptic(msgspec.structs.replace(PanopticConfig(grid=grid, boxes=boxes), **changes), SET)
+
+
+@cache
+def fitted() -> Checkpoint:
+    return fitter_of("panoptic")(scene(), SET, empty_field(DECK), SMALL)
+
+
+def answers(field: Panoptic, frame: PosedFrame) -> tuple[torch.Tensor, RayBatch]:
+    """Channels of all pixels of a frame, and their rays."""
+    rays = frame_rays([frame], 64)
+    batch = rays.rays(rays.pixels_of(0), 0.1)
+    views = stack_sources([view_from_frame(replace(frame, label=None), SET, 64)])
+    with torch.no_grad():
+        render = field.render(batch, encoded_views(views, views.rgb[:, :0]))
+    return torch.where(render.known, render.logits.argmax(1), -1), batch
+
+
+def test_boxes_outvote_wrong_labels_and_tell_which_thing_it_is() -> None:
+    field = fitted().model
+    assert isinstance(field, Panoptic)
+    frame = two_planes(0.4, 20, label=True)
+    assert frame.label is not None
+    truth = torch.from_numpy(np.where(frame.label.ravel() == 2, TABLE, FLOOR))
+    said, rays = answers(field, frame)
+    assert (said == truth).float().mean() > 0.95
+    assert (said == LAMP).float().mean() < 0.01  # a fifth of the pseudo labels
+    things = field.instances(rays, said)
+    assert set(things.unique().tolist()) == {0, 7}
+    assert (things[said == FLOOR] == 0).all()
+    assert (things[said == TABLE] == 7).float().mean() > 0.95
+
+
+def test_the_recipe_says_what_boxes_cover_and_no_frame_is_held_to_be_seen() -> None:
+    figures = fitted().recipe["panoptic"]
+    assert (figures["boxes"], figures["seen"], figures["labelled_frames"]) == (1, 1, 8)
+    assert 0.05 < figures["covered"] < 0.95 and 0.5 < figures["matched"] < 1
+    assert fitted().train_stamps_ns == frozenset()  # pseudo labels are no truth
+
+
+def test_true_labels_count_as_seen() -> None:
+    frames = [replace(f, label_is_pseudo=False) for f in scene()]
+    config = msgspec.structs.replace(SMALL, steps=2)
+    assert fit_panoptic(frames, SET, empty_field(DECK), config).train_stamps_ns == frozenset(range(8))
+
+
+def test_weights_keep_boxes(tmp_path: Path) -> None:
+    save_checkpoint(fitted(), tmp_path / "w.safetensors")
+    loaded = load_checkpoint(tmp_path / "w.safetensors").model
+    assert isinstance(loaded, Panoptic) and loaded.shape.boxes == (DECK,)
+    assert (answers(loaded, scene()[1])[0] == answers(fitted().model, scene()[1])[0]).float().mean() > 0.99
+
+
+def gradients(field: Panoptic, origin: tuple[float, float, float], channel: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Gradient of the density, and of the classifier, by one pseudo label on a ray straight down."""
+    with torch.no_grad():
+        field.grid.values[..., 0] = 5.0
+    field.grid.values.requires_grad_(True)
+    field.fitted_steps.fill_(1)
+    one, none = torch.ones(1), torch.zeros(1)
+    rays = RayBatch(torch.tensor([origin]), torch.tensor([(0.0, 0.0, -1.0)]), 0.1 * one, torch.inf * one, none)
+    samples = field.march(rays)
+    boxes = field.boxes_on(samples)
+    weights = PanopticFitConfig(points=0.0)
+    group = merged_classes(SET, field.shape.merge)
+    loss = semantic_losses(field, samples, boxes, field.learned(samples), torch.tensor([channel]), group, weights)
+    loss.backward()
+    density, head = field.grid.values.grad, field.classifier.weight.grad
+    assert density is not None and head is not None
+    return density, head
+
+
+@pytest.mark.parametrize("uncovered", ["stuff", "empty"])
+def test_a_pseudo_label_off_every_primitive_has_no_gradient(uncovered: str) -> None:
+    away, through = (-1.0, 0.0, 2.0), (0.8, 0.0, 2.0)
+    for origin, moves in ((away, False), (through, True)):
+        for gradient in gradients(empty_field(DECK, uncovered=uncovered), origin, TABLE):
+            assert bool((gradient != 0).any()) == moves
+    # Of a class without any box: it may be outside, where anything may be.
+    for gradient in gradients(empty_field(DECK, uncovered=uncovered), away, LAMP):
+        assert bool((gradient != 0).any()) == (uncovered == "stuff")
+
+
+def test_a_pseudo_label_moves_density_into_its_box() -> None:
+    density, _ = gradients(empty_field(DECK), (0.8, 0.0, 2.0), TABLE)
+    column = density[28, 20, :, 0]  # x = 0.8, y = 0; vertices from z = -0.5 on, 0.1 apart
+    assert (column[11:15] < 0).all() and (column[18:25] > 0).all()
+
+
+def test_merged_classes_share_a_pseudo_label() -> None:
+    merged = empty_field(DECK, merge={"lamp": ("table",)}, uncovered="empty")
+    assert all((g != 0).any() for g in gradients(merged, (0.8, 0.0, 2.0), LAMP))
+    assert not any((g != 0).any() for g in gradients(empty_field(DECK, uncovered="empty"), (0.8, 0.0, 2.0), LAMP))
+
+
+def test_what_boxes_say_is_shared_where_they_overlap() -> None:
+    floor = box(2, "floor", (0.0, 0.0, 0.3), (4.0, 4.0, 1.0))
+    field = empty_field(DECK, floor, uncovered="empty")
+    field.fitted_steps.fill_(1)
+    one, none = torch.ones(1), torch.zeros(1)
+    rays = RayBatch(torch.tensor([(0.8, 0.0, 2.0)]), torch.tensor([(0.0, 0.0, -1.0)]), 0.1 * one, 9 * one, none)
+    samples = field.march(rays)
+    z = torch.tensor([[0.5, 1.1, 1.35, 1.8]])  # outside, deck, both, floor
+    points = rays.origin[:, None] + z[..., None] * rays.direction[:, None]
+    found = field.boxes_on(replace(samples, z=z, points=points, weight=torch.ones(1, 4) / 4))
+    assert found.fixed[0].tolist() == [[0, 0, 0, 0], [0, 1, 0, 0], [0.5, 0.5, 0, 0], [1, 0, 0, 0]]
+    assert found.on_ray[0].tolist() == [True, True, False, True]
+
+
+def test_of_overlapping_boxes_of_a_class_the_nearer_centre_has_the_point() -> None:
+    left, right = box(3, "table", (-0.4, 0, 0.5), (1, 1, 1)), box(4, "table", (0.4, 0, 0.5), (1, 1, 1))
+    field = empty_field(left, right)
+    with torch.no_grad():
+        field.grid.values[:, :, 10:, 0] = -10.0  # all is below z = 0.5
+        field.grid.values[:, :, :10, 0] = 9.0
+    field.grid.update_occupied()
+    field.fitted_steps.fill_(1)
+    x = torch.tensor([-0.7, -0.05, 0.05, 0.7, 1.5])
+    origin = torch.stack((x, 0 * x, 0 * x + 2), 1)
+    down = torch.tensor((0.0, 0.0, -1.0)).expand(5, 3)
+    rays = RayBatch(origin, down, 0 * x + 0.1, 0 * x + 9, 0 * x)
+    assert field.instances(rays, torch.full((5,), TABLE)).tolist() == [3, 3, 4, 4, 0]
+    assert field.instances(rays, torch.full((5,), FLOOR)).tolist() == [0] * 5
+
+
+def test_where_nothing_may_be_outside_the_grid_is_empty() -> None:
+    config = msgspec.structs.replace(SMALL, steps=20)
+    floor = box(2, "floor", (0.0, 0.0, -0.1), (8.0, 8.0, 0.5))
+    field = fit_panoptic(scene(), SET, empty_field(DECK, floor, uncovered="empty"), config).model
+    assert isinstance(field, Panoptic)
+    solid, opaque = field.solid(), field.grid.alpha() > 1e-3
+    assert solid.any() and not solid.all()
+    assert not (opaque & ~solid).any() and (opaque & solid).any()
+
+
+def test_boxes_survive_the_config() -> None:
+    assert box_config(primitive_of(DECK)) == DECK
+
+
+def test_what_cannot_be_fitted_is_refused() -> None:
+    far = box(1, "table", (90.0, 0.0, 0.0), (1, 1, 1))
+    with pytest.raises(ConfigError, match=r"boxes lie from \(89.50, .*cameras from .*world frame\?"):
+        fit_panoptic(scene(), SET, empty_field(far), SMALL)
+    with pytest.raises(ConfigError, match="needs boxes"):
+        fit_panoptic(scene(), SET, empty_field(), SMALL)
+    with pytest.raises(FrameError, match="no frame has a pseudo label"):
+        fit_panoptic(scene(False), SET, empty_field(DECK), SMALL)
+    only_lamps = [replace(f, label=np.full((48, 64), SET.ids[LAMP], np.uint8)) for f in scene()]
+    with pytest.raises(ConfigError, match=r"no class in common: labels say lamp, boxes table"):
+        fit_panoptic(only_lamps, SET, empty_field(DECK), SMALL)
+    other = make_label_set("other", ["floor", "table"])
+    with pytest.raises(WeightsError, match=r"'deck'.*'other'"):
+        fit_panoptic(scene(), other, empty_field(DECK), SMALL)
+    with pytest.raises(LabelError, match="a box is of class 'table'"):
+        Panoptic(PanopticConfig(boxes=(DECK,)), make_label_set("none", ["floor"]))
