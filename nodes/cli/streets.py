@@ -19,6 +19,7 @@ from semantic_mapper.benchmark.streets import (
     street_seeds,
     streets_table,
 )
+from semantic_mapper.benchmark.streets_panoptic import panoptic_arms
 from semantic_mapper.config import to_plain
 from semantic_mapper.nodes.cli.arm_suite import ArmSuite, tier_config
 from semantic_mapper.replay.evaluate.street_map import map_arm
@@ -39,7 +40,7 @@ def streets_suite(path: Path | None, tier: str | None, seed: int | None) -> ArmS
         file=f"streets-{config.width}",
         config=to_plain(config),
         label_set=STREETS_SUITE.label_set,
-        arms=lambda _: ARMS | {"map": map_arm},
+        arms=lambda folder: ARMS | {"map": map_arm} | panoptic_arms(folder),
         units=config.streets,
         run=lambda arms, store, stopped: _run(config, arms, store, stopped),
         scores=scores,

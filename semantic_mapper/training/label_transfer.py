@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 
 from semantic_mapper.fields.primitives import PrimitiveSet
+from semantic_mapper.geometry import pixel_grid, pixel_rays, transform, unproject
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.training.frame_rays import frame_rays
 from semantic_mapper.types import Float32, Float64, PosedFrame, UInt8
 
 NEAR_M = 0.3
@@ -93,17 +93,16 @@ def _channels(boxes: PrimitiveSet, label_set: LabelSet) -> NDArray[np.int64]:
 
 def _along_rays(frame: PosedFrame, boxes: PrimitiveSet) -> NDArray[np.int64]:
     """Positions (H * W, M) of the boxes along each pixel's ray, -1 = no more."""
-    rays = frame_rays([frame], frame.intrinsics.width)
-    return boxes.intervals(rays.rays(np.arange(len(rays)), NEAR_M)).index.numpy()
+    k, pose = frame.intrinsics, torch.from_numpy(frame.T_world_camera).float()
+    rays = pixel_rays(pixel_grid(k.width, k.height), k, pose, near_m=NEAR_M, far_m=np.inf)
+    return boxes.intervals(rays).index.numpy()
 
 
 def _inside(frame: PosedFrame, boxes: PrimitiveSet) -> tuple[NDArray[np.bool_], Float64]:
     """Which pixels' points are inside which box (H * W, P), none without depth; and the points (H * W, 3)."""
     assert frame.depth_m is not None
-    rays = frame_rays([frame], frame.intrinsics.width)
-    batch = rays.rays(np.arange(len(rays)), NEAR_M)
     depth = frame.depth_m.reshape(-1)
-    points = (batch.origin + torch.from_numpy(depth)[:, None] * batch.direction).double().numpy()
+    points = transform(frame.T_world_camera, unproject(frame.depth_m, frame.intrinsics)).reshape(-1, 3)
     inside = np.zeros((len(points), len(boxes)), np.bool_)
     inside[depth > 0] = boxes.inside(points[depth > 0])
     return inside, points

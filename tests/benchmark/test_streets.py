@@ -20,8 +20,8 @@ from semantic_mapper.benchmark.streets import (
     PQ,
     RMSE,
     Answer,
-    StreetScores,
     StreetsConfig,
+    StreetScores,
     drive,
     primitives_at,
     run_streets,
@@ -30,6 +30,7 @@ from semantic_mapper.benchmark.streets import (
     streets_digest,
     streets_table,
 )
+from semantic_mapper.benchmark.streets_panoptic import panoptic_arms
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.types import PosedFrame
 
@@ -92,3 +93,16 @@ def test_settings_that_score_one_image_are_refused(tmp_path: Path) -> None:
 def test_claims_name_arms_once() -> None:
     assert len({claim.name for claim in CLAIMS}) == len(CLAIMS)
     assert {claim.second for claim in CLAIMS} >= {"pseudo", "map", "box-crf"}
+
+
+def test_a_field_is_fitted_once_and_rendered_in_two_ways(tmp_path: Path) -> None:
+    config = msgspec.structs.replace(TINY, width=48, pairs=3, scored_every=2, voxel_m=1.0, field_steps=2)
+    arms = panoptic_arms(tmp_path)
+    learned = arms["panoptic"](config, SEED)
+    (file,) = tmp_path.iterdir()
+    made = file.stat().st_mtime_ns
+    fixed = arms["panoptic-fixed"](config, SEED)
+    assert [f.stat().st_mtime_ns for f in tmp_path.iterdir()] == [made]
+    assert set(learned) == {"labels", "panoptic", "agreement", "depth"}
+    assert not np.array_equal(learned["labels"][0], fixed["labels"][0])
+    assert np.array_equal(learned["depth"][0], fixed["depth"][0])

@@ -45,7 +45,7 @@ def test_a_pixel_has_the_class_and_the_number_of_the_first_box() -> None:
 
 def test_boxes_at_the_measured_depth_correct_what_was_predicted() -> None:
     found = box_crf(frame(5), BOXES, predicted(WALL, CAR), KITTI360)
-    inner = np.s_[10:20, 14:18], np.s_[10:20, 22:26]
+    inner = np.s_[10:20, 14:18], np.s_[10:20, 22:24]
     assert (found.label[inner[0]] == CAR).all() and (found.instance[inner[0]] == 1).all()
     assert (found.label[inner[1]] == WALL).all() and (found.instance == 0)[inner[1]].all()
 

@@ -74,19 +74,20 @@ class _Draws:
     blob: NDArray[np.int64]
 
 
-def pseudo_labels(views: Sequence[RoomView], seed: int, miou: float = MIOU) -> list[UInt8]:
-    """Labels (H, W) of each of ``views``, ids of ``KITTI360``, of about that mIoU over all of them.
+def pseudo_labels(views: Sequence[RoomView], seed: int, miou: float = MIOU, every: int = 1) -> list[UInt8]:
+    """Labels (H, W) of each of ``views``, ids of ``KITTI360``, of about that mIoU over every so many-th of them.
 
     Args:
         views: Left images of a street.
         seed: Of the street.
         miou: In 0..1.
+        every: Which views it is of.
     """
     draws = [_drawn(view, seed) for view in views]
     low, high = 0.0, _MOST
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        if pseudo_miou(views, [_predicted(d, middle) for d in draws]) > miou:
+        if pseudo_miou(views[::every], [_predicted(d, middle) for d in draws[::every]]) > miou:
             low = middle
         else:
             high = middle
