@@ -13,7 +13,7 @@ from semantic_mapper.scenes.primitives import Assembly, pack, place_parts
 from semantic_mapper.scenes.render import render_view
 from semantic_mapper.scenes.scene import Lights, Scene, extremes, shadow_cubes
 from semantic_mapper.scenes.shots import sequence_shots
-from semantic_mapper.scenes.street import ORIGIN_M, STEP_M, drive, make_street, render_street
+from semantic_mapper.scenes.streets.drive import ORIGIN_M, STEP_M, drive, make_street, render_street
 from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame
 
 BOX_M = (-4.1, -4.1, -0.2, 4.1, 4.1, 3.0)  # that the objects stand in

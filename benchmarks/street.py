@@ -16,7 +16,15 @@ from semantic_mapper.geometry import invert_pose
 from semantic_mapper.replay.importers.kitti360 import LABELS
 from semantic_mapper.scenes.config import NoiseConfig
 from semantic_mapper.scenes.shots import sequence_shots
-from semantic_mapper.scenes.street import CAMERA_M, SCANNER_M, STEP_M, drive, make_street, render_street, scan_street
+from semantic_mapper.scenes.streets.drive import (
+    CAMERA_M,
+    SCANNER_M,
+    STEP_M,
+    drive,
+    make_street,
+    render_street,
+    scan_street,
+)
 from semantic_mapper.types import CameraIntrinsics, Float64
 
 DRIVE = "2013_05_28_drive_0000_sync"

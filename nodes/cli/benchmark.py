@@ -20,7 +20,7 @@ SeedOption = Annotated[int | None, typer.Option(min=0, help="Of everything that 
 
 @verb
 def benchmark(
-    suite: Annotated[Literal["rooms", "klevr", "aerial"], typer.Argument(help="The suite.")] = "rooms",
+    suite: Annotated[Literal["rooms", "klevr", "aerial", "streets"], typer.Argument(help="The suite.")] = "rooms",
     weights: WeightsOption = None,
     protocol: suites.ProtocolOption = None,
     split: suites.SplitOption = None,
@@ -57,11 +57,15 @@ def benchmark(
 
     aerial: arms learn a town seen from a drone from 80 views, 4 of which have labels. The same options go with it.
 
+    streets: arms label every image of a drive from annotated boxes and noisy predicted labels. The same options go
+    with it.
+
     Example: semantic-mapper benchmark rooms --weights a.safetensors --weights b.safetensors --out runs/ab.json
     Example: semantic-mapper benchmark rooms --sources wide --depth off --rooms 5 --json
     Example: semantic-mapper benchmark rooms --protocol scratch --kind semantic_nerf --rooms 3 --seconds 600
     Example: semantic-mapper benchmark klevr --claims --out runs/klevr.json
     Example: semantic-mapper benchmark aerial --claims --out runs/aerial.json
+    Example: semantic-mapper benchmark streets --claims --out runs/streets.json
     """
     given = {"split": split, "rooms": rooms, "protocol": protocol, "views": views, "baseline": baseline, "depth": depth}
     given |= {"sources": sources, "own_image": own_image, "current": current}
@@ -80,6 +84,11 @@ def benchmark(
         from semantic_mapper.nodes.cli.klevr import klevr_suite
 
         return run_arm_suite(klevr_suite(config, tier, seed), arms or [], claims, out, print_json=print_json)
+    if suite == "streets":
+        from semantic_mapper.nodes.cli.arm_suite import run_arm_suite
+        from semantic_mapper.nodes.cli.streets import streets_suite
+
+        return run_arm_suite(streets_suite(config, tier, seed), arms or [], claims, out, print_json=print_json)
     from semantic_mapper.nodes.cli.suite import run_suite_verb
 
     suites.refuse_given("rooms", {"arm": arms, "claims": claims or None})

@@ -51,7 +51,8 @@ TierOption = Annotated[
     Literal["cpu", "gpu", "record"] | None,
     typer.Option(
         help="rooms: cpu = 160x120 and few samples, gpu = 320x240 and many. klevr: cpu = 52 scenes at 72x72, record = "
-        "120 at 256x256, three seeds. aerial: cpu = 2 towns at 192x192, record = 6 at 512x512.  [default: cpu]"
+        "120 at 256x256, three seeds. aerial: cpu = 2 towns at 192x192, record = 6 at 512x512. "
+        "streets: cpu = 3 streets, record = 10.  [default: cpu]"
     ),
 ]
 KeyframesOption = Annotated[

@@ -156,6 +156,14 @@ class Assembly:
                     center = (float(middle[0]), float(middle[1]), (z[0] + z[1]) / 2)
                     self.add(Shape.PRISM, material, center, size, yaw=yaw)
 
+    def wedge(self, material: int, size: Vector, z: float, turn: float, *, start: float = 0.0) -> None:
+        """Add a turned wedge (long, reach, rise): full height at y = ``start``, down to ``z`` at ``reach`` from it."""
+        long, reach, rise = size
+        away = start + reach / 2
+        middle = (-float(np.sin(turn)) * away, float(np.cos(turn)) * away, z + rise / 2)
+        yaw = turn + np.pi / 2  # own x points outwards, own y up, own z along the ridge
+        self.add(Shape.PRISM, material, middle, (reach, rise, long), yaw=yaw, tilt=np.pi / 2)
+
     def bounds(self) -> tuple[Float64, Float64]:
         """Lower and upper corner (3,) of all parts, in the assembly's frame."""
         lows, highs = zip(*(part_bounds(part) for part in self.parts), strict=True)

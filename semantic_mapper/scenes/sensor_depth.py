@@ -79,7 +79,7 @@ def measure_depth(
     disparity = _fatten_edges(disparity, window, rng)
     hidden = hidden_from_other_eye(disparity * (intrinsics.width / _NATIVE_WIDTH))
     shape = exact_m.shape
-    noise = _IID_SHARE * rng.standard_normal(shape, np.float32) + _CORRELATED_SHARE * _smooth_noise(shape, rng)
+    noise = _IID_SHARE * rng.standard_normal(shape, np.float32) + _CORRELATED_SHARE * smooth_noise(shape, rng)
     noisy = disparity + np.float32(model.sigma_px) * noise
     noisy = np.round(noisy / np.float32(model.step_px)) * np.float32(model.step_px)
     seen = (disparity > 0) & (noisy > 0) & ~hidden & (noisy <= model.max_disparity_px)
@@ -126,7 +126,7 @@ def _fatten_edges(disparity: Float32, radius: int, rng: np.random.Generator) -> 
     return np.where(some & (grown > disparity * 1.06), grown, disparity)
 
 
-def _smooth_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Float32:
+def smooth_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Float32:
     """(H, W) noise of unit variance that is alike within ``_CORRELATION_PX``."""
     height, width = shape
     coarse = rng.standard_normal((height // _CORRELATION_PX + 2, width // _CORRELATION_PX + 2), np.float32)
@@ -137,7 +137,7 @@ def _smooth_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Float32:
 def _returns_light(rgb: UInt8, exact_m: Float32, least: float, rng: np.random.Generator) -> np.ndarray:
     """(H, W) bool: the projected pattern is bright enough; it gets weaker with the square of range."""
     grey = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (5, 5), 1.2).astype(np.float32) + 8.0
-    threshold = least * np.exp(0.5 * _smooth_noise(grey.shape, rng))
+    threshold = least * np.exp(0.5 * smooth_noise(grey.shape, rng))
     return grey > threshold * exact_m * exact_m
 
 
@@ -149,6 +149,6 @@ def _has_texture(rgb: UInt8, least: float, rng: np.random.Generator) -> np.ndarr
     mean = cv2.boxFilter(grey, -1, size)
     variance = cv2.boxFilter(grey * grey, -1, size) - mean * mean
     contrast = np.sqrt(np.maximum(variance, 0.0))
-    threshold = least + _THRESHOLD_SIGMA * _smooth_noise(grey.shape, rng)
+    threshold = least + _THRESHOLD_SIGMA * smooth_noise(grey.shape, rng)
     threshold += _TEXTURE_WIDTH * (rng.random(grey.shape, np.float32) - 0.5)
     return contrast > threshold

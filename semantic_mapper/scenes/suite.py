@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
-from semantic_mapper.labels import CARLA, KLEVR, ROOMS, LabelSet
+from semantic_mapper.labels import CARLA, KITTI360, KLEVR, ROOMS, LabelSet
 from semantic_mapper.scenes.aerial.town import AERIAL_VERSION, make_town
 from semantic_mapper.scenes.aerial.views import aerial_views
 from semantic_mapper.scenes.config import SUITE_VERSION, TEST_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS
@@ -13,6 +13,8 @@ from semantic_mapper.scenes.klevr import KLEVR_VERSION, klevr_views, make_klevr
 from semantic_mapper.scenes.room import make_room
 from semantic_mapper.scenes.scene import Scene
 from semantic_mapper.scenes.sequence import RoomView, room_views
+from semantic_mapper.scenes.streets.layout import STREETS_VERSION, make_streets_street
+from semantic_mapper.scenes.streets.views import street_views
 from semantic_mapper.types import CameraIntrinsics
 
 
@@ -62,4 +64,12 @@ AERIAL_SUITE = Suite(
     lambda seed: make_town(seed).scene,
     lambda seed, count, intrinsics: aerial_views(seed, range(count), intrinsics),
 )
-SUITES = {suite.name: suite for suite in (ROOMS_SUITE, KLEVR_SUITE, AERIAL_SUITE)}
+STREETS_SUITE = Suite(
+    "streets",
+    STREETS_VERSION,
+    KITTI360,
+    {"train": range(1_000), "val": range(100_000, 100_020), "test": range(200_000, 200_020)},
+    lambda seed: make_streets_street(seed).scene,
+    lambda seed, count, intrinsics: street_views(seed, range(count), intrinsics),
+)
+SUITES = {suite.name: suite for suite in (ROOMS_SUITE, KLEVR_SUITE, AERIAL_SUITE, STREETS_SUITE)}

@@ -1,14 +1,14 @@
 """Look at the suite: contact sheets, how often each class is seen, how fast rooms are rendered.
 
-``python -m semantic_mapper.scenes.survey sheet --out rooms.png`` and likewise ``classes``, ``speed``, ``klevr`` and
-``aerial``.
+``python -m semantic_mapper.scenes.survey sheet --out rooms.png`` and likewise ``classes``, ``speed``, ``klevr``,
+``aerial`` and ``streets``.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +17,8 @@ import msgspec
 import numpy as np
 import typer
 
-from semantic_mapper.labels import CARLA, KLEVR, ROOMS
+from semantic_mapper.geometry import transform, unproject
+from semantic_mapper.labels import CARLA, KITTI360, KLEVR, ROOMS
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.plots import draw_picture_rows
 from semantic_mapper.scenes.aerial.views import aerial_camera, aerial_views, cached_town
@@ -35,8 +36,11 @@ from semantic_mapper.scenes.klevr import klevr_camera, klevr_views
 from semantic_mapper.scenes.render import render_view
 from semantic_mapper.scenes.room import make_room
 from semantic_mapper.scenes.room_templates import ROOM_TEMPLATES
-from semantic_mapper.scenes.sequence import room_views
+from semantic_mapper.scenes.sequence import RoomView, room_views
 from semantic_mapper.scenes.shots import sequence_shots
+from semantic_mapper.scenes.streets.boxes import StreetBox, street_boxes
+from semantic_mapper.scenes.streets.pseudo import pseudo_labels, pseudo_miou
+from semantic_mapper.scenes.streets.views import PAIRS, cached_street, street_camera, street_views
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 CAMERA = CameraIntrinsics(220.6, 220.6, 159.5, 119.5, 320, 240)  # an OAK-D's colour camera, at a quarter of its width
@@ -112,6 +116,23 @@ def images_per_second(seeds: Iterable[int], views: int, depth: DepthSensorName) 
         "room_and_path_s": making / rooms,
         "primitives": primitives / rooms,
     }
+
+
+def box_overlap(views: Sequence[RoomView], boxes: Sequence[StreetBox]) -> tuple[float, float]:
+    """Fraction of the surface pixels that lie in a box of their class, and of those in boxes of two classes."""
+    names = sorted({box.name for box in boxes})
+    covered = several = count = 0
+    for view in views:
+        exact = view.rendered.exact_depth_m
+        points = transform(view.T_world_camera, unproject(exact, view.frame.intrinsics)).reshape(-1, 3)
+        points, label = points[exact.ravel() > 0], view.rendered.label.ravel()[exact.ravel() > 0]
+        inside = np.zeros((len(names), len(points)), np.bool_)
+        for box in boxes:
+            inside[names.index(box.name)] |= box.contains(points)
+        own = np.array([KITTI360.id_of(name) for name in names])[:, None] == label
+        covered, several = covered + (inside & own).any(axis=0).sum(), several + (inside.sum(axis=0) > 1).sum()
+        count += len(points)
+    return float(covered / count), float(several / count)
 
 
 def _depth_picture(depth_m: Float32) -> UInt8:
@@ -208,6 +229,48 @@ def aerial(
     seconds = (time.process_time() - started) / count
     primitives = [len(cached_town(seed).scene.primitives) for seed in range(first, first + towns)]
     log.info("aerial_written", path=str(out), cpu_s_a_view=round(seconds, 3), primitives=primitives)
+
+
+@app.command()
+def streets(
+    out: Annotated[Path, typer.Option(help="PNG or JPEG to write")],
+    first: Annotated[int, typer.Option(help="seed of the first street")] = 200_000,
+    count: Annotated[int, typer.Option(help="how many")] = 2,
+    width: Annotated[int, typer.Option(help="pixels of a picture")] = 352,
+) -> None:
+    """Write pictures, measured depth, labels and predicted labels of streets, and measure what the suite promises."""
+    camera, columns = street_camera(width), list[UInt8]()
+    seen: dict[str, int] = dict.fromkeys(KITTI360.names, 0)
+    overlaps: list[float] = []
+    for seed in range(first, first + count):
+        started = time.process_time()
+        views = list(street_views(seed, range(PAIRS), camera))
+        seconds = (time.process_time() - started) / PAIRS
+        predicted, scored = pseudo_labels(views, seed, every=4), views[::4]
+        covered, several = box_overlap(scored, boxes := street_boxes(cached_street(seed), PAIRS))
+        overlaps.append(several)
+        ids = np.unique(np.concatenate([view.rendered.label.ravel() for view in scored]))
+        for name in KITTI360.names:
+            seen[name] += KITTI360.id_of(name) in ids
+        log.info(
+            "street",
+            seed=seed,
+            boxes=len(boxes),
+            primitives=len(cached_street(seed).scene.primitives),
+            in_own_class=round(covered, 4),
+            in_two_classes=round(several, 3),
+            pseudo_miou=round(pseudo_miou(scored, predicted[::4]), 3),
+            cpu_s_a_view=round(seconds, 2),
+        )
+        rows = [
+            [view.frame.rgb for view in views[::8]],
+            [_depth_picture(view.rendered.depth_m / 6) for view in views[::8]],
+            [KITTI360.colorize(view.rendered.label) for view in views[::8]],
+            [KITTI360.colorize(label) for label in predicted[::8]],
+        ]
+        columns += [np.concatenate(row, 1) for row in rows]
+    cv2.imwrite(str(out), np.ascontiguousarray(np.concatenate(columns, 0)[..., ::-1]))
+    log.info("streets_written", path=str(out), in_two_classes=round(float(np.mean(overlaps)), 3), streets_with=seen)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from semantic_mapper.replay.log.format import LogReader
 from semantic_mapper.scenes import Scene
 from semantic_mapper.scenes.config import NoiseConfig
 from semantic_mapper.scenes.shots import single_shot
-from semantic_mapper.scenes.street import CLASSES, MAX_RANGE_M, drive, make_street, render_street, scan_street
+from semantic_mapper.scenes.streets.drive import CLASSES, MAX_RANGE_M, drive, make_street, render_street, scan_street
 
 ID = dict(zip(LABELS.names, LABELS.ids, strict=True))
 CAMERA = camera_of_width(352)

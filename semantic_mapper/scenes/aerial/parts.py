@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from semantic_mapper.scenes.aerial.builder import KERB_M, STOREY_M, TownBuilder
-from semantic_mapper.scenes.primitives import Assembly, Shape
+from semantic_mapper.scenes.primitives import Assembly
 
 _PARAPET_M = 0.7
 _EDGE_M = 1.6  # paved, along a parapet
@@ -40,23 +40,12 @@ def gabled_house(b: TownBuilder, x: float, y: float, wide: float, deep: float, y
     house.box(wall, (0, 0, high / 2), (wide, deep, high))
     half = deep / 2 + _GABLE_M
     for turn in (0.0, np.pi):  # two wedges stand back to back
-        wedge(house, roof, (wide + 2 * _GABLE_M, half, rise), high, turn)
+        house.wedge(roof, (wide + 2 * _GABLE_M, half, rise), high, turn)
     if b.often(0.7):
         house.box(b.brick, (b.between(-0.3, 0.3) * wide, 0.15 * deep, high + rise), (0.8, 0.8, 2.0))
     if b.often(0.4):
         house.box(b.pick([b.wood, wall]), (wide / 2 + 1.6, -deep / 5, 1.3), (3.2, deep * 0.5, 2.6))
     b.place(house, x, y, z=KERB_M, yaw=yaw)
-
-
-def wedge(
-    assembly: Assembly, material: int, size: tuple[float, float, float], z: float, turn: float, *, start: float = 0.0
-) -> None:
-    """Add a wedge (long, reach, rise): full height at y = ``start``, down to ``z`` at ``reach`` from there; turned."""
-    long, reach, rise = size
-    away = start + reach / 2
-    middle = (-float(np.sin(turn)) * away, float(np.cos(turn)) * away, z + rise / 2)
-    yaw = turn + np.pi / 2  # own x points outwards, own y up, own z along the ridge
-    assembly.add(Shape.PRISM, material, middle, (reach, rise, long), yaw=yaw, tilt=np.pi / 2)
 
 
 def tree(b: TownBuilder, x: float, y: float, *, z: float = KERB_M) -> None:

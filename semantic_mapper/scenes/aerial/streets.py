@@ -90,7 +90,7 @@ def build_bridges(b: TownBuilder, plan: TownPlan) -> None:
         bridge.box(b.asphalt, (0, 0, DECK_M - 0.5), (2 * ROAD_M, 2 * flat, 1.0))
         bridge.box(b.paint, (0, 0, DECK_M), (_LINE_M, 2 * flat, 0.04), label="roadline")
         for end in (-1, 1):
-            parts.wedge(bridge, b.asphalt, (2 * ROAD_M, ramp, DECK_M), 0.0, 0.0 if end > 0 else np.pi, start=flat)
+            bridge.wedge(b.asphalt, (2 * ROAD_M, ramp, DECK_M), 0.0, 0.0 if end > 0 else np.pi, start=flat)
             middle = end * (flat + ramp / 2)
             tilt = -end * slope
             bridge.box(b.paint, (0, middle, DECK_M / 2 + 0.02), (_LINE_M, slant, 0.04), label="roadline", tilt=tilt)

@@ -151,6 +151,7 @@ def test_a_kind_without_a_file_is_fitted_to_each_room(suite: Path, tmp_path: Pat
         ("benchmark", "aerial", "--rooms", "3"),
         ("benchmark", "aerial", "--arm", "nerf"),
         ("benchmark", "aerial", "--tier", "gpu"),
+        ("benchmark", "streets", "--arm", "nerf"),
         ("benchmark", "rooms", "--claims"),
         ("benchmark", "rooms", "--tier", "record"),
         ("benchmark", "rooms", "--protocol", "finetune", "--map"),
@@ -250,3 +251,15 @@ def test_aerial_shows_arms_and_claims_and_continues(tmp_path: Path) -> None:
     assert found["claims"][0]["result"] in ("accepted", "refused") and found["claims"][1]["result"] == "not run"
     again = run(*command)
     assert again.returncode == 0 and out.with_suffix(".jsonl").read_bytes() == records
+
+
+def test_streets_shows_arms_and_claims(tmp_path: Path) -> None:
+    config, out = tmp_path / "streets.toml", tmp_path / "streets.json"
+    config.write_text("streets = 1\nwidth = 48\npairs = 3\nscored_every = 2\n", encoding="utf-8")
+    arms = ("--arm", "nearest", "--arm", "map")
+    done = run("benchmark", "streets", "--config", config, "--claims", "--out", out, *arms)
+    assert done.returncode == 0, done.stderr
+    assert "claims of Panoptic NeRF" in done.stdout and "not run" in done.stdout
+    found = json.loads(out.read_text())
+    assert set(found["arms"]) == {"nearest", "map"} and found["arms"]["nearest"]["figures"]["PQ"] > 0
+    assert found["arms"]["map"]["figures"]["depth answered"] > 10

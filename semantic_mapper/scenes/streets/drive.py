@@ -13,12 +13,14 @@ import numpy as np
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.scenes.config import NoiseConfig
 from semantic_mapper.scenes.daylight import Daylight, pose_of, shadow_map, sun_camera
-from semantic_mapper.scenes.materials import Color, Material, Pattern, display_hsv, material_table
-from semantic_mapper.scenes.primitives import Assembly, Part, Shape, pack, place_parts
+from semantic_mapper.scenes.materials import Pattern, display_hsv, material_table
+from semantic_mapper.scenes.primitives import Assembly, Shape, pack
 from semantic_mapper.scenes.render import cast_view, light_seen, seen_labels
 from semantic_mapper.scenes.scene import NO_LAMPS, Scene
 from semantic_mapper.scenes.sensor_color import expose
 from semantic_mapper.scenes.shots import Shot
+from semantic_mapper.scenes.streets.builder import StreetBuilder, clouds
+from semantic_mapper.scenes.streets.parts import house, tree
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, UInt8
 
 ORIGIN_M = np.array([830.0, 3700.0, 115.0])  # where the street begins: on the road, in its middle
@@ -56,39 +58,6 @@ CLASSES = (
 )  # fmt: skip
 
 
-class _Builder:
-    """Collects materials and parts; coordinates are relative to ``ORIGIN_M``."""
-
-    def __init__(self, seed: int) -> None:
-        self.rng = np.random.default_rng((seed, 360))
-        self.materials: list[Material] = []
-        self.groups: list[list[Part]] = []
-        self.grey = [self.material(Pattern.PLAIN, (0.6, 0.03, v), scale_m=0.4) for v in (0.42, 0.62, 0.9)]
-        self.glass = [self.material(Pattern.PLAIN, (0.58, 0.2, v), gloss=0.6, scale_m=1.5) for v in (0.15, 0.3)]
-        self.wood = [self.material(Pattern.WOOD, (0.08, s, v), scale_m=0.08) for s, v in ((0.4, 0.5), (0.15, 0.85))]
-        leaves = ((0.27, 0.6, 0.45), (0.22, 0.5, 0.5), (0.3, 0.45, 0.35))
-        self.leaves = [self.material(Pattern.PRINT, hsv, scale_m=0.3, dim=0.3) for hsv in leaves]
-
-    def between(self, low: float, high: float) -> float:
-        """A random number."""
-        return float(self.rng.uniform(low, high))
-
-    def pick(self, items: list[int]) -> int:
-        """A random one."""
-        return items[int(self.rng.integers(len(items)))]
-
-    def material(self, pattern: Pattern, hsv: Color, *, scale_m: float, dim: float = 0.8, gloss: float = 0.0) -> int:
-        """A new material whose second colour is ``dim`` times the first; returns its number."""
-        a = display_hsv(*hsv)
-        b = (a[0] * dim, a[1] * dim, a[2] * dim)
-        self.materials.append(Material(pattern, a, b, scale_m, int(self.rng.integers(1 << 30)), gloss=gloss))
-        return len(self.materials) - 1
-
-    def place(self, assembly: Assembly, x: float, y: float, *, z: float = 0.0, yaw: float = 0.0) -> None:
-        """Put an assembly down."""
-        self.groups.append(place_parts(assembly, yaw, ORIGIN_M + np.array([x, y, z])))
-
-
 def make_street(seed: int, length_m: float, label_set: LabelSet) -> Scene:
     """Build a street; everything follows from the arguments.
 
@@ -97,7 +66,7 @@ def make_street(seed: int, length_m: float, label_set: LabelSet) -> Scene:
         length_m: Way of the car; the street goes on for ``BEYOND_M``.
         label_set: Whose ids labels are; has the names ``CLASSES``.
     """
-    b = _Builder(seed)
+    b = StreetBuilder(np.random.default_rng((seed, 360)), ORIGIN_M)
     end = length_m + BEYOND_M
     _ground(b, end)
     for side in (1.0, -1.0):  # left with a strip for parking, right without
@@ -118,7 +87,7 @@ def make_street(seed: int, length_m: float, label_set: LabelSet) -> Scene:
     focal = _SHADOW_SIZE / 2 * _SUN_M / (end / 2 + 40.0)
     shadow = shadow_map(primitives, T_world_sun, focal, _SHADOW_SIZE)
     daylight = Daylight(
-        "sky", sun, shadow, T_world_sun, focal, _SHADOW_BIAS_M, _SKY_SHADE, (horizon, zenith), _clouds(b.rng), _HAZE_M
+        "sky", sun, shadow, T_world_sun, focal, _SHADOW_BIAS_M, _SKY_SHADE, (horizon, zenith), clouds(b.rng), _HAZE_M
     )
     size = (1e6, 1e6, 1e6)
     return Scene(seed, "street", size, primitives, material_table(b.materials), NO_LAMPS, (), label_set, daylight)
@@ -188,7 +157,7 @@ def scan_street(street: Scene, T_world_scanner: Float64, seed: int) -> Float32:
     return np.concatenate((points, reflectance[:, None]), axis=1).astype(np.float32)
 
 
-def _ground(b: _Builder, end: float) -> None:
+def _ground(b: StreetBuilder, end: float) -> None:
     asphalt = b.material(Pattern.PLAIN, (0.6, 0.04, b.between(0.38, 0.5)), scale_m=0.5, dim=0.75)
     paving = b.material(Pattern.TILES, (0.08, 0.08, 0.6), scale_m=0.2, dim=0.6)
     grass = b.material(Pattern.PRINT, (0.25, 0.5, 0.5), scale_m=0.4, dim=0.6)
@@ -206,7 +175,7 @@ def _ground(b: _Builder, end: float) -> None:
     b.place(terrain, middle, 0)
 
 
-def _sidewalk(b: _Builder, side: float, verge: float, end: float) -> None:
+def _sidewalk(b: StreetBuilder, side: float, verge: float, end: float) -> None:
     paving = b.material(Pattern.TILES, (0.07, 0.05, b.between(0.55, 0.75)), scale_m=0.4, dim=0.7)
     walk = Assembly("sidewalk")
     walk.box(paving, (0, side * (verge + 1.2), 0), (end + 160, 2.4, 2 * _KERB_M))
@@ -214,14 +183,15 @@ def _sidewalk(b: _Builder, side: float, verge: float, end: float) -> None:
     b.place(walk, end / 2 + 40, 0)
 
 
-def _plots(b: _Builder, side: float, front: float, end: float) -> None:
+def _plots(b: StreetBuilder, side: float, front: float, end: float) -> None:
     """Houses with gardens, or a green between them; a fence, wall or hedge in front."""
     x = -20.0
     while x < end:
         width, setback = b.between(11, 19), b.between(2.0, 7.0)
         middle = x + width / 2
         if b.rng.uniform() < 0.82:
-            _house(b, middle, side, front + setback, width - b.between(1.0, 5.0))
+            home = house(b, width - b.between(1.0, 5.0)).assembly
+            b.place(home, middle, side * (front + setback), yaw=0.0 if side > 0 else np.pi)
         else:
             for _ in range(3):
                 _tree(b, middle + b.between(-5, 5), side * (front + b.between(3, 12)))
@@ -244,52 +214,11 @@ def _plots(b: _Builder, side: float, front: float, end: float) -> None:
         x += width
 
 
-def _house(b: _Builder, x: float, side: float, front: float, width: float) -> None:
-    storeys = int(b.rng.integers(1, 4))
-    height, deep = 0.6 + 2.8 * storeys, b.between(8, 11)
-    pattern = (Pattern.PLAIN, Pattern.PLAIN, Pattern.TILES)[int(b.rng.integers(3))]
-    hsv = (b.between(0.0, 0.17), b.between(0.03, 0.45), b.between(0.6, 0.95))
-    wall = b.material(pattern, hsv, scale_m=0.3 if pattern == Pattern.TILES else 1.0, dim=0.85)
-    roof = b.material(Pattern.STRIPES, (b.between(0.0, 0.06), b.between(0.2, 0.6), b.between(0.3, 0.55)), scale_m=0.3)
-    house = Assembly("building")  # y = 0 is its front, the house lies at y > 0
-    house.box(wall, (0, deep / 2, height / 2), (width, deep, height))
-    pane = b.pick(b.glass)
-    door = int(b.rng.integers(max(int(width / 2.6), 1)))
-    for storey in range(storeys):
-        for k in range(max(int(width / 2.6), 1)):
-            at = -width / 2 + 1.4 + 2.6 * k
-            if storey == 0 and k == door:
-                house.box(b.pick(b.wood), (at, -0.02, 1.15), (1.0, 0.08, 2.1))
-                continue
-            z = 1.9 + 2.8 * storey
-            house.box(b.grey[2], (at, -0.01, z), (1.35, 0.08, 1.55))
-            house.box(pane, (at, -0.03, z), (1.15, 0.08, 1.35))
-    slope = np.radians(b.between(25, 45))
-    reach = deep / 2 / np.cos(slope) + 0.5
-    for turn in (1.0, -1.0):  # two slabs lean on each other; the ridge runs along the street
-        y, z = deep / 2 - turn * reach / 2 * np.cos(slope), height + reach / 2 * np.sin(slope) - 0.3
-        house.box(roof, (0, y, z), (width + 0.4, reach, 0.18), tilt=turn * slope)
-    gable = deep / 2 * np.tan(slope) * 0.55
-    house.box(wall, (0, deep / 2, height + gable / 2), (width - 0.3, deep * 0.45, gable))
-    if b.rng.uniform() < 0.6:
-        house.box(
-            b.grey[0], (b.between(-width / 3, width / 3), deep / 2, height + reach * np.sin(slope)), (0.6, 0.6, 2.0)
-        )
-    b.place(house, x, side * front, yaw=0.0 if side > 0 else np.pi)
+def _tree(b: StreetBuilder, x: float, y: float) -> None:
+    b.place(tree(b), x, y)
 
 
-def _tree(b: _Builder, x: float, y: float) -> None:
-    tree = Assembly("vegetation")
-    trunk, crown = b.between(1.8, 3.0), b.between(2.5, 5.0)
-    tree.cylinder(b.wood[0], (0, 0, trunk / 2), (0.3, 0.3, trunk))
-    leaf = b.pick(b.leaves)
-    for _ in range(6):
-        place = (b.between(-0.9, 0.9), b.between(-0.9, 0.9), trunk + b.between(0.2, 0.8) * crown)
-        tree.ellipsoid(leaf, place, (crown * 0.6, crown * 0.6, crown * b.between(0.45, 0.7)))
-    b.place(tree, x, y)
-
-
-def _furniture(b: _Builder, side: float, y: float, end: float) -> None:
+def _furniture(b: StreetBuilder, side: float, y: float, end: float) -> None:
     """Lamp posts, signs, bins and small trees along the kerb."""
     x = b.between(-10, 0)
     while x < end:
@@ -315,7 +244,7 @@ def _furniture(b: _Builder, side: float, y: float, end: float) -> None:
         x += b.between(6, 15)
 
 
-def _cars(b: _Builder, side: float, verge: float, end: float) -> None:
+def _cars(b: StreetBuilder, side: float, verge: float, end: float) -> None:
     x = b.between(4, 12)
     while x < end:
         car = Assembly("car")
@@ -336,12 +265,3 @@ def _cars(b: _Builder, side: float, verge: float, end: float) -> None:
         y = side * (verge - _LANE / 2) if side > 0 else side * (_ROAD - 1.0)
         b.place(car, x, y + b.between(-0.1, 0.1), yaw=0.0 if b.rng.uniform() < 0.7 else np.pi)
         x += b.between(5.5, 9) if side > 0 and b.rng.uniform() < 0.7 else b.between(14, 40)
-
-
-def _clouds(rng: np.random.Generator) -> Float32:
-    """(256, 256) cover of the sky, which goes on over its edges."""
-    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(256), np.fft.fftfreq(256)))
-    spectrum = np.fft.fft2(rng.standard_normal((256, 256))) / np.maximum(frequency, 1 / 256) ** 1.7
-    clouds = np.fft.ifft2(spectrum).real
-    clouds = (clouds - clouds.mean()) / clouds.std()
-    return np.clip(0.5 * clouds + rng.uniform(-0.4, 0.5), 0, 1).astype(np.float32)

@@ -1,0 +1,59 @@
+"""The suite STREETS for the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from semantic_mapper.benchmark.claims import CountTable
+from semantic_mapper.benchmark.store import RecordStore
+from semantic_mapper.benchmark.streets import (
+    ARMS,
+    CLAIMS,
+    LABELS,
+    MEASURES,
+    STREETS_TIERS,
+    Arm,
+    StreetsConfig,
+    run_streets,
+    street_seeds,
+    streets_table,
+)
+from semantic_mapper.benchmark.streets_panoptic import panoptic_arms
+from semantic_mapper.config import to_plain
+from semantic_mapper.nodes.cli.arm_suite import ArmSuite, tier_config
+from semantic_mapper.replay.evaluate.street_map import map_arm
+from semantic_mapper.scenes.suite import STREETS_SUITE
+
+
+def streets_suite(path: Path | None, tier: str | None, seed: int | None) -> ArmSuite[Arm]:
+    """The suite as a TOML file or a tier has it; raises as ``tier_config``."""
+    config = tier_config("streets", path, tier, seed, STREETS_TIERS)
+
+    def scores(names: Sequence[str], store: RecordStore) -> tuple[CountTable, Collection[str]]:
+        return streets_table(config, names, store), ()
+
+    return ArmSuite(
+        name="streets",
+        title=f"STREETS, {config.streets} streets of {config.pairs} pairs, {config.width} pixels wide",
+        paper="Panoptic NeRF",
+        file=f"streets-{config.width}",
+        config=to_plain(config),
+        label_set=STREETS_SUITE.label_set,
+        arms=lambda folder: ARMS | {"map": map_arm} | panoptic_arms(folder),
+        units=config.streets,
+        run=lambda arms, store, stopped: _run(config, arms, store, stopped),
+        scores=scores,
+        measures=MEASURES,
+        class_kinds=(LABELS,),
+        claims=CLAIMS,
+        seed=config.seed,
+    )
+
+
+def _run(
+    config: StreetsConfig, arms: Mapping[str, Arm], store: RecordStore, stopped: Callable[[], object]
+) -> Iterator[tuple[int, str]]:
+    seeds = street_seeds(config)
+    for name, seed in run_streets(config, arms, store, stopped):
+        yield seeds.index(seed) * len(arms) + list(arms).index(name), f"{name}, street {seed}"

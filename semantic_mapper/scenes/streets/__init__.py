@@ -1,0 +1,1 @@
+"""Streets seen from a car: drives laid out as KITTI-360 is, and the suite STREETS."""
