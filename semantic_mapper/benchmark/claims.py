@@ -60,6 +60,7 @@ class Claim:
         second_measure: Figure of ``second``; None = ``measure``.
         least, most: Bounds in points. A bound of 0 or above from below is a gain: its interval must lie above 0, too.
         factor: Of ``second``.
+        at_plateau: Arms whose steps the claim is about: it is judged only where they are at their plateau.
     """
 
     name: str
@@ -71,6 +72,7 @@ class Claim:
     least: float = -np.inf
     most: float = np.inf
     factor: float = 1.0
+    at_plateau: tuple[str, ...] = ()
 
     @property
     def arms(self) -> tuple[str, ...]:
@@ -114,7 +116,7 @@ def check_claim(claim: Claim, table: CountTable, *, unfinished: Collection[str] 
     Args:
         claim: What to judge.
         table: Counts by arm, by what is scored, and by unit.
-        unfinished: Arms that are not at their plateau; claims on them are not judged.
+        unfinished: Arms that are not at their plateau.
         seed: Of the bootstrap.
     """
     measures = (claim.measure, claim.second_measure or claim.measure)
@@ -135,7 +137,7 @@ def check_claim(claim: Claim, table: CountTable, *, unfinished: Collection[str] 
     low, high = (float(x) for x in np.nanpercentile(drawn, (2.5, 97.5)))
     difference = float(observed[0])
     right = claim.least <= difference <= claim.most and not (claim.least >= 0 >= low)
-    open_arms = tuple(arm for arm in dict.fromkeys(claim.arms) if arm in unfinished)
+    open_arms = tuple(arm for arm in claim.at_plateau if arm in unfinished)
     result: Result = "not judged" if open_arms else "accepted" if right else "refused"
     return ClaimResult(claim, result, difference, low, high, count, open_arms)
 

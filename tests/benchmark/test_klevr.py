@@ -101,7 +101,10 @@ def test_records_are_kept_and_not_made_again(gain: float, tmp_path: Path) -> Non
         assert np.array_equal(twice["nesf", TEST_CAMERAS][unit], 2 * counts)
     same = next(c for c in CLAIMS if c.name == "the same at test cameras")
     assert unfinished == ({"nesf"} if gain >= PLATEAU else set())
-    assert check_claim(same, table, unfinished=unfinished).result == ("not judged" if unfinished else "accepted")
+    assert check_claim(same, table, unfinished=unfinished).result == "accepted"
+    steps_matter = replace(same, at_plateau=("nesf",))
+    expected = "not judged" if unfinished else "accepted"
+    assert check_claim(steps_matter, table, unfinished=unfinished).result == expected
     assert klevr_digest(TINY) != klevr_digest(msgspec.structs.replace(TINY, mlp_steps=7))
 
 
@@ -130,8 +133,8 @@ def test_claims_compare_figures_of_one_arm_and_a_fraction() -> None:
 
 def test_claims_on_an_arm_that_still_learns_are_not_judged() -> None:
     table = {("a", POINTS): matrices([90, 80]), ("b", POINTS): matrices([60, 50])}
-    claim = Claim("gain", "", POINTS_MIOU, "a", "b", least=5.0)
-    judged, left = check_claim(claim, table), check_claim(claim, table, unfinished={"b", "c"})
+    claim = Claim("gain", "", POINTS_MIOU, "a", "b", least=5.0, at_plateau=("b",))
+    judged, left = check_claim(claim, table, unfinished={"a"}), check_claim(claim, table, unfinished={"b", "c"})
     assert judged.result == "accepted" and judged.unfinished == ()
     assert left.result == "not judged" and left.unfinished == ("b",)
     assert (left.difference, left.low, left.high) == (judged.difference, judged.low, judged.high)
