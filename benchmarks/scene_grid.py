@@ -146,7 +146,7 @@ def _psnr(frames: Sequence[PosedFrame], renders: Sequence[tuple[Float32, Float32
 
 
 def _memory() -> str:
-    return f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB"
+    return f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9:.2f} GB"  # it counts in KiB
 
 
 def _picture(

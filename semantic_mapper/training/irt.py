@@ -183,7 +183,7 @@ def _fit_scene(
         shape = msgspec.structs.replace(shape, variant=config.irt.variant)
     torch.manual_seed(config.seed)
     field = IRT(shape, label_set)
-    field.grid.load_state_dict(fit.grid.state_dict())
+    field.grid = fit.grid
     field.fitted_steps += fit.steps
     assert field.trunk is not None
     until = began + TRUNK_UNTIL * config.seconds if config.seconds else math.inf
