@@ -250,6 +250,7 @@ class _Fitter:
         """One step of Adam on a batch of rays at a fraction of the budget; returns their mean squared error."""
         if self.stage + 1 < len(self.stages) and fraction >= self.stages[self.stage + 1][0]:
             self.stage += 1
+            del self.gradient, self.first, self.second, self.samples  # before larger ones are made
             self.grid = self.grid.resampled(at_resolution(self.box, self._long_side(self.stage)))
             self._allocate()
         elif step >= WARM_UP and step % PRUNE_EVERY == 0:

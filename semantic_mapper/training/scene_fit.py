@@ -90,7 +90,7 @@ def fit_geometry(
     torch.manual_seed(config.seed)  # of what the kind draws
     field = build_field(kind, msgspec.structs.replace(shape or given, grid=fit.grid.config), label_set)
     assert isinstance(field, GridField)
-    field.grid.load_state_dict(fit.grid.state_dict())
+    field.grid = fit.grid
     field.fitted_steps += fit.steps
     return FittedGeometry(field, fit)
 
@@ -129,7 +129,7 @@ def fit_trunk(
     rays = frame_rays(fit.frames, config.width)
     networks = [p for name, p in trunk.named_parameters() if name != "features"]
     groups = [{"params": [trunk.features], "lr": FEATURE_RATE}, {"params": networks, "lr": TRUNK_RATE}]
-    optimiser = torch.optim.Adam(groups)
+    optimiser = torch.optim.Adam(groups, fused=True)  # without temporaries as large as the features
     errors: list[float] = []
     for step in range(config.trunk_steps):
         if stopped():
