@@ -1,5 +1,5 @@
-"""A picture of AERIAL's first town, after ``benchmark aerial``: its labelled views, and what IRT and the U-Net say of
-views that are held out, by day and in the dark.
+"""A picture of AERIAL's first town, after ``benchmark aerial``: its labelled views, and what IRT (the default of
+``finetune``) and the U-Net say of views that are held out, by day and in the dark.
 
 Example: python -m benchmarks.aerial_picture --folder runs/aerial-grids --out town.jpg
 """
@@ -29,7 +29,7 @@ from semantic_mapper.plots import draw_picture_rows
 from semantic_mapper.scenes.suite import AERIAL_SUITE
 from semantic_mapper.types import UInt8
 
-SHOWN = {"IRT": "irt-rttc", "U-Net": "unet"}
+SHOWN = {"IRT": "irt-bc", "U-Net": "unet"}
 COLUMNS, WIDTH_PX = 4, 150
 
 
@@ -49,7 +49,7 @@ def picture(config: AerialConfig, fitted: Mapping[str, Predict]) -> UInt8:
     for kind, caption in ((DAY, ""), (DARK, ", dark")):
         views = scored_views(config, episode, kind)
         views = [views[int(k)] for k in np.linspace(1, len(views) - 2, COLUMNS).round()]
-        rows[f"held-out view{caption}"] = [view.frame.rgb for view in views]
+        rows["in the dark" if kind == DARK else "held-out view"] = [view.frame.rgb for view in views]
         if kind == DAY:
             rows["true classes"] = [label_set.colorize(view.rendered.label) for view in views]
         for name, predict in fitted.items():

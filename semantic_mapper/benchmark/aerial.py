@@ -64,7 +64,7 @@ class AerialConfig(Config, frozen=True):
     voxel_m: Positive = 0.75
     grid_steps: AtLeastOne = 600  # of the photometric fit of a town
     nerf_steps: AtLeastOne = 300  # of logits that are trained jointly with the grid
-    unet_steps: AtLeastTwo = 200  # to begin with; doubled until a plateau is reached
+    unet_steps: AtLeastTwo = 400  # to begin with; doubled until a plateau is reached
     trunk_steps: AtLeastOne = 300  # of features on a town's grid
     irt_steps: AtLeastOne = 500
     mlp_steps: AtLeastOne = 600
@@ -137,8 +137,8 @@ def town_views(width: int, town: int, numbers: tuple[int, ...], dark: bool = Fal
 def thinned(frame: PosedFrame, every: int) -> PosedFrame:
     """A frame of one pixel in ``every`` along each side, with their camera."""
     i, first = frame.intrinsics, (every - 1) // 2
-    size = [len(range(first, side, every)) for side in (i.width, i.height)]
-    camera = CameraIntrinsics(i.fx / every, i.fy / every, (i.cx - first) / every, (i.cy - first) / every, *size)
+    width, height = (len(range(first, side, every)) for side in (i.width, i.height))
+    camera = CameraIntrinsics(i.fx / every, i.fy / every, (i.cx - first) / every, (i.cy - first) / every, width, height)
     label = None if frame.label is None else thin(frame.label, every)
     return replace(frame, rgb=thin(frame.rgb, every), label=label, intrinsics=camera)
 

@@ -37,6 +37,7 @@ from semantic_mapper.benchmark.aerial_irt import irt_arms
 from semantic_mapper.benchmark.claims import Claim, Counts, Unit, check_claim, check_claims, figure
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.geometry import unproject
 from semantic_mapper.labels import CARLA
 from semantic_mapper.scenes.aerial.views import aerial_camera, aerial_views
 from semantic_mapper.training.baselines import UNetBaseline, UNetConfig
@@ -102,6 +103,15 @@ def test_the_truth_scores_100_and_one_class_little() -> None:
     assert miou(plain) < 5.0
     agreeing, compared = total(plain, AGREEMENT)[0]
     assert agreeing == compared > 500
+
+
+def test_pixels_of_a_thinned_frame_are_those_of_the_frame() -> None:
+    (view, *_) = scored_views(TINY, EPISODE, DAY)
+    few, depth = thinned(view.frame, 3), view.rendered.exact_depth_m
+    assert few.rgb.shape == (16, 16, 3) and few.label is not None
+    assert np.array_equal(few.label, thin(view.rendered.label, 3))
+    there = thin(unproject(depth, view.frame.intrinsics), 3)
+    assert np.allclose(unproject(thin(depth, 3), few.intrinsics), there, atol=1e-4)
 
 
 def test_arms_are_not_shown_the_truth_they_are_scored_by() -> None:
