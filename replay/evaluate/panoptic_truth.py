@@ -101,7 +101,8 @@ class PanopticTruth:
         if instance is None:
             return
         k = working_intrinsics(frame.intrinsics, TRUTH_WIDTH)
-        small = cv2.resize(instance, (k.width, k.height), interpolation=cv2.INTER_NEAREST_EXACT)
+        size = (k.width, k.height)
+        small = np.asarray(cv2.resize(instance, size, interpolation=cv2.INTER_NEAREST_EXACT), np.uint16)
         self._views.append(_View(frame.T_world_camera, k, PanopticImage(resize_label(truth, k), small)))
         if len(self._views) > MAX_FRAMES:
             self._views = self._views[::2]

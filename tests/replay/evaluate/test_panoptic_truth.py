@@ -42,6 +42,7 @@ def score(log_path: Path, folder: Path, voxel_map: VoxelMap, stream: LabelSet = 
     with open_log(log_path) as log:
         truth = PanopticTruth(InstanceFolder(folder, log), stream, ROOMS)
         for frame in log:
+            assert frame.label is not None
             truth.add(frame, frame.label)
     return truth.score(voxel_map)
 
