@@ -36,6 +36,14 @@ BaselinesOption = Annotated[
 MeshOption = Annotated[
     Path | None, typer.Option(metavar="NPZ", help="DIR: also compare its map with this reference mesh.")
 ]
+InstancesOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        help="LOG: images of its frames' true objects, NNNNNN.png or CAMERA/NNNNNN.png (8 or 16 bits, 0 = none): also "
+        "score the finished map with its things by panoptic quality.",
+    ),
+]
 SecondsOption = Annotated[
     float | None, typer.Option(min=0, help="--baselines: training time of the U-Net.  [default: 300]")
 ]
@@ -49,6 +57,7 @@ def evaluate(
     baselines: BaselinesOption = False,
     seconds: SecondsOption = None,
     mesh: MeshOption = None,
+    instances: InstancesOption = None,
     max_frames: MaxFramesOption = 0,
     config: ConfigOption = None,
     seed: SeedOption = None,
@@ -76,6 +85,7 @@ def evaluate(
 
     Example: semantic-mapper eval runs/a runs/b
     Example: semantic-mapper eval kitchen.mcap --weights kitchen.safetensors --baselines
+    Example: semantic-mapper eval kitchen.mcap --instances kitchen/instance
     """
     out, print_json = results_file(out, json)
     if suite is not None:
@@ -83,8 +93,9 @@ def evaluate(
         from semantic_mapper.nodes.cli.suite import run_suite_verb
         from semantic_mapper.nodes.cli.suite_options import suite_config
 
-        if targets or baselines or mesh or max_frames:
-            raise typer.BadParameter("takes no DIR_OR_LOG, --baselines, --mesh or --max-frames", param_hint="--suite")
+        if targets or baselines or mesh or instances or max_frames:
+            given_in_vain = "takes no DIR_OR_LOG, --baselines, --mesh, --instances or --max-frames"
+            raise typer.BadParameter(given_in_vain, param_hint="--suite")
         given = {"split": split, "rooms": rooms, "protocol": protocol, "views": views, "baseline": baseline}
         given |= {"depth": depth, "keyframes": keyframes, "steps": steps, "seconds": seconds, "seed": seed}
         settings = suite_config(config, tier, given, maps)
@@ -95,7 +106,7 @@ def evaluate(
     if baselines and seconds == 0:
         raise typer.BadParameter("the U-Net needs time to learn", param_hint="--seconds")
     baseline_s = BASELINE_SECONDS if seconds is None else seconds
-    options = _single(weights), baselines, baseline_s, max_frames, config, seed or 0
+    options = _single(weights), baselines, baseline_s, max_frames, config, seed or 0, instances
     return _evaluate_targets(targets or [], options, mesh, out, print_json=print_json)
 
 
@@ -107,7 +118,7 @@ def _single(weights: list[Path] | None) -> Path | None:
 
 def _evaluate_targets(
     targets: list[Path],
-    options: tuple[Path | None, bool, float, int, Path | None, int],
+    options: tuple[Path | None, bool, float, int, Path | None, int, Path | None],
     mesh: Path | None,
     json_file: Path | None,
     *,
@@ -132,6 +143,8 @@ def _evaluate_targets(
     folders = [t for t in targets if t not in logs]
     if mesh is not None and not folders:
         raise typer.BadParameter("goes with a DIR that `replay` has written", param_hint="--mesh")
+    if options[-1] is not None and not logs:
+        raise typer.BadParameter("goes with a LOG", param_hint="--instances")
     path = json_file or (folders[0] / "eval.json" if folders else targets[0].with_suffix(".eval.json"))
     if json_file is not None or targets[0].exists():  # no folders for a log that is not there
         prepare_file(path)

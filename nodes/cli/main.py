@@ -10,6 +10,7 @@ from semantic_mapper import __version__
 from semantic_mapper.nodes.cli import autolabel as cli_autolabel
 from semantic_mapper.nodes.cli import bench as cli_bench
 from semantic_mapper.nodes.cli import benchmark as cli_benchmark
+from semantic_mapper.nodes.cli import boxes as cli_boxes
 from semantic_mapper.nodes.cli import calibrate as cli_calibrate
 from semantic_mapper.nodes.cli import cameras as cli_cameras
 from semantic_mapper.nodes.cli import compare as cli_compare
@@ -75,6 +76,7 @@ app.add_typer(cli_launch.app, name="launch")
 app.command("eval", cls=JsonCommand)(cli_eval.evaluate)
 # Coordinates below 0 look like options.
 app.command("query", cls=JsonCommand, context_settings={"ignore_unknown_options": True})(cli_query.query)
+app.command("boxes", context_settings={"ignore_unknown_options": True})(cli_boxes.boxes)
 app.command("train")(cli_train.train)
 app.command("benchmark", cls=JsonCommand)(cli_benchmark.benchmark)
 app.command("bench", cls=JsonCommand)(cli_bench.bench)

@@ -13,12 +13,14 @@ from rich.table import Table
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import LabelError, WeightsError
 from semantic_mapper.mapper import Mapper
+from semantic_mapper.mapping.map_scale import require_metres
 from semantic_mapper.nodes.cli.console import frame_progress
 from semantic_mapper.nodes.cli.run_replay import mapper_config
 from semantic_mapper.nodes.cli.summary_table import percent
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.evaluate.methods import baseline_predictors, evaluate_frames, field_predictors
+from semantic_mapper.replay.evaluate.panoptic_truth import InstanceFolder, PanopticTruth
 from semantic_mapper.replay.evaluate.shortfall import explain_shortfall
 from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.types import PosedFrame
@@ -26,7 +28,8 @@ from semantic_mapper.types import PosedFrame
 
 @dataclass(frozen=True, slots=True)
 class ScoreRequest:
-    """What the verb was requested; ``weights`` None = those in the package, ``max_frames`` 0 = all."""
+    """What the verb was requested; ``weights`` None = those in the package, ``max_frames`` 0 = all. ``instances`` is a
+    folder, or None."""
 
     log: Path
     weights: Path | None
@@ -35,6 +38,7 @@ class ScoreRequest:
     max_frames: int
     config: Path | None
     seed: int
+    instances: Path | None
 
 
 def score_log(request: ScoreRequest) -> dict[str, Any]:
@@ -58,6 +62,10 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
                 f"{bundle.weights_path}: a field of kind '{bundle.checkpoint.model.kind}' knows no classes, so that "
                 "there is nothing to score; give weights that were trained on labels"
             )
+        panoptic = None
+        if request.instances is not None:
+            require_metres(log.info.scale_known, "instances")
+            panoptic = PanopticTruth(InstanceFolder(request.instances, log), stream_labels, bundle.checkpoint.label_set)
         predictors = field_predictors(bundle)
         stamps = bundle.checkpoint.train_stamps_ns
         if request.baselines:
@@ -81,6 +89,7 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
                 stamps,
                 on_frame=bar.set,
                 voxel_map=bundle.pipeline.voxel_map,
+                panoptic=panoptic,
             )
         model, recipe = bundle.checkpoint.model, bundle.checkpoint.recipe
         shortfall = explain_shortfall(model.kind, found.methods, recipe)
@@ -146,6 +155,11 @@ def score_table(title: str, scores: Mapping[str, Any]) -> Table:
         ("ece", "calibration error"),
         ("sure", "confidence above 0.9"),
         ("sure_right", "of these right"),
+        ("pq", "PQ"),
+        ("sq", "SQ"),
+        ("rq", "RQ"),
+        ("pq_plus", "PQ+"),
+        ("pq_things", "PQ of things"),
         ("open_set_auroc", "AUROC, classes it lacks"),
         ("open_set_unknown", "unknown, of classes it lacks"),
     ):

@@ -18,6 +18,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper, make_field
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.replay.evaluate.panoptic_truth import SEEN, PanopticTruth
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
 from semantic_mapper.training.baselines import UNetBaseline, UNetConfig, WarpBaseline
 from semantic_mapper.training.views import stack_sources, view_from_frame
@@ -124,12 +125,14 @@ def evaluate_frames(
     exclude_stamps: frozenset[int],
     on_frame: Callable[[int], None] | None = None,
     voxel_map: VoxelMap | None = None,
+    panoptic: PanopticTruth | None = None,
 ) -> Evaluation:
     """Run every predictor over every frame; frames in ``exclude_stamps`` are predicted but not scored,
     and so are those with pseudo labels.
 
     ``voxel_map``, where it is given and one of the predictors fills it, is scored in the end as the method ``MAP``: its
-    points against the majority of the labels of the frames with depth that see them.
+    points against the majority of the labels of the frames with depth that see them. With ``panoptic``, which the
+    scored frames are added to, it is also scored as the method ``SEEN``: with its things, as those frames see it.
     """
     surface = SurfaceTruth(stream_labels)
     truth_mapper = TruthMapper(stream_labels, label_set)
@@ -149,6 +152,8 @@ def evaluate_frames(
                 scored += 1
                 if voxel_map is not None:
                     surface.add(frame)
+                if panoptic is not None:
+                    panoptic.add(frame, truth)
                 labelled = frame.label != stream_labels.ignore_id
                 strange = labelled & (truth == label_set.ignore_id)
                 for name, opinion in predicted.items():
@@ -179,6 +184,8 @@ def evaluate_frames(
     }
     if MAP in methods:
         methods[MAP]["open_set_unknown"] = rejected
+    if panoptic is not None and voxel_map is not None:
+        methods[SEEN] = {**panoptic.score(voxel_map)}
     return Evaluation(methods, scored, excluded, refused, pseudo)
 
 

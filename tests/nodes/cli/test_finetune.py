@@ -8,6 +8,8 @@ import shutil
 import signal
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from semantic_mapper.fields.checkpoint import load_checkpoint
@@ -73,6 +75,20 @@ def test_eval_of_a_log_compares_with_baselines_on_frames_that_nobody_was_fitted_
     assert scores["scored"] == 3 and scores["excluded"] == 3
     assert {"sray", "per-image U-Net", "labels carried by depth"} <= set(scores["methods"])
     assert "per-image U-Net" in done.stdout
+
+
+def test_eval_scores_the_map_with_its_things_where_objects_are_known(
+    log: Path, weights: Path, config: Path, tmp_path: Path
+) -> None:
+    for number, frame in enumerate(tiny_frames(6)[:2]):
+        cv2.imwrite(str(tmp_path / f"{number:06d}.png"), (frame.label // 3).astype(np.uint16))
+    file, options = tmp_path / "eval.json", ("--weights", weights, "--config", config, "--max-frames", "2")
+    done = run("eval", log, *options, "--instances", tmp_path, "--out", file)
+    assert done.returncode == 0, done.stderr
+    seen = json.loads(file.read_text())["logs"][str(log)]["methods"]["map seen from frames"]
+    assert 0 <= seen["pq"] <= seen["pq_plus"] <= 1 and seen["panoptic_frames"] == 2
+    assert "PQ of things" in done.stdout
+    assert run("eval", tmp_path, "--instances", tmp_path).returncode == 2
 
 
 def test_eval_of_a_folder_without_a_replay_says_so(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -56,3 +57,8 @@ def test_a_mapped_room_is_scored_at_its_own_points_and_at_the_true_surface(tmp_p
     assert figures["cast_miou"] == cast.metrics().miou
     assert figures["map_miou"] == figures["map_miou_mean_of_rooms"] == at_points.metrics().miou
     assert figures["view_miou_mean_of_rooms"] == record.view_miou
+    assert record.panoptic is not None
+    _, right, wrong, missed, _ = np.array(record.panoptic.sums)
+    assert right.sum() + missed.sum() > 10 and (wrong >= 0).all()
+    assert 0 <= figures["pq"] <= figures["pq_plus"] <= 1 and set(figures["pq_by_class"]) >= {"wall", "floor"}
+    assert map_figures([msgspec.structs.replace(record, panoptic=None)])["pq"] is None, "an older record"

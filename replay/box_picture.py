@@ -1,0 +1,254 @@
+"""Boxes drawn over three frames of a log, and from above with its path and what its depth shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.errors import LogError
+from semantic_mapper.evaluation.upright import camera_up, ceiling_height, upright_rotation
+from semantic_mapper.fields.primitives import Primitive
+from semantic_mapper.geometry import invert_pose, nearest_pixels, project, transform, unproject
+from semantic_mapper.imaging import resize_depth, resize_rgb, working_intrinsics
+from semantic_mapper.labels import LabelSet, make_label_set
+from semantic_mapper.plain_text import counted
+from semantic_mapper.plots import (
+    DIM_TEXT,
+    SMALL_PT,
+    TEXT,
+    Color,
+    LegendRow,
+    cut,
+    new_figure,
+    place,
+    put_legend,
+    put_picture,
+    put_text,
+    put_title,
+    rendered,
+)
+from semantic_mapper.replay.log.sequence import Log
+from semantic_mapper.types import CameraIntrinsics, Float64, PosedFrame, UInt8
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SHOWN = 3  # frames with boxes over them
+DEPTH_FRAMES = 16  # that the view from above shows surface of
+NEAR_M = 0.05  # edges are cut off nearer than this
+MARGIN, GAP, HEADER, CAPTION = 24, 14, 84, 26
+TILE_WIDTH, PLAN_HEIGHT, LEGEND_WIDTH = 512, 760, 200
+POINTS_WIDTH = 160  # of the depth images that the view from above is made of
+_EDGES = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]  # of ``Primitive.corners``
+_FOOTPRINT_FILL = 0.15
+
+
+class _Place(NamedTuple):
+    """Of a frame: its number in the log, time, camera and pose."""
+
+    number: int
+    stamp_ns: int
+    intrinsics: CameraIntrinsics
+    T_world_camera: Float64
+
+
+def draw_boxes(log: Log, boxes: Sequence[Primitive], title: str) -> tuple[UInt8, int]:
+    """Draw boxes over the frames that show the most of them, and from above.
+
+    Args:
+        log: Whose frames.
+        boxes: In its world.
+        title: Head of the picture.
+
+    Returns:
+        The picture (H, W, 3) uint8 RGB, and how many boxes have their middle in view of any frame.
+
+    Raises:
+        LogError: it has no frames.
+    """
+    places = _places(log)
+    if not places:
+        raise LogError(f"{log.path}: has no frames to draw boxes over")
+    seen = np.array([_in_view(boxes, at) for at in places]).reshape(len(places), len(boxes))
+    chosen = [
+        part[int(seen[part].sum(axis=1).argmax())]
+        for part in np.array_split(np.arange(len(places)), SHOWN)
+        if len(part)
+    ]
+    shown = [(places[i], log.frame(places[i].number)) for i in chosen]
+    step = max(1, len(places) // DEPTH_FRAMES)
+    surface = [log.frame(at.number) for at in places[::step]]
+    colors = _class_colors([box.class_name for box in boxes], log.info.label_set)
+    return _draw(shown, surface, [at.T_world_camera for at in places], boxes, colors, title), int(
+        seen.any(axis=0).sum()
+    )
+
+
+def _places(log: Log) -> list[_Place]:
+    return [
+        _Place(
+            number,
+            envelope.stamp_ns,
+            log.info.cameras[envelope.source],
+            np.array(envelope.T_world_camera, np.float64).reshape(4, 4),
+        )
+        for number, (envelope, _) in enumerate(log.frame_parts())
+        if envelope.source in log.info.cameras
+    ]
+
+
+def _in_view(boxes: Sequence[Primitive], at: _Place) -> NDArray[np.bool_]:
+    """Which of the boxes (B,) have their middle in an image."""
+    middle = np.array([_at_time(box, at.stamp_ns).T_world_box[:3, 3] for box in boxes]).reshape(-1, 3)
+    return nearest_pixels(transform(invert_pose(at.T_world_camera), middle), at.intrinsics)[0]
+
+
+def _at_time(box: Primitive, stamp_ns: int) -> Primitive:
+    """A box at the known time that is nearest."""
+    if box.stamps is None:
+        return box
+    return replace(box, T_world_box=min(box.stamps, key=lambda entry: abs(entry[0] - stamp_ns))[1])
+
+
+@rendered
+def _draw(
+    shown: Sequence[tuple[_Place, PosedFrame]],
+    surface: Sequence[PosedFrame],
+    poses: Sequence[Float64],
+    boxes: Sequence[Primitive],
+    colors: dict[str, Color],
+    title: str,
+) -> Figure:
+    heights = [round(TILE_WIDTH * at.intrinsics.height / at.intrinsics.width) for at, _ in shown]
+    width = SHOWN * (TILE_WIDTH + GAP) - GAP
+    top = HEADER + CAPTION + max(heights) + GAP + CAPTION
+    figure = new_figure(width + 2 * MARGIN, top + PLAN_HEIGHT + MARGIN)
+    put_title(figure, title, f"{counted(len(boxes), 'box', 'boxes')}; each with its id")
+    for column, ((at, frame), height) in enumerate(zip(shown, heights, strict=True)):
+        box = (MARGIN + column * (TILE_WIDTH + GAP), HEADER + CAPTION, TILE_WIDTH, height)
+        axes = put_picture(figure, box, frame.rgb, f"frame {at.number}", smooth=True)
+        for primitive in boxes:
+            _put_edges(axes, _at_time(primitive, at.stamp_ns), at, colors[primitive.class_name])
+    plan_width = width - LEGEND_WIDTH - GAP
+    _put_plan(figure, (MARGIN, top, plan_width, PLAN_HEIGHT), surface, np.stack(poses), boxes, colors)
+    counts = {name: sum(box.class_name == name for box in boxes) for name in colors}
+    rows: list[LegendRow] = [(f"{name}, {counts[name]}", color, None) for name, color in colors.items()]
+    put_legend(figure, (MARGIN + plan_width + GAP, top, LEGEND_WIDTH, PLAN_HEIGHT), rows)
+    return figure
+
+
+def _put_edges(axes: Axes, box: Primitive, at: _Place, color: Color) -> None:
+    """The edges of a box in the tile of a frame, and its id where its middle is in view."""
+    T_camera_world, k = invert_pose(at.T_world_camera), at.intrinsics
+    scale = TILE_WIDTH / k.width
+    corners = transform(T_camera_world, box.corners())
+    for a, b in _EDGES:
+        ends = _in_front(corners[a], corners[b])
+        if ends is not None:
+            x, y = ((project(ends, k) + 0.5) * scale).T
+            axes.plot(x, y, color=_rgb(color), linewidth=1.4, linestyle="-")
+    middle = transform(T_camera_world, box.T_world_box[:3, 3][None])
+    if nearest_pixels(middle, k)[0][0]:
+        x, y = (project(middle, k)[0] + 0.5) * scale
+        _put_id(axes, float(x), float(y), box.id)
+
+
+def _in_front(a: Float64, b: Float64) -> Float64 | None:
+    """The part (2, 3) of an edge in camera coordinates that is in front of the camera; None where nothing is."""
+    if a[2] < NEAR_M and b[2] < NEAR_M:
+        return None
+    ends = [a, b]
+    for i, (near, far) in enumerate(((a, b), (b, a))):
+        if near[2] < NEAR_M:
+            ends[i] = near + (far - near) * ((NEAR_M - near[2]) / (far[2] - near[2]))
+    return np.stack(ends)
+
+
+def _put_plan(
+    figure: Figure,
+    place_at: tuple[float, float, float, float],
+    surface: Sequence[PosedFrame],
+    poses: Float64,
+    boxes: Sequence[Primitive],
+    colors: dict[str, Color],
+) -> None:
+    """Surface, path and boxes from above, in metres of a level frame."""
+    xyz, rgb = _surface(surface)
+    R = upright_rotation(xyz, camera_up(poses))
+    level = xyz @ R.T
+    roof = ceiling_height(level) if len(level) else None
+    kept = np.ones(len(level), np.bool_) if roof is None else level[:, 2] < roof
+    order = np.argsort(level[kept][:, 2], kind="stable")  # what is higher hides what is below
+    level, rgb = level[kept][order], rgb[kept][order]
+
+    path = poses[:, :3, 3] @ R.T
+    moments = [(box, pose) for box in boxes for pose in _poses(box)]
+    prints = [_footprint(replace(box, T_world_box=pose).corners() @ R.T) for box, pose in moments]
+    every = np.concatenate([level[:, :2], path[:, :2], *prints])
+    low, high = every.min(axis=0), every.max(axis=0)
+    _, _, w, h = place_at
+    scale = 0.94 * min(w / max(high[0] - low[0], 1e-3), h / max(high[1] - low[1], 1e-3))
+
+    def pixels(at: Float64) -> Float64:
+        return (at[:, :2] - (low + high) / 2) * (scale, -scale) + (w / 2, h / 2)
+
+    axes = place(figure, place_at)
+    put_text(axes, (0, -11), cut("from above: surface, the camera's path, and boxes", w, 11), color=DIM_TEXT)
+    x, y = pixels(level).T
+    axes.scatter(x, y, c=rgb / 255, s=1.2, linewidths=0, rasterized=True)
+    x, y = pixels(path).T
+    axes.plot(x, y, color="white", linewidth=1, linestyle=":")
+    for (box, _), outline in zip(moments, prints, strict=True):
+        x, y = pixels(outline).T
+        color = _rgb(colors[box.class_name])
+        axes.fill(x, y, facecolor=(*color, _FOOTPRINT_FILL), edgecolor=color, linestyle="-")
+        _put_id(axes, float(x.mean()), float(y.mean()), box.id)
+    bar = 10.0 ** np.floor(np.log10(w / 3 / scale))
+    axes.plot((16, 16 + bar * scale), (h - 18, h - 18), color="white", linewidth=3, solid_capstyle="butt")
+    put_text(axes, (16, h - 34), f"{bar:g} m")
+
+
+def _surface(frames: Sequence[PosedFrame]) -> tuple[Float64, UInt8]:
+    """Points (N, 3) in the world and colours (N, 3) that the depth of frames shows."""
+    xyz, rgb = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
+    for frame in frames:
+        if frame.depth_m is None:
+            continue
+        k = working_intrinsics(frame.intrinsics, POINTS_WIDTH)
+        depth = resize_depth(frame, k)
+        xyz.append(transform(frame.T_world_camera, unproject(depth, k)[depth > 0]))
+        rgb.append(resize_rgb(frame, k)[depth > 0])
+    return np.concatenate(xyz), np.concatenate(rgb)
+
+
+def _poses(box: Primitive) -> list[Float64]:
+    return [box.T_world_box] if box.stamps is None else [pose for _, pose in box.stamps]
+
+
+def _footprint(corners: Float64) -> Float64:
+    """Outline (N, 2) of a box from above."""
+    return cv2.convexHull(corners[:, :2].astype(np.float32)).reshape(-1, 2).astype(np.float64)
+
+
+def _put_id(axes: Axes, x: float, y: float, box_id: int) -> None:
+    behind = {"facecolor": "black", "alpha": 0.5, "linewidth": 0, "pad": 1}
+    put_text(axes, (x, y), str(box_id), ha="center", fontsize=SMALL_PT, color=TEXT, bbox=behind, clip_on=True)
+
+
+def _rgb(color: Color) -> tuple[float, float, float]:
+    r, g, b = color
+    return r / 255, g / 255, b / 255
+
+
+def _class_colors(names: Sequence[str], label_set: LabelSet | None) -> dict[str, Color]:
+    """Colours of the classes, in the order in which they come: those of the label set where it has them."""
+    known = {} if label_set is None else dict(zip(label_set.names, label_set.colors, strict=True))
+    different = list(dict.fromkeys(names))
+    spare = make_label_set("boxes", different).colors if different else ()
+    return {name: known.get(name, color) for name, color in zip(different, spare, strict=True)}

@@ -1,0 +1,105 @@
+"""``boxes``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from semantic_mapper.fields.primitives import Primitive
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.replay.boxes import BoxFile, load_boxes, save_boxes
+from tests.nodes.support import error_line, run
+from tests.small import tiny_frames
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """A chair a metre in front of the first frame of the log, and a wall behind it."""
+    T = tiny_frames(6)[0].T_world_camera.copy()
+    chair = Primitive(2, "chair", "box", np.eye(4), np.array([0.3, 0.3, 0.4]), True)
+    chair.T_world_box[:3, 3] = (T @ (0, 0, 1.0, 1))[:3]
+    wall = Primitive(5, "wall", "box", np.eye(4), np.array([1.0, 1, 2]), False)
+    wall.T_world_box[:3, 3] = (T @ (0, 0, -3.0, 1))[:3]
+    save_boxes(path := tmp_path / "boxes.json", BoxFile((chair, wall)))
+    return path
+
+
+def test_a_file_goes_round_through_all_changes(file: Path) -> None:
+    before = load_boxes(file).primitives[0]
+    for words in (
+        ("duplicate", "2"),
+        ("move", "6", "-0.5", "0", "1e-1"),
+        ("turn", "6", "90"),
+        ("resize", "6", "1", "2", "0.5"),
+        ("reclass", "6", "table"),
+        ("duplicate", "6", "--at-ns", "70"),
+        ("duplicate", "6", "--at-ns", "90"),
+        ("move", "6", "0", "1", "0", "--at-ns", "90"),
+        ("delete", "2", "5"),
+    ):
+        done = run("boxes", file, *words, "--in-place")
+        assert done.returncode == 0, done.stderr
+    assert "box 2, 5 deleted; 1 box written" in done.stdout
+    (table,) = load_boxes(file).primitives
+    assert (table.id, table.class_name, table.size.tolist()) == (6, "table", [1, 2, 0.5])
+    np.testing.assert_allclose(table.T_world_box[:3, 0], (0, 1, 0), atol=1e-12)
+    first, later = (pose[:3, 3] - before.T_world_box[:3, 3] for _, pose in table.stamps or ())
+    np.testing.assert_allclose((first, later), ((-0.5, 0, 0.1), (-0.5, 1, 0.1)), atol=1e-12)
+
+
+def test_list_and_out_leave_the_file_alone(file: Path, tmp_path: Path) -> None:
+    text, out = file.read_bytes(), tmp_path / "new" / "fewer.json"
+    listed = json.loads(run("boxes", file, "list", "--json").stdout)
+    assert [(b["id"], b["class"], b["thing"]) for b in listed["boxes"]] == [(2, "chair", True), (5, "wall", False)]
+    assert "chair" in run("boxes", file).stdout
+    assert run("boxes", file, "delete", "5", "--out", out).returncode == 0
+    assert len(load_boxes(out).primitives) == 1 and file.read_bytes() == text
+
+
+def test_boxes_are_drawn_where_the_frames_show_them(file: Path, log: Path, tmp_path: Path) -> None:
+    out = tmp_path / "boxes.png"
+    done = run("boxes", file, "picture", log, "--out", out)
+    assert done.returncode == 0 and "1 of 2 boxes in view of its frames; written" in done.stdout
+    color = np.array(ROOMS.colors[ROOMS.names.index("chair")])[::-1]
+    tiles = np.asarray(cv2.imread(str(out)))[110 : 110 + 300, 24 : 24 + 3 * 512].astype(int)
+    assert (np.abs(tiles - color).max(-1) < 8).sum() > 300
+
+
+def test_wrong_use_and_wrong_ids_are_told_apart_and_change_nothing(file: Path, tmp_path: Path) -> None:
+    text = file.read_bytes()
+    for words in (
+        ("delete", "2"),
+        ("delete", "2", "--in-place", "--out", tmp_path / "b.json"),
+        ("move", "2", "1", "1", "--in-place"),
+        ("move", "2", "1", "1", "one", "--in-place"),
+        ("delete", "two", "--in-place"),
+        ("resize", "2", "1", "1", "1", "--at-ns", "5", "--in-place"),
+        ("picture", "log.mcap"),
+        ("list", "--in-place"),
+        ("delete", "2", "--in-place", "--json"),
+    ):
+        assert run("boxes", file, *words).returncode == 2, words
+    done = run("boxes", file, "delete", "9", "--in-place")
+    assert done.returncode == 1 and error_line(done.stderr).endswith(f"{file}: has no box 9; it has 2, 5")
+    assert file.read_bytes() == text
+
+
+def test_xml_of_kitti360_is_not_replaced(tmp_path: Path) -> None:
+    xml = tmp_path / "0000.xml"
+    corners = [(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+
+    def matrix(name: str, rows: list) -> str:
+        data = " ".join(str(v) for row in rows for v in row)
+        return f"<{name}><rows>{len(rows)}</rows><cols>{len(rows[0])}</cols><data>{data}</data></{name}>"
+
+    shape = matrix("vertices", corners) + matrix("faces", quads) + matrix("transform", np.eye(4).tolist())
+    xml.write_text(f"<a><object1>{shape}<label>car</label><index>0</index><timestamp>-1</timestamp></object1></a>")
+    done = run("boxes", xml, "move", "1", "1", "0", "0", "--in-place")
+    assert done.returncode == 1 and "give --out FILE.json" in error_line(done.stderr)
+    assert run("boxes", xml, "move", "1", "1", "0", "0", "--out", tmp_path / "b.json").returncode == 0
+    assert load_boxes(tmp_path / "b.json").primitives[0].T_world_box[0, 3] == 1
