@@ -130,7 +130,7 @@ def gradients(
     field.fitted_steps.fill_(1)
     one, none = torch.ones(1), torch.zeros(1)
     rays = RayBatch(torch.tensor([origin]), torch.tensor([(0.0, 0.0, -1.0)]), 0.1 * one, torch.inf * one, none)
-    samples = field.march(rays)
+    samples = field.march(rays, kept=64)
     boxes = field.boxes_on(samples)
     weights = PanopticFitConfig(points=0.0, learned=learned)
     group = merged_classes(SET, field.shape.merge)
