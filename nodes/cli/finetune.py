@@ -179,10 +179,10 @@ def finetune(
             f"  {recipe['steps']} steps in {recipe['seconds']} s, best at step {recipe['best_step']}: held-out loss "
             f"{recipe['held_out_loss']:.3f}, accuracy {recipe['held_out_accuracy'] * 100:.1f} %"
         )
-    if pseudo := recipe.get("pseudo_labels"):
-        by = f" that {pseudo['of']} has rendered" if pseudo["of"] else ""
+    if by_field := recipe.get("pseudo_labels"):
+        by = f" that {by_field['of']} has rendered" if pseudo["of"] else ""
         output.print(
-            f"  {pseudo['keyframes']} of the {len(chosen)} keyframes have pseudo labels{by}: the figures above say how "
+            f"  {by_field['keyframes']} of the {len(chosen)} keyframes have pseudo labels{by}: the figures above say how "
             "well these are learned, not how right they are"
         )
     if own := recipe.get("own_view"):
