@@ -120,6 +120,7 @@ def main() -> None:
     parser.add_argument("--boxes", choices=["true", "query"], nargs="+", default=["true", "query"])
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="of PanopticFitConfig")
     parser.add_argument("--uncovered", choices=["stuff", "empty"], default="stuff")
+    parser.add_argument("--every", type=int, default=1, help="score every n-th frame")
     parser.add_argument("--keep", type=Path, required=True, help="folder for what the mapper has rendered")
     parser.add_argument("--out", type=Path, help="PNG of a few frames")
     given = parser.parse_args()
@@ -134,7 +135,11 @@ def main() -> None:
     sheets: list[UInt8] = []
     for seed in given.rooms:
         room = map_room(seed, given.frames, given.width, given.keep)
-        answers: dict[str, list[UInt8]] = {"S-Ray": list(room.pseudo), "map cast back": list(room.cast)}
+        scored = room.frames[:: given.every]
+        answers: dict[str, list[UInt8]] = {
+            "S-Ray": list(room.pseudo[:: given.every]),
+            "map cast back": list(room.cast[:: given.every]),
+        }
         taught = [
             replace(f, label=label, label_is_pseudo=True) for f, label in zip(room.frames, room.pseudo, strict=True)
         ]
@@ -147,20 +152,20 @@ def main() -> None:
             field = checkpoint.model
             assert isinstance(field, Panoptic)
             began = time.process_time()
-            answers[f"panoptic, {kind} boxes"] = [predict(field, f) for f in room.frames]
-            rendering = (time.process_time() - began) / len(room.frames)
+            answers[f"panoptic, {kind} boxes"] = [predict(field, f) for f in scored]
+            rendering = (time.process_time() - began) / len(scored)
             print(f"room {seed}, {kind} boxes: fit {spent:.0f} CPU s, a frame {rendering:.2f}", flush=True)
             print(f"  {checkpoint.recipe['panoptic']}", flush=True)
         for name, labels in answers.items():
-            found = score(room.frames, labels)
+            found = score(scored, labels)
             rows.setdefault(name, []).append(found)
             figures = found.metrics()
             print(f"  room {seed} {name}: {_per_cent(figures.miou)}; {_per_cent(figures.total_accuracy)}", flush=True)
-        for number in (5, 20, 35):
-            truth = room.frames[number].label
+        for number in np.linspace(0, len(scored) - 1, 3).round().astype(int):
+            truth = scored[number].label
             assert truth is not None
             shown = [ROOMS.colorize(labels[number]) for labels in answers.values()]
-            sheets.append(np.hstack([room.frames[number].rgb, *shown, ROOMS.colorize(truth)]))
+            sheets.append(np.hstack([scored[number].rgb, *shown, ROOMS.colorize(truth)]))
     torch.set_num_threads(1)
     for name, found in rows.items():
         figures = sum(found[1:], found[0]).metrics()

@@ -26,6 +26,7 @@ from semantic_mapper.fields.primitives import Intervals, Primitive, PrimitiveSet
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
 from semantic_mapper.types import Int64, RayBatch
 
+LOOKED_AT = 8  # samples of a ray that say its class
 LEAST = 1e-6  # of a rendered probability
 SKY = "sky"  # class of light that leaves the grid, where the label set has it
 
@@ -74,6 +75,7 @@ class Panoptic(GridField):
     channel_of_box: torch.Tensor  # (P,) int64
     thing: torch.Tensor  # (P,) bool
     outside: torch.Tensor  # (L,) 1 where a class may be outside of all boxes
+    stuff: torch.Tensor  # (L,) 1 where a class may be in any box, too: boxes are coarse
 
     def __init__(self, config: PanopticConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
         super().__init__(config, label_set, sampling)
@@ -84,6 +86,8 @@ class Panoptic(GridField):
         self.register_buffer("channel_of_box", of_boxes, persistent=False)
         self.register_buffer("thing", torch.tensor([b.thing for b in config.boxes], dtype=torch.bool), persistent=False)
         self.register_buffer("outside", torch.tensor(self._allowed_outside(label_set)).float(), persistent=False)
+        fills = [config.uncovered == "stuff" and n in STUFF_NAMES and n != SKY for n in label_set.names]
+        self.register_buffer("stuff", torch.tensor(fills).float(), persistent=False)
         self.sky = channel.get(SKY)
         self.head = relu_layers(config.trunk_width, config.head_width, 1)
         self.classifier = nn.Linear(config.head_width, len(label_set))
@@ -93,7 +97,7 @@ class Panoptic(GridField):
 
         A ray whose depth was measured ends there.
         """
-        samples = at_measured(samples, self.grid.config)
+        samples = heaviest(at_measured(samples, self.grid.config), LOOKED_AT)
         boxes = self.boxes_on(samples)
         points = boxes.fixed if self.shape.classes == "fixed" else self.learned(samples)
         rendered = self.composited(samples, points)
@@ -139,7 +143,7 @@ class Panoptic(GridField):
 
         Where boxes of one class overlap, a point is of the one whose centre is nearer.
         """
-        samples = at_measured(self.march(rays), self.grid.config)
+        samples = heaviest(at_measured(self.march(rays), self.grid.config), LOOKED_AT)
         boxes = self.boxes_on(samples)
         none = boxes.index < 0
         index = boxes.index.clamp_min(0)
@@ -182,6 +186,15 @@ class Panoptic(GridField):
 def ray_share(samples: RaySamples) -> torch.Tensor:
     """What samples (R, K) count, as if none had been left out."""
     return samples.weight * (samples.opacity / samples.weight.sum(1).clamp_min(1e-6))[:, None]
+
+
+def heaviest(samples: RaySamples, count: int) -> RaySamples:
+    """The ``count`` samples of greatest weight of each ray, in their order."""
+    if samples.z.shape[1] <= count:
+        return samples
+    index = samples.weight.topk(count, dim=1).indices.sort(dim=1).values
+    points = samples.points.gather(1, index[..., None].expand(-1, -1, 3))
+    return replace(samples, points=points, z=samples.z.gather(1, index), weight=samples.weight.gather(1, index))
 
 
 def trimmed(found: Intervals) -> Intervals:
