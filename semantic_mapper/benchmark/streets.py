@@ -129,7 +129,9 @@ def _drive(width: int, pairs: int, miou: float, every: int, moving: bool, seed: 
     both = list(street_pairs(seed, range(pairs), street_camera(width), moving=moving))
     left = tuple(pair.left for pair in both)
     boxes = street_boxes(cached_street(seed, moving), pairs)
-    return Drive(seed, left, tuple(pair.right for pair in both), tuple(pseudo_labels(left, seed, miou, every)), tuple(boxes))
+    return Drive(
+        seed, left, tuple(pair.right for pair in both), tuple(pseudo_labels(left, seed, miou, every)), tuple(boxes)
+    )
 
 
 def primitives_at(boxes: Sequence[StreetBox], number: int) -> PrimitiveSet:
