@@ -264,7 +264,7 @@ def streets(
         )
         rows = [
             [view.frame.rgb for view in views[::8]],
-            [_depth_picture(view.rendered.depth_m / 6) for view in views[::8]],
+            [_depth_picture(view.rendered.depth_m / np.float32(6)) for view in views[::8]],
             [KITTI360.colorize(view.rendered.label) for view in views[::8]],
             [KITTI360.colorize(label) for label in predicted[::8]],
         ]

@@ -59,13 +59,14 @@ def box_crf(frame: PosedFrame, boxes: PrimitiveSet, predicted: UInt8, label_set:
     height, width = predicted.shape
     channel_of = _channels(boxes, label_set)
     inside, points = _inside(frame, boxes)
-    share = np.zeros((height * width, len(label_set)))
-    np.add.at(share.T, channel_of, inside.T)
-    share = (share > 0) / np.maximum((share > 0).sum(axis=1), 1)[:, None]
+    held = np.zeros((height * width, len(label_set)), np.bool_)
+    for channel, column in zip(channel_of, inside.T, strict=True):
+        held[:, channel] |= column
+    share = held / np.maximum(held.sum(axis=1, keepdims=True), 1)
     said = np.full((height * width, len(label_set)), (1 - _RIGHT) / (len(label_set) - 1))
-    channel = label_set.to_channels(predicted).ravel()
-    known = channel >= 0
-    said[known, channel[known]] = _RIGHT
+    named = label_set.to_channels(predicted).ravel()
+    known = named >= 0
+    said[known, named[known]] = _RIGHT
     said[~known] = 1 / len(label_set)
     unary = np.log(said) + np.log(np.where(inside.any(axis=1)[:, None], share + _ELSEWHERE, 1.0))
     channel = _mean_field(unary.reshape(height, width, -1), frame.rgb).argmax(axis=2).ravel()

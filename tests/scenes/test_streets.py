@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from semantic_mapper.labels import KITTI360
-from semantic_mapper.scenes.render import cast_view, seen_labels
 from semantic_mapper.scenes.scene import scene_at
 from semantic_mapper.scenes.sequence import RoomView
 from semantic_mapper.scenes.streets.boxes import street_boxes
 from semantic_mapper.scenes.streets.layout import IGNORED, make_streets_street
-from semantic_mapper.scenes.streets.pseudo import LEAST_MIOU, MOST_MIOU, pseudo_labels, pseudo_miou
+from semantic_mapper.scenes.streets.pseudo import LEAST_MIOU, MIOU, MOST_MIOU, pseudo_labels, pseudo_miou
 from semantic_mapper.scenes.streets.views import (
     BASELINE_M,
     STEP_M,
@@ -33,7 +32,7 @@ CAMERA = street_camera(88)
 SEED = 3
 EVALUATED = set(KITTI360.names) - set(IGNORED)
 # Of what a change may not touch unless it raises ``STREETS_VERSION``.
-DIGEST_OF_VERSION_1 = ""
+DIGEST_OF_VERSION_1 = "8aec28b4197bfc8806e9853f518872aa3c63a9a17272c7631fc15d2a1bdda8c9"
 
 
 @pytest.fixture(scope="module")
@@ -99,15 +98,13 @@ def test_boxes_are_coarse_but_cover_their_objects(views: list[RoomView]) -> None
             own = p.instance == box.id
             assert set(p.label[own].tolist()) == {KITTI360.id_of(box.name)}
             assert box.contains(p.center[own]).all()
-    truth = {box.id: box for box in street_boxes(street, 24)}
-    assert all(np.array_equal(box.size, truth[box.id].size) for box in boxes)
 
 
-@pytest.mark.parametrize("wanted", [0.55, 0.65, 0.75])
+@pytest.mark.parametrize("wanted", [0.55, MIOU, 0.75])
 def test_predicted_labels_are_as_wrong_as_wanted(views: list[RoomView], wanted: float) -> None:
     labels = pseudo_labels(views, SEED, wanted)
     assert pseudo_miou(views, labels) == pytest.approx(wanted, abs=0.03)
-    assert LEAST_MIOU < 0.65 < MOST_MIOU
+    assert wanted != MIOU or LEAST_MIOU < pseudo_miou(views, labels) < MOST_MIOU
     again = pseudo_labels(views, SEED, wanted)
     assert all(np.array_equal(a, b) for a, b in zip(labels, again, strict=True))
     other = pseudo_labels(views, SEED + 1, wanted)
@@ -119,7 +116,10 @@ def test_cars_drive_if_asked_and_their_boxes_with_them() -> None:
     moving = [box for box in street_boxes(street, 5) if box.stamps is not None]
     assert len(moving) == 2 == len(street.scene.walks)
     p = street.scene.primitives
-    assert np.array_equal(make_streets_street(SEED).scene.primitives.center[:50], p.center[:50])
+    still = cached_street(SEED).scene
+    assert np.array_equal(still.primitives.center, p.center[: len(still.primitives)])
+    assert still.daylight is not None and street.scene.daylight is not None
+    assert np.array_equal(still.daylight.sun, street.scene.daylight.sun)
     for box in moving:
         own = p.instance == box.id
         assert not p.casts_shadow[own].any()
@@ -129,14 +129,16 @@ def test_cars_drive_if_asked_and_their_boxes_with_them() -> None:
 
 
 @pytest.mark.slow
-def test_every_evaluated_class_is_seen_in_four_streets_of_ten() -> None:
-    streets = dict.fromkeys(EVALUATED, 0)
+def test_ten_streets_show_every_class_and_have_boxes_that_overlap() -> None:
+    streets, overlaps = dict.fromkeys(EVALUATED, 0), list[float]()
     for seed in STREETS_SUITE.seeds["test"][:10]:
-        street = make_streets_street(seed)
-        seen: set[int] = set()
-        for number in range(0, 24, 4):
-            _, index = cast_view(street.scene, CAMERA, street_pose(street, number))
-            seen |= set(np.unique(seen_labels(street.scene, index)).tolist())
+        street = cached_street(seed)
+        views = list(street_views(seed, range(0, 24, 4), CAMERA))
+        covered, several = box_overlap(views, street_boxes(street, 24))
+        assert covered > 0.99
+        overlaps.append(several)
+        seen = set(np.unique([view.rendered.label for view in views]).tolist())
         for name in EVALUATED:
             streets[name] += KITTI360.id_of(name) in seen
     assert min(streets.values()) >= 4, streets
+    assert np.mean(overlaps) >= 0.1, overlaps

@@ -61,8 +61,8 @@ def test_what_was_predicted_decides_where_boxes_overlap_and_where_none_is() -> N
     assert (holes.instance[10:20, 12:18] == 1).all(), "the box on the ray tells which car"
 
 
-def test_smoothing_follows_edges_of_the_image() -> None:
+def test_what_nothing_is_known_of_is_as_its_neighbours_of_like_colour() -> None:
     label = predicted(CAR, WALL)
-    label[14, 8] = SKY  # one wrong pixel
+    label[14, [8, 19, 20, 30]] = KITTI360.ignore_id
     found = box_crf(frame(0), PrimitiveSet([]), label, KITTI360)
-    assert found.label[14, 8] == CAR and (found.label[:, :19] == CAR).all() and (found.label[:, 21:] == WALL).all()
+    assert found.label[14, [8, 19, 20, 30]].tolist() == [CAR, CAR, WALL, WALL], "the edge lies between 19 and 20"

@@ -38,7 +38,7 @@ BEHIND_M = 14.0  # of street behind the first frame
 KERB_M = 0.12
 ROAD_M, PARKING_M, WALK_M = 3.4, 2.3, 2.1  # half the width of the road; widths of the strip for parking and sidewalk
 
-_SCENE_STREAM = 0
+_SCENE_STREAM, _TRAFFIC_STREAM = 0, 7
 _LENGTH_M = (60.0, 86.0)  # of street ahead of the first frame
 _RADIUS_M = (70.0, 140.0)
 _GARDENS_M = 45.0  # from the sidewalk to where the terrain ends
@@ -102,7 +102,10 @@ def make_streets_street(seed: int, *, moving: bool = False) -> Street:
     if crossing is not None:
         _side_street(b, crossing, crossed)
     _surroundings(b)
-    walks = _traffic(b) if moving else ()
+    walks: tuple[Walk, ...] = ()
+    if moving:
+        rest, b.rng = b.rng, np.random.default_rng((STREETS_CODE, STREETS_VERSION, seed, _TRAFFIC_STREAM))
+        walks, b.rng = _traffic(b), rest
     primitives = pack(b.groups, KITTI360)
     if moving:
         still = ~np.isin(primitives.group, [walk.group for walk in walks])  # shadows are those of what stands still

@@ -41,9 +41,10 @@ CONFUSED: dict[str, tuple[float, tuple[str, ...]]] = {
     "sign": (0.2, ("building", "pole")),
 }
 _WARP_PX = (1.0, 3.0)  # at a width of 352
+_WARPED = 3.0  # times the strength: the fraction of the warp that there is, at most all
 _SMALL_PX, _MISSED = 40, 0.3  # segments smaller than this at that width, and how many of them are missed
 _CLIPPED, _BLOBS = 250, 0.5  # grey level; fraction of the clipped area with blobs
-_MOST, _HALVINGS = 3.0, 9  # strength, and its search
+_MOST, _HALVINGS = 3.0, 12  # strength, and its search
 _STREAM = 6
 _PIECES = 2  # a large segment is taken for something else in parts
 
@@ -59,7 +60,7 @@ class _Draws:
         other: (S,) channels.
         ease: (S,) of its class.
         missed: (S,) small segments that vanish.
-        map_x, map_y: (H, W) float32 where each pixel's label comes from.
+        warp: (2, H, W) float32 pixels to the right and down to where each pixel's label comes from.
         blob: (H, W) channel of clipped pixels in blobs, -1 elsewhere.
     """
 
@@ -69,8 +70,7 @@ class _Draws:
     other: NDArray[np.int64]
     ease: NDArray[np.float64]
     missed: NDArray[np.bool_]
-    map_x: Float32
-    map_y: Float32
+    warp: Float32
     blob: NDArray[np.int64]
 
 
@@ -84,14 +84,17 @@ def pseudo_labels(views: Sequence[RoomView], seed: int, miou: float = MIOU, ever
         every: Which views it is of.
     """
     draws = [_drawn(view, seed) for view in views]
+    judged = range(0, len(views), every)
+
+    def reached(strength: float) -> float:
+        return pseudo_miou([views[k] for k in judged], [_predicted(draws[k], strength) for k in judged])
+
     low, high = 0.0, _MOST
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        if pseudo_miou(views[::every], [_predicted(d, middle) for d in draws[::every]]) > miou:
-            low = middle
-        else:
-            high = middle
-    return [_predicted(d, high) for d in draws]
+        low, high = (middle, high) if reached(middle) > miou else (low, middle)
+    strength = min((low, high), key=lambda s: abs(reached(s) - miou))  # a large segment that changes is a jump
+    return [_predicted(d, strength) for d in draws]
 
 
 def pseudo_miou(views: Sequence[RoomView], labels: Sequence[UInt8]) -> float:
@@ -111,8 +114,7 @@ def pseudo_miou(views: Sequence[RoomView], labels: Sequence[UInt8]) -> float:
 def _drawn(view: RoomView, seed: int) -> _Draws:
     rng = np.random.default_rng((STREETS_CODE, STREETS_VERSION, seed, _STREAM, view.frame.seq))
     truth = KITTI360.to_channels(view.rendered.label)
-    height, width = truth.shape
-    scale = width / 352
+    scale = truth.shape[1] / 352
     part = (_patch(truth.shape, 6 * _PIECES, rng) > 0).astype(np.int64)
     key = (truth * 65536 + view.rendered.instance.astype(np.int64) * (truth != KITTI360.names.index("road"))) * 2 + part
     segment = _connected(key)
@@ -127,12 +129,10 @@ def _drawn(view: RoomView, seed: int) -> _Draws:
     size = np.bincount(segment.ravel())
     missed = (size < _SMALL_PX * scale**2) & (rng.random(len(size)) < _MISSED)
     amount = scale * rng.uniform(*_WARP_PX)
-    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    map_x = x + np.float32(amount) * smooth_noise(truth.shape, rng)
-    map_y = y + np.float32(amount) * smooth_noise(truth.shape, rng)
+    warp = np.float32(amount) * np.stack([smooth_noise(truth.shape, rng) for _ in range(2)])
     clipped = (view.frame.rgb.min(axis=2) >= _CLIPPED) & (_patch(truth.shape, 12, rng) > 0)
     blob = np.where(clipped & (rng.random() < _BLOBS), int(rng.integers(len(KITTI360))), -1)
-    return _Draws(truth, segment, rng.random(len(size)), other, ease, missed, map_x, map_y, blob)
+    return _Draws(truth, segment, rng.random(len(size)), other, ease, missed, warp, blob)
 
 
 def _predicted(draws: _Draws, strength: float) -> UInt8:
@@ -141,8 +141,11 @@ def _predicted(draws: _Draws, strength: float) -> UInt8:
     said = np.where(swapped, draws.other, own)[draws.segment]
     said = _filled(said, draws.missed[draws.segment])
     said = np.where(draws.blob >= 0, draws.blob, said)
-    x, y = draws.map_x, draws.map_y
-    warped = cv2.remap(said.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+    row, column = np.indices(said.shape, np.float32)
+    across, down = np.float32(min(1.0, _WARPED * strength)) * draws.warp
+    warped = cv2.remap(
+        said.astype(np.uint8), column + across, row + down, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
+    )
     return KITTI360.to_ids(np.asarray(warped, np.int64))
 
 
@@ -165,6 +168,7 @@ def _filled(said: NDArray[np.int64], missing: NDArray[np.bool_]) -> NDArray[np.i
     _, nearest = cv2.distanceTransformWithLabels(
         missing.astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
     )
+    nearest = np.asarray(nearest, np.int64)
     label_of = np.zeros(int(nearest.max()) + 1, np.int64)
     label_of[nearest[~missing]] = said[~missing]
     return np.where(missing, label_of[nearest], said)

@@ -117,7 +117,7 @@ def scanned_pixels(intrinsics: CameraIntrinsics) -> Bool:
 def exposures(seed: int, count: int) -> Float64:
     """(count,) factors of the light, which drift through 0.4 to 2.5."""
     rng = np.random.default_rng((STREETS_CODE, STREETS_VERSION, seed, _LIGHT_STREAM))
-    knots = rng.uniform(*np.log(_DRIFT), _KNOTS)
+    knots = rng.uniform(np.log(_DRIFT[0]), np.log(_DRIFT[1]), _KNOTS)
     return np.exp(np.interp(np.linspace(0, _KNOTS - 1, max(count, 2)), np.arange(_KNOTS), knots))[:count]
 
 
