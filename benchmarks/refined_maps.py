@@ -1,31 +1,37 @@
-"""Maps before and after ``refine`` against the truth: mIoU, and pictures of classes and of things.
+"""Maps before and after ``refine`` against the truth: mIoU, and pictures of classes.
 
 Example: python -m benchmarks.refined_maps runs/kitchen/map.npz refined.npz --truth redkitchen
-Example: python -m benchmarks.refined_maps room.npz refined.npz --truth 100000 --out refined.jpg
-Example: python -m benchmarks.refined_maps map.npz refined.npz --truth redkitchen --log kitchen.mcap --out kitchen.jpg
+Example: python -m benchmarks.refined_maps room.npz refined.npz --truth 100000 --out refined.png
+Example: python -m benchmarks.refined_maps map.npz refined.npz --truth redkitchen --log kitchen.mcap --out kitchen.png
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from semantic_mapper.benchmark.config import SequenceConfig, camera_of_width
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, map_confusion
-from semantic_mapper.geometry import transform, unproject
-from semantic_mapper.labels import NYU40, ROOMS, STUFF_NAMES, LabelSet
-from semantic_mapper.mapping.map_types import MapView
+from semantic_mapper.fields.nesf import load_nesf
+from semantic_mapper.labels import NYU40, LabelSet
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.plots import new_figure, rendered, write_picture
-from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.plots import (
+    Curve,
+    Panel,
+    class_colors,
+    class_rows,
+    draw_panels,
+    new_figure,
+    put_legend,
+    put_picture,
+    rendered,
+    write_picture,
+)
 from semantic_mapper.replay.evaluate.room_map import NEAR_M, true_surface
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.scenes import CameraPathConfig, make_room, room_frames
@@ -66,81 +72,76 @@ def score(map_: Labelled, truth: Labelled, label_set: LabelSet) -> ConfusionMatr
 
 
 @rendered
-def draw(rows: Sequence[Sequence[UInt8]], names: Sequence[str]) -> Figure:
-    """Pictures (h, w, 3) in rows, one column a name."""
-    width, height = WIDTH * len(names), HEIGHT * len(rows) + HEAD
-    figure = new_figure(width, height)
+def draw(rows: Sequence[Sequence[UInt8]], names: Sequence[str], label_set: LabelSet) -> Figure:
+    """A picture a name beside each other: colours (h, w, 3), then classes (h, w); and below what the classes are."""
+    shown = [classes for row in rows for classes in row[1:]]
+    legend = [(name, colour, None) for name, colour, _ in class_rows(np.zeros(0, np.uint8), label_set, shown)]
+    width, columns = WIDTH * len(names), 6
+    foot = HEAD + HEIGHT * len(rows)
+    legend_height = 22 * -(-len(legend) // columns)
+    figure = new_figure(width, foot + legend_height + 10)
     for row, pictures in enumerate(rows):
         for column, picture in enumerate(pictures):
-            bottom = (len(rows) - 1 - row) * HEIGHT / height
-            axes = figure.add_axes((column * WIDTH / width, bottom, (WIDTH - 4) / width, (HEIGHT - 4) / height))
-            axes.imshow(picture, interpolation="nearest")
-            axes.set_axis_off()
-            if row == 0:
-                axes.set_title(names[column], fontsize=10)
+            box = (column * WIDTH, HEAD + row * HEIGHT, WIDTH - 4, HEIGHT - 4)
+            coloured = class_colors(picture, label_set) if column else picture
+            put_picture(figure, box, coloured, names[column] if row == 0 else "")
+    put_legend(figure, (8, foot + 4, width - 16, legend_height), legend, columns)
     return figure
 
 
+def draw_curves(history: Sequence[Mapping[str, float]], validation: Mapping[str, float]) -> UInt8:
+    """What the validation maps said while a network was trained, and of what was saved (``recipe`` of its weights).
+
+    Both against smoothed votes, from which training starts.
+    """
+    start, last = history[0], history[-1]["step"]
+    panels = [
+        Panel(
+            f"{name}, validation rooms, over smoothed votes",
+            unit,
+            "step",
+            [
+                Curve("network", [(h["step"], factor * (h[key] - start[key])) for h in history], marked=True),
+                Curve("as saved, blended", [(last, factor * (validation[key] - start[key]))]),
+            ],
+        )
+        for key, name, unit, factor in (("miou", "mIoU", "points", 100), ("loss", "cross-entropy", "nats", 1))
+    ]
+    return draw_panels("", panels)
+
+
 class Seen(NamedTuple):
-    """A frame that maps are looked at from: with the true labels (H, W) and things (H, W), where they are known."""
+    """A frame that maps are looked at from, and its labels (H, W), ids of the maps' classes, where they are known."""
 
     frame: PosedFrame
     label: UInt8 | None
-    instance: NDArray[np.int64] | None
 
 
 def room_looks(seed: int, numbers: Sequence[int]) -> list[Seen]:
     """Frames of a room's walk."""
     walk = CameraPathConfig(step_m=SequenceConfig().step_m)
     found = list(room_views(seed, max(numbers) + 1, camera_of_width(320), path=walk))
-    return [Seen(v.frame, v.frame.label, v.rendered.instance.astype(np.int64)) for v in (found[n] for n in numbers)]
+    return [Seen(v.frame, v.frame.label) for v in (found[n] for n in numbers)]
 
 
-def log_looks(log: Path, numbers: Sequence[int]) -> list[Seen]:
+def log_looks(log: Path, numbers: Sequence[int], label_set: LabelSet) -> list[Seen]:
     """Frames of a log."""
     with open_log(log) as reader:
-        return [Seen(frame, None, None) for n, frame in enumerate(reader) if n in numbers]
+        theirs = reader.info.label_set
+        table = None if theirs is None else label_set.to_ids(label_set.channel_map_from(theirs))
+        return [
+            Seen(frame, None if table is None or frame.label is None else table[frame.label])
+            for n, frame in enumerate(reader)
+            if n in numbers
+        ]
 
 
-class Things:
-    """The things of a map, as queries find them, to be seen from anywhere."""
-
-    def __init__(self, voxel_map: VoxelMap, up: tuple[float, float, float]) -> None:
-        found = InstanceTracker(up=up).update(MapMirror.of(voxel_map).snapshot())
-        self._voxel_m = voxel_map.config.voxel_size_m
-        self._tree = KDTree(np.concatenate([thing.voxels for thing in found]))
-        self._number = np.repeat([thing.id for thing in found], [len(thing.voxels) for thing in found])
-
-    def seen(self, view: MapView, frame: PosedFrame) -> UInt8:
-        """Picture (H, W, 3)."""
-        hit = view.depth_m > 0
-        xyz = transform(frame.T_world_camera, unproject(view.depth_m, frame.intrinsics)[hit])
-        _, nearest = self._tree.query(xyz / self._voxel_m, distance_upper_bound=2.0)
-        number = np.zeros(hit.shape, np.int64)
-        number[hit] = np.append(self._number, 0)[nearest]
-        return in_colours(number)
-
-
-def in_colours(number: NDArray[np.int64]) -> UInt8:
-    """Picture (H, W, 3) of numbers (H, W); 0 is grey."""
-    colours = np.random.default_rng(3).integers(40, 256, (4096, 3), np.uint8)
-    colours[0] = 90
-    return colours[number % 4096]
-
-
-def views(looks: Sequence[Seen], maps: Sequence[VoxelMap], up: tuple[float, float, float]) -> list[list[UInt8]]:
-    """Two rows for each frame: its colours, the classes of each map seen from there, the true ones; then the things."""
-    things = [Things(voxel_map, up) for voxel_map in maps]
+def views(looks: Sequence[Seen], maps: Sequence[VoxelMap]) -> list[list[UInt8]]:
+    """Of each frame: its colours, the classes of each map seen from there, the true ones."""
     rows: list[list[UInt8]] = []
-    for frame, label, instance in looks:
-        casts = [voxel_map.ray_cast(frame.T_world_camera, frame.intrinsics) for voxel_map in maps]
-        classes = [m.label_set.colorize(cast.label) for cast, m in zip(casts, maps, strict=True)]
-        rows.append([frame.rgb, *classes])
-        rows.append([frame.rgb, *(found.seen(cast, frame) for found, cast in zip(things, casts, strict=True))])
-        if label is not None and instance is not None:
-            stuff = np.isin(label, ROOMS.thing_ids(STUFF_NAMES), invert=True)
-            rows[-2].append(ROOMS.colorize(label))
-            rows[-1].append(in_colours(np.where(stuff, 0, instance)))
+    for frame, label in looks:
+        classes = [voxel_map.ray_cast(frame.T_world_camera, frame.intrinsics).label for voxel_map in maps]
+        rows.append([frame.rgb, *classes, *([] if label is None else [label])])
     return rows
 
 
@@ -151,8 +152,9 @@ def main() -> None:
     parser.add_argument("--truth", required=True, help="seed of a room, or folder of a recording")
     parser.add_argument("--frames", nargs="+", type=int, default=[5, 25], help="of the room's walk or the log, to draw")
     parser.add_argument("--log", type=Path, help="of a recording, to draw")
-    parser.add_argument("--up", nargs=3, type=float, default=(0.0, 0.0, 1.0))
     parser.add_argument("--out", type=Path, help="picture")
+    parser.add_argument("--weights", type=Path, help="whose training to draw")
+    parser.add_argument("--curves", type=Path, help="picture of that")
     arguments = parser.parse_args()
     loaded = [VoxelMap.load(path) for path in arguments.maps]
     label_set = loaded[0].label_set
@@ -163,11 +165,14 @@ def main() -> None:
         print(f"{path}: mIoU {100 * (found.miou or 0):.1f} %, total accuracy {100 * (found.total_accuracy or 0):.1f} %")
     if arguments.out:
         if arguments.log:
-            looks = log_looks(arguments.log, arguments.frames)
+            looks = log_looks(arguments.log, arguments.frames, label_set)
         else:
             looks = room_looks(int(arguments.truth), arguments.frames)
-        names = ("colour", *(path.stem for path in arguments.maps), *([] if arguments.log else ["truth"]))
-        write_picture(arguments.out, draw(views(looks, loaded, tuple(arguments.up)), names))
+        names = ("colour", *(path.stem for path in arguments.maps), "truth")
+        write_picture(arguments.out, draw(views(looks, loaded), names, label_set))
+    if arguments.curves:
+        recipe = load_nesf(arguments.weights).recipe
+        write_picture(arguments.curves, draw_curves(recipe["history"], recipe["validation"]))
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
 Maps are kept, so that other weights are scored in a fraction of the time. A run that ended early goes on where it was.
 
-Example: python -m benchmarks.refined_rooms --split val --refine nesf.safetensors
-Example: python -m benchmarks.refined_rooms --split test --refine nesf.safetensors --rendered 4
+Example: python -m benchmarks.refined_rooms --split val --refine nesf-rooms
+Example: python -m benchmarks.refined_rooms --split test --refine nesf-rooms --rendered 4
 """
 
 from __future__ import annotations
@@ -169,6 +169,13 @@ def main() -> None:
     rows = {name: [known[way[0], seed] for seed in suite_seeds(suite)] for name, way in networks.items()}
     for name, scored in rows.items():
         show(name, scored, rows["as mapped"])
+    if "refined" in rows:
+        a, b = ([from_rows(s.points) for s in rows[name]] for name in ("refined", "smoothed"))
+        change = paired_bootstrap(a, b)
+        print(
+            f"refined over smoothed, points: {_points(change.observed)}, 95 % interval {_points(change.low)} to "
+            f"{_points(change.high)}"
+        )
 
 
 if __name__ == "__main__":

@@ -112,7 +112,7 @@ class MapperOptions(Config, frozen=True):
     # nobody else wants the processor, and once more at the end: to ``refined.npz`` in ``out``, and for clients that ask
     # for it (``MapClient(refined=True)``). Mapping goes on from the raw votes. Needs save_every_s. 0 = never.
     refine_every_s: Annotated[float, msgspec.Meta(ge=0)] = 0.0
-    refine_weights: str = ""  # from `train --kind nesf`; empty = votes are smoothed, nothing is learned
+    refine_weights: str = ""  # as `refine --weights`; empty = those that ship, where the classes are theirs
     # Where questions about the map are answered: a name, or an endpoint (ipc://PATH, tcp://127.0.0.1:PORT; with keys
     # also tcp://0.0.0.0:PORT, for other machines); empty = nowhere. A name stands for a socket among those of the
     # launch, or of this user where the node is started by hand.

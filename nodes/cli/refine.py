@@ -23,7 +23,10 @@ def refine(
     out: Annotated[Path, typer.Option("--out", help="Map to write (.npz).")],
     weights: Annotated[
         Path | None,
-        typer.Option(help="From `train --kind nesf`; without it votes are smoothed over neighbouring surface."),
+        typer.Option(
+            help="From `train --kind nesf`; 'smoothed' smooths votes over neighbouring surface. Without it: the "
+            "weights that ship, or smoothed votes for a map of other classes."
+        ),
     ] = None,
     fill: Annotated[
         float,
@@ -43,20 +46,19 @@ def refine(
 ) -> None:
     """Relabel a saved map by its shape, colour and votes, and label surface that nothing voted for.
 
-    With --weights a network decides that has seen many maps; it may tell things apart, too (`query OUT instances`).
-    Without, votes are smoothed over surface of the same slope within some 6 cm; nothing is learned then, and any
-    classes will do.
+    A network decides that has seen many maps. For a map of other classes than its own, and with --weights smoothed,
+    votes are smoothed over surface of the same slope within some 6 cm; nothing is learned then.
 
     Writes a map like any other: query, export, merge it, or go on mapping into it. Geometry and colours are unchanged.
 
     Example: semantic-mapper refine runs/kitchen/map.npz --out refined.npz
-    Example: semantic-mapper refine runs/kitchen/map.npz --out refined.npz --weights nesf.safetensors
+    Example: semantic-mapper refine runs/kitchen/map.npz --out refined.npz --weights smoothed
     """
     if by_name and weights is None:
-        raise typer.BadParameter("goes with --weights; smoothed votes take any classes", param_hint="--by-name")
+        raise typer.BadParameter("goes with --weights; without, other classes are smoothed", param_hint="--by-name")
     output = Output.guarded()
     output.quiet = json
-    from semantic_mapper.fields.nesf import load_nesf, smoothed_votes
+    from semantic_mapper.fields.nesf import SHIPPED, SMOOTHED, SMOOTHING, find_nesf
     from semantic_mapper.mapping.refine import refine as refine_map
     from semantic_mapper.mapping.voxel_map import VoxelMap
     from semantic_mapper.nodes.cli.outputs import prepare_file
@@ -66,9 +68,8 @@ def refine(
     path, direction = map_path(source), parse_up(up)
     refuse_overwriting(out, path)
     prepare_file(out)
-    network = None if weights is None else load_nesf(weights)
     voxel_map = VoxelMap.load(path)
-    network = network or smoothed_votes(voxel_map.label_set)
+    network = find_nesf(weights, voxel_map.label_set)
     with frame_progress("refine", None, unit="tiles") as bar:
 
         def on_tile(done: int, total: int) -> None:
@@ -78,10 +79,14 @@ def refine(
         report = refine_map(voxel_map, network, fill=fill, up=direction, by_name=by_name, on_tile=on_tile)
     voxel_map.save(out)
     output.print(_table(report))
-    if weights is None:
-        output.print("no --weights: the votes were smoothed, nothing was learned")
-    elif not report.voted:
-        output.print("the map had no votes: its classes are guessed from shape and colour")
+    if network.digest != SMOOTHED:
+        output.print(f"refined by the weights {weights or SHIPPED}")
+        if not report.voted:
+            output.print("the map had no votes: its classes are guessed from shape and colour")
+    elif weights == SMOOTHING:
+        output.print("the votes were smoothed, nothing was learned")
+    else:
+        output.print(f"no weights ship for label set '{voxel_map.label_set.name}': the votes were smoothed")
     relabelled, filled = (100 * count / max(report.surface, 1) for count in (report.relabelled, report.filled))
     output.print(f"{out}: {relabelled:.1f} % of the surface relabelled, {filled:.1f} % filled")
     if report.things is not None:

@@ -83,17 +83,15 @@ def _maps(settings: NesfTrainConfig, folder: Path, weights: Path, stop: StopRequ
             raise ConfigError("training needs the maps of at least two logs, one of them to validate on")
         held_out = max(1, len(paths) // 10)
         return paths[:-held_out], paths[-held_out:]
-    held_out = range(VALIDATION_SEED, VALIDATION_SEED + settings.validation_rooms)
-    seeds = range(settings.first_seed, settings.first_seed + settings.rooms)
-    paths: dict[int, list[Path]] = {}
+    validated = range(VALIDATION_SEED, VALIDATION_SEED + settings.validation_rooms)
+    trained_on = range(settings.first_seed, settings.first_seed + settings.rooms)
+    found: tuple[list[Path], list[Path]] = [], []
     with frame_progress("map the rooms", None, unit="rooms") as bar:
-        bar.start(len(held_out) + len(seeds))
-        for seed in (*held_out, *seeds):
-            if stop:
-                break
-            rendered = (1,) if seed in held_out else (1, SELDOM)
-            paths[seed] = make_room_maps([seed], folder, weights, rendered=rendered)
-            bar.advance()
-    return [path for seed in seeds for path in paths.get(seed, [])], [
-        path for seed in held_out for path in paths.get(seed, [])
-    ]
+        bar.start(len(validated) + len(trained_on))
+        for seeds, rendered, paths in ((validated, (1,), found[1]), (trained_on, (1, SELDOM), found[0])):
+            for seed in seeds:
+                if stop:
+                    break
+                paths += make_room_maps([seed], folder, weights, rendered=rendered)
+                bar.advance()
+    return found

@@ -31,7 +31,7 @@ class Job:
 
     Args:
         source: A copy of the saved map; results are written beside it.
-        weights: None = votes are smoothed.
+        weights: As of ``find_nesf``.
         idle: Compute only while nobody else wants the processor.
     """
 
@@ -82,12 +82,12 @@ def refine_job(job: Job) -> None:
     Raises:
         MapError, WeightsError: it cannot be refined, read or written.
     """
-    from semantic_mapper.fields.nesf import load_nesf, smoothed_votes
+    from semantic_mapper.fields.nesf import find_nesf
     from semantic_mapper.mapping.refine import refine
     from semantic_mapper.mapping.voxel_map import VoxelMap
 
     voxel_map = VoxelMap.load(job.source)
-    refine(voxel_map, load_nesf(job.weights) if job.weights else smoothed_votes(voxel_map.label_set))
+    refine(voxel_map, find_nesf(job.weights, voxel_map.label_set))
     voxel_map.save(job.refined)
     found = voxel_map.changes(0)
     arrays: dict[str, Any] = {name: array for name in _ARRAYS if (array := getattr(found, name)) is not None}

@@ -39,6 +39,8 @@ from semantic_mapper.fields.sparse_conv import OFFSETS, CellLevel, cell_levels, 
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.types import Float32
 
+SHIPPED = Path("nesf-rooms")  # names the weights that ship, for maps of the classes of ROOMS
+SMOOTHING = Path("smoothed")  # in place of weights: votes are smoothed, nothing is learned
 CELL_M = 0.04
 SHAPE_CHANNELS = 9  # before those of the classes
 UP_CHANNEL, VOTES_CHANNEL = 2, 8
@@ -221,10 +223,25 @@ class NesfWeights:
 
 
 def smoothed_votes(label_set: LabelSet) -> NesfWeights:
-    """Used where no weights are given, and the baseline that weights have to beat: votes smoothed, nothing learned."""
+    """Used where no weights fit, and the baseline that weights have to beat: votes smoothed, nothing learned."""
     model = Nesf(label_set, NesfConfig(width=1, centres=False)).eval()
     model.start_smoothed()
     return NesfWeights(model, {}, SMOOTHED)
+
+
+def find_nesf(weights: Path | None, label_set: LabelSet) -> NesfWeights:
+    """What refines maps of some classes.
+
+    Args:
+        weights: File or name; ``SMOOTHING``; None = the weights that ship, or smoothing where the classes are others.
+
+    Raises:
+        WeightsError: no such file, damaged, or weights of another kind.
+    """
+    if weights == SMOOTHING:
+        return smoothed_votes(label_set)
+    found = load_nesf(weights or SHIPPED)
+    return found if weights or found.model.label_set == label_set else smoothed_votes(label_set)
 
 
 def save_nesf(weights: NesfWeights, path: Path) -> None:

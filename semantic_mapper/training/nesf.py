@@ -73,8 +73,8 @@ class NesfTrainConfig(Config, frozen=True):
     labelled_voxels: AtLeastOne = 16_384  # of a crop that are compared
     learning_rate: Positive = 3e-3
     weight_decay: AtLeastZero = 0.01
-    balance: Fraction = 0.25  # a class counts by its fraction of all maps' voxels to the power of minus this
-    centres: AtLeastZero = 1.0  # weight of the distance to objects' centres, where maps have instances
+    balance: Fraction = 0.1  # a class counts by its fraction of all maps' voxels to the power of minus this
+    centres: AtLeastZero = 0.0  # weight of the distance to objects' centres, where maps have instances; 0 = not learned
     no_votes: Fraction = 0.1  # of crops that lose all votes
     cubes: Fraction = 0.3  # of crops that lose those of some of their cubes of 1 m
     cubes_lost: Fraction = 0.3  # of the cubes

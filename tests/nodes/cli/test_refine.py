@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semantic_mapper.fields.nesf import load_nesf, save_nesf
+from semantic_mapper.fields.nesf import SHIPPED, load_nesf, save_nesf
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.map_grids import training_map
@@ -51,11 +51,11 @@ def test_json_tells_classes_before_and_after(files: Path, tmp_path: Path) -> Non
     assert sum(found["before"].values()) == sum(found["after"].values()) == found["surface"]
 
 
-def test_without_weights_votes_are_smoothed_whatever_the_classes(tmp_path: Path) -> None:
+def test_maps_of_other_classes_than_the_weights_that_ship_are_smoothed(tmp_path: Path) -> None:
     make_map(NYU40).save(tmp_path / "map.npz")
     done = run("refine", tmp_path / "map.npz", "--up", "z", "--out", tmp_path / "smooth.npz")
     assert done.returncode == 0, done.stderr
-    assert "no --weights: the votes were smoothed" in done.stdout
+    assert "no weights ship for label set 'nyu40': the votes were smoothed" in done.stdout
     before, after = (VoxelMap.load(tmp_path / name).mesh() for name in ("map.npz", "smooth.npz"))
 
     def borders(labels: np.ndarray) -> float:
@@ -65,16 +65,19 @@ def test_without_weights_votes_are_smoothed_whatever_the_classes(tmp_path: Path)
 
 
 def test_queries_say_how_things_were_told_apart(files: Path, tmp_path: Path) -> None:
-    ways = {"learned": ("--weights", files / "nesf.safetensors"), "smooth": ()}
+    ways = {"learned": ("--weights", files / "nesf.safetensors"), "shipped": (), "smooth": ("--weights", "smoothed")}
+    said = {"learned": "told apart", "shipped": "by the weights nesf-rooms", "smooth": "the votes were smoothed"}
     for name, options in ways.items():
         done = run("refine", files, "--up", "z", "--out", tmp_path / f"{name}.npz", *options)
         assert done.returncode == 0, done.stderr
-        assert ("told apart" in done.stdout) == (name == "learned")
+        assert said[name] in done.stdout
+        assert ("told apart" in done.stdout) == (name == "learned"), "connected pieces are better than what ships"
+    assert VoxelMap.load(tmp_path / "shipped.npz").refined == load_nesf(SHIPPED).digest
     told = [
         json.loads(run("query", tmp_path / f"{name}.npz", "instances", "--json").stdout)["told_apart_by"]
         for name in ways
     ]
-    assert told == ["what `refine` has learned", "connected pieces of one class"]
+    assert told == ["what `refine` has learned", *["connected pieces of one class"] * 2]
 
 
 @pytest.mark.parametrize(
