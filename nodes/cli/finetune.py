@@ -180,10 +180,10 @@ def finetune(
             f"{recipe['held_out_loss']:.3f}, accuracy {recipe['held_out_accuracy'] * 100:.1f} %"
         )
     if by_field := recipe.get("pseudo_labels"):
-        by = f" that {by_field['of']} has rendered" if pseudo["of"] else ""
+        by = f" that {by_field['of']} has rendered" if by_field["of"] else ""
         output.print(
-            f"  {by_field['keyframes']} of the {len(chosen)} keyframes have pseudo labels{by}: the figures above say how "
-            "well these are learned, not how right they are"
+            f"  {by_field['keyframes']} of the {len(chosen)} keyframes have pseudo labels{by}: the figures above say "
+            "how well these are learned, not how right they are"
         )
     if own := recipe.get("own_view"):
         output.print(
