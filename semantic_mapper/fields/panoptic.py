@@ -75,7 +75,6 @@ class Panoptic(GridField):
     channel_of_box: torch.Tensor  # (P,) int64
     thing: torch.Tensor  # (P,) bool
     outside: torch.Tensor  # (L,) 1 where a class may be outside of all boxes
-    stuff: torch.Tensor  # (L,) 1 where a class may be in any box, too: boxes are coarse
 
     def __init__(self, config: PanopticConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
         super().__init__(config, label_set, sampling)
@@ -86,8 +85,6 @@ class Panoptic(GridField):
         self.register_buffer("channel_of_box", of_boxes, persistent=False)
         self.register_buffer("thing", torch.tensor([b.thing for b in config.boxes], dtype=torch.bool), persistent=False)
         self.register_buffer("outside", torch.tensor(self._allowed_outside(label_set)).float(), persistent=False)
-        fills = [config.uncovered == "stuff" and n in STUFF_NAMES and n != SKY for n in label_set.names]
-        self.register_buffer("stuff", torch.tensor(fills).float(), persistent=False)
         self.sky = channel.get(SKY)
         self.head = relu_layers(config.trunk_width, config.head_width, 1)
         self.classifier = nn.Linear(config.head_width, len(label_set))

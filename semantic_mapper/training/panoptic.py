@@ -236,8 +236,7 @@ def semantic_losses(
     by_fixed = -(torch.log(fixed.clamp_min(LEAST)) * there).sum() / count
     by_learned = -(torch.log(seen.clamp_min(LEAST)) * possible(boxes, group, channel)).sum() / count
     # Where one class is allowed this is the paper's cross-entropy; where there are several, one of them has to be it.
-    # Floors and walls without boxes reach into the coarse boxes of things.
-    allowed = (learned * torch.maximum(boxes.classes, field.stuff)).sum(-1)
+    allowed = (learned * boxes.classes).sum(-1)
     surface = (samples.weight.detach() > POINT_WEIGHT) & (boxes.classes.sum(-1) > 0)
     by_points = -(torch.log(allowed.clamp_min(LEAST)) * surface).sum() / surface.sum().clamp_min(1)
     return weights.fixed * by_fixed + weights.learned * by_learned + weights.points * by_points
