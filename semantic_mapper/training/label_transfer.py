@@ -68,7 +68,7 @@ def box_crf(frame: PosedFrame, boxes: PrimitiveSet, predicted: UInt8, label_set:
     known = named >= 0
     said[known, named[known]] = _RIGHT
     said[~known] = 1 / len(label_set)
-    unary = np.log(said) + np.log(np.where(inside.any(axis=1)[:, None], share + _ELSEWHERE, 1.0))
+    unary = np.log(said) + np.log(np.where(np.any(inside, axis=1, keepdims=True), share + _ELSEWHERE, 1.0))
     channel = _mean_field(unary.reshape(height, width, -1), frame.rgb).argmax(axis=2).ravel()
     ids = np.array([p.id if p.thing else 0 for p in boxes.primitives])
     centre = np.array([p.T_world_box[:3, 3] for p in boxes.primitives]).reshape(-1, 3)
