@@ -59,7 +59,6 @@ def box_crf(frame: PosedFrame, boxes: PrimitiveSet, predicted: UInt8, label_set:
     height, width = predicted.shape
     channel_of = _channels(boxes, label_set)
     inside, points = _inside(frame, boxes)
-    anywhere: NDArray[np.bool_] = np.any(inside, axis=1, keepdims=True)
     held = np.zeros((height * width, len(label_set)), np.bool_)
     for channel, column in zip(channel_of, inside.T, strict=True):
         held[:, channel] |= column
@@ -69,7 +68,7 @@ def box_crf(frame: PosedFrame, boxes: PrimitiveSet, predicted: UInt8, label_set:
     known = named >= 0
     said[known, named[known]] = _RIGHT
     said[~known] = 1 / len(label_set)
-    unary = np.log(said) + np.log(np.where(anywhere, share + _ELSEWHERE, 1.0))
+    unary = np.log(said) + np.log(np.where(np.any(inside, axis=1, keepdims=True), share + _ELSEWHERE, 1.0))
     channel = _mean_field(unary.reshape(height, width, -1), frame.rgb).argmax(axis=2).ravel()
     ids = np.array([p.id if p.thing else 0 for p in boxes.primitives])
     centre = np.array([p.T_world_box[:3, 3] for p in boxes.primitives]).reshape(-1, 3)

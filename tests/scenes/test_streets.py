@@ -82,7 +82,7 @@ def test_stereo_depth_has_holes_and_errors_that_grow_with_distance(views: list[R
 
 def test_scan_lines_meet_the_lower_part_of_the_image() -> None:
     met = scanned_pixels(street_camera(352))
-    rows = met.any(axis=1)
+    rows = np.asarray(met.any(axis=1))
     assert not rows[: int(street_camera(352).cy) - 12].any() and rows[-20:].all() and 0.3 < met.mean() < 0.75
 
 
