@@ -110,9 +110,8 @@ def make_streets_street(seed: int, *, moving: bool = False) -> Street:
     if moving:
         still = ~np.isin(primitives.group, [walk.group for walk in walks])  # shadows are those of what stands still
         primitives = replace(primitives, casts_shadow=primitives.casts_shadow & still)
-    scene = Scene(
-        seed, "street", (np.inf, np.inf, np.inf), primitives, material_table(b.materials), NO_LAMPS, walks, KITTI360
-    )
+    nowhere, table = (np.inf, np.inf, np.inf), material_table(b.materials)
+    scene = Scene(seed, "street", nowhere, primitives, table, NO_LAMPS, walks, KITTI360)
     return Street(replace(scene, daylight=_daylight(b, scene)), b.way, tuple(b.placed))
 
 
