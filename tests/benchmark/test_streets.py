@@ -96,7 +96,7 @@ def test_claims_name_arms_once() -> None:
 
 
 def test_a_field_is_fitted_once_and_rendered_in_two_ways(tmp_path: Path) -> None:
-    config = msgspec.structs.replace(TINY, width=48, pairs=3, scored_every=2, voxel_m=1.0, field_steps=2)
+    config = msgspec.structs.replace(TINY, width=48, pairs=2, scored_every=1, voxel_m=2.5, field_steps=2)
     arms = panoptic_arms(tmp_path)
     learned = arms["panoptic"](config, SEED)
     (file,) = tmp_path.iterdir()
