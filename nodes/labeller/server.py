@@ -128,9 +128,11 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
             _check_name(self.headers.get("Host", ""))
             if (origin := self.headers.get("Origin")) is not None:
                 _check_name(urlsplit(origin).netloc)
-            given, _, path = self.path.removeprefix("/").partition("/")
+            given, slash, path = self.path.removeprefix("/").partition("/")
             if not hmac.compare_digest(given.encode(), token.encode()):
                 raise _RefusedError(HTTPStatus.FORBIDDEN, "open the address that `label --serve` has shown")
+            if not slash:
+                raise _RefusedError(HTTPStatus.NOT_FOUND, "the address ends in a slash: /TOKEN/")
             return path
 
         def _get(self, path: str) -> tuple[bytes, str] | tuple[bytes, str, str]:

@@ -98,7 +98,8 @@ def open_opensfm(folder: Path, options: ImportOptions) -> PosedPictures:
     model = models[number]
     names = sorted(model.shots, key=numeric_order)
     root = _root(folder, file, names[0])
-    cameras = {name: _intrinsics(camera, f"{file}, camera '{name}'") for name, camera in model.cameras.items()}
+    used = {shot.camera for shot in model.shots.values()}
+    cameras = {n: _intrinsics(c, f"{file}, camera '{n}'") for n, c in model.cameras.items() if n in used}
     pictures = [_picture(root, name, model.shots[name], cameras, file) for name in names]
     poses = np.stack([picture.T_world_camera for picture in pictures])
     reference = model.reference_lla or _reference_beside(file)

@@ -31,7 +31,6 @@ TEXTURE = 32  # channels of an image's texture
 GREY = 0.5
 NEAR_VOXELS, NEAR_SHARE = 1.0, 0.02  # from a measured depth within which samples count: voxels, fraction of depth
 VOTE_START = 4.0  # logits of a class that all votes are for
-DENSEST_OF = 32  # samples of greatest weight among which ``select = "density"`` chooses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +101,7 @@ class IRT(GridField):
         return logits if carried is None or self.vote is None else logits + self.vote(carried)
 
     def selected(self, samples: RaySamples) -> RaySamples:
-        """The points that are looked at: k a ray, in order."""
+        """The points that are looked at: k a ray."""
         k = self.shape.points
         if samples.z.shape[1] <= k:
             return samples

@@ -209,7 +209,7 @@ class ClassFit:
             order = torch.randperm(len(self.looked_at), generator=self.generator)
             self.looked_at = self.looked_at[order[:LOOK_RAYS].sort().values]
         self.step, self.fraction = 0, 0.0
-        carry_labels(field, data.rays, torch.where(train, data.channel, IGNORE))
+        carry_labels(field, data.rays, torch.where(train, data.channel, IGNORE), config.grid.near_m)
 
     def run(
         self, began: float, on_progress: Callable[[FinetuneProgress], None] | None, stopped: Callable[[], object]
@@ -236,7 +236,7 @@ class ClassFit:
             latest = self._look()
             best = latest if best.beaten_by(latest.loss) else best
         self.field.load_state_dict(best.state, strict=False)
-        carry_labels(self.field, self.data.rays, self.data.channel)
+        carry_labels(self.field, self.data.rays, self.data.channel, self.config.grid.near_m)
         return best
 
     def _learn(self) -> float:
@@ -343,8 +343,9 @@ class _Pool:
         return pixels, self.weight[self.channel[pixels]]
 
 
-def carry_labels(field: IRT, rays: FrameRays, channel: torch.Tensor) -> None:
-    """Give a field the labels (F H W,) of frames, with the depth at which they are: measured, else rendered."""
+def carry_labels(field: IRT, rays: FrameRays, channel: torch.Tensor, near_m: float) -> None:
+    """Give a field the labels (F H W,) of frames, with the depth at which they are: measured, else rendered from
+    ``near_m`` on."""
     carried = field.carried
     if carried is None:
         return
@@ -355,7 +356,7 @@ def carry_labels(field: IRT, rays: FrameRays, channel: torch.Tensor) -> None:
         blank = (depth == 0).nonzero()[:, 0]
         with torch.no_grad():
             for part in blank.split(4096):
-                samples = field.march(rays.rays(pixels[part.numpy()], 0.05))
+                samples = field.march(rays.rays(pixels[part.numpy()], near_m))
                 met = samples.opacity > 0.5
                 z = (samples.weight * samples.z).sum(1) / samples.weight.sum(1).clamp_min(1e-6)
                 depth[part] = torch.where(met, z, torch.zeros_like(z))

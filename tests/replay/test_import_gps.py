@@ -268,6 +268,14 @@ def test_lenses_that_are_not_read_are_told(tmp_path: Path, camera: dict[str, Any
         imported(make_opensfm(tmp_path / "flight", flight(4), **camera))
 
 
+def test_a_camera_that_no_picture_uses_may_have_any_lens(tmp_path: Path) -> None:
+    folder = make_opensfm(tmp_path / "flight", flight(4))
+    cameras = json.loads((folder / "reconstruction.json").read_text())[0]["cameras"]
+    round_ones = {"width": 64, "height": 48, "projection_type": "fisheye", "focal": 0.5}
+    change(folder, cameras=cameras | {"other": round_ones})
+    assert len(imported(folder)[1]) == 4
+
+
 def test_what_is_wrong_with_a_reconstruction_is_told(tmp_path: Path) -> None:
     folder = make_opensfm(tmp_path / "flight", flight(4))
     whole = (folder / "reconstruction.json").read_text()

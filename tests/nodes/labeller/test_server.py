@@ -101,6 +101,11 @@ def test_nothing_is_there_without_the_token(page: Page, path: str) -> None:
     assert not list(page.out.glob("*.png"))
 
 
+def test_an_address_without_its_last_slash_is_refused_by_name(page: Page) -> None:
+    answer = page.ask(f"/{page.token}")
+    assert answer.status == 404 and b"ends in a slash" in answer.body
+
+
 def test_two_pages_have_two_tokens(log: Path, tmp_path: Path) -> None:
     with open_log(log) as opened:
         session = LabelSession(opened, make_label_folder(tmp_path / "labels", opened, ROOMS), [0])
