@@ -38,7 +38,7 @@ class ScoreRequest:
     max_frames: int
     config: Path | None
     seed: int
-    instances: Path | None
+    instances: Path | None = None
 
 
 def score_log(request: ScoreRequest) -> dict[str, Any]:

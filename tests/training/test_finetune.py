@@ -317,7 +317,7 @@ class FakeTime:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 100.0
         self.looks = 0
-        monkeypatch.setattr(finetuning.time, "monotonic", lambda: self.now)
+        monkeypatch.setattr("semantic_mapper.training.budget.time.monotonic", lambda: self.now)
         evaluate = finetuning._evaluate
 
         def look(*given):
