@@ -56,7 +56,7 @@ def curves(config: KlevrConfig, folder: Path) -> UInt8:
         Panel("points of novel scenes", "mIoU, %", "steps", points),
         Panel("rays of training", "cross-entropy of balanced rays", "steps", entropy),
     ]
-    return draw_panels("NeSF's arms while they learn", panels, size=(560, 400))
+    return draw_panels("NeSF's arms while they learn", panels, size=(640, 400))
 
 
 def main() -> None:
