@@ -49,13 +49,14 @@ def picture(config: KlevrConfig, folder: Path, columns: int) -> UInt8:
 def curves(config: KlevrConfig, folder: Path) -> UInt8:
     """What the points of novel scenes, and the rays of training, say of each arm that was run."""
     found = {name: nesf_curve(config, name, folder) for name in NESF_ARMS}
-    points = [Curve(n, [(p.step, 100 * p.miou_points) for p in c], True) for n, c in found.items() if c]
-    entropy = [Curve(n, [(p.step, p.cross_entropy) for p in c], True) for n, c in found.items() if c]
+    named = {f"{name}, {curve[-1].step:,} steps": curve for name, curve in found.items() if curve}
+    points = [Curve(n, [(p.step, 100 * p.miou_points) for p in c], True) for n, c in named.items()]
+    entropy = [Curve(n, [(p.step, p.cross_entropy) for p in c], True) for n, c in named.items()]
     panels = [
         Panel("points of novel scenes", "mIoU, %", "steps", points),
         Panel("rays of training", "cross-entropy of balanced rays", "steps", entropy),
     ]
-    return draw_panels("NeSF's arms while they learn", panels, size=(560, 400))
+    return draw_panels("NeSF's arms while they learn", panels, size=(640, 400))
 
 
 def main() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from semantic_mapper.benchmark.aerial import (
@@ -18,7 +18,7 @@ from semantic_mapper.benchmark.aerial_arms import IMAGE_ARMS
 from semantic_mapper.benchmark.aerial_claims import CLAIMS, MEASURES
 from semantic_mapper.benchmark.aerial_fields import field_arms
 from semantic_mapper.benchmark.aerial_irt import irt_arms
-from semantic_mapper.benchmark.claims import CountTable
+from semantic_mapper.benchmark.claims import CountTable, Training
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.config import to_plain
 from semantic_mapper.nodes.cli.arm_suite import ArmSuite, tier_config
@@ -30,8 +30,8 @@ def aerial_suite(path: Path | None, tier: str | None, seed: int | None) -> ArmSu
     config = tier_config("aerial", path, tier, seed, AERIAL_TIERS)
     size = f"{config.towns} towns, {config.choices} choices of {config.labelled} labelled views"
 
-    def scores(names: Sequence[str], store: RecordStore) -> tuple[CountTable, Collection[str]]:
-        return aerial_table(config, names, store), ()
+    def scores(names: Sequence[str], store: RecordStore) -> tuple[CountTable, Training]:
+        return aerial_table(config, names, store), Training()
 
     return ArmSuite(
         name="aerial",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
@@ -12,7 +12,7 @@ import typer
 from rich.table import Table
 
 from semantic_mapper import __version__
-from semantic_mapper.benchmark.claims import Claim, ClaimResult, CountTable, Measure, check_claims, figure
+from semantic_mapper.benchmark.claims import Claim, ClaimResult, CountTable, Measure, Training, check_claims, figure
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.config import Config, convert_config, load_config, to_plain
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
@@ -42,7 +42,7 @@ class ArmSuite(Generic[ArmT]):
         arms: By name; what they fit is kept in the folder.
         units: Records an arm makes.
         run: Makes the records of these arms that are missing; yields how many units are done, and what is next.
-        scores: Counts of the records that there are of these arms, and the arms that are not at their plateau.
+        scores: Counts of the records that there are of these arms, and how their arms were trained.
         measures: Rows of the table.
         class_kinds: What is shown by class.
         claims: To judge.
@@ -58,7 +58,7 @@ class ArmSuite(Generic[ArmT]):
     arms: Callable[[Path], Mapping[str, ArmT]]
     units: int
     run: Callable[[Mapping[str, ArmT], RecordStore, Callable[[], object]], Iterator[tuple[int, str]]]
-    scores: Callable[[Sequence[str], RecordStore], tuple[CountTable, Collection[str]]]
+    scores: Callable[[Sequence[str], RecordStore], tuple[CountTable, Training]]
     measures: Sequence[Measure]
     class_kinds: Sequence[str]
     claims: Sequence[Claim]
@@ -113,8 +113,8 @@ def run_arm_suite(
             bar.start(len(arms) * suite.units)
             for done, text in suite.run(arms, store, lambda: stop):
                 bar.set(done, text)
-        table, unfinished = suite.scores(list(every), store)
-        results = check_claims(suite.claims, table, unfinished=unfinished, seed=suite.seed)
+        table, training = suite.scores(list(every), store)
+        results = check_claims(suite.claims, table, training=training, seed=suite.seed)
         found: dict[str, Any] = {"title": suite.title, "config": suite.config}
         found["arms"] = {n: row for n in every if (row := _figures(suite, n, table))["figures"]}
         found["claims"] = [_plain(result) for result in results]
@@ -155,7 +155,7 @@ def _plain(result: ClaimResult) -> dict[str, Any]:
         "high": result.high,
         "units": result.units,
         "result": result.result,
-        "unfinished": result.unfinished,
+        "reason": result.reason,
     }
 
 
@@ -189,7 +189,7 @@ def _claims_table(paper: str, results: Sequence[ClaimResult]) -> Table:
         measured = ("-", "-")
         if result.difference is not None:
             measured = f"{result.difference:+.1f}", f"{result.low:+.1f} to {result.high:+.1f}"
-        why = f": {', '.join(result.unfinished)} not at the plateau" if result.unfinished else ""
+        why = f": {result.reason}" if result.reason else ""
         row = (claim.name, claim.paper or "-", claim.measure.name, claim.accepted_if, *measured, result.result + why)
         table.add_row(*row)
     return table

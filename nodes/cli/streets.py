@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from semantic_mapper.benchmark.claims import CountTable
+from semantic_mapper.benchmark.claims import CountTable, Training
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.benchmark.streets import (
     ARMS,
@@ -30,8 +30,8 @@ def streets_suite(path: Path | None, tier: str | None, seed: int | None) -> ArmS
     """The suite as a TOML file or a tier has it; raises as ``tier_config``."""
     config = tier_config("streets", path, tier, seed, STREETS_TIERS)
 
-    def scores(names: Sequence[str], store: RecordStore) -> tuple[CountTable, Collection[str]]:
-        return streets_table(config, names, store), ()
+    def scores(names: Sequence[str], store: RecordStore) -> tuple[CountTable, Training]:
+        return streets_table(config, names, store), Training()
 
     return ArmSuite(
         name="streets",

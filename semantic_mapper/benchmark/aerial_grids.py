@@ -9,7 +9,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import msgspec
 import numpy as np
@@ -24,6 +23,7 @@ from semantic_mapper.benchmark.aerial import (
     thinned,
     training_frames,
 )
+from semantic_mapper.benchmark.kept import NPZ_ERRORS, warn_unreadable
 from semantic_mapper.config import GridConfig, to_plain
 from semantic_mapper.fields.grid.scene_grid import SceneGrid
 from semantic_mapper.files import write_bytes
@@ -150,8 +150,8 @@ def _read(path: Path) -> TownGrid | None:
         with np.load(path, allow_pickle=False) as file:
             values, sky, origin = file["values"], file["sky"], [float(x) for x in file["origin_m"]]
             voxel, *figures = (float(x) for x in file["figures"])
-    except (OSError, ValueError, KeyError, BadZipFile) as error:
-        _log.warning("grid_unreadable", file=str(path), error=str(error))
+    except NPZ_ERRORS as error:
+        warn_unreadable(path, error)
         return None
     x, y, z, _ = values.shape
     grid = SceneGrid(GridConfig(origin_m=(origin[0], origin[1], origin[2]), voxel_m=voxel, shape=(x, y, z)))

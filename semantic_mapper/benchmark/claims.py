@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from types import MappingProxyType
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,7 @@ class Claim:
         least, most: Bounds in points. A bound of 0 or above from below is a gain: its interval must lie above 0, too.
         factor: Of ``second``.
         at_plateau: Arms whose steps the claim is about: it is judged only where they are at their plateau.
+        same_steps: Judge it only where both arms were trained for the same steps.
     """
 
     name: str
@@ -73,6 +75,7 @@ class Claim:
     most: float = np.inf
     factor: float = 1.0
     at_plateau: tuple[str, ...] = ()
+    same_steps: bool = False
 
     @property
     def arms(self) -> tuple[str, ...]:
@@ -89,6 +92,16 @@ class Claim:
         return f"{self.least:g} to {self.most:g}"
 
 
+class Training(NamedTuple):
+    """How arms were trained: those that are not at their plateau, and the steps of each (by seed)."""
+
+    unfinished: Collection[str] = ()
+    steps: Mapping[str, Collection[int]] = MappingProxyType({})
+
+
+_NOT_SAID = Training()
+
+
 @dataclass(frozen=True, slots=True)
 class ClaimResult:
     """What came of a claim; figures in points, None where it was not run."""
@@ -99,7 +112,7 @@ class ClaimResult:
     low: float | None = None
     high: float | None = None
     units: int = 0
-    unfinished: tuple[str, ...] = ()  # arms that are not at their plateau: why it is not judged
+    reason: str = ""  # why it is not judged
 
 
 def figure(table: CountTable, arm: str, measure: Measure) -> float | None:
@@ -110,13 +123,13 @@ def figure(table: CountTable, arm: str, measure: Measure) -> float | None:
     return float(measure.value([_sum(units, None) for units in kinds if units])[0])
 
 
-def check_claim(claim: Claim, table: CountTable, *, unfinished: Collection[str] = (), seed: int = 0) -> ClaimResult:
+def check_claim(claim: Claim, table: CountTable, *, training: Training = _NOT_SAID, seed: int = 0) -> ClaimResult:
     """Judge a claim by the units that both sides have been scored on, with a 95 % bootstrap interval over them.
 
     Args:
         claim: What to judge.
         table: Counts by arm, by what is scored, and by unit.
-        unfinished: Arms that are not at their plateau.
+        training: Of the arms.
         seed: Of the bootstrap.
     """
     measures = (claim.measure, claim.second_measure or claim.measure)
@@ -137,16 +150,26 @@ def check_claim(claim: Claim, table: CountTable, *, unfinished: Collection[str] 
     low, high = (float(x) for x in np.nanpercentile(drawn, (2.5, 97.5)))
     difference = float(observed[0])
     right = claim.least <= difference <= claim.most and not (claim.least >= 0 >= low)
-    open_arms = tuple(arm for arm in claim.at_plateau if arm in unfinished)
-    result: Result = "not judged" if open_arms else "accepted" if right else "refused"
-    return ClaimResult(claim, result, difference, low, high, count, open_arms)
+    reason = _not_judged(claim, training)
+    result: Result = "not judged" if reason else "accepted" if right else "refused"
+    return ClaimResult(claim, result, difference, low, high, count, reason)
 
 
 def check_claims(
-    claims: Sequence[Claim], table: CountTable, *, unfinished: Collection[str] = (), seed: int = 0
+    claims: Sequence[Claim], table: CountTable, *, training: Training = _NOT_SAID, seed: int = 0
 ) -> list[ClaimResult]:
     """``check_claim`` of each."""
-    return [check_claim(claim, table, unfinished=unfinished, seed=seed) for claim in claims]
+    return [check_claim(claim, table, training=training, seed=seed) for claim in claims]
+
+
+def _not_judged(claim: Claim, training: Training) -> str:
+    """Why a claim is not judged; empty where it is."""
+    if unfinished := [arm for arm in claim.at_plateau if arm in training.unfinished]:
+        return f"{', '.join(unfinished)} not at the plateau"
+    steps = {arm: sorted(training.steps.get(arm, ())) for arm in claim.arms}
+    if claim.same_steps and len({*map(tuple, steps.values())}) > 1:
+        return ", ".join(f"{arm} {'/'.join(map(str, found))} steps" for arm, found in steps.items())
+    return ""
 
 
 def _draws(units: Sequence[Unit], rng: np.random.Generator) -> dict[Unit, Float64]:

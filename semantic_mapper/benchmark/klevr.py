@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
 from typing import Annotated, Literal, NamedTuple
 
@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 import torch
 
-from semantic_mapper.benchmark.claims import Counts, CountTable, Unit
+from semantic_mapper.benchmark.claims import Counts, CountTable, Training, Unit
 from semantic_mapper.benchmark.plateau import PLATEAU
 from semantic_mapper.benchmark.records import SceneRecord
 from semantic_mapper.benchmark.scoring import as_rows
@@ -29,7 +29,7 @@ from semantic_mapper.scenes.suite import KLEVR_SUITE
 from semantic_mapper.training.frame_rays import frame_rays
 from semantic_mapper.types import Float32, PosedFrame, UInt8
 
-RECORD_VERSION = 3  # raised by a change of what a record means: older ones are made again
+RECORD_VERSION = 4  # raised by a change of what a record means: older ones are made again
 TRAIN_CAMERAS, TEST_CAMERAS, POINTS = "train cameras", "test cameras", "points"
 
 VIEW_ARMS = {"nesf-5-views": 5, "nesf-25-views": 25}  # arms whose densities are fitted to fewer views
@@ -69,11 +69,12 @@ SceneScores = Mapping[int, Mapping[str, ConfusionMatrix]]  # by seed of the nove
 
 
 class ArmScores(NamedTuple):
-    """What an arm says of the novel scenes, and the mIoU that the last fifth of its steps brought; None = no steps that
-    are doubled until a plateau."""
+    """What an arm says of the novel scenes, what the last fifth of its steps brought in mIoU, and these steps; None =
+    none that are doubled until a plateau."""
 
     scenes: SceneScores
     last_fifth: float | None = None
+    steps: int | None = None
 
 
 Arm = Callable[[KlevrConfig], ArmScores]
@@ -177,16 +178,13 @@ def run_klevr(
         scores = arm(own)
         for scene, confusions in scores.scenes.items():
             rows = {kind: as_rows(matrix) for kind, matrix in confusions.items()}
-            record = SceneRecord(
-                settings=settings, weights=name, room=scene, confusions=rows, last_fifth=scores.last_fifth
-            )
-            store.add(record)
+            store.add(SceneRecord(settings, name, scene, rows, scores.last_fifth, scores.steps))
 
 
 def klevr_scores(
     configs: Sequence[KlevrConfig], names: Sequence[str], store: RecordStore
-) -> tuple[CountTable, Collection[str]]:
-    """Counts of the records that there are, and the arms that are not at their plateau.
+) -> tuple[CountTable, Training]:
+    """Counts of the records that there are, and how their arms were trained.
 
     Args:
         configs: One a seed; what they say of a scene adds up.
@@ -195,17 +193,20 @@ def klevr_scores(
     """
     table: dict[tuple[str, str], dict[Unit, Counts]] = {}
     unfinished: set[str] = set()
+    steps: dict[str, set[int]] = {}
     for name, config in product(names, configs):
         for scene in novel_seeds(config):
             record = store.find(SceneRecord, klevr_digest(config), name, scene)
             if record is None:
                 continue
-            if record.last_fifth is not None and record.last_fifth >= PLATEAU:
+            if record.last_fifth is not None and abs(record.last_fifth) >= PLATEAU:
                 unfinished.add(name)
+            if record.steps is not None:
+                steps.setdefault(name, set()).add(record.steps)
             for kind, rows in record.confusions.items():
                 units = table.setdefault((name, kind), {})
                 units[0, scene] = units.get((0, scene), 0) + np.array(rows, np.int64)
-    return table, unfinished
+    return table, Training(unfinished, steps)
 
 
 def surface_points(config: KlevrConfig, scene: int, numbers: Sequence[int] | None = None) -> tuple[Float32, UInt8]:

@@ -9,12 +9,12 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
-from zipfile import BadZipFile
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from semantic_mapper.benchmark.kept import NPZ_ERRORS, warn_unreadable
 from semantic_mapper.config import AtLeastOne, AtLeastTwo, Config, GridConfig, NotNegative, to_plain
 from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
@@ -113,8 +113,8 @@ def _read(path: Path) -> SceneDensity | None:
         with np.load(path, allow_pickle=False) as file:
             raw, origin = file["raw"], [float(x) for x in file["origin_m"]]
             voxel, psnr = float(file["voxel_m"]), float(file["psnr"])
-    except (OSError, ValueError, KeyError, BadZipFile) as error:
-        _log.warning("density_unreadable", file=str(path), error=str(error))
+    except NPZ_ERRORS as error:
+        warn_unreadable(path, error)
         return None
     x, y, z = raw.shape
     grid = GridConfig(origin_m=(origin[0], origin[1], origin[2]), voxel_m=voxel, shape=(x, y, z))

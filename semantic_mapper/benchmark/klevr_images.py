@@ -13,10 +13,11 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import torch
-from safetensors.torch import load_file, save
+from safetensors.torch import save
 from torch import nn
 from torch.nn import functional
 
+from semantic_mapper.benchmark.kept import read_json, read_network
 from semantic_mapper.benchmark.klevr import (
     POINTS,
     TEST_CAMERAS,
@@ -88,7 +89,7 @@ def unet_arm(config: KlevrConfig, folder: Path) -> ArmScores:
         xyz, truth = surface_points(config, scene)
         matrix = matrices[POINTS] = ConfusionMatrix(KLEVR_SUITE.label_set)
         matrix.update(truth, vote_at_points(config, scene, xyz, unet.predict), f"points of scene {scene}")
-    return ArmScores(found, gain)
+    return ArmScores(found, gain, unet.config.steps)
 
 
 def unet_network(config: KlevrConfig, folder: Path) -> tuple[UNetBaseline, float]:
@@ -115,10 +116,9 @@ def _fit_unet(config: KlevrConfig, folder: Path, steps: int) -> tuple[UNetBaseli
     settings = UNetConfig(steps=steps, width=config.width, seed=config.seed)
     unet = UNetBaseline(KLEVR_SUITE.label_set, settings)
     path = folder / f"unet-{_unet_digest(config, settings)}.safetensors"
-    if path.exists():
-        unet.net.load_state_dict(load_file(path))
-        unet.net.eval()
-        return unet, msgspec.json.decode(path.with_suffix(".json").read_bytes(), type=float)
+    kept = read_json(path.with_suffix(".json"), float)
+    if kept is not None and read_network(path, unet.net):
+        return unet, kept
     checked = [f for s in train_seeds(config)[:_CHECKED_SCENES] for f in _held_out(config, s)]
     before: list[float] = []
 

@@ -14,11 +14,13 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 import torch
-from safetensors.torch import load_file, save
+from safetensors.torch import save
 from torch.nn import functional
 
+from semantic_mapper.benchmark.kept import read_json, read_network
 from semantic_mapper.benchmark.klevr import (
     POINTS,
+    TRAIN_CAMERAS,
     VIEW_ARMS,
     Arm,
     ArmScores,
@@ -34,7 +36,7 @@ from semantic_mapper.benchmark.klevr import (
     train_seeds,
 )
 from semantic_mapper.benchmark.klevr_grids import NEAR_M, KlevrGridConfig, SceneDensity, grid_digest, scene_densities
-from semantic_mapper.benchmark.plateau import fit_to_plateau
+from semantic_mapper.benchmark.plateau import PLATEAU, fit_to_plateau
 from semantic_mapper.config import to_plain
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.fields.grid.scene_grid import SceneGrid, grid_box
@@ -100,23 +102,24 @@ def nesf_arms(folder: Path) -> dict[str, Arm]:
     """Arms by name; densities and networks are kept in ``folder``."""
 
     def run(name: str, config: KlevrConfig) -> ArmScores:
-        model, gain = arm_network(config, name, folder)
+        model, curve = arm_network(config, name, folder)
         own, _ = arm_settings(config, name)
-        return ArmScores(nesf_scores(own, model, folder, NESF_ARMS[name]), gain)
+        return ArmScores(nesf_scores(own, model, folder, NESF_ARMS[name]), last_fifth(curve), curve[-1].step)
 
     return {name: partial(run, name) for name in NESF_ARMS}
 
 
-def arm_network(config: KlevrConfig, name: str, folder: Path) -> tuple[GridNesf, float]:
-    """The network of an arm, its steps doubled until its plateau, and the mIoU that the last fifth of them brought."""
+def arm_network(config: KlevrConfig, name: str, folder: Path) -> tuple[GridNesf, list[TrainingPoint]]:
+    """The network of an arm, its steps doubled until its plateau, and how it was trained."""
     (own, training), arm = arm_settings(config, name), NESF_ARMS[name]
 
-    def fit(steps: int) -> tuple[GridNesf, float]:
+    def fit(steps: int) -> tuple[tuple[GridNesf, list[TrainingPoint]], float]:
         settings = msgspec.structs.replace(training, steps=steps)
         model = nesf_network(own, settings, folder, arm)
-        return model, last_fifth(read_curve(own, settings, folder, arm))
+        curve = read_curve(own, settings, folder, arm)
+        return (model, curve), last_fifth(curve)
 
-    return fit_to_plateau(fit, training.steps, config.doublings)
+    return fit_to_plateau(fit, training.steps, config.doublings)[0]
 
 
 def last_fifth(curve: Sequence[TrainingPoint]) -> float:
@@ -168,11 +171,10 @@ def nesf_scores(config: KlevrConfig, model: GridNesf, folder: Path, arm: NesfArm
 def nesf_network(config: KlevrConfig, training: GridNesfTraining, folder: Path, arm: NesfArm) -> GridNesf:
     """The network of an arm: read from ``folder``, or trained and kept there, its curve beside it."""
     label_set = KLEVR_SUITE.label_set
-    path = _network_path(config, training, folder, arm)
-    if path.exists():
-        model = GridNesf(label_set, training.network)
-        model.load_state_dict(load_file(path))
-        return model.eval()
+    path = network_path(config, training, folder, arm)
+    kept = GridNesf(label_set, training.network)
+    if read_curve(config, training, folder, arm) and read_network(path, kept):
+        return kept
     grids = _grids(config, train_seeds(config), folder, arm)
     scenes = [_training_scene(config, training, scene, grid, arm) for scene, grid in grids.items()]
     novel = {s: (g, *surface_points(config, s)) for s, g in _grids(config, novel_seeds(config), folder, arm).items()}
@@ -193,19 +195,20 @@ def nesf_network(config: KlevrConfig, training: GridNesfTraining, folder: Path, 
 
 
 def nesf_curve(config: KlevrConfig, name: str, folder: Path) -> list[TrainingPoint]:
-    """How the kept network of an arm with the most steps was trained; empty where there is none."""
+    """How the kept network of an arm was trained, that with the most steps before its plateau; empty without one."""
     own, training = arm_settings(config, name)
-    curves = (
-        read_curve(own, msgspec.structs.replace(training, steps=training.steps << k), folder, NESF_ARMS[name])
-        for k in reversed(range(config.doublings + 1))
-    )
-    return next(filter(None, curves), [])
+    found: list[TrainingPoint] = []
+    for k in range(config.doublings + 1):
+        settings = msgspec.structs.replace(training, steps=training.steps << k)
+        found = read_curve(own, settings, folder, NESF_ARMS[name]) or found
+        if found and abs(last_fifth(found)) < PLATEAU:
+            break
+    return found
 
 
 def read_curve(config: KlevrConfig, training: GridNesfTraining, folder: Path, arm: NesfArm) -> list[TrainingPoint]:
     """How a kept network was trained; empty where there is none."""
-    path = _network_path(config, training, folder, arm).with_suffix(".json")
-    return msgspec.json.decode(path.read_bytes(), type=list[TrainingPoint]) if path.exists() else []
+    return read_json(network_path(config, training, folder, arm).with_suffix(".json"), list[TrainingPoint]) or []
 
 
 def _training_scene(
@@ -218,14 +221,18 @@ def _training_scene(
     return labelled_points(grid, xyz, label_set.to_channels(ids).astype(np.int64), training)
 
 
-def _network_path(config: KlevrConfig, training: GridNesfTraining, folder: Path, arm: NesfArm) -> Path:
+def network_path(config: KlevrConfig, training: GridNesfTraining, folder: Path, arm: NesfArm) -> Path:
+    """Where the network of an arm is kept."""
     return folder / f"nesf-{_network_digest(config, training, arm)}.safetensors"
 
 
 def _network_digest(config: KlevrConfig, training: GridNesfTraining, arm: NesfArm) -> str:
-    grids = [grid_digest(grid_config(config, arm.views), scene) for scene in train_seeds(config)]
-    maps = [label_map_numbers(config, scene) for scene in train_seeds(config)]
-    plain = [to_plain(training), ["exact"] if arm.exact else grids, maps, VERSION]
+    """Of all that a network and its curve follow from: novel scenes, too, as the curve is looked at there."""
+    train, novel = train_seeds(config), novel_seeds(config)
+    scenes = [grid_digest(grid_config(config, arm.views), scene) for scene in (*train, *novel)]
+    maps = [label_map_numbers(config, scene) for scene in train]
+    points = [scored_numbers(config, scene)[TRAIN_CAMERAS] for scene in novel]
+    plain = [to_plain(training), arm.exact, scenes, maps, points, VERSION]
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
 
 

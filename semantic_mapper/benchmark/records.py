@@ -121,6 +121,7 @@ class SceneRecord(Config, frozen=True, tag_field="record", tag="scene"):
     room: int  # seed of the scene
     confusions: dict[str, Rows]
     last_fifth: float | None = None  # mIoU that the last fifth of the arm's steps brought, where looked for
+    steps: int | None = None  # of the arm, where they are doubled until its plateau
 
 
 Record = RoomRecord | MapRecord | SceneRecord

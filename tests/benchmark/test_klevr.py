@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from semantic_mapper.benchmark.claims import Claim, Counts, Unit, check_claim
+from semantic_mapper.benchmark.claims import Claim, Counts, Training, Unit, check_claim
 from semantic_mapper.benchmark.klevr import (
     POINTS,
     TEST_CAMERAS,
@@ -80,31 +80,31 @@ def test_truth_scores_all_and_background_alone_a_sixth() -> None:
     assert miou is not None and 0.1 < miou < 0.25
 
 
-@pytest.mark.parametrize("gain", [0.004, 0.006])
+@pytest.mark.parametrize("gain", [0.004, 0.006, -0.006])
 def test_records_are_kept_and_not_made_again(gain: float, tmp_path: Path) -> None:
     calls: list[str] = []
 
     def arm(config: KlevrConfig) -> ArmScores:
         calls.append("arm")
-        return ArmScores(score_images(config, right), gain)
+        return ArmScores(score_images(config, right), gain, 40)
 
     path = tmp_path / "klevr.jsonl"
     assert list(run_klevr(TINY, {"nesf": arm}, RecordStore(path))) == ["nesf"]
     store = RecordStore(path)
     assert list(run_klevr(TINY, {"nesf": arm}, store)) == [] and calls == ["arm"]
     assert list(run_klevr(msgspec.structs.replace(TINY, seed=1), {"nesf": arm}, store, lambda: True)) == []
-    table, unfinished = klevr_scores([TINY], ["nesf"], store)
+    table, training = klevr_scores([TINY], ["nesf"], store)
     assert set(table) == {("nesf", TRAIN_CAMERAS), ("nesf", TEST_CAMERAS)}
     assert set(table["nesf", TEST_CAMERAS]) == {(0, scene) for scene in novel_seeds(TINY)}
     twice, _ = klevr_scores([TINY, TINY], ["nesf"], store)
     for unit, counts in table["nesf", TEST_CAMERAS].items():
         assert np.array_equal(twice["nesf", TEST_CAMERAS][unit], 2 * counts)
     same = next(c for c in CLAIMS if c.name == "the same at test cameras")
-    assert unfinished == ({"nesf"} if gain >= PLATEAU else set())
-    assert check_claim(same, table, unfinished=unfinished).result == "accepted"
+    assert training == ({"nesf"} if abs(gain) >= PLATEAU else set(), {"nesf": {40}})
+    assert check_claim(same, table, training=training).result == "accepted"
     steps_matter = replace(same, at_plateau=("nesf",))
-    expected = "not judged" if unfinished else "accepted"
-    assert check_claim(steps_matter, table, unfinished=unfinished).result == expected
+    expected = "not judged" if training.unfinished else "accepted"
+    assert check_claim(steps_matter, table, training=training).result == expected
     assert klevr_digest(TINY) != klevr_digest(msgspec.structs.replace(TINY, mlp_steps=7))
 
 
@@ -134,15 +134,33 @@ def test_claims_compare_figures_of_one_arm_and_a_fraction() -> None:
 def test_claims_on_an_arm_that_still_learns_are_not_judged() -> None:
     table = {("a", POINTS): matrices([90, 80]), ("b", POINTS): matrices([60, 50])}
     claim = Claim("gain", "", POINTS_MIOU, "a", "b", least=5.0, at_plateau=("b",))
-    judged, left = check_claim(claim, table, unfinished={"a"}), check_claim(claim, table, unfinished={"b", "c"})
-    assert judged.result == "accepted" and judged.unfinished == ()
-    assert left.result == "not judged" and left.unfinished == ("b",)
+    judged = check_claim(claim, table, training=Training({"a"}))
+    left = check_claim(claim, table, training=Training({"b", "c"}))
+    assert judged.result == "accepted" and judged.reason == ""
+    assert left.result == "not judged" and left.reason == "b not at the plateau"
     assert (left.difference, left.low, left.high) == (judged.difference, judged.low, judged.high)
-    assert check_claim(claim, {}, unfinished={"a"}).result == "not run"
+    assert check_claim(claim, {}, training=Training({"a"})).result == "not run"
 
 
-@pytest.mark.parametrize(("reached", "steps", "gain"), [((50, 60, 60.4, 61), 40, 0.004), ((50, 60, 70, 80), 40, 0.1)])
-def test_steps_are_doubled_until_the_plateau(reached: tuple[float, ...], steps: int, gain: float) -> None:
+def test_claims_on_the_same_steps_are_not_judged_after_others() -> None:
+    table = {("a", POINTS): matrices([90, 80]), ("b", POINTS): matrices([60, 50])}
+    claim = Claim("gain", "", POINTS_MIOU, "a", "b", least=5.0, same_steps=True)
+    assert check_claim(claim, table, training=Training((), {"a": {40}, "b": {40}})).result == "accepted"
+    left = check_claim(claim, table, training=Training((), {"a": {40}, "b": {20, 40}}))
+    assert left.result == "not judged" and left.reason == "a 40 steps, b 20/40 steps"
+    assert check_claim(replace(claim, same_steps=False), table, training=Training((), {"a": {40}})).result == "accepted"
+
+
+@pytest.mark.parametrize(
+    ("reached", "steps", "gain"),
+    [
+        ((50, 60, 60.4), [10, 20], 0.004),
+        ((50, 60, 59.6), [10, 20], -0.004),
+        ((50, 60, 70, 80), [10, 20, 40], 0.1),
+        ((50, 30, 30.1), [10, 20], 0.001),  # what loses is not at its plateau
+    ],
+)
+def test_steps_are_doubled_until_the_plateau(reached: tuple[float, ...], steps: list[int], gain: float) -> None:
     asked: list[int] = []
 
     def fit(steps: int) -> tuple[int, float]:
@@ -150,8 +168,8 @@ def test_steps_are_doubled_until_the_plateau(reached: tuple[float, ...], steps: 
         k = len(asked)
         return steps, (reached[k] - reached[k - 1]) / 100
 
-    assert fit_to_plateau(fit, 10, doublings=2) == (steps if gain >= PLATEAU else 20, pytest.approx(gain))
-    assert asked == ([10, 20, 40] if gain >= PLATEAU else [10, 20])
+    assert fit_to_plateau(fit, 10, doublings=2) == (steps[-1], pytest.approx(gain))
+    assert asked == steps
 
 
 def test_settings_that_no_run_can_follow_are_refused(tmp_path: Path) -> None:

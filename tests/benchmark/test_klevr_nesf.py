@@ -24,11 +24,15 @@ from semantic_mapper.benchmark.klevr_grids import KlevrGridConfig, grid_digest, 
 from semantic_mapper.benchmark.klevr_nesf import (
     NESF_ARMS,
     TrainingPoint,
+    arm_network,
+    arm_settings,
     exact_grid,
     last_fifth,
     nesf_arms,
+    nesf_curve,
     nesf_network,
     nesf_scores,
+    network_path,
     training_of,
 )
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
@@ -57,9 +61,10 @@ def test_a_density_is_fitted_once_and_is_the_same_when_read(tmp_path: Path) -> N
     assert (file.stat().st_mtime_ns, file.read_bytes()) == before
     assert again.grid == first.grid and np.array_equal(again.raw, first.raw) and again.psnr == first.psnr
     assert np.isfinite(first.psnr)
-    file.write_bytes(before[1][:-100])
-    mended = scene_density(GRID, 3, tmp_path)
-    assert np.array_equal(mended.raw, first.raw) and file.read_bytes() == before[1]
+    for damaged in (before[1][:-100], before[1][:400] + bytes(200) + before[1][600:], b""):
+        file.write_bytes(damaged)
+        mended = scene_density(GRID, 3, tmp_path)
+        assert np.array_equal(mended.raw, first.raw) and file.read_bytes() == before[1]
 
 
 def test_the_digest_tells_all_that_a_fit_depends_on() -> None:
@@ -101,6 +106,38 @@ def test_every_arm_that_a_claim_names_exists_and_few_scenes_serve_those_of_few_v
     few = scenes_of_arm(KlevrConfig(), "nesf-5-views")
     assert (few.train_scenes, few.novel_scenes) == (12, 6)
     assert scenes_of_arm(TINY, "nesf-5-views").novel_scenes == 2 and scenes_of_arm(TINY, "nesf") == TINY
+
+
+@pytest.mark.parametrize("name", ["nesf", "exact-points"])
+def test_a_curve_of_other_scenes_or_pictures_is_not_taken(name: str, tmp_path: Path) -> None:
+    changes = {
+        "novel_scenes": 3,
+        "variant": "float",
+        "width": 44,
+        "train_views": 25,
+        "scored_views": 4,
+        "train_scenes": 2,
+    }
+    paths: set[Path] = set()
+    for changed in ({}, *({k: v} for k, v in changes.items())):
+        config, training = arm_settings(msgspec.structs.replace(TINY, **changed), name)
+        paths.add(network_path(config, training, tmp_path, NESF_ARMS[name]))
+    assert len(paths) == len(changes) + 1
+
+
+def test_damaged_files_of_an_arm_are_made_again(tmp_path: Path) -> None:
+    few = msgspec.structs.replace(
+        TINY, train_scenes=2, views=12, train_views=8, label_maps=3, nesf_steps=20, doublings=0
+    )
+    torch.set_num_threads(1)
+    first, curve = arm_network(few, "exact-points", tmp_path)
+    kept = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert len(kept) == 2 and curve[-1].step == 20 and nesf_curve(few, "exact-points", tmp_path) == curve
+    for path, content in kept.items():
+        path.write_bytes(content[: len(content) // 2])
+        again, same = arm_network(few, "exact-points", tmp_path)
+        assert same == curve and {p: p.read_bytes() for p in tmp_path.iterdir()} == kept
+        assert all(torch.equal(a, b) for a, b in zip(first.parameters(), again.parameters(), strict=True))
 
 
 @pytest.mark.parametrize("name", ["nesf-no-rotation", "nesf-grid-32"])
