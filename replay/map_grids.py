@@ -105,7 +105,8 @@ def make_log_maps(
         LogError: a log cannot be read.
         WeightsError: of ``weights``, or a file in the folder is damaged.
     """
-    paths: dict[Path, Path] = {}
+    paths: list[Path] = []
+    contents: dict[str, Path] = {}
     left_out: dict[str, str] = {}
     field = _field_digest(weights)
     for log in logs:
@@ -113,8 +114,9 @@ def make_log_maps(
             break
         content = _log_digest(log)
         path = folder / f"log-{log.stem}-{content[:12]}.npz"
-        if path in paths:
-            raise ConfigError(f"{log} and {paths[path]} are the same log; name it once")
+        if content in contents:
+            raise ConfigError(f"{log} and {contents[content]} are the same log; name it once")
+        contents[content] = log
         made_of = _digest_of({"log": content, "weights": field})
         reason = "" if _is_kept(path, made_of) else _map_log(log, path, weights, made_of, stopped)
         if stopped() and not path.is_file():
@@ -123,12 +125,12 @@ def make_log_maps(
             left_out[str(log)] = reason
             _log.warning("log_left_out", log=str(log), reason=reason)
         else:
-            paths[path] = log
+            paths.append(path)
         on_log(log)
     if left_out and not paths:
         reasons = "; ".join(f"{log}: {reason}" for log, reason in left_out.items())
         raise ConfigError(f"none of {len(left_out)} logs can be learned from ({reasons})")
-    return list(paths)
+    return paths
 
 
 def made_of_room(seed: int, field: str, frames: int = ROOM_FRAMES, rendered: int = 1) -> str:

@@ -11,6 +11,9 @@ import pytest
 
 from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapping.refine import up_frame
+from semantic_mapper.replay import map_grids
+from semantic_mapper.replay.evaluate.room_map import UP
 from semantic_mapper.replay.map_grids import make_log_maps, make_room_maps
 from semantic_mapper.training.nesf import TrainingMap
 from tests.nodes.support import write_log, write_weights
@@ -26,6 +29,13 @@ def test_logs_without_labels_or_depth_are_named(tmp_path: Path) -> None:
     assert not (tmp_path / "maps").exists()
 
 
+@pytest.fixture
+def upright(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Untrained weights find no floor, which says where up is."""
+    monkeypatch.setattr(map_grids, "up_frame", lambda voxel_map, up: up_frame(voxel_map, UP))
+
+
+@pytest.mark.usefixtures("upright")
 def test_logs_are_known_by_their_content_and_not_by_their_name(tmp_path: Path) -> None:
     weights = write_weights(tmp_path / "tiny.safetensors")
     for name in ("one", "other", "again"):
@@ -45,6 +55,7 @@ def test_logs_are_known_by_their_content_and_not_by_their_name(tmp_path: Path) -
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.usefixtures("upright")
 def test_logs_whose_labels_never_reach_their_map_are_left_out(tmp_path: Path) -> None:
     weights = write_weights(tmp_path / "tiny.safetensors")
     names = tuple(f"other {number}" for number in range(len(ROOMS)))
