@@ -1,6 +1,6 @@
 """What refining beside a mapper costs its step: the same frames in laps, with the process at work and with it frozen.
 
-Example: python -m benchmarks.live_refinement kitchen.mcap --laps 9
+Example: python -m benchmarks.live_refinement kitchen.mcap --laps 9 --weights smoothed
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ def main() -> None:
     parser.add_argument("log", type=Path)
     parser.add_argument("--config", type=Path)
     parser.add_argument("--laps", type=int, default=9)
+    parser.add_argument("--weights", type=Path, help="as `refine --weights`")
     args = parser.parse_args()
     prepare_process()
     bundle = Mapper.load(None, mapper_config(args.config, None))
@@ -39,7 +40,7 @@ def main() -> None:
     turn, steps = Turn(0, 0, 0), []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.npz"
-        with LiveRefinement(voxel_map, path, 1e-9, None) as refinement:
+        with LiveRefinement(voxel_map, path, 1e-9, args.weights) as refinement:
             while turn.lap < args.laps:
                 results = session.process(frames[turn.place % len(frames)])
                 ms = sum(sum(r.stage_ms.values()) for r in results if isinstance(r, MapUpdate))

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 
 import msgspec
@@ -129,6 +130,8 @@ def autolabel(
         label_set = log.info.label_set
         if bundle.checkpoint.model.knows_classes:
             label_set = _label_set(log, bundle.label_set, request)
+        else:
+            _check_depth_is_missing(log, request)
         bundle.voxel_map.note_scale(log.info.scale_known)
         labeller = _Labeller(bundle, label_set, request)
         digest = hashlib.sha256(bundle.weights_path.read_bytes()).hexdigest()
@@ -233,6 +236,17 @@ def _label_set(log: Log, weights: LabelSet, request: AutolabelRequest) -> LabelS
             "that were finetuned on its labels, replace all labels with --overwrite-labels, or import it with --rename"
         )
     return there
+
+
+def _check_depth_is_missing(log: Log, request: AutolabelRequest) -> None:
+    """Weights without classes have something to do only where a frame lacks depth.
+
+    Raises:
+        LogError: none does.
+    """
+    frames = islice(log.frame_parts(), request.max_frames or None)
+    if all(envelope.has_depth for envelope, _ in frames):
+        raise LogError(f"{log.path}: no frame lacks depth, and these weights know no classes: nothing was rendered")
 
 
 def _settings(request: AutolabelRequest) -> str:

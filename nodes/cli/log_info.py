@@ -90,13 +90,17 @@ def autolabel_rows(note: dict[str, Any]) -> list[tuple[str, str]]:
         note: As ``AutolabelNote.plain`` gives it.
     """
     confidence = "" if note["mean_confidence"] is None else f", mean confidence {note['mean_confidence'] * 100:.1f} %"
-    counts = [f"{note['labelled']} of {counted(note['frames'], 'frame')} labelled{confidence}"]
+    frames = counted(note["frames"], "frame")
+    counts = [f"{note['labelled']} of {frames} labelled{confidence}"]
     counts += [f"{note[key]} {text}" for key, text in _AUTOLABEL_COUNTS.items() if note[key]]
     settings = [f"--min-confidence {note['min_confidence']:g}"] if note["min_confidence"] else []
     settings += ["--overwrite-labels"] if note["overwrite_labels"] else []
     settings += ["--depth"] if note["depth"] else []
     by = f"{note['weights']} ({note['kind']}, SHA-256 {note['digest'][:16]})"
-    return [("pseudo labels by", " ".join([by, *settings])), ("pseudo labels", "; ".join(counts))]
+    by = " ".join([by, *settings])
+    if not note["classes"]:
+        return [("depth by", by), ("depth", f"{note['depth_written']} of {frames} got what was rendered")]
+    return [("pseudo labels by", by), ("pseudo labels", "; ".join(counts))]
 
 
 _AUTOLABEL_COUNTS = {

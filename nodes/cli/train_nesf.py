@@ -78,7 +78,12 @@ def train_on_maps(
 def _maps(settings: NesfTrainConfig, folder: Path, weights: Path, stop: StopRequest) -> tuple[list[Path], list[Path]]:
     """Files of the maps to train on and to validate on."""
     if settings.logs:
-        paths = make_log_maps([Path(log) for log in settings.logs], folder, weights)
+        with frame_progress("map the logs", None, unit="logs") as bar:
+            bar.start(len(settings.logs))
+            logs = [Path(log) for log in settings.logs]
+            paths = make_log_maps(logs, folder, weights, lambda log: bar.advance(), lambda: stop)
+        if stop:
+            return paths, []
         if len(paths) < 2:
             raise ConfigError("training needs the maps of at least two logs, one of them to validate on")
         held_out = max(1, len(paths) // 10)

@@ -18,7 +18,7 @@ from typing import Self
 import structlog
 
 from semantic_mapper.errors import SemanticMapperError
-from semantic_mapper.fields.nesf import load_nesf
+from semantic_mapper.fields.nesf import find_nesf
 from semantic_mapper.mapping.refine import shared_classes
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.refining import REFINED_NAME, Job, read_changes
@@ -38,7 +38,7 @@ class LiveRefinement:
         voxel_map: Of the mapper; only its classes, version and epoch are read.
         path: Of its saved map.
         every_s: From the beginning of one refinement to the next.
-        weights: From ``train --kind nesf``; None = votes are smoothed.
+        weights: As of ``find_nesf``.
         idle: Compute only while nobody else wants the processor; the last map never waits for that.
 
     Raises:
@@ -48,8 +48,8 @@ class LiveRefinement:
     def __init__(
         self, voxel_map: VoxelMap, path: Path, every_s: float, weights: Path | None, *, idle: bool = True
     ) -> None:
-        if weights is not None:
-            shared_classes(voxel_map.label_set, load_nesf(weights).model.label_set, by_name=False)
+        network = find_nesf(weights, voxel_map.label_set).model
+        shared_classes(voxel_map.label_set, network.label_set, by_name=False)
         config = voxel_map.config
         self.mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
         self.failure = ""  # of the last refinement; empty where it went well

@@ -266,6 +266,10 @@ def load_nesf(path: Path) -> NesfWeights:
         WeightsError: no such file, damaged, or weights of another kind.
     """
     path = find_checkpoint(path)
+    if not path.exists():
+        raise WeightsError(
+            f"{path}: no such weights file; make one with `semantic-mapper train --kind {MAP_KIND}`, or check the path"
+        )
     tensors, metadata = open_weights(path)
     kind = metadata.get("field", "sray")
     if kind != MAP_KIND:

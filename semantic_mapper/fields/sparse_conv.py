@@ -1,7 +1,8 @@
 """Convolutions over the occupied cells of a 3D grid, in plain torch: neighbour tables, gathers, matrix products.
 
 A *submanifold* convolution gives an output where there is an input and nowhere else (Graham et al. 2018), so a surface
-stays a surface however many layers follow. Missing neighbours count as zeros.
+stays a surface however many layers follow. Missing neighbours count as zeros. ``dense`` methods are the reference that
+tests hold the sparse ones to.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ LEVELS = 3
 
 
 class UNet3d(nn.Module):
-    """Features of cells in, features of cells out; the same parameters serve both backbones.
+    """Features of cells in, features of cells out; the dense reference has the same parameters.
 
     Args:
         channels_in: C.
@@ -50,7 +50,7 @@ class UNet3d(nn.Module):
         return self.head(x)
 
     def dense(self, x: torch.Tensor) -> torch.Tensor:
-        """Features (1, C, X, Y, Z) of a full grid, sizes divisible by 4 -> (1, K, X, Y, Z)."""
+        """The reference for tests: features (1, C, X, Y, Z) of a full grid, sizes divisible by 4 -> (1, K, X, Y, Z)."""
         kept: list[torch.Tensor] = []
         for n in range(LEVELS):
             x = torch.relu(self.second[n].dense(torch.relu(self.first[n].dense(x))))  # pyright: ignore

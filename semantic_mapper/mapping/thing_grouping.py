@@ -39,10 +39,10 @@ def group_things(
     centre = voxels.astype(np.float64) * voxel_m + way_m.astype(np.float64)
     agree = np.linalg.norm(centre[first] - centre[second], axis=1) < AGREE_M
     piece = _components(len(voxels), first[agree], second[agree])
-    return _without_crumbs(piece, first, second, centre)
+    return _join_small_pieces(piece, first, second, centre)
 
 
-def _without_crumbs(
+def _join_small_pieces(
     piece: NDArray[np.int64], first: NDArray[np.int64], second: NDArray[np.int64], centre: Float64
 ) -> NDArray[np.int64]:
     """Pieces (N,); small ones that touch large ones, by the pairs ``first``, ``second``, are part of them now."""

@@ -179,7 +179,7 @@ def favour_by_frequency(model: GridNesf, scenes: Sequence[LabelledScene], balanc
     Rays of solids are drawn more often than they are seen; without the shift, edges of solids spread over the floor.
     """
     classes = len(model.label_set)
-    true, drawn = (np.mean([s.frequencies(classes, share) for s in scenes], axis=0) for share in (0.0, balanced))
+    true, drawn = (np.mean([s.frequencies(classes, rate) for s in scenes], axis=0) for rate in (0.0, balanced))
     seen = drawn > 0
     shift = torch.from_numpy(np.where(seen, np.log(np.maximum(true, 1e-9) / np.where(seen, drawn, 1)), 0)).float()
     with torch.no_grad():

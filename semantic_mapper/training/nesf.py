@@ -11,7 +11,10 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import io
 import time
-from collections.abc import Callable, Sequence
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -61,14 +64,14 @@ class NesfTrainConfig(Config, frozen=True):
 
     kind: str = "nesf"
     field: NesfConfig = NesfConfig()
-    rooms: NotNegative = 62  # procedural rooms to map, from ``first_seed`` on
+    rooms: NotNegative = 102  # procedural rooms to map, from ``first_seed`` on
     validation_rooms: NotNegative = 12  # of other materials than those
     first_seed: NotNegative = 50_000  # S-Ray's weights were trained on rooms below: on those its votes are too sure
     logs: tuple[str, ...] = ()  # labelled logs with depth, in place of rooms; the last tenth of them validates
     maps: str = ""  # folder of the maps that are made of them; empty = "maps" in the run's folder
     weights: str = ""  # of the field that maps; empty = those that ship
     seconds: float = 0.0  # of training; 0 = only steps count
-    steps: NotNegative = 2000  # of one map each
+    steps: NotNegative = 2400  # of one map each
     crop_voxels: AtLeastOne = 60_000  # of larger maps, those nearest to a point of theirs
     labelled_voxels: AtLeastOne = 16_384  # of a crop that are compared
     learning_rate: Positive = 3e-3
@@ -79,13 +82,13 @@ class NesfTrainConfig(Config, frozen=True):
     cubes: Fraction = 0.3  # of crops that lose those of some of their cubes of 1 m
     cubes_lost: Fraction = 0.3  # of the cubes
     no_colour: Fraction = 0.3
-    validate_every: AtLeastOne = 200  # steps
+    validate_every: AtLeastOne = 500  # steps
     save_every_s: Positive = 120.0
     seed: NotNegative = 0
 
 
 class VoxelLabels(NamedTuple):
-    """Labelled voxels of a map, each once, by most of its pixels.
+    """Labelled voxels of a map, each once: the class of most of its pixels, and the object of most of those.
 
     Args:
         row: (V,) int64 of the map's points.
@@ -108,6 +111,7 @@ class TrainingMap:
         channel: (H,) int64 its class; a voxel may stand here with several.
         instance: (H,) int64 number of the pixel's object, from 1; 0 = not known, or no countable thing.
         count: (H,) float32 pixels.
+        made_of: Digest of what it was made of; empty = not noted.
     """
 
     points: SurfacePoints
@@ -115,12 +119,15 @@ class TrainingMap:
     channel: NDArray[np.int64]
     instance: NDArray[np.int64]
     count: NDArray[np.float32]
+    made_of: str = ""
 
     @property
     def voxels(self) -> VoxelLabels:
         """The labels of its voxels."""
-        order = np.lexsort((self.count, self.row))
-        last = order[np.append(np.diff(self.row[order]) > 0, [True])]
+        _, of_class = np.unique((self.row << 8) | self.channel, return_inverse=True)
+        pixels = np.bincount(of_class, self.count)[of_class]  # with the same class at the same voxel
+        order = np.lexsort((self.count, self.channel, pixels, self.row))
+        last = order[np.diff(self.row[order], append=-1) != 0]
         found = np.stack((self.channel, self.instance))[:, last]
         _, number = np.unique(found, axis=1, return_inverse=True)
         thing = np.where(found[1] > 0, number.reshape(-1), -1)
@@ -141,7 +148,8 @@ class TrainingMap:
             row=self.row.astype(np.int32),
             channel=self.channel.astype(np.uint8),
             instance=self.instance.astype(np.uint16),
-            count=self.count.astype(np.float16),
+            count=self.count,
+            made_of=np.array(self.made_of),
         )
         path.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(path, content.getvalue())
@@ -151,16 +159,28 @@ class TrainingMap:
         """What ``save`` wrote; large arrays stay in half precision.
 
         Raises:
-            WeightsError: it is something else.
+            WeightsError: damaged, or something else.
         """
-        try:
-            with np.load(path) as stored:
-                points = SurfacePoints(*(stored[name] for name in SurfacePoints._fields))
-                points = points._replace(rgb=(points.rgb / np.float32(255)).astype(np.float16))
-                row, channel, instance = (stored[name].astype(np.int64) for name in ("row", "channel", "instance"))
-                return cls(points, row, channel, instance, stored["count"].astype(np.float32))
-        except (KeyError, ValueError, OSError) as error:
-            raise WeightsError(f"{path}: not a training map ({error}); delete it, and it is made again") from error
+        with _stored(path) as stored:
+            points = SurfacePoints(*(stored[name] for name in SurfacePoints._fields))
+            points = points._replace(rgb=(points.rgb / np.float32(255)).astype(np.float16))
+            row, channel, instance = (stored[name].astype(np.int64) for name in ("row", "channel", "instance"))
+            return cls(points, row, channel, instance, stored["count"].astype(np.float32), str(stored["made_of"]))
+
+    @classmethod
+    def read_made_of(cls, path: Path) -> str:
+        """``made_of`` alone; empty where the file has none. Errors as of ``load``."""
+        with _stored(path) as stored:
+            return str(stored["made_of"]) if "made_of" in stored else ""
+
+
+@contextmanager
+def _stored(path: Path) -> Iterator[Any]:
+    try:
+        with np.load(path) as stored:
+            yield stored
+    except (KeyError, ValueError, OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        raise WeightsError(f"{path}: not a training map ({error}); delete it, and it is made again") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,7 +312,7 @@ class _Crop(NamedTuple):
         log_p: (V, L).
         channel: (V,).
         way: (V, 3) float32 metres to their objects' centres, at most ``FARTHEST_M`` long.
-        share: (V,) float32 what each counts in the loss of that; 0 = its object is not known.
+        weight: (V,) float32 of each in the loss of that; 0 = its object is not known.
     """
 
     cells: Cells
@@ -300,7 +320,7 @@ class _Crop(NamedTuple):
     log_p: torch.Tensor
     channel: torch.Tensor
     way: torch.Tensor
-    share: torch.Tensor
+    weight: torch.Tensor
 
 
 def _crop(
@@ -326,14 +346,14 @@ def _crop(
     way = (centre[chosen] - points.xyz[labels.row[chosen]].astype(np.float32)) @ move.T * CELL_M
     length = np.linalg.norm(way, axis=1, keepdims=True)
     way *= np.minimum(1, FARTHEST_M / np.maximum(length, 1e-6))
-    share = np.where(labels.thing[chosen] >= 0, np.maximum(size[chosen], 1) ** -0.5, 0)
+    weight = np.where(labels.thing[chosen] >= 0, np.maximum(size[chosen], 1) ** -0.5, 0)
     return _Crop(
         pool(part),
         part.xyz[rows],
         torch.from_numpy(part.log_p[rows]),
         torch.from_numpy(labels.channel[chosen]),
         torch.from_numpy(way.astype(np.float32)),
-        torch.from_numpy(share.astype(np.float32)),
+        torch.from_numpy(weight.astype(np.float32)),
     )
 
 
@@ -380,9 +400,9 @@ def _step(
     optimiser.zero_grad()
     logits, way = model.read(model(crop.cells), near_cells(crop.xyz, crop.cells.cells), crop.log_p)
     loss = torch.nn.functional.cross_entropy(logits, crop.channel, weight)
-    if config.centres > 0 and bool((crop.share > 0).any()):
+    if config.centres > 0 and bool((crop.weight > 0).any()):
         apart = (way - crop.way).norm(dim=1)
-        loss = loss + config.centres * (apart * crop.share).sum() / crop.share.sum()
+        loss = loss + config.centres * (apart * crop.weight).sum() / crop.weight.sum()
     total = float(loss.detach())
     if not np.isfinite(total):
         raise WeightsError(f"the loss of step {step} is {total}: training has diverged; lower learning_rate")

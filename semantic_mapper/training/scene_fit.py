@@ -33,6 +33,7 @@ from semantic_mapper.types import PosedFrame
 
 TRUNK_RAYS, TRUNK_SAMPLES = 1024, 8
 FEATURE_RATE, TRUNK_RATE = 2e-2, 2e-3
+GRID_UNTIL = 0.6  # fraction of the time, where features are fitted to the grid afterwards
 
 OnProgress = Callable[[FinetuneProgress], None]
 
@@ -86,7 +87,7 @@ def fit_geometry(
     if not isinstance(given, GridFieldConfig):
         raise ConfigError(f"a field of kind '{kind}' has no scene grid; kinds with one build on GridField")
     box = given.grid if start is not None and config.grid.box_m is None else None
-    fit = fit_grid(frames, grid_settings(config), _told(on_progress), stopped, box)
+    fit = fit_grid(frames, grid_settings(config), _grid_progress(on_progress), stopped, box)
     torch.manual_seed(config.seed)  # of what the kind draws
     field = build_field(kind, msgspec.structs.replace(shape or given, grid=fit.grid.config), label_set)
     assert isinstance(field, GridField)
@@ -106,10 +107,21 @@ def fit_scene(
 ) -> Checkpoint:
     """Fit a plain ``GridField``: geometry and colour, no classes. Arguments and errors as of ``fit_geometry``."""
     began = time.monotonic()
-    geometry = fit_geometry(GridField.kind, frames, label_set, start, config, on_progress, stopped)
+    until = GRID_UNTIL if isinstance(start, GridField) and start.trunk is not None else 1.0
+    part = msgspec.structs.replace(config, seconds=until * config.seconds)
+    progress = part_of(on_progress, 0, until)
+    geometry = fit_geometry(GridField.kind, frames, label_set, start, part, progress, stopped)
     field = geometry.field
     if field.trunk is not None:
-        fit_trunk(field, field.trunk, geometry.fit, grid_settings(config), stopped)
+        ends = began + config.seconds if config.seconds else math.inf
+        fit_trunk(
+            field,
+            field.trunk,
+            geometry.fit,
+            grid_settings(config),
+            lambda: stopped() or time.monotonic() > ends,
+            part_of(on_progress, until, 1.0),
+        )
     return scene_checkpoint(geometry, config, time.monotonic() - began, seen_stamps_ns)
 
 
@@ -188,7 +200,7 @@ def part_of(on_progress: OnProgress | None, first: float, last: float) -> OnProg
     return lambda p: on_progress(replace(p, fraction=first + (last - first) * p.fraction))
 
 
-def _told(on_progress: OnProgress | None) -> Callable[[GridFitProgress], None] | None:
+def _grid_progress(on_progress: OnProgress | None) -> Callable[[GridFitProgress], None] | None:
     """Progress of the grid in the words of a finetuning: held-out figures come at the end only."""
     if on_progress is None:
         return None

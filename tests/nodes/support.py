@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 from semantic_mapper.config import GridFieldConfig
 from semantic_mapper.fields.checkpoint import Checkpoint, save_checkpoint
 from semantic_mapper.fields.grid.field import GridField
-from semantic_mapper.labels import ROOMS
+from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.nodes.cli import main as cli
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.replay.log.format import LogWriter
@@ -48,8 +48,8 @@ initial_blocks = 200
 """
 
 
-def write_log(path: Path, frames: Sequence[PosedFrame]) -> Path:
-    info = StreamInfo(source="test room", cameras={"rooms": INTRINSICS}, label_set=ROOMS, frame_count=len(frames))
+def write_log(path: Path, frames: Sequence[PosedFrame], label_set: LabelSet = ROOMS) -> Path:
+    info = StreamInfo(source="test room", cameras={"rooms": INTRINSICS}, label_set=label_set, frame_count=len(frames))
     with LogWriter(path, info) as log:
         for frame in frames:
             log.write_frame(frame)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from semantic_mapper.errors import ConfigError
+from semantic_mapper.errors import ConfigError, WeightsError
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.mapping.refine import up_frame
+from semantic_mapper.replay import map_grids
+from semantic_mapper.replay.evaluate.room_map import UP
 from semantic_mapper.replay.map_grids import make_log_maps, make_room_maps
 from semantic_mapper.training.nesf import TrainingMap
 from tests.nodes.support import write_log, write_weights
@@ -25,9 +29,53 @@ def test_logs_without_labels_or_depth_are_named(tmp_path: Path) -> None:
     assert not (tmp_path / "maps").exists()
 
 
-def test_a_map_that_is_there_is_not_made_again(tmp_path: Path) -> None:
-    (tmp_path / "log-a.npz").write_bytes(b"made before")
-    assert make_log_maps([tmp_path / "a.mcap"], tmp_path) == [tmp_path / "log-a.npz"]
+@pytest.fixture
+def upright(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Untrained weights find no floor, which says where up is."""
+    monkeypatch.setattr(map_grids, "up_frame", lambda voxel_map, up: up_frame(voxel_map, UP))
+
+
+@pytest.mark.usefixtures("upright")
+def test_logs_are_known_by_their_content_and_not_by_their_name(tmp_path: Path) -> None:
+    weights = write_weights(tmp_path / "tiny.safetensors")
+    for name in ("one", "other", "again"):
+        (tmp_path / name).mkdir()
+    one = write_log(tmp_path / "one" / "kitchen.mcap", tiny_frames(2))
+    other = write_log(tmp_path / "other" / "kitchen.mcap", tiny_frames(3))
+    again = Path(shutil.copy(one, tmp_path / "again" / "renamed.mcap"))
+    maps, mapped = tmp_path / "maps", []
+    paths = make_log_maps([one, other], maps, weights, mapped.append)
+    assert len(set(paths)) == 2 and mapped == [one, other]
+    written = [path.stat().st_ino for path in paths]
+    assert make_log_maps([one, other], maps, weights) == paths
+    assert [path.stat().st_ino for path in paths] == written, "nothing is made twice"
+    with pytest.raises(ConfigError, match=r"are the same log"):
+        make_log_maps([one, again], maps, weights)
+    assert make_log_maps([one], tmp_path / "none", weights, stopped=lambda: True) == []
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.usefixtures("upright")
+def test_logs_whose_labels_never_reach_their_map_are_left_out(tmp_path: Path) -> None:
+    weights = write_weights(tmp_path / "tiny.safetensors")
+    names = tuple(f"other {number}" for number in range(len(ROOMS)))
+    strange = write_log(tmp_path / "strange.mcap", tiny_frames(2), label_set=replace(ROOMS, names=names))
+    with pytest.raises(ConfigError, match=r"strange.mcap: no label of a class"):
+        make_log_maps([strange], tmp_path / "maps", weights)
+
+
+def test_maps_made_of_something_else_are_made_again(tmp_path: Path) -> None:
+    weights = write_weights(tmp_path / "tiny.safetensors")
+    (path,) = make_room_maps([7], tmp_path, weights, frames=1)
+    first = TrainingMap.load(path)
+    assert make_room_maps([7], tmp_path, weights, frames=1) == [path]
+    replace(first, made_of="other weights", count=first.count * 0).save(path)
+    make_room_maps([7], tmp_path, weights, frames=1)
+    again = TrainingMap.load(path)
+    assert again.made_of == first.made_of and again.count.sum() == first.count.sum() > 0
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(WeightsError, match="delete it, and it is made again"):
+        make_room_maps([7], tmp_path, weights, frames=1)
 
 
 def test_rooms_become_training_maps(tmp_path: Path) -> None:

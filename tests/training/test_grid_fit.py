@@ -102,8 +102,13 @@ def test_a_scene_fit_gives_weights_that_say_what_they_are() -> None:
 def test_a_trunk_learns_colours_in_the_grids_geometry() -> None:
     grid = msgspec.structs.replace(SMALL, trunk_steps=60)
     config = FinetuneConfig(seconds=0, steps=150, width=72, grid=grid)
-    field = fit_scene(objects(), ROOMS, build_field("grid", {"features": 4, "trunk_width": 16}, ROOMS), config).model
+    progress = []
+    field = fit_scene(
+        objects(), ROOMS, build_field("grid", {"features": 4, "trunk_width": 16}, ROOMS), config, progress.append
+    ).model
     assert isinstance(field, GridField) and field.trunk is not None
+    fractions = [p.fraction for p in progress]
+    assert len(fractions) == 150 + 60 and fractions == sorted(fractions) and fractions[-1] == 1
     rays = frame_rays(objects(), 72)
     pixels = rays.pixels_of(5)
     with torch.no_grad():

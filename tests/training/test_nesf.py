@@ -42,6 +42,17 @@ def test_hits_lie_on_the_surface_and_have_the_class_of_their_pixels(noisy: Train
     assert np.median(noisy.points.rise[noisy.row[floor]]) > 0.9
 
 
+def test_a_voxel_has_the_class_of_most_pixels_whatever_their_objects(noisy: TrainingMap) -> None:
+    columns = np.array([(0, 4, 1, 3), (0, 4, 2, 3), (0, 5, 3, 5), (2, 1, 0, 1), (2, 4, 9, 1), (2, 4, 8, 2)])
+    row, channel, instance, count = columns.T
+    found = dataclasses.replace(noisy, row=row, channel=channel, instance=instance, count=count.astype(np.float32))
+    voxels = found.voxels
+    assert voxels.row.tolist() == [0, 2] and voxels.channel.tolist() == [4, 4]
+    assert (voxels.thing >= 0).all() and len(np.unique(voxels.thing)) == 2
+    none = dataclasses.replace(found, row=row[:0], channel=channel[:0], instance=instance[:0], count=found.count[:0])
+    assert len(none.voxels.row) == 0
+
+
 def test_labels_of_images_teach_the_network(noisy: TrainingMap) -> None:
     trained = train_nesf(TINY, ROOMS, [noisy], [noisy])
     found = trained.recipe["validation"]
@@ -86,9 +97,11 @@ def test_training_maps_and_weights_survive_their_files(noisy: TrainingMap, tmp_p
     np.testing.assert_allclose(again.points.rgb.astype(np.float32), noisy.points.rgb, atol=0.003)
     for name in ("row", "channel", "instance", "count"):
         np.testing.assert_array_equal(getattr(again, name), getattr(noisy, name))
-    (tmp_path / "other.npz").write_bytes(b"no map")
-    with pytest.raises(WeightsError, match="not a training map"):
-        TrainingMap.load(tmp_path / "other.npz")
+    content = (tmp_path / "map.npz").read_bytes()
+    for damaged in (b"no map", b"", content[:-50], content[:5000] + b"damage" + content[5006:]):
+        (tmp_path / "other.npz").write_bytes(damaged)
+        with pytest.raises(WeightsError, match="not a training map"):
+            TrainingMap.load(tmp_path / "other.npz")
     trained = train_nesf(NesfTrainConfig(steps=1, field=NesfConfig(width=2)), ROOMS, [noisy], [noisy])
     save_nesf(trained, tmp_path / "w.safetensors")
     loaded = load_nesf(tmp_path / "w.safetensors")
@@ -125,10 +138,10 @@ def test_targets_are_the_ways_to_whole_objects(noisy: TrainingMap) -> None:
     thing[:600] = np.arange(600) % 2
     labels = VoxelLabels(row, np.zeros(len(row), np.int64), thing)
     crop = _crop(noisy.points, labels, NesfTrainConfig(labelled_voxels=10_000), np.random.default_rng(0))
-    assert crop is not None and (crop.share > 0).sum() == 600
+    assert crop is not None and (crop.weight > 0).sum() == 600
     length = crop.way.norm(dim=1)
     assert length.max() <= FARTHEST_M + 1e-5
-    near = ((length < FARTHEST_M - 1e-4) & (crop.share > 0)).numpy()
+    near = ((length < FARTHEST_M - 1e-4) & (crop.weight > 0)).numpy()
     reached = crop.xyz[near] + crop.way[near].numpy() / CELL_M
     assert near.sum() > 10
     assert len(np.unique(np.rint(reached * 4), axis=0)) <= 4, "those that reach a centre reach one of two"

@@ -23,6 +23,7 @@ from semantic_mapper.mapper import Mapper
 from semantic_mapper.mapping.pipeline import is_measured
 from semantic_mapper.nodes.cli.console import frame_progress
 from semantic_mapper.nodes.cli.labelling import choose_keyframes
+from semantic_mapper.nodes.cli.log_info import autolabel_rows
 from semantic_mapper.nodes.cli.run_replay import REPLAY_DELAY_FRAMES, mapper_config
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.autolabel import RENDERED_SPREAD, AutolabelReport, AutolabelRequest, autolabel
@@ -519,6 +520,7 @@ def test_a_grid_gives_depth_and_leaves_labels_as_they_are(tmp_path: Path) -> Non
     frames = [dataclasses.replace(f, depth_m=None) for f in unlabelled(tiny_frames(3), 1)]
     weights, plain = write_grid(tmp_path / "grid.safetensors"), write_log(tmp_path / "plain.mcap", frames)
     report = relabelled(plain, tmp_path / "new.mcap", weights, depth=True)
+    assert autolabel_rows(report.note.plain())[1] == ("depth", "3 of 3 frames got what was rendered")
     assert (report.note.kept, report.note.labelled, report.note.unlabelled) == (1, 0, 2)
     assert (report.note.classes, report.note.depth_written) == ((), 3)
     with LogReader(tmp_path / "new.mcap") as log:
@@ -527,6 +529,13 @@ def test_a_grid_gives_depth_and_leaves_labels_as_they_are(tmp_path: Path) -> Non
             assert (frame.label is None) == (old.label is None) and not frame.label_is_pseudo
             seen = (frame.depth_m > 0) & (true.depth_m > 0)
             assert seen.mean() > 0.8 and np.median(np.abs(frame.depth_m - true.depth_m)[seen]) < 0.05
+
+
+def test_a_grid_has_nothing_to_do_where_every_frame_has_depth(tmp_path: Path) -> None:
+    weights, plain = write_grid(tmp_path / "grid.safetensors"), write_log(tmp_path / "plain.mcap", tiny_frames(2))
+    with pytest.raises(LogError, match="no frame lacks depth"):
+        relabelled(plain, tmp_path / "new.mcap", weights, depth=True)
+    assert not (tmp_path / "new.mcap").exists()
 
 
 def test_bench_takes_no_pseudo_labels_for_truth(new: Path) -> None:

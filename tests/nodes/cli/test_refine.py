@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from semantic_mapper.fields.checkpoint import default_checkpoint_path
 from semantic_mapper.fields.nesf import SHIPPED, load_nesf, save_nesf
 from semantic_mapper.labels import NYU40, ROOMS
 from semantic_mapper.mapping.voxel_map import VoxelMap
-from semantic_mapper.replay.map_grids import training_map
+from semantic_mapper.replay.map_grids import made_of_room, training_map
 from tests.mapping.test_refine import UP, make_map, random_weights
 from tests.nodes.support import error_line, run, write_weights
 from tests.small import tiny_frames
@@ -87,7 +90,7 @@ def test_queries_say_how_things_were_told_apart(files: Path, tmp_path: Path) -> 
         (("missing.npz", "--out", "out.npz"), "no such map"),
         (("nesf.safetensors", "--out", "out.npz"), "not a map"),
         (("map.npz", "--out", "out.npz", "--weights", "field.safetensors"), "weights of kind 'sray'"),
-        (("map.npz", "--out", "out.npz", "--weights", "missing.safetensors"), "no such weights file"),
+        (("map.npz", "--out", "out.npz", "--weights", "missing.safetensors"), "train --kind nesf"),
         (("map.npz", "--out", "out.npz", "--weights", "nyu40.safetensors", "--up", "z"), "--by-name"),
         (("map.npz", "--out", "out.npz", "--weights", "nesf.safetensors", "--up", "sideways"), "--up sideways"),
     ],
@@ -118,8 +121,11 @@ def test_weights_that_refine_maps_label_no_frames(files: Path, tmp_path: Path) -
 
 def test_training_on_maps_goes_on_where_it_stopped(tmp_path: Path) -> None:
     frames = tiny_frames()
-    for name in ("room-100000", "room-50000", "room-50000-every-4"):
-        training_map(make_map(), frames, ROOMS, UP).save(tmp_path / "maps" / f"{name}.npz")
+    field = hashlib.sha256(default_checkpoint_path().read_bytes()).hexdigest()
+    for name, seed, rendered in (("100000", 100_000, 1), ("50000", 50_000, 1), ("50000-every-4", 50_000, 4)):
+        found = training_map(make_map(), frames, ROOMS, UP)
+        made_of = made_of_room(seed, field, rendered=rendered)
+        dataclasses.replace(found, made_of=made_of).save(tmp_path / "maps" / f"room-{name}.npz")
     recipe = tmp_path / "tiny.toml"
     recipe.write_text(
         f'kind = "nesf"\nrooms = 1\nvalidation_rooms = 1\nsteps = 4\nmaps = "{tmp_path / "maps"}"\n'
