@@ -166,7 +166,7 @@ def autolabel(
 
 
 def _check_place(request: AutolabelRequest, readers: list[LogReader]) -> None:
-    """Make sure that the new log is none that is there.
+    """Refuse a new log in place of a file that exists.
 
     Raises:
         ConfigError: it is the old one, or would be taken for a part of it.

@@ -43,7 +43,7 @@ def choose_keyframes(
     Raises:
         LogError: the log, a frame or the labels of one are missing.
         LabelError: nobody knows what the labels mean.
-        ImportSourceError: a labels.json that is none.
+        ImportSourceError: a labels.json that is not of a label folder.
         KeyboardInterrupt: a stop request came.
     """
     with open_log(path) as log:

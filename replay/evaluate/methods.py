@@ -64,7 +64,7 @@ class Evaluation:
 
 
 def field_predictors(bundle: Mapper) -> dict[str, Predictor]:
-    """The field as it maps (the frame itself is a source view), for a novel view (the frame is none), and what its
+    """The field as it maps (the frame itself is a source view), for a novel view (the frame is not one), and what its
     encoder says of the frame alone, where it has an opinion of single images."""
     novel = _with_current_view(bundle.pipeline.config, False)
     pipeline = MappingPipeline(

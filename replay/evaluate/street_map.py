@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from semantic_mapper.benchmark.streets import Answer, StreetsConfig, StreetScores, drive, score_street
+from semantic_mapper.benchmark.scene_runs import ViewScores
+from semantic_mapper.benchmark.streets import Answer, StreetsConfig, drive, score_street
 from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.scenes.suite import STREETS_SUITE
@@ -14,7 +15,7 @@ VOXEL_M, DEPTH_MAX_M = 0.2, 60.0
 RIGHT = 0.7  # probability that a predicted label is right
 
 
-def map_arm(config: StreetsConfig, seed: int) -> StreetScores:
+def map_arm(config: StreetsConfig, seed: int) -> ViewScores:
     """Fuse all left frames; a frame's answer is the map's where a ray meets it, else its own predicted label."""
     street, label_set = drive(config, seed), STREETS_SUITE.label_set
     settings = VoxelMapConfig(voxel_size_m=VOXEL_M, depth_max_m=DEPTH_MAX_M)

@@ -472,7 +472,7 @@ class _Import:
         return _Placed(frames, xy, seen), scale, height, others
 
     def _place_by_gps(self, placed: _Placed) -> GpsFit | None:
-        """Where the pictures' positions put the model, unless the scale is told otherwise; None = they tell nothing."""
+        """Where the pictures' positions put the model, unless a scale is given; None = they do not say."""
         if self._options.scale != ScaleHint():
             return None
         poses = np.stack([frame.T_world_camera for frame in placed.frames.values()])

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.benchmark.claims import Counts, CountTable, Unit
 from semantic_mapper.benchmark.records import SceneRecord
+from semantic_mapper.benchmark.scene_runs import ViewScores, counts_of, run_missing
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.config import AtLeastOne, AtLeastTwo, Config, NotNegative, Positive, to_plain
 from semantic_mapper.errors import ConfigError
@@ -95,10 +96,9 @@ class Episode:
         return self.town * 1000 + self.choice
 
 
-EpisodeScores = Mapping[str, Mapping[int, Counts]]  # by what is scored and by view
 Predict = Callable[[PosedFrame, int], UInt8]  # ids of ``thinned`` frames, by image, camera and pose alone
 Fit = Callable[[AerialConfig, Episode], Predict]
-Arm = Callable[[AerialConfig, Episode], EpisodeScores]
+Arm = Callable[[AerialConfig, Episode], ViewScores]
 
 
 def episodes(config: AerialConfig) -> list[Episode]:
@@ -152,7 +152,7 @@ def thin(image: NDArray[_T], every: int) -> NDArray[_T]:
 def scored(fit: Fit) -> Arm:
     """An arm that fits, then answers; its scores tell the CPU time of the fit."""
 
-    def run(config: AerialConfig, episode: Episode) -> EpisodeScores:
+    def run(config: AerialConfig, episode: Episode) -> ViewScores:
         began = time.process_time()
         predict = fit(config, episode)
         milliseconds = round(1000 * (time.process_time() - began))
@@ -162,7 +162,7 @@ def scored(fit: Fit) -> Arm:
     return run
 
 
-def score_episode(config: AerialConfig, episode: Episode, predict: Predict) -> EpisodeScores:
+def score_episode(config: AerialConfig, episode: Episode, predict: Predict) -> ViewScores:
     """Scores of an arm that says a class of every pixel: by day, in the dark, from low, and of views among each
     other."""
     found: dict[str, dict[int, Counts]] = {}
@@ -217,20 +217,14 @@ def run_aerial(
     """
     check_aerial(config)
     settings = aerial_digest(config)
-    for name, arm in arms.items():
-        for episode in episodes(config):
-            if store.find(SceneRecord, settings, name, episode.number) is not None:
-                continue
-            if stopped():
-                return
-            yield name, episode
-            scores = arm(config, episode)
-            rows = {
-                f"{kind}/{view}": tuple(tuple(int(n) for n in row) for row in counts)
-                for kind, views in scores.items()
-                for view, counts in views.items()
-            }
-            store.add(SceneRecord(settings=settings, weights=name, room=episode.number, confusions=rows))
+    by_number = {episode.number: episode for episode in episodes(config)}
+    jobs = ((name, number) for name in arms for number in by_number)
+
+    def score(name: str, number: int) -> ViewScores:
+        return arms[name](config, by_number[number])
+
+    for name, number in run_missing(jobs, settings, score, store, stopped):
+        yield name, by_number[number]
 
 
 def aerial_table(config: AerialConfig, names: Sequence[str], store: RecordStore) -> CountTable:
@@ -247,10 +241,9 @@ def aerial_table(config: AerialConfig, names: Sequence[str], store: RecordStore)
         for episode, record in records:
             if record is None or episode.town not in have - lack:
                 continue
-            for key, rows in record.confusions.items():
-                kind, view = key.rsplit("/", 1)
-                table, unit = found.setdefault((name, kind), {}), (episode.town, int(view))
-                table[unit] = table.get(unit, 0) + np.array(rows, np.int64)
+            for kind, view, counts in counts_of(record):
+                table, unit = found.setdefault((name, kind), {}), (episode.town, view)
+                table[unit] = table.get(unit, 0) + counts
     return found
 
 

@@ -19,7 +19,6 @@ from semantic_mapper.benchmark.aerial import (
     Arm,
     Counts,
     Episode,
-    EpisodeScores,
     Fit,
     Predict,
     labelled_frames,
@@ -28,6 +27,7 @@ from semantic_mapper.benchmark.aerial import (
     thin,
 )
 from semantic_mapper.benchmark.plateau import fit_to_plateau
+from semantic_mapper.benchmark.scene_runs import ViewScores
 from semantic_mapper.evaluation.metrics import ConfusionMatrix
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.scenes.aerial.views import cached_town, primitives_seen
@@ -63,7 +63,7 @@ def fit_color(config: AerialConfig, episode: Episode) -> Predict:
     return predict
 
 
-def patch_arm(config: AerialConfig, episode: Episode) -> EpisodeScores:
+def patch_arm(config: AerialConfig, episode: Episode) -> ViewScores:
     """Whether patches of 7x7 pixels tell bridges and flat roofs from roads of the same asphalt.
 
     As many patches of either are learned from the labelled views and asked for in the test views. Where the labelled

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.benchmark.claims import Claim, Counts, CountTable, Measure, Unit, miou_measure
 from semantic_mapper.benchmark.records import SceneRecord
+from semantic_mapper.benchmark.scene_runs import ViewScores, counts_of, run_missing
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.config import AtLeastOne, Config, Fraction, NotNegative, Positive, to_plain
 from semantic_mapper.errors import ConfigError
@@ -110,8 +111,7 @@ class Answer:
     depth_m: Float32 | None = None
 
 
-StreetScores = Mapping[str, Mapping[int, Counts]]  # by what is scored and by frame
-Arm = Callable[[StreetsConfig, int], StreetScores]
+Arm = Callable[[StreetsConfig, int], ViewScores]
 
 
 def street_seeds(config: StreetsConfig) -> range:
@@ -152,13 +152,13 @@ def primitives_at(boxes: Sequence[StreetBox], number: int) -> PrimitiveSet:
     )
 
 
-def pseudo_arm(config: StreetsConfig, seed: int) -> StreetScores:
+def pseudo_arm(config: StreetsConfig, seed: int) -> ViewScores:
     """The predicted labels themselves."""
     street = drive(config, seed)
     return score_street(config, street, lambda frame: Answer(street.pseudo[frame.seq], None, frame.depth_m))
 
 
-def nearest_arm(config: StreetsConfig, seed: int) -> StreetScores:
+def nearest_arm(config: StreetsConfig, seed: int) -> ViewScores:
     """The first box along each ray."""
     street = drive(config, seed)
 
@@ -168,7 +168,7 @@ def nearest_arm(config: StreetsConfig, seed: int) -> StreetScores:
     return score_street(config, street, answer)
 
 
-def crf_arm(config: StreetsConfig, seed: int) -> StreetScores:
+def crf_arm(config: StreetsConfig, seed: int) -> ViewScores:
     """Boxes at the measured depth, smoothed over the predicted labels."""
     street = drive(config, seed)
 
@@ -191,7 +191,7 @@ def scored_views(config: StreetsConfig, street: Drive) -> list[RoomView]:
     return list(street.left[:: config.scored_every])
 
 
-def score_street(config: StreetsConfig, street: Drive, answer: Callable[[PosedFrame], Answer]) -> StreetScores:
+def score_street(config: StreetsConfig, street: Drive, answer: Callable[[PosedFrame], Answer]) -> ViewScores:
     """Scores of an arm at the scored frames, which it gets without the true labels."""
     views = scored_views(config, street)
     answers = [answer(replace(view.frame, label=None)) for view in views]
@@ -252,19 +252,8 @@ def run_streets(
     """
     check_streets(config)
     settings = streets_digest(config)
-    for seed in street_seeds(config):
-        for name, arm in arms.items():
-            if store.find(SceneRecord, settings, name, seed) is not None:
-                continue
-            if stopped():
-                return
-            yield name, seed
-            rows = {
-                f"{kind}/{number}": tuple(tuple(int(n) for n in row) for row in counts)
-                for kind, frames in arm(config, seed).items()
-                for number, counts in frames.items()
-            }
-            store.add(SceneRecord(settings=settings, weights=name, room=seed, confusions=rows))
+    jobs = ((name, seed) for seed in street_seeds(config) for name in arms)
+    yield from run_missing(jobs, settings, lambda name, seed: arms[name](config, seed), store, stopped)
 
 
 def streets_table(config: StreetsConfig, names: Sequence[str], store: RecordStore) -> CountTable:
@@ -273,9 +262,8 @@ def streets_table(config: StreetsConfig, names: Sequence[str], store: RecordStor
     for name in names:
         for seed in street_seeds(config):
             record = store.find(SceneRecord, streets_digest(config), name, seed)
-            for key, rows in ({} if record is None else record.confusions).items():
-                kind, number = key.rsplit("/", 1)
-                found.setdefault((name, kind), {})[seed, int(number)] = np.array(rows, np.int64)
+            for kind, number, counts in () if record is None else counts_of(record):
+                found.setdefault((name, kind), {})[seed, number] = counts
     return found
 
 

@@ -15,12 +15,12 @@ import msgspec
 import numpy as np
 import torch
 
+from semantic_mapper.benchmark.scene_runs import ViewScores
 from semantic_mapper.benchmark.streets import (
     Answer,
     Arm,
     Drive,
     StreetsConfig,
-    StreetScores,
     drive,
     primitives_at,
     score_street,
@@ -58,7 +58,7 @@ def panoptic_arms(folder: Path) -> dict[str, Arm]:
     """Arms by name; fits are kept in ``folder``."""
 
     def arm(name: str, classes: str) -> Arm:
-        def run(config: StreetsConfig, seed: int) -> StreetScores:
+        def run(config: StreetsConfig, seed: int) -> ViewScores:
             street = drive(config, seed)
             field = street_field(config, street, name, folder)
             field.shape = msgspec.structs.replace(field.shape, classes=classes)

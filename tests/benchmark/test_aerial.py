@@ -17,7 +17,6 @@ from semantic_mapper.benchmark.aerial import (
     LOW,
     AerialConfig,
     Episode,
-    EpisodeScores,
     aerial_digest,
     aerial_table,
     episodes,
@@ -35,6 +34,7 @@ from semantic_mapper.benchmark.aerial_fields import field_arms
 from semantic_mapper.benchmark.aerial_grids import town_grid
 from semantic_mapper.benchmark.aerial_irt import irt_arms
 from semantic_mapper.benchmark.claims import Claim, Counts, Unit, check_claim, check_claims, figure
+from semantic_mapper.benchmark.scene_runs import ViewScores
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.geometry import unproject
@@ -68,12 +68,12 @@ def terrain(frame: PosedFrame, every: int) -> UInt8:
     return np.full(thinned(frame, every).rgb.shape[:2], TERRAIN, np.uint8)
 
 
-def total(scores: EpisodeScores, kind: str) -> Counts:
+def total(scores: ViewScores, kind: str) -> Counts:
     """All views together."""
     return np.sum(list(scores[kind].values()), axis=0)
 
 
-def miou(scores: EpisodeScores, kind: str = DAY) -> float:
+def miou(scores: ViewScores, kind: str = DAY) -> float:
     """In points."""
     value = figure({("a", kind): {(0, v): c for v, c in scores[kind].items()}}, "a", replace(MIOU, kinds=(kind,)))
     assert value is not None
@@ -125,7 +125,7 @@ def test_arms_are_not_shown_the_truth_they_are_scored_by() -> None:
 def test_a_run_goes_on_where_it_was(tmp_path: Path) -> None:
     calls: list[Episode] = []
 
-    def arm(config: AerialConfig, episode: Episode) -> EpisodeScores:
+    def arm(config: AerialConfig, episode: Episode) -> ViewScores:
         calls.append(episode)
         return score_episode(config, episode, terrain)
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from semantic_mapper.benchmark.claims import figure
+from semantic_mapper.benchmark.scene_runs import ViewScores
 from semantic_mapper.benchmark.store import RecordStore
 from semantic_mapper.benchmark.streets import (
     ARMS,
@@ -21,7 +22,6 @@ from semantic_mapper.benchmark.streets import (
     RMSE,
     Answer,
     StreetsConfig,
-    StreetScores,
     drive,
     primitives_at,
     run_streets,
@@ -38,7 +38,7 @@ TINY = StreetsConfig(streets=1, width=88, pairs=8, scored_every=4)
 SEED = street_seeds(TINY)[0]
 
 
-def truth_arm(config: StreetsConfig, seed: int) -> StreetScores:
+def truth_arm(config: StreetsConfig, seed: int) -> ViewScores:
     street = drive(config, seed)
 
     def answer(frame: PosedFrame) -> Answer:
