@@ -47,6 +47,7 @@ def import_(
         typer.Option(help="Found out when not given."),
     ] = None,
     max_frames: Annotated[int, typer.Option(min=0, help="Stop after this many; 0 = all.")] = 0,
+    every: Annotated[int, typer.Option(metavar="N", min=1, help="Only every N-th frame.")] = 1,
     rename: Annotated[
         Path | None, typer.Option(help='TOML: [classes] couch = "sofa", ...; classes that get one name become one.')
     ] = None,
@@ -97,8 +98,8 @@ def import_(
     log.parent.mkdir(parents=True, exist_ok=True)
     film = film_options(calibration, focal_prior, scale, distance, square_mm, board, camera_height, int(rotate) // 90)
     if format is None and is_film(source):
-        if renames is not None or max_frames:
-            raise typer.BadParameter("a film has no classes to rename, and is read to its end")
+        if renames is not None or max_frames or every > 1:
+            raise typer.BadParameter("a film has no classes to rename, and all of it is read")
         found, page = import_film_log(source, log, film, overwrite=overwrite)
         print_film(output, found, log)
         output.print(f"  {page}  (report)")
@@ -112,6 +113,7 @@ def import_(
 
         options = ImportOptions(
             max_frames=max_frames or None,
+            every=every,
             quarters=int(rotate) // 90,
             topics=_topics_by_role(topic or []),
             world=world,

@@ -32,6 +32,7 @@ class ImportOptions:
         camera_id: Name that the camera gets in the log.
         frame_hz: Rate from which stamps are made where the recording has none; None = what the format has (folder 6,
             scannet 30).
+        every: Only every this many-th frame of the recording, the first one among them.
         max_frames: Stop after this many frames; None = all.
         quarters: Turn every image clockwise by this many quarters of a full turn: for a camera mounted on its side.
         match_s: TUM and ROS bags: largest time between a colour image, its depth image and its pose.
@@ -43,6 +44,7 @@ class ImportOptions:
 
     camera_id: str = "camera"
     frame_hz: float | None = None
+    every: int = 1
     max_frames: int | None = None
     quarters: int = 0
     match_s: float = 0.02

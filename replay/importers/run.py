@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -203,7 +203,7 @@ def import_recording(
     if not src.is_dir() and not (name == "rosbag" and src.is_file()):
         raise ImportSourceError(f"{src}: no such {'file or folder' if name == 'rosbag' else 'folder'}")
     recording = FORMATS[name](src, options)
-    total = len(recording) if options.max_frames is None else min(len(recording), options.max_frames)
+    numbers = range(0, len(recording), options.every)[: options.max_frames]
     info, changed = _changes(src, recording.info, options, renames or {})
     packing = codec or CodecOptions(depth_scale=recording.depth_scale.units_per_m)
 
@@ -211,12 +211,12 @@ def import_recording(
         if name == "folder" and (src / AUTOLABEL_ATTACHMENT).is_file():
             _attach_note(src / AUTOLABEL_ATTACHMENT, writer)
         keep_files = codec is None and options.quarters % 4 == 0
-        tally = _copy(recording, writer, total, changed, on_progress, keep_files=keep_files)
+        tally = _copy(recording, writer, numbers, changed, on_progress, keep_files=keep_files)
         frames = writer.frames
         if frames == 0:
             different = {s.reason: s for s in reversed(tally.skipped)}  # the first of each reason
             reasons = "; ".join(f"{s.file}: {s.reason}" for s in list(different.values())[::-1][:3])
-            raise ImportSourceError(f"{src}: none of its {total} frames can be used: {reasons}")
+            raise ImportSourceError(f"{src}: none of its {len(numbers)} frames can be used: {reasons}")
     return ImportReport(
         frames=frames,
         labelled=tally.labelled,
@@ -300,14 +300,14 @@ class _Tally:
 def _copy(
     recording: Recording,
     writer: LogWriter,
-    total: int,
+    numbers: Sequence[int],
     changed: Callable[[PosedFrame], PosedFrame],
     on_progress: Callable[[int, int], None] | None,
     *,
     keep_files: bool,
 ) -> _Tally:
     tally = _Tally()
-    for number in range(total):
+    for done, number in enumerate(numbers, 1):
         try:
             loaded = recording.load(number)
             writer.write_frame(changed(loaded.frame), encoded_rgb=loaded.encoded_rgb if keep_files else None)
@@ -318,5 +318,5 @@ def _copy(
         else:
             tally.count(loaded)
         if on_progress is not None:
-            on_progress(number + 1, total)
+            on_progress(done, len(numbers))
     return tally

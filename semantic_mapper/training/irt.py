@@ -179,15 +179,15 @@ def _fit_scene(
     shape = msgspec.structs.replace(shape, variant=variant, carried=carried, carried_size=size)
     known = start if isinstance(start, IRT) and start.fitted else None  # whose box is that of a scene
     part = msgspec.structs.replace(config, seconds=GRID_UNTIL * config.seconds)
-    told = part_of(on_progress, 0, GRID_UNTIL)
-    geometry = fit_geometry(IRT.kind, frames, label_set, known, part, told, stopped, shape)
+    progress = part_of(on_progress, 0, GRID_UNTIL)
+    geometry = fit_geometry(IRT.kind, frames, label_set, known, part, progress, stopped, shape)
     field, settings = geometry.field, grid_settings(part)
     if config.steps:
         settings = msgspec.structs.replace(settings, trunk_steps=min(settings.trunk_steps, config.steps))
     assert field.trunk is not None
     until = began + TRUNK_UNTIL * config.seconds if config.seconds else math.inf
-    told = part_of(on_progress, GRID_UNTIL, TRUNK_UNTIL)
-    fit_trunk(field, field.trunk, geometry.fit, settings, lambda: stopped() or time.monotonic() > until, told)
+    progress = part_of(on_progress, GRID_UNTIL, TRUNK_UNTIL)
+    fit_trunk(field, field.trunk, geometry.fit, settings, lambda: stopped() or time.monotonic() > until, progress)
     return geometry
 
 
@@ -203,7 +203,7 @@ class ClassFit:
         self.learned = {n: p for n, p in field.named_parameters() if p.requires_grad}
         self.optimiser = torch.optim.AdamW(self.learned.values(), LEARNING_RATE, weight_decay=WEIGHT_DECAY)
         train = (data.channel >= 0) & ~data.held_out
-        self.pool = _Pool(torch.where(train, data.channel, IGNORE), len(field.label_set))
+        self.pool = _BalancedPixels(torch.where(train, data.channel, IGNORE), len(field.label_set))
         self.looked_at = data.held_out.nonzero()[:, 0]
         if len(self.looked_at) > LOOK_RAYS:
             order = torch.randperm(len(self.looked_at), generator=self.generator)
@@ -313,7 +313,7 @@ class ClassFit:
             return self.field.carried(surface(samples), counted.float())
 
 
-class _Pool:
+class _BalancedPixels:
     """Pixels to draw: partly as they come, partly with every class equally likely.
 
     The weight of a drawn ray takes that back, and makes rare classes count somewhat more.

@@ -233,6 +233,18 @@ def test_an_import_may_be_done_again_and_tells_its_progress(folder: Path) -> Non
     assert import_recording(folder, dst, options=ImportOptions(max_frames=2), overwrite=True).frames == 2
 
 
+def test_every_second_frame_is_imported(folder: Path) -> None:
+    dst, told = folder.parent / "log.mcap", list[tuple[int, int]]()
+    import_recording(folder, dst)
+    with LogReader(dst) as log:
+        stamps = [log.frame(number).stamp_ns for number in range(len(log))]
+    options = ImportOptions(every=2, max_frames=2)
+    import_recording(folder, dst, "folder", lambda *at: told.append(at), options=options, overwrite=True)
+    with LogReader(dst) as log:
+        assert [log.frame(number).stamp_ns for number in range(len(log))] == stamps[:3:2]
+    assert told == [(1, 2), (2, 2)]
+
+
 def test_a_destination_that_cannot_be_written_is_a_clear_error(folder: Path) -> None:
     with pytest.raises(LogError, match="cannot be written"):
         import_recording(folder, folder / "no" / "such" / "log.mcap")
