@@ -4,6 +4,8 @@ Strokes are made from the true labels as a person would paint them: of each clas
 as wide as the labelling page's brush or as the class is there, and at most a sixth of the image long. Everything else
 is unlabelled. Frames are those that ``label --suggest`` names.
 
+``--grow`` lets strokes grow over what looks like them. ``--corrections N`` adds N strokes to a frame, one after the
+other, each on the largest region that the strokes so far have not grown to rightly, as who looks at the page would.
 ``--kind irt`` fits an Implicit Ray-Transformer instead: geometry and colours of all frames, labels of the chosen ones.
 
 Example: python -m benchmarks.label_strokes kitchen.mcap 0 1 --labels 4 --out runs/strokes.jsonl
@@ -27,7 +29,8 @@ from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.training.finetune import FinetuneConfig
 from semantic_mapper.training.irt import fit_irt
-from semantic_mapper.types import UInt8
+from semantic_mapper.training.strokes import grow_strokes
+from semantic_mapper.types import PosedFrame, UInt8
 
 BRUSH = 1 / 40  # of the image's width, across: the page's own
 LENGTH = 1 / 6  # of a stroke, at most
@@ -96,6 +99,54 @@ def with_strokes(scene: Scene, count: int, chosen: list[int], seed: int) -> tupl
     return replace(scene, pool=pool), strokes, painted / labelled
 
 
+def with_grown(scene: Scene, painted: Scene, chosen: list[int]) -> tuple[Scene, float, float]:
+    """Strokes that have grown, the fraction of pixels that they label, and the fraction of these that are right."""
+    pool, unknown = list(painted.pool), scene.label_set.ignore_id
+    for i in chosen:
+        pool[i] = grow_strokes(pool[i], scene.label_set)
+    truth = np.stack([_label(scene.pool[i]) for i in chosen])
+    label = np.stack([_label(pool[i]) for i in chosen])
+    there = (label != unknown) & (truth != unknown)
+    return replace(painted, pool=pool), float(there.mean()), float((label == truth)[there].mean())
+
+
+def _label(frame: PosedFrame) -> UInt8:
+    assert frame.label is not None
+    return frame.label
+
+
+def corrected(scene: Scene, painted: Scene, count: int, chosen: list[int]) -> Scene:
+    """Strokes and ``count`` more a frame, each in the middle of the largest region that is wrong or unlabelled."""
+    rng, pool = np.random.default_rng(1), list(painted.pool)
+    for i in chosen:
+        frame, strokes, truth = pool[i], _label(pool[i]).copy(), _label(scene.pool[i])
+        for _ in range(count):
+            grown = _label(grow_strokes(replace(frame, label=strokes), scene.label_set))
+            found = _largest_wrong(grown, truth, scene.label_set)
+            if found is None:
+                break
+            class_id, inside = found
+            v, u = np.unravel_index(int(inside.argmax()), inside.shape)
+            _stroke(strokes, inside, (float(u), float(v)), class_id, truth.shape[1], rng)
+        pool[i] = replace(frame, label=strokes)
+    return replace(painted, pool=pool)
+
+
+def _largest_wrong(grown: UInt8, truth: UInt8, label_set: LabelSet) -> tuple[int, np.ndarray] | None:
+    """Class of the largest connected region without its label, and distances (H, W) to its border; None = too thin."""
+    wrong = (grown != truth) & (truth != label_set.ignore_id)
+    best, largest = None, 0
+    for class_id in label_set.ids:
+        _, part, stats, _ = cv2.connectedComponentsWithStats((wrong & (truth == class_id)).astype(np.uint8))
+        for number, area in enumerate(stats[1:, cv2.CC_STAT_AREA], 1):
+            if area > largest:
+                best, largest = (class_id, part == number), area
+    if best is None:
+        return None
+    inside = cv2.distanceTransform(np.pad(best[1].astype(np.uint8), 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    return (best[0], inside) if inside.max() >= LEAST_PX else None
+
+
 def fit_scene_irt(scene: Scene, chosen: list[int], steps: int) -> LearnedField:
     """An IRT of the scene: all of its frames, labels of the chosen ones alone."""
     labelled = [scene.pool[i] for i in chosen]
@@ -117,6 +168,8 @@ def main() -> None:
     parser.add_argument("--labels", type=int, default=4, help="number of labelled frames")
     parser.add_argument("--kind", choices=("sray", "irt"), default="sray")
     parser.add_argument("--strokes", default="0,1,2", help="a class and frame; 0 = full masks, -1 = learn nothing")
+    parser.add_argument("--grow", action="store_true", help="strokes grow, as `finetune --strokes` lets them")
+    parser.add_argument("--corrections", type=int, default=0, help="further strokes a frame")
     parser.add_argument("--out", type=Path, required=True, help="figures as JSON, a line each")
     given = parser.parse_args()
     torch.set_num_threads(1)
@@ -129,6 +182,12 @@ def main() -> None:
             painted, strokes, fraction = scene, 0, float(count == 0)
             if count > 0:
                 painted, strokes, fraction = with_strokes(scene, count, chosen, 0)
+            right = 1.0
+            if count > 0 and given.corrections:
+                painted = corrected(scene, painted, given.corrections, chosen)
+                strokes += given.corrections * len(chosen)
+            if count > 0 and given.grow:
+                painted, fraction, right = with_grown(scene, painted, chosen)
             began = time.process_time()
             if count < 0:
                 model = _as_shipped(scene)
@@ -143,14 +202,18 @@ def main() -> None:
                 "kind": given.kind,
                 "strokes_a_class": count,
                 "strokes": strokes,
-                "painted": round(fraction, 4),
+                "corrections": given.corrections,
+                "grown": given.grow,
+                "labelled": round(fraction, 4),
+                "right": round(right, 4),
             }
             with given.out.open("a") as file:
                 file.write(
                     json.dumps({**row, "steps": given.steps, "miou": round(miou, 4), "cpu_s": round(cpu_s)}) + "\n"
                 )
             print(
-                f"{scene.name:>10} {count} strokes a class ({strokes} in all, {100 * fraction:.1f} % painted): "
+                f"{scene.name:>10} {count} strokes a class ({strokes} in all, {100 * fraction:.1f} % labelled, "
+                f"{100 * right:.1f} % of it right): "
                 f"{100 * miou:.1f} %, {cpu_s:.0f} CPU s",
                 flush=True,
             )

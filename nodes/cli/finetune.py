@@ -94,6 +94,12 @@ def finetune(
             "--keyframes. Unlabelled pixels count for nothing.",
         ),
     ] = None,
+    strokes: Annotated[
+        bool,
+        typer.Option(
+            "--strokes", help="Labels are strokes: let each grow over what looks like it, as the labelling page shows."
+        ),
+    ] = False,
 ) -> int:
     """Fit the field to a few labelled keyframes of a log.
 
@@ -103,11 +109,13 @@ def finetune(
     keyframes have depth computed from the log's pictures. Ctrl-C writes the best weights so far (exit code 130).
 
     Example: semantic-mapper finetune kitchen.mcap --keyframes 8 --seconds 480 --out kitchen.safetensors
-    Example: semantic-mapper finetune kitchen.mcap --labels kitchen-labels --out kitchen.safetensors
+    Example: semantic-mapper finetune kitchen.mcap --labels kitchen-labels --strokes --out kitchen.safetensors
     Example: semantic-mapper finetune kitchen.mcap --kind irt --keyframes 4 --out kitchen.safetensors
     Example: semantic-mapper finetune yard.mcap --kind panoptic --boxes boxes.json --out yard.safetensors
     """
     _refuse_mixed(weights, from_scratch, kind, keyframes, frames, labels, unlabelled, variant, boxes, pseudo, uncovered)
+    if strokes and kind in ("grid", "panoptic"):
+        raise typer.BadParameter(f"--kind {kind} learns from no strokes", param_hint="--strokes")
     output = Output.guarded()
     import msgspec
 
@@ -145,6 +153,7 @@ def finetune(
         boxes,
         pseudo,
         uncovered or "stuff",
+        strokes,
     )
     with StopRequest() as stop, frame_progress("finetune", None, unit="%") as bar:
         checkpoint, chosen = finetune_log(request, stop, bar)

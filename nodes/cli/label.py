@@ -73,8 +73,9 @@ def label(
     """Label frames of a log by hand (--serve), say which to label (--suggest), or send labelled ones to a finetuner.
 
     --suggest names the frames that show most surface which no labelled frame shows. --serve opens a page on which a
-    person paints on them, and saves each stroke at once; what is not painted is not learned from. `finetune --labels
-    DIR` learns from what was painted. The page is on this machine alone; to see it from another one, tunnel its port.
+    person paints on them, saves each stroke at once, and shows what strokes grow to. `finetune --labels DIR --strokes`
+    learns from that, without --strokes from painted pixels alone. The page is on this machine alone; to see it from
+    another one, tunnel its port.
 
     Without these, labelled frames are sent to a running finetuner: those that together show most of what the log shows.
     Frames must be in the world that the mapper maps. `semantic-mapper top --once --json` tells what became of them,
@@ -179,7 +180,7 @@ def _serve(
         order = page_order(chosen, folder.numbers()) or [0]
         with LabelServer(LabelSession(opened, folder, order), port) as server:
             output.print(f"label at {server.url}")
-            output.print(f"  saved to {out}: learn from it with `semantic-mapper finetune {log} --labels {out}`")
+            output.print(f"  saved to {out}: learn from it with `semantic-mapper finetune {log} --labels {out} --strokes`")
             while not stop:
                 time.sleep(POLL_S)
         output.print(f"{out}: {counted(len(folder.numbers()), 'labelled frame')} of {log.name}")

@@ -41,7 +41,17 @@ def import_(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Log to write (.mcap).")],
     format: Annotated[  # noqa: A002 - the name of the option
         Literal[
-            "folder", "tum", "scannet", "replica", "kitti360", "rosbag", "polycam", "record3d", "transforms", "colmap"
+            "folder",
+            "tum",
+            "scannet",
+            "replica",
+            "kitti360",
+            "rosbag",
+            "polycam",
+            "record3d",
+            "transforms",
+            "colmap",
+            "opensfm",
         ]
         | None,
         typer.Option(help="Found out when not given."),

@@ -36,6 +36,7 @@ from semantic_mapper.replay.log_depth import ComputedFrame, compute_depths
 from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress
 from semantic_mapper.training.fitters import FITTERS, fitter_of
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
+from semantic_mapper.training.strokes import grow_strokes, labelled_fraction
 from semantic_mapper.types import PosedFrame
 
 LEAST_KEYFRAMES = 2
@@ -52,6 +53,7 @@ class FinetuneRequest:
     0 for a kind that learns no classes, and for all frames that the folder has labels of. ``frames`` (numbers in the
     log) names the labelled frames instead. ``unlabelled``: how many others a kind of one scene uses at most, 0 = all,
     None = 300. ``boxes``, ``pseudo`` (folder or weights) and ``uncovered`` are of the kind "panoptic".
+    ``strokes``: label images are strokes, and grow.
     """
 
     log: Path
@@ -68,6 +70,7 @@ class FinetuneRequest:
     boxes: Path | None = None
     pseudo: Path | None = None
     uncovered: str = "stuff"
+    strokes: bool = False
 
 
 def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress) -> tuple[Checkpoint, list[int]]:
@@ -108,6 +111,11 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
             by_number = choose_labelled(log, label_set, request, computed, stop, bar, folder)
         frames, chosen = list(by_number.values()), list(by_number)
         pseudo = sum(f.label_is_pseudo for f in frames)
+        grown: dict[str, float] = {}
+        if request.strokes:
+            grown["painted"] = labelled_fraction(frames, label_set)
+            frames = [grow_strokes(frame, label_set) for frame in frames]
+            grown["grown"] = labelled_fraction(frames, label_set)
         if kind in FITTERS:
             frames += read_unlabelled(log, frames, request, computed, stop, bar)
         note = read_note(log.attachments())
@@ -117,6 +125,8 @@ def finetune_log(request: FinetuneRequest, stop: StopRequest, bar: FrameProgress
     checkpoint = _fit(kind, frames, label_set, None if start is None else start.model, seen, request, stop, bar)
     if pseudo:
         checkpoint.recipe["pseudo_labels"] = {"keyframes": pseudo, "of": "" if note is None else note.weights}
+    if grown:
+        checkpoint.recipe["strokes"] = grown
     save_checkpoint(checkpoint, request.out)
     return checkpoint, chosen
 
@@ -201,6 +211,11 @@ def finetune_lines(checkpoint: Checkpoint, chosen: Sequence[int], request: Finet
         lines.append(
             f"  {pseudo['keyframes']} of the {len(chosen)} keyframes have pseudo labels{by}: the figures above say how "
             "well these are learned, not how right they are"
+        )
+    if grown := recipe.get("strokes"):
+        lines.append(
+            f"  strokes of {_per_cent(grown['painted'])} of the keyframes' pixels have grown to "
+            f"{_per_cent(grown['grown'])}"
         )
     if own := recipe.get("own_view"):
         lines.append(

@@ -33,7 +33,7 @@ _FILES = {
     "strokes.js": ("strokes.js", "text/javascript; charset=utf-8"),
     "page.css": ("page.css", "text/css; charset=utf-8"),
 }
-_FRAME = re.compile(r"frames/([0-9]{1,9})/(image|label)")
+_FRAME = re.compile(r"frames/([0-9]{1,9})/(image|label|grown)")
 _HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
@@ -144,6 +144,8 @@ def _make_handler(session: LabelSession, token: str) -> type[BaseHTTPRequestHand
             number, what = _frame(path)
             if what == "image":
                 return session.image(number), "image/jpeg"
+            if what == "grown":
+                return session.grown(number), "application/octet-stream"
             label = session.label(number)
             return label, "application/octet-stream", revision_of(label)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -13,6 +14,7 @@ import numpy as np
 from semantic_mapper.errors import FrameError, LabelError, LogError
 from semantic_mapper.replay.label_folder import LabelFolder
 from semantic_mapper.replay.log.sequence import Log
+from semantic_mapper.training.strokes import grow_strokes
 from semantic_mapper.types import PosedFrame
 
 JPEG_QUALITY = 95
@@ -74,6 +76,20 @@ class LabelSession:
         """
         with self._lock:
             return self._label(number)
+
+    def grown(self, number: int) -> bytes:
+        """What the strokes of a frame grow to, in the form of ``label``.
+
+        Raises:
+            LogError, FrameError: as ``label``.
+        """
+        label_set = self._folder.label_set
+        with self._lock:
+            frame = self._frame(number)
+            label = np.frombuffer(self._label(number), np.uint8).reshape(self._size(number))
+        grown = grow_strokes(replace(frame, label=label), label_set).label
+        assert grown is not None
+        return grown.tobytes()
 
     def _label(self, number: int) -> bytes:
         size = self._size(number)

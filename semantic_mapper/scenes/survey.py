@@ -71,7 +71,7 @@ def contact_sheet(
         tiles: list[UInt8] = []
         for view in room_views(seed, views, camera, room=room, path=SPREAD, noise=noise):
             depth = view.rendered.depth_m
-            tiles += [view.frame.rgb, ROOMS.colorize(view.rendered.label), _depth_picture(depth)]
+            tiles += [view.frame.rgb, ROOMS.colorize(view.rendered.label), depth_picture(depth)]
         rows.append(np.concatenate(tiles, 1))
         cv2.putText(rows[-1], f"{seed} {room.template}", (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 0), 1)
     rows += [np.zeros_like(rows[0])] * (-len(rows) % across)
@@ -135,7 +135,8 @@ def box_overlap(views: Sequence[RoomView], boxes: Sequence[StreetBox]) -> tuple[
     return float(covered / count), float(several / count)
 
 
-def _depth_picture(depth_m: Float32) -> UInt8:
+def depth_picture(depth_m: Float32) -> UInt8:
+    """Near is red, 6 m and more are blue, black where there is none."""
     grey = np.clip(depth_m / 6.0 * 255.0, 0, 255).astype(np.uint8)
     picture = np.asarray(cv2.applyColorMap(255 - grey, cv2.COLORMAP_TURBO), np.uint8)[..., ::-1].copy()
     picture[depth_m == 0] = 0
@@ -264,7 +265,7 @@ def streets(
         )
         rows = [
             [view.frame.rgb for view in views[::8]],
-            [_depth_picture(view.rendered.depth_m / np.float32(6)) for view in views[::8]],
+            [depth_picture(view.rendered.depth_m / np.float32(6)) for view in views[::8]],
             [KITTI360.colorize(view.rendered.label) for view in views[::8]],
             [KITTI360.colorize(label) for label in predicted[::8]],
         ]

@@ -10,6 +10,7 @@ const stage = $("stage"), sheet = $("sheet"), image = $("image"), brush = $("bru
 let session, at = 0, number = -1, strokes = null, current = null;  // current: id of the class that is painted
 let pen = null;  // where the stroke that is being painted is; {x, y, pointer}
 let keyboard = { x: 0, y: 0, down: false };
+let growing = 0;  // number of the last request for grown strokes
 let size = 16;  // pixels of the frame, across
 
 // ---- saving: one request at a time, the newest state last
@@ -54,6 +55,24 @@ async function sendAll() {
     showPlace();
   }
   say("saved");
+  grow();
+}
+
+// Shows what the strokes of this frame grow to, as the server has them.
+async function grow() {
+  const mine = ++growing, of = number, canvas = $("grown");
+  canvas.hidden = !$("grow").checked;
+  if (canvas.hidden) return;
+  try {
+    const ids = new Uint8Array(await (await request(`frames/${of}/grown`)).arrayBuffer());
+    if (mine === growing && of === number) new Strokes(canvas, image.width, image.height, ids, colorsById(), session.ignore);
+  } catch (error) {
+    say(`strokes do not grow: ${error.message}`, true);
+  }
+}
+
+function colorsById() {
+  return Object.fromEntries(session.classes.map((c) => [c.id, c.color]));
 }
 
 async function request(path, options) {
@@ -103,8 +122,7 @@ async function show(wanted) {
     image.width = picture.naturalWidth;
     image.height = picture.naturalHeight;
     image.getContext("2d").drawImage(picture, 0, 0);
-    const colors = Object.fromEntries(session.classes.map((c) => [c.id, c.color]));
-    strokes = new Strokes($("paint"), image.width, image.height, ids, colors, session.ignore);
+    strokes = new Strokes($("paint"), image.width, image.height, ids, colorsById(), session.ignore);
   } catch (error) {
     if (mine !== showing) return;
     say(`frame ${wanted} cannot be shown: ${error.message}`, true);
@@ -118,7 +136,9 @@ async function show(wanted) {
   $("undo").disabled = true;
   showPlace();
   fit();
+  $("grown").width = image.width;  // clears what another frame has left
   if (unsaved.size) save(); else say(session.labelled.includes(number) ? "saved" : "nothing painted yet");
+  grow();
 }
 
 function showPlace() {
@@ -256,6 +276,7 @@ function setBrush(pixels) {
 function setOpacity(percent) {
   $("opacity").value = percent;
   $("paint").style.opacity = $("opacity").value / 100;
+  $("grown").style.opacity = $("opacity").value / 200;
   $("opacity-text").textContent = `${$("opacity").value} %`;
 }
 
@@ -301,6 +322,7 @@ document.addEventListener("keydown", (event) => {
   else if (event.key === "]") setBrush(size * 1.25 + 0.5);
   else if (event.key === "-") setOpacity(Number($("opacity").value) - 10);
   else if (event.key === "+" || event.key === "=") setOpacity(Number($("opacity").value) + 10);
+  else if (event.key === "s") { $("grow").checked = !$("grow").checked; grow(); }
   else if (event.key === "n" || event.key === "PageDown") go(1);
   else if (event.key === "p" || event.key === "PageUp") go(-1);
   else return;
@@ -312,6 +334,7 @@ $("opacity").addEventListener("input", () => setOpacity($("opacity").value));
 $("zoom").addEventListener("input", () => { $("zoom-text").textContent = `${$("zoom").value} %`; fit(); });
 $("eraser").addEventListener("click", () => choose(session.ignore));
 $("undo").addEventListener("click", undo);
+$("grow").addEventListener("change", grow);
 $("again").addEventListener("click", () => save());
 $("previous").addEventListener("click", () => go(-1));
 $("next").addEventListener("click", () => go(1));

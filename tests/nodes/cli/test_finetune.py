@@ -242,6 +242,7 @@ def test_options_of_a_field_of_one_scene_are_refused_with_other_weights(
         (("--kind", "grid", "--keyframes", "2"), "Only --kind grid learns none"),
         (("--kind", "sray", "--keyframes", "2"), "there is grid, irt"),
         (("--kind", "grid", "--from-scratch"), "starts from nothing"),
+        (("--kind", "grid", "--strokes"), "learns from no strokes"),
     ],
 )
 def test_options_that_do_not_go_with_a_kind_are_refused(arguments, said, log: Path, tmp_path: Path) -> None:

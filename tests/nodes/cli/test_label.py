@@ -144,6 +144,11 @@ def test_finetuning_learns_from_strokes_of_a_folder(log: Path, weights: Path, tm
     assert made.train_stamps_ns == {FRAMES[n].stamp_ns for n in (1, 4, 5)}
     labels = [anchor.label for anchor in made.anchors]
     assert all(label is not None and (label == ROOMS.ignore_id).any() for label in labels), "strokes, no masks"
+    done = run("finetune", plain, *options, "--strokes", "--out", tmp_path / "grown.safetensors")
+    assert done.returncode == 0 and "of the keyframes' pixels have grown to" in done.stdout, done.stderr
+    grown = load_checkpoint(tmp_path / "grown.safetensors")
+    painted, after = grown.recipe["strokes"]["painted"], grown.recipe["strokes"]["grown"]
+    assert painted < after <= 1
     done = run("finetune", log, *options, "--keyframes", "2", "--out", tmp_path / "two.safetensors")
     assert done.returncode == 0, done.stderr
     assert load_checkpoint(tmp_path / "two.safetensors").train_stamps_ns < made.train_stamps_ns

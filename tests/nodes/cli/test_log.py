@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from semantic_mapper.labels import ROOMS
+from semantic_mapper.replay.importers.run import FORMATS
 from semantic_mapper.replay.log.format import LogWriter
 from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import PosedFrame
@@ -149,3 +150,9 @@ def test_recover_never_writes_over_a_log(log: Path, tmp_path: Path) -> None:
     assert done.returncode == 1
     assert "taken.mcap: exists already" in error_line(done.stderr)
     assert taken.read_text() == "mine"
+
+
+def test_every_format_can_be_named(tmp_path: Path) -> None:
+    for name in FORMATS:
+        done = run("import", tmp_path / "missing", tmp_path / "log.mcap", "--format", name)
+        assert done.returncode == 1 and "missing" in error_line(done.stderr), name

@@ -179,3 +179,26 @@ def test_what_was_painted_elsewhere_is_shown_and_not_overwritten(page: Page) -> 
     assert page.shown(40, 10) == [*ROOMS.colors[CEILING - 1], 255] and page.shown(40, 30)[3] == 0
     page.browser.drag(page.on((10, 60), (80, 60)))
     assert page.saved(4, lambda label: bool((label[60, 10:81] == FLOOR).all() and (label[5:15] == CEILING).all()))
+
+
+def test_the_page_shows_what_strokes_grow_to(page: Page) -> None:
+    def grown(x: int, y: int) -> int:
+        script = f"document.getElementById('grown').getContext('2d').getImageData({x}, {y}, 1, 1).data[3]"
+        return page.browser.evaluate(script)
+
+    def covered() -> int:
+        script = (
+            "(c => [...c.getContext('2d').getImageData(0, 0, c.width, c.height).data]"
+            ".filter((v, i) => i % 4 === 3 && v).length)(document.getElementById('grown'))"
+        )
+        return page.browser.evaluate(script)
+
+    page.browser.press("2")
+    page.browser.drag(page.on((10, 50), (30, 50), (80, 50)))
+    assert page.saved(4, lambda label: bool((label[50, 10:81] == FLOOR).all()))
+    painted = int((cv2.imread(str(page.out / "000004.png"), cv2.IMREAD_UNCHANGED) == FLOOR).sum())
+    assert page.eventually(lambda: covered() > painted) and grown(40, 50) == 255
+    page.browser.press("s")
+    assert page.browser.evaluate("document.getElementById('grown').hidden") is True
+    page.browser.press("s", "n")
+    assert page.status("nothing painted yet") and page.eventually(lambda: covered() == 0)

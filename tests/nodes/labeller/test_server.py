@@ -230,3 +230,15 @@ def test_what_was_changed_in_another_tab_is_not_overwritten(page: Page) -> None:
     assert page.ask("frames/1/label").body == one.tobytes()
     again = page.ask("frames/1/label", "PUT", other.tobytes(), If_Match=saved.headers["ETag"])
     assert again.status == 200 and page.ask("frames/1/label").headers["ETag"] == again.headers["ETag"]
+
+
+def test_what_strokes_grow_to_keeps_them_and_adds_to_them(page: Page) -> None:
+    assert set(page.ask("frames/4/grown").body) == {ROOMS.ignore_id}, "nothing is painted"
+    painted = strokes()
+    page.ask("frames/4/label", "PUT", painted.tobytes())
+    answer = page.ask("frames/4/grown")
+    grown = np.frombuffer(answer.body, np.uint8).reshape(HEIGHT, WIDTH)
+    assert answer.status == 200 and (grown[painted != ROOMS.ignore_id] == painted[painted != ROOMS.ignore_id]).all()
+    assert (grown != ROOMS.ignore_id).sum() > 1.2 * (painted != ROOMS.ignore_id).sum()
+    assert set(np.unique(grown)) <= {ROOMS.ignore_id, WALL, FLOOR}
+    assert page.ask("frames/4/label").body == painted.tobytes(), "only strokes are saved"
