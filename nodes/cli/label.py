@@ -180,7 +180,9 @@ def _serve(
         order = page_order(chosen, folder.numbers()) or [0]
         with LabelServer(LabelSession(opened, folder, order), port) as server:
             output.print(f"label at {server.url}")
-            output.print(f"  saved to {out}: learn from it with `semantic-mapper finetune {log} --labels {out} --strokes`")
+            output.print(
+                f"  saved to {out}: learn from it with `semantic-mapper finetune {log} --labels {out} --strokes`"
+            )
             while not stop:
                 time.sleep(POLL_S)
         output.print(f"{out}: {counted(len(folder.numbers()), 'labelled frame')} of {log.name}")

@@ -40,7 +40,7 @@ from semantic_mapper.types import PosedFrame
 _log = get_logger(__name__)
 
 NEAR_M = 0.5
-VERSION = 1  # raised by a change of the fit: older files are left alone and made again
+VERSION = 2  # raised by a change of the fit: older files are left alone and made again
 
 _BEHIND_M, _AHEAD_M, _ASIDE_M, _LOW_M, _HIGH_M = 2.0, 60.0, 20.0, -0.6, 11.0  # of the grid's box, round the cameras
 _AT_ONCE = 4096  # rays of a picture
@@ -114,7 +114,7 @@ def render_answer(field: Panoptic, frame: PosedFrame) -> Answer:
             samples = field.march(rays)
             boxes = field.boxes_on(samples)
             points = boxes.fixed if field.shape.classes == "fixed" else field.learned(samples)
-            channel = field.composited(samples, points).argmax(1)
+            channel = field.composited(samples, points, boxes).argmax(1)
             depth = (ray_share(samples) * samples.z).sum(1) / samples.opacity.clamp_min(1e-6)
             depth = torch.where(samples.opacity > 0.5, depth, 0.0)
             found.append((channel.numpy(), field.instances(rays, channel).numpy(), depth.numpy()))

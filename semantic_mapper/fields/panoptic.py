@@ -28,7 +28,7 @@ from semantic_mapper.types import Int64, RayBatch
 
 LOOKED_AT = 8  # samples of a ray that say its class
 LEAST = 1e-6  # of a rendered probability
-SKY = "sky"  # class of light that leaves the grid, where the label set has it
+SKY = "sky"  # class of light that leaves the grid and meets no box, where the label set has it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,12 +40,14 @@ class BoxesOnRays:
         index: (R, M) int64 number of the box of each interval, -1 = none.
         classes: (R, K, L) what the boxes allow: 0 or 1.
         on_ray: (R, L) bool, classes that are anywhere on the ray.
+        behind: (R,) int64 class of light that leaves the grid: of the first box there, else sky; -1 = neither.
     """
 
     box: torch.Tensor
     index: torch.Tensor
     classes: torch.Tensor
     on_ray: torch.Tensor
+    behind: torch.Tensor
 
     @property
     def fixed(self) -> torch.Tensor:
@@ -90,16 +92,17 @@ class Panoptic(GridField):
         self.classifier = nn.Linear(config.head_width, len(label_set))
 
     def classify(self, samples: RaySamples, sources: EncodedViews) -> tuple[torch.Tensor, torch.Tensor]:
-        """Log probabilities (R, L), and where they are known (R,): where a ray meets something, or sees the sky.
+        """Log probabilities (R, L), and where they are known (R,): where a ray meets something, or sees what is behind
+        the grid.
 
         A ray whose depth was measured ends there.
         """
         samples = heaviest(at_measured(samples, self.grid.config), LOOKED_AT)
         boxes = self.boxes_on(samples)
         points = boxes.fixed if self.shape.classes == "fixed" else self.learned(samples)
-        rendered = self.composited(samples, points)
-        sky = (rendered.argmax(1) == self.sky) if self.sky is not None else torch.zeros_like(rendered[:, 0]).bool()
-        return torch.log(rendered.clamp_min(LEAST)), self.known(samples) | (sky & self.fitted)
+        rendered = self.composited(samples, points, boxes)
+        behind = rendered.argmax(1) == boxes.behind
+        return torch.log(rendered.clamp_min(LEAST)), self.known(samples) | (behind & self.fitted)
 
     def learned(self, samples: RaySamples, r: torch.Tensor | None = None) -> torch.Tensor:
         """The learned field (R, K, L) at samples; ``r`` (R, K, W) is what the trunk says there, if it is known."""
@@ -107,14 +110,11 @@ class Panoptic(GridField):
         r = self.trunk(samples.points) if r is None else r
         return torch.softmax(self.classifier(self.head(r)), -1)
 
-    def composited(self, samples: RaySamples, points: torch.Tensor) -> torch.Tensor:
-        """Probabilities (R, L) of rays, of those of points (R, K, L); what gets through is sky, if that is a class."""
+    def composited(self, samples: RaySamples, points: torch.Tensor, boxes: BoxesOnRays) -> torch.Tensor:
+        """Probabilities (R, L) of rays, of those of points (R, K, L) and of what is behind the grid."""
         rendered = (ray_share(samples)[..., None] * points).sum(1)
-        if self.sky is None:
-            return rendered
-        light = torch.zeros_like(rendered)
-        light[:, self.sky] = samples.light
-        return rendered + light
+        light = samples.light * (boxes.behind >= 0)
+        return rendered.scatter_add(1, boxes.behind.clamp_min(0)[:, None], light[:, None])
 
     def boxes_on(self, samples: RaySamples) -> BoxesOnRays:
         """What boxes hold samples."""
@@ -133,7 +133,20 @@ class Panoptic(GridField):
             on_ray = on_ray | (self.outside > 0)
         if self.sky is not None:
             on_ray[:, self.sky] = True
-        return BoxesOnRays(inside, found.index, allowed, on_ray)
+        return BoxesOnRays(inside, found.index, allowed, on_ray, self._behind(samples.rays, found))
+
+    def _behind(self, rays: RayBatch, found: Intervals) -> torch.Tensor:
+        beyond = (found.index >= 0) & (found.leave > self._exit_z(rays)[:, None])
+        first = found.index.gather(1, beyond.float().argmax(1, keepdim=True))[:, 0]
+        return torch.where(beyond.any(1), self._channels(first), -1 if self.sky is None else self.sky)
+
+    def _exit_z(self, rays: RayBatch) -> torch.Tensor:
+        """z (R,) at which rays leave the grid."""
+        grid = self.grid.config
+        low = rays.origin.new_tensor(grid.origin_m)
+        high = low + grid.voxel_m * (rays.origin.new_tensor(grid.shape) - 1)
+        step = torch.where(rays.direction.abs() < LEAST, LEAST, rays.direction)
+        return torch.maximum((low - rays.origin) / step, (high - rays.origin) / step).amin(1)
 
     def instances(self, rays: RayBatch, label: torch.Tensor) -> torch.Tensor:
         """Which thing rays (R,) see (Eq. 8): ids (R,) of boxes of the class (R,), a channel; 0 where there is none.

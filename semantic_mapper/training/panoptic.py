@@ -231,8 +231,8 @@ def semantic_losses(
     there = channel >= 0
     stands_for = group[channel.clamp_min(0)]
     count = there.sum().clamp_min(1)
-    fixed = (field.composited(samples, boxes.fixed) * stands_for).sum(1)
-    seen = (field.composited(samples, learned) * stands_for).sum(1)
+    fixed = (field.composited(samples, boxes.fixed, boxes) * stands_for).sum(1)
+    seen = (field.composited(samples, learned, boxes) * stands_for).sum(1)
     by_fixed = -(torch.log(fixed.clamp_min(LEAST)) * there).sum() / count
     by_learned = -(torch.log(seen.clamp_min(LEAST)) * possible(boxes, group, channel)).sum() / count
     # Where one class is allowed this is the paper's cross-entropy; where there are several, one of them has to be it.

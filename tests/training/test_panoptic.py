@@ -99,6 +99,22 @@ def test_boxes_outvote_wrong_labels_and_tell_which_thing_it_is() -> None:
     assert (things[said == TABLE] == 7).float().mean() > 0.95
 
 
+def test_what_leaves_the_grid_sees_the_first_box_behind_it_else_the_sky() -> None:
+    far, farther = box(1, "floor", (9.0, 0.0, 0.5), (2.0, 1.0, 1.0)), box(2, "lamp", (20.0, 0.0, 0.5), (2.0, 9.0, 1.0))
+    field = empty_field(farther, far, box(3, "table", (1.0, 0.0, 0.5), (0.2, 1.0, 1.0)))
+    n = 3
+    origin = torch.tensor([(-1.0, 0.0, 0.5), (-1.0, 3.0, 0.5), (-1.0, 0.0, 0.5)])
+    direction = torch.tensor([(1.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+    rays = RayBatch(origin, direction, torch.full((n,), 0.1), torch.full((n,), torch.inf), torch.zeros(n))
+    with torch.no_grad():
+        field.grid.values[..., 0] = -20.0  # nothing stops light
+        samples = field.march(rays)
+        boxes = field.boxes_on(samples)
+        said = field.composited(samples, boxes.fixed, boxes).argmax(1)
+    assert samples.light.min() > 0.99
+    assert said.tolist() == [FLOOR, LAMP, SKY], "the table is in the grid, which is empty there"
+
+
 def test_the_recipe_says_what_boxes_cover_and_no_frame_is_held_to_be_seen() -> None:
     figures = fitted().recipe["panoptic"]
     assert (figures["boxes"], figures["seen"], figures["labelled_frames"]) == (1, 1, 8)
