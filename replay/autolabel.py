@@ -322,7 +322,7 @@ class _Labeller:
         self._no_class = np.uint8(bundle.label_set.ignore_id)
         self._queue: deque[_Message] = deque()
         self._waiting: dict[tuple[str, int, int], deque[_Message]] = {}
-        self._pixels, self._confidence = 0, 0.0
+        self._pixels, self._all_pixels, self._confidence = 0, 0, 0.0
         self.frames = self.rendered = self.labelled = self.kept = self.replaced = self.depth_written = 0
         self.without = 0
         self.unlabelled: list[str] = []
@@ -379,6 +379,7 @@ class _Labeller:
             depth_written=self.depth_written,
             mean_confidence=round(self._confidence / self._pixels, 4) if self._pixels else None,
             train_stamps_ns=tuple(sorted(checkpoint.train_stamps_ns)),
+            labelled_pixels=round(self._pixels / self._all_pixels, 4) if self._all_pixels else None,
         )
 
     def _push_frame(self, message: _Message) -> None:
@@ -444,6 +445,7 @@ class _Labeller:
         found = np.where(sure, label, np.uint8(self._ignore_id))
         self._set_label(message, found if sure.any() else None)
         self._pixels += int(sure.sum())
+        self._all_pixels += sure.size
         self._confidence += float(confidence[sure].sum(dtype=np.float64))
 
     def _sure(self, update: MapUpdate) -> NDArray[np.bool_]:

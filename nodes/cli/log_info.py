@@ -90,6 +90,8 @@ def autolabel_rows(note: dict[str, Any]) -> list[tuple[str, str]]:
         note: As ``AutolabelNote.plain`` gives it.
     """
     confidence = "" if note["mean_confidence"] is None else f", mean confidence {note['mean_confidence'] * 100:.1f} %"
+    if note.get("labelled_pixels") is not None:
+        confidence = f", {note['labelled_pixels'] * 100:.1f} % of the pixels{confidence}"
     frames = counted(note["frames"], "frame")
     counts = [f"{note['labelled']} of {frames} labelled{confidence}"]
     counts += [f"{note[key]} {text}" for key, text in _AUTOLABEL_COUNTS.items() if note[key]]

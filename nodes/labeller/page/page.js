@@ -15,12 +15,12 @@ let size = 16;  // pixels of the frame, across
 
 // ---- saving: one request at a time, the newest state last
 
-const unsaved = new Map();  // frames and their ids that the server does not have yet
+const unsaved = new Map();  // by frame: {ids}, a new one after each change, until the server has said that it has them
 const revisions = new Map();  // of frames, as the server has given them: what has changed there since is not replaced
 let saving = null;
 
 function changed() {
-  unsaved.set(number, strokes.ids);
+  unsaved.set(number, { ids: strokes.ids });
   $("undo").disabled = !strokes.undoable;
   save();
 }
@@ -32,13 +32,13 @@ function save() {
 
 async function sendAll() {
   while (unsaved.size) {
-    const [frame, ids] = unsaved.entries().next().value;
-    unsaved.delete(frame);
+    const [frame, state] = unsaved.entries().next().value, ids = state.ids.slice();
     say("saving");
     try {
       const headers = { "If-Match": revisions.get(frame) };
-      const answer = await request(`frames/${frame}/label`, { method: "PUT", body: ids.slice(), headers });
+      const answer = await request(`frames/${frame}/label`, { method: "PUT", body: ids, headers });
       revisions.set(frame, answer.headers.get("ETag"));
+      if (unsaved.get(frame) === state) unsaved.delete(frame);
     } catch (error) {
       if (error.status === 412) {
         unsaved.delete(frame);
@@ -46,7 +46,6 @@ async function sendAll() {
         say(`${error.message}; shown as it is now, without the last stroke`, true);
         return;
       }
-      if (!unsaved.has(frame)) unsaved.set(frame, ids);
       say(`not saved: ${error.message}`, true);
       return;
     }
@@ -113,7 +112,7 @@ async function show(wanted) {
   endStroke();
   say("loading");
   try {
-    const ids = unsaved.get(wanted) ?? await load(wanted);
+    const ids = unsaved.get(wanted)?.ids ?? await load(wanted);
     const picture = new Image();
     picture.src = `frames/${wanted}/image`;
     await picture.decode();

@@ -102,7 +102,7 @@ def test_labels_that_are_there_stay_and_others_are_marked(new: Path) -> None:
     assert note is not None and (note.frames, note.labelled, note.kept, note.replaced) == (6, 4, 2, 0)
     said = json.loads(new.with_suffix(".json").read_text())
     assert said["labelled"] == 4 and said["files"] == [str(new)] and said["kind"] == "sray"
-    assert 0 < said["mean_confidence"] <= 1
+    assert 0 < said["mean_confidence"] <= 1 and 0 < said["labelled_pixels"] <= 1
 
 
 def test_labels_are_those_that_replay_renders(new: Path, part_labelled: Path, weights: Path) -> None:
@@ -142,6 +142,8 @@ def test_pixels_that_are_not_sure_are_unknown(part_labelled: Path, weights: Path
     unknown = sure == ROOMS.ignore_id
     assert 0 < unknown.mean() < 1 and np.array_equal(sure[~unknown], everything[~unknown])
     assert kept.mean_confidence > note.mean_confidence
+    assert kept.labelled_pixels is not None and note.labelled_pixels is not None
+    assert kept.labelled_pixels < note.labelled_pixels
     report = relabelled(part_labelled, tmp_path / "none.mcap", weights, min_confidence=1.0)
     assert report.note.labelled == 0 and report.note.unlabelled == 4  # no label rather than one of nothing
     with LogReader(tmp_path / "none.mcap") as log:

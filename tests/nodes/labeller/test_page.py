@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -202,3 +203,23 @@ def test_the_page_shows_what_strokes_grow_to(page: Page) -> None:
     assert page.browser.evaluate("document.getElementById('grown').hidden") is True
     page.browser.press("s", "n")
     assert page.status("nothing painted yet") and page.eventually(lambda: covered() == 0)
+
+
+def test_a_stroke_that_is_on_its_way_is_shown_and_not_lost(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    on_its_way, save = threading.Event(), LabelSession.save
+
+    def slow(*arguments: Any) -> None:
+        assert on_its_way.wait(WAIT_S)
+        save(*arguments)
+
+    monkeypatch.setattr(LabelSession, "save", slow)
+    page.browser.press("2")
+    page.browser.drag(page.on((10, 50), (80, 50)))
+    page.browser.press("n")
+    assert page.eventually(lambda: page.browser.evaluate("document.getElementById('number').value") == "1")
+    page.browser.press("p")
+    assert page.eventually(lambda: page.shown(40, 50)[3] == 255), "the first stroke is there"
+    on_its_way.set()
+    page.browser.press("1")
+    page.browser.drag(page.on((10, 10), (80, 10)))
+    assert page.saved(4, lambda label: bool(label[50, 40] == FLOOR and label[10, 40] == WALL))
