@@ -9,7 +9,7 @@ metres. Without, the model is placed as one of COLMAP.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import cv2
 import msgspec
@@ -58,8 +58,8 @@ class _Shot(msgspec.Struct):
 
 
 class _Reference(msgspec.Struct):
-    latitude: float
-    longitude: float
+    latitude: Annotated[float, msgspec.Meta(ge=-90, le=90)]
+    longitude: Annotated[float, msgspec.Meta(ge=-180, le=180)]
     altitude: float
 
 

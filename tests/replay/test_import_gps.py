@@ -233,6 +233,9 @@ def test_a_reconstruction_without_gps_is_made_of_room_size(tmp_path: Path) -> No
     (folder / "reference_lla.json").write_text('{"latitude": 1.0, "longitude": 2.0, "altitude": 3.0}')
     change(folder, reference_lla=None)
     assert imported(folder)[0].info.scale_known
+    change(folder, reference_lla={"latitude": 200.0, "longitude": 0.0, "altitude": 0.0})
+    with pytest.raises(ImportSourceError, match=r"reference_lla\.latitude|<= 90"):
+        imported(folder)
 
 
 def test_a_lens_of_browns_model_is_undone(tmp_path: Path) -> None:
