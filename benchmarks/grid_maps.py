@@ -69,11 +69,10 @@ def main() -> None:
     parser.add_argument("--rooms", type=int, default=3, help="validation rooms")
     parser.add_argument("--frames", type=int, default=40, help="of each, 5 cm apart")
     parser.add_argument("--steps", type=int, default=GridFitConfig().steps)
-    parser.add_argument("--far", type=float, default=GridFitConfig().far_m, help="how far the box reaches, metres")
     parser.add_argument("--side", type=int, default=GridFitConfig().long_side, help="vertices on its longest side")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    settings = GridFitConfig(steps=given.steps, far_m=given.far, long_side=given.side)
+    settings = GridFitConfig(steps=given.steps, long_side=given.side)
     computed = convert_config({"from_motion": {"delay_frames": DELAY_FRAMES}}, DepthConfig, "settings")
     for seed in VALIDATION_SEEDS[: given.rooms]:
         steps = room_walk(seed, given.frames, ERRORS["exact"])

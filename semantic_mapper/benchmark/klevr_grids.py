@@ -20,7 +20,7 @@ from semantic_mapper.files import write_bytes
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.scenes.klevr import BOX_HIGH_M, BOX_LOW_M, Variant, klevr_camera, klevr_views
 from semantic_mapper.scenes.suite import KLEVR_SUITE
-from semantic_mapper.training.grid_fit import GridFitConfig, fit_grid, held_out_psnr
+from semantic_mapper.training.grid_fit import OPACITY, GridFitConfig, fit_grid, held_out_psnr
 
 _log = get_logger(__name__)
 
@@ -75,6 +75,7 @@ def scene_density(config: KlevrGridConfig, scene: int, folder: Path) -> SceneDen
         long_side=config.long_side,
         box_m=(*BOX_LOW_M, *BOX_HIGH_M),
         near_m=NEAR_M,
+        opacity=OPACITY,
         exposure=False,
         held_out=0,
         seed=scene,

@@ -13,16 +13,22 @@ from semantic_mapper.config import GridConfig
 from semantic_mapper.fields.grid.kernels import fuse_grid_depth
 from semantic_mapper.fields.grid.march import BIAS
 from semantic_mapper.fields.grid.scene_grid import HAZE, NOTHING, SceneGrid
-from semantic_mapper.geometry import invert_pose, transform
+from semantic_mapper.geometry import invert_pose, nearest_pixels, transform
 from semantic_mapper.imaging import resize_depth
+from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.frame_rays import FrameRays
-from semantic_mapper.types import Bool, Float32, PosedFrame
+from semantic_mapper.training.sparse_points import sparse_points
+from semantic_mapper.types import Bool, Float32, Float64, PosedFrame
 
 TRUNCATION = 3.0  # voxels
 BETA = 0.5  # voxels: spread of the Laplace distribution that turns distance into density
 MARGIN = 0.02  # of the box that depth reaches, added on every side
 OUTLIERS = 0.2  # per cent of the depth on either side that may lie outside of the box
 EVERY = 7  # pixel, for the bounds of a box
+TILES, LEAST_FEATURES = 4, 5  # of an image along each side, and how many features a tile has to have
+CORNERS, MARGIN_OF_TILES = 1, 0.05  # per cent of their corners that may lie outside of the box; what is added to it
+
+_log = get_logger(__name__)
 
 
 def grid_of_depth(rays: FrameRays, config: GridConfig) -> SceneGrid:
@@ -57,18 +63,53 @@ def distance_to_surface(rays: FrameRays, config: GridConfig) -> tuple[Float32, B
     return distance * np.float32(TRUNCATION), weight > 0
 
 
-def depth_bounds(
-    frames: Sequence[PosedFrame], far_m: float
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Corners of the box that the frames' depth reaches; without any depth, what they can see up to ``far_m``."""
-    points = [p for f in frames if f.depth_m is not None for p in _measured(f)]
-    if points:
-        low, high = np.percentile(points, (OUTLIERS, 100 - OUTLIERS), axis=0)
-    else:
-        corners = np.concatenate([_frustum(f, far_m) for f in frames])
-        low, high = corners.min(0), corners.max(0)
-    margin = MARGIN * float((high - low).max())
-    return tuple((low - margin).tolist()), tuple((high + margin).tolist())
+Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+
+def depth_bounds(frames: Sequence[PosedFrame]) -> Corners:
+    """Corners of the box that the frames' depth reaches; one frame has some, at least."""
+    points = np.concatenate([_measured(f) for f in frames if f.depth_m is not None])
+    return _with_margin(*np.percentile(points, (OUTLIERS, 100 - OUTLIERS), axis=0), MARGIN)
+
+
+def image_bounds(frames: Sequence[PosedFrame], far_m: float) -> Corners:
+    """Corners of the box that images without depth show: each of their tiles at the depth of its matched features.
+
+    Where too few features match, what they see up to ``far_m``, with a warning.
+    """
+    points = sparse_points(frames)
+    shown = [_tiles(f, points) for f in frames]
+    if sum(len(s) > 0 for s in shown) < max(2, len(frames) / 2):
+        _log.warning(
+            "box_guessed",
+            far_m=far_m,
+            reason="no depth, and too few matching features to find out how far the images see; set grid.box_m",
+        )
+        every = np.concatenate([_frustum(f, far_m) for f in frames])
+        return _with_margin(every.min(0), every.max(0), MARGIN)
+    return _with_margin(*np.percentile(np.concatenate(shown), (CORNERS, 100 - CORNERS), axis=0), MARGIN_OF_TILES)
+
+
+def _with_margin(low: Float64, high: Float64, margin: float) -> Corners:
+    metres = margin * float((high - low).max())
+    return tuple((low - metres).tolist()), tuple((high + metres).tolist())
+
+
+def _tiles(frame: PosedFrame, points: Float64) -> Float64:
+    """Corners (N, 3) in the world of a frame's tiles, each at the median depth of the features in it."""
+    k = frame.intrinsics
+    in_camera = transform(invert_pose(frame.T_world_camera), points)
+    seen, v, u = nearest_pixels(in_camera, k)
+    z = in_camera[seen, 2]
+    column, row = u[seen] * TILES // k.width, v[seen] * TILES // k.height
+    found = [np.zeros((0, 3))]
+    for i, j in np.ndindex(TILES, TILES):
+        inside = z[(column == i) & (row == j)]
+        if len(inside) >= LEAST_FEATURES:
+            x = (np.array((i, i + 1, i, i + 1)) * k.width / TILES - k.cx) / k.fx
+            y = (np.array((j, j, j + 1, j + 1)) * k.height / TILES - k.cy) / k.fy
+            found.append(np.stack((x, y, np.ones(4)), axis=1) * np.median(inside))
+    return transform(frame.T_world_camera, np.concatenate(found))
 
 
 def _measured(frame: PosedFrame) -> Float32:

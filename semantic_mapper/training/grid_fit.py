@@ -39,7 +39,7 @@ from semantic_mapper.fields.grid.march import most_samples
 from semantic_mapper.fields.grid.scene_grid import NOTHING, SceneGrid, at_resolution, grid_box, sky_texels
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
-from semantic_mapper.training.grid_depth import depth_bounds, grid_of_depth
+from semantic_mapper.training.grid_depth import depth_bounds, grid_of_depth, image_bounds
 from semantic_mapper.training.schedule import budget_fraction
 from semantic_mapper.types import Float32, Float64, PosedFrame
 
@@ -50,6 +50,8 @@ WARM_UP = 200  # steps before anything is pruned
 COARSE = ((0.0, 3), (0.3, 1.5), (0.6, 1))  # fraction of the steps, and how much coarser the grid is until the next
 MIN_PARALLAX = 1e-3  # distance of cameras as a fraction of the box, below which poses only turn
 MIN_FRAMES = 2
+LONG_SIDE, OPACITY = 96, 1e-2  # of scenes with depth
+VOXELS = 2.5e6  # of a grid without depth: its box is flat, or has much air
 PSNR_VIEWS = 4  # of those that are held out, evenly spread: rendering costs as much as hundreds of steps
 MIN_GAIN_DB = 1.0  # over the mean colour; the sky's colours alone, with poses that mean nothing, gain half of it
 _log = get_logger(__name__)
@@ -62,10 +64,11 @@ class GridFitConfig(Config, frozen=True):
     seconds: AtLeastZero = 0.0  # wall-clock bound; 0 = only steps count (then a run repeats bit for bit)
     rays: AtLeastOne = 2048  # a step
     width: AtLeastOne = 320  # working width of the images
-    long_side: Annotated[int, msgspec.Meta(ge=8, le=2048)] = 96  # vertices along the box's longest side
+    # Vertices along the box's longest side; None = 96, and where no frame has depth as many as make 2.5 M in all
+    long_side: Annotated[int, msgspec.Meta(ge=8, le=2048)] | None = None
     voxel_m: Positive | None = None  # sets their distance instead
-    # Lower corner, then upper corner of the box in metres of the world; None = what depth reaches, or what the cameras
-    # can see up to ``far_m``
+    # Lower corner, then upper corner of the box in metres of the world; None = what depth reaches; without depth, what
+    # matched features show; where these are too few, what the cameras can see up to ``far_m``
     box_m: tuple[float, float, float, float, float, float] | None = None
     near_m: AtLeastZero = 0.1
     far_m: Metres = 8.0
@@ -74,7 +77,9 @@ class GridFitConfig(Config, frozen=True):
     density_variation: AtLeastZero = 1e-5  # weight of the total variation, a ray
     colour_variation: AtLeastZero = 1e-6
     point_colour: AtLeastZero = 0.1  # weight of the colour of each sample
-    opacity: AtLeastZero = 1e-2  # weight of what stops light: clears haze of the sky's colour
+    # Weight of what stops light: clears haze of the sky's colour. None = 0.01 where frames have depth, else 0: without
+    # depth the sky's colours explain surface
+    opacity: AtLeastZero | None = None
     depth: AtLeastZero = 0.1  # weight of what lies off the measured depth, where frames have some
     start_from_depth: bool = True  # where frames have some
     exposure: bool = True  # a gain a frame and channel, for cameras whose exposure drifts
@@ -167,17 +172,22 @@ def fit_grid(
 
 
 def scene_box(frames: Sequence[PosedFrame], config: GridFitConfig) -> GridConfig:
-    """The box that ``config`` asks for, or what the frames' depth reaches, or what they can see up to ``far_m``.
+    """The box that ``config`` asks for, or what the frames' depth reaches, or what their images show.
 
     Raises:
         ConfigError: a box without a volume, or too large for ``voxel_m``.
     """
+    long_side = config.long_side or LONG_SIDE
     if config.box_m is not None:
         low, high = config.box_m[:3], config.box_m[3:]
+    elif any(f.depth_m is not None for f in frames):
+        low, high = depth_bounds(frames)
     else:
-        low, high = depth_bounds(frames, config.far_m)
-    box = grid_box(low, high, config.long_side, config.voxel_m)
-    wanted = max(b - a for a, b in zip(low, high, strict=True)) / (config.long_side - 1)
+        low, high = image_bounds(frames, config.far_m)
+        sides = [b - a for a, b in zip(low, high, strict=True)]
+        long_side = config.long_side or max(LONG_SIDE, round(max(sides) * (VOXELS / math.prod(sides)) ** (1 / 3)))
+    box = grid_box(low, high, long_side, config.voxel_m)
+    wanted = max(b - a for a, b in zip(low, high, strict=True)) / (long_side - 1)
     if config.voxel_m is None and box.voxel_m > wanted * (1 + 1e-9):
         _log.warning(
             "voxels_grown", wanted_m=round(wanted, 4), voxel_m=round(box.voxel_m, 4), reason="16 M voxels at most"
@@ -228,7 +238,9 @@ class _Fitter:
         self.rng = np.random.default_rng(config.seed)
         self.order = np.zeros(0, np.int64)
         self.log_gain = np.zeros((len(rays.intrinsics), 3))
-        from_depth = config.start_from_depth and bool((rays.depth_m > 0).any())
+        measured = bool((rays.depth_m > 0).any())
+        from_depth = config.start_from_depth and measured
+        self.opacity = (OPACITY if measured else 0.0) if config.opacity is None else config.opacity
         # A start from depth has nothing to gain from coarse grids.
         self.stages = COARSE[-1:] if from_depth else COARSE
         self.stage = 0
@@ -289,7 +301,7 @@ class _Fitter:
         inverse = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
         colour = self.rays.rgb[pixels].astype(np.float32) / np.float32(255)
         results = RayResults(*(np.empty((len(pixels), 3), np.float32) for _ in range(3)))
-        loss = LossWeights(self.config.point_colour, self.config.opacity, self.config.depth)
+        loss = LossWeights(self.config.point_colour, self.opacity, self.config.depth)
         rays = self.grid.rays(batch, jitter).arrays()
         targets = TargetArrays(colour, inverse, gain, behind)
         photometric_rays(len(pixels), self.grid.arrays(), rays, targets, loss, self.samples, results)

@@ -15,7 +15,7 @@ from benchmarks.grid_scenes import BOX_M, object_frames, objects_scene
 from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.fields.grid.field import GridField
 from semantic_mapper.fields.registry import build_field
-from semantic_mapper.geometry import scale_intrinsics
+from semantic_mapper.geometry import invert_pose, nearest_pixels, scale_intrinsics, transform
 from semantic_mapper.imaging import resize_rgb
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.training.finetune import FinetuneConfig, finetune
@@ -24,6 +24,7 @@ from semantic_mapper.training.frame_rays import frame_rays
 from semantic_mapper.training.grid_depth import distance_to_surface, grid_of_depth
 from semantic_mapper.training.grid_fit import GridFitConfig, fit_grid, render_frame, scene_box
 from semantic_mapper.training.scene_fit import fit_scene
+from semantic_mapper.training.sparse_points import sparse_points
 from semantic_mapper.types import PosedFrame
 from tests.small import tiny_frames
 
@@ -179,7 +180,33 @@ def test_a_box_for_too_many_voxels_grows_them_and_says_so() -> None:
         scene_box(objects(), msgspec.structs.replace(config, voxel_m=0.01))
 
 
-def test_without_depth_the_box_is_what_cameras_can_see() -> None:
-    box = scene_box(objects(), GridFitConfig(far_m=12.0))
+def test_without_depth_the_box_holds_what_matched_features_show() -> None:
+    box = scene_box(objects(), GridFitConfig())
+    high = [o + (n - 1) * box.voxel_m for o, n in zip(box.origin_m, box.shape, strict=True)]
+    assert all(-8 < o < low for o, low in zip(box.origin_m, BOX_M[:3], strict=True))
+    assert all(top < h < 8 for h, top in zip(high, BOX_M[3:], strict=True))
+    assert 2e6 < np.prod(box.shape) < 3e6
+
+
+def test_without_depth_and_features_the_box_is_what_cameras_can_see_and_that_is_said() -> None:
+    plain = [replace(frame, rgb=np.full_like(frame.rgb, 128)) for frame in objects()]
+    with structlog.testing.capture_logs() as logs:
+        box = scene_box(plain, GridFitConfig(far_m=12.0))
     high = [o + (n - 1) * box.voxel_m for o, n in zip(box.origin_m, box.shape, strict=True)]
     assert all(o < -4 and h > 3 for o, h in zip(box.origin_m, high, strict=True))
+    assert [entry["far_m"] for entry in logs if entry["event"] == "box_guessed"] == [12.0]
+
+
+def test_triangulated_points_lie_on_the_surface() -> None:
+    frames = tiny_frames()
+    points = sparse_points(frames)
+    assert len(points) > 30
+    off = []
+    for frame in frames:
+        in_camera = transform(invert_pose(frame.T_world_camera), points)
+        seen, v, u = nearest_pixels(in_camera, frame.intrinsics)
+        assert frame.depth_m is not None
+        depth = frame.depth_m[v[seen], u[seen]]
+        off.append(np.abs(in_camera[seen, 2] - depth)[depth > 0] / depth[depth > 0])
+    assert np.median(np.concatenate(off)) < 0.1
+    assert len(sparse_points([replace(f, T_world_camera=frames[0].T_world_camera) for f in frames])) == 0
