@@ -145,6 +145,8 @@ def _suggest(output: Output, log: Path, count: int, images: Path | None, weights
         found = suggest_for_log(opened, count, open_images(images, opened), weights, stop, bar)
     if found.frames:
         output.print(suggestion_table(found))
+        if all(frame.brings.gain is None for frame in found.frames):
+            output.print("the frames have no depth that says what they show: these are spread evenly over time")
     else:
         output.print(f"{log.name}: its {counted(len(found.labelled), 'labelled frame')} show all that it shows")
     if json:

@@ -198,7 +198,7 @@ def finetune_lines(checkpoint: Checkpoint, chosen: Sequence[int], request: Finet
     recipe, out, log = checkpoint.recipe, request.out, request.log.name
     lines = [f"{out}: finetuned on frames {', '.join(map(str, chosen))} of {log}"] if chosen else []
     if "psnr" in recipe:
-        psnr = "no views held out" if recipe["psnr"] is None else f"held-out views {recipe['psnr']:.1f} dB"
+        psnr = "no held-out views rendered" if recipe["psnr"] is None else f"held-out views {recipe['psnr']:.1f} dB"
         steps = recipe.get("grid_steps", recipe["steps"])
         lines.append(f"{out}: grid of {log}, {steps} steps in {recipe['seconds']} s, {psnr}")
     if "held_out_loss" in recipe:

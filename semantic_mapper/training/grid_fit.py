@@ -105,7 +105,8 @@ class GridFit:
         grid: The grid.
         steps: That it was fitted for.
         seconds: Wall-clock time.
-        psnr: Of held-out frames in dB, each with the gain that fits it best if exposure was fitted; NaN without.
+        psnr: Of held-out frames in dB, each with the gain that fits it best if exposure was fitted; NaN where none were
+            rendered: none held out, or stopped.
         mean_colour_psnr: The same of images of their mean colour.
         frames: F frames that it was fitted to.
         gains: (F, 3) their exposure.
@@ -159,7 +160,8 @@ def fit_grid(
         if on_progress is not None:
             on_progress(GridFitProgress(steps, min(fraction, 1.0), loss))
     grid = fitter.finish()
-    psnr, mean_psnr = held_out_psnr(grid, held_out[:: -(-len(held_out) // PSNR_VIEWS) or 1], config)
+    shown = [] if stopped() else held_out[:: -(-len(held_out) // PSNR_VIEWS) or 1]
+    psnr, mean_psnr = held_out_psnr(grid, shown, config)
     if psnr < mean_psnr + MIN_GAIN_DB and fraction >= 1:
         raise FrameError(
             f"held-out views are rendered with {psnr:.1f} dB, hardly better than by their mean colour "

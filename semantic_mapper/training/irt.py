@@ -203,13 +203,13 @@ class ClassFit:
         self.learned = {n: p for n, p in field.named_parameters() if p.requires_grad}
         self.optimiser = torch.optim.AdamW(self.learned.values(), LEARNING_RATE, weight_decay=WEIGHT_DECAY)
         train = (data.channel >= 0) & ~data.held_out
-        self.pool = _BalancedPixels(torch.where(train, data.channel, IGNORE), len(field.label_set))
+        self.taught = torch.where(train, data.channel, IGNORE)
+        self.pool = _BalancedPixels(self.taught, len(field.label_set))
         self.looked_at = data.held_out.nonzero()[:, 0]
         if len(self.looked_at) > LOOK_RAYS:
             order = torch.randperm(len(self.looked_at), generator=self.generator)
             self.looked_at = self.looked_at[order[:LOOK_RAYS].sort().values]
         self.step, self.fraction = 0, 0.0
-        carry_labels(field, data.rays, torch.where(train, data.channel, IGNORE), config.grid.near_m)
 
     def run(
         self, began: float, on_progress: Callable[[FinetuneProgress], None] | None, stopped: Callable[[], object]
@@ -219,6 +219,9 @@ class ClassFit:
         left = max(config.seconds - (time.monotonic() - began), 0.05 * config.seconds)
         clock = BudgetClock(left, config.steps, config.evaluations)
         latest = best = BestWeights(math.inf, math.nan, 0, self._state())
+        if stopped():
+            return best
+        carry_labels(self.field, self.data.rays, self.taught, config.grid.near_m)
         while self.fraction < 1 and not stopped():
             loss = self._learn()
             self.step += 1
