@@ -18,6 +18,7 @@ from semantic_mapper.config import MapperConfig, with_quality
 from semantic_mapper.errors import ConfigError, FrameError
 from semantic_mapper.fields.base import EncodedViews, SemanticField, check_classes, stack_views
 from semantic_mapper.fields.depth_prior import depth_prior
+from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.geometry import camera_matrix, check_pose, scale_intrinsics
 from semantic_mapper.imaging import FrameViews, fill_holes, resize_label, resize_spread, working_intrinsics
 from semantic_mapper.labels import LabelSet
@@ -402,6 +403,8 @@ class MappingPipeline:
         store = self.keyframes if keyframes is None else keyframes
         # Cameras of another shape have feature maps of another size; one render takes views of one size.
         chosen = store.choose(frame.T_world_camera, intrinsics, depth, count, size)
+        if not chosen and self._holds_scene:  # what it says does not depend on the views
+            chosen = [k for k in store.keyframes if k.encoded.size == size][-1:]
         others = sum(k.encoded.size != size for k in store.keyframes)
         if others and not self._told_sizes:
             self._told_sizes = True
@@ -430,14 +433,23 @@ class MappingPipeline:
             frame.T_world_camera,
             prior,
             resized.rgb(intrinsics),
-            measured=resized.depth(intrinsics) > 0 if frame.depth_m is not None else None,
+            measured=(resized.depth(intrinsics) > 0) & (prior > 0) if frame.depth_m is not None else None,
             computed=frame.depth_sigma_m is not None,
         )
 
+    @property
+    def _holds_scene(self) -> bool:
+        return isinstance(self.field, LearnedField) and self.field.holds_scene
+
     def _depth_prior(self, resized: FrameViews, intrinsics: CameraIntrinsics) -> Float32:
-        """Where the surface is expected: the sensor's depth (``depth_prior``), else the map's own ray cast."""
+        """Where the surface is expected: the sensor's depth (``depth_prior``), else the map's own ray cast.
+
+        Nowhere, without a sensor, for a field that holds the scene: it knows better.
+        """
         frame = resized.frame
         depth = resized.depth(intrinsics)
+        if self._holds_scene and not is_measured(frame):
+            return np.zeros_like(depth)
         if frame.depth_m is not None:
             return depth_prior(depth, resized.rgb(intrinsics))
         if self.voxel_map.block_count == 0:

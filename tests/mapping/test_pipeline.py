@@ -3,8 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semantic_mapper.config import GridFieldConfig
 from semantic_mapper.errors import FrameError, PoseError, WeightsError
 from semantic_mapper.fields.checkpoint import default_checkpoint_path, load_checkpoint
+from semantic_mapper.fields.grid.field import GridField
 from semantic_mapper.fields.sray_streaming import StreamingSRay
 from semantic_mapper.geometry import scale_intrinsics
 from semantic_mapper.labels import NYU40, ROOMS
@@ -301,3 +303,32 @@ def test_labels_of_anchors_are_used_and_labels_of_other_frames_are_not():
         maps.append(pipeline)
     assert not same_map(maps[0], maps[1])
     assert same_map(maps[0], maps[2])
+
+
+class SceneField(GridField):
+    """Has the geometry of a scene, and notes which rays it was asked for."""
+
+    def render(self, rays, sources):
+        self.__dict__.setdefault("priors", []).append(float(rays.prior_depth_m.max()))
+        return super().render(rays, sources)
+
+
+def test_a_field_that_holds_the_scene_is_told_no_depth_but_a_sensors_and_needs_no_near_view():
+    frames = tiny_frames()
+    config = tiny_config(keyframes={"use_current_view": False})
+    field = SceneField(GridFieldConfig(), ROOMS)
+    pipeline = MappingPipeline(config, field, ROOMS)
+    for frame in frames:
+        pipeline.step(frame)
+    priors = field.__dict__["priors"]
+    assert min(priors) > 0, "a sensor's"
+    priors.clear()
+    pipeline.step(replace(frames[0], depth_m=None, seq=100, stamp_ns=frames[-1].stamp_ns + 10**9))
+    assert priors and max(priors) == 0, "neither the map's"
+    priors.clear()
+    away = frames[0].T_world_camera.copy()
+    away[:3, 3] += 30
+    pipeline.step(
+        replace(frames[0], depth_m=None, seq=101, stamp_ns=frames[-1].stamp_ns + 2 * 10**9, T_world_camera=away)
+    )
+    assert priors, "rendered, though no keyframe looks there"
