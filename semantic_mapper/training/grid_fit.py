@@ -77,7 +77,7 @@ class GridFitConfig(Config, frozen=True):
     density_variation: AtLeastZero = 1e-5  # weight of the total variation, a ray
     colour_variation: AtLeastZero = 1e-6
     point_colour: AtLeastZero = 0.1  # weight of the colour of each sample
-    # Weight of what stops light: clears haze of the sky's colour. None = 0.01 where frames have depth, else 0: without
+    # Weight of what stops light: clears haze of the sky's colour. None = 0.01 where depth of frames is used, else 0: without
     # depth the sky's colours explain surface
     opacity: AtLeastZero | None = None
     depth: AtLeastZero = 0.1  # weight of what lies off the measured depth, where frames have some
@@ -240,7 +240,7 @@ class _Fitter:
         self.rng = np.random.default_rng(config.seed)
         self.order = np.zeros(0, np.int64)
         self.log_gain = np.zeros((len(rays.intrinsics), 3))
-        measured = bool((rays.depth_m > 0).any())
+        measured = bool((rays.depth_m > 0).any()) and (config.depth > 0 or config.start_from_depth)
         from_depth = config.start_from_depth and measured
         self.opacity = (OPACITY if measured else 0.0) if config.opacity is None else config.opacity
         # A start from depth has nothing to gain from coarse grids.
