@@ -77,8 +77,8 @@ class GridFitConfig(Config, frozen=True):
     density_variation: AtLeastZero = 1e-5  # weight of the total variation, a ray
     colour_variation: AtLeastZero = 1e-6
     point_colour: AtLeastZero = 0.1  # weight of the colour of each sample
-    # Weight of what stops light: clears haze of the sky's colour. None = 0.01 where depth of frames is used, else 0: without
-    # depth the sky's colours explain surface
+    # Weight of what stops light: clears haze of the sky's colour. None = 0.01 where depth of frames is used, else 0:
+    # without depth the sky's colours explain surface
     opacity: AtLeastZero | None = None
     depth: AtLeastZero = 0.1  # weight of what lies off the measured depth, where frames have some
     start_from_depth: bool = True  # where frames have some
