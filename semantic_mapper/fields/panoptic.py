@@ -22,10 +22,14 @@ from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.grid.field import GridField, RaySamples
 from semantic_mapper.fields.irt import at_measured
 from semantic_mapper.fields.nerf_math import relu_layers
-from semantic_mapper.fields.primitives import Intervals, Primitive, PrimitiveSet
+from semantic_mapper.fields.primitives import Intervals, Primitive, PrimitiveSet, resized
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
 from semantic_mapper.types import Int64, RayBatch
 
+# Where boxes need not cover everything (``uncovered`` is stuff), they are coarse: the core of a box holds nothing but
+# what it says. Between there and a little beyond its faces may be that, or what needs no box.
+CORE = 0.85  # of a box's size
+LOOSE_M = 0.04  # beyond its faces
 LOOKED_AT = 8  # samples of a ray that say its class
 LEAST = 1e-6  # of a rendered probability
 SKY = "sky"  # class of light that leaves the grid, where the label set has it
@@ -38,19 +42,29 @@ class BoxesOnRays:
     Args:
         box: (R, K, M) bool, whether the sample is in the interval.
         index: (R, M) int64 number of the box of each interval, -1 = none.
-        classes: (R, K, L) what the boxes allow: 0 or 1.
+        named: (R, K, L) classes of the boxes there, in a core those of the cores: 0 or 1.
+        classes: (R, K, L) what may be there: these, and outside of the cores of boxes what needs no box: 0 or 1.
         on_ray: (R, L) bool, classes that are anywhere on the ray.
     """
 
     box: torch.Tensor
     index: torch.Tensor
+    named: torch.Tensor
     classes: torch.Tensor
     on_ray: torch.Tensor
 
     @property
     def fixed(self) -> torch.Tensor:
-        """The fixed field (R, K, L): equal shares of what is allowed."""
-        return self.classes / self.classes.sum(-1, keepdim=True).clamp_min(1)
+        """The fixed field (R, K, L): equal shares of what boxes say, or of the rest; near their faces half of each."""
+        parts = [p / p.sum(-1, keepdim=True).clamp_min(1) for p in (self.named, self.classes - self.named)]
+        both = parts[0] + parts[1]
+        return both / both.sum(-1, keepdim=True).clamp_min(1)
+
+    def allowed_of(self, points: torch.Tensor) -> torch.Tensor:
+        """Probabilities (R, K, L) of what may be there alone; as they are where nothing may be."""
+        allowed = points * self.classes
+        total = allowed.sum(-1, keepdim=True)
+        return torch.where(total > 0, allowed / total.clamp_min(LEAST), points)
 
     @property
     def covered(self) -> torch.Tensor:
@@ -79,7 +93,10 @@ class Panoptic(GridField):
     def __init__(self, config: PanopticConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
         super().__init__(config, label_set, sampling)
         self.shape = config
-        self.primitives = PrimitiveSet([primitive_of(b) for b in config.boxes])
+        boxes = [primitive_of(b) for b in config.boxes]
+        loose = config.uncovered == "stuff"
+        self.primitives = PrimitiveSet([resized(b, b.size + 2 * LOOSE_M) for b in boxes] if loose else boxes)
+        self.cores = PrimitiveSet([resized(b, CORE * b.size) for b in boxes] if loose else [])
         channel = {name: i for i, name in enumerate(label_set.names)}
         of_boxes = torch.tensor([_channel(channel, b.class_name) for b in config.boxes], dtype=torch.long)
         self.register_buffer("channel_of_box", of_boxes, persistent=False)
@@ -96,7 +113,7 @@ class Panoptic(GridField):
         """
         samples = heaviest(at_measured(samples, self.grid.config), LOOKED_AT)
         boxes = self.boxes_on(samples)
-        points = boxes.fixed if self.shape.classes == "fixed" else self.learned(samples)
+        points = boxes.fixed if self.shape.classes == "fixed" else boxes.allowed_of(self.learned(samples))
         rendered = self.composited(samples, points)
         sky = (rendered.argmax(1) == self.sky) if self.sky is not None else torch.zeros_like(rendered[:, 0]).bool()
         return torch.log(rendered.clamp_min(LEAST)), self.known(samples) | (sky & self.fitted)
@@ -118,22 +135,20 @@ class Panoptic(GridField):
 
     def boxes_on(self, samples: RaySamples) -> BoxesOnRays:
         """What boxes hold samples."""
-        found = trimmed(self.primitives.intervals(samples.rays)).to(samples.z.device)
-        inside = found.inside(samples.z.detach())
-        none, classes = found.index < 0, len(self.label_set)
-        channel = torch.where(none, classes, self._channels(found.index))
-        allowed = torch.zeros(*samples.z.shape, classes + 1, device=samples.z.device)
-        allowed.scatter_add_(2, channel[:, None].expand(inside.shape), inside.float())
-        allowed = (allowed[..., :classes] > 0).float()
+        found, inside, named = self._named(self.primitives, samples)
+        allowed, classes = named, len(self.label_set)
+        channel = torch.where(found.index < 0, classes, self._channels(found.index))
         on_ray = torch.zeros(len(channel), classes + 1, dtype=torch.bool, device=channel.device)
         on_ray = on_ray.scatter_(1, channel, value=True)[:, :classes]
         if self.shape.uncovered == "stuff":
-            outside = ~inside.any(-1)
-            allowed = torch.where(outside[..., None], self.outside, allowed)
+            _, _, core = self._named(self.cores, samples)
+            in_core = core.any(-1, keepdim=True)
+            named = torch.where(in_core, core, named)
+            allowed = torch.where(in_core, core, torch.maximum(named, self.outside))
             on_ray = on_ray | (self.outside > 0)
         if self.sky is not None:
             on_ray[:, self.sky] = True
-        return BoxesOnRays(inside, found.index, allowed, on_ray)
+        return BoxesOnRays(inside, found.index, named, allowed, on_ray)
 
     def instances(self, rays: RayBatch, label: torch.Tensor) -> torch.Tensor:
         """Which thing rays (R,) see (Eq. 8): ids (R,) of boxes of the class (R,), a channel; 0 where there is none.
@@ -171,6 +186,15 @@ class Panoptic(GridField):
         inside = found.inside(z.expand(len(origin), -1)).any(-1).view(grid.shape)
         grown = nn.functional.max_pool3d(inside[None, None].float(), 3, 1, 1)[0, 0]
         return grown > 0
+
+    def _named(self, primitives: PrimitiveSet, samples: RaySamples) -> tuple[Intervals, torch.Tensor, torch.Tensor]:
+        """Intervals of rays, which samples are inside (R, K, M), and classes of the boxes there (R, K, L), 0 or 1."""
+        found = trimmed(primitives.intervals(samples.rays)).to(samples.z.device)
+        inside, classes = found.inside(samples.z.detach()), len(self.label_set)
+        channel = torch.where(found.index < 0, classes, self._channels(found.index))
+        named = torch.zeros(*samples.z.shape, classes + 1, device=samples.z.device)
+        named.scatter_add_(2, channel[:, None].expand(inside.shape), inside.float())
+        return found, inside, (named[..., :classes] > 0).float()
 
     def _channels(self, index: torch.Tensor) -> torch.Tensor:
         return self.channel_of_box[index.clamp_min(0)] if len(self.channel_of_box) else torch.zeros_like(index)

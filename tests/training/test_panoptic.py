@@ -179,6 +179,28 @@ def test_what_boxes_say_is_shared_where_they_overlap() -> None:
     assert found.on_ray[0].tolist() == [True, True, False, True]
 
 
+@pytest.mark.parametrize("uncovered", ["stuff", "empty"])
+def test_near_the_faces_of_a_box_its_class_and_what_needs_no_box_are_possible(uncovered: str) -> None:
+    field = empty_field(DECK, uncovered=uncovered)  # from z = 0.5 to 1
+    field.fitted_steps.fill_(1)
+    one, none = torch.ones(1), torch.zeros(1)
+    rays = RayBatch(torch.tensor([(0.8, 0.0, 2.0)]), torch.tensor([(0.0, 0.0, -1.0)]), 0.1 * one, 9 * one, none)
+    samples = field.march(rays)
+    z = torch.tensor([[0.95, 0.98, 1.02, 1.05, 1.48]])  # above the box, near its top (twice), inside, near its bottom
+    points = rays.origin[:, None] + z[..., None] * rays.direction[:, None]
+    found = field.boxes_on(replace(samples, z=z, points=points, weight=torch.ones(1, 5) / 5))
+    table, rest = [0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 1.0, 0.0]  # floor, table, lamp, sky
+    if uncovered == "empty":
+        nothing = [0.0] * 4
+        assert found.classes[0].tolist() == [nothing, nothing, table, table, table]
+        return
+    either = [1.0, 1.0, 1.0, 0.0]
+    assert found.classes[0].tolist() == [rest, either, either, table, either]
+    assert found.fixed[0, 1].tolist() == [0.25, 0.5, 0.25, 0.0]
+    said = found.allowed_of(torch.full((1, 5, 4), 0.25))
+    assert said[0, 3].tolist() == table and said[0, 0].tolist() == [0.5, 0.0, 0.5, 0.0]
+
+
 def test_of_overlapping_boxes_of_a_class_the_nearer_centre_has_the_point() -> None:
     left, right = box(3, "table", (-0.4, 0, 0.5), (1, 1, 1)), box(4, "table", (0.4, 0, 0.5), (1, 1, 1))
     field = empty_field(left, right)
@@ -211,7 +233,7 @@ def test_boxes_survive_the_config() -> None:
 
 def test_what_cannot_be_fitted_is_refused() -> None:
     far = box(1, "table", (90.0, 0.0, 0.0), (1, 1, 1))
-    with pytest.raises(ConfigError, match=r"boxes lie from \(89.50, .*cameras from .*world frame\?"):
+    with pytest.raises(ConfigError, match=r"boxes lie from \(89.46, .*cameras from .*world frame\?"):
         fit_panoptic(scene(), SET, empty_field(far), SMALL)
     with pytest.raises(ConfigError, match="needs boxes"):
         fit_panoptic(scene(), SET, empty_field(), SMALL)
