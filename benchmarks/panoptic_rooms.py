@@ -181,7 +181,7 @@ def main() -> None:
         if given.out is not None:
             draw(room, given, answers)
     for name, found in rows.items():
-        matrices, counts = ([pair[i] for pair in found] for i in (0, 1))
+        matrices, counts = [matrix for matrix, _ in found], [of for _, of in found]
         change = ""
         for other in ("S-Ray", "map cast back"):
             if name not in ("S-Ray", other) and len(found) > 1:
@@ -191,11 +191,11 @@ def main() -> None:
 
 
 def draw(room: MappedRoom, given: argparse.Namespace, answers: Mapping[str, Sequence[PanopticImage]]) -> None:
-    """Boxes, labels of S-Ray, of the last answer and true ones, things of both, of three frames."""
+    """Image, boxes, labels of S-Ray, of the last answer and true ones, things of both, of two frames."""
     rows: list[UInt8] = []
     last = list(answers.values())[-1]
     boxes = room.found_boxes if given.boxes[-1] == "query" else room.true_boxes
-    for number in np.linspace(0, len(last) - 1, 5).round().astype(int)[1:4]:
+    for number in np.linspace(0, len(last) - 1, 4).round().astype(int)[1:3]:
         frame, things = (of[number * given.every] for of in (room.frames, room.things))
         assert frame.label is not None
         drawn = frame.rgb.copy()
@@ -205,7 +205,7 @@ def draw(room: MappedRoom, given: argparse.Namespace, answers: Mapping[str, Sequ
         s_ray, found, truth = map(ROOMS.colorize, (answers["S-Ray"][number].label, last[number].label, frame.label))
         true_things = np.where(np.isin(frame.label, ROOMS.thing_ids(STUFF_NAMES)), things, 0)
         numbers = (thing_colours(last[number].instance), thing_colours(true_things))
-        rows.append(np.hstack([drawn, s_ray, found, truth, *numbers]))
+        rows.append(np.hstack([frame.rgb, drawn, s_ray, found, truth, *numbers]))
     write_picture(given.out, np.vstack(rows))
 
 

@@ -24,7 +24,7 @@ from semantic_mapper.fields.irt import at_measured
 from semantic_mapper.fields.nerf_math import relu_layers
 from semantic_mapper.fields.primitives import Intervals, Primitive, PrimitiveSet, resized
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
-from semantic_mapper.types import Int64, RayBatch
+from semantic_mapper.types import FieldRender, Int64, RayBatch
 
 # Where boxes need not cover everything (``uncovered`` is stuff), they are coarse: the core of a box holds nothing but
 # what it says. Between there and a little beyond its faces may be that, or what needs no box.
@@ -105,6 +105,10 @@ class Panoptic(GridField):
         self.sky = channel.get(SKY)
         self.head = relu_layers(config.trunk_width, config.head_width, 1)
         self.classifier = nn.Linear(config.head_width, len(label_set))
+
+    def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
+        """Render rays; colours and classes are of the same few samples, as in the fit."""
+        return self.render_marched(self.march(rays, LOOKED_AT), sources)
 
     def classify(self, samples: RaySamples, sources: EncodedViews) -> tuple[torch.Tensor, torch.Tensor]:
         """Log probabilities (R, L), and where they are known (R,): where a ray meets something, or sees the sky.
