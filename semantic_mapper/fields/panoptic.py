@@ -40,9 +40,10 @@ class BoxesOnRays:
     """What boxes hold the K samples of R rays.
 
     Args:
-        box: (R, K, M) bool, whether the sample is in the interval.
+        box: (R, K, M) bool, whether the sample is in the interval, and the box has a say there: in a core, those have
+            whose centre it holds, such as books in a shelf.
         index: (R, M) int64 number of the box of each interval, -1 = none.
-        named: (R, K, L) classes of the boxes there, in a core those of the cores: 0 or 1.
+        named: (R, K, L) classes of the boxes there: 0 or 1.
         classes: (R, K, L) what may be there: these, and outside of the cores of boxes what needs no box: 0 or 1.
         on_ray: (R, L) bool, classes that are anywhere on the ray.
     """
@@ -88,6 +89,7 @@ class Panoptic(GridField):
     class_rows = ("classifier.weight", "classifier.bias")
     channel_of_box: torch.Tensor  # (P,) int64
     thing: torch.Tensor  # (P,) bool
+    within: torch.Tensor  # (P, P) bool, whether the centre of a box is in the core of another, or in its own
     outside: torch.Tensor  # (L,) 1 where a class may be outside of all boxes
 
     def __init__(self, config: PanopticConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
@@ -97,6 +99,8 @@ class Panoptic(GridField):
         loose = config.uncovered == "stuff"
         self.primitives = PrimitiveSet([resized(b, b.size + 2 * LOOSE_M) for b in boxes] if loose else boxes)
         self.cores = PrimitiveSet([resized(b, CORE * b.size) for b in boxes] if loose else [])
+        within = self.cores.inside(np.array([b.T_world_box[:3, 3] for b in boxes]).reshape(-1, 3))
+        self.register_buffer("within", torch.from_numpy(within), persistent=False)
         channel = {name: i for i, name in enumerate(label_set.names)}
         of_boxes = torch.tensor([_channel(channel, b.class_name) for b in config.boxes], dtype=torch.long)
         self.register_buffer("channel_of_box", of_boxes, persistent=False)
@@ -139,16 +143,25 @@ class Panoptic(GridField):
 
     def boxes_on(self, samples: RaySamples) -> BoxesOnRays:
         """What boxes hold samples."""
-        found, inside, named = self._named(self.primitives, samples)
-        allowed, classes = named, len(self.label_set)
+        z, classes = samples.z.detach(), len(self.label_set)
+        found = trimmed(self.primitives.intervals(samples.rays)).to(z.device)
+        inside = found.inside(z)
+        in_core = torch.zeros_like(inside[..., :1])
+        if len(self.cores):
+            cores = trimmed(self.cores.intervals(samples.rays)).to(z.device)
+            core = cores.inside(z)
+            in_core = core.any(-1, keepdim=True)
+            within = self.within[found.index.clamp_min(0)[:, None], cores.index.clamp_min(0)[:, :, None]]  # R C M
+            inside &= ~in_core | (torch.einsum("rkc,rcm->rkm", core.float(), within.float()) > 0)
         channel = torch.where(found.index < 0, classes, self._channels(found.index))
+        named = torch.zeros(*z.shape, classes + 1, device=z.device)
+        named.scatter_add_(2, channel[:, None].expand(inside.shape), inside.float())
+        named = (named[..., :classes] > 0).float()
+        allowed = named
         on_ray = torch.zeros(len(channel), classes + 1, dtype=torch.bool, device=channel.device)
         on_ray = on_ray.scatter_(1, channel, value=True)[:, :classes]
         if self.shape.uncovered == "stuff":
-            _, _, core = self._named(self.cores, samples)
-            in_core = core.any(-1, keepdim=True)
-            named = torch.where(in_core, core, named)
-            allowed = torch.where(in_core, core, torch.maximum(named, self.outside))
+            allowed = torch.where(in_core, named, torch.maximum(named, self.outside))
             on_ray = on_ray | (self.outside > 0)
         if self.sky is not None:
             on_ray[:, self.sky] = True
@@ -190,15 +203,6 @@ class Panoptic(GridField):
         inside = found.inside(z.expand(len(origin), -1)).any(-1).view(grid.shape)
         grown = nn.functional.max_pool3d(inside[None, None].float(), 3, 1, 1)[0, 0]
         return grown > 0
-
-    def _named(self, primitives: PrimitiveSet, samples: RaySamples) -> tuple[Intervals, torch.Tensor, torch.Tensor]:
-        """Intervals of rays, which samples are inside (R, K, M), and classes of the boxes there (R, K, L), 0 or 1."""
-        found = trimmed(primitives.intervals(samples.rays)).to(samples.z.device)
-        inside, classes = found.inside(samples.z.detach()), len(self.label_set)
-        channel = torch.where(found.index < 0, classes, self._channels(found.index))
-        named = torch.zeros(*samples.z.shape, classes + 1, device=samples.z.device)
-        named.scatter_add_(2, channel[:, None].expand(inside.shape), inside.float())
-        return found, inside, (named[..., :classes] > 0).float()
 
     def _channels(self, index: torch.Tensor) -> torch.Tensor:
         return self.channel_of_box[index.clamp_min(0)] if len(self.channel_of_box) else torch.zeros_like(index)
