@@ -8,18 +8,22 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from semantic_mapper.benchmark.config import camera_of_width
 from semantic_mapper.config import PanopticConfig, SamplingConfig
 from semantic_mapper.evaluation.bootstrap import paired_bootstrap
 from semantic_mapper.evaluation.metrics import ConfusionMatrix, confusion_of
+from semantic_mapper.evaluation.panoptic import PanopticCounts, PanopticImage
 from semantic_mapper.fields.panoptic import Panoptic, box_config
 from semantic_mapper.fields.primitives import Primitive
 from semantic_mapper.fields.render import render_image
@@ -29,11 +33,13 @@ from semantic_mapper.labels import ROOMS, STUFF_NAMES
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.nodes.cli.map_answers import answer_instances
 from semantic_mapper.plots import write_picture
-from semantic_mapper.queries.instances import InstanceTracker
-from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.oriented_box import upright_box
+from semantic_mapper.replay.box_picture import edges_in_view
 from semantic_mapper.replay.boxes import load_boxes
-from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, RoomConfig, Scene, make_room, room_frames
+from semantic_mapper.replay.evaluate.thing_surface import ThingSurface
+from semantic_mapper.replay.instance_images import thing_image
+from semantic_mapper.scenes import CameraPathConfig, NoiseConfig, RoomConfig, Scene, make_room
+from semantic_mapper.scenes.sequence import room_views
 from semantic_mapper.training.finetune import FinetuneConfig, PanopticFitConfig
 from semantic_mapper.training.grid_fit import GridFitConfig
 from semantic_mapper.training.panoptic import fit_panoptic
@@ -46,30 +52,37 @@ INFLATED = 1.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedRoom:
-    """A room's frames with true labels, those of S-Ray, those of the map cast back, and boxes of its things."""
+    """A room's frames with the true things, labels of S-Ray, those and things of the map cast back, and boxes."""
 
     frames: list[PosedFrame]
+    things: list[NDArray[np.uint16]]
     pseudo: UInt8
-    cast: UInt8
+    cast: list[PanopticImage]
     true_boxes: tuple[Primitive, ...]
     found_boxes: tuple[Primitive, ...]
 
 
 def map_room(seed: int, count: int, width: int, keep: Path) -> MappedRoom:
     """Map a room as ``replay`` does it; what was rendered is kept in a folder."""
-    frames = list(room_frames(seed, count, camera_of_width(width), path=CameraPathConfig(), noise=NoiseConfig()))
-    labels, things = keep / f"{seed}-{count}-{width}.npz", keep / f"{seed}-{count}-{width}.json"
-    if not things.is_file():
+    views = list(room_views(seed, count, camera_of_width(width), path=CameraPathConfig(), noise=NoiseConfig()))
+    frames = [view.frame for view in views]
+    kept, boxes = (keep / f"{seed}-{count}-{width}{end}" for end in ("-things.npz", ".json"))
+    if not kept.is_file():
         keep.mkdir(parents=True, exist_ok=True)
         mapper = Mapper.load()
         pseudo = [mapper.step(replace(f, label=None)).label for f in frames]
-        cast = [mapper.voxel_map.ray_cast(f.T_world_camera, f.intrinsics).label for f in frames]
-        np.savez_compressed(labels, pseudo=np.stack(pseudo), cast=np.stack(cast))
-        found = InstanceTracker(up=UP).update(MapMirror.of(mapper.voxel_map).snapshot())
-        things.write_text(json.dumps({"map": "room", **answer_instances(UP.tolist(), found)}))
-    with np.load(labels) as kept:
-        found_boxes = load_boxes(things).primitives
-        return MappedRoom(frames, kept["pseudo"], kept["cast"], thing_boxes(make_room(seed, RoomConfig())), found_boxes)
+        surface, cast = ThingSurface(mapper.voxel_map), list[PanopticImage]()
+        for f in frames:
+            seen = mapper.voxel_map.ray_cast(f.T_world_camera, f.intrinsics)
+            cast.append(surface.panoptic(seen, f.T_world_camera, f.intrinsics))
+        boxes.write_text(json.dumps({"map": "room", **answer_instances(UP.tolist(), surface.things)}))
+        label, instance = (np.stack(images) for images in zip(*cast, strict=True))
+        np.savez_compressed(kept, pseudo=np.stack(pseudo), label=label, instance=instance)
+    with np.load(kept) as found:
+        cast = list(map(PanopticImage, found["label"], found["instance"]))
+        true_boxes = thing_boxes(make_room(seed, RoomConfig()))
+        things = [view.rendered.instance for view in views]
+        return MappedRoom(frames, things, found["pseudo"], cast, true_boxes, load_boxes(boxes).primitives)
 
 
 def thing_boxes(scene: Scene) -> tuple[Primitive, ...]:
@@ -91,23 +104,44 @@ def thing_boxes(scene: Scene) -> tuple[Primitive, ...]:
     return tuple(found)
 
 
-def predict(field: Panoptic, frame: PosedFrame) -> UInt8:
-    """Labels of a frame."""
+def predict(field: Panoptic, frame: PosedFrame) -> PanopticImage:
+    """Labels and things of a frame."""
     views = stack_sources([view_from_frame(replace(frame, label=None), field.label_set, frame.intrinsics.width)])
     depth_m = resize_depth(frame, frame.intrinsics)
     scene = (frame.intrinsics, frame.T_world_camera, depth_m, SamplingConfig(), 0)
     found = render_image(field, encoded_views(views, views.rgb[:, :0]), *scene)
     channel = np.where(found.known.numpy(), found.logits.argmax(1).numpy(), -1)
-    return ROOMS.to_ids(channel).reshape(depth_m.shape)
+    label = ROOMS.to_ids(channel).reshape(depth_m.shape)
+    return PanopticImage(label, thing_image(field, frame, label))
 
 
-def score(frames: Sequence[PosedFrame], labels: Sequence[UInt8]) -> ConfusionMatrix:
-    """All frames; a pixel without an answer is wrong."""
-    total = ConfusionMatrix(ROOMS)
-    for frame, label in zip(frames, labels, strict=True):
+def score(room: MappedRoom, every: int, found: Sequence[PanopticImage]) -> tuple[ConfusionMatrix, PanopticCounts]:
+    """Every n-th frame of a room; a pixel without an answer is wrong."""
+    total, counts = ConfusionMatrix(ROOMS), PanopticCounts(ROOMS)
+    for frame, things, image in zip(room.frames[::every], room.things[::every], found, strict=True):
         assert frame.label is not None
-        total = total + confusion_of(frame.label, label, ROOMS, "frame")
-    return total
+        total = total + confusion_of(frame.label, image.label, ROOMS, "frame")
+        counts.update(PanopticImage(frame.label, things), image)
+    return total, counts
+
+
+def fit(room: MappedRoom, kind: str, given: argparse.Namespace) -> Panoptic:
+    """The field of a room."""
+    losses = PanopticFitConfig()
+    for text in given.set:
+        name, value = text.split("=")
+        losses = msgspec.structs.replace(losses, **{name: type(getattr(losses, name))(float(value))})
+    grid = GridFitConfig(held_out=0)
+    config = FinetuneConfig(seconds=0, steps=given.steps, width=given.width, grid=grid, panoptic=losses)
+    labels = room.pseudo if given.pseudo == "sray" else [image.label for image in room.cast]
+    taught = [replace(f, label=label, label_is_pseudo=True) for f, label in zip(room.frames, labels, strict=True)]
+    boxes = tuple(map(box_config, room.true_boxes if kind == "true" else room.found_boxes))
+    start = Panoptic(PanopticConfig(boxes=boxes, uncovered=given.uncovered), ROOMS)
+    began = time.process_time()
+    checkpoint = fit_panoptic(taught, ROOMS, start, config)
+    print(f"  {kind} boxes: fit {time.process_time() - began:.0f} CPU s; {checkpoint.recipe['panoptic']}", flush=True)
+    assert isinstance(checkpoint.model, Panoptic)
+    return checkpoint.model
 
 
 def main() -> None:
@@ -116,67 +150,77 @@ def main() -> None:
     parser.add_argument("--rooms", nargs="+", type=int, default=[100000])
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--width", type=int, default=160)
-    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--boxes", choices=["true", "query"], nargs="+", default=["true", "query"])
+    parser.add_argument("--pseudo", choices=["sray", "map"], default="map", help="labels to learn from")
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="of PanopticFitConfig")
     parser.add_argument("--uncovered", choices=["stuff", "empty"], default="stuff")
     parser.add_argument("--every", type=int, default=1, help="score every n-th frame")
     parser.add_argument("--keep", type=Path, required=True, help="folder for what the mapper has rendered")
-    parser.add_argument("--out", type=Path, help="PNG of a few frames")
+    parser.add_argument("--out", type=Path, help="PNG of a few frames of the last room")
     given = parser.parse_args()
-    fit = PanopticFitConfig()
-    for text in given.set:
-        name, value = text.split("=")
-        fit = msgspec.structs.replace(fit, **{name: type(getattr(fit, name))(float(value))})
-    config = FinetuneConfig(
-        seconds=0, steps=given.steps, width=given.width, grid=GridFitConfig(held_out=0), panoptic=fit
-    )
-    rows: dict[str, list[ConfusionMatrix]] = {}
-    sheets: list[UInt8] = []
-    for seed in given.rooms:
-        room = map_room(seed, given.frames, given.width, given.keep)
-        scored = room.frames[:: given.every]
-        answers: dict[str, list[UInt8]] = {
-            "S-Ray": list(room.pseudo[:: given.every]),
-            "map cast back": list(room.cast[:: given.every]),
-        }
-        taught = [
-            replace(f, label=label, label_is_pseudo=True) for f, label in zip(room.frames, room.pseudo, strict=True)
-        ]
-        for kind in given.boxes:
-            boxes = tuple(map(box_config, room.true_boxes if kind == "true" else room.found_boxes))
-            start = Panoptic(PanopticConfig(boxes=boxes, uncovered=given.uncovered), ROOMS)
-            began = time.process_time()
-            checkpoint = fit_panoptic(taught, ROOMS, start, config)
-            spent = time.process_time() - began
-            field = checkpoint.model
-            assert isinstance(field, Panoptic)
-            began = time.process_time()
-            answers[f"panoptic, {kind} boxes"] = [predict(field, f) for f in scored]
-            rendering = (time.process_time() - began) / len(scored)
-            print(f"room {seed}, {kind} boxes: fit {spent:.0f} CPU s, a frame {rendering:.2f}", flush=True)
-            print(f"  {checkpoint.recipe['panoptic']}", flush=True)
-        for name, labels in answers.items():
-            found = score(scored, labels)
-            rows.setdefault(name, []).append(found)
-            figures = found.metrics()
-            print(f"  room {seed} {name}: {_per_cent(figures.miou)}; {_per_cent(figures.total_accuracy)}", flush=True)
-        for number in np.linspace(0, len(scored) - 1, 3).round().astype(int):
-            truth = scored[number].label
-            assert truth is not None
-            shown = [ROOMS.colorize(labels[number]) for labels in answers.values()]
-            sheets.append(np.hstack([scored[number].rgb, *shown, ROOMS.colorize(truth)]))
     torch.set_num_threads(1)
+    rows: dict[str, list[tuple[ConfusionMatrix, PanopticCounts]]] = {}
+    for seed in given.rooms:
+        print(f"room {seed}", flush=True)
+        room = map_room(seed, given.frames, given.width, given.keep)
+        no_things = np.zeros_like(room.things[0])
+        answers = {
+            "S-Ray": [PanopticImage(label, no_things) for label in room.pseudo[:: given.every]],
+            "map cast back": room.cast[:: given.every],
+        }
+        for kind in given.boxes:
+            field = fit(room, kind, given)
+            began = time.process_time()
+            answers[f"panoptic, {kind} boxes"] = [predict(field, f) for f in room.frames[:: given.every]]
+            seconds = (time.process_time() - began) / len(answers["S-Ray"])
+            print(f"  a frame with its things: {seconds:.2f} CPU s", flush=True)
+        for name, found in answers.items():
+            rows.setdefault(name, []).append(score(room, given.every, found))
+            print("  " + _row(name, *rows[name][-1]), flush=True)
+        if given.out is not None:
+            draw(room, given, answers)
     for name, found in rows.items():
-        figures = sum(found[1:], found[0]).metrics()
+        matrices, counts = [matrix for matrix, _ in found], [of for _, of in found]
         change = ""
         for other in ("S-Ray", "map cast back"):
             if name not in ("S-Ray", other) and len(found) > 1:
-                c = paired_bootstrap(found, rows[other])
-                change += f" | {100 * c.observed:+.1f} ({100 * c.low:+.1f} to {100 * c.high:+.1f}) over {other}"
-        print(f"| {name} | {_per_cent(figures.miou)} | {_per_cent(figures.total_accuracy)} |{change}")
-    if given.out is not None:
-        write_picture(given.out, np.vstack(sheets))
+                c = paired_bootstrap(matrices, [matrix for matrix, _ in rows[other]])
+                change += f" {100 * c.observed:+.1f} ({100 * c.low:+.1f} to {100 * c.high:+.1f}) over {other};"
+        print(_row(name, sum(matrices[1:], matrices[0]), sum(counts[1:], counts[0])) + change)
+
+
+def draw(room: MappedRoom, given: argparse.Namespace, answers: Mapping[str, Sequence[PanopticImage]]) -> None:
+    """Image, boxes, labels of S-Ray, of the last answer and true ones, things of both, of two frames."""
+    rows: list[UInt8] = []
+    last = list(answers.values())[-1]
+    boxes = room.found_boxes if given.boxes[-1] == "query" else room.true_boxes
+    for number in np.linspace(0, len(last) - 1, 4).round().astype(int)[1:3]:
+        frame, things = (of[number * given.every] for of in (room.frames, room.things))
+        assert frame.label is not None
+        drawn = frame.rgb.copy()
+        for box in boxes:
+            for (ax, ay), (bx, by) in edges_in_view(box, frame.T_world_camera, frame.intrinsics):
+                cv2.line(drawn, (round(ax), round(ay)), (round(bx), round(by)), (255, 200, 0), 1, cv2.LINE_AA)
+        s_ray, found, truth = map(ROOMS.colorize, (answers["S-Ray"][number].label, last[number].label, frame.label))
+        true_things = np.where(np.isin(frame.label, ROOMS.thing_ids(STUFF_NAMES)), things, 0)
+        numbers = (thing_colours(last[number].instance), thing_colours(true_things))
+        rows.append(np.hstack([frame.rgb, drawn, s_ray, found, truth, *numbers]))
+    write_picture(given.out, np.vstack(rows))
+
+
+def thing_colours(number: NDArray[np.integer[Any]]) -> UInt8:
+    """A colour for each thing, black where there is none."""
+    colours = np.random.default_rng(3).integers(60, 256, (65536, 3)).astype(np.uint8)
+    colours[0] = 0
+    return colours[number]
+
+
+def _row(name: str, matrix: ConfusionMatrix, counts: PanopticCounts) -> str:
+    labels, things = matrix.metrics(), counts.metrics()
+    of_things = "-" if name == "S-Ray" else f"{_per_cent(things.pq)} | {_per_cent(things.pq_things)}"
+    by_class = ", ".join(f"{n} {_per_cent(v)}" for n, v in labels.per_class.items())
+    return f"| {name} | {_per_cent(labels.miou)} | {_per_cent(labels.total_accuracy)} | {of_things} | {by_class}"
 
 
 def _per_cent(value: float | None) -> str:

@@ -26,7 +26,7 @@ from semantic_mapper.fields.panoptic import Panoptic
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.labels import make_label_set
 from semantic_mapper.plots import draw_picture_rows
-from semantic_mapper.replay.box_picture import edges_in_image
+from semantic_mapper.replay.box_picture import edges_in_view
 from semantic_mapper.scenes.sequence import RoomView
 from semantic_mapper.scenes.suite import STREETS_SUITE
 from semantic_mapper.scenes.survey import depth_picture
@@ -65,7 +65,7 @@ def with_boxes(view: RoomView, street: Drive, field: Panoptic) -> UInt8:
         z = float((T_camera_world @ box.T_world_box[:, 3])[2])
         if not box.thing or not 0 < z < BOXES_M:
             continue
-        for ends in edges_in_image(box, T_camera_world, k):
+        for ends in edges_in_view(box, view.T_world_camera, k):
             (x0, y0), (x1, y1) = (np.clip((ends + 0.5) * FINER, -1e5, 1e5)).round().astype(int).tolist()
             cv2.line(image, (x0, y0), (x1, y1), colors[box.class_name], 2, cv2.LINE_AA)
     return np.asarray(image, np.uint8)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.primitives import Primitive
+from semantic_mapper.fields.primitives import Primitive, resized
 from semantic_mapper.labels import STUFF_NAMES
 from semantic_mapper.replay.boxes import MAX_ID, BoxFile
 from semantic_mapper.types import Float64
@@ -64,7 +64,7 @@ class BoxEditor:
         """Give a box another size (3,) along its own axes; its middle stays."""
         if not (self._finite(box_id, size) > 0).all():
             raise ConfigError(f"{self.path}, box {box_id}: sizes must be above 0 m, got {size.tolist()}")
-        self._change(box_id, lambda box: _resized(box, size))
+        self._change(box_id, lambda box: resized(box, size))
 
     def duplicate(self, box_id: int) -> int:
         """Put a copy of a box where it is, under the least free id above all others, which is returned."""
@@ -121,15 +121,6 @@ class BoxEditor:
 
     def _set(self, primitives: tuple[Primitive, ...]) -> None:
         self.boxes = replace(self.boxes, primitives=primitives)
-
-
-def _resized(box: Primitive, size: Float64) -> Primitive:
-    ratio = size / box.size
-    if box.polygon is not None:
-        return replace(box, size=size, polygon=box.polygon * ratio[:2])
-    if box.vertices is not None:
-        return replace(box, size=size, vertices=box.vertices * ratio)
-    return replace(box, size=size)
 
 
 def _listed(numbers: Sequence[int]) -> str:

@@ -147,7 +147,7 @@ def _put_edges(axes: Axes, box: Primitive, at: _Place, color: Color) -> None:
     """The edges of a box in the tile of a frame, and its id where its middle is in view."""
     T_camera_world, k = invert_pose(at.T_world_camera), at.intrinsics
     scale = TILE_WIDTH / k.width
-    for ends in edges_in_image(box, T_camera_world, k):
+    for ends in edges_in_view(box, at.T_world_camera, k):
         x, y = ((ends + 0.5) * scale).T
         axes.plot(x, y, color=_rgb(color), linewidth=1.4, linestyle="-")
     middle = transform(T_camera_world, box.T_world_box[:3, 3][None])
@@ -156,11 +156,11 @@ def _put_edges(axes: Axes, box: Primitive, at: _Place, color: Color) -> None:
         _put_id(axes, float(x), float(y), box.id)
 
 
-def edges_in_image(box: Primitive, T_camera_world: Float64, intrinsics: CameraIntrinsics) -> list[Float64]:
-    """Edges of a box's corners in front of a camera: both ends (2, 2) of each in pixels."""
-    corners = transform(T_camera_world, box.corners())
-    edges = (_in_front(corners[a], corners[b]) for a, b in _EDGES)
-    return [project(ends, intrinsics) for ends in edges if ends is not None]
+def edges_in_view(box: Primitive, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> list[Float64]:
+    """Ends (2, 2) in pixels of the edges of a box, as far as they are in front of a camera."""
+    corners = transform(invert_pose(T_world_camera), box.corners())
+    ends = [_in_front(corners[a], corners[b]) for a, b in _EDGES]
+    return [project(e, intrinsics) for e in ends if e is not None]
 
 
 def _in_front(a: Float64, b: Float64) -> Float64 | None:

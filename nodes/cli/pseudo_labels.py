@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import structlog
 
 from semantic_mapper.config import PanopticConfig
@@ -33,12 +34,14 @@ class PseudoLabels:
         of: The frame, by number in the log, with its pseudo label; None as a label where there is none.
         source: For people.
         train_stamps_ns: Frames whose true labels those who made them have learned from.
+        once_all_are_seen: A frame and its label, once ``of`` has seen all of them.
     """
 
     label_set: LabelSet
     of: Callable[[PosedFrame, int], PosedFrame]
     source: str
     train_stamps_ns: frozenset[int] = frozenset()
+    once_all_are_seen: Callable[[PosedFrame], PosedFrame] = lambda frame: frame
 
 
 def open_pseudo_labels(log: Log, pseudo: Path | None) -> PseudoLabels:
@@ -58,8 +61,11 @@ def open_pseudo_labels(log: Log, pseudo: Path | None) -> PseudoLabels:
         return PseudoLabels(log.info.label_set, lambda frame, _: frame, "the log's own label images")
     mapper = Mapper.load(pseudo)
     mapper.voxel_map.note_scale(log.info.scale_known)
-    source = f"{mapper.weights_path.name}, rendered on the fly"
-    return PseudoLabels(mapper.label_set, lambda f, _: _rendered(mapper, f), source, mapper.checkpoint.train_stamps_ns)
+    source = f"the map that {mapper.weights_path.name} makes of the frames"
+    stamps = mapper.checkpoint.train_stamps_ns
+    return PseudoLabels(
+        mapper.label_set, lambda f, _: _rendered(mapper, f), source, stamps, lambda f: _cast_back(mapper, f)
+    )
 
 
 def read_pseudo_labelled(
@@ -105,7 +111,7 @@ def read_pseudo_labelled(
         raise LogError(f"{log.path}: no frame has a pseudo label ({reasons[0] if reasons else labels.source})")
     if reasons:
         _log.warning("frames_without_pseudo_label", count=len(reasons), reason=reasons[0])
-    return frames
+    return [labels.once_all_are_seen(frame) for frame in frames]
 
 
 def boxed_field(boxes: BoxFile, path: Path, label_set: LabelSet, uncovered: str) -> tuple[Panoptic, int]:
@@ -133,3 +139,11 @@ def _of_folder(folder: LabelFolder, frame: PosedFrame, number: int) -> PosedFram
 def _rendered(mapper: Mapper, frame: PosedFrame) -> PosedFrame:
     label = mapper.step(replace(frame, label=None, label_is_pseudo=False)).label
     return replace(frame, label=label, label_is_pseudo=True)
+
+
+def _cast_back(mapper: Mapper, frame: PosedFrame) -> PosedFrame:
+    """A frame with the labels of the map, and its own where the map has none: many views err less than one."""
+    if frame.label is None:
+        return frame
+    seen = mapper.voxel_map.ray_cast(frame.T_world_camera, frame.intrinsics).label
+    return replace(frame, label=np.where(seen == mapper.label_set.ignore_id, frame.label, seen))

@@ -168,6 +168,10 @@ def score_table(title: str, scores: Mapping[str, Any]) -> Table:
     table.add_section()
     for name in dict.fromkeys(n for m in methods.values() for n in m["per_class"]):
         table.add_row(f"IoU {name}", *(_show(m["per_class"].get(name)) for m in methods.values()))
+    table.add_section()
+    of_things = [m.get("pq_per_class", {}) for m in methods.values()]
+    for name in dict.fromkeys(n for classes in of_things for n in classes):
+        table.add_row(f"PQ {name}", *(_show(c[name]["pq"] if name in c else None) for c in of_things))
     return table
 
 

@@ -22,10 +22,14 @@ from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.grid.field import GridField, RaySamples
 from semantic_mapper.fields.irt import at_measured
 from semantic_mapper.fields.nerf_math import relu_layers
-from semantic_mapper.fields.primitives import Intervals, Primitive, PrimitiveSet
+from semantic_mapper.fields.primitives import Intervals, Primitive, PrimitiveSet, resized
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
-from semantic_mapper.types import Int64, RayBatch
+from semantic_mapper.types import FieldRender, Int64, RayBatch
 
+# Where boxes need not cover everything (``uncovered`` is stuff), they are coarse: the core of a box holds nothing but
+# what it says. Between there and a little beyond its faces may be that, or what needs no box.
+CORE = 0.85  # of a box's size
+LOOSE_M = 0.04  # beyond its faces
 LOOKED_AT = 8  # samples of a ray that say its class
 LEAST = 1e-6  # of a rendered probability
 SKY = "sky"  # class of light that leaves the grid and meets no box, where the label set has it
@@ -36,23 +40,34 @@ class BoxesOnRays:
     """What boxes hold the K samples of R rays.
 
     Args:
-        box: (R, K, M) bool, whether the sample is in the interval.
+        box: (R, K, M) bool, whether the sample is in the interval, and the box has a say there: in a core, those have
+            whose centre it holds, such as books in a shelf.
         index: (R, M) int64 number of the box of each interval, -1 = none.
-        classes: (R, K, L) what the boxes allow: 0 or 1.
+        named: (R, K, L) classes of the boxes there: 0 or 1.
+        classes: (R, K, L) what may be there: these, and outside of the cores of boxes what needs no box: 0 or 1.
         on_ray: (R, L) bool, classes that are anywhere on the ray.
         behind: (R,) int64 class of light that leaves the grid: of the first box there, else sky; -1 = neither.
     """
 
     box: torch.Tensor
     index: torch.Tensor
+    named: torch.Tensor
     classes: torch.Tensor
     on_ray: torch.Tensor
     behind: torch.Tensor
 
     @property
     def fixed(self) -> torch.Tensor:
-        """The fixed field (R, K, L): equal shares of what is allowed."""
-        return self.classes / self.classes.sum(-1, keepdim=True).clamp_min(1)
+        """The fixed field (R, K, L): equal shares of what boxes say, or of the rest; near their faces half of each."""
+        parts = [p / p.sum(-1, keepdim=True).clamp_min(1) for p in (self.named, self.classes - self.named)]
+        both = parts[0] + parts[1]
+        return both / both.sum(-1, keepdim=True).clamp_min(1)
+
+    def allowed_of(self, points: torch.Tensor) -> torch.Tensor:
+        """Probabilities (R, K, L) of what may be there alone; as they are where nothing may be."""
+        allowed = points * self.classes
+        total = allowed.sum(-1, keepdim=True)
+        return torch.where(total > 0, allowed / total.clamp_min(LEAST), points)
 
     @property
     def covered(self) -> torch.Tensor:
@@ -76,12 +91,18 @@ class Panoptic(GridField):
     class_rows = ("classifier.weight", "classifier.bias")
     channel_of_box: torch.Tensor  # (P,) int64
     thing: torch.Tensor  # (P,) bool
+    within: torch.Tensor  # (P, P) bool, whether the centre of a box is in the core of another, or in its own
     outside: torch.Tensor  # (L,) 1 where a class may be outside of all boxes
 
     def __init__(self, config: PanopticConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
         super().__init__(config, label_set, sampling)
         self.shape = config
-        self.primitives = PrimitiveSet([primitive_of(b) for b in config.boxes])
+        boxes = [primitive_of(b) for b in config.boxes]
+        loose = config.uncovered == "stuff"
+        self.primitives = PrimitiveSet([resized(b, b.size + 2 * LOOSE_M) for b in boxes] if loose else boxes)
+        self.cores = PrimitiveSet([resized(b, CORE * b.size) for b in boxes] if loose else [])
+        within = self.cores.inside(np.array([b.T_world_box[:3, 3] for b in boxes]).reshape(-1, 3))
+        self.register_buffer("within", torch.from_numpy(within), persistent=False)
         channel = {name: i for i, name in enumerate(label_set.names)}
         of_boxes = torch.tensor([_channel(channel, b.class_name) for b in config.boxes], dtype=torch.long)
         self.register_buffer("channel_of_box", of_boxes, persistent=False)
@@ -91,6 +112,10 @@ class Panoptic(GridField):
         self.head = relu_layers(config.trunk_width, config.head_width, 1)
         self.classifier = nn.Linear(config.head_width, len(label_set))
 
+    def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
+        """Render rays; colours and classes are of the same few samples, as in the fit."""
+        return self.render_marched(self.march(rays, LOOKED_AT), sources)
+
     def classify(self, samples: RaySamples, sources: EncodedViews) -> tuple[torch.Tensor, torch.Tensor]:
         """Log probabilities (R, L), and where they are known (R,): where a ray meets something, or sees what is behind
         the grid.
@@ -99,7 +124,7 @@ class Panoptic(GridField):
         """
         samples = heaviest(at_measured(samples, self.grid.config), LOOKED_AT)
         boxes = self.boxes_on(samples)
-        points = boxes.fixed if self.shape.classes == "fixed" else self.learned(samples)
+        points = boxes.fixed if self.shape.classes == "fixed" else boxes.allowed_of(self.learned(samples))
         rendered = self.composited(samples, points, boxes)
         behind = rendered.argmax(1) == boxes.behind
         return torch.log(rendered.clamp_min(LEAST)), self.known(samples) | (behind & self.fitted)
@@ -118,22 +143,29 @@ class Panoptic(GridField):
 
     def boxes_on(self, samples: RaySamples) -> BoxesOnRays:
         """What boxes hold samples."""
-        found = trimmed(self.primitives.intervals(samples.rays)).to(samples.z.device)
-        inside = found.inside(samples.z.detach())
-        none, classes = found.index < 0, len(self.label_set)
-        channel = torch.where(none, classes, self._channels(found.index))
-        allowed = torch.zeros(*samples.z.shape, classes + 1, device=samples.z.device)
-        allowed.scatter_add_(2, channel[:, None].expand(inside.shape), inside.float())
-        allowed = (allowed[..., :classes] > 0).float()
+        z, classes = samples.z.detach(), len(self.label_set)
+        found = trimmed(self.primitives.intervals(samples.rays)).to(z.device)
+        inside = found.inside(z)
+        in_core = torch.zeros_like(inside[..., :1])
+        if len(self.cores):
+            cores = trimmed(self.cores.intervals(samples.rays)).to(z.device)
+            core = cores.inside(z)
+            in_core = core.any(-1, keepdim=True)
+            within = self.within[found.index.clamp_min(0)[:, None], cores.index.clamp_min(0)[:, :, None]]  # R C M
+            inside &= ~in_core | (torch.einsum("rkc,rcm->rkm", core.float(), within.float()) > 0)
+        channel = torch.where(found.index < 0, classes, self._channels(found.index))
+        named = torch.zeros(*z.shape, classes + 1, device=z.device)
+        named.scatter_add_(2, channel[:, None].expand(inside.shape), inside.float())
+        named = (named[..., :classes] > 0).float()
+        allowed = named
         on_ray = torch.zeros(len(channel), classes + 1, dtype=torch.bool, device=channel.device)
         on_ray = on_ray.scatter_(1, channel, value=True)[:, :classes]
         if self.shape.uncovered == "stuff":
-            outside = ~inside.any(-1)
-            allowed = torch.where(outside[..., None], self.outside, allowed)
+            allowed = torch.where(in_core, named, torch.maximum(named, self.outside))
             on_ray = on_ray | (self.outside > 0)
         if self.sky is not None:
             on_ray[:, self.sky] = True
-        return BoxesOnRays(inside, found.index, allowed, on_ray, self._behind(samples.rays, found))
+        return BoxesOnRays(inside, found.index, named, allowed, on_ray, self._behind(samples.rays, found))
 
     def _behind(self, rays: RayBatch, found: Intervals) -> torch.Tensor:
         beyond = (found.index >= 0) & (found.leave > self._exit_z(rays)[:, None])

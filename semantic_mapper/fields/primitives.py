@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -72,6 +72,16 @@ class Primitive:
         """The 8 corners (8, 3) of its box, world metres; the last axis changes fastest."""
         signs = np.stack(np.meshgrid(*(3 * [(-0.5, 0.5)]), indexing="ij"), -1).reshape(8, 3)
         return (signs * self.size) @ self.T_world_box[:3, :3].T + self.T_world_box[:3, 3]
+
+
+def resized(box: Primitive, size: Float64) -> Primitive:
+    """A primitive of another size (3,) along its own axes; outlines and meshes scale with it."""
+    ratio = size / box.size
+    if box.polygon is not None:
+        return replace(box, size=size, polygon=box.polygon * ratio[:2])
+    if box.vertices is not None:
+        return replace(box, size=size, vertices=box.vertices * ratio)
+    return replace(box, size=size)
 
 
 class Meshes(NamedTuple):

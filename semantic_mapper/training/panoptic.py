@@ -200,7 +200,7 @@ def ambiguous_fraction(field: Panoptic, data: PseudoRays, config: FinetuneConfig
     with torch.no_grad():
         samples = field.march(rays, 1)
         boxes = field.boxes_on(samples)
-        several = boxes.covered[:, 0] & (boxes.classes[:, 0].sum(-1) > 1)
+        several = boxes.named[:, 0].sum(-1) > 1
     return float((several & (samples.opacity > 0.5)).float().mean())
 
 

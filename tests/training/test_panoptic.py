@@ -14,7 +14,7 @@ import torch
 from semantic_mapper.config import BoxConfig, GridConfig, PanopticConfig
 from semantic_mapper.errors import ConfigError, FrameError, LabelError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from semantic_mapper.fields.panoptic import Panoptic, box_config, merged_classes, primitive_of
+from semantic_mapper.fields.panoptic import BoxesOnRays, Panoptic, box_config, merged_classes, primitive_of
 from semantic_mapper.fields.primitives import Primitive
 from semantic_mapper.fields.source_maps import encoded_views
 from semantic_mapper.labels import make_label_set
@@ -181,18 +181,42 @@ def test_merged_classes_share_a_pseudo_label() -> None:
         assert bool((density != 0).any()) == moves
 
 
-def test_what_boxes_say_is_shared_where_they_overlap() -> None:
-    floor = box(2, "floor", (0.0, 0.0, 0.3), (4.0, 4.0, 1.0))
-    field = empty_field(DECK, floor, uncovered="empty")
+def along_a_ray(field: Panoptic, *z: float) -> BoxesOnRays:
+    """What boxes hold points on a ray straight down from 2 m, through the middle of the deck."""
     field.fitted_steps.fill_(1)
     one, none = torch.ones(1), torch.zeros(1)
     rays = RayBatch(torch.tensor([(0.8, 0.0, 2.0)]), torch.tensor([(0.0, 0.0, -1.0)]), 0.1 * one, 9 * one, none)
     samples = field.march(rays)
-    z = torch.tensor([[0.5, 1.1, 1.35, 1.8]])  # outside, deck, both, floor
-    points = rays.origin[:, None] + z[..., None] * rays.direction[:, None]
-    found = field.boxes_on(replace(samples, z=z, points=points, weight=torch.ones(1, 4) / 4))
+    depths = torch.tensor([z])
+    points = rays.origin[:, None] + depths[..., None] * rays.direction[:, None]
+    return field.boxes_on(replace(samples, z=depths, points=points, weight=torch.ones_like(depths) / len(z)))
+
+
+def test_what_boxes_say_is_shared_where_they_overlap() -> None:
+    floor = box(2, "floor", (0.0, 0.0, 0.3), (4.0, 4.0, 1.0))
+    field = empty_field(DECK, floor, uncovered="empty")
+    found = along_a_ray(field, 0.5, 1.1, 1.35, 1.8)  # outside, deck, both, floor
     assert found.fixed[0].tolist() == [[0, 0, 0, 0], [0, 1, 0, 0], [0.5, 0.5, 0, 0], [1, 0, 0, 0]]
     assert found.on_ray[0].tolist() == [True, True, False, True]
+
+
+def test_near_the_faces_of_a_box_its_class_and_what_needs_no_box_are_possible() -> None:
+    heights = (0.95, 0.98, 1.02, 1.05, 1.48)  # above the box, near its top (twice), inside, near its bottom
+    table, rest, either = [0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 1.0, 0.0], [1.0, 1.0, 1.0, 0.0]
+    found = along_a_ray(empty_field(DECK), *heights)
+    assert found.classes[0].tolist() == [rest, either, either, table, either]
+    assert found.fixed[0, 1].tolist() == [0.25, 0.5, 0.25, 0.0]
+    said = found.allowed_of(torch.full((1, 5, 4), 0.25))
+    assert said[0, 3].tolist() == table and said[0, 0].tolist() == [0.5, 0.0, 0.5, 0.0]
+    exact = along_a_ray(empty_field(DECK, uncovered="empty"), *heights)
+    assert exact.classes[0].tolist() == [[0.0] * 4, [0.0] * 4, table, table, table]
+
+
+def test_in_the_core_of_a_box_others_have_a_say_where_it_holds_their_centre() -> None:
+    within, above = box(8, "lamp", (0.8, 0.0, 0.75), (0.2, 0.2, 0.2)), box(9, "lamp", (0.8, 0.0, 1.1), (0.3, 0.3, 0.3))
+    # Near the bottom of the upper lamp, near the top of the lower one, and inside of that.
+    found = along_a_ray(empty_field(DECK, within, above), 1.045, 1.13, 1.25)
+    assert found.classes[0].tolist() == [[0, 1, 0, 0], [0, 1, 1, 0], [0, 1, 1, 0]]
 
 
 def test_of_overlapping_boxes_of_a_class_the_nearer_centre_has_the_point() -> None:
@@ -227,7 +251,7 @@ def test_boxes_survive_the_config() -> None:
 
 def test_what_cannot_be_fitted_is_refused() -> None:
     far = box(1, "table", (90.0, 0.0, 0.0), (1, 1, 1))
-    with pytest.raises(ConfigError, match=r"boxes lie from \(89.50, .*cameras from .*world frame\?"):
+    with pytest.raises(ConfigError, match=r"boxes lie from \(89.46, .*cameras from .*world frame\?"):
         fit_panoptic(scene(), SET, empty_field(far), SMALL)
     with pytest.raises(ConfigError, match="needs boxes"):
         fit_panoptic(scene(), SET, empty_field(), SMALL)

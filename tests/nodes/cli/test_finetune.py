@@ -87,7 +87,7 @@ def test_eval_scores_the_map_with_its_things_where_objects_are_known(
     assert done.returncode == 0, done.stderr
     seen = json.loads(file.read_text())["logs"][str(log)]["methods"]["map seen from frames"]
     assert 0 <= seen["pq"] <= seen["pq_plus"] <= 1 and seen["panoptic_frames"] == 2
-    assert "PQ of things" in done.stdout
+    assert "PQ of things" in done.stdout and "PQ wall" in done.stdout
     assert run("eval", tmp_path, "--instances", tmp_path).returncode == 2
 
 

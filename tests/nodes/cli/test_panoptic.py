@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,10 @@ import pytest
 from semantic_mapper.fields.checkpoint import load_checkpoint
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS, STUFF_NAMES
+from semantic_mapper.mapper import Mapper
+from semantic_mapper.nodes.cli.console import frame_progress
+from semantic_mapper.nodes.cli.pseudo_labels import open_pseudo_labels, read_pseudo_labelled
+from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.log.sequence import open_log
 from tests.nodes.support import error_line, run
 from tests.small import tiny_frames
@@ -86,3 +91,18 @@ def test_what_does_not_go_with_boxes_is_refused(log: Path, boxes: Path, weights:
     done = run("autolabel", log, "--weights", weights, "--instances", tmp_path / "i", "--out", tmp_path / "n.mcap")
     assert done.returncode == 1 and "has no boxes" in error_line(done.stderr)
     assert not (tmp_path / "i").exists()
+
+
+def test_weights_teach_with_the_map_that_they_make_of_the_frames(log: Path, weights: Path) -> None:
+    with open_log(log) as opened, frame_progress("read", len(opened)) as bar:
+        labels = open_pseudo_labels(opened, weights)
+        taught = read_pseudo_labelled(opened, labels, lambda frame: frame, 0, 96, StopRequest(), bar)
+        mapper = Mapper.load(weights)
+        own = [mapper.step(replace(frame, label=None)).label for frame in opened]
+    nothing, mapped, changed = mapper.label_set.ignore_id, 0, 0
+    for frame, label in zip(taught, own, strict=True):
+        assert frame.label is not None and frame.label_is_pseudo
+        seen = mapper.voxel_map.ray_cast(frame.T_world_camera, frame.intrinsics).label
+        np.testing.assert_array_equal(frame.label, np.where(seen == nothing, label, seen))
+        mapped, changed = mapped + int((seen != nothing).sum()), changed + int((frame.label != label).sum())
+    assert mapped and changed
