@@ -59,7 +59,9 @@ def build_kernels(folder: Path, machine: str) -> list[Path]:
             command += [f"-mcpu={processor}", *FLAGS, f'-DSOURCE_DIGEST="{source_digest()}"', "-o", str(partial)]
             command += [*map(str, sorted(SOURCES.glob("*.c"))), "-lm"]
             subprocess.run(command, env=environment, check=True)
-            library.write_bytes(partial.read_bytes())
+            beside = library.with_suffix(".new")
+            beside.write_bytes(partial.read_bytes())
+            beside.replace(library)  # a process that has loaded the old one keeps it
             built.append(library)
     return built
 
