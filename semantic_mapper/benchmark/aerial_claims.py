@@ -52,6 +52,8 @@ CLAIMS = (
     Claim("above Color-NeRF", "58.7 / 56.8", MIOU, "irt-rttc", "irt-colour", least=0.0),
     Claim("20 points are no better than 10", "51.2 / 51.1", MIOU, "irt-20-points", "irt-rttc", least=-1.0, most=1.0),
     Claim("the default of finetune above carried labels", "", MIOU, "irt-bc", "warp", least=0.0),
+    Claim("RTTC above BC", "", MIOU, "irt-rttc", "irt-plain-bc", least=0.0),
+    Claim("RTTC above BC, labels carried", "", MIOU, "irt-carry", "irt-bc", least=0.0),
     Claim("stage 1 brings", "a figure only", MIOU, "irt-rttc", "irt-no-stage-1", least=10.0),
     Claim("dark: half of the U-Net's drop", "18 / 81", DARK_DROP, "irt-rttc", "unet", most=0.0, factor=0.5),
     Claim(

@@ -104,7 +104,12 @@ def irt_fits(folder: Path) -> dict[str, Fit]:
         return fit
 
     variants: dict[str, IRTVariant] = {"irt-b": "B", "irt-rt": "RT", "irt-rtt": "RTT", "irt-rtc": "RTC"}
-    arms = {"irt-rttc": arm(), "irt-bc": arm("BC", carry=True, points=6), "irt-carry": arm(carry=True)}
+    arms = {
+        "irt-rttc": arm(),
+        "irt-bc": arm("BC", carry=True, points=6),
+        "irt-carry": arm(carry=True),
+        "irt-plain-bc": arm("BC"),
+    }
     arms |= {name: arm(variant) for name, variant in variants.items()}
     return arms | {
         "irt-colour": arm(colour=True),

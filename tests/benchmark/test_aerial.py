@@ -183,7 +183,7 @@ def test_a_grid_is_fitted_once_and_knows_depth(folder: Path) -> None:
 @pytest.mark.parametrize("name", ["warp", "semantic-nerf", "irt-b", "irt-carry"])
 def test_arms_on_a_grid_beat_one_class(name: str, folder: Path) -> None:
     scores = (field_arms(folder) | irt_arms(folder))[name](TINY, EPISODE)
-    assert miou(scores) > 7.0 > 5.0 > miou(score_episode(TINY, EPISODE, terrain))
+    assert miou(scores) > 5.0 > 3.0 * miou(score_episode(TINY, EPISODE, terrain))
 
 
 def test_a_dimmed_unet_sees_other_pictures_and_the_default_none() -> None:

@@ -12,6 +12,7 @@ from semantic_mapper.scenes.primitives import Assembly
 _FLOOR_M = KERB_M + 0.02
 _STALL_M, _STALL_LONG_M, _LANE_M = 2.6, 5.0, 6.0
 _MOST_CARS = 60
+_DIVIDED_M = 33.5  # width from which a block has two flat roofs
 
 
 def fill_blocks(b: TownBuilder, plan: TownPlan, lacking: frozenset[str]) -> None:
@@ -88,20 +89,16 @@ def _houses(b: TownBuilder, area: Rectangle, lacking: frozenset[str]) -> None:
 
 
 def _offices(b: TownBuilder, area: Rectangle, lacking: frozenset[str]) -> None:
-    """Two to four flat roofs of several heights round a yard."""
+    """One flat roof, or two of one height, before a yard."""
     _floor(b, area, "ground", b.square)
     wide, deep = area.size
-    split = b.between(0.42, 0.58)
-    halves = [(area.x0, area.x0 + split * wide), (area.x0 + split * wide, area.x1)]
-    for x0, x1 in halves:
-        if b.often(0.5):
-            rows = [(area.y0, area.y1 - deep * b.between(0.15, 0.35))]
-        else:
-            rows = [(area.y0, area.y0 + 0.5 * deep), (area.y0 + 0.5 * deep, area.y1)]
-        for y0, y1 in rows:
-            size = (x1 - x0 - b.between(1.5, 4.5), y1 - y0 - b.between(1.5, 4.0))
-            storeys = int(b.rng.integers(2, 7))
-            parts.flat_building(b, (x0 + x1) / 2, (y0 + y1) / 2, *size, storeys)
+    split = b.between(0.45, 0.55) if wide > _DIVIDED_M else 1.0
+    storeys, y0 = int(b.rng.integers(2, 7)), area.y0 + 0.5
+    y1 = area.y1 - deep * b.between(0.12, 0.3)
+    for x0, x1 in ((0.0, split), (split, 1.0)):
+        if x0 < x1:
+            size = (x1 - x0) * wide - b.between(1.0, 2.0), y1 - y0
+            parts.flat_building(b, area.x0 + (x0 + x1) / 2 * wide, (y0 + y1) / 2, *size, storeys)
     if "static" not in lacking:
         parts.static_thing(b, area.middle[0], area.y1 + 0.8, 0.0)
     for _ in range(2):

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from semantic_mapper.scenes.materials import Color, Material, Pattern, display_hsv
-from semantic_mapper.scenes.primitives import Assembly, Part, place_parts
+from semantic_mapper.scenes.primitives import Assembly, Part, rotation_x, rotation_z, turned_parts
 
 STOREY_M = 3.0
-ASPHALT_WALKS = 0.6  # of sidewalks and of the edges of flat roofs
 SHARED = 0.5  # probability that two classes of a pair share one material
 ROAD_M = 4.5  # half the width of a street
 WALK_M = 2.5  # width of a sidewalk
@@ -19,8 +18,8 @@ class TownBuilder:
     """Collects materials and parts in the frame of the world: centre of the town at the origin, z up, streets at 0.
 
     Few colours are shared by all classes, so that colour tells little. Flat roofs and bridges are of the streets' very
-    asphalt, and water and the floors of car parks have its colours; squares, walls, fronts and sidewalks are of one
-    pale stone, trees of the grass, and vehicles, signs and clothes of one set of lacquers.
+    asphalt, and edged alike; water, sidewalks and the floors of car parks have its colours; squares, walls, fronts and
+    paths are of one pale stone, trees of the grass, and vehicles, signs and clothes of one set of lacquers.
 
     Args:
         rng: Of everything that is drawn.
@@ -36,6 +35,7 @@ class TownBuilder:
         self.asphalt = self.material(plain, grey, scale_m=2.5, dim=0.65)
         self.water = self.material(plain, grey, scale_m=5.0, dim=0.6)
         self.parking = self.material(plain, grey, scale_m=3.5, dim=0.55)
+        self.walk = self.parking  # of sidewalks, and of the edges of bridges and flat roofs
         pale = (between(0.07, 0.11), between(0.06, 0.12), between(0.6, 0.66))
         self.paving = self.material(Pattern.TILES, pale, scale_m=1.2, dim=0.6)
         self.square = self.paving if self.often(SHARED) else self.material(plain, pale, scale_m=2.0, dim=0.6)
@@ -71,18 +71,17 @@ class TownBuilder:
         """A random one."""
         return items[int(self.rng.integers(len(items)))]
 
-    def walk(self) -> int:
-        """What a sidewalk, or the edge of a flat roof, is paved with."""
-        return self.parking if self.often(ASPHALT_WALKS) else self.paving
-
     def material(self, pattern: Pattern, hsv: Color, *, scale_m: float, dim: float = 0.8) -> int:
         """A new material whose second colour is ``dim`` times the first; returns its number."""
         a = display_hsv(*hsv)
         return self._add(pattern, a, (a[0] * dim, a[1] * dim, a[2] * dim), scale_m)
 
-    def place(self, assembly: Assembly, x: float, y: float, *, z: float = 0.0, yaw: float = 0.0) -> None:
-        """Put an assembly down."""
-        self.groups.append(place_parts(assembly, yaw, np.array([x, y, z])))
+    def place(
+        self, assembly: Assembly, x: float, y: float, *, z: float = 0.0, yaw: float = 0.0, tilt: float = 0.0
+    ) -> None:
+        """Put an assembly down, turned by ``yaw`` about z and then by ``tilt`` about the world's x axis."""
+        turn = rotation_x(tilt) @ rotation_z(yaw)
+        self.groups.append(turned_parts(assembly, turn, np.array([x, y, z])))
 
     def _add(self, pattern: Pattern, a: Color, b: Color, scale_m: float) -> int:
         self.materials.append(Material(pattern, a, b, scale_m, int(self.rng.integers(1 << 30))))

@@ -4,33 +4,84 @@ from __future__ import annotations
 
 import numpy as np
 
-from semantic_mapper.scenes.aerial.builder import KERB_M, STOREY_M, TownBuilder
+from semantic_mapper.scenes.aerial.builder import KERB_M, ROAD_M, STOREY_M, WALK_M, TownBuilder
 from semantic_mapper.scenes.primitives import Assembly
 
 _PARAPET_M = 0.7
-_EDGE_M = 1.6  # paved, along a parapet
+_LINED = 0.65  # of a lane's length
+_PITCH_M = 42.0  # from junction to junction, about
+LINE_M = 0.35  # width of a line
+LANE_M = 1.8  # middle of a lane off the middle of a street
+PARKED_M = 3.4  # middle of a parked car
+ZEBRAS = 0.45  # crossings between two junctions
+_DECK_CARS = 0.33  # on flat roofs; more than on streets, as their rows are short
 _GABLE_M = 0.35  # by which a roof stands out
 
 
 def flat_building(b: TownBuilder, x: float, y: float, wide: float, deep: float, storeys: int) -> None:
-    """A block under a roof of asphalt with white seams and machines; along the parapet it is paved as sidewalks are."""
-    house, wall, walk, high = Assembly("building"), b.pick(b.walls), b.walk(), STOREY_M * storeys
+    """A block under a deck for cars, which is made like the streets: asphalt between walks, lines, lamps."""
+    house, wall, high = Assembly("building"), b.pick(b.walls), STOREY_M * storeys
+    top = high + 0.2
     house.box(wall, (0, 0, high / 2), (wide, deep, high))
-    house.box(walk, (0, 0, high + 0.05), (wide - 0.4, deep - 0.4, 0.1))
-    house.box(b.asphalt, (0, 0, high + 0.1), (wide - 2 * _EDGE_M, deep - 2 * _EDGE_M, 0.2))
+    house.box(b.walk, (0, 0, high + 0.05), (wide - 0.4, deep - 0.4, 0.1))
+    inner = wide - 2 * WALK_M, deep - 2 * WALK_M
+    house.box(b.asphalt, (0, 0, high + 0.1), (*inner, 0.2))
     for side in (-1, 1):
-        house.box(walk, (side * (wide - 0.4) / 2, 0, high + _PARAPET_M / 2), (0.4, deep, _PARAPET_M))
-        house.box(walk, (0, side * (deep - 0.4) / 2, high + _PARAPET_M / 2), (wide, 0.4, _PARAPET_M))
-    for _ in range(2):  # seams as wide as the lines on the streets
-        if b.often(0.5):
-            house.box(b.paint, (b.between(-0.3, 0.3) * wide, 0, high + 0.2), (0.35, deep - 2 * _EDGE_M, 0.04))
-        else:
-            house.box(b.paint, (0, b.between(-0.3, 0.3) * deep, high + 0.2), (wide - 2 * _EDGE_M, 0.35, 0.04))
-    for _ in range(int(b.rng.integers(1, 4))):
-        size = (b.between(1.2, 3.5), b.between(1.2, 3.0), b.between(1.0, 2.6))
-        place = (b.between(-0.35, 0.35) * wide, b.between(-0.35, 0.35) * deep, high + 0.2 + size[2] / 2)
-        house.box(b.pick([*b.metal, *b.lacquers]), place, size)
+        house.box(b.walk, (side * (wide - 0.4) / 2, 0, high + _PARAPET_M / 2), (0.4, deep, _PARAPET_M))
+        house.box(b.walk, (0, side * (deep - 0.4) / 2, high + _PARAPET_M / 2), (wide, 0.4, _PARAPET_M))
+    yaw = 0.0 if inner[0] > inner[1] else np.pi / 2  # of the lanes
+    long, across = max(inner), min(inner)
+    lanes = round(across / (2 * ROAD_M))
+    for k in range(lanes):
+        aside = ((k + 0.5) / lanes - 0.5) * across
+        house.box(b.paint, (*along(0, 0, yaw, 0, aside), high + 0.2), (_LINED * long, LINE_M, 0.04), yaw=yaw)
+        if b.often(2 * ZEBRAS * long / _PITCH_M):
+            size = (3.0, across / lanes - 1, 0.04)
+            house.box(b.zebra, (*along(0, 0, yaw, long / 2 - 1.6, aside), high + 0.2), size, yaw=yaw)
+        cars_on(b, along(x, y, yaw, 0, aside), yaw, long, top + KERB_M, wide=across / lanes, often=_DECK_CARS)
+        if b.often(3 * long / _PITCH_M):
+            side = -1 if k == 0 else 1
+            at = b.between(-0.3, 0.3) * long, side * (across / 2 + 0.5)
+            street_lamp(b, *along(x, y, yaw, *at), yaw - side * np.pi / 2, z=top + KERB_M)
     b.place(house, x, y, z=KERB_M)
+
+
+def cars_on(
+    b: TownBuilder,
+    place: tuple[float, float],
+    yaw: float,
+    long: float,
+    z: float,
+    *,
+    often: float,
+    wide: float = 2 * ROAD_M,
+    tilt: float = 0.0,
+) -> None:
+    """Cars on a stretch of asphalt that is not a street.
+
+    Args:
+        b: Of the town.
+        place: Middle of the stretch.
+        yaw: Along which it runs.
+        long: Its length in metres, along the slope.
+        z: Height of the asphalt in its middle.
+        often: Probability that a place is taken, every 6 m on either side, where ``crowd`` is 1.
+        wide: Its width in metres.
+        tilt: By which a stretch along y is turned about x.
+    """
+    for at in np.arange(-long / 2 + 3, long / 2 - 2.9, 6.0):
+        for side in (-1, 1):
+            if b.often(often * b.crowd):
+                ahead = float(at) + b.between(-0.4, 0.4)
+                aside = side * min(LANE_M if b.often(0.4) else PARKED_M, wide / 2 - 1.1)
+                x, y = along(*place, yaw, ahead * float(np.cos(tilt)), aside)
+                car(b, x, y, yaw, z=z + ahead * float(np.sin(tilt)), tilt=tilt)
+
+
+def along(x: float, y: float, yaw: float, ahead: float, left: float) -> tuple[float, float]:
+    """A place seen from (x, y), looking along ``yaw``."""
+    c, s = float(np.cos(yaw)), float(np.sin(yaw))
+    return x + c * ahead - s * left, y + s * ahead + c * left
 
 
 def gabled_house(b: TownBuilder, x: float, y: float, wide: float, deep: float, yaw: float) -> None:
@@ -59,14 +110,14 @@ def tree(b: TownBuilder, x: float, y: float, *, z: float = KERB_M) -> None:
     b.place(growth, x, y, z=z)
 
 
-def car(b: TownBuilder, x: float, y: float, yaw: float, *, z: float = 0.05) -> None:
+def car(b: TownBuilder, x: float, y: float, yaw: float, *, z: float = 0.05, tilt: float = 0.0) -> None:
     """Body, windows and roof of a car."""
     vehicle, paint = Assembly("car"), b.pick(b.lacquers)
     long, high = b.between(4.0, 4.8), b.between(1.4, 1.7)
     vehicle.pillow(paint, (0, 0, 0.58), (long, 1.85, 0.95))
     vehicle.pillow(b.glass, (-0.15, 0, high - 0.35), (long * 0.58, 1.65, 0.8))
     vehicle.box(paint, (-0.2, 0, high - 0.02), (long * 0.33, 1.35, 0.1))
-    b.place(vehicle, x, y, z=z, yaw=yaw)
+    b.place(vehicle, x, y, z=z, yaw=yaw, tilt=tilt)
 
 
 def bus(b: TownBuilder, x: float, y: float, yaw: float) -> None:
@@ -97,12 +148,12 @@ def person(b: TownBuilder, x: float, y: float) -> None:
     b.place(figure, x, y, z=KERB_M, yaw=b.between(0, np.pi))
 
 
-def street_lamp(b: TownBuilder, x: float, y: float, yaw: float) -> None:
+def street_lamp(b: TownBuilder, x: float, y: float, yaw: float, *, z: float = 0.0) -> None:
     """A post with an arm over the street (own x)."""
     post = Assembly("pole")
     post.cylinder(b.metal[0], (0, 0, 3.5), (0.3, 0.3, 7.0))
     post.box(b.metal[0], (1.0, 0, 7.0), (2.2, 0.3, 0.25))
-    b.place(post, x, y, yaw=yaw)
+    b.place(post, x, y, z=z, yaw=yaw)
 
 
 def traffic_light(b: TownBuilder, x: float, y: float, yaw: float) -> None:

@@ -8,15 +8,16 @@ import numpy as np
 
 from semantic_mapper.scenes.aerial import parts
 from semantic_mapper.scenes.aerial.builder import KERB_M, ROAD_M, WALK_M, TownBuilder
+from semantic_mapper.scenes.aerial.parts import LANE_M, LINE_M, PARKED_M, ZEBRAS, along
 from semantic_mapper.scenes.aerial.plan import DECK_M, RIVER_M, TownPlan
 from semantic_mapper.scenes.primitives import Assembly
 
 _FAR_M = 700.0  # where the land ends
 _WATER_M = -1.6
 _STREET_TOP_M = 0.04
-_LINE_M, _LINE_TOP_M = 0.35, 0.05
-_LANE_M = 1.8  # middle of a lane off the middle of a street
-_PARKED_M = 3.4  # middle of a parked car
+_LINE_TOP_M = 0.05
+_BRIDGE_CARS = 0.42  # as many as streets have, buses and trucks counted in
+_UNLINED_M = 7.5  # at the foot of a ramp
 
 
 def lay_ground(b: TownBuilder, plan: TownPlan) -> None:
@@ -50,19 +51,19 @@ def lay_streets(b: TownBuilder, plan: TownPlan) -> None:
             if high > low:
                 roads.box(b.asphalt, (x, (low + high) / 2, _STREET_TOP_M - 0.3), (2 * ROAD_M, high - low, 0.6))
     for x, y, along_x, long in segments(plan):
-        size = (long - 6.0, _LINE_M) if along_x else (_LINE_M, long - 6.0)
+        size = (long - 6.0, LINE_M) if along_x else (LINE_M, long - 6.0)
         lines.box(b.paint, (x, y, _LINE_TOP_M - 0.05), (*size, 0.1))
-        if b.often(0.45):
+        if b.often(ZEBRAS):
             at = (long / 2 - 1.6) * (1 if b.often(0.5) else -1)
             middle = (x + at, y) if along_x else (x, y + at)
             lines.box(b.zebra, (*middle, _LINE_TOP_M - 0.05), (3.0, 2 * ROAD_M - 1, 0.11) if along_x else _turned())
     for row in plan.block_rows():
         for column in range(len(plan.xs) - 1):
             block = plan.block(column, row)
-            walks.box(b.walk(), (*block.middle, KERB_M - 0.25), (*block.size, 0.5))
+            walks.box(b.walk, (*block.middle, KERB_M - 0.25), (*block.size, 0.5))
     for bank in (-1, 1):
         y = plan.ys[plan.river] if bank < 0 else plan.ys[plan.river + 1]
-        walks.box(b.paving, (0, y - bank * (ROAD_M + WALK_M / 2), KERB_M - 0.25), (x1 - x0, WALK_M, 0.5))
+        walks.box(b.walk, (0, y - bank * (ROAD_M + WALK_M / 2), KERB_M - 0.25), (x1 - x0, WALK_M, 0.5))
     _outer_walks(b, plan, walks)
     for assembly in (roads, lines, walks):
         b.place(assembly, 0, 0)
@@ -74,37 +75,48 @@ def _outer_walks(b: TownBuilder, plan: TownPlan, walks: Assembly) -> None:
     aside, z = ROAD_M + WALK_M / 2, KERB_M - 0.25
     banks = (y0 + ROAD_M, plan.ys[plan.river] + ROAD_M), (plan.ys[plan.river + 1] - ROAD_M, y1 + ROAD_M)
     for side, x, y in ((-1, x0, y0), (1, x1, y1)):
-        walks.box(b.walk(), (0, y + side * aside, z), (x1 - x0 + 2 * ROAD_M, WALK_M, 0.5))
+        walks.box(b.walk, (0, y + side * aside, z), (x1 - x0 + 2 * ROAD_M, WALK_M, 0.5))
         for low, high in banks:
-            walks.box(b.walk(), (x + side * aside, (low + high) / 2, z), (WALK_M, high - low, 0.5))
+            walks.box(b.walk, (x + side * aside, (low + high) / 2, z), (WALK_M, high - low, 0.5))
 
 
 def build_bridges(b: TownBuilder, plan: TownPlan) -> None:
-    """Decks of the streets' asphalt with sidewalks of the streets' paving, ramps down to them, and piers."""
+    """Decks of the streets' asphalt with their lines, walks, cars and lamps, ramps down to the streets, and piers."""
     foot = (plan.ys[plan.river + 1] - plan.ys[plan.river]) / 2 - ROAD_M  # from the middle of the river
     flat = RIVER_M + 1.0
     ramp, wide = foot - flat, 2 * (ROAD_M + WALK_M)
     slope, slant = float(np.arctan2(DECK_M, ramp)), float(np.hypot(DECK_M, ramp))
     for number in plan.bridges:
-        bridge, walks = Assembly("bridge"), {-1: b.walk(), 1: b.walk()}
+        bridge, here = Assembly("bridge"), (plan.xs[number], plan.river_y)
         bridge.box(b.asphalt, (0, 0, DECK_M - 0.5), (2 * ROAD_M, 2 * flat, 1.0))
-        bridge.box(b.paint, (0, 0, DECK_M), (_LINE_M, 2 * flat, 0.04), label="roadline")
+        bridge.box(b.paint, (0, 0, DECK_M), (LINE_M, 2 * flat, 0.04), label="roadline")
+        parts.cars_on(b, here, np.pi / 2, 2 * flat, DECK_M + 0.02, often=_BRIDGE_CARS)
         for end in (-1, 1):
             bridge.wedge(b.asphalt, (2 * ROAD_M, ramp, DECK_M), 0.0, 0.0 if end > 0 else np.pi, start=flat)
-            middle = end * (flat + ramp / 2)
-            tilt = -end * slope
-            bridge.box(b.paint, (0, middle, DECK_M / 2 + 0.02), (_LINE_M, slant, 0.04), label="roadline", tilt=tilt)
+            middle, tilt = end * (flat + ramp / 2), -end * slope
+            share = 1 - _UNLINED_M / slant  # of the ramp that has a line, from the deck on
+            at = (0, end * (flat + share * ramp / 2), DECK_M * (1 - share / 2) + 0.02)
+            bridge.box(b.paint, at, (LINE_M, share * slant, 0.04), label="roadline", tilt=tilt)
+            if b.often(2 * ZEBRAS):
+                low = (0, end * (foot - 1.8), DECK_M * 1.8 / ramp + 0.02)
+                bridge.box(b.zebra, low, (2 * ROAD_M - 1, 3.0, 0.06), label="roadline", tilt=tilt)
+            place, z = (here[0], here[1] + middle), DECK_M / 2 + 0.02
+            parts.cars_on(b, place, np.pi / 2, slant - 3.0, z, often=_BRIDGE_CARS, tilt=tilt)
             for side in (-1, 1):
                 x = side * (ROAD_M + WALK_M / 2)
-                bridge.box(walks[side], (x, middle, DECK_M / 2 + KERB_M - 0.5), (WALK_M, slant, 1.0), tilt=tilt)
+                bridge.box(b.walk, (x, middle, DECK_M / 2 + KERB_M - 0.5), (WALK_M, slant, 1.0), tilt=tilt)
                 rail = (side * wide / 2, middle, DECK_M / 2 + 0.4)
-                bridge.box(b.metal[1], rail, (0.3, slant, 1.6), tilt=tilt)
+                bridge.box(b.walk, rail, (0.3, slant, 1.6), tilt=tilt)
         for side in (-1, 1):
             x = side * (ROAD_M + WALK_M / 2)
-            bridge.box(walks[side], (x, 0, DECK_M + KERB_M - 0.5), (WALK_M, 2 * flat, 1.0))
-            bridge.box(b.metal[1], (side * wide / 2, 0, DECK_M + 0.4), (0.3, 2 * flat, 1.6))
+            bridge.box(b.walk, (x, 0, DECK_M + KERB_M - 0.5), (WALK_M, 2 * flat, 1.0))
+            bridge.box(b.walk, (side * wide / 2, 0, DECK_M + 0.4), (0.3, 2 * flat, 1.6))
             bridge.box(b.metal[2], (0, side * RIVER_M * 0.45, DECK_M / 2 - 1.5), (wide - 3, 1.6, DECK_M + 1))
-        b.place(bridge, plan.xs[number], plan.river_y)
+            for at in (-0.6, 0.25):
+                aside, ahead = side * (ROAD_M + 0.5), side * at * foot
+                z = DECK_M * min(1.0, (foot - abs(ahead)) / ramp)
+                parts.street_lamp(b, *along(*here, np.pi / 2, ahead, aside), np.pi / 2 - side * np.pi / 2, z=z)
+        b.place(bridge, *here)
 
 
 def fill_streets(b: TownBuilder, plan: TownPlan, lacking: frozenset[str]) -> None:
@@ -114,23 +126,15 @@ def fill_streets(b: TownBuilder, plan: TownPlan, lacking: frozenset[str]) -> Non
         for side in (-1, 1):
             _vehicles(b, (x, y), yaw, side, long, lacking)
             at, aside = b.between(-0.3, 0.3) * long, side * (ROAD_M + 0.5)
-            parts.street_lamp(b, *_along(x, y, yaw, at, aside), yaw - side * np.pi / 2)
+            parts.street_lamp(b, *along(x, y, yaw, at, aside), yaw - side * np.pi / 2)
             if "pedestrian" not in lacking:
                 for _ in range(int(b.rng.integers(0, 3) * b.crowd + 0.5)):
-                    parts.person(b, *_along(x, y, yaw, b.between(-0.4, 0.4) * long, side * (ROAD_M + 1.6)))
-        corner = _along(x, y, yaw, long / 2 - 1.5, -(ROAD_M + 0.6))
+                    parts.person(b, *along(x, y, yaw, b.between(-0.4, 0.4) * long, side * (ROAD_M + 1.6)))
+        corner = along(x, y, yaw, long / 2 - 1.5, -(ROAD_M + 0.6))
         if "trafficlight" not in lacking and b.often(0.3):
             parts.traffic_light(b, *corner, yaw + np.pi / 2)
         elif "trafficsign" not in lacking and b.often(0.35):
             parts.traffic_sign(b, *corner, yaw)
-    for number in plan.bridges:
-        for side in (-1, 1):
-            for at in (-8.0, 0.0, 8.0):
-                for aside in (_LANE_M, _PARKED_M):
-                    if b.often(0.24 * b.crowd):
-                        place = plan.xs[number] + side * aside, plan.river_y + at + b.between(-1, 1)
-                        parts.car(b, *place, side * np.pi / 2, z=DECK_M + 0.02)
-                        break
 
 
 def segments(plan: TownPlan) -> Iterator[tuple[float, float, bool, float]]:
@@ -172,17 +176,12 @@ def _vehicles(
     large = [name for name in ("bus", "truck") if name not in lacking]
     if large and b.often(0.24 * b.crowd):
         build = parts.bus if large[int(b.rng.integers(len(large)))] == "bus" else parts.truck
-        build(b, *_along(*place, yaw, b.between(-0.2, 0.2) * long, -side * _LANE_M), yaw + (side < 0) * np.pi)
+        build(b, *along(*place, yaw, b.between(-0.2, 0.2) * long, -side * LANE_M), yaw + (side < 0) * np.pi)
     elif b.often(0.5 * b.crowd):
-        parts.car(b, *_along(*place, yaw, b.between(-0.4, 0.4) * long, -side * _LANE_M), yaw)
+        parts.car(b, *along(*place, yaw, b.between(-0.4, 0.4) * long, -side * LANE_M), yaw)
     for at in np.arange(-long / 2 + 6.5, long / 2 - 5, 6.0):
         if b.often(0.24 * b.crowd):
-            parts.car(b, *_along(*place, yaw, float(at) + b.between(-0.4, 0.4), side * _PARKED_M), yaw)
-
-
-def _along(x: float, y: float, yaw: float, ahead: float, left: float) -> tuple[float, float]:
-    c, s = float(np.cos(yaw)), float(np.sin(yaw))
-    return x + c * ahead - s * left, y + s * ahead + c * left
+            parts.car(b, *along(*place, yaw, float(at) + b.between(-0.4, 0.4), side * PARKED_M), yaw)
 
 
 def _turned() -> tuple[float, float, float]:

@@ -19,7 +19,7 @@ from semantic_mapper.scenes.materials import display_hsv, material_table
 from semantic_mapper.scenes.primitives import pack
 from semantic_mapper.scenes.scene import NO_LAMPS, Scene
 
-AERIAL_VERSION = 2  # part of every seed: a change that alters a town raises it
+AERIAL_VERSION = 3  # part of every seed: a change that alters a town raises it
 AERIAL_CODE = 2207  # tells the random streams of this suite from those of others
 MAY_LACK = ("truck", "bus", "fence", "static", "dynamic", "pedestrian", "trafficsign", "trafficlight")
 
