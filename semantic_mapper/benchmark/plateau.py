@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
-PLATEAU = 0.005  # of mIoU in the last fifth of the steps: what gains or loses more is not at its plateau
+PLATEAU = 0.005  # of mIoU in the last fifth of the steps: a curve that changes by more is not at its plateau
 
 FittedT = TypeVar("FittedT")
 
 
 def fit_to_plateau(fit: Callable[[int], tuple[FittedT, float]], steps: int, doublings: int) -> tuple[FittedT, float]:
-    """Fit again with twice the steps until the last fifth of them changes the mIoU by less than ``PLATEAU``.
+    """Fit again with twice the steps until the last fifth of them brings less than ``PLATEAU`` of mIoU, or costs some.
 
     Args:
         fit: From steps to what was fitted, and the mIoU that its last fifth brought.
@@ -20,7 +20,7 @@ def fit_to_plateau(fit: Callable[[int], tuple[FittedT, float]], steps: int, doub
     """
     fitted, gain = fit(steps)
     for _ in range(doublings):
-        if abs(gain) < PLATEAU:
+        if gain < PLATEAU:
             break
         steps *= 2
         fitted, gain = fit(steps)
