@@ -108,7 +108,7 @@ def unet_fit(darkest: float = 1.0) -> Fit:
         def fit(steps: int) -> tuple[UNetBaseline, float]:
             return _fit_unet(config, seen, held_out, steps, darkest)
 
-        unet, _ = fit_to_plateau(fit, config.unet_steps, _MOST_DOUBLINGS)
+        unet, _ = fit_to_plateau(fit, config.unet_steps, _MOST_DOUBLINGS, a_loss_ends_it=True)
         return lambda frame, every: thin(unet.predict(frame), every)
 
     return run

@@ -170,6 +170,9 @@ def test_steps_are_doubled_until_the_plateau(reached: tuple[float, ...], steps: 
 
     assert fit_to_plateau(fit, 10, doublings=2) == (steps[-1], pytest.approx(gain))
     assert asked == steps
+    if reached[1] < reached[0] and gain > 0:
+        asked.clear()
+        assert fit_to_plateau(fit, 10, doublings=2, a_loss_ends_it=True)[0] == 10
 
 
 def test_settings_that_no_run_can_follow_are_refused(tmp_path: Path) -> None:
