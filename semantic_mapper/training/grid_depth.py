@@ -69,7 +69,8 @@ Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 def depth_bounds(frames: Sequence[PosedFrame]) -> Corners:
     """Corners of the box that the frames' depth reaches; one frame has some, at least."""
     points = np.concatenate([_measured(f) for f in frames if f.depth_m is not None])
-    return _with_margin(*np.percentile(points, (OUTLIERS, 100 - OUTLIERS), axis=0), MARGIN)
+    low, high = np.percentile(points, (OUTLIERS, 100 - OUTLIERS), axis=0)
+    return _with_margin(low, high, MARGIN)
 
 
 def image_bounds(frames: Sequence[PosedFrame], far_m: float) -> Corners:
@@ -87,7 +88,8 @@ def image_bounds(frames: Sequence[PosedFrame], far_m: float) -> Corners:
         )
         every = np.concatenate([_frustum(f, far_m) for f in frames])
         return _with_margin(every.min(0), every.max(0), MARGIN)
-    return _with_margin(*np.percentile(np.concatenate(shown), (CORNERS, 100 - CORNERS), axis=0), MARGIN_OF_TILES)
+    low, high = np.percentile(np.concatenate(shown), (CORNERS, 100 - CORNERS), axis=0)
+    return _with_margin(low, high, MARGIN_OF_TILES)
 
 
 def _with_margin(low: Float64, high: Float64, margin: float) -> Corners:
