@@ -198,6 +198,7 @@ class PanopticConfig(GridFieldConfig, frozen=True):
     # What may be outside of all boxes. stuff: the classes that are no things, and those that no box has. empty: nothing
     uncovered: Literal["stuff", "empty"] = "stuff"
     classes: Literal["learned", "fixed"] = "learned"  # what is rendered; fixed: what the boxes say, as an ablation
+    samples: Literal["march", "uniform"] = "march"  # of a ray; uniform: evenly from near to far, as an ablation
     boxes: tuple[BoxConfig, ...] = ()
     merge: dict[str, tuple[str, ...]] = {}  # by class of the pseudo labels: those that they cannot tell from it
 

@@ -1,4 +1,4 @@
-"""Arms of STREETS that fit a Panoptic NeRF to a street, whole or without one of its parts.
+"""Arms of STREETS that fit a Panoptic NeRF to a street, whole or without one of its parts, or from labels alone.
 
 Fits are kept in a folder, so that what is only rendered in another way needs no fit of its own.
 """
@@ -45,12 +45,17 @@ VERSION = 2  # raised by a change of the fit: older files are left alone and mad
 _BEHIND_M, _AHEAD_M, _ASIDE_M, _LOW_M, _HIGH_M = 2.0, 60.0, 20.0, -0.6, 11.0  # of the grid's box, round the cameras
 _AT_ONCE = 4096  # rays of a picture
 
+UNIFORM = "panoptic-uniform"  # samples evenly along rays
+GRID_LABELS = "grid-labels"  # no boxes: the predicted labels alone teach, as in Semantic-NeRF
+
 # Arms, and what each leaves out of the fit.
 LEFT_OUT: dict[str, dict[str, Any]] = {
     "panoptic": {},
     "panoptic-no-fixed-2d": {"fixed": 0.0},
     "panoptic-no-3d": {"points": 0.0},
     "panoptic-no-depth": {"depth": 0.0},
+    UNIFORM: {},
+    GRID_LABELS: {"fixed": 0.0, "points": 0.0},
 }
 
 
@@ -86,6 +91,14 @@ def fit_settings(config: StreetsConfig, street: Drive, name: str) -> FinetuneCon
     )
 
 
+def field_shape(street: Drive, name: str) -> PanopticConfig:
+    """Boxes of an arm's field, and how it samples rays."""
+    if name == GRID_LABELS:
+        return PanopticConfig()
+    boxes = tuple(box_config(p) for p in primitives_at([b for b in street.boxes if b.stamps is None], 0).primitives)
+    return PanopticConfig(boxes=boxes, uncovered="empty", samples="uniform" if name == UNIFORM else "march")
+
+
 def street_field(config: StreetsConfig, street: Drive, name: str, folder: Path) -> Panoptic:
     """The fitted field of an arm: read from ``folder``, or fitted and kept there."""
     settings = fit_settings(config, street, name)
@@ -93,8 +106,7 @@ def street_field(config: StreetsConfig, street: Drive, name: str, folder: Path) 
     path = folder / f"{name}-{street.seed}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.safetensors"
     if path.is_file():
         return _of(load_checkpoint(path))
-    boxes = tuple(box_config(p) for p in primitives_at([b for b in street.boxes if b.stamps is None], 0).primitives)
-    start = Panoptic(PanopticConfig(boxes=boxes, uncovered="empty"), STREETS_SUITE.label_set)
+    start = Panoptic(field_shape(street, name), STREETS_SUITE.label_set)
     frames = [*street.frames(), *(view.frame for view in street.right)]
     began = time.process_time()
     checkpoint = fit_panoptic(frames, STREETS_SUITE.label_set, start, settings)
@@ -119,7 +131,8 @@ def render_answer(field: Panoptic, frame: PosedFrame) -> Answer:
             depth = torch.where(samples.opacity > 0.5, depth, 0.0)
             found.append((channel.numpy(), field.instances(rays, channel).numpy(), depth.numpy()))
     channel, instance, depth = (np.concatenate(parts).reshape(k.height, k.width) for parts in zip(*found, strict=True))
-    return Answer(field.label_set.to_ids(channel), instance, depth.astype(np.float32))
+    things = instance if field.shape.boxes else None
+    return Answer(field.label_set.to_ids(channel), things, depth.astype(np.float32))
 
 
 def _of(checkpoint: Checkpoint) -> Panoptic:

@@ -20,6 +20,7 @@ from semantic_mapper.config import BoxConfig, PanopticConfig, SamplingConfig
 from semantic_mapper.errors import LabelError
 from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.grid.field import GridField, RaySamples
+from semantic_mapper.fields.grid.march import KEPT
 from semantic_mapper.fields.irt import at_measured
 from semantic_mapper.fields.nerf_math import relu_layers
 from semantic_mapper.fields.primitives import Intervals, Primitive, PrimitiveSet, resized
@@ -112,6 +113,16 @@ class Panoptic(GridField):
         self.head = relu_layers(config.trunk_width, config.head_width, 1)
         self.classifier = nn.Linear(config.head_width, len(label_set))
 
+    def march(self, rays: RayBatch, kept: int = KEPT, jitter: torch.Tensor | None = None) -> RaySamples:
+        """The samples of greatest weight of each ray, or as many evenly from where it enters the grid to its end."""
+        if self.shape.samples == "march":
+            return super().march(rays, kept, jitter)
+        enter, leave = self._span(rays)
+        place = 0.5 if jitter is None else jitter[:, None]
+        fraction = (torch.arange(kept, device=enter.device) + place) / kept
+        z = enter[:, None] + fraction * (leave - enter).clamp_min(LEAST)[:, None]
+        return self._samples_at(rays, self.grid.rays(rays), z)
+
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
         """Render rays; colours and classes are of the same few samples, as in the fit."""
         return self.render_marched(self.march(rays, LOOKED_AT), sources)
@@ -168,17 +179,18 @@ class Panoptic(GridField):
         return BoxesOnRays(inside, found.index, named, allowed, on_ray, self._behind(samples.rays, found))
 
     def _behind(self, rays: RayBatch, found: Intervals) -> torch.Tensor:
-        beyond = (found.index >= 0) & (found.leave > self._exit_z(rays)[:, None])
+        beyond = (found.index >= 0) & (found.leave > self._span(rays)[1][:, None])
         first = found.index.gather(1, beyond.float().argmax(1, keepdim=True))[:, 0]
         return torch.where(beyond.any(1), self._channels(first), -1 if self.sky is None else self.sky)
 
-    def _exit_z(self, rays: RayBatch) -> torch.Tensor:
-        """z (R,) at which rays leave the grid."""
+    def _span(self, rays: RayBatch) -> tuple[torch.Tensor, torch.Tensor]:
+        """z (R,) at which rays enter the grid, or begin in it, and at which they leave it; less where they miss it."""
         grid = self.grid.config
         low = rays.origin.new_tensor(grid.origin_m)
         high = low + grid.voxel_m * (rays.origin.new_tensor(grid.shape) - 1)
         step = torch.where(rays.direction.abs() < LEAST, LEAST, rays.direction)
-        return torch.maximum((low - rays.origin) / step, (high - rays.origin) / step).amin(1)
+        ends = (low - rays.origin) / step, (high - rays.origin) / step
+        return torch.maximum(torch.minimum(*ends).amax(1), rays.near_m), torch.maximum(*ends).amin(1)
 
     def instances(self, rays: RayBatch, label: torch.Tensor) -> torch.Tensor:
         """Which thing rays (R,) see (Eq. 8): ids (R,) of boxes of the class (R,), a channel; 0 where there is none.

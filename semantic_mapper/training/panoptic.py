@@ -21,7 +21,7 @@ from semantic_mapper.fields.grid.field import RaySamples
 from semantic_mapper.fields.grid.kernels import adam_grid
 from semantic_mapper.fields.grid.scene_grid import NOTHING
 from semantic_mapper.fields.learned import LearnedField
-from semantic_mapper.fields.panoptic import BoxesOnRays, Panoptic, merged_classes, ray_share
+from semantic_mapper.fields.panoptic import BoxesOnRays, Panoptic, heaviest, merged_classes, ray_share
 from semantic_mapper.imaging import resize_label
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
@@ -99,7 +99,8 @@ def fit_panoptic(
     Args:
         frames: With poses; their label images are the pseudo labels.
         label_set: Of these and of the boxes.
-        start: A ``Panoptic`` with the boxes; its weights are not looked at.
+        start: A ``Panoptic`` with the boxes; its weights are not looked at. Without boxes pseudo labels alone teach,
+            where ``config`` leaves out the losses that need some.
         config: ``seconds`` bounds the whole fit. ``steps``, if not 0, is the number of steps of each of its two parts.
         on_progress: Called after every step.
         stopped: Asked before every step; once it says so (anything true), the field so far is the result.
@@ -112,7 +113,8 @@ def fit_panoptic(
     """
     if config.seconds <= 0 and config.steps <= 0:
         raise ConfigError("a fit needs a budget: set seconds, steps, or both")
-    if not isinstance(start, Panoptic) or not start.shape.boxes:
+    by_boxes = config.panoptic.fixed > 0 or config.panoptic.points > 0
+    if not isinstance(start, Panoptic) or (by_boxes and not start.shape.boxes):
         raise ConfigError("a field of kind 'panoptic' needs boxes that stand still; give a file of them (--boxes)")
     if start.label_set != label_set:
         raise WeightsError(f"the boxes are of label set '{start.label_set.name}', the labels of '{label_set.name}'")
@@ -165,6 +167,8 @@ def survey_boxes(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> S
     Raises:
         ConfigError: no pixel does, or boxes and pseudo labels have no class in common.
     """
+    if not len(field.primitives):
+        return Survey(0, 0, 0.0, 1.0)
     pixels = _some_pixels(data, config.seed)
     rays = data.rays.rays(pixels, config.grid.near_m)
     found = field.primitives.intervals(rays)
@@ -198,7 +202,7 @@ def ambiguous_fraction(field: Panoptic, data: PseudoRays, config: FinetuneConfig
     """Fraction of pixels whose surface is in boxes of more than one class."""
     rays = data.rays.rays(_some_pixels(data, config.seed), config.grid.near_m)
     with torch.no_grad():
-        samples = field.march(rays, 1)
+        samples = heaviest(field.march(rays), 1)
         boxes = field.boxes_on(samples)
         several = boxes.named[:, 0].sum(-1) > 1
     return float((several & (samples.opacity > 0.5)).float().mean())

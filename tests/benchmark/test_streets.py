@@ -106,3 +106,10 @@ def test_a_field_is_fitted_once_and_rendered_in_two_ways(tmp_path: Path) -> None
     assert set(learned) == {"labels", "panoptic", "agreement", "depth"}
     assert not np.array_equal(learned["labels"][0], fixed["labels"][0])
     assert np.array_equal(learned["depth"][0], fixed["depth"][0])
+
+
+def test_a_grid_without_boxes_names_classes_and_no_things(tmp_path: Path) -> None:
+    config = msgspec.structs.replace(TINY, width=48, pairs=2, scored_every=1, voxel_m=2.5, field_steps=2)
+    found = panoptic_arms(tmp_path)["grid-labels"](config, SEED)
+    assert set(found) == {"labels", "agreement", "depth"}
+    assert "panoptic" in panoptic_arms(tmp_path)["panoptic-uniform"](config, SEED)

@@ -136,6 +136,25 @@ def test_weights_keep_boxes(tmp_path: Path) -> None:
     assert (answers(loaded, scene()[1])[0] == answers(field, scene()[1])[0]).float().mean() > 0.99
 
 
+def test_even_samples_spread_from_where_a_ray_enters_the_grid_to_where_it_leaves() -> None:
+    field = empty_field(DECK, samples="uniform")
+    field.fitted_steps.fill_(1)
+    origin, down = torch.tensor([(0.0, 0.0, 3.5), (0.0, 0.0, 0.5)]), torch.tensor([(0.0, 0.0, -1.0)] * 2)
+    rays = RayBatch(origin, down, torch.full((2,), 0.2), torch.full((2,), torch.inf), torch.zeros(2))
+    expected = torch.tensor([(1.5, 2.5, 3.5), (0.3333, 0.6, 0.8667)])  # the grid reaches from -0.5 to 2.5 m
+    torch.testing.assert_close(field.march(rays, 3, torch.tensor([0.5, 0.5])).z, expected, atol=1e-3, rtol=0)
+
+
+def test_labels_alone_teach_where_there_are_no_boxes() -> None:
+    losses = msgspec.structs.replace(SMALL.panoptic, fixed=0.0, points=0.0)
+    config = msgspec.structs.replace(SMALL, steps=4, panoptic=losses)
+    checkpoint = fit_panoptic(scene(), SET, empty_field(), config)
+    assert isinstance(checkpoint.model, Panoptic)
+    assert {LAMP, FLOOR} & set(answers(checkpoint.model, scene()[0])[0].tolist())
+    figures = checkpoint.recipe["panoptic"]
+    assert (figures["boxes"], figures["covered"], figures["matched"]) == (0, 0.0, 1.0)
+
+
 def gradients(
     field: Panoptic, origin: tuple[float, float, float], channel: int, learned: float = 1.0
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
