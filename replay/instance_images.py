@@ -85,6 +85,7 @@ def thing_image(field: Panoptic, frame: PosedFrame, label: UInt8) -> NDArray[np.
     with torch.no_grad():
         for part in asked.split(RAYS):
             prior = torch.from_numpy(depth[part.numpy()])
-            rays = pixel_rays(pixels[part], k, pose, near_m=near_m, far_m=field.sampling.far_m, prior_depth_m=prior)
+            at = {"near_m": near_m, "far_m": field.sampling.far_m, "stamp_ns": frame.stamp_ns}
+            rays = pixel_rays(pixels[part], k, pose, **at, prior_depth_m=prior)
             found[part.numpy()] = field.instances(rays, torch.from_numpy(channel[part.numpy()])).numpy()
     return found.reshape(label.shape)

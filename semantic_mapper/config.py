@@ -187,6 +187,7 @@ class BoxConfig(Config, frozen=True):
     polygon: tuple[tuple[float, float], ...] | None = None
     vertices: tuple[tuple[float, float, float], ...] | None = None
     faces: tuple[tuple[int, int, int], ...] | None = None
+    stamps: tuple[tuple[int, tuple[tuple[float, float, float, float], ...]], ...] | None = None  # of one that moves
 
 
 class PanopticConfig(GridFieldConfig, frozen=True):

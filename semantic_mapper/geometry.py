@@ -203,6 +203,7 @@ def pixel_rays(
     far_m: float,
     prior_depth_m: torch.Tensor | None = None,
     measured: torch.Tensor | None = None,
+    stamp_ns: int | None = None,
 ) -> RayBatch:
     """Rays through pixels, in world coordinates (S-Ray Eq. 3 with z as the parameter).
 
@@ -213,6 +214,7 @@ def pixel_rays(
         near_m, far_m: z bounds for every ray.
         prior_depth_m: (R,) z, 0 = none.
         measured: (R,) bool, where the prior is not filled in; None = wherever there is one.
+        stamp_ns: Of the view.
     """
     count = expect_shape(pixels, "R 2", "pixels")["R"]
     x = (pixels[:, 0] - intrinsics.cx) / intrinsics.fx
@@ -229,6 +231,7 @@ def pixel_rays(
         far_m=torch.full_like(x, far_m),
         prior_depth_m=prior_depth_m,
         measured=measured,
+        stamp_ns=stamp_ns,
     )
 
 

@@ -217,6 +217,7 @@ class RayBatch:
         prior_depth_m: (R,) float32 z from a sensor or a map, 0 = none.
         measured: (R,) bool, where the prior is measured at the very pixel rather than filled in from others; None =
             wherever there is a prior.
+        stamp_ns: When they are, for fields with things that move; None = such things are not there.
     """
 
     origin: torch.Tensor
@@ -225,6 +226,7 @@ class RayBatch:
     far_m: torch.Tensor
     prior_depth_m: torch.Tensor
     measured: torch.Tensor | None = None
+    stamp_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -114,22 +114,21 @@ def read_pseudo_labelled(
     return [labels.once_all_are_seen(frame) for frame in frames]
 
 
-def boxed_field(boxes: BoxFile, path: Path, label_set: LabelSet, uncovered: str) -> tuple[Panoptic, int]:
-    """An empty field with the boxes that stand still, and how many move, which are left out.
+def boxed_field(boxes: BoxFile, path: Path, label_set: LabelSet, uncovered: str) -> Panoptic:
+    """An empty field with the boxes.
 
     Raises:
-        ConfigError: a class that the label set lacks, or no box that stands still.
+        ConfigError: a class that the label set lacks, or no box.
     """
     check_classes(boxes, label_set, path)
-    still: Sequence[object] = [p for p in boxes.primitives if not p.moves]
-    if not still:
-        raise ConfigError(f"{path}: holds no box that stands still; draw some, or take `query MAP instances`")
+    if not boxes.primitives:
+        raise ConfigError(f"{path}: holds no box; draw some, or take `query MAP instances`")
     config = PanopticConfig(
-        boxes=tuple(box_config(p) for p in boxes.primitives if not p.moves),
+        boxes=tuple(box_config(p) for p in boxes.primitives),
         merge=dict(boxes.merge),
         uncovered="empty" if uncovered == "empty" else "stuff",
     )
-    return Panoptic(config, label_set), len(boxes.primitives) - len(still)
+    return Panoptic(config, label_set)
 
 
 def _of_folder(folder: LabelFolder, frame: PosedFrame, number: int) -> PosedFrame:

@@ -172,7 +172,7 @@ def _finetune_boxes(request: FinetuneRequest, boxes: BoxFile, stop: StopRequest,
     assert request.boxes is not None
     with open_log(request.log) as log:
         labels = open_pseudo_labels(log, request.pseudo)
-        start, moving = boxed_field(boxes, request.boxes, labels.label_set, request.uncovered)
+        start = boxed_field(boxes, request.boxes, labels.label_set, request.uncovered)
         computed = _compute_depths(log, request.depth, stop, bar)
         frames = read_pseudo_labelled(
             log,
@@ -188,7 +188,7 @@ def _finetune_boxes(request: FinetuneRequest, boxes: BoxFile, stop: StopRequest,
     if note is not None and any(f.label_is_pseudo for f in frames):
         seen |= frozenset(note.train_stamps_ns)
     checkpoint = _fit(Panoptic.kind, frames, labels.label_set, start, seen, request, stop, bar)
-    checkpoint.recipe["panoptic"] |= {"moving": moving, "left_out": boxes.left_out, "pseudo": labels.source}
+    checkpoint.recipe["panoptic"] |= {"left_out": boxes.left_out, "pseudo": labels.source}
     save_checkpoint(checkpoint, request.out)
     return checkpoint
 
@@ -229,8 +229,11 @@ def finetune_lines(checkpoint: Checkpoint, chosen: Sequence[int], request: Finet
             f"({boxed['pseudo']}) of {boxed['labelled_frames']} of {boxed['frames']} frames, matched "
             f"{_per_cent(boxed['matched'])}"
         )
-        if boxed["moving"] or boxed["left_out"]:
-            lines.append(f"  left out: {boxed['moving']} boxes that move, {boxed['left_out']} of no class")
+        if boxed["moving"]:
+            lines.append(f"  {boxed['moving']} boxes that move, with grids of their own")
+        if boxed["lost"] or boxed["left_out"]:
+            lost = f"{boxed['lost']} boxes that move, without depth inside of them"
+            lines.append(f"  left out: {lost}; {boxed['left_out']} of no class")
     if checkpoint.model.holds_scene:
         lines.append(f"  {out.stat().st_size / 1e6:.1f} MB that show the scene: as private as the recording")
     return lines

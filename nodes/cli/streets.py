@@ -40,7 +40,7 @@ def streets_suite(path: Path | None, tier: str | None, seed: int | None) -> ArmS
         file=f"streets-{config.width}",
         config=to_plain(config),
         label_set=STREETS_SUITE.label_set,
-        arms=lambda folder: ARMS | {"map": map_arm} | panoptic_arms(folder),
+        arms=lambda folder: ARMS | {"map": map_arm} | panoptic_arms(folder, moving=config.moving),
         units=config.streets,
         run=lambda arms, store, stopped: _run(config, arms, store, stopped),
         scores=scores,

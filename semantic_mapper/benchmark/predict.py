@@ -72,7 +72,7 @@ def predict_view(
     shown = any(frame is query for frame in sources)
     prior = depth_prior(depth_m, resize_rgb(query, query.intrinsics)) if shown else fill_holes(depth_m)
     scene = (renderer, encoded, query.intrinsics, query.T_world_camera, prior, sampling, tier.rays_per_chunk)
-    render = render_image(*scene, measured=depth_m > 0)
+    render = render_image(*scene, measured=depth_m > 0, stamp_ns=query.stamp_ns)
     return _as_prediction(render, field.label_set, label_set, (query.intrinsics.height, query.intrinsics.width))
 
 

@@ -136,19 +136,22 @@ def _drive(width: int, pairs: int, miou: float, every: int, moving: bool, seed: 
 
 def primitives_at(boxes: Sequence[StreetBox], number: int) -> PrimitiveSet:
     """Boxes as fields take them, those that move where they are in a frame."""
-    return PrimitiveSet(
-        [
-            Primitive(
-                id=box.id,
-                class_name=box.name,
-                shape=cast("ShapeName", box.shape),
-                T_world_box=box.T_world_box if box.stamps is None else box.stamps[number][1],
-                size=box.size,
-                thing=box.thing,
-                polygon=box.polygon,
-            )
-            for box in boxes
-        ]
+    places = [b.T_world_box if b.stamps is None else b.stamps[number][1] for b in boxes]
+    found = [replace(primitive(b), T_world_box=T, stamps=None) for b, T in zip(boxes, places, strict=True)]
+    return PrimitiveSet(found)
+
+
+def primitive(box: StreetBox) -> Primitive:
+    """A box as fields take it."""
+    return Primitive(
+        id=box.id,
+        class_name=box.name,
+        shape=cast("ShapeName", box.shape),
+        T_world_box=box.T_world_box,
+        size=box.size,
+        thing=box.thing,
+        polygon=box.polygon,
+        stamps=box.stamps,
     )
 
 

@@ -22,7 +22,7 @@ from semantic_mapper.benchmark.streets import (
     Drive,
     StreetsConfig,
     drive,
-    primitives_at,
+    primitive,
     score_street,
     streets_digest,
 )
@@ -45,12 +45,14 @@ VERSION = 2  # raised by a change of the fit: older files are left alone and mad
 _BEHIND_M, _AHEAD_M, _ASIDE_M, _LOW_M, _HIGH_M = 2.0, 60.0, 20.0, -0.6, 11.0  # of the grid's box, round the cameras
 _AT_ONCE = 4096  # rays of a picture
 
+STILL = "panoptic-still"  # boxes that move are left out, as if nothing moved; where cars drive
 UNIFORM = "panoptic-uniform"  # samples evenly along rays
 GRID_LABELS = "grid-labels"  # no boxes: the predicted labels alone teach, as in Semantic-NeRF
 
 # Arms, and what each leaves out of the fit.
 LEFT_OUT: dict[str, dict[str, Any]] = {
     "panoptic": {},
+    STILL: {},
     "panoptic-no-fixed-2d": {"fixed": 0.0},
     "panoptic-no-3d": {"points": 0.0},
     "panoptic-no-depth": {"depth": 0.0},
@@ -59,8 +61,8 @@ LEFT_OUT: dict[str, dict[str, Any]] = {
 }
 
 
-def panoptic_arms(folder: Path) -> dict[str, Arm]:
-    """Arms by name; fits are kept in ``folder``."""
+def panoptic_arms(folder: Path, *, moving: bool = False) -> dict[str, Arm]:
+    """Arms by name, some of them only where cars drive (``moving``); fits are kept in ``folder``."""
 
     def arm(name: str, classes: str) -> Arm:
         def run(config: StreetsConfig, seed: int) -> ViewScores:
@@ -71,7 +73,8 @@ def panoptic_arms(folder: Path) -> dict[str, Arm]:
 
         return run
 
-    return {name: arm(name, "learned") for name in LEFT_OUT} | {"panoptic-fixed": arm("panoptic", "fixed")}
+    names = [name for name in LEFT_OUT if moving or name != STILL]
+    return {name: arm(name, "learned") for name in names} | {"panoptic-fixed": arm("panoptic", "fixed")}
 
 
 def fit_settings(config: StreetsConfig, street: Drive, name: str) -> FinetuneConfig:
@@ -95,7 +98,7 @@ def field_shape(street: Drive, name: str) -> PanopticConfig:
     """Boxes of an arm's field, and how it samples rays."""
     if name == GRID_LABELS:
         return PanopticConfig()
-    boxes = tuple(box_config(p) for p in primitives_at([b for b in street.boxes if b.stamps is None], 0).primitives)
+    boxes = tuple(box_config(primitive(b)) for b in street.boxes if name != STILL or b.stamps is None)
     return PanopticConfig(boxes=boxes, uncovered="empty", samples="uniform" if name == UNIFORM else "march")
 
 
@@ -122,10 +125,11 @@ def render_answer(field: Panoptic, frame: PosedFrame) -> Answer:
     found: list[tuple[np.ndarray[Any, Any], ...]] = []
     with torch.inference_mode():
         for pixels in pixel_grid(k.width, k.height).split(_AT_ONCE):
-            rays = pixel_rays(pixels, k, pose, near_m=NEAR_M, far_m=np.inf)
+            rays = pixel_rays(pixels, k, pose, near_m=NEAR_M, far_m=np.inf, stamp_ns=frame.stamp_ns)
             samples = field.march(rays)
             boxes = field.boxes_on(samples)
             points = boxes.fixed if field.shape.classes == "fixed" else field.learned(samples)
+            points = field.of_movers(samples, points)
             channel = field.composited(samples, points, boxes).argmax(1)
             depth = (ray_share(samples) * samples.z).sum(1) / samples.opacity.clamp_min(1e-6)
             depth = torch.where(samples.opacity > 0.5, depth, 0.0)

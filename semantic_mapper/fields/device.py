@@ -44,7 +44,7 @@ def choose_device(name: DeviceName, local_rank: int) -> torch.device:
 def to_device(batch: BatchT, device: torch.device) -> BatchT:
     """A copy of a dataclass of tensors (``SourceViews``, ``RayBatch``, ``RayTargets``) on another device."""
     values = {f.name: getattr(batch, f.name) for f in fields(batch)}
-    return replace(batch, **{name: value if value is None else value.to(device) for name, value in values.items()})
+    return replace(batch, **{n: v.to(device) if isinstance(v, torch.Tensor) else v for n, v in values.items()})
 
 
 def bfloat16_is_fast(device: torch.device) -> bool:

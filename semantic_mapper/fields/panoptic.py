@@ -22,8 +22,9 @@ from semantic_mapper.fields.base import EncodedViews
 from semantic_mapper.fields.grid.field import GridField, RaySamples
 from semantic_mapper.fields.grid.march import KEPT
 from semantic_mapper.fields.irt import at_measured
+from semantic_mapper.fields.moving_boxes import MovingBoxes
 from semantic_mapper.fields.nerf_math import relu_layers
-from semantic_mapper.fields.primitives import Intervals, Primitive, PrimitiveSet, resized
+from semantic_mapper.fields.primitives import Intervals, Primitive, PrimitiveSet, resized, trimmed
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
 from semantic_mapper.types import FieldRender, Int64, RayBatch
 
@@ -33,6 +34,7 @@ CORE = 0.85  # of a box's size
 LOOSE_M = 0.04  # beyond its faces
 LOOKED_AT = 8  # samples of a ray that say its class
 LEAST = 1e-6  # of a rendered probability
+THERE = 0.01  # weight from which on something is next to a measured depth
 SKY = "sky"  # class of light that leaves the grid and meets no box, where the label set has it
 
 
@@ -80,7 +82,7 @@ class Panoptic(GridField):
     """Classes and instances of one scene from its boxes, its geometry and what label images taught.
 
     Args:
-        config: The grid's box, sizes, and the boxes; those that move are left out.
+        config: The grid's box, sizes, and the boxes; those that move have grids of their own.
         label_set: Classes of the logits.
         sampling: As of ``GridField``.
 
@@ -90,38 +92,49 @@ class Panoptic(GridField):
 
     kind = "panoptic"
     class_rows = ("classifier.weight", "classifier.bias")
-    channel_of_box: torch.Tensor  # (P,) int64
+    channel_of_box: torch.Tensor  # (P,) int64, of boxes that stand still
     thing: torch.Tensor  # (P,) bool
+    channel_of_mover: torch.Tensor  # (M,) int64, of boxes that move
+    moving_thing: torch.Tensor  # (M,) bool
     within: torch.Tensor  # (P, P) bool, whether the centre of a box is in the core of another, or in its own
     outside: torch.Tensor  # (L,) 1 where a class may be outside of all boxes
 
     def __init__(self, config: PanopticConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
         super().__init__(config, label_set, sampling)
         self.shape = config
-        boxes = [primitive_of(b) for b in config.boxes]
+        boxes = [primitive_of(b) for b in config.boxes if b.stamps is None]
+        movers = [primitive_of(b) for b in config.boxes if b.stamps is not None]
+        self.moving = MovingBoxes(movers, config.grid.voxel_m)
         loose = config.uncovered == "stuff"
         self.primitives = PrimitiveSet([resized(b, b.size + 2 * LOOSE_M) for b in boxes] if loose else boxes)
         self.cores = PrimitiveSet([resized(b, CORE * b.size) for b in boxes] if loose else [])
         within = self.cores.inside(np.array([b.T_world_box[:3, 3] for b in boxes]).reshape(-1, 3))
         self.register_buffer("within", torch.from_numpy(within), persistent=False)
         channel = {name: i for i, name in enumerate(label_set.names)}
-        of_boxes = torch.tensor([_channel(channel, b.class_name) for b in config.boxes], dtype=torch.long)
-        self.register_buffer("channel_of_box", of_boxes, persistent=False)
-        self.register_buffer("thing", torch.tensor([b.thing for b in config.boxes], dtype=torch.bool), persistent=False)
+        for names, those in (("channel_of_box", "thing"), boxes), (("channel_of_mover", "moving_thing"), movers):
+            channels = torch.tensor([_channel(channel, b.class_name) for b in those], dtype=torch.long)
+            self.register_buffer(names[0], channels, persistent=False)
+            things = torch.tensor([b.thing for b in those], dtype=torch.bool)
+            self.register_buffer(names[1], things, persistent=False)
         self.register_buffer("outside", torch.tensor(self._allowed_outside(label_set)).float(), persistent=False)
         self.sky = channel.get(SKY)
         self.head = relu_layers(config.trunk_width, config.head_width, 1)
         self.classifier = nn.Linear(config.head_width, len(label_set))
 
     def march(self, rays: RayBatch, kept: int = KEPT, jitter: torch.Tensor | None = None) -> RaySamples:
-        """The samples of greatest weight of each ray, or as many evenly from where it enters the grid to its end."""
+        """The samples of greatest weight of each ray, or as many evenly from where it enters the grid to its end.
+
+        Rays with a time meet the boxes that move, too.
+        """
         if self.shape.samples == "march":
-            return super().march(rays, kept, jitter)
-        enter, leave = self._span(rays)
-        place = 0.5 if jitter is None else jitter[:, None]
-        fraction = (torch.arange(kept, device=enter.device) + place) / kept
-        z = enter[:, None] + fraction * (leave - enter).clamp_min(LEAST)[:, None]
-        return self._samples_at(rays, self.grid.rays(rays), z)
+            samples = super().march(rays, kept, jitter)
+        else:
+            enter, leave = self._span(rays)
+            place = 0.5 if jitter is None else jitter[:, None]
+            fraction = (torch.arange(kept, device=enter.device) + place) / kept
+            z = enter[:, None] + fraction * (leave - enter).clamp_min(LEAST)[:, None]
+            samples = self._samples_at(rays, self.grid.rays(rays), z)
+        return heaviest(self.moving.composite(samples, kept), kept) if self.fitted else samples
 
     def render(self, rays: RayBatch, sources: EncodedViews) -> FieldRender:
         """Render rays; colours and classes are of the same few samples, as in the fit."""
@@ -133,9 +146,10 @@ class Panoptic(GridField):
 
         A ray whose depth was measured ends there.
         """
-        samples = heaviest(at_measured(samples, self.grid.config), LOOKED_AT)
+        samples = heaviest(self._at_measured(samples), LOOKED_AT)
         boxes = self.boxes_on(samples)
         points = boxes.fixed if self.shape.classes == "fixed" else boxes.allowed_of(self.learned(samples))
+        points = self.of_movers(samples, points)
         rendered = self.composited(samples, points, boxes)
         behind = rendered.argmax(1) == boxes.behind
         return torch.log(rendered.clamp_min(LEAST)), self.known(samples) | (behind & self.fitted)
@@ -145,6 +159,17 @@ class Panoptic(GridField):
         assert self.trunk is not None
         r = self.trunk(samples.points) if r is None else r
         return torch.softmax(self.classifier(self.head(r)), -1)
+
+    def of_movers(self, samples: RaySamples, points: torch.Tensor) -> torch.Tensor:
+        """Probabilities (R, K, L) of points; those of boxes that move have the box's class."""
+        if samples.mover is None:
+            return points
+        own = nn.functional.one_hot(self.channel_of_mover[samples.mover.clamp_min(0)], points.shape[2])
+        return torch.where((samples.mover >= 0)[..., None], own.to(points), points)
+
+    def colour(self, samples: RaySamples) -> torch.Tensor:
+        """Colours (R, K, 3) in [0, 1] of samples."""
+        return self.moving.colour(samples, super().colour(samples))
 
     def composited(self, samples: RaySamples, points: torch.Tensor, boxes: BoxesOnRays) -> torch.Tensor:
         """Probabilities (R, L) of rays, of those of points (R, K, L) and of what is behind the grid."""
@@ -197,23 +222,44 @@ class Panoptic(GridField):
 
         Where boxes of one class overlap, a point is of the one whose centre is nearer.
         """
-        samples = heaviest(at_measured(self.march(rays), self.grid.config), LOOKED_AT)
-        boxes = self.boxes_on(samples)
+        samples = heaviest(self._at_measured(self.march(rays)), LOOKED_AT)
+        share = ray_share(samples)
+        still = share if samples.mover is None else share * (samples.mover < 0)
+        weights = [still.new_zeros(len(label), 1), self._by_box(samples, still, label)]
+        if samples.mover is not None:
+            mover = samples.mover.clamp_min(0)
+            fits = (samples.mover >= 0) & self.moving_thing[mover] & (self.channel_of_mover[mover] == label[:, None])
+            by_mover = share.new_zeros(len(label), len(self.moving))
+            weights.append(by_mover.scatter_add_(1, mover, share * fits))
+        known = sorted(self.shape.boxes, key=lambda box: box.stamps is not None)  # as the weights are
+        ids = torch.tensor([0, *(b.id for b in known)], device=label.device)
+        return ids[torch.cat(weights, 1).argmax(1)]
+
+    def _by_box(self, samples: RaySamples, share: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
+        """How much of rays (R,) each box that stands still has (R, P): of the class (R,), and a thing."""
+        by_box = share.new_zeros(len(label), len(self.primitives))
+        if not len(self.primitives):
+            return by_box
+        rays, boxes = samples.rays, self.boxes_on(samples)
         none = boxes.index < 0
         index = boxes.index.clamp_min(0)
-        if not len(self.primitives):
-            return torch.zeros_like(label)
         fits = self.thing[index] & (self._channels(boxes.index) == label[:, None]) & ~none
         inside = boxes.box & fits[:, None]
         centre = rays.origin.new_tensor(np.stack([p.T_world_box[:3, 3] for p in self.primitives.primitives]))
         xyz = rays.origin[:, None] + samples.z[..., None] * rays.direction[:, None]
         away = (xyz[:, :, None] - centre[index][:, None]).norm(dim=-1).masked_fill(~inside, torch.inf)
         nearest = torch.zeros_like(inside).scatter_(2, away.argmin(-1, keepdim=True), value=True) & inside
-        weight = (ray_share(samples)[..., None] * nearest).sum(1)  # R M
-        by_box = weight.new_zeros(len(label), len(self.primitives)).scatter_add_(1, index, weight)
-        most, box = by_box.max(1)
-        ids = torch.tensor([b.id for b in self.shape.boxes], device=box.device)
-        return torch.where(most > 0, ids[box], 0)
+        return by_box.scatter_add_(1, index, (share[..., None] * nearest).sum(1))
+
+    def _at_measured(self, samples: RaySamples) -> RaySamples:
+        """Rays whose depth was measured end there: in the box that moves there, unless the scene has more next to it."""
+        ended, mover = at_measured(samples, self.grid.config), samples.mover
+        if mover is None:
+            return ended
+        weight = ended.weight[:, :-1]
+        most, near = weight.amax(1), mover.gather(1, weight.argmax(1, keepdim=True))[:, 0]
+        last = self.moving.holding(samples.rays, samples.rays.prior_depth_m).masked_fill((most > THERE) & (near < 0), -1)
+        return replace(ended, mover=torch.cat((mover, last[:, None]), 1))
 
     def solid(self) -> torch.Tensor:
         """Vertices of the grid (X, Y, Z) that are in a box or next to one that is: where density may be."""
@@ -246,15 +292,7 @@ def heaviest(samples: RaySamples, count: int) -> RaySamples:
     """The ``count`` samples of greatest weight of each ray, in their order."""
     if samples.z.shape[1] <= count:
         return samples
-    index = samples.weight.topk(count, dim=1).indices.sort(dim=1).values
-    points = samples.points.gather(1, index[..., None].expand(-1, -1, 3))
-    return replace(samples, points=points, z=samples.z.gather(1, index), weight=samples.weight.gather(1, index))
-
-
-def trimmed(found: Intervals) -> Intervals:
-    """Without columns that no ray needs; one at least."""
-    most = max(int((found.index >= 0).sum(1).max()) if len(found.index) else 0, 1)
-    return replace(found, enter=found.enter[:, :most], leave=found.leave[:, :most], index=found.index[:, :most])
+    return samples.at(samples.weight.topk(count, dim=1).indices.sort(dim=1).values)
 
 
 def merged_classes(label_set: LabelSet, merge: Mapping[str, Sequence[str]]) -> torch.Tensor:
@@ -282,6 +320,7 @@ def box_config(primitive: Primitive) -> BoxConfig:
         polygon=rows(primitive.polygon),  # type: ignore[arg-type]
         vertices=rows(primitive.vertices),  # type: ignore[arg-type]
         faces=rows(primitive.faces),  # type: ignore[arg-type]
+        stamps=None if primitive.stamps is None else tuple((t, rows(pose)) for t, pose in primitive.stamps),  # type: ignore[arg-type]
     )
 
 
@@ -302,6 +341,7 @@ def primitive_of(box: BoxConfig) -> Primitive:
         polygon=floats(box.polygon),
         vertices=floats(box.vertices),
         faces=faces,
+        stamps=None if box.stamps is None else tuple((t, np.array(pose, np.float64)) for t, pose in box.stamps),
     )
 
 

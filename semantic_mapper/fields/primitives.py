@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from semantic_mapper.errors import ConfigError
+from semantic_mapper.geometry import interpolate_pose
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.types import Float64, Int32, Int64, RayBatch
 
@@ -24,6 +25,7 @@ ShapeName = Literal["box", "ellipsoid", "prism", "mesh"]
 SHAPES: tuple[ShapeName, ...] = ("box", "ellipsoid", "prism", "mesh")
 AROUND, RINGS = 20, 10  # of the triangles of an ellipsoid
 MAX_INTERVALS = 32  # of a ray; those behind are dropped
+ALONE_NS = 50_000_000  # a pose at one time alone holds for so long before and after
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +59,24 @@ class Primitive:
     def moves(self) -> bool:
         """Whether it is at different places at different times."""
         return self.stamps is not None
+
+    def pose_at(self, stamp_ns: int) -> Float64 | None:
+        """Its pose (4, 4) at a time, between two stamps on the way from one to the other.
+
+        None where that is by more than half of the median gap of the stamps before the first or after the last.
+        """
+        if self.stamps is None:
+            return self.T_world_box
+        known = sorted(self.stamps, key=lambda entry: entry[0])
+        times = np.array([t for t, _ in known], np.int64)
+        beyond = max(int(times[0]) - stamp_ns, stamp_ns - int(times[-1]))
+        if beyond > (np.median(np.diff(times)) / 2 if len(times) > 1 else ALONE_NS):
+            return None
+        after = int(np.clip(np.searchsorted(times, stamp_ns), 0, len(times) - 1))
+        if beyond >= 0 or times[after] == stamp_ns:
+            return known[after][1]
+        fraction = (stamp_ns - int(times[after - 1])) / int(times[after] - times[after - 1])
+        return interpolate_pose(known[after - 1][1], known[after][1], fraction)
 
     def mesh(self) -> tuple[Float64, Int64]:
         """Vertices (V, 3) float64 world metres and faces (F, 3) int64 of its closed surface, facing outwards.
@@ -133,6 +153,12 @@ class Intervals:
     def to(self, device: torch.device) -> Intervals:
         """The same on a device."""
         return Intervals(*(t.to(device) for t in (self.enter, self.leave, self.index, self.count)))
+
+
+def trimmed(found: Intervals) -> Intervals:
+    """Without columns that no ray needs; one at least."""
+    most = max(int((found.index >= 0).sum(1).max()) if len(found.index) else 0, 1)
+    return replace(found, enter=found.enter[:, :most], leave=found.leave[:, :most], index=found.index[:, :most])
 
 
 class PrimitiveSet:

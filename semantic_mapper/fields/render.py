@@ -38,6 +38,7 @@ def render_image(
     rays_per_chunk: int,
     on_chunk: Callable[[int], None] | None = None,
     measured: NDArray[np.bool_] | None = None,
+    stamp_ns: int | None = None,
 ) -> FieldRender:
     """Render every pixel of a view without gradients, row by row.
 
@@ -49,6 +50,7 @@ def render_image(
         rays_per_chunk: Rays rendered at once; 0 = what suits the device.
         measured: (H, W), where the prior is not filled in; None = wherever there is one.
         on_chunk: Called with the number of rays done after each chunk.
+        stamp_ns: Of the view, for fields with things that move; None = such things are not there.
 
     Returns:
         ``FieldRender`` of H * W rays.
@@ -70,6 +72,7 @@ def render_image(
                 far_m=sampling.far_m,
                 prior_depth_m=prior[start : start + rays_per_chunk],
                 measured=None if seen is None else seen[start : start + rays_per_chunk],
+                stamp_ns=stamp_ns,
             )
             parts.append(field.render(rays, sources))
             if on_chunk is not None:
@@ -93,10 +96,11 @@ def render_view(
     sampling: SamplingConfig,
     rays_per_chunk: int,
     measured: NDArray[np.bool_] | None = None,
+    stamp_ns: int | None = None,
 ) -> tuple[Float32, NDArray[np.bool_], Float32]:
     """``render_image`` as arrays: class probabilities (H, W, L), known (H, W), depth (H, W) in metres."""
     scene = (field, sources, intrinsics, T_world_camera, prior_depth_m, sampling, rays_per_chunk)
-    render = render_image(*scene, measured=measured)
+    render = render_image(*scene, measured=measured, stamp_ns=stamp_ns)
     shape = (intrinsics.height, intrinsics.width)
     probabilities = torch.softmax(render.logits, dim=-1).view(*shape, -1)
     return (

@@ -36,6 +36,7 @@ def render_sparse_view(
     rgb: UInt8,
     fraction: float,
     measured: NDArray[np.bool_] | None = None,
+    stamp_ns: int | None = None,
 ) -> tuple[Float32, NDArray[np.bool_], Float32, int]:
     """As ``render_view``, with rays for at most a ``share`` of the pixels, and for every fourth a side at least.
 
@@ -43,6 +44,7 @@ def render_sparse_view(
         rgb: (H, W, 3) uint8 colours of the view, whose edges tell where to look closer.
         fraction: Of the pixels that may have rays of their own, the most doubtful first; 0..1.
         measured: (H, W), where the prior is not filled in; None = wherever there is one.
+        stamp_ns: Of the view, for fields with things that move; None = such things are not there.
 
     Returns:
         Class probabilities (H, W, L), known (H, W), depth (H, W) in metres, and the number of rays rendered. Pixels
@@ -66,8 +68,16 @@ def render_sparse_view(
             pixels = torch.from_numpy(np.stack((u, v), axis=1).astype(np.float32)).to(pose.device)
             prior = torch.from_numpy(prior_depth_m[v, u]).to(pose.device)
             seen = None if measured is None else torch.from_numpy(measured[v, u]).to(pose.device)
-            bounds = {"near_m": sampling.near_m, "far_m": sampling.far_m}
-            rays = pixel_rays(pixels, intrinsics, pose, **bounds, prior_depth_m=prior, measured=seen)
+            rays = pixel_rays(
+                pixels,
+                intrinsics,
+                pose,
+                near_m=sampling.near_m,
+                far_m=sampling.far_m,
+                prior_depth_m=prior,
+                measured=seen,
+                stamp_ns=stamp_ns,
+            )
             with torch.inference_mode():
                 render = field.render(rays, sources)
                 probabilities[v, u] = torch.softmax(render.logits, dim=-1).cpu().numpy()

@@ -435,6 +435,7 @@ class MappingPipeline:
             resized.rgb(intrinsics),
             measured=(resized.depth(intrinsics) > 0) & (prior > 0) if frame.depth_m is not None else None,
             computed=frame.depth_sigma_m is not None,
+            stamp_ns=frame.stamp_ns,
         )
 
     @property

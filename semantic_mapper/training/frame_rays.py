@@ -51,10 +51,9 @@ class FrameRays:
             ((u - camera[:, 2]) / camera[:, 0], (v - camera[:, 3]) / camera[:, 1], np.ones(len(u))), axis=1
         )
         direction = np.einsum("rij,rj->ri", self.T_world_camera[frame, :3, :3], towards.astype(np.float32))
-        near, far = (np.full(len(u), x, np.float32) for x in (near_m, np.inf))
-        none = np.zeros(len(u), np.float32)
+        near, far, none = (torch.full((len(u),), x) for x in (near_m, np.inf, 0.0))
         origin = np.ascontiguousarray(self.T_world_camera[frame, :3, 3])
-        return RayBatch(*(torch.from_numpy(a) for a in (origin, direction, near, far, none)))
+        return RayBatch(torch.from_numpy(origin), torch.from_numpy(direction), near, far, none)
 
     def pixels_of(self, frame: int) -> Int64:
         """Numbers of all pixels of a frame, row by row."""

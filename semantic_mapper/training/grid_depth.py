@@ -31,18 +31,18 @@ CORNERS, MARGIN_OF_TILES = 1, 0.05  # per cent of their corners that may lie out
 _log = get_logger(__name__)
 
 
-def grid_of_depth(rays: FrameRays, config: GridConfig) -> SceneGrid:
+def grid_of_depth(rays: FrameRays, config: GridConfig, unseen: float = HAZE) -> SceneGrid:
     """A grid whose density is that of the measured surface; colours are grey.
 
-    Density is Laplace-CDF(-distance) / beta with beta = half a voxel. What was not observed is haze, for images to
-    clear or fill: ``distance_to_surface`` says where that is.
+    Density is Laplace-CDF(-distance) / beta with beta = half a voxel. What was not observed (``distance_to_surface``
+    says where that is) has the raw density ``unseen``: haze, for images to clear or fill.
     """
     distance, observed = distance_to_surface(rays, config)
     grid = SceneGrid(config)
     density = np.where(distance > 0, 0.5 * np.exp(-np.abs(distance) / BETA), 1 - 0.5 * np.exp(-np.abs(distance) / BETA))
     per_voxel = density / BETA
     raw = np.log(np.expm1(np.maximum(per_voxel, 1e-9))) - BIAS
-    values = np.where(observed, np.maximum(raw, NOTHING), HAZE).astype(np.float32)
+    values = np.where(observed, np.maximum(raw, NOTHING), unseen).astype(np.float32)
     with torch.no_grad():
         grid.values[..., 0] = torch.from_numpy(values)
     grid.update_occupied()

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import msgspec
@@ -41,7 +41,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
 from semantic_mapper.training.grid_depth import depth_bounds, grid_of_depth, image_bounds
 from semantic_mapper.training.schedule import budget_fraction
-from semantic_mapper.types import Float32, Float64, PosedFrame
+from semantic_mapper.types import Bool, Float32, Float64, PosedFrame
 
 BETA1, BETA2 = 0.9, 0.99
 SKY_RATE, GAIN_RATE = 0.02, 2e-3
@@ -127,6 +127,7 @@ def fit_grid(
     on_progress: Callable[[GridFitProgress], None] | None = None,
     stopped: Callable[[], object] = bool,
     box: GridConfig | None = None,
+    leave_out: Callable[[Sequence[PosedFrame], FrameRays], Bool] | None = None,
 ) -> GridFit:
     """Fit a grid to posed images.
 
@@ -136,6 +137,7 @@ def fit_grid(
         on_progress: Called after every step.
         stopped: Asked before every step; once it says so (anything true), the grid so far is the result.
         box: Instead of the one that ``config`` describes.
+        leave_out: Which pixels (P,) of the frames show something else than the scene.
 
     Raises:
         FrameError: too few frames, poses that only turn, or held-out views rendered hardly better than by their mean
@@ -150,7 +152,8 @@ def fit_grid(
         raise FrameError(f"a grid needs at least {MIN_FRAMES} frames to fit besides held-out ones, got {len(seen)}")
     box = box or scene_box(frames, config)
     _check_parallax(frames, box)
-    fitter = _Fitter(frame_rays(seen, config.width), box, config)
+    rays = frame_rays(seen, config.width)
+    fitter = _Fitter(rays, box, config, None if leave_out is None else leave_out(seen, rays))
     steps = 0
     fraction = 0.0
     while fraction < 1 and not stopped():
@@ -235,7 +238,10 @@ def psnr_of(mean_square: float) -> float:
 class _Fitter:
     """The grid at its present resolution, and the state of Adam."""
 
-    def __init__(self, rays: FrameRays, box: GridConfig, config: GridFitConfig) -> None:
+    def __init__(self, rays: FrameRays, box: GridConfig, config: GridFitConfig, left_out: Bool | None) -> None:
+        self.pixels = np.arange(len(rays)) if left_out is None else np.flatnonzero(~left_out)
+        if left_out is not None:
+            rays = replace(rays, depth_m=np.where(left_out, np.float32(0), rays.depth_m))
         self.rays, self.box, self.config = rays, box, config
         self.rng = np.random.default_rng(config.seed)
         self.order = np.zeros(0, np.int64)
@@ -289,7 +295,7 @@ class _Fitter:
     def _draw(self) -> np.ndarray:
         """The next pixels of a random order of all."""
         while len(self.order) < self.config.rays:
-            self.order = np.concatenate((self.order, self.rng.permutation(len(self.rays))))
+            self.order = np.concatenate((self.order, self.rng.permutation(self.pixels)))
         drawn, self.order = np.split(self.order, [self.config.rays])
         return drawn
 

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
+from semantic_mapper.config import BoxConfig
 from semantic_mapper.errors import ConfigError, FrameError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint
 from semantic_mapper.fields.grid.field import RaySamples
@@ -28,6 +29,7 @@ from semantic_mapper.log_events import get_logger
 from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, PanopticFitConfig
 from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
 from semantic_mapper.training.grid_fit import BETA1, BETA2, GridFit, GridFitProgress, fit_grid, view_fraction
+from semantic_mapper.training.moving_boxes import LEAST_PIXELS, fill_boxes, shown_boxes
 from semantic_mapper.training.scene_fit import (
     FEATURE_RATE,
     TRUNK_RATE,
@@ -36,7 +38,7 @@ from semantic_mapper.training.scene_fit import (
     scene_checkpoint,
 )
 from semantic_mapper.training.schedule import budget_fraction
-from semantic_mapper.types import PosedFrame
+from semantic_mapper.types import Bool, Int64, PosedFrame
 
 GRID_UNTIL = 0.35  # fraction of the time for geometry and colours alone
 SAMPLES = 8  # of a ray, those of greatest weight
@@ -59,11 +61,13 @@ class PseudoRays:
         rays: Of the frames.
         channel: (P,) int64, -1 = none.
         gain: (F, 3) exposure of the frames.
+        still: Numbers of the pixels that show what stands still.
     """
 
     rays: FrameRays
     channel: torch.Tensor
     gain: torch.Tensor
+    still: Int64
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +77,8 @@ class Survey:
     Args:
         boxes: That stand still.
         seen: Of these, boxes that any surveyed ray meets.
+        moving: Boxes that move, and are followed.
+        lost: Boxes that move, and of whose inside no frame measures depth.
         covered: Fraction of pixels whose ray meets a box.
         matched: Fraction of pixels with a pseudo label whose class is possible on their ray.
         ambiguous: Fraction of pixels whose surface is in boxes of several classes.
@@ -83,6 +89,8 @@ class Survey:
     covered: float
     matched: float
     ambiguous: float = math.nan
+    moving: int = 0
+    lost: int = 0
 
 
 def fit_panoptic(
@@ -115,27 +123,33 @@ def fit_panoptic(
         raise ConfigError("a fit needs a budget: set seconds, steps, or both")
     by_boxes = config.panoptic.fixed > 0 or config.panoptic.points > 0
     if not isinstance(start, Panoptic) or (by_boxes and not start.shape.boxes):
-        raise ConfigError("a field of kind 'panoptic' needs boxes that stand still; give a file of them (--boxes)")
+        raise ConfigError("a field of kind 'panoptic' needs boxes; give a file of them (--boxes)")
     if start.label_set != label_set:
         raise WeightsError(f"the boxes are of label set '{start.label_set.name}', the labels of '{label_set.name}'")
     began = time.monotonic()
     usable = usable_frames(frames)
     everything = pseudo_rays(usable, label_set, config.width)
-    survey = survey_boxes(start, everything, config)
+    boxes, lost = _followed(start, usable, everything.rays)
+    if by_boxes and not boxes:
+        raise ConfigError(f"no box can be used: of the inside of {lost} that move no frame measures depth")
+    survey = replace(survey_boxes(start, everything, config), moving=len(start.moving) - lost, lost=lost)
     fit = _fit_grid(frames, start, config, on_progress, stopped)
-    shape = msgspec.structs.replace(start.shape, grid=fit.grid.config)
+    shape = msgspec.structs.replace(start.shape, grid=fit.grid.config, boxes=boxes)
     torch.manual_seed(config.seed)
     field = Panoptic(shape, label_set)
     field.grid.load_state_dict(fit.grid.state_dict())
     field.fitted_steps += fit.steps
-    data = replace(pseudo_rays(fit.frames, label_set, config.width), gain=torch.from_numpy(fit.gains))
+    data = pseudo_rays(fit.frames, label_set, config.width)
+    moving, _ = shown_boxes(start.moving, fit.frames, data.rays)
+    data = replace(data, gain=torch.from_numpy(fit.gains), still=np.flatnonzero(~moving))
     joint = JointFit(field, data, config)
     joint.run(began, on_progress, stopped)
+    fill_boxes(field, fit.frames, data.rays, fit.gains, config.grid.near_m)
     survey = replace(survey, ambiguous=ambiguous_fraction(field, everything, config))
     taught = [f for f in usable if f.label is not None and not f.label_is_pseudo]
     geometry = FittedGeometry(field, fit)
     checkpoint = scene_checkpoint(geometry, config, time.monotonic() - began, seen_stamps_ns, taught)
-    figures: dict[str, Any] = {name: getattr(survey, name) for name in ("boxes", "seen")}
+    figures: dict[str, Any] = {name: getattr(survey, name) for name in ("boxes", "seen", "moving", "lost")}
     figures |= {name: round(getattr(survey, name), 4) for name in ("covered", "matched", "ambiguous")}
     figures["labelled_frames"] = sum(f.label is not None for f in usable)
     figures["frames"] = len(usable)
@@ -158,7 +172,8 @@ def pseudo_rays(frames: Sequence[PosedFrame], label_set: LabelSet, width: int) -
         else label_set.to_channels(resize_label(f.label, k), f"frame seq={f.seq}").ravel()
         for f, k in zip(frames, rays.intrinsics, strict=True)
     ]
-    return PseudoRays(rays, torch.from_numpy(np.concatenate(channel)).long(), torch.ones(len(frames), 3))
+    channels = torch.from_numpy(np.concatenate(channel)).long()
+    return PseudoRays(rays, channels, torch.ones(len(frames), 3), np.arange(len(rays)))
 
 
 def survey_boxes(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> Survey:
@@ -290,7 +305,7 @@ class JointFit:
         left = FINAL_RATE**fraction
         for group, rate in zip(self.optimiser.param_groups, self.rates, strict=True):
             group["lr"] = rate * left
-        pixels = self.rng.integers(0, len(self.data.rays), config.panoptic.rays)
+        pixels = self.data.still[self.rng.integers(0, len(self.data.still), config.panoptic.rays)]
         batch = self.data.rays.rays(pixels, config.grid.near_m)
         samples = field.march(batch, SAMPLES, torch.from_numpy(self.rng.random(len(pixels), np.float32)))
         assert field.trunk is not None
@@ -367,7 +382,19 @@ def _fit_grid(
         if on_progress is not None:
             on_progress(FinetuneProgress(p.step, GRID_UNTIL * p.fraction, p.loss, math.nan, math.nan, False))
 
-    return fit_grid(frames, settings, tell, stopped, box)
+    def leave_out(seen: Sequence[PosedFrame], rays: FrameRays) -> Bool:
+        return shown_boxes(start.moving, seen, rays)[0]
+
+    return fit_grid(frames, settings, tell, stopped, box, leave_out if len(start.moving) else None)
+
+
+def _followed(start: Panoptic, frames: Sequence[PosedFrame], rays: FrameRays) -> tuple[tuple[BoxConfig, ...], int]:
+    """The boxes without those that move and whose inside no frame measures, and how many those are."""
+    _, measured = shown_boxes(start.moving, frames, rays)
+    lost = {box.id for box, count in zip(start.moving.primitives, measured, strict=True) if count < LEAST_PIXELS}
+    if lost:
+        _log.warning("moving_boxes_left_out", count=len(lost), reason="no frame at their times measures depth in them")
+    return tuple(box for box in start.shape.boxes if box.id not in lost), len(lost)
 
 
 def _some_pixels(data: PseudoRays, seed: int) -> np.ndarray:

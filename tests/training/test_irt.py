@@ -48,17 +48,21 @@ def look_down(azimuth: float) -> np.ndarray:
     return T
 
 
-def two_planes(azimuth: float, number: int, *, label: bool) -> PosedFrame:
-    """A deck 0.8 m above the ground, both of one texture: only their height tells them apart."""
+def two_planes(azimuth: float, number: int, *, label: bool, shift: float = 0.0) -> PosedFrame:
+    """A deck 0.8 m above the ground, both of one texture: only their height tells them apart.
+
+    The deck stands ``shift`` m further along x.
+    """
     T = look_down(azimuth)
     pixels = pixel_grid(64, 48).numpy().astype(np.float64)
     d = np.stack(((pixels[:, 0] - CAMERA.cx) / CAMERA.fx, (pixels[:, 1] - CAMERA.cy) / CAMERA.fy, np.ones(64 * 48)), 1)
     d = d @ T[:3, :3].T
     up, down = (0.8 - T[2, 3]) / d[:, 2], -T[2, 3] / d[:, 2]
     at = T[:3, 3] + up[:, None] * d
-    deck = (np.abs(at[:, 0] - 0.8) < 0.7) & (np.abs(at[:, 1]) < 0.7)  # on another side of the picture from elsewhere
+    deck = (np.abs(at[:, 0] - 0.8 - shift) < 0.7) & (np.abs(at[:, 1]) < 0.7)  # on another side of the picture from elsewhere
     z = np.where(deck, up, down)
-    cell = np.floor((T[:3, 3] + z[:, None] * d)[:, :2] / 0.15).astype(np.int64)
+    seen = T[:3, 3] + z[:, None] * d - deck[:, None] * (shift, 0, 0)
+    cell = np.floor(seen[:, :2] / 0.15).astype(np.int64)
     grey = (cell[:, 0] * 7919 + cell[:, 1] * 104729) % 97 / 97
     rgb = np.stack((grey, 0.5 + 0.5 * grey, 1 - grey), 1) * 255
     return PosedFrame(

@@ -35,6 +35,7 @@ class RaySamples:
         z: (R, K) metres.
         weight: (R, K) compositing weights, differentiable by the grid's density.
         light: (R,) what gets through the grid to the sky.
+        mover: (R, K) int64 number of the box that moves whose sample it is, -1 = of the scene; None = all are.
     """
 
     rays: RayBatch
@@ -42,11 +43,19 @@ class RaySamples:
     z: torch.Tensor
     weight: torch.Tensor
     light: torch.Tensor
+    mover: torch.Tensor | None = None
 
     @property
     def opacity(self) -> torch.Tensor:
         """(R,) what the grid stops."""
         return 1 - self.light
+
+    def at(self, index: torch.Tensor) -> RaySamples:
+        """The samples at positions (R, N) of each ray."""
+        points = self.points.gather(1, index[..., None].expand(-1, -1, 3))
+        mover = None if self.mover is None else self.mover.gather(1, index)
+        z, weight = self.z.gather(1, index), self.weight.gather(1, index)
+        return RaySamples(self.rays, points, z, weight, self.light, mover)
 
 
 class GridField(LearnedField):

@@ -81,6 +81,7 @@ class ViewRenderer:
         *,
         measured: NDArray[np.bool_] | None = None,
         computed: bool = False,
+        stamp_ns: int | None = None,
     ) -> RenderedView:
         """Render one view.
 
@@ -92,6 +93,7 @@ class ViewRenderer:
             rgb: (h, w, 3) uint8 colours of the view.
             measured: (h, w), where the prior is not filled in; None = wherever there is one.
             computed: Whether the prior was computed from pictures: it may be farther off than a sensor's.
+            stamp_ns: Of the view, for fields with things that move; None = such things are not there.
         """
         fraction, sampling = self._config.ray_fraction, self._sampling
         if self._rate_controller is not None:
@@ -109,9 +111,9 @@ class ViewRenderer:
             samples = sampling.guided
         scene = (self._field, sources, intrinsics, T_world_camera, prior_m, sampling, self._config.rays_per_chunk)
         if fraction == 1:
-            probabilities, known, depth_m = render_view(*scene, measured)
+            probabilities, known, depth_m = render_view(*scene, measured, stamp_ns)
             rays = prior_m.size
         else:
-            probabilities, known, depth_m, rays = render_sparse_view(*scene, rgb, fraction, measured)
+            probabilities, known, depth_m, rays = render_sparse_view(*scene, rgb, fraction, measured, stamp_ns)
         self._last = (0 if blind else rays, samples)
         return RenderedView(probabilities, known, depth_m, rays, samples)
