@@ -20,7 +20,7 @@ from semantic_mapper.fields.primitives import Intervals, Primitive, PrimitiveSet
 from semantic_mapper.types import Float64, RayBatch
 
 FINER = 0.5  # voxels of a box, as a fraction of the scene's
-MOST_VERTICES = 100_000  # of a box; a larger one has larger voxels
+MOST_VERTICES = 100_000  # of a box, about; a larger one has larger voxels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
