@@ -66,7 +66,7 @@ def without_moving_boxes(
         return {}
     field = street_field(config, street, STILL, folder)
     label_set = STREETS_SUITE.label_set
-    return {"without boxes that move": [label_set.colorize(render_answer(field, v.frame).label) for v in views]}
+    return {"moving left out": [label_set.colorize(render_answer(field, v.frame).label) for v in views]}
 
 
 def with_boxes(view: RoomView, street: Drive, field: Panoptic) -> UInt8:
@@ -103,7 +103,7 @@ def main() -> None:
     config = load_config(arguments.config, StreetsConfig) if arguments.config else StreetsConfig()
     image = picture(config, arguments.folder)
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(arguments.out), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
+    cv2.imwrite(str(arguments.out), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 65])
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ def box(x: float, size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> MovingB
     low[:3, 3], high[:3, 3] = (x, 0, 0), (x, 0, 1)
     boxes = MovingBoxes([Primitive(1, "car", "box", low, np.array(size), True, stamps=((0, low), (10, high)))], 0.2)
     boxes.grid(0).values[..., 0] = 12.0
+    boxes.grid(0).update_occupied()
     return boxes
 
 
@@ -46,6 +47,12 @@ def test_what_is_in_front_dims_what_is_behind(x: float, of_scene: float, of_box:
 def test_a_box_that_is_elsewhere_or_nowhere_changes_nothing(stamp_ns: int | None) -> None:
     before = scene(stamp_ns)
     assert box(4.0).composite(before, 8) is before
+
+
+def test_a_box_that_nobody_has_filled_is_empty() -> None:
+    boxes = MovingBoxes(box(1.0).primitives, 0.2)
+    found = boxes.composite(scene(0), 8)
+    assert found.light.tolist() == [0.5, 0.5] and found.weight.sum(1).tolist() == [0.5, 0.5]
 
 
 def test_a_large_box_has_larger_voxels() -> None:
