@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
@@ -49,6 +50,15 @@ class Labels:
     kept: int = 0
     right: int = 0
 
+    def add(self, room: BenchmarkRoom, number: int, image: UInt8) -> None:
+        """Take the labels (H, W) of a frame of the room, and count."""
+        truth, kept = room.frames[number].label, image != room.label_set.ignore_id
+        assert truth is not None
+        self.images[number] = image
+        self.pixels += truth.size
+        self.kept += int(kept.sum())
+        self.right += int((kept & (image == truth)).sum())
+
 
 def labelled_by(field: IRT, room: BenchmarkRoom, numbers: tuple[int, ...], suite: SuiteConfig, sure: float) -> Labels:
     """Labels of frames as ``autolabel --min-confidence`` writes them, and how many pixels are right and there."""
@@ -57,12 +67,7 @@ def labelled_by(field: IRT, room: BenchmarkRoom, numbers: tuple[int, ...], suite
         frame = as_given(room.given[number], depth=True)
         found = predict_view(field, [frame], frame, suite.tier, room.label_set)
         kept = found.known & (found.confidence >= sure)
-        labels.images[number] = np.where(kept, found.label, room.label_set.ignore_id).astype(np.uint8)
-        truth = room.frames[number].label
-        assert truth is not None
-        labels.pixels += truth.size
-        labels.kept += int(kept.sum())
-        labels.right += int((kept & (found.label == truth)).sum())
+        labels.add(room, number, np.where(kept, found.label, room.label_set.ignore_id).astype(np.uint8))
     return labels
 
 
@@ -109,8 +114,47 @@ def replace_labels(room: BenchmarkRoom, taught: dict[int, PosedFrame]) -> Benchm
     return replace(room, given=tuple(given))
 
 
+def keep_and_print(
+    rooms: Sequence[int],
+    out: Path,
+    judged: str,
+    run: Callable[[int], tuple[Mapping[str, ConfusionMatrix], Labels]],
+) -> None:
+    """A line a room in ``out``, and a table; rooms that are there are not run again.
+
+    Args:
+        judged: The row that is compared with all others.
+        run: From the seed of a room to confusions by row, and what the teacher's labels are.
+    """
+    out.parent.mkdir(parents=True, exist_ok=True)
+    lines = out.read_text().splitlines() if out.exists() else []
+    found = {record["room"]: record for record in map(json.loads, lines)}
+    for seed in rooms:
+        if seed in found:
+            continue
+        rows, labels = run(seed)
+        found[seed] = {"room": seed, "kept": labels.kept / labels.pixels, "right": labels.right / max(labels.kept, 1)}
+        found[seed]["rows"] = {name: matrix.counts.tolist() for name, matrix in rows.items()}
+        with out.open("a") as file:
+            file.write(json.dumps(found[seed]) + "\n")
+    names = list(found[rooms[0]]["rows"])
+    matrices = {n: [from_rows(found[s]["rows"][n]) for s in rooms] for n in names}
+    print("| | " + " | ".join(str(seed) for seed in rooms) + " | all |")
+    for name, parts in matrices.items():
+        whole = reduce(add, parts)
+        print(f"| {name} | " + " | ".join(f"{100 * (m.metrics().miou or 0):.1f}" for m in [*parts, whole]) + " |")
+    for name in names if len(rooms) > 1 else ():
+        if name != judged:
+            change = paired_bootstrap(matrices[judged], matrices[name])
+            low, high = 100 * change.low, 100 * change.high
+            print(f"{judged} minus {name}: {100 * change.observed:+.1f} ({low:.1f} to {high:.1f})")
+    for seed in rooms:
+        kept, right = 100 * found[seed]["kept"], 100 * found[seed]["right"]
+        print(f"{seed}: {kept:.1f} % of the pixels labelled, {right:.1f} % of these right")
+
+
 def main() -> None:
-    """A line a room and row in ``--out``; rooms that are there are not run again."""
+    """A line a room in ``--out``, and a table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rooms", nargs="+", type=int, default=[100000, 100001, 100002])
     parser.add_argument("--seconds", type=float, default=120.0, help="of each S-Ray")
@@ -118,31 +162,11 @@ def main() -> None:
     parser.add_argument("--min-confidence", type=float, default=0.9)
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
-    given.out.parent.mkdir(parents=True, exist_ok=True)
-    lines = given.out.read_text().splitlines() if given.out.exists() else []
-    found = {record["room"]: record for record in map(json.loads, lines)}
-    for seed in given.rooms:
-        if seed in found:
-            continue
-        rows, labels = run_room(seed, given.seconds, given.irt_seconds, given.min_confidence)
-        counts = {name: matrix.counts.tolist() for name, matrix in rows.items()}
-        found[seed] = {"room": seed, "kept": labels.kept / labels.pixels, "right": labels.right / max(labels.kept, 1)}
-        found[seed]["rows"] = counts
-        with given.out.open("a") as file:
-            file.write(json.dumps(found[seed]) + "\n")
-    matrices = {n: [from_rows(found[s]["rows"][n]) for s in given.rooms] for n in ROWS}
-    print("| | " + " | ".join(str(seed) for seed in given.rooms) + " | all |")
-    for name, parts in matrices.items():
-        whole = reduce(add, parts)
-        print(f"| {name} | " + " | ".join(f"{100 * (m.metrics().miou or 0):.1f}" for m in [*parts, whole]) + " |")
-    for name in ROWS if len(given.rooms) > 1 else ():
-        if name != ROWS[2]:
-            change = paired_bootstrap(matrices[ROWS[2]], matrices[name])
-            low, high = 100 * change.low, 100 * change.high
-            print(f"{ROWS[2]} minus {name}: {100 * change.observed:+.1f} ({low:.1f} to {high:.1f})")
-    for seed in given.rooms:
-        kept, right = 100 * found[seed]["kept"], 100 * found[seed]["right"]
-        print(f"{seed}: {kept:.1f} % of the pixels labelled, {right:.1f} % of these right")
+
+    def run(seed: int) -> tuple[dict[str, ConfusionMatrix], Labels]:
+        return run_room(seed, given.seconds, given.irt_seconds, given.min_confidence)
+
+    keep_and_print(given.rooms, given.out, ROWS[2], run)
 
 
 if __name__ == "__main__":

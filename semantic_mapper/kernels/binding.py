@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from semantic_mapper.errors import DependencyError, ShapeError
 
@@ -146,9 +147,12 @@ def _packer(hint: Any) -> tuple[str, _Pack]:
         return "q", _add_number
     if hint is bool:
         return "q", _add_flag
-    if typing.get_origin(hint) is np.ndarray:
-        (dtype,) = typing.get_args(typing.get_args(hint)[1])
-        return "Pq" + MAX_DIMENSIONS * "q", functools.partial(_add_array, None if dtype is Any else np.dtype(dtype))
+    parts = typing.get_args(hint)
+    if typing.get_origin(hint) is np.ndarray:  # what NDArray[scalar] stands for, before numpy 2.5
+        parts = typing.get_args(parts[1])
+    if typing.get_origin(hint) in (np.ndarray, NDArray):
+        scalar = None if parts[0] is Any else np.dtype(parts[0])
+        return "Pq" + MAX_DIMENSIONS * "q", functools.partial(_add_array, scalar)
     if isinstance(hint, type) and issubclass(hint, tuple):
         fields = [_packer(field) for field in typing.get_type_hints(hint).values()]
         adders = [add for _, add in fields]

@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from semantic_mapper.config import Config, UNetFieldConfig
 from semantic_mapper.errors import FrameError
+from semantic_mapper.fields.device import choose_device, to_device
 from semantic_mapper.fields.peers.unet_field import UNetField
 from semantic_mapper.geometry import NEAREST_Z_M, invert_pose, nearest_pixels, transform, unproject
 from semantic_mapper.imaging import fill_holes, resize_depth
@@ -40,7 +41,8 @@ class UNetConfig(Config, frozen=True):
 
 
 class UNetBaseline:
-    """A per-image U-Net from random weights: a residual encoder of colours with a classifier on top.
+    """A per-image U-Net from random weights, on the GPU where there is one: a residual encoder of colours with a
+    classifier on top.
 
     What the encoder of the finetuned field says of single images, in the same seconds, is the row "own image alone".
     """
@@ -49,7 +51,8 @@ class UNetBaseline:
         torch.manual_seed(config.seed)
         self.label_set = label_set
         self.config = config
-        self.net = UNetField(UNetFieldConfig(), label_set)
+        self.device = choose_device("auto", 0)
+        self.net = UNetField(UNetFieldConfig(), label_set).to(self.device)
 
     def fit(self, frames: Sequence[PosedFrame], on_progress: Callable[[float], None] | None = None) -> int:
         """Train on labelled frames for the budget, with colour jitter and mirrored images; returns the steps done."""
@@ -76,8 +79,8 @@ class UNetBaseline:
                 sources = _dimmed(sources, self.config.darkest, generator)
             channel = torch.stack([v.channel for v in batch])
             with self.net.encoder.batch_statistics():
-                logits = self.net.predict_image(sources)
-            loss = functional.cross_entropy(logits, channel, ignore_index=IGNORE)
+                logits = self.net.predict_image(to_device(sources, self.device))
+            loss = functional.cross_entropy(logits, channel.to(self.device), ignore_index=IGNORE)
             optimiser.zero_grad()
             loss.backward()  # pyright: ignore[reportUnknownMemberType]
             optimiser.step()
@@ -104,10 +107,10 @@ class UNetBaseline:
             self.config.width,
         )
         with torch.inference_mode():
-            logits = self.net.predict_image(stack_sources([view]))
+            logits = self.net.predict_image(to_device(stack_sources([view]), self.device))
             full = functional.interpolate(logits, size=frame.rgb.shape[:2], mode="bilinear", align_corners=False)
             channel = full[0].argmax(0)
-        return self.label_set.to_ids(channel.numpy())
+        return self.label_set.to_ids(channel.cpu().numpy())
 
 
 def _dimmed(sources: SourceViews, darkest: float, generator: torch.Generator) -> SourceViews:
