@@ -232,7 +232,7 @@ def finetune_lines(checkpoint: Checkpoint, chosen: Sequence[int], request: Finet
         if boxed["moving"]:
             lines.append(f"  {boxed['moving']} boxes that move, with grids of their own")
         if boxed["lost"] or boxed["left_out"]:
-            lost = f"{boxed['lost']} boxes that move, without depth inside of them"
+            lost = f"{boxed['lost']} boxes that move, which no frame shows at their times"
             lines.append(f"  left out: {lost}; {boxed['left_out']} of no class")
     if checkpoint.model.holds_scene:
         lines.append(f"  {out.stat().st_size / 1e6:.1f} MB that show the scene: as private as the recording")
