@@ -163,7 +163,10 @@ def _changed(file: Path, found: BoxFile, action: Action, words: list[str], at_ns
         with open_log(Path(words[0])) as log:
             changed, dropped = with_times(found, file, log)
         gone = f", {len(dropped)} that are at none of its frames dropped" if dropped else ""
-        return changed, f"{counted(by_frame - len(dropped), 'box', 'boxes')} that move have times of {words[0]}{gone}"
+        return (
+            changed,
+            f"{counted(by_frame - len(dropped), 'box', 'boxes')} with times of {words[0]} instead of frames{gone}",
+        )
     editor = BoxEditor(file, found)
     done = _edit(editor, action, words, at_ns)
     return editor.boxes, done
