@@ -194,14 +194,21 @@ class Panoptic(GridField):
         named.scatter_add_(2, channel[:, None].expand(inside.shape), inside.float())
         named = (named[..., :classes] > 0).float()
         allowed = named
-        on_ray = torch.zeros(len(channel), classes + 1, dtype=torch.bool, device=channel.device)
-        on_ray = on_ray.scatter_(1, channel, value=True)[:, :classes]
         if self.shape.uncovered == "stuff":
             allowed = torch.where(in_core, named, torch.maximum(named, self.outside))
-            on_ray = on_ray | (self.outside > 0)
+        return BoxesOnRays(inside, found.index, named, allowed, self.on_ray(found), self._behind(samples.rays, found))
+
+    def on_ray(self, found: Intervals) -> torch.Tensor:
+        """Classes (R, L) bool that are anywhere on rays, of the boxes that they meet."""
+        classes = len(self.label_set)
+        channel = torch.where(found.index < 0, classes, self._channels(found.index))
+        there = torch.zeros(len(channel), classes + 1, dtype=torch.bool, device=channel.device)
+        there = there.scatter_(1, channel, value=True)[:, :classes]
+        if self.shape.uncovered == "stuff":
+            there = there | (self.outside > 0)
         if self.sky is not None:
-            on_ray[:, self.sky] = True
-        return BoxesOnRays(inside, found.index, named, allowed, on_ray, self._behind(samples.rays, found))
+            there[:, self.sky] = True
+        return there
 
     def _held(self) -> Int64:
         """See ``held``; a few centres at a time, so that thousands of boxes need no table of all pairs."""
@@ -270,13 +277,15 @@ class Panoptic(GridField):
         return by_box.scatter_add_(1, index, (share[..., None] * nearest).sum(1))
 
     def _at_measured(self, samples: RaySamples) -> RaySamples:
-        """Rays whose depth was measured end there: in the box that moves there, unless the scene has more next to it."""
+        """Rays whose depth was measured end there: in the box that moves there, unless the scene has more by it."""
         ended, mover = at_measured(samples, self.grid.config), samples.mover
         if mover is None:
             return ended
         weight = ended.weight[:, :-1]
         most, near = weight.amax(1), mover.gather(1, weight.argmax(1, keepdim=True))[:, 0]
-        last = self.moving.holding(samples.rays, samples.rays.prior_depth_m).masked_fill((most > THERE) & (near < 0), -1)
+        last = self.moving.holding(samples.rays, samples.rays.prior_depth_m).masked_fill(
+            (most > THERE) & (near < 0), -1
+        )
         return replace(ended, mover=torch.cat((mover, last[:, None]), 1))
 
     def solid(self) -> torch.Tensor:
