@@ -22,6 +22,7 @@ from semantic_mapper.scenes.daylight import pose_of
 from semantic_mapper.types import Float64
 
 ORIGIN = GpsPosition(52.52, 13.405, 34.0)
+DIAGONAL_35MM = 43.27
 DEGREE_M = 111_320.0  # of a sphere: the rows are short
 
 
@@ -37,8 +38,8 @@ def rows_over(reach_m: float, height_m: float, rows: int, pictures: int, pitch_d
     return np.stack(poses)
 
 
-def save_picture(file: Path, rgb: np.ndarray, enu: Float64) -> None:
-    """A JPEG with its position."""
+def save_picture(file: Path, rgb: np.ndarray, enu: Float64, focal_35mm: int) -> None:
+    """A JPEG with its position, and the focal length that a drone's camera writes."""
     east, north, up = enu
     latitude = ORIGIN.latitude + north / DEGREE_M
     longitude = ORIGIN.longitude + east / DEGREE_M / np.cos(np.radians(ORIGIN.latitude))
@@ -50,6 +51,7 @@ def save_picture(file: Path, rgb: np.ndarray, enu: Float64) -> None:
     }
     height = IFDRational(round((ORIGIN.altitude_m + up) * 1000), 1000)
     exif.get_ifd(0x8825).update({1: "N", 3: "E", 5: b"\x00", 6: height, **angles})
+    exif.get_ifd(0x8769).update({0xA405: focal_35mm})
     image.save(file, exif=exif, quality=92)
 
 
@@ -71,7 +73,13 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for n, pose in enumerate(poses):
         rgb = render_town(town, camera, pose, n).rgb
-        save_picture(folder / f"DJI_{n:04d}.JPG", rgb, pose[:3, 3] + rng.normal(0, given.gps_sigma, 3))
+        position = pose[:3, 3] + rng.normal(0, given.gps_sigma, 3)
+        save_picture(
+            folder / f"DJI_{n:04d}.JPG",
+            rgb,
+            position,
+            round(camera.fx * DIAGONAL_35MM / np.hypot(camera.width, camera.height)),
+        )
     began = time.process_time()
     log = given.out / "flight.mcap"
     report = import_film(folder, log, FilmOptions(), lambda *_: None, overwrite=True)

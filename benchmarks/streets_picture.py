@@ -1,5 +1,6 @@
 """A picture of STREETS' first street, after ``benchmark streets --arm panoptic``: images, boxes of things, predicted
-labels, what Panoptic NeRF says (classes, things, depth), and the truth.
+labels, what Panoptic NeRF says (classes, things, depth), and the truth. Where cars drive, also what it says without
+boxes that move.
 
 Example: python -m benchmarks.streets_picture --folder runs/streets-grids --out street.jpg
 """
@@ -20,7 +21,7 @@ from semantic_mapper.benchmark.streets import (
     scored_views,
     street_seeds,
 )
-from semantic_mapper.benchmark.streets_panoptic import render_answer, street_field
+from semantic_mapper.benchmark.streets_panoptic import STILL, render_answer, street_field
 from semantic_mapper.config import load_config
 from semantic_mapper.fields.panoptic import Panoptic
 from semantic_mapper.geometry import invert_pose
@@ -49,11 +50,23 @@ def picture(config: StreetsConfig, folder: Path) -> UInt8:
         "boxes of things": [with_boxes(view, street, field) for view in views],
         "predicted labels": [label_set.colorize(street.pseudo[view.frame.seq]) for view in views],
         "Panoptic NeRF": [label_set.colorize(answer.label) for answer in said],
+        **without_moving_boxes(config, street, views, folder),
         "true classes": [label_set.colorize(view.rendered.label) for view in views],
         "its things": [thing_colors(answer.instance) for answer in said],
         "its depth": [depth_picture(answer.depth_m / np.float32(6)) for answer in said if answer.depth_m is not None],
     }
     return draw_picture_rows(rows, label_set, WIDTH_PX)
+
+
+def without_moving_boxes(
+    config: StreetsConfig, street: Drive, views: list[RoomView], folder: Path
+) -> dict[str, list[UInt8]]:
+    """Classes that it says if boxes that move are left out; nothing where no car drives."""
+    if not config.moving:
+        return {}
+    field = street_field(config, street, STILL, folder)
+    label_set = STREETS_SUITE.label_set
+    return {"moving left out": [label_set.colorize(render_answer(field, v.frame).label) for v in views]}
 
 
 def with_boxes(view: RoomView, street: Drive, field: Panoptic) -> UInt8:
@@ -90,7 +103,7 @@ def main() -> None:
     config = load_config(arguments.config, StreetsConfig) if arguments.config else StreetsConfig()
     image = picture(config, arguments.folder)
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(arguments.out), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
+    cv2.imwrite(str(arguments.out), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 65])
 
 
 if __name__ == "__main__":

@@ -196,7 +196,8 @@ class PanopticConfig(GridFieldConfig, frozen=True):
     features: Annotated[int, msgspec.Meta(ge=1, le=64)] = 16
     trunk_width: Channels = 64
     head_width: Channels = 64
-    # What may be outside of all boxes. stuff: the classes that are no things, and those that no box has. empty: nothing
+    # What may be outside of all boxes. stuff: the classes that are no things, and those that no box has that stands
+    # still. empty: nothing
     uncovered: Literal["stuff", "empty"] = "stuff"
     classes: Literal["learned", "fixed"] = "learned"  # what is rendered; fixed: what the boxes say, as an ablation
     samples: Literal["march", "uniform"] = "march"  # of a ray; uniform: evenly from near to far, as an ablation

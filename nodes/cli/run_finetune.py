@@ -254,7 +254,7 @@ def _left_out(boxed: Mapping[str, Any]) -> list[tuple[int, str]]:
     """How many boxes were left out, for which reason."""
     reasons = {
         "unseen": "that no frame sees",
-        "lost": "that move, without depth inside of them",
+        "lost": "that move, which no frame shows at their times",
         "left_out": "of no class",
     }
     return [(boxed[name], f"{boxed[name]} {reason}") for name, reason in reasons.items()]

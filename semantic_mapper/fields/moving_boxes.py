@@ -15,12 +15,12 @@ from torch import nn
 
 from semantic_mapper.config import GridConfig
 from semantic_mapper.fields.grid.field import RaySamples
-from semantic_mapper.fields.grid.scene_grid import NOTHING, SceneGrid, grid_box
+from semantic_mapper.fields.grid.scene_grid import SceneGrid, grid_box
 from semantic_mapper.fields.primitives import Intervals, Primitive, PrimitiveSet, trimmed
 from semantic_mapper.types import Float64, RayBatch
 
 FINER = 0.5  # voxels of a box, as a fraction of the scene's
-MOST_VERTICES = 100_000  # of a box; a larger one has larger voxels
+MOST_VERTICES = 100_000  # of a box, about; a larger one has larger voxels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +57,7 @@ class MovingBoxes(nn.Module):
         self.shapes = [PrimitiveSet([replace(p, T_world_box=np.eye(4))]) for p in self.primitives]
         self.grids = nn.ModuleList(SceneGrid(_grid(shape, voxel_m)) for shape in self.shapes)
         for grid in self.grids:
-            cast("SceneGrid", grid).values[..., 0] = NOTHING
+            cast("SceneGrid", grid).occupied.zero_()  # values stay untouched: memory that nobody needs is none
 
     def __len__(self) -> int:
         return len(self.primitives)

@@ -277,15 +277,14 @@ class Panoptic(GridField):
         return by_box.scatter_add_(1, index, (share[..., None] * nearest).sum(1))
 
     def _at_measured(self, samples: RaySamples) -> RaySamples:
-        """Rays whose depth was measured end there: in the box that moves there, unless the scene has more by it."""
+        """Rays whose depth was measured end there: in the box that moves, unless the scene has more next to it."""
         ended, mover = at_measured(samples, self.grid.config), samples.mover
         if mover is None:
             return ended
         weight = ended.weight[:, :-1]
         most, near = weight.amax(1), mover.gather(1, weight.argmax(1, keepdim=True))[:, 0]
-        last = self.moving.holding(samples.rays, samples.rays.prior_depth_m).masked_fill(
-            (most > THERE) & (near < 0), -1
-        )
+        of_scene = (most > THERE) & (near < 0)
+        last = self.moving.holding(samples.rays, samples.rays.prior_depth_m).masked_fill(of_scene, -1)
         return replace(ended, mover=torch.cat((mover, last[:, None]), 1))
 
     def solid(self) -> torch.Tensor:
@@ -306,7 +305,7 @@ class Panoptic(GridField):
         return self.channel_of_box[index.clamp_min(0)] if len(self.channel_of_box) else torch.zeros_like(index)
 
     def _allowed_outside(self, label_set: LabelSet) -> list[bool]:
-        named = {b.class_name for b in self.shape.boxes}
+        named = {b.class_name for b in self.shape.boxes if b.stamps is None}
         return [n != SKY and (n in STUFF_NAMES or n not in named) for n in label_set.names]
 
 

@@ -42,15 +42,16 @@ def boxes_in_view(boxes: Sequence[Primitive], frames: Sequence[PosedFrame]) -> B
     for number in np.flatnonzero(~still).tolist():
         seen[number] = _moving_meets(boxes[number], centre[number], radius[number], frames, cone)
     if len(boxes) and not seen.any():
-        raise nothing_in_view(world, world, pose[:, :3, 3])
+        raise nothing_in_view(world, world, pose[:, :3, 3], moving=not still.all())
     return seen
 
 
-def nothing_in_view(low: Float64, high: Float64, cameras: Float64 | Float32) -> ConfigError:
+def nothing_in_view(low: Float64, high: Float64, cameras: Float64 | Float32, moving: bool = False) -> ConfigError:
     """That no box is in view of any frame, with where boxes (P, 3) and cameras (F, 3) are."""
+    times = ", and the stamps of those that move the log's, in nanoseconds" if moving else ""
     return ConfigError(
         f"no box is in view of any frame: boxes lie from {_metres(low.min(0))} to {_metres(high.max(0))}, cameras from "
-        f"{_metres(cameras.min(0))} to {_metres(cameras.max(0))}. Are the boxes in the log's world frame?"
+        f"{_metres(cameras.min(0))} to {_metres(cameras.max(0))}. Are the boxes in the log's world frame{times}?"
     )
 
 

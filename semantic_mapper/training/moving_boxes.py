@@ -1,4 +1,4 @@
-"""Boxes that move, in a fit: which pixels may show them, and small grids of what depth images say is in them."""
+"""Boxes that move, in a fit: which pixels may show them, and small grids of what is in them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch.nn import functional
 from semantic_mapper.fields.grid.field import OPAQUE
 from semantic_mapper.fields.grid.scene_grid import NOTHING, SceneGrid
 from semantic_mapper.fields.moving_boxes import MovingBoxes, RaysInBox
-from semantic_mapper.fields.panoptic import Panoptic, ray_share
+from semantic_mapper.fields.panoptic import CORE, Panoptic, ray_share
 from semantic_mapper.geometry import invert_pose
 from semantic_mapper.training.frame_rays import FrameRays
 from semantic_mapper.training.grid_depth import grid_of_depth
@@ -22,13 +22,14 @@ from semantic_mapper.types import Bool, Float32, Int64, PosedFrame
 
 ELSEWHERE = 0.05  # of z, by which measured depth lies before a box or behind it where a pixel shows something else
 LEAST_PIXELS = 50  # measured inside of a box in all frames, below which nothing is known of its inside
+OPAQUE_RAW = 9.0  # raw density of a box of whose inside nothing is known
 FAR_M = 1e4  # z of what does not hide anything of a box
 SPREAD = 5  # voxels over which colours are averaged
 
 
 def shown_boxes(boxes: MovingBoxes, frames: Sequence[PosedFrame], rays: FrameRays) -> tuple[Bool, Int64]:
-    """Which pixels (P,) of frames may show a box that moves, and how many have depth inside of each box (M,)."""
-    shown, measured = np.zeros(len(rays), np.bool_), np.zeros(len(boxes), np.int64)
+    """Which pixels (P,) of frames may show a box that moves, and how many may show each box (M,)."""
+    shown, count = np.zeros(len(rays), np.bool_), np.zeros(len(boxes), np.int64)
     for number, frame in enumerate(frames):
         for met, pixels in _met(boxes, frame, rays, number):
             depth = torch.from_numpy(rays.depth_m[pixels])
@@ -36,30 +37,33 @@ def shown_boxes(boxes: MovingBoxes, frames: Sequence[PosedFrame], rays: FrameRay
             known = depth > 0
             elsewhere = known & ((depth < (1 - ELSEWHERE) * enter) | (depth > (1 + ELSEWHERE) * leave))
             shown[pixels[~elsewhere.numpy()]] = True
-            measured[met.number] += int(met.found.inside(depth[:, None]).any(-1)[:, 0].sum())
-    return shown, measured
+            count[met.number] += int((~elsewhere).sum())
+    return shown, count
 
 
 def fill_boxes(field: Panoptic, frames: Sequence[PosedFrame], rays: FrameRays, gains: Float32, near_m: float) -> None:
     """Fill the grids of the boxes that move from depth images and colours; the scene's own grid is fitted.
 
-    What the scene itself has at a measured depth, such as the road under a car, is not of the box.
+    What the scene itself has at a measured depth, such as the road under a car, is not of the box. Where no frame
+    measures the inside of a box, its core is full.
 
     Args:
         field: Its boxes that move are filled.
-        frames: F of them; those without depth tell nothing.
+        frames: F of them.
         rays: Of the frames.
         gains: (F, 3) exposure of the frames.
         near_m: From which on rays look.
     """
     boxes = field.moving
     depths = [np.zeros_like(rays.depth_m) for _ in boxes.primitives]
+    measured = np.zeros(len(boxes), np.int64)
     for number, frame in enumerate(frames):
         for met, pixels in _met(boxes, frame, rays, number):
             depth = rays.depth_m[pixels].copy()
             surface = _scene_depth(field, rays, pixels, near_m)
             depth[(depth > 0) & (surface > 0) & (depth > (1 - ELSEWHERE) * surface)] = FAR_M
             depths[met.number][pixels] = depth
+            measured[met.number] += int(met.found.inside(torch.from_numpy(depth)[:, None]).any(-1).sum())
     poses = rays.T_world_camera.astype(np.float64)
     for box, depth in enumerate(depths):
         T_box_camera = poses.copy()
@@ -69,9 +73,21 @@ def fill_boxes(field: Panoptic, frames: Sequence[PosedFrame], rays: FrameRays, g
                 T_box_camera[number] = invert_pose(T_world_box) @ poses[number]
         own = replace(rays, T_world_camera=T_box_camera.astype(np.float32), depth_m=depth)
         grid = boxes.grid(box)
+        if measured[box] < LEAST_PIXELS:
+            _fill_core(grid)
+            continue
         filled = grid_of_depth(own, grid.config, NOTHING)
         grid.load_state_dict(filled.state_dict())
         _paint(grid, own, gains)
+
+
+def _fill_core(grid: SceneGrid) -> None:
+    """Make the core of a box opaque, with round edges, as things have; grey."""
+    axes = torch.meshgrid(*(torch.linspace(-1, 1, n) for n in grid.config.shape), indexing="ij")
+    inside = torch.stack(axes).pow(4).sum(0) <= CORE**4
+    with torch.no_grad():
+        grid.values[..., 0] = torch.where(inside, OPAQUE_RAW, NOTHING)
+    grid.update_occupied()
 
 
 def _paint(grid: SceneGrid, rays: FrameRays, gains: Float32) -> None:

@@ -31,7 +31,7 @@ from semantic_mapper.training.boxes_in_view import nothing_in_view
 from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, PanopticFitConfig
 from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
 from semantic_mapper.training.grid_fit import BETA1, BETA2, GridFit, GridFitProgress, fit_grid, view_fraction
-from semantic_mapper.training.moving_boxes import LEAST_PIXELS, fill_boxes, shown_boxes
+from semantic_mapper.training.moving_boxes import fill_boxes, shown_boxes
 from semantic_mapper.training.scene_fit import (
     FEATURE_RATE,
     TRUNK_RATE,
@@ -82,7 +82,7 @@ class Survey:
         boxes: That stand still.
         seen: Of these, boxes that any surveyed ray meets.
         moving: Boxes that move, and are followed.
-        lost: Boxes that move, and of whose inside no frame measures depth.
+        lost: Boxes that move, and that no frame shows at their times.
         covered: Fraction of pixels whose ray meets a box.
         matched: Fraction of pixels with a pseudo label whose class is possible on their ray.
         crowded: Fraction of pixels whose ray meets more boxes than are looked at, ``MAX_INTERVALS``.
@@ -138,7 +138,10 @@ def fit_panoptic(
     everything = pseudo_rays(usable, label_set, config.width)
     boxes, lost = _followed(start, usable, everything.rays)
     if by_boxes and not boxes:
-        raise ConfigError(f"no box can be used: of the inside of {lost} that move no frame measures depth")
+        raise ConfigError(
+            f"no box is in view of any frame: {lost} move, and no frame shows them at the times of their stamps. Are "
+            "the stamps the log's, in nanoseconds?"
+        )
     survey = replace(survey_boxes(start, everything, config), moving=len(start.moving) - lost, lost=lost)
     fit = _fit_grid(usable, start, config, on_progress, stopped)
     shape = msgspec.structs.replace(start.shape, grid=fit.grid.config, boxes=boxes)
@@ -415,11 +418,11 @@ def _fit_grid(
 
 
 def _followed(start: Panoptic, frames: Sequence[PosedFrame], rays: FrameRays) -> tuple[tuple[BoxConfig, ...], int]:
-    """The boxes without those that move and whose inside no frame measures, and how many those are."""
-    _, measured = shown_boxes(start.moving, frames, rays)
-    lost = {box.id for box, count in zip(start.moving.primitives, measured, strict=True) if count < LEAST_PIXELS}
+    """The boxes without those that move and that no frame shows at their times, and how many those are."""
+    _, shown = shown_boxes(start.moving, frames, rays)
+    lost = {box.id for box, count in zip(start.moving.primitives, shown, strict=True) if not count}
     if lost:
-        _log.warning("moving_boxes_left_out", count=len(lost), reason="no frame at their times measures depth in them")
+        _log.warning("moving_boxes_left_out", count=len(lost), reason="no frame shows them at their times")
     return tuple(box for box in start.shape.boxes if box.id not in lost), len(lost)
 
 

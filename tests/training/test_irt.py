@@ -59,9 +59,8 @@ def two_planes(azimuth: float, number: int, *, label: bool, shift: float = 0.0) 
     d = d @ T[:3, :3].T
     up, down = (0.8 - T[2, 3]) / d[:, 2], -T[2, 3] / d[:, 2]
     at = T[:3, 3] + up[:, None] * d
-    deck = (np.abs(at[:, 0] - 0.8 - shift) < 0.7) & (
-        np.abs(at[:, 1]) < 0.7
-    )  # on another side of the picture from elsewhere
+    # On another side of the picture from elsewhere.
+    deck = (np.abs(at[:, 0] - 0.8 - shift) < 0.7) & (np.abs(at[:, 1]) < 0.7)
     z = np.where(deck, up, down)
     seen = T[:3, 3] + z[:, None] * d - deck[:, None] * (shift, 0, 0)
     cell = np.floor(seen[:, :2] / 0.15).astype(np.int64)

@@ -36,12 +36,14 @@ from semantic_mapper.training.finetune import FinetuneConfig
 from tests.nodes.support import error_line, run, write_log
 from tests.small import tiny_frames
 
-BOXED = 9  # id of the box
+BOXED, MOVING = 9, 10  # ids of boxes
+WHEN = 2  # the frame in which the second box is there
 
 
 @pytest.fixture(scope="module")
 def boxes(folder: Path) -> Path:
-    """A box round what the frames show of their most frequent thing, and one that moves."""
+    """A box round what the frames show of their most frequent thing, one that is there in one frame alone, and one that
+    is never there."""
     frames = tiny_frames(6)
     labels = np.stack([f.label for f in frames if f.label is not None])
     thing = max(ROOMS.thing_ids(STUFF_NAMES), key=lambda i: int((labels == i).sum()))
@@ -55,9 +57,10 @@ def boxes(folder: Path) -> Path:
     T[:3, 3] = (low + high) / 2
     name = ROOMS.names[ROOMS.ids.index(thing)]
     still = {"id": BOXED, "class": name, "T_world_box": T.tolist(), "size": (high - low + 0.1).tolist()}
-    moving = still | {"id": 10, "stamps": [[1, T.tolist()]]}
+    moving = still | {"id": MOVING, "stamps": [[frames[WHEN].stamp_ns, T.tolist()]]}
+    away = still | {"id": 11, "stamps": [[10**18, T.tolist()]]}
     path = folder / "boxes.json"
-    path.write_text(json.dumps({"boxes": [still, moving]}))
+    path.write_text(json.dumps({"boxes": [still, moving, away]}))
     return path
 
 
@@ -83,24 +86,26 @@ def test_boxes_become_labels_and_things_that_never_score(
 ) -> None:
     (out, said), new = fitted, tmp_path / "labelled.mcap"
     assert "1 of 1 boxes seen" in said and "own label images) of 6 of 6 frames" in said
-    assert "boxes left out: 1 that no frame sees" in said, "of the one that moves, no frame is of its time"
+    assert "1 boxes that move, with grids of their own" in said
+    assert "boxes left out: 1 that no frame sees" in said, "of the one that moves later, no frame is of its time"
     checkpoint = load_checkpoint(out)
     assert checkpoint.train_stamps_ns == {f.stamp_ns for f in tiny_frames(6)}  # their labels are true ones
     things = tmp_path / "things"
     done = run("autolabel", log, "--weights", out, "--overwrite-labels", "--instances", things, "--out", new)
     assert done.returncode == 0, done.stderr
     listed = json.loads((things / "instances.json").read_text())["instances"]
-    assert [thing["id"] for thing in listed] == [BOXED]
+    assert [thing["id"] for thing in listed] == [BOXED, MOVING]
     assert sorted(path.name for path in things.iterdir()) == ["instances.json", "rooms"]
     with open_log(new) as labelled:
         for number, frame in enumerate(labelled):
             assert frame.label is not None and frame.label_is_pseudo
             ids = cv2.imread(str(things / "rooms" / f"{number:06d}.png"), cv2.IMREAD_UNCHANGED)
             assert ids is not None and ids.dtype == np.uint16 and ids.shape == frame.label.shape
-            assert set(np.unique(ids).tolist()) <= {0, BOXED}
-            assert int((ids > 0).sum()) == listed[0]["pixels"].get(f"rooms/{number:06d}", 0)
+            assert set(np.unique(ids).tolist()) <= ({0, BOXED, MOVING} if number == WHEN else {0, BOXED})
+            for thing in listed:
+                assert int((ids == thing["id"]).sum()) == thing["pixels"].get(f"rooms/{number:06d}", 0)
             assert (frame.label[ids > 0] == ROOMS.id_of(listed[0]["class"])).all()
-    assert listed[0]["pixels"]
+    assert listed[0]["pixels"] and list(listed[1]["pixels"]) == [f"rooms/{WHEN:06d}"]
     done = run("eval", new, "--weights", out)
     assert done.returncode == 1 and "pseudo" in error_line(done.stderr)
     # As if nobody had seen the true labels, its things are scored against themselves.
