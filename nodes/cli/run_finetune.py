@@ -234,7 +234,7 @@ def finetune_lines(checkpoint: Checkpoint, chosen: Sequence[int], request: Finet
             f"({boxed['pseudo']}) of {boxed['labelled_frames']} of {boxed['frames']} frames, matched "
             f"{_per_cent(boxed['matched'])}"
         )
-        if not recipe["steps"]:
+        if checkpoint.model.config.classes == "fixed":
             lines.append("  stopped before classes were learned: they are those of the boxes alone")
         if boxed["crowded"]:
             lines.append(

@@ -53,6 +53,7 @@ SURVEYED = 20000  # rays that say how much of the images boxes cover
 LOOKED_AT = 2000  # of these together: where many boxes overlap, each ray takes a table of pairs
 FEW_COVERED = 0.01  # fraction of pixels that meet a box, below which the log is warned about
 FEW_MATCHED = 0.5  # fraction of the pseudo labels that are possible on their ray, below which the log is warned about
+LEARNED = 50  # steps of the second part, below which the learned classes of a stopped fit are hardly more than noise
 FORGET = 50  # steps between two looks at which cells are empty
 _log = get_logger(__name__)
 
@@ -117,8 +118,8 @@ def fit_panoptic(
             where ``config`` leaves out the losses that need some.
         config: ``seconds`` bounds the whole fit. ``steps``, if not 0, is the number of steps of each of its two parts.
         on_progress: Called after every step.
-        stopped: Asked before every step; once it says so (anything true), the field so far is the result. Before the
-            second part nothing has been learned of classes: the field then says what the boxes say, in full.
+        stopped: Asked before every step; once it says so (anything true), the field so far is the result. Where the second
+            part had less than ``LEARNED`` steps, its classes are those of the boxes alone (``fixed``).
         seen_stamps_ns: Frames whose true labels those who made the pseudo labels have learned from.
 
     Raises:
@@ -154,7 +155,7 @@ def fit_panoptic(
     data = replace(data, gain=torch.from_numpy(fit.gains), still=np.flatnonzero(~moving))
     joint = JointFit(field, data, config)
     joint.run(began, on_progress, stopped)
-    if not joint.step:
+    if joint.step < LEARNED and stopped():
         field.shape = field.config = msgspec.structs.replace(shape, classes="fixed")
     fill_boxes(field, fit.frames, data.rays, fit.gains, config.grid.near_m)
     survey = replace(survey, ambiguous=ambiguous_fraction(field, everything, config))

@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+import structlog
 import torch
 
 from semantic_mapper.config import BoxConfig, GridConfig, PanopticConfig
@@ -296,10 +297,11 @@ def test_boxes_behind_the_nearest_of_a_ray_are_counted() -> None:
         assert (survey.crowded > 0.05) == crowded and survey.crowded <= survey.covered
 
 
-def test_few_labels_that_fit_the_boxes_are_warned_about(caplog: pytest.LogCaptureFixture) -> None:
+def test_few_labels_that_fit_the_boxes_are_warned_about() -> None:
     off = [replace(f, label=np.full((48, 64), SET.ids[TABLE], np.uint8)) for f in scene()]
-    survey = survey_boxes(empty_field(DECK), pseudo_rays(off, SET, 64), SMALL)
-    assert survey.matched < FEW_MATCHED and "few_labels_match" in caplog.text
+    with structlog.testing.capture_logs() as logs:
+        survey = survey_boxes(empty_field(DECK), pseudo_rays(off, SET, 64), SMALL)
+    assert survey.matched < FEW_MATCHED and [log["event"] for log in logs] == ["few_labels_match"]
 
 
 def test_frames_without_labels_are_those_that_are_held_out() -> None:
@@ -310,14 +312,13 @@ def test_frames_without_labels_are_those_that_are_held_out() -> None:
     assert held_out_unlabelled(scene(), 3) == list(scene())
 
 
-def test_a_stop_before_classes_are_learned_leaves_what_the_boxes_say(tmp_path: Path) -> None:
-    steps: list[int] = []
-
-    def stop_after_some(progress: FinetuneProgress) -> None:
-        steps.append(progress.step)
-
-    stopped = fit_panoptic(scene(), SET, empty_field(DECK), SMALL, stop_after_some, lambda: len(steps) >= 30)
-    assert (stopped.recipe["grid_steps"], stopped.recipe["steps"]) == (30, 0)
+@pytest.mark.parametrize("joint", [0, 2])
+def test_a_stop_before_classes_are_learned_leaves_what_the_boxes_say(joint: int, tmp_path: Path) -> None:
+    done: list[FinetuneProgress] = []
+    stopped = fit_panoptic(
+        scene(), SET, empty_field(DECK), SMALL, done.append, lambda: len(done) >= SMALL.steps + joint
+    )
+    assert (stopped.recipe["grid_steps"], stopped.recipe["steps"]) == (SMALL.steps, joint)
     save_checkpoint(stopped, tmp_path / "w.safetensors")
     field = load_checkpoint(tmp_path / "w.safetensors").model
     assert isinstance(field, Panoptic) and field.shape.classes == "fixed"
