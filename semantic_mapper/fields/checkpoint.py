@@ -81,7 +81,7 @@ def default_checkpoint_path() -> Path:
 
 def find_checkpoint(path: Path) -> Path:
     """The path itself, or that of weights which ship with the package under this name (``COMPUTED_DEPTH``)."""
-    return path if path.exists() else shipped_checkpoint(path) or path
+    return path if path.exists() and not path.is_dir() else shipped_checkpoint(path) or path
 
 
 def shipped_checkpoint(name: Path) -> Path | None:
