@@ -118,7 +118,7 @@ def fit_panoptic(
             where ``config`` leaves out the losses that need some.
         config: ``seconds`` bounds the whole fit. ``steps``, if not 0, is the number of steps of each of its two parts.
         on_progress: Called after every step.
-        stopped: Asked before every step; once it says so (anything true), the field so far is the result. With less than
+        stopped: Asked before every step; once it says so, the field so far is the result. With less than
             ``LEARNED`` steps of the second part its classes are those of the boxes alone (``fixed``).
         seen_stamps_ns: Frames whose true labels those who made the pseudo labels have learned from.
 
