@@ -235,7 +235,10 @@ def finetune_lines(checkpoint: Checkpoint, chosen: Sequence[int], request: Finet
             f"{_per_cent(boxed['matched'])}"
         )
         if checkpoint.model.config.classes == "fixed":
-            lines.append("  stopped before classes were learned: they are those of the boxes alone")
+            lines.append(
+                "  stopped before classes were learned: they are those of the boxes alone; what is in none of them "
+                "(wall or floor) is not told apart"
+            )
         if boxed["crowded"]:
             lines.append(
                 f"  {_per_cent(boxed['crowded'])} of the pixels meet more than {MAX_INTERVALS} boxes: of these the "

@@ -53,7 +53,7 @@ SURVEYED = 20000  # rays that say how much of the images boxes cover
 LOOKED_AT = 2000  # of these together: where many boxes overlap, each ray takes a table of pairs
 FEW_COVERED = 0.01  # fraction of pixels that meet a box, below which the log is warned about
 FEW_MATCHED = 0.5  # fraction of the pseudo labels that are possible on their ray, below which the log is warned about
-LEARNED = 50  # steps of the second part, below which the learned classes of a stopped fit are hardly more than noise
+LEARNED = 10  # steps of the second part, below which the learned classes of a stopped fit are hardly more than noise
 FORGET = 50  # steps between two looks at which cells are empty
 _log = get_logger(__name__)
 
