@@ -52,8 +52,8 @@ def picture(config: StreetsConfig, folder: Path) -> UInt8:
         "Panoptic NeRF": [label_set.colorize(answer.label) for answer in said],
         **without_moving_boxes(config, street, views, folder),
         "true classes": [label_set.colorize(view.rendered.label) for view in views],
-        "its things": [thing_colors(answer.instance) for answer in said],
-        "its depth": [depth_picture(answer.depth_m / np.float32(6)) for answer in said if answer.depth_m is not None],
+        "things found": [thing_colors(answer.instance) for answer in said],
+        "depth found": [depth_picture(answer.depth_m / np.float32(6)) for answer in said if answer.depth_m is not None],
     }
     return draw_picture_rows(rows, label_set, WIDTH_PX)
 

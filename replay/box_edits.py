@@ -1,17 +1,19 @@
-"""Changes to files of boxes: each function takes what a file says and returns what the changed one says."""
+"""Changes to files of boxes. A changed box is checked as one that is read."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.primitives import Primitive, resized
-from semantic_mapper.labels import STUFF_NAMES
-from semantic_mapper.replay.boxes import MAX_ID, BoxFile
+from semantic_mapper.errors import ConfigError, PoseError
+from semantic_mapper.fields.primitives import Primitive, moved, resized
+from semantic_mapper.replay.box_values import MAX_ID, BoxFile, is_thing
+from semantic_mapper.replay.boxes import check_box, usable
+from semantic_mapper.replay.importers.kitti360 import SOURCE as KITTI360_SOURCE
+from semantic_mapper.replay.log.sequence import Log
 from semantic_mapper.types import Float64
 
 MAX_LISTED = 20  # ids that an error names
@@ -36,16 +38,17 @@ class BoxEditor:
         self.boxes = boxes
 
     def delete(self, ids: Sequence[int]) -> None:
-        """Take boxes out."""
-        gone = {self._find(i).id for i in ids}
-        self._set(tuple(p for p in self.boxes.primitives if p.id not in gone))
+        """Take boxes out, those that cannot be used as well; of JSON none of these may be left."""
+        bad = {b.id for b in self.boxes.bad}
+        gone = {i if i in bad else self._find(i).id for i in ids}
+        kept = tuple(p for p in self.boxes.primitives if p.id not in gone)
+        left = tuple(b for b in self.boxes.bad if b.id not in gone)
+        self.boxes = usable(self.path, replace(self.boxes, primitives=kept, bad=left))
 
     def reclass(self, box_id: int, class_name: str) -> None:
         """Give a box another class. Whether it is a thing is as of other boxes of that class, else by its name."""
         alike = [p.thing for p in self.boxes.primitives if p.class_name == class_name and p.id != box_id]
-        thing = alike[0] if alike else class_name not in STUFF_NAMES
-        if not class_name:
-            raise ConfigError(f"{self.path}, box {box_id}: a class has a name")
+        thing = alike[0] if alike else is_thing(class_name)
         self._change(box_id, lambda box: replace(box, class_name=class_name, thing=thing))
 
     def move(self, box_id: int, by: Float64, at_ns: int | None = None) -> None:
@@ -62,9 +65,8 @@ class BoxEditor:
 
     def resize(self, box_id: int, size: Float64) -> None:
         """Give a box another size (3,) along its own axes; its middle stays."""
-        if not (self._finite(box_id, size) > 0).all():
-            raise ConfigError(f"{self.path}, box {box_id}: sizes must be above 0 m, got {size.tolist()}")
-        self._change(box_id, lambda box: resized(box, size))
+        new = self._finite(box_id, size)
+        self._change(box_id, lambda box: resized(box, new))
 
     def duplicate(self, box_id: int) -> int:
         """Put a copy of a box where it is, under the least free id above all others, which is returned."""
@@ -80,9 +82,8 @@ class BoxEditor:
 
         One that stood still is known at that time alone from then on.
         """
-        if at_ns < 0:
-            raise ConfigError(f"{self.path}, box {box_id}: a time must not be below 0 ns, got {at_ns}")
         box = self._find(box_id)
+        self._refuse_frames(box)
         known = box.stamps or ()
         if any(stamp == at_ns for stamp, _ in known):
             raise ConfigError(f"{self.path}, box {box_id}: has a pose at {at_ns} ns already; move that one")
@@ -91,16 +92,24 @@ class BoxEditor:
         self._change(box_id, lambda box: replace(box, stamps=stamps, T_world_box=stamps[0][1]))
 
     def _moved(self, box: Primitive, move: Callable[[Float64], Float64], at_ns: int | None) -> Primitive:
+        if at_ns is None:
+            return moved(box, move)
+        self._refuse_frames(box)
         if box.stamps is None:
-            if at_ns is not None:
-                raise ConfigError(f"{self.path}, box {box.id}: stands still, so that it has no pose at {at_ns} ns")
-            return replace(box, T_world_box=move(box.T_world_box))
+            raise ConfigError(f"{self.path}, box {box.id}: stands still, so that it has no pose at {at_ns} ns")
         times = [stamp for stamp, _ in box.stamps]
-        if at_ns is not None and at_ns not in times:
+        if at_ns not in times:
             known = _listed(times)
             raise ConfigError(f"{self.path}, box {box.id}: has no pose at {at_ns} ns, but at {known}")
-        stamps = tuple((t, move(pose) if at_ns in (None, t) else pose) for t, pose in box.stamps)
+        stamps = tuple((t, move(pose) if at_ns == t else pose) for t, pose in box.stamps)
         return replace(box, stamps=stamps, T_world_box=stamps[0][1])
+
+    def _refuse_frames(self, box: Primitive) -> None:
+        if box.frames is not None:
+            raise ConfigError(
+                f"{self.path}, box {box.id}: has poses by frame and no times; give it those of a log first: "
+                "`boxes FILE times LOG`"
+            )
 
     def _finite(self, box_id: int, value: Float64 | float) -> Float64:
         if not np.isfinite(value).all():
@@ -116,11 +125,53 @@ class BoxEditor:
         raise ConfigError(f"{self.path}: has no box {box_id}; {has}")
 
     def _change(self, box_id: int, change: Callable[[Primitive], Primitive]) -> None:
-        self._find(box_id)
-        self._set(tuple(change(box) if box.id == box_id else box for box in self.boxes.primitives))
+        new = change(self._find(box_id))
+        try:
+            check_box(new)
+        except (ConfigError, PoseError) as error:
+            raise ConfigError(f"{self.path}, box {box_id}: {error}; nothing is changed") from error
+        self._set(tuple(new if box.id == box_id else box for box in self.boxes.primitives))
 
     def _set(self, primitives: tuple[Primitive, ...]) -> None:
         self.boxes = replace(self.boxes, primitives=primitives)
+
+
+def with_times(boxes: BoxFile, path: Path, log: Log) -> tuple[BoxFile, list[int]]:
+    """Boxes with poses by frame of a drive of KITTI-360, with the times of these frames in a log of it instead.
+
+    Poses at frames that the log lacks are dropped, and boxes without any other.
+
+    Args:
+        boxes: Of a file.
+        path: Of the file, for errors.
+        log: Imported from KITTI-360.
+
+    Returns:
+        The boxes, and the ids of those that were dropped.
+
+    Raises:
+        ConfigError: the log is of something else.
+    """
+    if all(box.frames is None for box in boxes.primitives):
+        return boxes, []
+    if not log.info.source.startswith(KITTI360_SOURCE):
+        raise ConfigError(
+            f"{path}: boxes have poses by frame of a drive of KITTI-360, and {log.path} is of '{log.info.source}'; "
+            "give the log that `import` made of the drive, or delete these boxes"
+        )
+    times: dict[int, int] = {}
+    for envelope, _ in log.frame_parts():
+        times.setdefault(envelope.seq, envelope.stamp_ns)
+    timed = [_timed(box, times) for box in boxes.primitives]
+    dropped = [box.id for box, new in zip(boxes.primitives, timed, strict=True) if new is None]
+    return replace(boxes, primitives=tuple(new for new in timed if new is not None)), dropped
+
+
+def _timed(box: Primitive, times: Mapping[int, int]) -> Primitive | None:
+    if box.frames is None:
+        return box
+    stamps = tuple(sorted({times[number]: pose for number, pose in box.frames if number in times}.items()))
+    return replace(box, frames=None, stamps=stamps, T_world_box=stamps[0][1]) if stamps else None
 
 
 def _listed(numbers: Sequence[int]) -> str:

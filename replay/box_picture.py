@@ -105,15 +105,10 @@ def _places(log: Log) -> list[_Place]:
 
 def _in_view(boxes: Sequence[Primitive], at: _Place) -> NDArray[np.bool_]:
     """Which of the boxes (B,) have their middle in an image."""
-    middle = np.array([_at_time(box, at.stamp_ns).T_world_box[:3, 3] for box in boxes]).reshape(-1, 3)
-    return nearest_pixels(transform(invert_pose(at.T_world_camera), middle), at.intrinsics)[0]
-
-
-def _at_time(box: Primitive, stamp_ns: int) -> Primitive:
-    """A box at the known time that is nearest."""
-    if box.stamps is None:
-        return box
-    return replace(box, T_world_box=min(box.stamps, key=lambda entry: abs(entry[0] - stamp_ns))[1])
+    poses = [box.pose_at(at.stamp_ns) for box in boxes]
+    middle = np.array([np.zeros(3) if pose is None else pose[:3, 3] for pose in poses]).reshape(-1, 3)
+    there = np.array([pose is not None for pose in poses], np.bool_)
+    return there & nearest_pixels(transform(invert_pose(at.T_world_camera), middle), at.intrinsics)[0]
 
 
 @rendered
@@ -134,7 +129,8 @@ def _draw(
         box = (MARGIN + column * (TILE_WIDTH + GAP), HEADER + CAPTION, TILE_WIDTH, height)
         axes = put_picture(figure, box, frame.rgb, f"frame {at.number}", smooth=True)
         for primitive in boxes:
-            _put_edges(axes, _at_time(primitive, at.stamp_ns), at, colors[primitive.class_name])
+            if (pose := primitive.pose_at(at.stamp_ns)) is not None:
+                _put_edges(axes, replace(primitive, T_world_box=pose), at, colors[primitive.class_name])
     plan_width = width - LEGEND_WIDTH - GAP
     _put_plan(figure, (MARGIN, top, plan_width, PLAN_HEIGHT), surface, np.stack(poses), boxes, colors)
     counts = {name: sum(box.class_name == name for box in boxes) for name in colors}
@@ -232,7 +228,8 @@ def _surface(frames: Sequence[PosedFrame]) -> tuple[Float64, UInt8]:
 
 
 def _poses(box: Primitive) -> list[Float64]:
-    return [box.T_world_box] if box.stamps is None else [pose for _, pose in box.stamps]
+    known = box.stamps or box.frames
+    return [box.T_world_box] if known is None else [pose for _, pose in known]
 
 
 def _footprint(corners: Float64) -> Float64:

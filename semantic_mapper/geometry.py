@@ -35,18 +35,19 @@ def expect_shape(x: torch.Tensor | NDArray[np.generic], pattern: str, name: str 
     return sizes
 
 
-def check_pose(T_world_camera: Float64, where: str) -> None:
+def check_pose(T_world_camera: Float64, where: str, of: str = "camera") -> None:
     """Refuse what is not a rigid transform.
 
     Args:
         T_world_camera: (4, 4).
         where: Names the frame or file in the error.
+        of: Whose pose it is.
 
     Raises:
         PoseError: NaN or infinite numbers, wrong last row, a 3x3 part that is not a rotation, or a position farther
             than ``MAX_TRANSLATION_M`` from the origin.
     """
-    expect_shape(T_world_camera, "4 4", f"{where}: T_world_camera")
+    expect_shape(T_world_camera, "4 4", f"{where}: T_world_{of}")
     if not np.isfinite(T_world_camera).all():
         raise PoseError(f"{where}: the pose holds NaN or infinity; drop the frame or give it a tracked pose")
     if not np.allclose(T_world_camera[3], (0, 0, 0, 1), atol=1e-9):
@@ -57,12 +58,12 @@ def check_pose(T_world_camera: Float64, where: str) -> None:
         det = float(np.linalg.det(R))
     if not (error <= ROTATION_TOLERANCE and det > 0):
         raise PoseError(
-            f"{where}: the pose is not a rotation (|R^T R - I| = {error:.2g}, det = {det:.3f}); "
-            "give T_world_camera as a row-major rigid 4x4 without scale or mirror"
+            f"{where}: the pose is not a rotation (|R^T R - I| = {error:.2g}, det = {det:.3g}); "
+            f"give T_world_{of} as a row-major rigid 4x4 without scale or mirror"
         )
     if np.abs(T_world_camera[:3, 3]).max() > MAX_TRANSLATION_M:
         raise PoseError(
-            f"{where}: the camera is at {T_world_camera[:3, 3]} m, beyond the {MAX_TRANSLATION_M / 1000:g} km from the "
+            f"{where}: the {of} is at {T_world_camera[:3, 3]} m, beyond the {MAX_TRANSLATION_M / 1000:g} km from the "
             "origin within which float32 resolves a voxel; give poses in metres, relative to a nearer origin"
         )
 

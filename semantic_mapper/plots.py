@@ -145,15 +145,31 @@ def png_bytes(picture: UInt8) -> bytes:
     return data.tobytes()
 
 
+def jpeg_bytes(picture: UInt8) -> bytes:
+    """An RGB picture (H, W, 3) as JPEG.
+
+    Raises:
+        SemanticMapperError: OpenCV cannot encode it.
+    """
+    crisp = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)  # thin lines keep their colour
+    encoded, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), crisp)
+    if not encoded:
+        raise SemanticMapperError("the picture could not be encoded as JPEG")
+    return data.tobytes()
+
+
 def write_picture(path: Path, picture: UInt8) -> None:
-    """Write an RGB picture (H, W, 3) as PNG, whole or not at all, in a folder that is made if missing.
+    """Write an RGB picture (H, W, 3), as JPEG if its name says so, else as PNG; whole or not at all.
+
+    The folder is made if missing.
 
     Raises:
         SemanticMapperError: it cannot be encoded or written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(path, png_bytes(picture))
+        is_jpeg = path.suffix.lower() in (".jpg", ".jpeg")
+        write_bytes(path, jpeg_bytes(picture) if is_jpeg else png_bytes(picture))
     except OSError as error:
         raise SemanticMapperError(f"{path}: cannot be written: {error.strerror or error}") from error
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from semantic_mapper.errors import ConfigError
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.outputs import prepare_file
 from semantic_mapper.nodes.cli.verb import verb
@@ -30,6 +31,7 @@ class Action(StrEnum):
     RESIZE = "resize"
     TURN = "turn"
     DUPLICATE = "duplicate"
+    TIMES = "times"
     PICTURE = "picture"
 
 
@@ -41,8 +43,10 @@ ARGUMENTS = {
     Action.RESIZE: "ID X Y Z",
     Action.TURN: "ID DEGREES",
     Action.DUPLICATE: "ID",
+    Action.TIMES: "LOG",
     Action.PICTURE: "LOG",
 }
+PICTURES = (".png", ".jpg", ".jpeg")
 AT_TIMES = (Action.MOVE, Action.TURN, Action.DUPLICATE)  # that --at-ns goes with
 
 
@@ -56,7 +60,7 @@ def boxes(
         Action,
         typer.Argument(
             metavar="ACTION",
-            help="list, delete, reclass, move, resize, turn, duplicate or picture.",
+            help="list, delete, reclass, move, resize, turn, duplicate, times or picture.",
             show_default=False,
         ),
     ] = Action.LIST,
@@ -73,7 +77,7 @@ def boxes(
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The changed boxes (boxes.json), or the picture (.png).")
+        Path | None, typer.Option(metavar="FILE", help="The changed boxes (.json), or the picture (.png, .jpg).")
     ] = None,
     in_place: Annotated[bool, typer.Option("--in-place", help="Change the file itself.")] = False,
     json: Annotated[bool, typer.Option("--json", help="list: print JSON, and nothing else, on stdout.")] = False,
@@ -82,7 +86,8 @@ def boxes(
 
     move shifts a box by metres along the axes of the world, turn turns it round its own upright axis (anticlockwise
     from above), resize gives it another size along its own axes. duplicate puts a copy with a new id in the same place,
-    to be moved. picture draws the boxes over the three frames of a log that show most of them, and from above.
+    to be moved. times gives boxes of KITTI-360 that move, whose poses are by frame, the times of a log of their drive.
+    picture draws the boxes over the three frames of a log that show most of them, and from above.
 
     Example: semantic-mapper boxes things.json list
     Example: semantic-mapper boxes things.json delete 4 7 --out boxes.json
@@ -93,14 +98,10 @@ def boxes(
     words = arguments or []
     _check_usage(action, words, at_ns, out, in_place=in_place, json=json)
     output = Output.guarded()
-    from semantic_mapper.errors import ConfigError
-    from semantic_mapper.replay.box_edits import BoxEditor
-    from semantic_mapper.replay.boxes import load_boxes, save_boxes
+    from semantic_mapper.replay.boxes import load_boxes, read_boxes, save_boxes
 
     output.quiet = json
-    if out is not None:
-        prepare_file(out)
-    found = load_boxes(file)
+    found = read_boxes(file) if action is Action.DELETE else load_boxes(file)
     if action is Action.LIST:
         if json:
             output.json(describe_boxes(found))
@@ -110,12 +111,13 @@ def boxes(
         assert out is not None  # or it was wrong usage
         output.print(_draw(found, Path(words[0]), file, out))
         return
-    if in_place and file.suffix.lower() == ".xml":
+    target = out or file
+    if found.is_xml and _same_file(target, file):
         raise ConfigError(f"{file}: boxes are written as JSON; give --out FILE.json")
-    editor = BoxEditor(file, found)
-    done = _edit(editor, action, words, at_ns)
-    save_boxes(out or file, editor.boxes)
-    output.print(f"{done}; {counted(len(editor.boxes.primitives), 'box', 'boxes')} written to {out or file}")
+    changed, done = _changed(file, found, action, words, at_ns)
+    prepare_file(target)
+    save_boxes(target, changed)
+    output.print(f"{done}; {counted(len(changed.primitives), 'box', 'boxes')} written to {target}")
 
 
 def _check_usage(
@@ -131,10 +133,43 @@ def _check_usage(
     if not edits and (in_place or (out is None) is (action is Action.PICTURE)):
         usage = "picture needs --out FILE.png" if action is Action.PICTURE else "list writes no file"
         raise typer.BadParameter(usage, param_hint="--out")
+    if out is not None:
+        _check_name(action, words, out)
     if at_ns is not None and action not in AT_TIMES:
         raise typer.BadParameter(f"goes with {', '.join(AT_TIMES)}", param_hint="--at-ns")
     if json and action is not Action.LIST:
         raise typer.BadParameter("goes with list", param_hint="--json")
+
+
+def _check_name(action: Action, words: list[str], out: Path) -> None:
+    wanted = PICTURES if action is Action.PICTURE else (".json",)
+    if out.suffix.lower() not in wanted:
+        raise typer.BadParameter(f"{action} writes {' or '.join(wanted)}, got {out}", param_hint="--out")
+    if action in (Action.PICTURE, Action.TIMES) and _same_file(out, Path(words[0])):
+        raise typer.BadParameter(f"{out} is the log", param_hint="--out")
+
+
+def _same_file(a: Path, b: Path) -> bool:
+    return a == b or (a.exists() and b.exists() and a.samefile(b))
+
+
+def _changed(file: Path, found: BoxFile, action: Action, words: list[str], at_ns: int | None) -> tuple[BoxFile, str]:
+    """The changed boxes, and what was done."""
+    from semantic_mapper.replay.box_edits import BoxEditor, with_times
+    from semantic_mapper.replay.log.sequence import open_log
+
+    if action is Action.TIMES:
+        by_frame = sum(box.frames is not None for box in found.primitives)
+        with open_log(Path(words[0])) as log:
+            changed, dropped = with_times(found, file, log)
+        gone = f", {len(dropped)} that are at none of its frames dropped" if dropped else ""
+        return (
+            changed,
+            f"{counted(by_frame - len(dropped), 'box', 'boxes')} with times of {words[0]} instead of frames{gone}",
+        )
+    editor = BoxEditor(file, found)
+    done = _edit(editor, action, words, at_ns)
+    return editor.boxes, done
 
 
 def _edit(editor: BoxEditor, action: Action, words: list[str], at_ns: int | None) -> str:
@@ -181,11 +216,16 @@ def _number(word: str) -> float:
 
 def _draw(found: BoxFile, log_path: Path, file: Path, out: Path) -> str:
     from semantic_mapper.plots import write_picture
+    from semantic_mapper.replay.box_edits import with_times
     from semantic_mapper.replay.box_picture import draw_boxes
     from semantic_mapper.replay.log.sequence import open_log
 
+    if _same_file(out, file):
+        raise ConfigError(f"{out}: is the file of boxes; give the picture another name")
+    prepare_file(out)
     with open_log(log_path) as log:
-        picture, seen = draw_boxes(log, found.primitives, f"{file.name} in {log_path.name}")
+        timed, _ = with_times(found, file, log)
+        picture, seen = draw_boxes(log, timed.primitives, f"{file.name} in {log_path.name}")
     write_picture(out, picture)
     count = len(found.primitives)
     hint = "" if seen or not count else "; are they in the log's world frame?"
@@ -205,11 +245,13 @@ def describe_boxes(found: BoxFile) -> dict[str, Any]:
             "center": np.round(box.T_world_box[:3, 3], 4).tolist(),
             "size": np.round(box.size, 4).tolist(),
             "stamps_ns": [stamp for stamp, _ in box.stamps or ()],
+            "frames": [number for number, _ in box.frames or ()],
         }
         for box in found.primitives
     ]
     merge = {name: list(rest) for name, rest in found.merge.items()}
-    return {"boxes": listed, "merge": merge, "left_out": found.left_out}
+    bad = [{"number": b.number, "id": b.id, "problem": b.problem} for b in found.bad]
+    return {"boxes": listed, "merge": merge, "left_out": found.left_out, "bad": bad}
 
 
 def box_table(title: str, found: BoxFile) -> Table:
@@ -221,7 +263,16 @@ def box_table(title: str, found: BoxFile) -> Table:
         table.add_column(name, overflow="fold")
     for box in describe_boxes(found)["boxes"]:
         lengths = (" ".join(f"{value:.2f}" for value in box[key]) for key in ("center", "size"))
-        times = box["stamps_ns"]
-        span = f"{len(times)}: {times[0]} to {times[-1]} ns" if times else "always"
-        table.add_row(str(box["id"]), box["class"], box["shape"], "yes" if box["thing"] else "no", *lengths, span)
+        thing = "yes" if box["thing"] else "no"
+        table.add_row(str(box["id"]), box["class"], box["shape"], thing, *lengths, _span(box))
+    if found.left_out:
+        table.caption = f"left out: {found.left_out} of no class"
     return table
+
+
+def _span(box: dict[str, Any]) -> str:
+    """When a described box is where it is."""
+    times, frames = box["stamps_ns"], box["frames"]
+    if times:
+        return f"{len(times)}: {times[0]} to {times[-1]} ns"
+    return f"{counted(len(frames), 'frame')}: {frames[0]} to {frames[-1]}" if frames else "always"

@@ -74,12 +74,15 @@ RefineOption = Annotated[
 ]
 SuiteConfigOption = Annotated[
     Path | None,
-    typer.Option("--config", help="TOML file with a SuiteConfig; klevr: a KlevrConfig; aerial: an AerialConfig."),
+    typer.Option(
+        "--config",
+        help="TOML file with a SuiteConfig; klevr: a KlevrConfig; aerial: an AerialConfig; streets: a StreetsConfig.",
+    ),
 ]
 ArmOption = Annotated[
-    list[str] | None, typer.Option("--arm", help="klevr and aerial: what to run; may repeat.  [default: all]")
+    list[str] | None, typer.Option("--arm", help="klevr, aerial and streets: what to run; may repeat.  [default: all]")
 ]
-ClaimsOption = Annotated[bool, typer.Option("--claims", help="klevr and aerial: judge the paper's claims.")]
+ClaimsOption = Annotated[bool, typer.Option("--claims", help="klevr, aerial and streets: judge the paper's claims.")]
 
 
 def refuse_given(suite: str, given: Mapping[str, object]) -> None:

@@ -44,6 +44,7 @@ from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
 
 CAMERAS = ("image_00", "image_01")
+SOURCE = "kitti360 "  # begins the name of the source of such logs, whose frames have the numbers of the drive
 NOMINAL_HZ = 10.0  # of drives whose timestamps.txt is not there
 _CLASSES = (  # from id 7 on
     "road 804080|sidewalk f423e8|parking faaaa0|rail track e6968c|building 464646|wall 66669c|fence be9999|"
@@ -108,7 +109,7 @@ class Kitti360Recording:
         # The two cameras fire together: the left one first, so that stamps never fall.
         self._order = sorted((number, name) for name in self._cameras for number in self._files[name])
         self.info = StreamInfo(
-            source=f"kitti360 {drive}",
+            source=f"{SOURCE}{drive}",
             cameras=self._intrinsics,
             label_set=LABELS if labelled else None,
             frame_count=len(self._order),

@@ -26,6 +26,7 @@ SEED = 1  # pycolmap takes 0 for "another each time"
 MIN_MODEL_IMAGES = 5
 INIT_TRIALS = 40
 LARGE, LEAST_PRECISION = 1280, 0.25  # pixels of the longer side from which on COLMAP's limits hold; their least factor
+MAX_FOCAL_CHANGE = 0.1  # of one that is known about: EXIF data has whole millimetres, and the picture may be cropped
 FOCAL_RANGE = 0.2, 5.0  # times the longer side; a model beyond it has run away
 
 
@@ -36,12 +37,15 @@ class Camera(msgspec.Struct, frozen=True):
         width, height: Of the frames.
         fixed: fx, fy, cx, cy of a calibrated camera, which stay; None = not calibrated.
         focal_priors: Focal lengths to begin with, in this order, until most frames find their place; not calibrated.
+        about: The first of these is known about, and held until all frames have their place. Rows of pictures over flat
+            ground fit a wrong one as well.
     """
 
     width: int
     height: int
     fixed: tuple[float, float, float, float] | None
     focal_priors: tuple[float, ...]
+    about: bool = False
 
 
 class Model(msgspec.Struct, frozen=True):
@@ -117,7 +121,7 @@ def main(folder: Path) -> None:
     _match(pycolmap, folder, [file.stem for file in files], descriptors, pairs, _precision(camera))
     attempts: list[Attempt] = []
     for number, prior in enumerate(camera.focal_priors if camera.fixed is None else (camera.fixed[0],)):
-        models = _map(pycolmap, folder, number, camera, prior, len(files))
+        models = _map(pycolmap, folder, number, camera, prior, len(files), held=camera.about and number == 0)
         attempts.append(Attempt(prior, models))
         if models and models[0].images >= ENOUGH * len(files):
             break
@@ -188,8 +192,10 @@ def _match(
     _tell("match", len(pairs), len(pairs))
 
 
-def _map(pycolmap: Any, folder: Path, number: int, camera: Camera, prior: float, count: int) -> list[Model]:
-    """Models of one attempt, the largest first."""
+def _map(
+    pycolmap: Any, folder: Path, number: int, camera: Camera, prior: float, count: int, *, held: bool
+) -> list[Model]:
+    """Models of one attempt, the largest first; ``held``: the focal length is about right, and freed at the end."""
     with pycolmap.Database.open(folder / DATABASE) as database:
         database.update_camera(_camera(pycolmap, camera, prior))
     options = pycolmap.IncrementalPipelineOptions()
@@ -199,14 +205,16 @@ def _map(pycolmap: Any, folder: Path, number: int, camera: Camera, prior: float,
     options.max_num_models = 6
     options.init_num_trials = INIT_TRIALS
     options.extract_colors = False
-    options.ba_refine_focal_length = options.ba_refine_extra_params = camera.fixed is None
+    options.ba_refine_extra_params = camera.fixed is None
+    options.ba_refine_focal_length = camera.fixed is None and not held
     precision = _precision(camera)
     options.mapper.init_max_error *= precision
     options.mapper.abs_pose_max_error *= precision
     options.mapper.filter_max_reproj_error *= precision
     options.triangulation.merge_max_reproj_error *= precision
     options.triangulation.complete_max_reproj_error *= precision
-    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = camera.fixed is None
+    options.mapper.abs_pose_refine_extra_params = camera.fixed is None
+    options.mapper.abs_pose_refine_focal_length = camera.fixed is None and not held
     options.min_focal_length_ratio = options.mapper.min_focal_length_ratio = FOCAL_RANGE[0]
     options.max_focal_length_ratio = options.mapper.max_focal_length_ratio = FOCAL_RANGE[1]
     done = [0]
@@ -227,6 +235,8 @@ def _map(pycolmap: Any, folder: Path, number: int, camera: Camera, prior: float,
         initial_image_pair_callback=lambda: step(2),
         next_image_callback=lambda: step(1),
     )
+    if held:
+        found = {index: _freed(pycolmap, out / str(index), prior) for index in found}
     models = [
         Model(
             folder=f"{out.name}/{index}",
@@ -239,6 +249,21 @@ def _map(pycolmap: Any, folder: Path, number: int, camera: Camera, prior: float,
     size = max(camera.width, camera.height)
     models = [model for model in models if FOCAL_RANGE[0] < model.focal_px / size < FOCAL_RANGE[1]]
     return sorted(models, key=lambda model: (-model.images, model.error_px))
+
+
+def _freed(pycolmap: Any, folder: Path, prior: float) -> Any:
+    """The model in a folder, adjusted with a free focal length; as it was where that runs away from the known one."""
+    held, model = pycolmap.Reconstruction(folder), pycolmap.Reconstruction(folder)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.solver_options.num_threads = 1  # as above
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
+    focal = float(next(iter(model.cameras.values())).mean_focal_length())
+    if abs(focal / prior - 1) > MAX_FOCAL_CHANGE:
+        return held
+    model.write(folder)
+    return model
 
 
 def _check_focal(pycolmap: Any, folder: Path) -> FocalCheck:

@@ -222,10 +222,10 @@ class _Lens:
         self.measured: CameraIntrinsics | None = None
         ratio = film.width / film.full_width
         self.priors = tuple(f * max(film.width, film.height) for f in FOCAL_PRIORS)
-        self.source = "found, beginning with usual lenses"
+        self.source, self.about = "found, beginning with usual lenses", False
         if film.focal_px is not None:
             self.priors = (film.focal_px, *self.priors)
-            self.source = "found, beginning with that of the picture's EXIF data"
+            self.source, self.about = "found, about that of the picture's EXIF data", True
         if options.focal_prior_px is not None:
             if not 0.1 <= options.focal_prior_px / max(film.full_width, film.full_height) <= 20:
                 raise ConfigError(
@@ -233,7 +233,7 @@ class _Lens:
                     f"{film.full_width}x{film.full_height}; most lenses have 0.6 to 1.5 times the width"
                 )
             self.priors = tuple(f * options.focal_prior_px * ratio for f in RETRY_PRIORS)
-            self.source = f"found, beginning with the given {options.focal_prior_px:g}"
+            self.source, self.about = f"found, beginning with the given {options.focal_prior_px:g}", False
         if options.calibration is None:
             return
         if options.focal_prior_px is not None:
@@ -264,7 +264,7 @@ class _Lens:
     def request(self, film: Film) -> colmap.Camera:
         """For the process."""
         if self.rectify is None:
-            return colmap.Camera(film.width, film.height, None, self.priors)
+            return colmap.Camera(film.width, film.height, None, self.priors, self.about)
         i = self.rectify.intrinsics
         return colmap.Camera(film.width, film.height, (i.fx, i.fy, i.cx + 0.5, i.cy + 0.5), (i.fx,))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -25,6 +25,7 @@ ShapeName = Literal["box", "ellipsoid", "prism", "mesh"]
 SHAPES: tuple[ShapeName, ...] = ("box", "ellipsoid", "prism", "mesh")
 AROUND, RINGS = 20, 10  # of the triangles of an ellipsoid
 MAX_INTERVALS = 32  # of a ray; those behind are dropped
+ROUNDING = 1e-9  # of a size: nothing is moved by less
 ALONE_NS = 50_000_000  # a pose at one time alone holds for so long before and after
 
 
@@ -35,13 +36,14 @@ class Primitive:
     Args:
         id: 1 to 65535, of this primitive alone.
         class_name: Of the label set.
-        shape: What it is; its axes and centre are those of ``T_world_box``.
+        shape: What it is, in the axes of ``T_world_box``, whose origin is the middle of its bounds (``centred``).
         T_world_box: (4, 4) float64 pose; of one that moves, its first.
         size: (3,) metres, the sides of a box, the diameters of an ellipsoid, the bounds of a prism or a mesh.
         thing: Whether it is one countable thing, or part of some stuff.
         polygon: (N, 2) metres, outline of a prism in x and y; it reaches from -size[2] / 2 to size[2] / 2 in z.
         vertices, faces: (V, 3) float64 metres in the box's axes and (F, 3) int64, of a mesh.
-        stamps: Of one that moves: (ns, (4, 4) pose) at each time that is known; None = it stands still.
+        stamps: Of one that moves: (ns, (4, 4) pose) at each time that is known.
+        frames: Of one that moves, whose times are not known: (number of a frame of its drive, (4, 4) pose) instead.
     """
 
     id: int
@@ -54,19 +56,21 @@ class Primitive:
     vertices: Float64 | None = None
     faces: Int64 | None = None
     stamps: tuple[tuple[int, Float64], ...] | None = None
+    frames: tuple[tuple[int, Float64], ...] | None = None
 
     @property
     def moves(self) -> bool:
         """Whether it is at different places at different times."""
-        return self.stamps is not None
+        return self.stamps is not None or self.frames is not None
 
     def pose_at(self, stamp_ns: int) -> Float64 | None:
         """Its pose (4, 4) at a time, between two stamps on the way from one to the other.
 
-        None where that is by more than half of the median gap of the stamps before the first or after the last.
+        None where that is by more than half of the median gap of the stamps before the first or after the last, and of
+        one whose times are not known.
         """
         if self.stamps is None:
-            return self.T_world_box
+            return self.T_world_box if self.frames is None else None
         known = sorted(self.stamps, key=lambda entry: entry[0])
         times = np.array([t for t, _ in known], np.int64)
         beyond = max(int(times[0]) - stamp_ns, stamp_ns - int(times[-1]))
@@ -94,8 +98,35 @@ class Primitive:
         return (signs * self.size) @ self.T_world_box[:3, :3].T + self.T_world_box[:3, 3]
 
 
+def moved(box: Primitive, move: Callable[[Float64], Float64]) -> Primitive:
+    """A primitive with all its poses (4, 4) changed alike."""
+
+    def each(known: tuple[tuple[int, Float64], ...] | None) -> tuple[tuple[int, Float64], ...] | None:
+        return None if known is None else tuple((when, move(pose)) for when, pose in known)
+
+    return replace(box, T_world_box=move(box.T_world_box), stamps=each(box.stamps), frames=each(box.frames))
+
+
+def centred(box: Primitive) -> Primitive:
+    """The same piece of space, with the origin of its axes in the middle of its outline or mesh."""
+    middle = np.zeros(3)
+    if box.polygon is not None:
+        middle[:2] = (box.polygon.min(0) + box.polygon.max(0)) / 2
+    if box.vertices is not None:
+        middle = (box.vertices.min(0) + box.vertices.max(0)) / 2
+    if np.abs(middle).max() <= ROUNDING * box.size.max():
+        return box
+    shift = np.eye(4)
+    shift[:3, 3] = middle
+    box = moved(box, lambda pose: pose @ shift)
+    if box.polygon is not None:
+        return replace(box, polygon=box.polygon - middle[:2])
+    assert box.vertices is not None
+    return replace(box, vertices=box.vertices - middle)
+
+
 def resized(box: Primitive, size: Float64) -> Primitive:
-    """A primitive of another size (3,) along its own axes; outlines and meshes scale with it."""
+    """A primitive of another size (3,) along its own axes round its middle; outlines and meshes scale with it."""
     ratio = size / box.size
     if box.polygon is not None:
         return replace(box, size=size, polygon=box.polygon * ratio[:2])
@@ -233,7 +264,7 @@ def closed_mesh(vertices: Float64, faces: Int64) -> tuple[Float64, Int64]:
     if faces.size == 0 or faces.min() < 0 or faces.max() >= len(vertices):
         raise ConfigError(f"faces must name vertices 0 to {len(vertices) - 1}")
     extent = float(np.ptp(vertices, axis=0).max())
-    places, place_of = np.unique(np.round(vertices / max(extent * 1e-9, 1e-12)), axis=0, return_inverse=True)
+    places, place_of = np.unique(np.round(vertices / max(extent * ROUNDING, 1e-12)), axis=0, return_inverse=True)
     first = np.zeros(len(places), np.int64)
     first[place_of.ravel()] = np.arange(len(vertices))
     faces = place_of.ravel()[faces]
@@ -339,7 +370,7 @@ def triangulate(polygon: Float64) -> Int64:
     """Triangles (N - 2, 3) of a simple polygon (N, 2) whose corners go round anticlockwise.
 
     Raises:
-        ConfigError: it crosses itself, or its corners lie on a line.
+        ConfigError: it crosses or touches itself, or all its corners lie on a line.
     """
     left = list(range(len(polygon)))
     triangles: list[tuple[int, int, int]] = []
@@ -354,7 +385,7 @@ def triangulate(polygon: Float64) -> Int64:
                 del left[k]
                 break
         else:
-            raise ConfigError("the outline crosses itself or has corners on a line; give a simple polygon")
+            raise ConfigError("the outline crosses or touches itself; give a simple polygon")
     if len(left) < 3 or _cross(polygon, *left) <= 0:
         raise ConfigError("the outline has no area; give a simple polygon of at least 3 corners")
     return np.array([*triangles, tuple(left)], np.int64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,13 @@ import pytest
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.primitives import Primitive
 from semantic_mapper.geometry import check_pose
-from semantic_mapper.replay.box_edits import BoxEditor
-from semantic_mapper.replay.boxes import BoxFile, load_boxes, save_boxes
+from semantic_mapper.labels import ROOMS
+from semantic_mapper.replay.box_edits import BoxEditor, with_times
+from semantic_mapper.replay.boxes import BoxFile, load_boxes, read_boxes, save_boxes
+from semantic_mapper.replay.log.format import LogWriter
+from semantic_mapper.replay.log.sequence import open_log
+from semantic_mapper.transport.messages import StreamInfo
+from tests.small import tiny_frames
 
 
 def pose(*center: float) -> np.ndarray:
@@ -107,13 +113,17 @@ def test_a_box_is_duplicated_over_time_with_the_pose_of_the_nearest_time(editor:
     ("edit", "says"),
     [
         (lambda e: e.delete([3, 4]), "has no box 4; it has 3, 7, 9"),
-        (lambda e: e.resize(3, np.array([1, 0, 1.0])), "box 3: sizes must be above 0"),
+        (lambda e: e.resize(3, np.array([1, 0, 1.0])), "box 3: size must be at least 0.001 m"),
         (lambda e: e.move(3, np.array([np.nan, 0, 0])), "box 3: values must be numbers"),
         (lambda e: e.turn(3, np.inf), "box 3: values must be numbers"),
         (lambda e: e.move(3, np.zeros(3), 5), "box 3: stands still"),
+        (lambda e: e.move(3, np.array([1e9, 0, 0])), r"box 3: T_world_box: the box is at \[1"),
+        (lambda e: e.resize(7, np.array([1, 1e-9, 1.0])), "box 7: size must be at least"),
+        (lambda e: e.resize(3, np.array([1, 1, 1e6])), "box 3: size must be metres within 100 km"),
+        (lambda e: e.reclass(3, ""), "box 3: class must be the name"),
         (lambda e: e.turn(9, 1.0, 150), "box 9: has no pose at 150 ns, but at 100, 200"),
         (lambda e: e.add_time(9, 100), "box 9: has a pose at 100 ns already"),
-        (lambda e: e.add_time(9, -1), "box 9: a time must not be below 0"),
+        (lambda e: e.add_time(9, -1), "box 9: stamps must be whole numbers of nanoseconds from 0"),
     ],
 )
 def test_what_cannot_be_names_the_file_and_the_box_and_changes_nothing(editor: BoxEditor, edit, says: str) -> None:
@@ -136,3 +146,53 @@ def test_the_answer_of_a_query_becomes_a_file_of_boxes(tmp_path: Path) -> None:
     save_boxes(path, editor.boxes)
     once, again = editor.boxes.primitives[0], load_boxes(path).primitives[0]
     np.testing.assert_array_equal(once.size, again.size)
+
+
+def test_boxes_that_cannot_be_used_are_taken_out_and_none_is_left(tmp_path: Path) -> None:
+    path = tmp_path / "boxes.json"
+    good = {"id": 1, "class": "chair", "T_world_box": np.eye(4).tolist(), "size": [1, 1, 1]}
+    path.write_text(json.dumps({"boxes": [good, good | {"id": 70000}, good | {"id": 3, "size": [1, 1, 0]}]}))
+    editor = BoxEditor(path, read_boxes(path))
+    with pytest.raises(ConfigError, match=r"box 3 \(id 3\): size"):
+        editor.delete([70000])
+    editor.delete([3, 70000])
+    assert [p.id for p in editor.boxes.primitives] == [1]
+
+
+@pytest.fixture
+def by_frame(editor: BoxEditor) -> BoxEditor:
+    """Box 7 is at 5, 6, 7 ... at these frames, box 9 at a frame that no log here has."""
+    far = tuple((number, pose(number, 0, 1)) for number in (5, 7, 8))
+    still, wall, car = editor.boxes.primitives
+    wall = replace(wall, frames=far, T_world_box=far[0][1])
+    car = replace(car, stamps=None, frames=((90, pose(0, 0, 0)),), T_world_box=pose(0, 0, 0))
+    save_boxes(editor.path, replace(editor.boxes, primitives=(still, wall, car)))
+    return BoxEditor(editor.path, load_boxes(editor.path))
+
+
+def test_poses_by_frame_take_the_times_of_a_log_of_their_drive(by_frame: BoxEditor, tmp_path: Path) -> None:
+    frames = [replace(f, seq=5 + i) for i, f in enumerate(tiny_frames(3))]
+    for name, source in (("drive", "kitti360 2013_05_28_drive_0000_sync"), ("robot", "my robot")):
+        info = StreamInfo(source, {f.camera_id: f.intrinsics for f in frames}, ROOMS)
+        with LogWriter(tmp_path / f"{name}.mcap", info) as writer:
+            for frame in frames:
+                writer.write_frame(frame)
+    with open_log(tmp_path / "drive.mcap") as log:
+        timed, dropped = with_times(by_frame.boxes, by_frame.path, log)
+    with (
+        open_log(tmp_path / "robot.mcap") as log,
+        pytest.raises(ConfigError, match=r"boxes\.json: boxes have poses by frame.*'my robot'"),
+    ):
+        with_times(by_frame.boxes, by_frame.path, log)
+    still, wall = timed.primitives
+    assert dropped == [9] and not still.moves and wall.frames is None
+    assert [(t, T[0, 3]) for t, T in wall.stamps or ()] == [(frames[0].stamp_ns, 5), (frames[2].stamp_ns, 7)]
+
+
+def test_poses_by_frame_move_together_and_have_no_times_to_change(by_frame: BoxEditor) -> None:
+    by_frame.move(7, np.array([0, 1.0, 0]))
+    wall = box(by_frame, 7)
+    assert [(n, T[:3, 3].tolist()) for n, T in wall.frames or ()] == [(n, [n, 1, 1]) for n in (5, 7, 8)]
+    for edit in (lambda: by_frame.move(7, np.zeros(3), 5), lambda: by_frame.add_time(7, 5)):
+        with pytest.raises(ConfigError, match=r"box 7: has poses by frame and no times.*times LOG"):
+            edit()

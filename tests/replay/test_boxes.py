@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import ConfigError
-from semantic_mapper.fields.primitives import Primitive, PrimitiveSet
+from semantic_mapper.fields.primitives import Primitive, PrimitiveSet, resized
 from semantic_mapper.geometry import pose_matrix
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.nodes.cli.map_answers import answer_instances
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.oriented_box import OrientedBox
-from semantic_mapper.replay.boxes import QUERY_MARGIN_M, check_classes, load_boxes, save_boxes
+from semantic_mapper.replay.box_values import BoxFile
+from semantic_mapper.replay.boxes import QUERY_MARGIN_M, check_classes, load_boxes, read_boxes, save_boxes
+from semantic_mapper.replay.importers.kitti360 import LABELS
 
 T = pose_matrix(np.array((1.0, 2.0, 0.5)), np.array((0, 0, 0.3, 0.9)))
 CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -40,9 +42,10 @@ def matrix(name: str, values: np.ndarray, kind: str = "f") -> str:
     return f"<{name} type_id='opencv-matrix'>{shape}<data>{data}</data></{name}>"
 
 
-def kitti_xml(*objects: tuple[int, str, int, np.ndarray]) -> str:
+def kitti_xml(*objects: tuple[int, str, int, np.ndarray], instance: int = 0) -> str:
     listed = "".join(
         f"<object{index}><index>{index}</index><label>{label}</label><timestamp>{stamp}</timestamp>"
+        f"<instanceId>{instance}</instanceId>"
         f"{matrix('transform', transform)}{matrix('vertices', CORNERS)}{matrix('faces', QUADS, 'i')}</object{index}>"
         for index, label, stamp, transform in objects
     )
@@ -54,8 +57,14 @@ def same(a: Primitive, b: Primitive) -> bool:
     arrays += [(a.vertices, b.vertices), (a.faces, b.faces)]
     equal = all(np.array_equal(np.array(x, float), np.array(y, float), equal_nan=True) for x, y in arrays)
     named = (a.id, a.class_name, a.shape, a.thing) == (b.id, b.class_name, b.shape, b.thing)
-    stamps = [[(s, T.tolist()) for s, T in p.stamps or ()] for p in (a, b)]
-    return equal and named and stamps[0] == stamps[1]
+    known = [[[(s, T.tolist()) for s, T in poses or ()] for poses in (p.stamps, p.frames)] for p in (a, b)]
+    return equal and named and known[0] == known[1]
+
+
+def at(*centre: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[: len(centre), 3] = centre
+    return pose
 
 
 def test_all_shapes_are_read_and_written(tmp_path: Path) -> None:
@@ -83,6 +92,7 @@ def test_kitti360_xml_survives_a_round_trip(tmp_path: Path) -> None:
     xml = kitti_xml((0, "building", -1, scaled), (1, "driveway", -1, T), (2, "car", 7, T), (3, "unknownObject", -1, T))
     (tmp_path / "drive.xml").write_text(xml)
     boxes = load_boxes(tmp_path / "drive.xml")
+    assert boxes.primitives[2].frames and boxes.primitives[2].stamps is None
     assert [(p.id, p.class_name, p.thing, p.moves) for p in boxes.primitives] == [
         (1, "building", True, False),
         (2, "parking", False, False),
@@ -111,7 +121,7 @@ def test_what_query_instances_writes_is_a_file_of_boxes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"size": [1, 0, 1]}, "size must be above 0"),
+        ({"size": [1, 0, 1]}, "size must be at least 0.001 m"),
         ({"size": [1, float("nan"), 1]}, "size holds NaN"),
         ({"size": [1, 1]}, "size must be 3 numbers"),
         ({"T_world_box": (2 * np.eye(4)).tolist()}, "last row"),
@@ -124,20 +134,34 @@ def test_what_query_instances_writes_is_a_file_of_boxes(tmp_path: Path) -> None:
         ({"shape": "prism", "polygon": [[0, 0], [1, 1], [1, 0], [0, 1]]}, "outline"),
         ({"shape": "mesh", "vertices": CORNERS.tolist(), "faces": [[0, 1, 2]]}, "the surface is open"),
         ({"stamps": [[0.5, T.tolist()]]}, "whole numbers of nanoseconds"),
+        ({"stamps": [[-1, T.tolist()]]}, "whole numbers of nanoseconds from 0"),
+        ({"stamps": [[5, T.tolist()], [5, T.tolist()]]}, "stamps has 5 twice"),
+        ({"stamps": [[5, (2 * T).tolist()]]}, "stamps, pose at 5: the last row"),
+        ({"stamps": [[5, T.tolist()]], "frames": [[5, T.tolist()]]}, "has stamps and frames"),
+        ({"size": [1, 1, 1e-9]}, "size must be at least 0.001 m"),
+        ({"size": [1, 1, 1e200]}, "size must be metres within 100 km"),
+        ({"T_world_box": at(1e9).tolist()}, r"the box is at \[1.e\+09"),
+        ({"T_world_box": np.diag((-1.0, 1, 1, 1)).tolist()}, "give T_world_box as"),
+        ({"shape": "prism", "polygon": [[0, 0], [1, 1], [2, 2], [0, 0]]}, "no area"),
+        ({"shape": "prism", "polygon": [[0, 0], [1, 1], [0, 0]]}, "3 different corners, got 2"),
+        ({"shape": "mesh", "vertices": (1e200 * CORNERS).tolist(), "faces": [[0, 1, 2]]}, "vertices must be metres"),
+        ({"shape": "mesh", "vertices": [], "faces": []}, "vertices must be"),
+        ({"shape": "mesh", "vertices": CORNERS.tolist(), "faces": [[0.5, 1, 2]]}, "faces must be whole"),
     ],
 )
 def test_bad_boxes_are_refused_with_their_number(tmp_path: Path, changed: dict[str, Any], message: str) -> None:
     path = write(tmp_path / "boxes.json", entry(), entry(**{"id": 2} | changed))
-    with pytest.raises(ConfigError, match=rf"boxes\.json, box 2: .*{message}"):
+    number = "" if isinstance(changed.get("id"), str) else rf" \(id {changed.get('id', 2)}\)"
+    with pytest.raises(ConfigError, match=rf"boxes\.json, box 2{number}: .*{message}"):
         load_boxes(path)
 
 
 def test_two_boxes_of_one_id_and_classes_that_are_not_there_are_refused(tmp_path: Path) -> None:
     path = write(tmp_path / "boxes.json", entry(), entry(id=2), entry())
-    with pytest.raises(ConfigError, match="box 3: id 1 is that of box 1"):
+    with pytest.raises(ConfigError, match=r"box 3 \(id 1\): id 1 is that of box 1"):
         load_boxes(path)
     path = write(path, entry(), entry(id=2, **{"class": "bathtup"}))
-    with pytest.raises(ConfigError, match=r"box 2: .*did you mean 'bathtub'"):
+    with pytest.raises(ConfigError, match=r"box with id 2: .*did you mean 'bathtub'"):
         check_classes(load_boxes(path), ROOMS, path)
     path = write(path, entry(), merge={"chair": ["stool"]})
     with pytest.raises(ConfigError, match=r"merge: .*'stool'"):
@@ -152,3 +176,100 @@ def test_files_without_boxes_are_refused(tmp_path: Path, text: str) -> None:
         load_boxes(path)
     with pytest.raises(ConfigError, match=r"nothing\.json"):
         load_boxes(tmp_path / "nothing.json")
+
+
+def test_an_outline_or_mesh_is_where_it_is_drawn_wherever_its_origin_is(tmp_path: Path) -> None:
+    triangles = np.concatenate((QUADS[:, :3], QUADS[:, (0, 2, 3)])).tolist()
+    ring = [[10, 0], [19, 0], [19, 0], [19, 4], [10, 0]]  # closed, one corner twice
+    entries = [
+        entry(shape="prism", size=[1, 1, 0.3], polygon=ring, stamps=[[7, T.tolist()]]),
+        entry(id=2, shape="mesh", size=None, vertices=(CORNERS + 10).tolist(), faces=triangles),
+    ]
+    prism, mesh = load_boxes(write(tmp_path / "a.json", *entries)).primitives
+    corners = np.array([(x, y, z) for x in (10, 19) for y in (0, 4) for z in (-0.15, 0.15)])
+    np.testing.assert_allclose(prism.corners(), corners @ T[:3, :3].T + T[:3, 3])
+    np.testing.assert_allclose(prism.T_world_box, prism.stamps[0][1] if prism.stamps else None)
+    np.testing.assert_allclose(mesh.corners(), (CORNERS + 10) @ T[:3, :3].T + T[:3, 3])
+    for box, size in ((prism, (4.5, 2, 0.15)), (mesh, (0.5, 0.5, 0.5))):
+        core = (resized(box, 0.5 * box.size).mesh()[0] - box.T_world_box[:3, 3]) @ box.T_world_box[:3, :3]
+        np.testing.assert_allclose((core.min(0), core.max(0)), np.outer((-0.5, 0.5), size), atol=1e-12)
+    save_boxes(tmp_path / "b.json", BoxFile((prism, mesh)))
+    assert all(same(a, b) for a, b in zip((prism, mesh), load_boxes(tmp_path / "b.json").primitives, strict=True))
+
+
+def test_the_example_of_the_docs_is_a_file_of_boxes(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "panoptic.md").read_text()
+    (tmp_path / "boxes.json").write_text(text.split("```json")[1].split("```")[0])
+    car, road = load_boxes(tmp_path / "boxes.json").primitives
+    assert (car.thing, road.thing) == (True, False)
+    np.testing.assert_array_equal(road.corners().min(0)[:2], (0, 0))
+    assert PrimitiveSet([road]).inside(road.T_world_box[:3, 3] + np.array([(0.1, -0.1, 0)])).all()
+
+
+def test_kitti360_moving_objects_are_boxes_with_poses_by_frame(tmp_path: Path) -> None:
+    moves = [(i, "car", 20 - i, T @ at(-i)) for i in range(3)]
+    xml = kitti_xml(*moves, (3, "car", 20, T), (4, "truck", 3, T), (5, "car", -1, T), instance=7)
+    (tmp_path / "a.xml").write_text(xml)
+    boxes = read_boxes(tmp_path / "a.xml")
+    car, truck, parked = boxes.primitives
+    assert [(b.number, b.problem[-8:]) for b in boxes.bad] == [(4, "frame 20")]
+    assert [n for n, _ in car.frames or ()] == [18, 19, 20] and car.stamps is None and not parked.moves
+    for number, pose in car.frames or ():
+        np.testing.assert_allclose(pose, T @ at(number - 20), atol=1e-12)
+        assert car.pose_at(number) is None
+    np.testing.assert_array_equal(car.T_world_box, (car.frames or ())[0][1])
+    with pytest.raises(ConfigError, match="2 boxes that move have poses by frame, but no times"):
+        check_classes(boxes, LABELS, tmp_path / "a.xml")
+    save_boxes(tmp_path / "b.json", boxes)
+    assert all(same(a, b) for a, b in zip(boxes.primitives, load_boxes(tmp_path / "b.json").primitives, strict=True))
+    assert truck.id == 5
+
+
+def test_objects_of_xml_that_cannot_be_used_are_left_out_and_counted(tmp_path: Path) -> None:
+    xml = kitti_xml(
+        (0, "car", -1, T), (69999, "car", -1, T), (3, "", -1, T), (4, "gate", -1, 1e9 * T), (5, "lamp", -1, T)
+    )
+    first = xml.rindex("<faces")
+    (tmp_path / "a.xml").write_text("\ufeff" + xml[:first] + xml[first:].replace("0 1 3 2", "0.7 1 3 2"))
+    boxes = load_boxes(tmp_path / "a.xml")
+    assert [p.id for p in boxes.primitives] == [1]
+    assert [(b.number, b.id) for b in boxes.bad] == [(2, 70000), (3, 4), (4, 5), (5, 6)]
+    for b, problem in zip(
+        boxes.bad, ("1 to 65535", "<label> is missing", "100 km", "faces must be whole"), strict=True
+    ):
+        assert problem in b.problem
+    (tmp_path / "a.xml").write_text(kitti_xml((69999, "car", -1, T)))
+    with pytest.raises(ConfigError, match=r"box 1 \(id 70000\): id must be"):
+        load_boxes(tmp_path / "a.xml")
+
+
+def test_things_are_the_same_by_class_in_json_and_xml(tmp_path: Path) -> None:
+    names = LABELS.names
+    (tmp_path / "a.xml").write_text(kitti_xml(*((i, name, -1, T) for i, name in enumerate(names))))
+    entries = [entry(id=i, thing=None, **{"class": name}) for i, name in enumerate(names, 1)]
+    told = [load_boxes(f).primitives for f in (tmp_path / "a.xml", write(tmp_path / "a.json", *entries))]
+    assert [[p.thing for p in listed] for listed in told[:1]] == [[p.thing for p in told[1]]]
+    things = {p.class_name for p in told[0] if p.thing}
+    assert things >= {"building", "car", "pole", "traffic sign"} and not things & {"road", "gate", "wall", "rail track"}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"boxes": [], "merg": {}}', "unknown key 'merg'; did you mean 'merge'"),
+        ('{"boxs": []}', "unknown key 'boxs'; did you mean 'boxes'"),
+    ],
+)
+def test_unknown_keys_of_the_file_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "boxes.json").write_text(text)
+    with pytest.raises(ConfigError, match=rf"boxes\.json: {message}"):
+        load_boxes(tmp_path / "boxes.json")
+
+
+def test_all_bad_boxes_are_named_and_a_byte_order_mark_is_none(tmp_path: Path) -> None:
+    path = write(tmp_path / "boxes.json", entry(), entry(id=70000), entry(id=3, size=[1, 1, 0]), entry(id="a"))
+    path.write_text("\ufeff" + path.read_text())
+    with pytest.raises(
+        ConfigError, match=r"box 2 \(id 70000\).*box 3 \(id 3\).*box 4: id must.*boxes boxes.json delete 3 70000"
+    ):
+        load_boxes(path)

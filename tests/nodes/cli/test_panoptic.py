@@ -205,7 +205,7 @@ def test_what_does_not_go_with_boxes_is_refused(log: Path, boxes: Path, weights:
     broken = tmp_path / "broken.json"
     broken.write_text(boxes.read_text().replace('"class": "', '"class": "x', 1))
     done = run("finetune", log, "--kind", "panoptic", "--boxes", broken, "--out", out)
-    assert done.returncode == 1 and "broken.json, box 1: label set 'rooms' has no class" in error_line(done.stderr)
+    assert done.returncode == 1 and "box with id 9: label set 'rooms' has no class" in error_line(done.stderr)
     done = run("autolabel", log, "--weights", weights, "--instances", tmp_path / "i", "--out", tmp_path / "n.mcap")
     assert done.returncode == 1 and "has no boxes" in error_line(done.stderr)
     assert not (tmp_path / "i").exists()

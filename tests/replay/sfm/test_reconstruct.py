@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.drone_pictures import DIAGONAL_35MM, rows_over, save_picture
 from semantic_mapper.drivers.calibration import save_calibration
 from semantic_mapper.errors import ConfigError, ImportSourceError
 from semantic_mapper.evaluation.trajectory import align_similar
@@ -18,6 +19,7 @@ from semantic_mapper.replay.sfm.film_note import read_left_out
 from semantic_mapper.replay.sfm.reconstruct import FilmOptions, FilmReport, import_film
 from semantic_mapper.replay.sfm.refusals import FilmError
 from semantic_mapper.replay.sfm.scale import Mark, MarkedDistance, ScaleHint
+from semantic_mapper.scenes.aerial.views import aerial_camera, cached_town, render_town
 from semantic_mapper.types import Float64
 from tests.nodes.support import run
 
@@ -72,6 +74,16 @@ def test_the_log_says_what_it_is(walked: tuple[Path, Float64], report: FilmRepor
     # z is up: the camera is held without roll, looking ahead or a little down.
     assert all(abs(f.T_world_camera[2, 0]) < 0.15 and f.T_world_camera[2, 1] < -0.6 for f in frames)
     assert "the scale is unknown" in " ".join(report.notices)
+
+
+def test_a_row_over_flat_ground_keeps_the_focal_length_that_its_pictures_tell(tmp_path: Path) -> None:
+    camera, folder = aerial_camera(400), tmp_path / "row"
+    folder.mkdir()
+    told = round(camera.fx * DIAGONAL_35MM / np.hypot(camera.width, camera.height))
+    for n, pose in enumerate(rows_over(60.0, 60.0, 1, 9, 65.0)):
+        save_picture(folder / f"{n:03d}.jpg", render_town(cached_town(1), camera, pose, n).rgb, pose[:3, 3], told)
+    report = import_film(folder, tmp_path / "row.mcap", FilmOptions(), quiet)
+    assert report.registered == 9 and report.focal_px == pytest.approx(camera.fx, rel=0.02)  # with a free one: 95 px
 
 
 def test_films_that_show_nothing_or_stand_still_are_refused_and_leave_nothing(tmp_path: Path) -> None:
