@@ -121,7 +121,7 @@ def autolabel(
         LogError: the log cannot be read, the new one is there already or cannot be written, or no frame could be
             rendered. Nothing is left of the new one.
         WeightsError: there are no such weights, or they tell no classes apart.
-        KeyboardInterrupt: it was stopped; nothing is left of the new log.
+        KeyboardInterrupt: it was stopped; nothing is left of the new log, nor of images of things.
     """
     with open_log(request.logs) as log, ExitStack() as stack:
         readers = log.logs if isinstance(log, LogSequence) else [log]
@@ -134,6 +134,8 @@ def autolabel(
             _check_depth_is_missing(log, request)
         bundle.voxel_map.note_scale(log.info.scale_known)
         labeller = _Labeller(bundle, label_set, request)
+        if labeller.instances is not None:
+            stack.callback(labeller.instances.close)
         digest = hashlib.sha256(bundle.weights_path.read_bytes()).hexdigest()
         on_start(min(len(log), request.max_frames or len(log)))
         writers: list[LogWriter] = []
@@ -151,8 +153,6 @@ def autolabel(
                 labeller.push(_Message(writers[-1], envelope, parts))
                 on_frame(labeller.frames)
         labeller.finish()
-        if labeller.instances is not None:
-            labeller.instances.finish()
         note = labeller.note(digest)
         if not labeller.rendered:
             why = labeller.unlabelled[0] if labeller.unlabelled else "none can be read"
@@ -162,6 +162,8 @@ def autolabel(
             writer.flush()
         damage = tuple(str(error) for error in log.errors)
         files = tuple(part_path(request.out, number) for number in range(len(writers)))
+        if labeller.instances is not None:
+            labeller.instances.finish()
     return AutolabelReport(files, note, tuple(labeller.unlabelled), damage)
 
 
@@ -327,7 +329,6 @@ class _Labeller:
         self.without = 0
         self.unlabelled: list[str] = []
         model = bundle.checkpoint.model
-        # An image a frame is written as it is rendered; the list of things, when the log is whole.
         self.instances = (
             None
             if request.instances is None or not isinstance(model, Panoptic)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ FILE = "instances.json"
 
 
 class InstanceImages:
-    """Writes a folder of images of things: uint16 ids of boxes, 0 = none.
+    """Writes a folder of images of things: uint16 ids of boxes, 0 = none; nothing is in it before ``finish``.
 
     ``instances.json`` has each thing's id, class, box, and pixels by frame ("CAMERA/NNNNNN").
 
@@ -38,8 +40,10 @@ class InstanceImages:
     def __init__(self, folder: Path, field: Panoptic) -> None:
         self._folder, self._field = folder, field
         self._pixels: dict[int, dict[str, int]] = {b.id: {} for b in field.shape.boxes if b.thing}
+        self._new = not folder.exists()
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            self._unfinished = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=folder))
         except OSError as error:
             raise LogError(f"{folder}: cannot be made: {error.strerror or error}") from error
 
@@ -56,20 +60,37 @@ class InstanceImages:
         """
         ids = thing_image(self._field, frame, label)
         name = f"{frame.camera_id}/{number:06d}"
-        path = self._folder / f"{name}.png"
+        path = self._unfinished / f"{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         write_bytes(path, cv2.imencode(".png", ids)[1].tobytes(), raises=LogError)
         for thing, count in zip(*np.unique(ids[ids > 0], return_counts=True), strict=True):
             self._pixels[int(thing)][name] = int(count)
 
     def finish(self) -> None:
-        """Write the list of things."""
+        """Put all images in place, then the list of things.
+
+        Raises:
+            LogError: they cannot be written.
+        """
         things: list[dict[str, Any]] = [
             {"id": b.id, "class": b.class_name, "box": msgspec.to_builtins(b), "pixels": self._pixels[b.id]}
             for b in self._field.shape.boxes
             if b.thing
         ]
-        write_json(self._folder / FILE, {"instances": things})
+        try:
+            for image in sorted(self._unfinished.rglob("*.png")):
+                place = self._folder / image.relative_to(self._unfinished)
+                place.parent.mkdir(parents=True, exist_ok=True)
+                image.replace(place)
+            write_json(self._folder / FILE, {"instances": things})
+        except OSError as error:
+            raise LogError(f"{self._folder}: cannot be written: {error.strerror or error}") from error
+
+    def close(self) -> None:
+        """Remove what was not finished, and the folder if it is new and empty."""
+        shutil.rmtree(self._unfinished, ignore_errors=True)
+        if self._new and not any(self._folder.iterdir()):
+            self._folder.rmdir()
 
 
 def thing_image(field: Panoptic, frame: PosedFrame, label: UInt8) -> NDArray[np.uint16]:

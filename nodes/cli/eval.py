@@ -41,7 +41,7 @@ InstancesOption = Annotated[
     typer.Option(
         metavar="DIR",
         help="LOG: images of its frames' true objects, NNNNNN.png or CAMERA/NNNNNN.png (8 or 16 bits, 0 = none): also "
-        "score the finished map with its things by panoptic quality.",
+        "score the finished map with its things by panoptic quality, and so weights with boxes with theirs.",
     ),
 ]
 SecondsOption = Annotated[

@@ -71,7 +71,7 @@ def finetune(
         ),
     ] = None,
     pseudo: Annotated[
-        Path | None,
+        str | None,
         typer.Option(
             metavar="DIR|WEIGHTS",
             help="--kind panoptic: pseudo labels, a folder of NNNNNN.png or weights that make them; without it the "
@@ -174,7 +174,7 @@ def _refuse_mixed(
     unlabelled: int | None,
     variant: str | None,
     boxes: Path | None,
-    pseudo: Path | None,
+    pseudo: str | None,
     uncovered: str | None,
 ) -> None:
     """Refuse options that do not go together.

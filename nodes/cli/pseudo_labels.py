@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +11,12 @@ import structlog
 
 from semantic_mapper.config import PanopticConfig
 from semantic_mapper.errors import ConfigError, FrameError, LabelError, LogError
-from semantic_mapper.fields.checkpoint import anchor_from_frame
+from semantic_mapper.fields.checkpoint import (
+    anchor_from_frame,
+    default_checkpoint_path,
+    load_checkpoint,
+    shipped_checkpoint,
+)
 from semantic_mapper.fields.panoptic import Panoptic, box_config
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapper import Mapper
@@ -20,8 +25,10 @@ from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.boxes import BoxFile, check_classes
 from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import Log
+from semantic_mapper.training.boxes_in_view import boxes_in_view
 from semantic_mapper.types import PosedFrame
 
+OWN = "the log's own label images"
 _log = structlog.get_logger(__name__)
 
 
@@ -33,6 +40,7 @@ class PseudoLabels:
         label_set: Of them.
         of: The frame, by number in the log, with its pseudo label; None as a label where there is none.
         source: For people.
+        numbers: Frames that have one; None = all.
         train_stamps_ns: Frames whose true labels those who made them have learned from.
         once_all_are_seen: A frame and its label, once ``of`` has seen all of them.
     """
@@ -40,11 +48,12 @@ class PseudoLabels:
     label_set: LabelSet
     of: Callable[[PosedFrame, int], PosedFrame]
     source: str
+    numbers: frozenset[int] | None = None
     train_stamps_ns: frozenset[int] = frozenset()
     once_all_are_seen: Callable[[PosedFrame], PosedFrame] = lambda frame: frame
 
 
-def open_pseudo_labels(log: Log, pseudo: Path | None) -> PseudoLabels:
+def open_pseudo_labels(log: Log, pseudo: str | None) -> PseudoLabels:
     """The pseudo labels of a log.
 
     Args:
@@ -52,19 +61,28 @@ def open_pseudo_labels(log: Log, pseudo: Path | None) -> PseudoLabels:
         pseudo: Folder of label images, or weights; None = the log's own label images, else the shipped weights.
 
     Raises:
+        ConfigError: ``pseudo`` names both a folder and weights in the package.
         LabelError, LogError, WeightsError: they cannot be read.
     """
-    if pseudo is not None and pseudo.is_dir():
-        folder = open_label_folder(pseudo, log)
-        return PseudoLabels(folder.label_set, lambda f, n: _of_folder(folder, f, n), str(pseudo))
-    if pseudo is None and log.info.label_set is not None and any(e.has_label for e, _ in log.frame_parts()):
-        return PseudoLabels(log.info.label_set, lambda frame, _: frame, "the log's own label images")
+    if pseudo is not None and Path(pseudo).is_dir():
+        if "/" not in pseudo and shipped_checkpoint(Path(pseudo)) is not None:
+            raise ConfigError(
+                f"--pseudo {pseudo}: is a folder here, and weights in the package have this name. Give ./{pseudo} for "
+                "the label images in the folder; for the weights run the command elsewhere, or rename the folder"
+            )
+        folder = open_label_folder(Path(pseudo), log)
+        source, numbers = f"the folder {pseudo}", frozenset(folder.numbers())
+        return PseudoLabels(folder.label_set, lambda f, n: _of_folder(folder, f, n), source, numbers)
+    if pseudo is None and log.info.label_set is not None:
+        numbers = frozenset(n for n, (envelope, _) in enumerate(log.frame_parts()) if envelope.has_label)
+        if numbers:
+            return PseudoLabels(log.info.label_set, lambda frame, _: frame, OWN, numbers)
     mapper = Mapper.load(pseudo)
     mapper.voxel_map.note_scale(log.info.scale_known)
     source = f"the map that {mapper.weights_path.name} makes of the frames"
     stamps = mapper.checkpoint.train_stamps_ns
     return PseudoLabels(
-        mapper.label_set, lambda f, _: _rendered(mapper, f), source, stamps, lambda f: _cast_back(mapper, f)
+        mapper.label_set, lambda f, _: _rendered(mapper, f), source, None, stamps, lambda f: _cast_back(mapper, f)
     )
 
 
@@ -77,7 +95,7 @@ def read_pseudo_labelled(
     stop: StopRequest,
     bar: FrameProgress,
 ) -> list[PosedFrame]:
-    """Frames of a log at working width with their pseudo labels: ``count`` at most (0 = all), evenly spread.
+    """Frames of a log at working width with their pseudo labels: ``count`` at most (0 = all), see ``choose_frames``.
 
     A frame whose label image is missing or cannot be used gives its colours alone; these are counted.
 
@@ -87,9 +105,8 @@ def read_pseudo_labelled(
     """
     frames: list[PosedFrame] = []
     reasons: list[str] = []
-    count = min(count or len(log), len(log))
     bar.start(len(log))
-    for number in sorted({round(i * (len(log) - 1) / max(count - 1, 1)) for i in range(count)}):
+    for number in choose_frames(len(log), count or len(log), labels.numbers):
         bar.set(number + 1, "reading frames and pseudo labels")
         if stop:
             raise KeyboardInterrupt
@@ -114,21 +131,59 @@ def read_pseudo_labelled(
     return [labels.once_all_are_seen(frame) for frame in frames]
 
 
-def boxed_field(boxes: BoxFile, path: Path, label_set: LabelSet, uncovered: str) -> Panoptic:
-    """An empty field with the boxes.
+def choose_frames(total: int, count: int, labelled: frozenset[int] | None) -> list[int]:
+    """Numbers of ``count`` of ``total`` frames at most, ascending: labelled ones first, evenly spread."""
+    first = range(total) if labelled is None else sorted(labelled)
+    chosen = _evenly(first, count)
+    rest = sorted(set(range(total)) - set(first))
+    return sorted(chosen + _evenly(rest, count - len(chosen)))
+
+
+def check_boxes(boxes: BoxFile, path: Path, labels: PseudoLabels) -> None:
+    """Refuse boxes that cannot go with pseudo labels.
 
     Raises:
-        ConfigError: a class that the label set lacks, or no box.
+        ConfigError: a class that these lack, with where they come from and what may be done; or no box.
     """
-    check_classes(boxes, label_set, path)
+    try:
+        check_classes(boxes, labels.label_set, path)
+    except ConfigError as error:
+        end = "" if str(error).endswith("?") else "."
+        raise ConfigError(f"{error}{end} {_where_classes_come_from(boxes, labels)}") from error
     if not boxes.primitives:
         raise ConfigError(f"{path}: holds no box; draw some, or take `query MAP instances`")
+
+
+def boxed_field(
+    boxes: BoxFile, frames: Sequence[PosedFrame], label_set: LabelSet, uncovered: str
+) -> tuple[Panoptic, int]:
+    """An empty field with the boxes that frames may see, and how many they cannot.
+
+    Raises:
+        ConfigError: they can see none.
+    """
+    seen = boxes_in_view(boxes.primitives, frames)
     config = PanopticConfig(
-        boxes=tuple(box_config(p) for p in boxes.primitives),
+        boxes=tuple(box_config(p) for p, there in zip(boxes.primitives, seen, strict=True) if there),
         merge=dict(boxes.merge),
         uncovered="empty" if uncovered == "empty" else "stuff",
     )
-    return Panoptic(config, label_set)
+    return Panoptic(config, label_set), int((~seen).sum())
+
+
+def _where_classes_come_from(boxes: BoxFile, labels: PseudoLabels) -> str:
+    said = f"Pseudo labels are {labels.source}"
+    correct = "correct the boxes (`boxes FILE reclass ID CLASS`)"
+    path = default_checkpoint_path()
+    needed = {p.class_name for p in boxes.primitives}.union(*([name, *others] for name, others in boxes.merge.items()))
+    if labels.source == OWN and needed <= set(load_checkpoint(path).label_set.names):
+        return f"{said}; weights '{path.stem}' have all classes of the boxes: --pseudo {path.stem} takes their labels"
+    return f"{said}: {correct}, or give other labels (--pseudo)"
+
+
+def _evenly(numbers: Sequence[int], count: int) -> list[int]:
+    count = min(count, len(numbers))
+    return [numbers[round(i * (len(numbers) - 1) / max(count - 1, 1))] for i in range(count)]
 
 
 def _of_folder(folder: LabelFolder, frame: PosedFrame, number: int) -> PosedFrame:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import structlog
 
@@ -21,12 +22,13 @@ from semantic_mapper.fields.checkpoint import (
 from semantic_mapper.fields.irt import IRT
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.panoptic import Panoptic
+from semantic_mapper.fields.primitives import MAX_INTERVALS
 from semantic_mapper.fields.sray import SRay
 from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.nodes.cli.console import FrameProgress
 from semantic_mapper.nodes.cli.outputs import prepare_file
-from semantic_mapper.nodes.cli.pseudo_labels import boxed_field, open_pseudo_labels, read_pseudo_labelled
+from semantic_mapper.nodes.cli.pseudo_labels import boxed_field, check_boxes, open_pseudo_labels, read_pseudo_labelled
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.autolabel_note import read_note
 from semantic_mapper.replay.boxes import BoxFile, load_boxes
@@ -35,6 +37,7 @@ from semantic_mapper.replay.log.sequence import Log, open_log
 from semantic_mapper.replay.log_depth import ComputedFrame, compute_depths
 from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress
 from semantic_mapper.training.fitters import FITTERS, fitter_of
+from semantic_mapper.training.frame_rays import usable_frames
 from semantic_mapper.training.select import candidate_from_frame, choose_keyframes
 from semantic_mapper.training.strokes import grow_strokes, labelled_fraction
 from semantic_mapper.types import PosedFrame
@@ -68,7 +71,7 @@ class FinetuneRequest:
     frames: Sequence[int] = ()
     unlabelled: int | None = None
     boxes: Path | None = None
-    pseudo: Path | None = None
+    pseudo: str | None = None
     uncovered: str = "stuff"
     strokes: bool = False
 
@@ -157,7 +160,8 @@ def _fit(
         bar.set(int(progress.fraction * 100), note)
 
     checkpoint = fitter_of(kind)(frames, label_set, start, request.config, on_progress, lambda: stop, seen)
-    if stop and not checkpoint.recipe["steps"]:
+    learned = "grid_steps" if kind == Panoptic.kind else "steps"  # boxes need no more than geometry
+    if stop and not checkpoint.recipe[learned]:
         raise KeyboardInterrupt
     checkpoint.recipe["source"] = request.log.name
     return checkpoint
@@ -172,7 +176,7 @@ def _finetune_boxes(request: FinetuneRequest, boxes: BoxFile, stop: StopRequest,
     assert request.boxes is not None
     with open_log(request.log) as log:
         labels = open_pseudo_labels(log, request.pseudo)
-        start = boxed_field(boxes, request.boxes, labels.label_set, request.uncovered)
+        check_boxes(boxes, request.boxes, labels)
         computed = _compute_depths(log, request.depth, stop, bar)
         frames = read_pseudo_labelled(
             log,
@@ -184,11 +188,12 @@ def _finetune_boxes(request: FinetuneRequest, boxes: BoxFile, stop: StopRequest,
             bar,
         )
         note = read_note(log.attachments())
+    start, unseen = boxed_field(boxes, usable_frames(frames), labels.label_set, request.uncovered)
     seen = labels.train_stamps_ns
     if note is not None and any(f.label_is_pseudo for f in frames):
         seen |= frozenset(note.train_stamps_ns)
     checkpoint = _fit(Panoptic.kind, frames, labels.label_set, start, seen, request, stop, bar)
-    checkpoint.recipe["panoptic"] |= {"left_out": boxes.left_out, "pseudo": labels.source}
+    checkpoint.recipe["panoptic"] |= {"left_out": boxes.left_out, "unseen": unseen, "pseudo": labels.source}
     save_checkpoint(checkpoint, request.out)
     return checkpoint
 
@@ -229,14 +234,33 @@ def finetune_lines(checkpoint: Checkpoint, chosen: Sequence[int], request: Finet
             f"({boxed['pseudo']}) of {boxed['labelled_frames']} of {boxed['frames']} frames, matched "
             f"{_per_cent(boxed['matched'])}"
         )
+        if checkpoint.model.config.classes == "fixed":
+            lines.append(
+                "  stopped before classes were learned: they are those of the boxes alone; what is in none of them "
+                "(wall or floor) is not told apart"
+            )
+        if boxed["crowded"]:
+            lines.append(
+                f"  {_per_cent(boxed['crowded'])} of the pixels meet more than {MAX_INTERVALS} boxes: of these the "
+                "nearest count"
+            )
         if boxed["moving"]:
             lines.append(f"  {boxed['moving']} boxes that move, with grids of their own")
-        if boxed["lost"] or boxed["left_out"]:
-            lost = f"{boxed['lost']} boxes that move, which no frame shows at their times"
-            lines.append(f"  left out: {lost}; {boxed['left_out']} of no class")
+        if left_out := [text for count, text in _left_out(boxed) if count]:
+            lines.append(f"  boxes left out: {'; '.join(left_out)}")
     if checkpoint.model.holds_scene:
         lines.append(f"  {out.stat().st_size / 1e6:.1f} MB that show the scene: as private as the recording")
     return lines
+
+
+def _left_out(boxed: Mapping[str, Any]) -> list[tuple[int, str]]:
+    """How many boxes were left out, for which reason."""
+    reasons = {
+        "unseen": "that no frame sees",
+        "lost": "that move, which no frame shows at their times",
+        "left_out": "of no class",
+    }
+    return [(boxed[name], f"{boxed[name]} {reason}") for name, reason in reasons.items()]
 
 
 def _per_cent(fraction: float) -> str:

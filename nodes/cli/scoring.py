@@ -19,7 +19,12 @@ from semantic_mapper.nodes.cli.run_replay import mapper_config
 from semantic_mapper.nodes.cli.summary_table import percent
 from semantic_mapper.plain_text import counted
 from semantic_mapper.replay.autolabel_note import read_note
-from semantic_mapper.replay.evaluate.methods import baseline_predictors, evaluate_frames, field_predictors
+from semantic_mapper.replay.evaluate.methods import (
+    baseline_predictors,
+    evaluate_frames,
+    field_predictors,
+    thing_tellers,
+)
 from semantic_mapper.replay.evaluate.panoptic_truth import InstanceFolder, PanopticTruth
 from semantic_mapper.replay.evaluate.shortfall import explain_shortfall
 from semantic_mapper.replay.log.sequence import Log, open_log
@@ -90,6 +95,7 @@ def score_log(request: ScoreRequest) -> dict[str, Any]:
                 on_frame=bar.set,
                 voxel_map=bundle.pipeline.voxel_map,
                 panoptic=panoptic,
+                things=thing_tellers(bundle),
             )
         model, recipe = bundle.checkpoint.model, bundle.checkpoint.recipe
         shortfall = explain_shortfall(model.kind, found.methods, recipe)

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.nn import functional
 
 from semantic_mapper.config import MapperConfig, convert_config, to_plain
 from semantic_mapper.errors import FrameError, LabelError
 from semantic_mapper.evaluation.metrics import ConfidenceScores, ConfusionMatrix
+from semantic_mapper.evaluation.panoptic import PanopticImage
 from semantic_mapper.fields.learned import LearnedField
+from semantic_mapper.fields.panoptic import Panoptic
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
 from semantic_mapper.mapper import Mapper, make_field
@@ -20,6 +25,7 @@ from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.replay.evaluate.panoptic_truth import SEEN, PanopticTruth
 from semantic_mapper.replay.evaluate.truth import SurfaceTruth, TruthMapper
+from semantic_mapper.replay.instance_images import thing_image
 from semantic_mapper.training.baselines import UNetBaseline, UNetConfig, WarpBaseline
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import Float32, PosedFrame, UInt8
@@ -44,6 +50,7 @@ SURE = 0.9  # confidence of a pixel that a user would keep
 MAP = "points of the map"  # the method whose figures are those of the fused map
 
 Predictor = Callable[[PosedFrame], Opinion]
+ThingTeller = Callable[[PosedFrame, UInt8], NDArray[np.uint16]]  # ids (H, W) of a frame's things, given its classes
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +85,14 @@ def field_predictors(bundle: Mapper) -> dict[str, Predictor]:
     if type(bundle.checkpoint.model).source_logits is not LearnedField.source_logits and kind != "unet":
         found["own image alone"] = lambda frame: _of_image(bundle, frame)
     return found
+
+
+def thing_tellers(bundle: Mapper) -> dict[str, ThingTeller]:
+    """The predictors of ``field_predictors`` that tell things apart by themselves, and how: those of boxes."""
+    model = bundle.checkpoint.model
+    if not isinstance(model, Panoptic):
+        return {}
+    return {model.kind: partial(thing_image, model)}
 
 
 def _mapped(pipeline: MappingPipeline, frame: PosedFrame) -> Opinion:
@@ -126,13 +141,15 @@ def evaluate_frames(
     on_frame: Callable[[int], None] | None = None,
     voxel_map: VoxelMap | None = None,
     panoptic: PanopticTruth | None = None,
+    things: Mapping[str, ThingTeller] = {},
 ) -> Evaluation:
     """Run every predictor over every frame; frames in ``exclude_stamps`` are predicted but not scored,
     and so are those with pseudo labels.
 
     ``voxel_map``, where it is given and one of the predictors fills it, is scored in the end as the method ``MAP``: its
     points against the majority of the labels of the frames with depth that see them. With ``panoptic``, which the
-    scored frames are added to, it is also scored as the method ``SEEN``: with its things, as those frames see it.
+    scored frames are added to, it is also scored as the method ``SEEN``: with its things, as those frames see it. The
+    predictors that ``things`` names are, too.
     """
     surface = SurfaceTruth(stream_labels)
     truth_mapper = TruthMapper(stream_labels, label_set)
@@ -153,7 +170,8 @@ def evaluate_frames(
                 if voxel_map is not None:
                     surface.add(frame)
                 if panoptic is not None:
-                    panoptic.add(frame, truth)
+                    found = {name: partial(_panoptic, tell, frame, predicted[name]) for name, tell in things.items()}
+                    panoptic.add(frame, truth, found)
                 labelled = frame.label != stream_labels.ignore_id
                 strange = labelled & (truth == label_set.ignore_id)
                 for name, opinion in predicted.items():
@@ -186,7 +204,13 @@ def evaluate_frames(
         methods[MAP]["open_set_unknown"] = rejected
     if panoptic is not None and voxel_map is not None:
         methods[SEEN] = {**panoptic.score(voxel_map)}
+        for name, figures in panoptic.score_methods().items():
+            methods[name] |= figures
     return Evaluation(methods, scored, excluded, refused, pseudo)
+
+
+def _panoptic(tell: ThingTeller, frame: PosedFrame, opinion: Opinion) -> PanopticImage:
+    return PanopticImage(opinion.label, tell(frame, opinion.label))
 
 
 def _of_confidence(scores: ConfidenceScores) -> dict[str, float | None]:

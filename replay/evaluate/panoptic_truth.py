@@ -1,8 +1,8 @@
-"""Frames whose objects are known, and the finished map with its things as those frames see it."""
+"""Frames whose objects are known, and what the finished map and other methods say of these frames with their things."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -69,6 +69,7 @@ class _View(NamedTuple):
     T_world_camera: Float64
     intrinsics: CameraIntrinsics
     truth: PanopticImage
+    found: Mapping[str, PanopticImage]
 
 
 class PanopticTruth:
@@ -76,7 +77,7 @@ class PanopticTruth:
 
     Args:
         folder: Has the objects.
-        stream_labels: Of the frames. Segments that the map finds of other classes are as if nothing had been found.
+        stream_labels: Of the frames. Segments that are found of other classes are as if nothing had been found.
         label_set: Of the map, and of the true classes that are added.
     """
 
@@ -90,8 +91,13 @@ class PanopticTruth:
         self._stride = 1
         self._seen = 0
 
-    def add(self, frame: PosedFrame, truth: UInt8) -> None:
-        """Remember a frame whose objects are known, at reduced size; ``truth`` (H, W) are ids of the map.
+    def add(self, frame: PosedFrame, truth: UInt8, found: Mapping[str, Callable[[], PanopticImage]] = {}) -> None:
+        """Remember a frame whose objects are known, at reduced size.
+
+        Args:
+            frame: Of the log.
+            truth: (H, W) ids of the map.
+            found: By method, what it says of the frame (H, W), ids of the map; asked where objects are known.
 
         Raises:
             LogError: see ``InstanceFolder.read``.
@@ -101,12 +107,24 @@ class PanopticTruth:
         if instance is None:
             return
         k = working_intrinsics(frame.intrinsics, TRUTH_WIDTH)
-        size = (k.width, k.height)
-        small = np.asarray(cv2.resize(instance, size, interpolation=cv2.INTER_NEAREST_EXACT), np.uint16)
-        self._views.append(_View(frame.T_world_camera, k, PanopticImage(resize_label(truth, k), small)))
+        said = {name: _resized(ask(), k) for name, ask in found.items()}
+        self._views.append(_View(frame.T_world_camera, k, _resized(PanopticImage(truth, instance), k), said))
         if len(self._views) > MAX_FRAMES:
             self._views = self._views[::2]
             self._stride *= 2
+
+    def score_methods(self) -> Mapping[str, Mapping[str, Any]]:
+        """The figures of ``PanopticMetrics`` by method of ``add``, of the frames that ``score`` looks at.
+
+        Raises:
+            LabelError: no frame was added.
+        """
+        views = self._known_views()
+        counts = {name: PanopticCounts(self._label_set) for name in views[0].found}
+        for view in views:
+            for name, found in view.found.items():
+                counts[name].update(view.truth, self._of_shared(found), name)
+        return {name: _figures(of) | {"panoptic_frames": len(views)} for name, of in counts.items()}
 
     def score(self, voxel_map: VoxelMap) -> Mapping[str, Any]:
         """The figures of ``SegmentationMetrics`` and of ``PanopticMetrics``, whose classes are ``pq_per_class``.
@@ -115,15 +133,32 @@ class PanopticTruth:
             LabelError: no frame was added.
             MapError: lengths of the map are not metres.
         """
-        if not self._views:
-            raise LabelError(f"{self._folder.path}: has no image of any frame that is scored")
+        views = self._known_views()
         things = ThingSurface(voxel_map)
         matrix, counts = ConfusionMatrix(self._label_set), PanopticCounts(self._label_set)
-        for view in self._views:
+        for view in views:
             cast = voxel_map.ray_cast(view.T_world_camera, view.intrinsics)
             found = things.panoptic(cast, view.T_world_camera, view.intrinsics)
             matrix.update(view.truth.label, found.label, SEEN)
-            counts.update(view.truth, found._replace(label=self._shared[found.label]), SEEN)
-        panoptic = asdict(counts.metrics())
-        panoptic["pq_per_class"] = panoptic.pop("per_class")
-        return asdict(matrix.metrics()) | panoptic | {"panoptic_frames": len(self._views)}
+            counts.update(view.truth, self._of_shared(found), SEEN)
+        return asdict(matrix.metrics()) | _figures(counts) | {"panoptic_frames": len(views)}
+
+    def _known_views(self) -> list[_View]:
+        if not self._views:
+            raise LabelError(f"{self._folder.path}: has no image of any frame that is scored")
+        return self._views
+
+    def _of_shared(self, found: PanopticImage) -> PanopticImage:
+        return found._replace(label=self._shared[found.label])
+
+
+def _resized(image: PanopticImage, intrinsics: CameraIntrinsics) -> PanopticImage:
+    size = (intrinsics.width, intrinsics.height)
+    instance = cv2.resize(np.asarray(image.instance, np.uint16), size, interpolation=cv2.INTER_NEAREST_EXACT)
+    return PanopticImage(resize_label(image.label, intrinsics), np.asarray(instance, np.uint16))
+
+
+def _figures(counts: PanopticCounts) -> dict[str, Any]:
+    figures = asdict(counts.metrics())
+    figures["pq_per_class"] = figures.pop("per_class")
+    return figures

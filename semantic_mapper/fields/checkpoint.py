@@ -81,8 +81,13 @@ def default_checkpoint_path() -> Path:
 
 def find_checkpoint(path: Path) -> Path:
     """The path itself, or that of weights which ship with the package under this name (``COMPUTED_DEPTH``)."""
-    named = _shipped() / f"{path}.safetensors"
-    return named if not path.exists() and path.parent == Path() and named.exists() else path
+    return path if path.exists() and not path.is_dir() else shipped_checkpoint(path) or path
+
+
+def shipped_checkpoint(name: Path) -> Path | None:
+    """Weights that ship with the package under a name; None where there are none."""
+    named = _shipped() / f"{name}.safetensors"
+    return named if name.parent == Path() and named.exists() else None
 
 
 def _shipped() -> Path:

@@ -35,6 +35,7 @@ LOOSE_M = 0.04  # beyond its faces
 LOOKED_AT = 8  # samples of a ray that say its class
 LEAST = 1e-6  # of a rendered probability
 THERE = 0.01  # weight from which on something is next to a measured depth
+PAIRS = 1 << 19  # of centres and cores that are looked at together
 SKY = "sky"  # class of light that leaves the grid and meets no box, where the label set has it
 
 
@@ -96,7 +97,7 @@ class Panoptic(GridField):
     thing: torch.Tensor  # (P,) bool
     channel_of_mover: torch.Tensor  # (M,) int64, of boxes that move
     moving_thing: torch.Tensor  # (M,) bool
-    within: torch.Tensor  # (P, P) bool, whether the centre of a box is in the core of another, or in its own
+    held: torch.Tensor  # (H,) int64 ascending, i * P + j where the centre of box i is in the core of box j
     outside: torch.Tensor  # (L,) 1 where a class may be outside of all boxes
 
     def __init__(self, config: PanopticConfig, label_set: LabelSet, sampling: SamplingConfig | None = None) -> None:
@@ -108,8 +109,7 @@ class Panoptic(GridField):
         loose = config.uncovered == "stuff"
         self.primitives = PrimitiveSet([resized(b, b.size + 2 * LOOSE_M) for b in boxes] if loose else boxes)
         self.cores = PrimitiveSet([resized(b, CORE * b.size) for b in boxes] if loose else [])
-        within = self.cores.inside(np.array([b.T_world_box[:3, 3] for b in boxes]).reshape(-1, 3))
-        self.register_buffer("within", torch.from_numpy(within), persistent=False)
+        self.register_buffer("held", torch.from_numpy(self._held()), persistent=False)
         channel = {name: i for i, name in enumerate(label_set.names)}
         for names, those in (("channel_of_box", "thing"), boxes), (("channel_of_mover", "moving_thing"), movers):
             channels = torch.tensor([_channel(channel, b.class_name) for b in those], dtype=torch.long)
@@ -187,21 +187,46 @@ class Panoptic(GridField):
             cores = trimmed(self.cores.intervals(samples.rays)).to(z.device)
             core = cores.inside(z)
             in_core = core.any(-1, keepdim=True)
-            within = self.within[found.index.clamp_min(0)[:, None], cores.index.clamp_min(0)[:, :, None]]  # R C M
+            within = self._within(found.index, cores.index)
             inside &= ~in_core | (torch.einsum("rkc,rcm->rkm", core.float(), within.float()) > 0)
         channel = torch.where(found.index < 0, classes, self._channels(found.index))
         named = torch.zeros(*z.shape, classes + 1, device=z.device)
         named.scatter_add_(2, channel[:, None].expand(inside.shape), inside.float())
         named = (named[..., :classes] > 0).float()
         allowed = named
-        on_ray = torch.zeros(len(channel), classes + 1, dtype=torch.bool, device=channel.device)
-        on_ray = on_ray.scatter_(1, channel, value=True)[:, :classes]
         if self.shape.uncovered == "stuff":
             allowed = torch.where(in_core, named, torch.maximum(named, self.outside))
-            on_ray = on_ray | (self.outside > 0)
+        return BoxesOnRays(inside, found.index, named, allowed, self.on_ray(found), self._behind(samples.rays, found))
+
+    def on_ray(self, found: Intervals) -> torch.Tensor:
+        """Classes (R, L) bool that are anywhere on rays, of the boxes that they meet."""
+        classes = len(self.label_set)
+        channel = torch.where(found.index < 0, classes, self._channels(found.index))
+        there = torch.zeros(len(channel), classes + 1, dtype=torch.bool, device=channel.device)
+        there = there.scatter_(1, channel, value=True)[:, :classes]
+        if self.shape.uncovered == "stuff":
+            there = there | (self.outside > 0)
         if self.sky is not None:
-            on_ray[:, self.sky] = True
-        return BoxesOnRays(inside, found.index, named, allowed, on_ray, self._behind(samples.rays, found))
+            there[:, self.sky] = True
+        return there
+
+    def _held(self) -> Int64:
+        """See ``held``; a few centres at a time, so that thousands of boxes need no table of all pairs."""
+        centres = np.array([b.T_world_box[:3, 3] for b in self.primitives.primitives]).reshape(-1, 3)
+        count, pairs = len(self.cores), [np.zeros(0, np.int64)]
+        part = max(PAIRS // max(count, 1), 1)
+        for first in range(0, len(centres) if count else 0, part):
+            centre, core = self.cores.inside(centres[first : first + part]).nonzero()
+            pairs.append((first + centre) * count + core)
+        return np.concatenate(pairs)
+
+    def _within(self, box: torch.Tensor, core: torch.Tensor) -> torch.Tensor:
+        """Whether the centres of boxes (R, M) are in cores (R, C): (R, C, M) bool."""
+        if not len(self.held):
+            return torch.zeros(len(box), core.shape[1], box.shape[1], dtype=torch.bool, device=box.device)
+        pair = box.clamp_min(0)[:, None] * len(self.cores) + core.clamp_min(0)[:, :, None]
+        place = torch.searchsorted(self.held, pair).clamp_max(len(self.held) - 1)
+        return self.held[place] == pair
 
     def _behind(self, rays: RayBatch, found: Intervals) -> torch.Tensor:
         beyond = (found.index >= 0) & (found.leave > self._span(rays)[1][:, None])

@@ -23,9 +23,11 @@ from semantic_mapper.fields.grid.kernels import adam_grid
 from semantic_mapper.fields.grid.scene_grid import NOTHING
 from semantic_mapper.fields.learned import LearnedField
 from semantic_mapper.fields.panoptic import BoxesOnRays, Panoptic, heaviest, merged_classes, ray_share
+from semantic_mapper.fields.primitives import MAX_INTERVALS
 from semantic_mapper.imaging import resize_label
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.log_events import get_logger
+from semantic_mapper.training.boxes_in_view import nothing_in_view
 from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, PanopticFitConfig
 from semantic_mapper.training.frame_rays import FrameRays, frame_rays, usable_frames
 from semantic_mapper.training.grid_fit import BETA1, BETA2, GridFit, GridFitProgress, fit_grid, view_fraction
@@ -48,7 +50,10 @@ LEAST = 1e-4  # of the probability that a pseudo label has: below, it has no gra
 POINT_WEIGHT = 0.05  # from which on a sample says what is there
 DEPTH_REACH = 0.05  # 1 / m, of inverse depth: a larger error counts linearly
 SURVEYED = 20000  # rays that say how much of the images boxes cover
+LOOKED_AT = 2000  # of these together: where many boxes overlap, each ray takes a table of pairs
 FEW_COVERED = 0.01  # fraction of pixels that meet a box, below which the log is warned about
+FEW_MATCHED = 0.5  # fraction of the pseudo labels that are possible on their ray, below which the log is warned about
+LEARNED = 10  # steps of the second part, below which the learned classes of a stopped fit are hardly more than noise
 FORGET = 50  # steps between two looks at which cells are empty
 _log = get_logger(__name__)
 
@@ -81,6 +86,7 @@ class Survey:
         lost: Boxes that move, and that no frame shows at their times.
         covered: Fraction of pixels whose ray meets a box.
         matched: Fraction of pixels with a pseudo label whose class is possible on their ray.
+        crowded: Fraction of pixels whose ray meets more boxes than are looked at, ``MAX_INTERVALS``.
         ambiguous: Fraction of pixels whose surface is in boxes of several classes.
     """
 
@@ -88,6 +94,7 @@ class Survey:
     seen: int
     covered: float
     matched: float
+    crowded: float = 0.0
     ambiguous: float = math.nan
     moving: int = 0
     lost: int = 0
@@ -111,7 +118,8 @@ def fit_panoptic(
             where ``config`` leaves out the losses that need some.
         config: ``seconds`` bounds the whole fit. ``steps``, if not 0, is the number of steps of each of its two parts.
         on_progress: Called after every step.
-        stopped: Asked before every step; once it says so (anything true), the field so far is the result.
+        stopped: Asked before every step; once it says so, the field so far is the result. With less than
+            ``LEARNED`` steps of the second part its classes are those of the boxes alone (``fixed``).
         seen_stamps_ns: Frames whose true labels those who made the pseudo labels have learned from.
 
     Raises:
@@ -127,7 +135,7 @@ def fit_panoptic(
     if start.label_set != label_set:
         raise WeightsError(f"the boxes are of label set '{start.label_set.name}', the labels of '{label_set.name}'")
     began = time.monotonic()
-    usable = usable_frames(frames)
+    usable = held_out_unlabelled(usable_frames(frames), config.grid.held_out)
     everything = pseudo_rays(usable, label_set, config.width)
     boxes, lost = _followed(start, usable, everything.rays)
     if by_boxes and not boxes:
@@ -136,7 +144,7 @@ def fit_panoptic(
             "the stamps the log's, in nanoseconds?"
         )
     survey = replace(survey_boxes(start, everything, config), moving=len(start.moving) - lost, lost=lost)
-    fit = _fit_grid(frames, start, config, on_progress, stopped)
+    fit = _fit_grid(usable, start, config, on_progress, stopped)
     shape = msgspec.structs.replace(start.shape, grid=fit.grid.config, boxes=boxes)
     torch.manual_seed(config.seed)
     field = Panoptic(shape, label_set)
@@ -147,24 +155,38 @@ def fit_panoptic(
     data = replace(data, gain=torch.from_numpy(fit.gains), still=np.flatnonzero(~moving))
     joint = JointFit(field, data, config)
     joint.run(began, on_progress, stopped)
+    if joint.step < LEARNED and stopped():
+        field.shape = field.config = msgspec.structs.replace(shape, classes="fixed")
     fill_boxes(field, fit.frames, data.rays, fit.gains, config.grid.near_m)
     survey = replace(survey, ambiguous=ambiguous_fraction(field, everything, config))
     taught = [f for f in usable if f.label is not None and not f.label_is_pseudo]
     geometry = FittedGeometry(field, fit)
     checkpoint = scene_checkpoint(geometry, config, time.monotonic() - began, seen_stamps_ns, taught)
     figures: dict[str, Any] = {name: getattr(survey, name) for name in ("boxes", "seen", "moving", "lost")}
-    figures |= {name: round(getattr(survey, name), 4) for name in ("covered", "matched", "ambiguous")}
+    figures |= {name: round(getattr(survey, name), 4) for name in ("covered", "matched", "crowded", "ambiguous")}
     figures["labelled_frames"] = sum(f.label is not None for f in usable)
     figures["frames"] = len(usable)
     recipe = checkpoint.recipe | {"grid_steps": fit.steps, "steps": joint.step, "panoptic": figures}
     return Checkpoint(checkpoint.model, (), recipe)
 
 
+def held_out_unlabelled(frames: Sequence[PosedFrame], every: int) -> list[PosedFrame]:
+    """Frames so that each ``every``-th, which ``fit_grid`` holds out, is without labels where there are such frames."""
+    plain, labelled = ([f for f in frames if (f.label is None) == none] for none in (True, False))
+    if not every or not plain:
+        return list(frames)
+    ordered: list[PosedFrame] = []
+    while plain or labelled:
+        held_out = (len(ordered) + 1) % every == 0
+        ordered.append((plain if plain and (held_out or not labelled) else labelled).pop(0))
+    return ordered
+
+
 def pseudo_rays(frames: Sequence[PosedFrame], label_set: LabelSet, width: int) -> PseudoRays:
     """The pixels of frames with their label images.
 
     Raises:
-        FrameError: no frame has one.
+        FrameError: no frame has one, or nothing is known in any of them.
     """
     rays = frame_rays(frames, width)
     if all(f.label is None for f in frames):
@@ -176,6 +198,11 @@ def pseudo_rays(frames: Sequence[PosedFrame], label_set: LabelSet, width: int) -
         for f, k in zip(frames, rays.intrinsics, strict=True)
     ]
     channels = torch.from_numpy(np.concatenate(channel)).long()
+    if not (channels >= 0).any():
+        raise FrameError(
+            f"all pixels of all {sum(f.label is not None for f in frames)} pseudo labels are unknown (id "
+            f"{label_set.ignore_id}), so that they teach nothing; give others (--pseudo)"
+        )
     return PseudoRays(rays, channels, torch.ones(len(frames), 3), np.arange(len(rays)))
 
 
@@ -193,12 +220,8 @@ def survey_boxes(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> S
     covered = (found.count > 0).float().mean().item()
     names = field.label_set.names
     if covered == 0:
-        low, high = field.primitives.meshes.low.min(0), field.primitives.meshes.high.max(0)
-        cameras = data.rays.T_world_camera[:, :3, 3]
-        raise ConfigError(
-            f"no box is in view of any frame: boxes lie from {_metres(low)} to {_metres(high)}, cameras from "
-            f"{_metres(cameras.min(0))} to {_metres(cameras.max(0))}. Are the boxes in the log's world frame?"
-        )
+        meshes = field.primitives.meshes
+        raise nothing_in_view(meshes.low, meshes.high, data.rays.T_world_camera[:, :3, 3])
     if covered < FEW_COVERED:
         _log.warning("few_boxes_in_view", covered=round(covered, 4), reason="are they in the log's world frame?")
     group = merged_classes(field.label_set, field.shape.merge)
@@ -210,25 +233,29 @@ def survey_boxes(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> S
             f"{', '.join(names[i] for i in boxed)}. `merge` of boxes.json says which stand for others"
         )
     channel = data.channel[torch.from_numpy(pixels)]
-    none = torch.zeros(len(pixels), 1)
-    boxes = field.boxes_on(RaySamples(rays, none[..., None].expand(-1, 1, 3), none, none, none[:, 0]))
-    matched = possible(boxes, group, channel)[channel >= 0].float().mean().item()
-    return Survey(len(field.primitives), len(found.index[found.index >= 0].unique()), covered, matched)
+    matched = possible(field.on_ray(found), group, channel)[channel >= 0].float().mean().item()
+    crowded = (found.count > MAX_INTERVALS).float().mean().item()
+    if matched < FEW_MATCHED:
+        _log.warning(
+            "few_labels_match", matched=round(matched, 4), reason="most name a class that no box on their ray has"
+        )
+    return Survey(len(field.primitives), len(found.index[found.index >= 0].unique()), covered, matched, crowded)
 
 
 def ambiguous_fraction(field: Panoptic, data: PseudoRays, config: FinetuneConfig) -> float:
     """Fraction of pixels whose surface is in boxes of more than one class."""
-    rays = data.rays.rays(_some_pixels(data, config.seed), config.grid.near_m)
-    with torch.no_grad():
-        samples = heaviest(field.march(rays), 1)
-        boxes = field.boxes_on(samples)
-        several = boxes.named[:, 0].sum(-1) > 1
-    return float((several & (samples.opacity > 0.5)).float().mean())
+    several = 0
+    for pixels in np.split(_some_pixels(data, config.seed), SURVEYED // LOOKED_AT):
+        with torch.no_grad():
+            samples = heaviest(field.march(data.rays.rays(pixels, config.grid.near_m)), 1)
+            named = field.boxes_on(samples).named[:, 0].sum(-1)
+        several += int(((named > 1) & (samples.opacity > 0.5)).sum())
+    return several / SURVEYED
 
 
-def possible(boxes: BoxesOnRays, group: torch.Tensor, channel: torch.Tensor) -> torch.Tensor:
-    """u(r) (R,): whether what a pseudo label (R,) may stand for is anywhere on the ray; False without a label."""
-    return ((group[channel.clamp_min(0)] > 0) & boxes.on_ray).any(1) & (channel >= 0)
+def possible(on_ray: torch.Tensor, group: torch.Tensor, channel: torch.Tensor) -> torch.Tensor:
+    """u(r) (R,): whether what a pseudo label (R,) may stand for is on the ray (R, L); False without a label."""
+    return ((group[channel.clamp_min(0)] > 0) & on_ray).any(1) & (channel >= 0)
 
 
 def semantic_losses(
@@ -256,7 +283,7 @@ def semantic_losses(
     fixed = (field.composited(samples, boxes.fixed, boxes) * stands_for).sum(1)
     seen = (field.composited(samples, learned, boxes) * stands_for).sum(1)
     by_fixed = -(torch.log(fixed.clamp_min(LEAST)) * there).sum() / count
-    by_learned = -(torch.log(seen.clamp_min(LEAST)) * possible(boxes, group, channel)).sum() / count
+    by_learned = -(torch.log(seen.clamp_min(LEAST)) * possible(boxes.on_ray, group, channel)).sum() / count
     # Where one class is allowed this is the paper's cross-entropy; where there are several, one of them has to be it.
     allowed = (learned * boxes.classes).sum(-1)
     surface = (samples.weight.detach() > POINT_WEIGHT) & (boxes.classes.sum(-1) > 0)
@@ -402,7 +429,3 @@ def _followed(start: Panoptic, frames: Sequence[PosedFrame], rays: FrameRays) ->
 
 def _some_pixels(data: PseudoRays, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, len(data.rays), SURVEYED)
-
-
-def _metres(xyz: np.ndarray) -> str:
-    return "(" + ", ".join(f"{x:.2f}" for x in xyz) + ") m"

@@ -1,5 +1,6 @@
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -185,3 +186,10 @@ def test_weights_that_ship_are_found_by_name_and_files_come_first(tmp_path, monk
     assert find_checkpoint(COMPUTED_DEPTH) == COMPUTED_DEPTH
     with pytest.raises(WeightsError, match="no such weights file"):
         load_checkpoint(tmp_path / "rooms-computed-depth.else")
+
+
+def test_a_folder_does_not_hide_shipped_weights_of_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rooms").mkdir()
+    assert find_checkpoint(Path("rooms")) == default_checkpoint_path()
+    assert find_checkpoint(tmp_path / "rooms") == tmp_path / "rooms"

@@ -9,20 +9,29 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+import structlog
 import torch
 
 from semantic_mapper.config import BoxConfig, GridConfig, PanopticConfig
 from semantic_mapper.errors import ConfigError, FrameError, LabelError, WeightsError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.fields.panoptic import BoxesOnRays, Panoptic, box_config, merged_classes, primitive_of
-from semantic_mapper.fields.primitives import Primitive
+from semantic_mapper.fields.primitives import MAX_INTERVALS, Primitive
 from semantic_mapper.fields.source_maps import encoded_views
 from semantic_mapper.labels import make_label_set
-from semantic_mapper.training.finetune import FinetuneConfig, PanopticFitConfig
+from semantic_mapper.training.boxes_in_view import boxes_in_view
+from semantic_mapper.training.finetune import FinetuneConfig, FinetuneProgress, PanopticFitConfig
 from semantic_mapper.training.fitters import fitter_of
 from semantic_mapper.training.frame_rays import frame_rays
 from semantic_mapper.training.grid_fit import GridFitConfig
-from semantic_mapper.training.panoptic import fit_panoptic, semantic_losses
+from semantic_mapper.training.panoptic import (
+    FEW_MATCHED,
+    fit_panoptic,
+    held_out_unlabelled,
+    pseudo_rays,
+    semantic_losses,
+    survey_boxes,
+)
 from semantic_mapper.training.views import stack_sources, view_from_frame
 from semantic_mapper.types import PosedFrame, RayBatch
 from tests.training.test_irt import two_planes
@@ -264,6 +273,62 @@ def test_where_nothing_may_be_outside_the_grid_is_empty() -> None:
     assert not (opaque & ~solid).any() and (opaque & solid).any()
 
 
+def test_boxes_that_no_frame_can_see_are_left_out_wherever_they_move() -> None:
+    behind = box(1, "lamp", (0.0, 0.0, 9.0), (1, 1, 1))  # above cameras that look down
+    beside = box(2, "lamp", (0.0, 60.0, 0.0), (1, 1, 1))
+    around = box(3, "floor", (0.0, 0.0, 3.0), (12, 12, 1))  # cameras are in it
+    seen = boxes_in_view([primitive_of(b) for b in (DECK, behind, beside, around)], scene())
+    assert seen.tolist() == [True, False, False, True]
+    stamps = sorted(f.stamp_ns for f in scene())
+    here, there = (primitive_of(b).T_world_box for b in (DECK, beside))
+    moving = replace(primitive_of(DECK), stamps=((stamps[0], there), (stamps[1], here)))
+    later = replace(moving, stamps=((stamps[-1] + 10**9, here),))
+    away = replace(moving, stamps=tuple((t, there) for t in stamps))
+    assert boxes_in_view([moving, later, away], scene()).tolist() == [True, False, False]
+    with pytest.raises(ConfigError, match=r"boxes lie from \(0.00, 60.00, .*cameras from .*world frame\?"):
+        boxes_in_view([primitive_of(beside)], scene())
+
+
+def test_boxes_behind_the_nearest_of_a_ray_are_counted() -> None:
+    stack = [box(n + 1, "table", (0.8, 0.0, 0.75), (1.7, 1.7, 0.5 + 0.001 * n)) for n in range(MAX_INTERVALS + 1)]
+    everything = pseudo_rays(scene(), SET, 64)
+    for boxes, crowded in ((stack, True), (stack[1:], False)):
+        survey = survey_boxes(empty_field(*boxes), everything, SMALL)
+        assert (survey.crowded > 0.05) == crowded and survey.crowded <= survey.covered
+
+
+def test_few_labels_that_fit_the_boxes_are_warned_about() -> None:
+    off = [replace(f, label=np.full((48, 64), SET.ids[TABLE], np.uint8)) for f in scene()]
+    with structlog.testing.capture_logs() as logs:
+        survey = survey_boxes(empty_field(DECK), pseudo_rays(off, SET, 64), SMALL)
+    assert survey.matched < FEW_MATCHED and [log["event"] for log in logs] == ["few_labels_match"]
+
+
+def test_frames_without_labels_are_those_that_are_held_out() -> None:
+    one, none = scene()[0], scene(labelled=False)
+    frames = held_out_unlabelled([*none[1:5], one, *none[5:], *scene()[1:3]], 3)
+    assert len(frames) == 10 and [f.label is None for f in frames[2::3]] == [True] * 3
+    assert [f.label is not None for f in frames].count(True) == 3
+    assert held_out_unlabelled(scene(), 3) == list(scene())
+
+
+@pytest.mark.parametrize("joint", [0, 2])
+def test_a_stop_before_classes_are_learned_leaves_what_the_boxes_say(joint: int, tmp_path: Path) -> None:
+    done: list[FinetuneProgress] = []
+    stopped = fit_panoptic(
+        scene(), SET, empty_field(DECK), SMALL, done.append, lambda: len(done) >= SMALL.steps + joint
+    )
+    assert (stopped.recipe["grid_steps"], stopped.recipe["steps"]) == (SMALL.steps, joint)
+    save_checkpoint(stopped, tmp_path / "w.safetensors")
+    field = load_checkpoint(tmp_path / "w.safetensors").model
+    assert isinstance(field, Panoptic) and field.shape.classes == "fixed"
+    said, _ = answers(field, scene()[0])
+    truth = two_planes(0.0, 0, label=True).label
+    assert truth is not None
+    deck = torch.from_numpy(truth.ravel() == 2)
+    assert (said[deck] == TABLE).float().mean() > 0.9
+
+
 def test_boxes_survive_the_config() -> None:
     assert box_config(primitive_of(DECK)) == DECK
 
@@ -279,6 +344,9 @@ def test_what_cannot_be_fitted_is_refused() -> None:
     only_lamps = [replace(f, label=np.full((48, 64), SET.ids[LAMP], np.uint8)) for f in scene()]
     with pytest.raises(ConfigError, match=r"no class in common: labels say lamp, boxes table"):
         fit_panoptic(only_lamps, SET, empty_field(DECK), SMALL)
+    unknown = [replace(f, label=np.full((48, 64), SET.ignore_id, np.uint8)) for f in scene()]
+    with pytest.raises(FrameError, match=r"all pixels of all 8 pseudo labels are unknown \(id 0\)"):
+        fit_panoptic(unknown, SET, empty_field(DECK), SMALL)
     other = make_label_set("other", ["floor", "table"])
     with pytest.raises(WeightsError, match=r"'deck'.*'other'"):
         fit_panoptic(scene(), other, empty_field(DECK), SMALL)

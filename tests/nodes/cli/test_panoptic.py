@@ -3,22 +3,37 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import cv2
 import numpy as np
 import pytest
 
-from semantic_mapper.fields.checkpoint import load_checkpoint
+from semantic_mapper.config import load_config
+from semantic_mapper.errors import ConfigError
+from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from semantic_mapper.geometry import transform, unproject
-from semantic_mapper.labels import ROOMS, STUFF_NAMES
+from semantic_mapper.labels import ROOMS, STUFF_NAMES, make_label_set
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.nodes.cli.console import frame_progress
-from semantic_mapper.nodes.cli.pseudo_labels import open_pseudo_labels, read_pseudo_labelled
+from semantic_mapper.nodes.cli.pseudo_labels import (
+    check_boxes,
+    choose_frames,
+    open_pseudo_labels,
+    read_pseudo_labelled,
+)
+from semantic_mapper.nodes.cli.run_finetune import FinetuneRequest, finetune_lines, finetune_log
+from semantic_mapper.nodes.cli.run_replay import mapper_config
 from semantic_mapper.nodes.process import StopRequest
+from semantic_mapper.replay.autolabel import AutolabelRequest, autolabel
+from semantic_mapper.replay.boxes import load_boxes
 from semantic_mapper.replay.log.sequence import open_log
-from tests.nodes.support import error_line, run
+from semantic_mapper.training.finetune import FinetuneConfig
+from tests.nodes.support import error_line, run, write_log
 from tests.small import tiny_frames
 
 BOXED, MOVING = 9, 10  # ids of boxes
@@ -49,15 +64,30 @@ def boxes(folder: Path) -> Path:
     return path
 
 
-def test_boxes_become_labels_and_things_that_never_score(log: Path, boxes: Path, tmp_path: Path) -> None:
-    out, settings, new = tmp_path / "w.safetensors", tmp_path / "small.toml", tmp_path / "labelled.mcap"
-    settings.write_text("width = 96\n[grid]\nlong_side = 32\nrays = 256\nheld_out = 0\n[panoptic]\nrays = 128\n")
+@pytest.fixture(scope="module")
+def settings(folder: Path) -> Path:
+    path = folder / "small.toml"
+    path.write_text("width = 96\n[grid]\nlong_side = 32\nrays = 256\nheld_out = 0\n[panoptic]\nrays = 128\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def fitted(log: Path, boxes: Path, settings: Path, folder: Path) -> tuple[Path, str]:
+    """Weights with boxes, and what was said of them."""
+    out = folder / "boxed.safetensors"
     arguments = ("--kind", "panoptic", "--boxes", boxes, "--steps", "30", "--seconds", "0", "--config", settings)
     done = run("finetune", log, *arguments, "--out", out)
     assert done.returncode == 0, done.stderr
-    said = " ".join(done.stdout.split())
+    return out, " ".join(done.stdout.split())
+
+
+def test_boxes_become_labels_and_things_that_never_score(
+    log: Path, fitted: tuple[Path, str], config: Path, tmp_path: Path
+) -> None:
+    (out, said), new = fitted, tmp_path / "labelled.mcap"
     assert "1 of 1 boxes seen" in said and "own label images) of 6 of 6 frames" in said
-    assert "1 boxes that move, with grids of their own" in said and "left out: 1 boxes that move" in said
+    assert "1 boxes that move, with grids of their own" in said
+    assert "boxes left out: 1 that no frame sees" in said, "of the one that moves later, no frame is of its time"
     checkpoint = load_checkpoint(out)
     assert checkpoint.train_stamps_ns == {f.stamp_ns for f in tiny_frames(6)}  # their labels are true ones
     things = tmp_path / "things"
@@ -65,6 +95,7 @@ def test_boxes_become_labels_and_things_that_never_score(log: Path, boxes: Path,
     assert done.returncode == 0, done.stderr
     listed = json.loads((things / "instances.json").read_text())["instances"]
     assert [thing["id"] for thing in listed] == [BOXED, MOVING]
+    assert sorted(path.name for path in things.iterdir()) == ["instances.json", "rooms"]
     with open_log(new) as labelled:
         for number, frame in enumerate(labelled):
             assert frame.label is not None and frame.label_is_pseudo
@@ -77,6 +108,88 @@ def test_boxes_become_labels_and_things_that_never_score(log: Path, boxes: Path,
     assert listed[0]["pixels"] and list(listed[1]["pixels"]) == [f"rooms/{WHEN:06d}"]
     done = run("eval", new, "--weights", out)
     assert done.returncode == 1 and "pseudo" in error_line(done.stderr)
+    # As if nobody had seen the true labels, its things are scored against themselves.
+    unseen, file = tmp_path / "unseen.safetensors", tmp_path / "eval.json"
+    save_checkpoint(replace(checkpoint, recipe=checkpoint.recipe | {"train_stamps_ns": []}), unseen)
+    few = ("--instances", things, "--max-frames", "1", "--config", config)
+    done = run("eval", log, "--weights", unseen, *few, "--out", file)
+    assert done.returncode == 0, done.stderr
+    methods = json.loads(file.read_text())["logs"][str(log)]["methods"]
+    assert methods["panoptic"]["panoptic_frames"] == methods["map seen from frames"]["panoptic_frames"] == 1
+    assert methods["panoptic"]["pq_per_class"][listed[0]["class"]]["pq"] > 0.5
+    assert "pq" not in methods["panoptic, novel view"]
+
+
+def test_a_stop_leaves_no_images_of_things(log: Path, fitted: tuple[Path, str], tmp_path: Path) -> None:
+    things, new = tmp_path / "things", tmp_path / "new.mcap"
+    request = AutolabelRequest((log,), new, fitted[0], overwrite_labels=True, instances=things)
+    for before in ([], ["mine"]):
+        for name in before:
+            (things / name).mkdir(parents=True)
+        calls = iter([False, False, True])
+        with pytest.raises(KeyboardInterrupt):
+            autolabel(request, lambda calls=calls: next(calls), lambda total: None, lambda done: None)
+        assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")) == (
+            ["things", "things/mine"] * len(before)
+        )
+
+
+def test_ctrl_c_while_geometry_is_fitted_leaves_what_the_boxes_say(
+    log: Path, boxes: Path, settings: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "w.safetensors"
+    sensor = mapper_config(None, None, depth="sensor", delay_frames=0).depth
+    config = load_config(settings, FinetuneConfig)
+    request = FinetuneRequest(log, 0, out, config, None, False, sensor, "panoptic", boxes=boxes)
+
+    def fit_and_press_at(note: str, stop: StopRequest) -> Checkpoint:
+        def set_and_press(done: int, said: str = "") -> None:
+            if said.startswith(note):
+                os.kill(os.getpid(), signal.SIGINT)
+
+        with frame_progress("fit", None) as bar, patch.object(bar, "set", set_and_press):
+            return finetune_log(request, stop, bar)[0]
+
+    with StopRequest() as stop, pytest.raises(KeyboardInterrupt):
+        fit_and_press_at("reading", stop)
+    assert not out.exists()
+    with StopRequest() as stop:
+        checkpoint = fit_and_press_at("step 3", stop)
+    assert (checkpoint.recipe["grid_steps"], checkpoint.recipe["steps"]) == (3, 0)
+    assert "those of the boxes alone" in " ".join(finetune_lines(checkpoint, [], request))
+    assert load_checkpoint(out).model.config.classes == "fixed"
+
+
+def test_frames_with_labels_go_before_others() -> None:
+    assert choose_frames(10, 4, None) == choose_frames(10, 4, frozenset(range(10))) == [0, 3, 6, 9]
+    assert choose_frames(10, 4, frozenset((1, 2, 3))) == [0, 1, 2, 3]
+    assert choose_frames(10, 2, frozenset((1, 2, 3, 8))) == [1, 8]
+    assert choose_frames(3, 9, frozenset((1,))) == [0, 1, 2]
+
+
+def test_a_class_that_labels_lack_says_whose_classes_they_are_and_which_weights_have_it(
+    log: Path, boxes: Path, tmp_path: Path
+) -> None:
+    mine = make_label_set("mine", ["wall", "spaceship"])
+    own = write_log(tmp_path / "own.mcap", [replace(tiny_frames(1)[0], label=np.ones((72, 96), np.uint8))], mine)
+    with open_log(own) as opened, pytest.raises(ConfigError, match=r"own label images; .*: --pseudo rooms takes"):
+        check_boxes(load_boxes(boxes), boxes, open_pseudo_labels(opened, None))
+    strange = tmp_path / "strange.json"
+    strange.write_text(boxes.read_text().replace('"class": "', '"class": "un'))
+    with open_log(log) as opened, pytest.raises(ConfigError, match=r"own label images: correct the boxes"):
+        check_boxes(load_boxes(strange), strange, open_pseudo_labels(opened, None))
+
+
+def test_a_folder_named_as_weights_in_the_package_has_to_be_told_from_them(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rooms").mkdir()
+    cv2.imwrite(str(tmp_path / "rooms" / "000002.png"), np.ones((72, 96), np.uint8))
+    with open_log(log) as opened:
+        with pytest.raises(ConfigError, match=r"Give \./rooms for the label images"):
+            open_pseudo_labels(opened, "rooms")
+        assert open_pseudo_labels(opened, "./rooms").numbers == {2}
 
 
 def test_what_does_not_go_with_boxes_is_refused(log: Path, boxes: Path, weights: Path, tmp_path: Path) -> None:
@@ -100,7 +213,7 @@ def test_what_does_not_go_with_boxes_is_refused(log: Path, boxes: Path, weights:
 
 def test_weights_teach_with_the_map_that_they_make_of_the_frames(log: Path, weights: Path) -> None:
     with open_log(log) as opened, frame_progress("read", len(opened)) as bar:
-        labels = open_pseudo_labels(opened, weights)
+        labels = open_pseudo_labels(opened, str(weights))
         taught = read_pseudo_labelled(opened, labels, lambda frame: frame, 0, 96, StopRequest(), bar)
         mapper = Mapper.load(weights)
         own = [mapper.step(replace(frame, label=None)).label for frame in opened]
