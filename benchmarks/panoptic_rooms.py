@@ -32,7 +32,7 @@ from semantic_mapper.imaging import resize_depth
 from semantic_mapper.labels import ROOMS, STUFF_NAMES
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.nodes.cli.map_answers import answer_instances
-from semantic_mapper.plots import write_picture
+from semantic_mapper.plots import draw_picture_rows, write_picture
 from semantic_mapper.queries.oriented_box import upright_box
 from semantic_mapper.replay.box_picture import edges_in_view
 from semantic_mapper.replay.boxes import load_boxes
@@ -48,6 +48,7 @@ from semantic_mapper.types import PosedFrame, UInt8
 
 UP = np.array((0.0, 0.0, 1.0))
 INFLATED = 1.1
+COLUMNS = 3  # frames of a picture
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,22 +192,30 @@ def main() -> None:
 
 
 def draw(room: MappedRoom, given: argparse.Namespace, answers: Mapping[str, Sequence[PanopticImage]]) -> None:
-    """Image, boxes, labels of S-Ray, of the last answer and true ones, things of both, of two frames."""
-    rows: list[UInt8] = []
+    """Image, boxes, labels of S-Ray, of the last answer and true ones, things of both, of a few frames."""
     last = list(answers.values())[-1]
     boxes = room.found_boxes if given.boxes[-1] == "query" else room.true_boxes
-    for number in np.linspace(0, len(last) - 1, 4).round().astype(int)[1:3]:
+    rows: dict[str, list[UInt8]] = {}
+    for number in np.linspace(0, len(last) - 1, COLUMNS + 2).round().astype(int)[1:-1]:
         frame, things = (of[number * given.every] for of in (room.frames, room.things))
         assert frame.label is not None
         drawn = frame.rgb.copy()
         for box in boxes:
             for (ax, ay), (bx, by) in edges_in_view(box, frame.T_world_camera, frame.intrinsics):
                 cv2.line(drawn, (round(ax), round(ay)), (round(bx), round(by)), (255, 200, 0), 1, cv2.LINE_AA)
-        s_ray, found, truth = map(ROOMS.colorize, (answers["S-Ray"][number].label, last[number].label, frame.label))
         true_things = np.where(np.isin(frame.label, ROOMS.thing_ids(STUFF_NAMES)), things, 0)
-        numbers = (thing_colours(last[number].instance), thing_colours(true_things))
-        rows.append(np.hstack([frame.rgb, drawn, s_ray, found, truth, *numbers]))
-    write_picture(given.out, np.vstack(rows))
+        shown = {
+            "image": frame.rgb,
+            "boxes": drawn,
+            "labels of S-Ray": ROOMS.colorize(answers["S-Ray"][number].label),
+            "Panoptic NeRF": ROOMS.colorize(last[number].label),
+            "true classes": ROOMS.colorize(frame.label),
+            "things found": thing_colours(last[number].instance),
+            "true things": thing_colours(true_things),
+        }
+        for caption, image in shown.items():
+            rows.setdefault(caption, []).append(image)
+    write_picture(given.out, draw_picture_rows(rows, ROOMS, 2 * given.width))
 
 
 def thing_colours(number: NDArray[np.integer[Any]]) -> UInt8:
