@@ -145,11 +145,14 @@ def check_boxes(boxes: BoxFile, path: Path, labels: PseudoLabels) -> None:
     Raises:
         ConfigError: a class that these lack, with where they come from and what may be done; or no box.
     """
+    needed = {p.class_name for p in boxes.primitives}.union(*([name, *others] for name, others in boxes.merge.items()))
     try:
         check_classes(boxes, labels.label_set, path)
     except ConfigError as error:
+        if needed <= set(labels.label_set.names):
+            raise
         end = "" if str(error).endswith("?") else "."
-        raise ConfigError(f"{error}{end} {_where_classes_come_from(boxes, labels)}") from error
+        raise ConfigError(f"{error}{end} {_where_classes_come_from(labels, needed)}") from error
     if not boxes.primitives:
         raise ConfigError(f"{path}: holds no box; draw some, or take `query MAP instances`")
 
@@ -171,14 +174,12 @@ def boxed_field(
     return Panoptic(config, label_set), int((~seen).sum())
 
 
-def _where_classes_come_from(boxes: BoxFile, labels: PseudoLabels) -> str:
+def _where_classes_come_from(labels: PseudoLabels, needed: set[str]) -> str:
     said = f"Pseudo labels are {labels.source}"
-    correct = "correct the boxes (`boxes FILE reclass ID CLASS`)"
     path = default_checkpoint_path()
-    needed = {p.class_name for p in boxes.primitives}.union(*([name, *others] for name, others in boxes.merge.items()))
     if labels.source == OWN and needed <= set(load_checkpoint(path).label_set.names):
         return f"{said}; weights '{path.stem}' have all classes of the boxes: --pseudo {path.stem} takes their labels"
-    return f"{said}: {correct}, or give other labels (--pseudo)"
+    return f"{said}: correct the boxes (`boxes FILE reclass ID CLASS`), or give other labels (--pseudo)"
 
 
 def _evenly(numbers: Sequence[int], count: int) -> list[int]:

@@ -180,6 +180,13 @@ def test_a_class_that_labels_lack_says_whose_classes_they_are_and_which_weights_
         check_boxes(load_boxes(strange), strange, open_pseudo_labels(opened, None))
 
 
+def test_boxes_without_times_are_refused_for_that_alone(log: Path, boxes: Path, tmp_path: Path) -> None:
+    timeless = tmp_path / "timeless.json"
+    timeless.write_text(boxes.read_text().replace('"stamps"', '"frames"'))
+    with open_log(log) as opened, pytest.raises(ConfigError, match=r"takes these from the log$"):
+        check_boxes(load_boxes(timeless), timeless, open_pseudo_labels(opened, None))
+
+
 def test_a_folder_named_as_weights_in_the_package_has_to_be_told_from_them(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
