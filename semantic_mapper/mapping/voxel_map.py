@@ -40,6 +40,7 @@ from semantic_mapper.mapping.storage.changes import (
     copy_changes,
     read_changes,
 )
+from semantic_mapper.mapping.storage.cleared_blocks import ClearedLog
 from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE
 from semantic_mapper.mapping.views.ray_casting import cast_view
 from semantic_mapper.mapping.views.readout import read_points
@@ -87,6 +88,7 @@ class VoxelMap:
         self.refined = ""
         self.instances: InstanceLayer | None = None
         self.cleared = 0
+        self._cleared_log = ClearedLog()
         self._grid = BlockGrid(
             config.voxel_size_m,
             len(label_set),
@@ -212,8 +214,9 @@ class VoxelMap:
             rgb = np.ascontiguousarray(frame.rgb)
             clears = measured and self.config.clear_free_space
             bounds = depth_bounds(depth, self.config.depth_max_m) if clears else NO_BOUNDS
+            cleared: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
             for blocks in self.changing(packed):
-                self.cleared += fuse_blocks(
+                voxels = fuse_blocks(
                     blocks,
                     self._grid.buffers(),
                     camera,
@@ -226,10 +229,13 @@ class VoxelMap:
                     measured=measured,
                     bounds=bounds,
                 )
+                cleared.append((pack_keys(self._grid.buffers().keys[blocks]), voxels))
             if clears:
-                self.cleared += clear_in_view(
-                    self._grid, packed, camera, self._limits, depth, rgb, bounds, self.version
-                )
+                args = (self._grid, packed, camera, self._limits, depth, rgb, bounds, self.version)
+                cleared += clear_in_view(*args)
+                for keys, voxels in cleared:
+                    self.cleared += int(voxels.sum())
+                    self._cleared_log.add(keys, voxels, self.version, frame.stamp_ns)
             self.frames += 1
             self.last_stamp_ns = frame.stamp_ns
         return len(packed)
@@ -441,7 +447,8 @@ class VoxelMap:
         _check_min_weight(min_weight)
         decision = (self.label_set, self.config.vote_discount, self.config.unknown_below, min_weight)
         chosen = choose_blocks(self._grid, (since, self.version, self.epoch), limit, decision)
-        return chosen._replace(scale_known=self.scale_known)
+        cleared = self._cleared_log.between(since, chosen.version)
+        return chosen._replace(scale_known=self.scale_known, cleared=cleared)
 
     def _read(
         self, grid: BlockGrid, voxels: Float64

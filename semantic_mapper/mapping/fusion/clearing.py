@@ -23,6 +23,8 @@ too.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,7 +53,7 @@ def clear_in_view(
     rgb: UInt8,
     bounds: DepthBounds,
     version: int,
-) -> int:
+) -> Iterator[tuple[Int64, Int64]]:
     """Clear what a frame sees through outside of the truncation band, in place; hold the map's lock meanwhile.
 
     Args:
@@ -64,21 +66,22 @@ def clear_in_view(
         bounds: Of ``depth``.
         version: Of the map, for the blocks that change.
 
-    Returns:
-        Voxels cleared.
+    Yields:
+        Packed keys (B,) of blocks that have changed, and how many of their voxels were cleared (B,).
 
     Raises:
         MapError: the disk fails.
     """
-    packed, cleared = _candidates(grid, band, camera, limits, bounds), 0
+    packed = _candidates(grid, band, camera, limits, bounds)
     for start in range(0, len(packed), grid.room):
         part = packed[start : start + grid.room]
         seen, _ = _clear(grid.page_in(part), grid.buffers(), camera, limits, depth, rgb, bounds, changes=False)
         if seen.any():  # only these count as changed
-            blocks = grid.activate(part[seen > 0])
-            cleared += int(_clear(blocks, grid.buffers(), camera, limits, depth, rgb, bounds, changes=True)[1].sum())
+            changing = part[seen > 0]
+            blocks = grid.activate(changing)
+            _, cleared = _clear(blocks, grid.buffers(), camera, limits, depth, rgb, bounds, changes=True)
             grid.mark_changed(blocks, version)
-    return cleared
+            yield changing, cleared
 
 
 def _candidates(

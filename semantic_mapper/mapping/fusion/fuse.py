@@ -130,7 +130,7 @@ def fuse_blocks(
     *,
     measured: bool = True,
     bounds: DepthBounds = NO_BOUNDS,
-) -> int:
+) -> Int64:
     """Fuse one frame into blocks, in place.
 
     Args:
@@ -147,13 +147,13 @@ def fuse_blocks(
         bounds: Of the depth, where what the frame sees through is to be cleared; see ``clearing``.
 
     Returns:
-        Voxels of a surface that were cleared.
+        (B,) voxels of a surface that were cleared.
     """
     cleared = np.empty(len(indices), np.int64)
     look, cap = (MEASURED, limits.max_weight) if measured else (COMPUTED_LOOK, COMPUTED_CAP)
     args = (indices, buffers, camera, limits, depth, rgb, trust, votes, DITHER, moment, look, cap)
     _fuse_frame_into_blocks(len(indices), *args, bounds, cleared)
-    return int(cleared.sum())
+    return cleared
 
 
 @parallel_kernel()
