@@ -128,6 +128,7 @@ class InstanceTracker:
         self._last: _Found | None = None
         self._epoch = 0
         self._whole: dict[int, _Whole] = {}
+        self._going: dict[int, _Whole] = {}  # found in less than half, and seen through, but not gone yet
         self._gone: deque[Instance] = deque(maxlen=MAX_GONE)
         self._lock = threading.Lock()
 
@@ -204,21 +205,27 @@ class InstanceTracker:
         if snapshot.epoch != self._epoch:  # all may have moved
             self._epoch, self._whole = snapshot.epoch, {}
         size_of = dict(zip(ids.tolist(), sizes.tolist(), strict=True))
-        for number, whole in sorted(self._whole.items()):
-            if 2 * size_of.get(number, 0) >= whole.most_voxels:
+        small = {n: whole for n, whole in self._whole.items() if 2 * size_of.get(n, 0) < whole.most_voxels}
+        self._going = {}
+        for number, whole in sorted(small.items()):
+            left, stamps = _seen_through(snapshot, whole)
+            if not len(stamps):
                 continue
-            gone_ns = _gone_since(snapshot, whole)
-            if gone_ns is not None:
-                self._gone.append(replace(whole.thing, gone_ns=gone_ns))
-                ids[ids == number] = 0
+            if 2 * left >= whole.most_voxels:
+                self._going[number] = whole
+                continue
+            self._gone.append(replace(whole.thing, gone_ns=int(stamps[len(stamps) // 2])))
+            ids[ids == number] = 0
 
     def _keep_whole(self, snapshot: MapSnapshot, things: tuple[Instance, ...]) -> None:
-        """Note the things as they are; what has shrunk below half without being seen through is whole again."""
-        before, self._whole = self._whole, {}
+        """Note the things as they are, save those that are about to go; what else has shrunk is whole again."""
+        before, found = self._whole, {thing.id for thing in things}
+        lost = [number for number in self._going if number not in found]
+        self._whole = {number: self._going[number] for number in lost[-MAX_GONE:]}
         for thing in things:
             known, size = before.get(thing.id), len(thing.voxels)
             most = size if known is None or 2 * size < known.most_voxels else max(size, known.most_voxels)
-            self._whole[thing.id] = _Whole(thing, snapshot.version, most)
+            self._whole[thing.id] = self._going.get(thing.id) or _Whole(thing, snapshot.version, most)
 
     def _describe(
         self,
@@ -269,18 +276,17 @@ def find_overlaps(old: _LabelledVoxels, new: _LabelledVoxels, count: int, pairs:
     ...
 
 
-def _gone_since(snapshot: MapSnapshot, whole: _Whole) -> int | None:
-    """Stamp of the frame at which most of a thing was gone; None where it is there, or was not seen through."""
+def _seen_through(snapshot: MapSnapshot, whole: _Whole) -> tuple[int, NDArray[np.int64]]:
+    """How many voxels of a thing have a surface still, and the stamp of each voxel cleared there, ascending.
+
+    None are cleared where these are too few to be what the thing has lost.
+    """
     packed = pack_keys(whole.thing.voxels >> 3)
     rows = snapshot.cleared.between(whole.version, snapshot.version)
     of_thing = np.isin(rows.packed, packed)
-    if not of_thing.any():
-        return None
-    left = _count_left(snapshot, packed, whole.thing.voxels)
-    cleared = np.cumsum(rows.voxels[of_thing])
-    if 2 * left >= whole.most_voxels or 2 * cleared[-1] < len(packed) - left:
-        return None
-    return int(rows.stamp_ns[of_thing][np.searchsorted(2 * cleared, cleared[-1])])
+    stamps = np.repeat(rows.stamp_ns[of_thing], rows.voxels[of_thing])
+    left = _count_left(snapshot, packed, whole.thing.voxels) if len(stamps) else len(packed)
+    return left, stamps if 2 * len(stamps) >= len(packed) - left else stamps[:0]
 
 
 def _count_left(snapshot: MapSnapshot, packed: NDArray[np.int64], voxels: NDArray[np.int32]) -> int:

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from semantic_mapper.client import MapClient
 from semantic_mapper.mapping.storage import cleared_blocks
@@ -33,7 +34,7 @@ class Stage:
         self.mirror = MapMirror.of(self.map)
         self.tracker = InstanceTracker(min_voxels=10)
 
-    def show(self, columns: slice | None, *, times: int = 1, class_id: int = TABLE) -> int:
+    def show(self, columns: slice | NDArray[np.int64] | None, *, times: int = 1, class_id: int = TABLE) -> int:
         """Frames with the thing in some columns; returns the stamp of the last."""
         depth, label = np.full(SIZE, WALL_M, np.float32), np.full(SIZE, FLOOR)
         if columns is not None:
@@ -86,6 +87,22 @@ def test_what_is_left_of_a_thing_that_went_is_another_one() -> None:
     stage.show(REST, times=5)
     (rest,) = stage.look()
     assert rest.id > table.id and [thing.id for thing in stage.tracker.gone] == [table.id]
+
+
+def test_a_thing_that_goes_in_pieces_goes_as_a_whole() -> None:
+    stage = Stage()
+    stage.show(WHOLE, times=10)
+    (table,) = stage.look()
+    stage.show(np.r_[30:55, 85:115], times=4)
+    pieces = stage.look()
+    assert len(pieces) == 2 and max(len(thing.voxels) for thing in pieces) < 0.5 * len(table.voxels)
+    assert table.id in [thing.id for thing in pieces] and stage.tracker.gone == ()
+    stage.show(np.r_[30:34], times=3)
+    stage.look()
+    gone = {thing.id: thing for thing in stage.tracker.gone}
+    np.testing.assert_array_equal(gone[table.id].voxels, table.voxels)
+    stage.show(None, times=4)
+    assert stage.look() == ()
 
 
 def test_a_thing_that_moves_stays_the_same() -> None:
