@@ -57,7 +57,7 @@ class MovingBoxes(nn.Module):
         self.shapes = [PrimitiveSet([replace(p, T_world_box=np.eye(4))]) for p in self.primitives]
         self.grids = nn.ModuleList(SceneGrid(_grid(shape, voxel_m)) for shape in self.shapes)
         for grid in self.grids:
-            cast("SceneGrid", grid).occupied.zero_()  # values stay untouched: memory that nobody needs is none
+            cast("SceneGrid", grid).occupied.zero_()  # values are not written, so take no memory
 
     def __len__(self) -> int:
         return len(self.primitives)
