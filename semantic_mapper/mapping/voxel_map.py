@@ -89,6 +89,7 @@ class VoxelMap:
         self.instances: InstanceLayer | None = None
         self.cleared = 0
         self._cleared_log = ClearedLog()
+        self._bounds = NO_BOUNDS  # of the last frame that cleared
         self._grid = BlockGrid(
             config.voxel_size_m,
             len(label_set),
@@ -213,7 +214,9 @@ class VoxelMap:
             )
             rgb = np.ascontiguousarray(frame.rgb)
             clears = measured and self.config.clear_free_space
-            bounds = depth_bounds(depth, self.config.depth_max_m) if clears else NO_BOUNDS
+            bounds = NO_BOUNDS
+            if clears:
+                bounds = self._bounds = depth_bounds(depth, self.config.depth_max_m, self._bounds)
             cleared: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
             for blocks in self.changing(packed):
                 voxels = fuse_blocks(
