@@ -269,21 +269,23 @@ def run_cost(given: argparse.Namespace) -> dict[str, Any]:
     """Milliseconds of fusing a frame, each frame with clearing on and off, in alternating order."""
     frames, labels = _read(Path(given.log))
     maps = {on: VoxelMap(VoxelMapConfig(clear_free_space=on), labels) for on in (False, True)}
-    took: list[tuple[float, float]] = []
+    took: list[tuple[float, float, float, float]] = []
     for play in range(3):
         for number, frame in enumerate(frames):
-            ms = {}
+            ms, cpu_ms = {}, {}
             for on in (True, False) if (number + play) % 2 else (False, True):
-                start = time.perf_counter()
+                start, cpu_start = time.perf_counter(), time.process_time()
                 map_frame(maps[on], frame)
                 ms[on] = (time.perf_counter() - start) * 1e3
+                cpu_ms[on] = (time.process_time() - cpu_start) * 1e3
             if play:  # the first lets the maps grow
-                took.append((ms[False], ms[True]))
-    off, on = np.array(took).T
+                took.append((ms[False], ms[True], cpu_ms[False], cpu_ms[True]))
+    off, on, cpu_off, cpu_on = np.array(took).T
     return {
         "off_ms": np.percentile(off, (50, 95)).round(2).tolist(),
         "on_ms": np.percentile(on, (50, 95)).round(2).tolist(),
         "difference_ms": np.percentile(on - off, (25, 50, 75, 95)).round(2).tolist(),
+        "cpu_difference_ms": float((cpu_on - cpu_off).mean().round(2)),  # of all threads
         "frames": len(took),
     }
 

@@ -22,7 +22,7 @@ from semantic_mapper.mapping.files.map_manifest import MapManifest
 from semantic_mapper.mapping.files.map_saving import MapSaving
 from semantic_mapper.mapping.files.merge import add_blocks, check_fit, copy_blocks, voxel_transform
 from semantic_mapper.mapping.fusion.allocation import blocks_in_band, frame_budget, make_camera
-from semantic_mapper.mapping.fusion.clearing import clear_in_view
+from semantic_mapper.mapping.fusion.clearing import clear_in_view, clear_without_return
 from semantic_mapper.mapping.fusion.depth_bounds import NO_BOUNDS, depth_bounds
 from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
 from semantic_mapper.mapping.fusion.frame_votes import check_depth, frame_votes, probability_table, trusted_depth
@@ -176,7 +176,8 @@ class VoxelMap:
 
         Args:
             frame: Gives rgb, intrinsics (rectified) and pose; its own depth is not looked at.
-            depth_m: (H, W) float32 z in metres; 0, negative, NaN or beyond ``depth_max_m`` = no measurement.
+            depth_m: (H, W) float32 z in metres; 0, negative, NaN or beyond ``depth_max_m`` = no measurement. All but the
+                last are free space up to ``no_return_range_m``.
             probabilities: (H, W, L) float32, each known pixel summing to 1; None = geometry and colour alone.
             known: (H, W) bool, where ``probabilities`` mean something; None = everywhere.
             rows: (H, W) int32, where several pixels share their probabilities: these are (K, L) then, and this says
@@ -197,7 +198,8 @@ class VoxelMap:
         check_pose(frame.T_world_camera, where)
         if any(frame.intrinsics.distortion):
             raise FrameError(f"{where}: the image is not rectified (distortion {frame.intrinsics.distortion})")
-        depth, weights = trusted_depth(check_depth(depth_m, frame.intrinsics, where), trust, where)
+        given = check_depth(depth_m, frame.intrinsics, where)
+        depth, weights = trusted_depth(given, trust, where)
         table = None
         if probabilities is not None:
             table = probability_table(depth, probabilities, known, rows, len(self.label_set), where)
@@ -234,8 +236,10 @@ class VoxelMap:
                 )
                 cleared.append((pack_keys(self._grid.buffers().keys[blocks]), voxels))
             if clears:
-                args = (self._grid, packed, camera, self._limits, depth, rgb, bounds, self.version)
-                cleared += clear_in_view(*args)
+                grid, limits, reach = self._grid, self._limits, self.config.no_return_range_m
+                cleared += clear_in_view(grid, packed, camera, limits, depth, rgb, bounds, self.version)
+                if reach > 0:
+                    cleared += clear_without_return(grid, camera, limits, given, rgb, reach, self.version)
                 for keys, voxels in cleared:
                     self.cleared += int(voxels.sum())
                     self._cleared_log.add(keys, voxels, self.version, frame.stamp_ns)

@@ -32,6 +32,7 @@ _BOUNDS = {  # of the settings of a map: what is beyond is a slip of units or di
     "voxel_size_m": (1e-4, 10.0),
     "truncation_voxels": (1e-3, 100.0),
     "depth_max_m": (1e-3, 1000.0),
+    "no_return_range_m": (0.0, 1000.0),
     "initial_blocks": (1, 1 << 27),
     "max_blocks": (1, 1 << 27),
     "max_weight": (1.0, 1e6),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -42,24 +41,26 @@ NONE_CLEARED = ClearedBlocks(*(np.empty(0, np.int64) for _ in range(4)))
 
 
 class ClearedLog:
-    """The rows of one map, frame by frame; the oldest frames are dropped beyond ``MAX_ROWS``."""
+    """The rows of one map; each new one takes the place of the oldest beyond ``MAX_ROWS``."""
 
     def __init__(self) -> None:
-        self._frames: deque[ClearedBlocks] = deque()
-        self._rows = 0
+        self._ring = ClearedBlocks(*np.empty((4, MAX_ROWS), np.int64))
+        self._added = 0
 
     def add(self, packed: NDArray[np.int64], voxels: NDArray[np.int64], version: int, stamp_ns: int) -> None:
         """Note how many voxels (B,) of blocks with keys (B,) a frame has cleared; blocks of 0 are left out."""
         rows = np.flatnonzero(voxels)
-        if not len(rows):
-            return
-        known = (np.full(len(rows), value, np.int64) for value in (version, stamp_ns))
-        self._frames.append(ClearedBlocks(packed[rows], voxels[rows], *known))
-        self._rows += len(rows)
-        while self._rows > MAX_ROWS:
-            self._rows -= len(self._frames.popleft().packed)
+        latest = rows[-len(self._ring.packed) :]
+        self._added += len(rows)
+        places = np.arange(self._added - len(latest), self._added) % len(self._ring.packed)
+        for column, values in zip(self._ring, (packed[latest], voxels[latest], version, stamp_ns), strict=True):
+            column[places] = values
 
     def between(self, after: int, up_to: int) -> ClearedBlocks:
         """The rows of versions above ``after``, up to ``up_to``."""
-        chosen = [rows for rows in self._frames if after < rows.version[0] <= up_to]
-        return ClearedBlocks(*map(np.concatenate, zip(*chosen, strict=True))) if chosen else NONE_CLEARED
+        version = self._ring.version[: self._added]
+        chosen = np.flatnonzero((version > after) & (version <= up_to))
+        if not len(chosen):
+            return NONE_CLEARED
+        chosen = chosen[np.argsort((chosen - self._added) % len(self._ring.packed))]
+        return ClearedBlocks(*(column[chosen] for column in self._ring))
