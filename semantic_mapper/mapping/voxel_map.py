@@ -176,8 +176,8 @@ class VoxelMap:
 
         Args:
             frame: Gives rgb, intrinsics (rectified) and pose; its own depth is not looked at.
-            depth_m: (H, W) float32 z in metres; 0, negative, NaN or beyond ``depth_max_m`` = no measurement. All but the
-                last are free space up to ``no_return_range_m``.
+            depth_m: (H, W) float32 z in metres; 0, negative, NaN or beyond ``depth_max_m`` = no measurement. All but
+                the last are free space up to ``no_return_range_m``.
             probabilities: (H, W, L) float32, each known pixel summing to 1; None = geometry and colour alone.
             known: (H, W) bool, where ``probabilities`` mean something; None = everywhere.
             rows: (H, W) int32, where several pixels share their probabilities: these are (K, L) then, and this says
