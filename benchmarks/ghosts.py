@@ -245,7 +245,8 @@ def run_static(given: argparse.Namespace) -> dict[str, Any]:
     maps: dict[bool, Float64] = {}
     result: dict[str, Any] = {}
     for clears in (False, True):
-        voxel_map = VoxelMap(VoxelMapConfig(clear_free_space=clears), labels)
+        config = VoxelMapConfig(clear_free_space=clears, no_return_range_m=given.no_return)
+        voxel_map = VoxelMap(config, labels)
         for play in range(PLAYS):
             for frame in frames:
                 map_frame(voxel_map, frame)
@@ -335,6 +336,7 @@ def main() -> None:
     parser.add_argument("--rooms", type=int, default=3, help="test rooms")
     parser.add_argument("--exact", action="store_true", help="rooms without noise and holes in depth")
     parser.add_argument("--mesh", type=Path, help="vertices and faces of the reference, .npz")
+    parser.add_argument("--no-return", type=float, default=0.0, help="metres that missing depth clears (static)")
     parser.add_argument("--picture", type=Path, help="PNG of the map before and after")
     given = parser.parse_args()
     print(json.dumps(dict(_runs())[given.run](given), indent=1))
