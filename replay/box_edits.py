@@ -150,7 +150,7 @@ def with_times(boxes: BoxFile, path: Path, log: Log) -> tuple[BoxFile, list[int]
         The boxes, and the ids of those that were dropped.
 
     Raises:
-        ConfigError: the log is of something else.
+        ConfigError: the log is of something else, or has none of the frames at which any box is.
     """
     if all(box.frames is None for box in boxes.primitives):
         return boxes, []
@@ -164,7 +164,12 @@ def with_times(boxes: BoxFile, path: Path, log: Log) -> tuple[BoxFile, list[int]
         times.setdefault(envelope.seq, envelope.stamp_ns)
     timed = [_timed(box, times) for box in boxes.primitives]
     dropped = [box.id for box, new in zip(boxes.primitives, timed, strict=True) if new is None]
-    return replace(boxes, primitives=tuple(new for new in timed if new is not None)), dropped
+    kept = tuple(new for new in timed if new is not None)
+    if not kept:
+        raise ConfigError(
+            f"{path}: all boxes move, and {log.path} has none of the frames of the drive at which they are"
+        )
+    return replace(boxes, primitives=kept), dropped
 
 
 def _timed(box: Primitive, times: Mapping[int, int]) -> Primitive | None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import codecs
 import json
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, cast
@@ -38,7 +39,7 @@ from semantic_mapper.replay.box_values import (
     whole_faces,
     whole_id,
 )
-from semantic_mapper.replay.kitti360_boxes import read_kitti360
+from semantic_mapper.replay.kitti360_boxes import MERGE, read_kitti360
 from semantic_mapper.types import Float64
 
 MAX_FILE_BYTES = 1 << 28  # 50,000 boxes of KITTI-360 take 0.1 GB
@@ -124,25 +125,59 @@ def check_box(box: Primitive) -> None:
     _from_json(_to_json(box))
 
 
-def check_classes(boxes: BoxFile, label_set: LabelSet, path: Path) -> None:
-    """Refuse boxes that no field can be fitted with: the label set lacks their class, or their times are not known.
+def with_classes(boxes: BoxFile, label_set: LabelSet, path: Path) -> tuple[BoxFile, LabelSet]:
+    """Boxes that a field can be fitted with, and the label set of the field.
+
+    That is the one of the pseudo labels, and those classes of boxes that it lacks, but that a class of it may stand for
+    as ``merge`` says. XML of KITTI-360 has no ``merge``: there ``kitti360_boxes.MERGE`` says so, and boxes of any other
+    class that the label set lacks are left out, with a warning.
+
+    Args:
+        boxes: Of a file.
+        label_set: Of the pseudo labels.
+        path: Of the file, for errors.
 
     Raises:
-        ConfigError: with the file, the id of the box, and the nearest name.
+        ConfigError: the label set lacks a class, with the file, the id of the box, and the nearest name.
     """
-    named = [(f"box with id {p.id}", p.class_name) for p in boxes.primitives]
-    named += [("merge", name) for group in boxes.merge.items() for name in (group[0], *group[1])]
-    for where, name in named:
-        if name not in label_set.names:
-            near = get_close_matches(name, label_set.names, n=1, cutoff=0.5)
-            hint = f"; did you mean '{near[0]}'?" if near else f"; it has {', '.join(label_set.names)}"
+    if boxes.is_xml:
+        boxes = _merged_kitti360(boxes, label_set, path)
+    boxed = dict.fromkeys(p.class_name for p in boxes.primitives)
+    merged = {name for others in boxes.merge.values() for name in others}
+    known = label_set.with_names([name for name in boxed if name in merged and name not in label_set.names])
+    named = [("merge", name, label_set) for name in boxes.merge]
+    named += [("merge", name, known) for others in boxes.merge.values() for name in others]
+    named += [(f"box with id {p.id}", p.class_name, known) for p in boxes.primitives]
+    for where, name, among in named:
+        if name not in among.names:
+            near = get_close_matches(name, among.names, n=1, cutoff=0.5)
+            hint = f"; did you mean '{near[0]}'?" if near else f"; it has {', '.join(among.names)}"
             raise ConfigError(f"{path}, {where}: label set '{label_set.name}' has no class '{name}'{hint}")
-    timeless = [str(p.id) for p in boxes.primitives if p.frames is not None]
-    if timeless:
-        raise ConfigError(
-            f"{path}: {len(timeless)} boxes that move have poses by frame, but no times (id {', '.join(timeless[:3])}"
-            f"{', ...' if len(timeless) > 3 else ''}); `boxes FILE times LOG --out boxes.json` takes these from the log"
-        )
+    return boxes, known
+
+
+def _merged_kitti360(boxes: BoxFile, label_set: LabelSet, path: Path) -> BoxFile:
+    """Boxes of XML of classes that labels have, or take for others, and what they take them for.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    boxed = {p.class_name for p in boxes.primitives}
+    merge = {
+        name: found
+        for name, others in MERGE.items()
+        if name in label_set.names and (found := tuple(o for o in others if o in boxed - set(label_set.names)))
+    }
+    known = {*label_set.names, *(name for others in merge.values() for name in others)}
+    kept = tuple(p for p in boxes.primitives if p.class_name in known)
+    if lacking := sorted(boxed - known):
+        names = f"label set '{label_set.name}' has no class {', '.join(lacking)}"
+        if not kept:
+            raise ConfigError(f"{path}: {names}; it has {', '.join(label_set.names)}")
+        count = len(boxes.primitives) - len(kept)
+        _log.warning("boxes_left_out", file=str(path), count=count, reason=names)
+        boxes = replace(boxes, left_out=boxes.left_out + count)
+    return replace(boxes, primitives=kept, merge=merge)
 
 
 def _read(path: Path) -> bytes:

@@ -31,6 +31,14 @@ from semantic_mapper.replay.box_values import (
 from semantic_mapper.replay.importers.kitti360 import LABELS
 from semantic_mapper.types import Float64
 
+# What labels without these classes take them for: those that the paper (Sec. 4) and the devkit's training ids merge.
+MERGE = {
+    "sidewalk": ("parking",),
+    "building": ("garage",),
+    "fence": ("gate",),
+    "pole": ("polegroup", "smallpole"),
+    "car": ("caravan", "trailer"),
+}
 _NAMES = {name.replace(" ", ""): name for name in LABELS.names}
 _NAMES |= {"driveway": "parking", "ground": "terrain", "bigpole": "pole"}
 

@@ -132,6 +132,18 @@ class LabelSet:
         ids, colors = zip(*first.values(), strict=True)
         return LabelSet(self.name, ids, tuple(first), colors, self.ignore_id), table
 
+    def with_names(self, names: Sequence[str]) -> LabelSet:
+        """This set and classes of more names, in their order, with the lowest ids that are free.
+
+        Raises:
+            LabelError: there are no more ids, or a name is there already.
+        """
+        free = [i for i in range(256) if i not in self.ids and i != self.ignore_id][: len(names)]
+        if len(free) < len(names):
+            raise LabelError(f"label set '{self.name}' has {len(self)} classes, and no ids for {len(names)} others")
+        colors = self.colors + tuple(_distinct_color(i) for i in free)
+        return LabelSet(self.name, (*self.ids, *free), (*self.names, *names), colors, self.ignore_id)
+
     def channel_map_from(self, other: LabelSet) -> NDArray[np.int64]:
         """For each id 0..255 of ``other``: this set's channel of the class with the same name, else -1."""
         mine = {name: channel for channel, name in enumerate(self.names)}

@@ -22,7 +22,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.nodes.cli.console import FrameProgress
 from semantic_mapper.nodes.process import StopRequest
-from semantic_mapper.replay.boxes import BoxFile, check_classes
+from semantic_mapper.replay.boxes import BoxFile, with_classes
 from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import Log
 from semantic_mapper.training.boxes_in_view import boxes_in_view
@@ -139,22 +139,21 @@ def choose_frames(total: int, count: int, labelled: frozenset[int] | None) -> li
     return sorted(chosen + _evenly(rest, count - len(chosen)))
 
 
-def check_boxes(boxes: BoxFile, path: Path, labels: PseudoLabels) -> None:
-    """Refuse boxes that cannot go with pseudo labels.
+def match_boxes(boxes: BoxFile, path: Path, labels: PseudoLabels) -> tuple[BoxFile, LabelSet]:
+    """Boxes that can go with pseudo labels, and the label set of a field of them; see ``with_classes``.
 
     Raises:
         ConfigError: a class that these lack, with where they come from and what may be done; or no box.
     """
     needed = {p.class_name for p in boxes.primitives}.union(*([name, *others] for name, others in boxes.merge.items()))
     try:
-        check_classes(boxes, labels.label_set, path)
+        boxes, label_set = with_classes(boxes, labels.label_set, path)
     except ConfigError as error:
-        if needed <= set(labels.label_set.names):
-            raise
         end = "" if str(error).endswith("?") else "."
         raise ConfigError(f"{error}{end} {_where_classes_come_from(labels, needed)}") from error
     if not boxes.primitives:
         raise ConfigError(f"{path}: holds no box; draw some, or take `query MAP instances`")
+    return boxes, label_set
 
 
 def boxed_field(
@@ -179,7 +178,10 @@ def _where_classes_come_from(labels: PseudoLabels, needed: set[str]) -> str:
     path = default_checkpoint_path()
     if labels.source == OWN and needed <= set(load_checkpoint(path).label_set.names):
         return f"{said}; weights '{path.stem}' have all classes of the boxes: --pseudo {path.stem} takes their labels"
-    return f"{said}: correct the boxes (`boxes FILE reclass ID CLASS`), or give other labels (--pseudo)"
+    return (
+        f"{said}: correct the boxes (`boxes FILE reclass ID CLASS`), say in `merge` of the file which class of the "
+        "labels stands for it, or give other labels (--pseudo)"
+    )
 
 
 def _evenly(numbers: Sequence[int], count: int) -> list[int]:

@@ -28,9 +28,10 @@ from semantic_mapper.geometry import check_pose
 from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.nodes.cli.console import FrameProgress
 from semantic_mapper.nodes.cli.outputs import prepare_file
-from semantic_mapper.nodes.cli.pseudo_labels import boxed_field, check_boxes, open_pseudo_labels, read_pseudo_labelled
+from semantic_mapper.nodes.cli.pseudo_labels import boxed_field, match_boxes, open_pseudo_labels, read_pseudo_labelled
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.autolabel_note import read_note
+from semantic_mapper.replay.box_edits import with_times
 from semantic_mapper.replay.boxes import BoxFile, load_boxes
 from semantic_mapper.replay.label_folder import LabelFolder, open_label_folder
 from semantic_mapper.replay.log.sequence import Log, open_log
@@ -176,7 +177,8 @@ def _finetune_boxes(request: FinetuneRequest, boxes: BoxFile, stop: StopRequest,
     assert request.boxes is not None
     with open_log(request.log) as log:
         labels = open_pseudo_labels(log, request.pseudo)
-        check_boxes(boxes, request.boxes, labels)
+        boxes, label_set = match_boxes(boxes, request.boxes, labels)
+        boxes, dropped = with_times(boxes, request.boxes, log)
         computed = _compute_depths(log, request.depth, stop, bar)
         frames = read_pseudo_labelled(
             log,
@@ -188,12 +190,14 @@ def _finetune_boxes(request: FinetuneRequest, boxes: BoxFile, stop: StopRequest,
             bar,
         )
         note = read_note(log.attachments())
-    start, unseen = boxed_field(boxes, usable_frames(frames), labels.label_set, request.uncovered)
+    start, unseen = boxed_field(boxes, usable_frames(frames), label_set, request.uncovered)
     seen = labels.train_stamps_ns
     if note is not None and any(f.label_is_pseudo for f in frames):
         seen |= frozenset(note.train_stamps_ns)
-    checkpoint = _fit(Panoptic.kind, frames, labels.label_set, start, seen, request, stop, bar)
-    checkpoint.recipe["panoptic"] |= {"left_out": boxes.left_out, "unseen": unseen, "pseudo": labels.source}
+    checkpoint = _fit(Panoptic.kind, frames, label_set, start, seen, request, stop, bar)
+    figures = checkpoint.recipe["panoptic"]
+    figures |= {"left_out": boxes.left_out, "unseen": unseen, "pseudo": labels.source}
+    figures["lost"] += len(dropped)
     save_checkpoint(checkpoint, request.out)
     return checkpoint
 
@@ -258,7 +262,7 @@ def _left_out(boxed: Mapping[str, Any]) -> list[tuple[int, str]]:
     reasons = {
         "unseen": "that no frame sees",
         "lost": "that move, which no frame shows at their times",
-        "left_out": "of no class",
+        "left_out": "of no class, or of one that the labels lack",
     }
     return [(boxed[name], f"{boxed[name]} {reason}") for name, reason in reasons.items()]
 

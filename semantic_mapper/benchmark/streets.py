@@ -57,6 +57,7 @@ class StreetsConfig(Config, frozen=True):
     """A run of the suite."""
 
     streets: Annotated[int, msgspec.Meta(ge=1, le=20)] = 3
+    split: Literal["val", "test"] = "test"
     width: Annotated[int, msgspec.Meta(ge=32)] = 352  # pixels; 1408x376 is the data set's size
     pairs: Annotated[int, msgspec.Meta(ge=2, le=PAIRS)] = PAIRS  # of images of a street
     scored_every: AtLeastOne = 4  # left image
@@ -64,6 +65,8 @@ class StreetsConfig(Config, frozen=True):
     moving: bool = False  # cars drive on the streets
     voxel_m: Positive = 0.25  # of fields' grids
     field_steps: AtLeastOne = 600  # of geometry and colours, and as many of all together
+    field_depth: bool = True  # fields get measured depth
+    semantics: Positive = 0.05  # weight of the semantic losses of fields
     seed: NotNegative = 0  # of networks
 
 
@@ -116,7 +119,7 @@ Arm = Callable[[StreetsConfig, int], ViewScores]
 
 def street_seeds(config: StreetsConfig) -> range:
     """The streets of a run."""
-    return STREETS_SUITE.seeds["test"][: config.streets]
+    return STREETS_SUITE.seeds[config.split][: config.streets]
 
 
 def drive(config: StreetsConfig, seed: int) -> Drive:
@@ -223,7 +226,7 @@ def evaluated(label: UInt8) -> UInt8:
 def streets_digest(config: StreetsConfig) -> str:
     """What tells records apart that were made in another way: 16 hex digits."""
     plain = to_plain(config) | {"suite_version": STREETS_SUITE.version, "record_version": RECORD_VERSION}
-    del plain["streets"]
+    del plain["streets"], plain["split"]  # records have the street's seed
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -80,7 +80,7 @@ def panoptic_arms(folder: Path, *, moving: bool = False) -> dict[str, Arm]:
 def fit_settings(config: StreetsConfig, street: Drive, name: str) -> FinetuneConfig:
     """How an arm's field is fitted."""
     left_out = LEFT_OUT[name]
-    depth = {} if "depth" not in left_out else {"depth": 0.0, "start_from_depth": False}
+    depth = {} if config.field_depth and "depth" not in left_out else {"depth": 0.0, "start_from_depth": False}
     cameras = np.array([view.T_world_camera[:3, 3] for view in street.left])
     ahead = np.array([view.T_world_camera[:3, 2] for view in street.left])[-1]
     ends = np.concatenate((cameras - _BEHIND_M * ahead, cameras + _AHEAD_M * ahead))[:, :2]
@@ -88,7 +88,8 @@ def fit_settings(config: StreetsConfig, street: Drive, name: str) -> FinetuneCon
     low, high = ends.min(axis=0) - aside, ends.max(axis=0) + aside
     box = (float(low[0]), float(low[1]), _LOW_M, float(high[0]), float(high[1]), _HIGH_M)
     grid = GridFitConfig(voxel_m=config.voxel_m, box_m=box, near_m=NEAR_M, held_out=0, **depth)
-    losses = PanopticFitConfig(**left_out)
+    weights = {"semantics": config.semantics} | left_out | ({} if config.field_depth else {"depth": 0.0})
+    losses = PanopticFitConfig(**weights)
     return FinetuneConfig(
         seconds=0.0, steps=config.field_steps, width=config.width, grid=grid, panoptic=losses, seed=config.seed
     )

@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+import structlog
 
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.primitives import Primitive, PrimitiveSet, resized
 from semantic_mapper.geometry import pose_matrix
-from semantic_mapper.labels import ROOMS
+from semantic_mapper.labels import ROOMS, make_label_set
 from semantic_mapper.nodes.cli.map_answers import answer_instances
 from semantic_mapper.queries.instances import Instance
 from semantic_mapper.queries.oriented_box import OrientedBox
 from semantic_mapper.replay.box_values import BoxFile
-from semantic_mapper.replay.boxes import QUERY_MARGIN_M, check_classes, load_boxes, read_boxes, save_boxes
+from semantic_mapper.replay.boxes import QUERY_MARGIN_M, load_boxes, read_boxes, save_boxes, with_classes
 from semantic_mapper.replay.importers.kitti360 import LABELS
 
 T = pose_matrix(np.array((1.0, 2.0, 0.5)), np.array((0, 0, 0.3, 0.9)))
@@ -162,10 +163,10 @@ def test_two_boxes_of_one_id_and_classes_that_are_not_there_are_refused(tmp_path
         load_boxes(path)
     path = write(path, entry(), entry(id=2, **{"class": "bathtup"}))
     with pytest.raises(ConfigError, match=r"box with id 2: .*did you mean 'bathtub'"):
-        check_classes(load_boxes(path), ROOMS, path)
+        with_classes(load_boxes(path), ROOMS, path)
     path = write(path, entry(), merge={"chair": ["stool"]})
     with pytest.raises(ConfigError, match=r"merge: .*'stool'"):
-        check_classes(load_boxes(path), ROOMS, path)
+        with_classes(load_boxes(path), ROOMS, path)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", '{"boxes": 3}', "<a", "<a></a>", '{"boxes": [], "merge": 3}'])
@@ -218,11 +219,36 @@ def test_kitti360_moving_objects_are_boxes_with_poses_by_frame(tmp_path: Path) -
         np.testing.assert_allclose(pose, T @ at(number - 20), atol=1e-12)
         assert car.pose_at(number) is None
     np.testing.assert_array_equal(car.T_world_box, (car.frames or ())[0][1])
-    with pytest.raises(ConfigError, match="2 boxes that move have poses by frame, but no times"):
-        check_classes(boxes, LABELS, tmp_path / "a.xml")
     save_boxes(tmp_path / "b.json", boxes)
     assert all(same(a, b) for a, b in zip(boxes.primitives, load_boxes(tmp_path / "b.json").primitives, strict=True))
     assert truck.id == 5
+
+
+def test_boxes_of_classes_that_labels_cannot_tell_from_others_add_these_to_the_label_set(tmp_path: Path) -> None:
+    labels = make_label_set("mine", ["car", "road"], ids=(0, 7), ignore_id=1)
+    entries = (entry(**{"class": "car"}), entry(id=2, **{"class": "trailer"}))
+    path = write(tmp_path / "boxes.json", *entries, merge={"car": ["trailer"]})
+    _, known = with_classes(load_boxes(path), labels, path)
+    assert (known.names, known.ids, known.ignore_id) == (("car", "road", "trailer"), (0, 7, 2), 1)
+    for merge in ({"cat": ["trailer"]}, {"car": ["trailer", "caravan"]}, {"car": []}):
+        write(path, *entries, merge=merge)
+        with pytest.raises(ConfigError, match=r"'cat'; did you mean 'car'|'caravan'|box with id 2.*'trailer'"):
+            with_classes(load_boxes(path), labels, path)
+
+
+def test_xml_of_kitti360_goes_with_labels_of_fewer_classes(tmp_path: Path) -> None:
+    names = ("car", "trailer", "parking", "truck", "lamp", "garage")
+    (path := tmp_path / "a.xml").write_text(kitti_xml(*((i, name, -1, T) for i, name in enumerate(names))))
+    boxes, known = with_classes(load_boxes(path), LABELS, path)
+    assert known == LABELS and len(boxes.primitives) == 6 and not boxes.merge  # these labels know all
+    few = make_label_set("few", ["car", "sidewalk", "building", "garage"])
+    with structlog.testing.capture_logs() as logs:
+        boxes, known = with_classes(load_boxes(path), few, path)
+    assert [p.class_name for p in boxes.primitives] == ["car", "trailer", "parking", "garage"]
+    assert boxes.merge == {"sidewalk": ("parking",), "car": ("trailer",)} and boxes.left_out == 2
+    assert known.names == (*few.names, "trailer", "parking") and "no class lamp, truck" in logs[0]["reason"]
+    with pytest.raises(ConfigError, match=r"a\.xml: label set 'cats' has no class car, garage, "):
+        with_classes(load_boxes(path), make_label_set("cats", ["cat"]), path)
 
 
 def test_objects_of_xml_that_cannot_be_used_are_left_out_and_counted(tmp_path: Path) -> None:

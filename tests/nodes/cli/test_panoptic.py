@@ -16,13 +16,14 @@ import pytest
 from semantic_mapper.config import load_config
 from semantic_mapper.errors import ConfigError
 from semantic_mapper.fields.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from semantic_mapper.fields.panoptic import Panoptic
 from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import ROOMS, STUFF_NAMES, make_label_set
 from semantic_mapper.mapper import Mapper
 from semantic_mapper.nodes.cli.console import frame_progress
 from semantic_mapper.nodes.cli.pseudo_labels import (
-    check_boxes,
     choose_frames,
+    match_boxes,
     open_pseudo_labels,
     read_pseudo_labelled,
 )
@@ -31,9 +32,11 @@ from semantic_mapper.nodes.cli.run_replay import mapper_config
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.replay.autolabel import AutolabelRequest, autolabel
 from semantic_mapper.replay.boxes import load_boxes
+from semantic_mapper.replay.importers.kitti360 import LABELS
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.training.finetune import FinetuneConfig
 from tests.nodes.support import error_line, run, write_log
+from tests.replay.test_boxes import kitti_xml
 from tests.small import tiny_frames
 
 BOXED, MOVING = 9, 10  # ids of boxes
@@ -173,18 +176,74 @@ def test_a_class_that_labels_lack_says_whose_classes_they_are_and_which_weights_
     mine = make_label_set("mine", ["wall", "spaceship"])
     own = write_log(tmp_path / "own.mcap", [replace(tiny_frames(1)[0], label=np.ones((72, 96), np.uint8))], mine)
     with open_log(own) as opened, pytest.raises(ConfigError, match=r"own label images; .*: --pseudo rooms takes"):
-        check_boxes(load_boxes(boxes), boxes, open_pseudo_labels(opened, None))
+        match_boxes(load_boxes(boxes), boxes, open_pseudo_labels(opened, None))
     strange = tmp_path / "strange.json"
     strange.write_text(boxes.read_text().replace('"class": "', '"class": "un'))
     with open_log(log) as opened, pytest.raises(ConfigError, match=r"own label images: correct the boxes"):
-        check_boxes(load_boxes(strange), strange, open_pseudo_labels(opened, None))
+        match_boxes(load_boxes(strange), strange, open_pseudo_labels(opened, None))
 
 
-def test_boxes_without_times_are_refused_for_that_alone(log: Path, boxes: Path, tmp_path: Path) -> None:
+def test_boxes_by_frame_of_a_drive_are_refused_for_another_log(log: Path, boxes: Path, tmp_path: Path) -> None:
     timeless = tmp_path / "timeless.json"
     timeless.write_text(boxes.read_text().replace('"stamps"', '"frames"'))
-    with open_log(log) as opened, pytest.raises(ConfigError, match=r"takes these from the log$"):
-        check_boxes(load_boxes(timeless), timeless, open_pseudo_labels(opened, None))
+    done = run("finetune", log, "--kind", "panoptic", "--boxes", timeless, "--out", tmp_path / "w.safetensors")
+    assert done.returncode == 1 and "give the log that `import` made of the drive" in error_line(done.stderr)
+
+
+def write_drive(root: Path, boxes: Path) -> Path:
+    """The frames of the log as a drive of KITTI-360 with scans and labels, the boxed thing a truck, all else building;
+    and XML: this truck, two that move, one of them at a frame that is not in the drive, and a lamp out of view."""
+    drive, camera = "2013_05_28_drive_0000_sync", "image_00"
+    still = json.loads(boxes.read_text())["boxes"][0]
+    thing = ROOMS.id_of(still["class"])
+    files: dict[str, str] = {}
+    for number, frame in enumerate(tiny_frames(6)):
+        k, name = frame.intrinsics, f"{100 + number:010d}"
+        assert frame.label is not None and frame.depth_m is not None
+        points = unproject(frame.depth_m, k)[frame.depth_m > 0]
+        label = np.where(frame.label == thing, LABELS.id_of("truck"), LABELS.id_of("building")).astype(np.uint8)
+        for folder, image in (
+            (f"data_2d_raw/{drive}/{camera}/data_rect", frame.rgb[..., ::-1]),
+            (f"data_2d_semantics/train/{drive}/{camera}/semantic", label),
+        ):
+            (root / folder).mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(root / folder / f"{name}.png"), image)
+        scans = root / f"data_3d_raw/{drive}/velodyne_points/data"
+        scans.mkdir(parents=True, exist_ok=True)
+        ahead_left_up = np.stack((points[:, 2], -points[:, 0], -points[:, 1], np.ones(len(points))), axis=1)
+        ahead_left_up.astype("<f4").tofile(scans / f"{name}.bin")
+        rows = f"P_rect_00: {k.fx} 0 {k.cx} 0 0 {k.fy} {k.cy} 0 0 0 1 0\nS_rect_00: {k.width} {k.height}\n"
+        files["calibration/perspective.txt"] = f"{rows}R_rect_00: 1 0 0 0 1 0 0 0 1\n"
+        row = " ".join(map(str, (100 + number, *frame.T_world_camera.ravel())))
+        files["poses"] = files.get("poses", "") + row + "\n"
+    files[f"data_poses/{drive}/cam0_to_world.txt"] = files.pop("poses")
+    files["calibration/calib_cam_to_velo.txt"] = "0 0 1 0 -1 0 0 0 0 -1 0 0\n"
+    T = np.array(still["T_world_box"])
+    T[:3, :3] = np.diag(still["size"])
+    far = T + np.array([[0, 0, 0, 5000.0]] + 3 * [[0, 0, 0, 0]])
+    objects = ((8, "truck", -1, T), (9, "truck", 100 + WHEN, T), (10, "truck", 4000, T), (11, "lamp", -1, far))
+    files["boxes.xml"] = kitti_xml(*objects)
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+    return root / "boxes.xml"
+
+
+def test_a_drive_of_kitti360_and_its_boxes_are_used_as_they_are(boxes: Path, settings: Path, tmp_path: Path) -> None:
+    xml, log, out = write_drive(tmp_path / "drive", boxes), tmp_path / "drive.mcap", tmp_path / "w.safetensors"
+    done = run("import", tmp_path / "drive", log)
+    assert done.returncode == 0, done.stderr
+    arguments = ("--kind", "panoptic", "--boxes", xml, "--steps", "10", "--seconds", "0", "--config", settings)
+    done = run("finetune", log, *arguments, "--out", out)
+    assert done.returncode == 0, done.stderr
+    said = " ".join(done.stdout.split())
+    assert "1 of 1 boxes seen" in said and "own label images) of 6 of 6 frames" in said
+    assert "1 boxes that move" in said and "left out: 1 that no frame sees; 1 that move, which no frame shows" in said
+    field = load_checkpoint(out).model
+    assert isinstance(field, Panoptic) and {(b.id, b.class_name) for b in field.shape.boxes} == {
+        (9, "truck"),
+        (10, "truck"),
+    }
 
 
 def test_a_folder_named_as_weights_in_the_package_has_to_be_told_from_them(
