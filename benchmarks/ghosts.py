@@ -2,7 +2,8 @@
 
 ``gone`` draws a box or a person-sized cylinder into depth and colour of ten frames of a log or of a test room; then the
 same camera goes on without it. Of each of its surface points in the map it counts the frames that see through it, and
-looks whether the point is there after the fifth. ``static`` replays a log ten times into one map. ``cost`` maps the
+looks whether the point is there after the fifth, and whether the instance that the thing was is reported as gone.
+``static`` replays a log ten times into one map. ``cost`` maps the
 same frames with clearing on and off in turns.
 
 Example: python -m benchmarks.ghosts gone rooms --picture ghost.png
@@ -29,11 +30,13 @@ from semantic_mapper.config import VoxelMapConfig
 from semantic_mapper.evaluation.splat import draw_points
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.geometry import invert_pose, transform
-from semantic_mapper.labels import ROOMS, LabelSet
+from semantic_mapper.labels import ROOMS, STUFF_NAMES, LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.plots import write_picture
+from semantic_mapper.queries.instances import InstanceTracker
+from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.replay.log.sequence import open_log
 from semantic_mapper.scenes import TEST_SEEDS, CameraPathConfig, NoiseConfig, room_frames
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame, UInt8
@@ -76,8 +79,8 @@ class Thing(NamedTuple):
         return np.where((near < far) & (near > 0), near, np.inf)
 
 
-def with_thing(frame: PosedFrame, thing: Thing) -> PosedFrame:
-    """The frame as if the thing had stood there, in front of what it hides."""
+def with_thing(frame: PosedFrame, thing: Thing, class_id: int) -> PosedFrame:
+    """The frame as if the thing had stood there, in front of what it hides; of a class where the frame has labels."""
     k, depth = frame.intrinsics, frame.depth_m
     assert depth is not None
     v, u = np.indices(depth.shape)
@@ -85,7 +88,8 @@ def with_thing(frame: PosedFrame, thing: Thing) -> PosedFrame:
     z = thing.hit(frame.T_world_camera[:3, 3], rays @ frame.T_world_camera[:3, :3].T).reshape(depth.shape)
     hides = np.isfinite(z) & ((depth == 0) | (z < depth))
     rgb = np.where(hides[..., None], np.array(COLOR, np.uint8), frame.rgb)
-    return replace(frame, depth_m=np.where(hides, z, depth).astype(np.float32), rgb=rgb)
+    label = None if frame.label is None else np.where(hides, class_id, frame.label).astype(np.uint8)
+    return replace(frame, depth_m=np.where(hides, z, depth).astype(np.float32), rgb=rgb, label=label)
 
 
 def place_thing(frame: PosedFrame, up: Float64, half_m: Sequence[float], is_round: bool) -> Thing:
@@ -124,12 +128,20 @@ class Gone(NamedTuple):
         due: Those of them that ``AFTER`` frames saw through.
         left: Those of these that were still there then.
         left_at_end: And after all frames.
+        instances: 1 where the thing was an instance of its own.
+        gone: 1 where that was reported as gone.
+        gone_at: How many frames after the thing had left; -1 = never.
+        gone_others: Instances that were reported as gone though they were not the thing.
     """
 
     points: int
     due: int
     left: int
     left_at_end: int
+    instances: int
+    gone: int
+    gone_at: int
+    gone_others: int
 
 
 def show_and_go(
@@ -138,17 +150,24 @@ def show_and_go(
     """Map ``SHOWN`` frames with the thing, then all others without; also the map after these and at the end."""
     config = VoxelMapConfig(clear_free_space=clears)
     shown, bare = VoxelMap(config, labels), VoxelMap(config, labels)
+    mirror, tracker = MapMirror.of(shown), InstanceTracker()
+    class_id = labels.thing_ids(STUFF_NAMES)[-1]
     for frame in frames[start : start + SHOWN]:
-        map_frame(shown, with_thing(frame, thing))
+        map_frame(shown, with_thing(frame, thing, class_id))
         map_frame(bare, frame)
+    things = tracker.update(mirror.apply(shown.changes(mirror.version)))
     pictures = [shown.points()]
     xyz = pictures[0].xyz.astype(np.float64)
     apart = 2 * config.voxel_size_m
     xyz = xyz[KDTree(bare.points().xyz).query(xyz, distance_upper_bound=apart)[0] > apart]
+    near = [KDTree(xyz).query(t.voxels * config.voxel_size_m, distance_upper_bound=apart)[0] <= apart for t in things]
+    own = {t.id for t, n in zip(things, near, strict=True) if t.class_id == class_id and n.mean() > 0.5}
     seen, left = np.zeros(len(xyz), int), 0
     there = np.zeros(len(xyz), bool)
-    for frame in (*frames[start + SHOWN :], *frames[: start + SHOWN]):
+    later = (*frames[start + SHOWN :], *frames[: start + SHOWN])
+    for frame in later:
         map_frame(shown, frame)
+        tracker.update(mirror.apply(shown.changes(mirror.version)))
         looks = sees_through(frame, xyz)
         due = looks & (seen == AFTER - 1)
         seen += looks
@@ -157,7 +176,15 @@ def show_and_go(
             left += int((there & due).sum())
     pictures.append(shown.points())
     at_end = int((_is_there(shown, xyz) & (seen >= AFTER)).sum())
-    return Gone(len(xyz), int((seen >= AFTER).sum()), left, at_end), pictures
+    gone = [t for t in tracker.gone if t.id in own]
+    gone_at = [n for n, frame in enumerate(later, 1) if gone and frame.stamp_ns == gone[0].gone_ns] or [-1]
+    told = (
+        int(bool(own)),
+        int(bool(gone)),
+        gone_at[0],
+        sum(t.id <= len(things) and t.id not in own for t in tracker.gone),
+    )
+    return Gone(len(xyz), int((seen >= AFTER).sum()), left, at_end, *told), pictures
 
 
 def sees_through(frame: PosedFrame, xyz: Float64) -> NDArray[np.bool_]:
@@ -204,7 +231,8 @@ def run_gone(given: argparse.Namespace) -> dict[str, Any]:
                         _draw(given.picture, frames[start], pictures)
             total = Gone(*(sum(column) for column in zip(*found, strict=True)))
             result[f"{name}, clearing {'on' if clears else 'off'}"] = {
-                **total._asdict(),
+                **total._replace(gone_at=0)._asdict(),
+                "gone_at": sorted(one.gone_at for one in found),
                 "cleared_in_time": 1 - total.left / max(total.due, 1),
             }
     return result
@@ -217,7 +245,8 @@ def run_static(given: argparse.Namespace) -> dict[str, Any]:
     maps: dict[bool, Float64] = {}
     result: dict[str, Any] = {}
     for clears in (False, True):
-        voxel_map = VoxelMap(VoxelMapConfig(clear_free_space=clears), labels)
+        config = VoxelMapConfig(clear_free_space=clears, no_return_range_m=given.no_return)
+        voxel_map = VoxelMap(config, labels)
         for play in range(PLAYS):
             for frame in frames:
                 map_frame(voxel_map, frame)
@@ -241,21 +270,23 @@ def run_cost(given: argparse.Namespace) -> dict[str, Any]:
     """Milliseconds of fusing a frame, each frame with clearing on and off, in alternating order."""
     frames, labels = _read(Path(given.log))
     maps = {on: VoxelMap(VoxelMapConfig(clear_free_space=on), labels) for on in (False, True)}
-    took: list[tuple[float, float]] = []
+    took: list[tuple[float, float, float, float]] = []
     for play in range(3):
         for number, frame in enumerate(frames):
-            ms = {}
+            ms, cpu_ms = {}, {}
             for on in (True, False) if (number + play) % 2 else (False, True):
-                start = time.perf_counter()
+                start, cpu_start = time.perf_counter(), time.process_time()
                 map_frame(maps[on], frame)
                 ms[on] = (time.perf_counter() - start) * 1e3
+                cpu_ms[on] = (time.process_time() - cpu_start) * 1e3
             if play:  # the first lets the maps grow
-                took.append((ms[False], ms[True]))
-    off, on = np.array(took).T
+                took.append((ms[False], ms[True], cpu_ms[False], cpu_ms[True]))
+    off, on, cpu_off, cpu_on = np.array(took).T
     return {
         "off_ms": np.percentile(off, (50, 95)).round(2).tolist(),
         "on_ms": np.percentile(on, (50, 95)).round(2).tolist(),
         "difference_ms": np.percentile(on - off, (25, 50, 75, 95)).round(2).tolist(),
+        "cpu_difference_ms": float((cpu_on - cpu_off).mean().round(2)),  # of all threads
         "frames": len(took),
     }
 
@@ -305,6 +336,7 @@ def main() -> None:
     parser.add_argument("--rooms", type=int, default=3, help="test rooms")
     parser.add_argument("--exact", action="store_true", help="rooms without noise and holes in depth")
     parser.add_argument("--mesh", type=Path, help="vertices and faces of the reference, .npz")
+    parser.add_argument("--no-return", type=float, default=0.0, help="metres that missing depth clears (static)")
     parser.add_argument("--picture", type=Path, help="PNG of the map before and after")
     given = parser.parse_args()
     print(json.dumps(dict(_runs())[given.run](given), indent=1))

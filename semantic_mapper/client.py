@@ -196,9 +196,13 @@ class MapClient:
         h = self._ask("points_in_box", messages.BoxAnswer, request)
         return MapPoints(**_arrays(h), measured=_measured(np.ones(len(h.xyz), np.bool_), h.computed))
 
-    def instances(self, up: ArrayLike = UP) -> tuple[Instance, ...]:
-        """All things; their ids stay from call to call, for each ``up``; see ``queries.instances.InstanceTracker``."""
-        request = messages.InstancesRequest(up=_point(up, "up"))
+    def instances(self, up: ArrayLike = UP, *, gone: bool = False) -> tuple[Instance, ...]:
+        """All things; their ids stay from call to call, for each ``up``; see ``queries.instances.InstanceTracker``.
+
+        With ``gone``, behind them also those of earlier answers that have gone since (``Instance.gone_ns``), the latest
+        64.
+        """
+        request = messages.InstancesRequest(up=_point(up, "up"), gone=gone)
         found = self._ask("instances", messages.InstancesAnswer, request)
         return _things(found, self._label_set(found.map_id))
 
@@ -393,9 +397,13 @@ def _things(found: messages.InstancesAnswer, labels: LabelSet) -> tuple[Instance
     measured = np.ones(len(numbers)) if found.measured is None else found.measured
     if len(measured) != len(numbers):
         raise CodecError(f"instances: {len(numbers)} things, {len(measured)} of them with a measured fraction")
+    gone_ns = np.full(len(numbers), -1) if found.gone_ns is None else found.gone_ns
+    if len(gone_ns) != len(numbers):
+        raise CodecError(f"instances: {len(numbers)} things, {len(gone_ns)} of them with when they went")
     things: list[Instance] = []
-    rows = zip(numbers.tolist(), places, parts, measured.tolist(), strict=True)
-    for (number, class_id, _), p, part, fraction in rows:
+    rows = zip(numbers.tolist(), places, parts, measured.tolist(), gone_ns.tolist(), strict=True)
+    for (number, class_id, _), p, part, fraction, went in rows:
         box = OrientedBox(p[4:7], p[7:10], p[10:19].reshape(3, 3))
-        things.append(Instance(number, class_id, names[class_id], float(p[0]), p[1:4], box, part, fraction))
+        name, gone = names[class_id], None if went < 0 else went
+        things.append(Instance(number, class_id, name, float(p[0]), p[1:4], box, part, fraction, gone))
     return tuple(things)

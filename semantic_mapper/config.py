@@ -262,6 +262,9 @@ class VoxelMapConfig(Config, frozen=True):
     vote_band_voxels: Positive = 2.0  # only voxels this near the surface take class votes
     unknown_below: Fraction = 0.0  # labels of less confidence read as unknown; 0 = none do
     clear_free_space: bool = True  # forget surfaces that frames with sensor depth see through (``fusion/clearing.py``)
+    # Where the sensor gives no depth there is nothing up to here, in metres: for sensors that are to be trusted so.
+    # 0 = no depth says nothing.
+    no_return_range_m: Annotated[float, msgspec.Meta(ge=0, le=1000)] = 0.0
     evidence: Literal["float32", "int16"] = "float32"  # "int16": half the memory for classes (``evidence.py``)
 
 

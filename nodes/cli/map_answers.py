@@ -76,25 +76,33 @@ CONNECTED, LEARNED = "connected pieces of one class", "what `refine` has learned
 
 
 def answer_instances(up: Sequence[float], instances: Sequence[Instance], told_apart_by: str = "") -> dict[str, Any]:
-    """The things in a map, the surest first, and by which means they were told apart; empty = not known."""
-    things = [
-        {
-            "id": thing.id,
-            "class": thing.class_name,
-            "confidence": round(thing.confidence, DIGITS),
-            "voxels": len(thing.voxels),
-            "measured": round(thing.measured, DIGITS),
-            "centroid": _rounded(thing.centroid),
-            "box": {
-                "center": _rounded(thing.box.center),
-                "size": _rounded(thing.box.size),
-                "R_world_box": np.round(thing.box.R_world_box, 6).tolist(),
-            },
-        }
-        for thing in sorted(instances, key=lambda thing: -thing.rank)
-    ]
-    by = {"told_apart_by": told_apart_by} if told_apart_by else {}
-    return {"question": "instances", "up": list(up), **by, "instances": things}
+    """The things in a map, the surest first, and by which means they were told apart; empty = not known.
+
+    Those that have gone are ``gone``, the latest first; the key is left out where there are none.
+    """
+    there = sorted((t for t in instances if t.gone_ns is None), key=lambda thing: -thing.rank)
+    gone = sorted((t for t in instances if t.gone_ns is not None), key=lambda thing: thing.gone_ns or 0, reverse=True)
+    found: dict[str, Any] = {"question": "instances", "up": list(up)}
+    found |= {"told_apart_by": told_apart_by} if told_apart_by else {}
+    found["instances"] = [_describe_thing(thing) for thing in there]
+    found |= {"gone": [{**_describe_thing(t), "gone_ns": t.gone_ns} for t in gone]} if gone else {}
+    return found
+
+
+def _describe_thing(thing: Instance) -> dict[str, Any]:
+    return {
+        "id": thing.id,
+        "class": thing.class_name,
+        "confidence": round(thing.confidence, DIGITS),
+        "voxels": len(thing.voxels),
+        "measured": round(thing.measured, DIGITS),
+        "centroid": _rounded(thing.centroid),
+        "box": {
+            "center": _rounded(thing.box.center),
+            "size": _rounded(thing.box.size),
+            "R_world_box": np.round(thing.box.R_world_box, 6).tolist(),
+        },
+    }
 
 
 def answer_table(found: dict[str, Any], width: int) -> Table:
@@ -127,10 +135,13 @@ def _instance_table(found: dict[str, Any], width: int) -> Table:
             f"{thing['measured'] * 100:.0f} %",
             _joined(thing["centroid"]),
             _joined(thing["box"]["size"]),
+            f"{thing['gone_ns'] / 1e9:.2f}" if "gone_ns" in thing else "",
         )
-        for thing in found["instances"]
+        for thing in (*found["instances"], *found.get("gone", ()))
     ]
-    names = ("id", "class", "confidence", "voxels", "measured", "centroid, m", "box, m")
+    names = ("id", "class", "confidence", "voxels", "measured", "centroid, m", "box, m", "gone at, s")
+    if not found.get("gone"):
+        names, rows = names[:-1], [row[:-1] for row in rows]
     widths = [max(map(len, column)) for column in zip(names, *rows, strict=True)]
     for name, widest in zip(names, widths, strict=True):
         if name == "class":

@@ -38,6 +38,7 @@ class Asked(NamedTuple):
     server: str = ""
     keys: Path | None = None
     refined: bool = False
+    gone: bool = False
 
 
 @verb
@@ -62,6 +63,9 @@ def query(
     refined: Annotated[
         bool, typer.Option("--refined", help="Running mapper: the map as it was refined last (`refine_every_s`).")
     ] = False,
+    gone: Annotated[
+        bool, typer.Option("--gone", help="Running mapper, instances: also those of earlier answers that have gone.")
+    ] = False,
     server: ServerOption = "",
     keys: KeysOption = None,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write the answer here, as JSON.")] = None,
@@ -80,12 +84,15 @@ def query(
     Example: semantic-mapper query runs/demo/map.npz instances --up 0 0 1 --out things.json
     Example: semantic-mapper query live nearest chair 0 0 1 --json
     Example: semantic-mapper query live nearest chair 0 0 1 --refined
+    Example: semantic-mapper query live instances --gone --json
     Example: semantic-mapper query tcp://robot:5570 info --server robot
     """
     class_name, point = _read_arguments(question, arguments or [])
     endpoint = map_endpoint(source)
     if refined and not endpoint:
         raise typer.BadParameter("goes with a running mapper; name the refined file itself", param_hint="--refined")
+    if gone and not (endpoint and question is Question.INSTANCES):
+        raise typer.BadParameter("goes with `instances` of a running mapper", param_hint="--gone")
     output = Output.guarded()
     from semantic_mapper.nodes.cli.map_answers import answer_table
     from semantic_mapper.replay.artifacts import write_json
@@ -94,7 +101,7 @@ def query(
     if out is not None:
         prepare_file(out)
     ask = ask_mapper if endpoint else ask_file
-    asked = Asked(question, class_name, point, up, min_confidence, server, keys, refined)
+    asked = Asked(question, class_name, point, up, min_confidence, server, keys, refined, gone)
     found = {"map": source, **ask(endpoint or source, asked)}
     if out is not None:
         write_json(out, found)
@@ -155,7 +162,7 @@ def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
             case Question.INSTANCES:
                 # A map that grows has no things of its own; of a refined one the answer does not say.
                 by = "" if asked.refined else map_answers.CONNECTED
-                return map_answers.answer_instances(asked.up, client.instances(asked.up), by)
+                return map_answers.answer_instances(asked.up, client.instances(asked.up, gone=asked.gone), by)
 
 
 def _read_arguments(question: Question, arguments: list[str]) -> tuple[str, tuple[float, ...]]:

@@ -66,6 +66,7 @@ class _Tracked(NamedTuple):
     tracker: InstanceTracker
     version: int
     things: tuple[Instance, ...]
+    gone: tuple[Instance, ...]
 
 
 class Answers:
@@ -213,11 +214,12 @@ class Answers:
         )  # out of here while it updates: one that fails half way is not used again
         if tracked is None or tracked.version != snapshot.version:
             tracker = tracked.tracker if tracked else InstanceTracker(up=up)
-            tracked = _Tracked(tracker, snapshot.version, tracker.update(snapshot))
+            tracked = _Tracked(tracker, snapshot.version, tracker.update(snapshot), tracker.gone)
         self._tracked[which] = tracked
         for old in list(self._tracked)[:-_MAX_TRACKERS]:
             del self._tracked[old]
-        return messages.InstancesAnswer(**self._about(snapshot), **_thing_arrays(tracked.things))
+        arrays = _thing_arrays((*tracked.things, *tracked.gone) if request.gone else tracked.things, gone=request.gone)
+        return messages.InstancesAnswer(**self._about(snapshot), **arrays)
 
     def _distances(self, snapshot: MapSnapshot, request: messages.DistanceRequest) -> messages.Answer:
         sides = _box_sides(snapshot, request)
@@ -278,7 +280,7 @@ def _computed(found: object) -> UInt8 | None:
     return computed.astype(np.uint8) if computed.any() else None
 
 
-def _thing_arrays(things: Sequence[Instance]) -> dict[str, Any]:
+def _thing_arrays(things: Sequence[Instance], *, gone: bool) -> dict[str, Any]:
     measured = [t.measured for t in things]
     numbers = [(t.id, t.class_id, len(t.voxels)) for t in things]
     places = [
@@ -289,7 +291,8 @@ def _thing_arrays(things: Sequence[Instance]) -> dict[str, Any]:
         "numbers": np.array(numbers, np.int64).reshape(-1, 3),
         "places": np.array(places, np.float64).reshape(-1, 19),
         "voxels": np.concatenate([np.empty((0, 3), np.int32), *(t.voxels for t in things)]),
-        "measured": np.array(measured) if min(measured, default=1.0) < 1 else None,
+        "measured": np.array(measured) if gone or min(measured, default=1.0) < 1 else None,
+        "gone_ns": np.array([-1 if t.gone_ns is None else t.gone_ns for t in things], np.int64) if gone else None,
     }
 
 

@@ -88,7 +88,9 @@ def fit_settings(config: StreetsConfig, street: Drive, name: str) -> FinetuneCon
     low, high = ends.min(axis=0) - aside, ends.max(axis=0) + aside
     box = (float(low[0]), float(low[1]), _LOW_M, float(high[0]), float(high[1]), _HIGH_M)
     grid = GridFitConfig(voxel_m=config.voxel_m, box_m=box, near_m=NEAR_M, held_out=0, **depth)
-    weights = {"semantics": config.semantics} | left_out | ({} if config.field_depth else {"depth": 0.0})
+    weights: dict[str, Any] = (
+        {"semantics": config.semantics} | left_out | ({} if config.field_depth else {"depth": 0.0})
+    )
     losses = PanopticFitConfig(**weights)
     return FinetuneConfig(
         seconds=0.0, steps=config.field_steps, width=config.width, grid=grid, panoptic=losses, seed=config.seed

@@ -22,7 +22,7 @@ from semantic_mapper.mapping.files.map_manifest import MapManifest
 from semantic_mapper.mapping.files.map_saving import MapSaving
 from semantic_mapper.mapping.files.merge import add_blocks, check_fit, copy_blocks, voxel_transform
 from semantic_mapper.mapping.fusion.allocation import blocks_in_band, frame_budget, make_camera
-from semantic_mapper.mapping.fusion.clearing import clear_in_view
+from semantic_mapper.mapping.fusion.clearing import clear_in_view, clear_without_return
 from semantic_mapper.mapping.fusion.depth_bounds import NO_BOUNDS, depth_bounds
 from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
 from semantic_mapper.mapping.fusion.frame_votes import check_depth, frame_votes, probability_table, trusted_depth
@@ -40,6 +40,7 @@ from semantic_mapper.mapping.storage.changes import (
     copy_changes,
     read_changes,
 )
+from semantic_mapper.mapping.storage.cleared_blocks import ClearedLog
 from semantic_mapper.mapping.storage.grid_buffers import BLOCK_SIDE
 from semantic_mapper.mapping.views.ray_casting import cast_view
 from semantic_mapper.mapping.views.readout import read_points
@@ -87,6 +88,8 @@ class VoxelMap:
         self.refined = ""
         self.instances: InstanceLayer | None = None
         self.cleared = 0
+        self._cleared_log = ClearedLog()
+        self._bounds = NO_BOUNDS  # of the last frame that cleared
         self._grid = BlockGrid(
             config.voxel_size_m,
             len(label_set),
@@ -173,7 +176,8 @@ class VoxelMap:
 
         Args:
             frame: Gives rgb, intrinsics (rectified) and pose; its own depth is not looked at.
-            depth_m: (H, W) float32 z in metres; 0, negative, NaN or beyond ``depth_max_m`` = no measurement.
+            depth_m: (H, W) float32 z in metres; 0, negative, NaN or beyond ``depth_max_m`` = no measurement. All but
+                the last are free space up to ``no_return_range_m``.
             probabilities: (H, W, L) float32, each known pixel summing to 1; None = geometry and colour alone.
             known: (H, W) bool, where ``probabilities`` mean something; None = everywhere.
             rows: (H, W) int32, where several pixels share their probabilities: these are (K, L) then, and this says
@@ -194,7 +198,8 @@ class VoxelMap:
         check_pose(frame.T_world_camera, where)
         if any(frame.intrinsics.distortion):
             raise FrameError(f"{where}: the image is not rectified (distortion {frame.intrinsics.distortion})")
-        depth, weights = trusted_depth(check_depth(depth_m, frame.intrinsics, where), trust, where)
+        given = check_depth(depth_m, frame.intrinsics, where)
+        depth, weights = trusted_depth(given, trust, where)
         table = None
         if probabilities is not None:
             table = probability_table(depth, probabilities, known, rows, len(self.label_set), where)
@@ -211,9 +216,12 @@ class VoxelMap:
             )
             rgb = np.ascontiguousarray(frame.rgb)
             clears = measured and self.config.clear_free_space
-            bounds = depth_bounds(depth, self.config.depth_max_m) if clears else NO_BOUNDS
+            bounds = NO_BOUNDS
+            if clears:
+                bounds = self._bounds = depth_bounds(depth, self.config.depth_max_m, self._bounds)
+            cleared: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
             for blocks in self.changing(packed):
-                self.cleared += fuse_blocks(
+                voxels = fuse_blocks(
                     blocks,
                     self._grid.buffers(),
                     camera,
@@ -226,10 +234,15 @@ class VoxelMap:
                     measured=measured,
                     bounds=bounds,
                 )
+                cleared.append((pack_keys(self._grid.buffers().keys[blocks]), voxels))
             if clears:
-                self.cleared += clear_in_view(
-                    self._grid, packed, camera, self._limits, depth, rgb, bounds, self.version
-                )
+                grid, limits, reach = self._grid, self._limits, self.config.no_return_range_m
+                cleared += clear_in_view(grid, packed, camera, limits, depth, rgb, bounds, self.version)
+                if reach > 0:
+                    cleared += clear_without_return(grid, camera, limits, given, rgb, reach, self.version)
+                for keys, voxels in cleared:
+                    self.cleared += int(voxels.sum())
+                    self._cleared_log.add(keys, voxels, self.version, frame.stamp_ns)
             self.frames += 1
             self.last_stamp_ns = frame.stamp_ns
         return len(packed)
@@ -441,7 +454,8 @@ class VoxelMap:
         _check_min_weight(min_weight)
         decision = (self.label_set, self.config.vote_discount, self.config.unknown_below, min_weight)
         chosen = choose_blocks(self._grid, (since, self.version, self.epoch), limit, decision)
-        return chosen._replace(scale_known=self.scale_known)
+        cleared = self._cleared_log.between(since, chosen.version)
+        return chosen._replace(scale_known=self.scale_known, cleared=cleared)
 
     def _read(
         self, grid: BlockGrid, voxels: Float64

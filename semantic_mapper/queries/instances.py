@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,17 +15,20 @@ from semantic_mapper.errors import MapError
 from semantic_mapper.kernels import kernel
 from semantic_mapper.labels import STUFF_NAMES
 from semantic_mapper.mapping.map_scale import require_metres
-from semantic_mapper.mapping.storage.block_index import unpack_keys
+from semantic_mapper.mapping.storage.block_index import pack_keys, unpack_keys
+from semantic_mapper.mapping.storage.block_store import BLOCK_VOXELS
 from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS
 from semantic_mapper.queries.checks import check_direction
 from semantic_mapper.queries.class_surface import ClassSurface, class_surface
 from semantic_mapper.queries.components import Components, components_of, find_components
 from semantic_mapper.queries.oriented_box import OrientedBox, upright_box
 from semantic_mapper.queries.snapshot import MapSnapshot
+from semantic_mapper.queries.surface import surface_voxels
 from semantic_mapper.types import Float64, Int32, Int64
 
 MIN_VOXELS = 30  # 120 cm^2 of surface at 2 cm: less is mostly stray votes
 SURE_VOXELS = 200  # smaller things are wrong more often
+MAX_GONE = 64  # things that have gone, kept to be reported
 LEAST_OVERLAP = 0.1  # of an instance's voxels must be found again in what it became
 
 
@@ -40,6 +44,7 @@ class Instance:
         box: Upright box round its surface points.
         voxels: (N, 3) int32 coordinates of its surface voxels; centres at ``voxels * voxel_size_m``.
         measured: Fraction of them that a sensor measured; the depth of the others was computed.
+        gone_ns: Stamp of the frame at which most of it was gone; all else is as it was before. None = it is there.
     """
 
     id: int
@@ -50,6 +55,7 @@ class Instance:
     box: OrientedBox
     voxels: NDArray[np.int32]
     measured: float = 1.0
+    gone_ns: int | None = None
 
     @property
     def rank(self) -> float:
@@ -65,6 +71,14 @@ class _Found(NamedTuple):
     ids: NDArray[np.int64]
     sizes: NDArray[np.int64]
     things: tuple[Instance, ...]
+
+
+class _Whole(NamedTuple):
+    """A thing as it was when it was last at least half as large as ever, and in which version of the map."""
+
+    thing: Instance
+    version: int
+    most_voxels: int
 
 
 class _LabelledVoxels(NamedTuple):
@@ -83,6 +97,10 @@ class InstanceTracker:
     several that became one, the oldest id stays; of a split, the part with the most voxels keeps the id. Matching looks
     at the last update alone: a thing that was not found in it comes back under a new id. What has not changed since
     then is not computed again. Safe to call from several threads.
+
+    A thing of which more than half was seen through since it was whole has gone (``gone``); what is left of it gets a
+    new id. One that is only no longer found (its class or the map's poses have changed, or it became part of another)
+    has not gone.
 
     Args:
         stuff: Names of classes that are no things; by default ``labels.STUFF_NAMES``.
@@ -108,7 +126,17 @@ class InstanceTracker:
             raise MapError(f"up: expected shape (3,), got {np.shape(up)}")
         self._next_id = 1
         self._last: _Found | None = None
+        self._epoch = 0
+        self._whole: dict[int, _Whole] = {}
+        self._going: dict[int, _Whole] = {}  # found in less than half, and seen through, but not gone yet
+        self._gone: deque[Instance] = deque(maxlen=MAX_GONE)
         self._lock = threading.Lock()
+
+    @property
+    def gone(self) -> tuple[Instance, ...]:
+        """The things that had gone by the last update, those first that went first; the latest ``MAX_GONE``."""
+        with self._lock:
+            return tuple(self._gone)
 
     def update(self, snapshot: MapSnapshot) -> tuple[Instance, ...]:
         """The instances of the map as it is now, by ascending id.
@@ -127,6 +155,7 @@ class InstanceTracker:
             ids, same = np.zeros(len(sizes), np.int64), np.full(len(sizes), -1, np.int64)
             if last:
                 self._match(last, surface, found, ids, same)
+                self._find_gone(snapshot, ids, sizes)
             new = np.flatnonzero(ids == 0)
             ids[new] = self._next_id + np.arange(len(new))
             self._next_id += len(new)
@@ -137,6 +166,7 @@ class InstanceTracker:
                 for part, number, kept in zip(parts, ids, same, strict=True)
             )
             self._last = _Found(surface, found, ids, sizes, things)
+            self._keep_whole(snapshot, things)
         return tuple(sorted(things, key=lambda thing: thing.id))
 
     def _match(
@@ -169,6 +199,33 @@ class InstanceTracker:
                 ids[successor] = last.ids[old]
                 if overlap == last.sizes[old] == sizes[successor] and not changed[successor]:
                     same[successor] = old
+
+    def _find_gone(self, snapshot: MapSnapshot, ids: NDArray[np.int64], sizes: NDArray[np.int64]) -> None:
+        """Note which things have gone, and take the ids of their remains away."""
+        if snapshot.epoch != self._epoch:  # all may have moved
+            self._epoch, self._whole = snapshot.epoch, {}
+        size_of = dict(zip(ids.tolist(), sizes.tolist(), strict=True))
+        small = {n: whole for n, whole in self._whole.items() if 2 * size_of.get(n, 0) < whole.most_voxels}
+        self._going = {}
+        for number, whole in sorted(small.items()):
+            left, stamps = _seen_through(snapshot, whole)
+            if not len(stamps):
+                continue
+            if 2 * left >= whole.most_voxels:
+                self._going[number] = whole
+                continue
+            self._gone.append(replace(whole.thing, gone_ns=int(stamps[len(stamps) // 2])))
+            ids[ids == number] = 0
+
+    def _keep_whole(self, snapshot: MapSnapshot, things: tuple[Instance, ...]) -> None:
+        """Note the things as they are, save those that are about to go; what else has shrunk is whole again."""
+        before, found = self._whole, {thing.id for thing in things}
+        lost = [number for number in self._going if number not in found]
+        self._whole = {number: self._going[number] for number in lost[-MAX_GONE:]}
+        for thing in things:
+            known, size = before.get(thing.id), len(thing.voxels)
+            most = size if known is None or 2 * size < known.most_voxels else max(size, known.most_voxels)
+            self._whole[thing.id] = self._going.get(thing.id) or _Whole(thing, snapshot.version, most)
 
     def _describe(
         self,
@@ -217,6 +274,28 @@ def find_overlaps(old: _LabelledVoxels, new: _LabelledVoxels, count: int, pairs:
         pairs: (N,) written, for the N voxels of ``new``.
     """
     ...
+
+
+def _seen_through(snapshot: MapSnapshot, whole: _Whole) -> tuple[int, NDArray[np.int64]]:
+    """How many voxels of a thing have a surface still, and the stamp of each voxel cleared there, ascending.
+
+    None are cleared where these are too few to be what the thing has lost.
+    """
+    packed = pack_keys(whole.thing.voxels >> 3)
+    rows = snapshot.cleared.between(whole.version, snapshot.version)
+    of_thing = np.isin(rows.packed, packed)
+    stamps = np.repeat(rows.stamp_ns[of_thing], rows.voxels[of_thing])
+    left = _count_left(snapshot, packed, whole.thing.voxels) if len(stamps) else len(packed)
+    return left, stamps if 2 * len(stamps) >= len(packed) - left else stamps[:0]
+
+
+def _count_left(snapshot: MapSnapshot, packed: NDArray[np.int64], voxels: NDArray[np.int32]) -> int:
+    """How many of the voxels (N, 3), which lie in blocks with keys (N,), have a surface still, of whichever class."""
+    surface = surface_voxels(snapshot, np.flatnonzero(np.isin(snapshot.packed, packed)))
+    blocks, row = np.unique(packed, return_inverse=True)
+    x, y, z = (voxels & 7).T
+    there = np.searchsorted(blocks, snapshot.packed[surface.row]) * BLOCK_VOXELS + surface.voxel
+    return int(np.isin(row * BLOCK_VOXELS + (z * 8 + y) * 8 + x, there).sum())
 
 
 def _changed(fresh: NDArray[np.bool_], start: Int64, component: Int64, count: int) -> NDArray[np.bool_]:

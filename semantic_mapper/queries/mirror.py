@@ -113,6 +113,7 @@ class MapMirror:
                 voxels=pool,
                 scale_known=changes.scale_known,
                 instances=instances,
+                cleared=old.cleared.followed_by(changes.cleared.between(old.version, changes.version)),
             )
             if changes.epoch == self._snapshot.epoch or changes.version >= changes.newest:
                 self._snapshot = self._next

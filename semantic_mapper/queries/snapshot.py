@@ -13,6 +13,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.instance_layer import InstanceLayer
 from semantic_mapper.mapping.storage.block_index import BlockIndex, unpack_keys
 from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS, TSDF_STEPS, BlockChanges, oldest_first
+from semantic_mapper.mapping.storage.cleared_blocks import NONE_CLEARED, ClearedBlocks
 from semantic_mapper.types import Bool, Float32, UInt8
 
 COMPUTED, MEASURED = 1, 2  # ``BlockVoxels.weight``: depth was computed, or a sensor measured it
@@ -55,6 +56,7 @@ class MapSnapshot:
         voxels: Memory shared with other snapshots; only ``slots`` of it belong to this one.
         scale_known: Whether lengths are metres.
         instances: Which voxels belong to which thing; None = not known.
+        cleared: Which blocks lost surface that frames saw through, and when; the latest.
     """
 
     version: int
@@ -70,6 +72,7 @@ class MapSnapshot:
     voxels: BlockVoxels
     scale_known: bool = True
     instances: InstanceLayer | None = None
+    cleared: ClearedBlocks = NONE_CLEARED
 
     @property
     def block_count(self) -> int:
@@ -127,4 +130,5 @@ class MapSnapshot:
             voxels.rgb[slots],
             self.scale_known,
             (voxels.weight[slots] == COMPUTED).astype(np.uint8),
+            self.cleared.between(since, version),
         )

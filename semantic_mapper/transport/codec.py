@@ -109,6 +109,7 @@ _NOT_SENT_AS_0 = (
     "pseudo_label",
     "depth_sigma",
     "refined",
+    "gone",
 )  # came later: what does not need it is read by older releases, too
 _FRAME_BUFFERS = ("rgb", "depth", "label", "depth_sigma")  # fields of a frame's header, in the order of their buffers
 

@@ -195,22 +195,25 @@ class BoxAnswer(Answer, frozen=True, kw_only=True):
 
 
 class InstancesRequest(LabelsRequest, frozen=True, kw_only=True):
-    """Countable things."""
+    """Countable things; ``gone``: also those that have gone lately (sent only then)."""
 
     up: Point
+    gone: bool = False
 
 
 class InstancesAnswer(Answer, frozen=True, kw_only=True):
     """All things, packed.
 
     ``numbers``: id, class id, voxels. ``places``: confidence, centroid, box: center, size, R_world_box row by row.
-    ``voxels``: of all things, one behind the other. ``measured``: fraction of each, None = 1.
+    ``voxels``: of all things, one behind the other. ``measured``: fraction of each, None = 1. ``gone_ns``: stamp of the
+    frame at which most of each was gone, -1 = it is there; None = that was not asked.
     """
 
     numbers: Annotated[Int64, ArrayForm("<i8", (3,))]
     places: Annotated[Float64, ArrayForm("<f8", (19,))]
     voxels: Annotated[Int32, ArrayForm("<i4", (3,))]
     measured: Annotated[Float64 | None, ArrayForm("<f8", optional=True)] = None
+    gone_ns: Annotated[Int64 | None, ArrayForm("<i8", optional=True)] = None
 
 
 class OccupancyRequest(Request, frozen=True, kw_only=True):

@@ -5,7 +5,8 @@ measured, of the eight around at most ``MOST_HOLES`` are not (speckles are noise
 thing), and all that is measured in its surroundings lies well behind what the voxel says. The surroundings reach as far
 as voxel and pose may be off (``ASIDE_VOXELS``, ``ASIDE_PER_M``), so that thin things, depth edges and grazing views are
 safe; the margin grows with the voxels and with the depth (``MARGIN_VOXELS``, ``MARGIN_PER_M``). A pixel without depth,
-or farther than ``depth_max``, clears nothing: black and shiny things return nothing. Nor does a pixel as near to the
+or farther than ``depth_max``, clears nothing: black and shiny things return nothing. (``clear_without_return`` is for
+sensors that return something wherever there is something.) Nor does a pixel as near to the
 edge of the image as a pose may be off, nor computed or rendered depth: where pictures are matched wrongly, that lies
 far behind, frame after frame.
 
@@ -23,12 +24,14 @@ too.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.kernels import parallel_kernel
 from semantic_mapper.mapping.fusion.allocation import Camera
-from semantic_mapper.mapping.fusion.depth_bounds import DepthBounds
+from semantic_mapper.mapping.fusion.depth_bounds import DepthBounds, depth_bounds
 from semantic_mapper.mapping.fusion.fuse import FusionLimits
 from semantic_mapper.mapping.storage.block_grid import BlockGrid
 from semantic_mapper.mapping.storage.block_index import find_blocks, pack_keys, unpack_keys
@@ -51,7 +54,7 @@ def clear_in_view(
     rgb: UInt8,
     bounds: DepthBounds,
     version: int,
-) -> int:
+) -> Iterator[tuple[Int64, Int64]]:
     """Clear what a frame sees through outside of the truncation band, in place; hold the map's lock meanwhile.
 
     Args:
@@ -64,21 +67,38 @@ def clear_in_view(
         bounds: Of ``depth``.
         version: Of the map, for the blocks that change.
 
-    Returns:
-        Voxels cleared.
+    Yields:
+        Packed keys (B,) of blocks that have changed, and how many of their voxels were cleared (B,).
 
     Raises:
         MapError: the disk fails.
     """
-    packed, cleared = _candidates(grid, band, camera, limits, bounds), 0
+    packed = _candidates(grid, band, camera, limits, bounds)
     for start in range(0, len(packed), grid.room):
         part = packed[start : start + grid.room]
         seen, _ = _clear(grid.page_in(part), grid.buffers(), camera, limits, depth, rgb, bounds, changes=False)
         if seen.any():  # only these count as changed
-            blocks = grid.activate(part[seen > 0])
-            cleared += int(_clear(blocks, grid.buffers(), camera, limits, depth, rgb, bounds, changes=True)[1].sum())
+            changing = part[seen > 0]
+            blocks = grid.activate(changing)
+            _, cleared = _clear(blocks, grid.buffers(), camera, limits, depth, rgb, bounds, changes=True)
             grid.mark_changed(blocks, version)
-    return cleared
+            yield changing, cleared
+
+
+def clear_without_return(
+    grid: BlockGrid, camera: Camera, limits: FusionLimits, depth: Float32, rgb: UInt8, range_m: float, version: int
+) -> Iterator[tuple[Int64, Int64]]:
+    """As ``clear_in_view``, but what pixels without depth see through, up to ``range_m``; in all blocks.
+
+    A frame without any depth clears nothing: its sensor has failed.
+    """
+    empty = ~(depth > 0)  # NaN, too
+    if empty.all() or not empty.any():
+        return
+    bounds = depth_bounds(np.where(empty, np.float32(range_m), depth), np.inf)
+    free = np.where(empty, np.float32(range_m), np.float32(0))
+    reach, no_band = limits._replace(depth_max=range_m), np.empty(0, np.int64)
+    yield from clear_in_view(grid, no_band, camera, reach, free, rgb, bounds, version)
 
 
 def _candidates(

@@ -36,12 +36,18 @@ class DepthBounds(NamedTuple):
 NO_BOUNDS = DepthBounds(np.empty((0, 0, 0), np.float32), np.empty((0, 0), np.float32), 1)
 
 
-def depth_bounds(depth: Float32, depth_max_m: float) -> DepthBounds:
-    """Bounds of depth (H, W) in metres; what is farther than ``depth_max_m`` is not measured."""
+def depth_bounds(depth: Float32, depth_max_m: float, before: DepthBounds = NO_BOUNDS) -> DepthBounds:
+    """Bounds of depth (H, W) in metres; what is farther than ``depth_max_m`` is not measured.
+
+    They take the memory of ``before``, which nobody looks at any more, where the size is the same: new memory of 2 MB
+    costs as much as filling it.
+    """
     cell = max(1, max(depth.shape) // _CELLS)
     h, w = depth.shape[0] // cell, depth.shape[1] // cell
-    nearest = np.empty((_LEVELS, h, w), np.float32)
-    bounds = DepthBounds(nearest, np.empty((-(-h // _COARSE), -(-w // _COARSE)), np.float32), cell)
+    bounds = before
+    if before.cell != cell or before.nearest.shape != (_LEVELS, h, w):
+        farthest = np.empty((-(-h // _COARSE), -(-w // _COARSE)), np.float32)
+        bounds = DepthBounds(np.empty((_LEVELS, h, w), np.float32), farthest, cell)
     _bound_depth(depth, depth_max_m, bounds)
     return bounds
 

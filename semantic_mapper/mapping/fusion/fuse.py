@@ -32,6 +32,7 @@ _BOUNDS = {  # of the settings of a map: what is beyond is a slip of units or di
     "voxel_size_m": (1e-4, 10.0),
     "truncation_voxels": (1e-3, 100.0),
     "depth_max_m": (1e-3, 1000.0),
+    "no_return_range_m": (0.0, 1000.0),
     "initial_blocks": (1, 1 << 27),
     "max_blocks": (1, 1 << 27),
     "max_weight": (1.0, 1e6),
@@ -130,7 +131,7 @@ def fuse_blocks(
     *,
     measured: bool = True,
     bounds: DepthBounds = NO_BOUNDS,
-) -> int:
+) -> Int64:
     """Fuse one frame into blocks, in place.
 
     Args:
@@ -147,13 +148,13 @@ def fuse_blocks(
         bounds: Of the depth, where what the frame sees through is to be cleared; see ``clearing``.
 
     Returns:
-        Voxels of a surface that were cleared.
+        (B,) voxels of a surface that were cleared.
     """
     cleared = np.empty(len(indices), np.int64)
     look, cap = (MEASURED, limits.max_weight) if measured else (COMPUTED_LOOK, COMPUTED_CAP)
     args = (indices, buffers, camera, limits, depth, rgb, trust, votes, DITHER, moment, look, cap)
     _fuse_frame_into_blocks(len(indices), *args, bounds, cleared)
-    return int(cleared.sum())
+    return cleared
 
 
 @parallel_kernel()

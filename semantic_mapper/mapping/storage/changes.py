@@ -19,6 +19,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.storage.block_grid import BLOCK_VOXELS, BlockGrid
 from semantic_mapper.mapping.storage.block_index import unpack_keys
 from semantic_mapper.mapping.storage.block_store import PackedBlocks
+from semantic_mapper.mapping.storage.cleared_blocks import NONE_CLEARED, ClearedBlocks
 from semantic_mapper.types import Float32, Int64, UInt8
 
 TSDF_STEPS = 127  # of the quantised TSDF, a truncation
@@ -43,6 +44,7 @@ class BlockChanges:
         rgb: (B, 512, 3) uint8.
         scale_known: Whether lengths of the map are metres.
         computed: (B, 512) uint8, 1 where no sensor measured what was observed; None = it did everywhere.
+        cleared: Which of these blocks lost surface that frames saw through after ``since``, and when; the latest.
     """
 
     since: int
@@ -56,6 +58,7 @@ class BlockChanges:
     rgb: UInt8
     scale_known: bool = True
     computed: UInt8 | None = None
+    cleared: ClearedBlocks = NONE_CLEARED
 
     @property
     def observed(self) -> NDArray[np.bool_]:
@@ -72,7 +75,7 @@ class ChosenBlocks(NamedTuple):
         label_set: For the ids.
         vote_discount, unknown_below: See ``readout``.
         min_weight: Voxels with fewer measurements count as not observed; > 0.
-        scale_known: Of the result.
+        scale_known, cleared: Of the result.
     """
 
     packed: NDArray[np.int64]
@@ -85,6 +88,7 @@ class ChosenBlocks(NamedTuple):
     unknown_below: float
     min_weight: float
     scale_known: bool = True
+    cleared: ClearedBlocks = NONE_CLEARED
 
 
 class CopiedChanges(NamedTuple):
@@ -183,6 +187,7 @@ def _room_for(chosen: ChosenBlocks) -> BlockChanges:
         np.empty((*flat, 3), np.uint8),
         chosen.scale_known,
         np.empty(flat, np.uint8),
+        chosen.cleared,
     )
 
 
