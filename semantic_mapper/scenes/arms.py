@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from semantic_mapper.scenes.config import SUITE_VERSION
-from semantic_mapper.scenes.materials import Material, joined_tables, material_table
+from semantic_mapper.scenes.materials import Material, material_table
 from semantic_mapper.scenes.people import cloth_material, skin_material
 from semantic_mapper.scenes.primitives import BEING, Part, Primitives, Shape, pack
-from semantic_mapper.scenes.scene import Scene
+from semantic_mapper.scenes.scene import Scene, add_primitives
 from semantic_mapper.types import Float64
 
 _ARMS_STREAM = 5
@@ -46,21 +46,9 @@ def draw_arms(seed: int, variety: float) -> Arms | None:
 
 def hold_arms(scene: Scene, arms: Arms, T_world_camera: Float64) -> Scene:
     """The scene with ``arms`` before the camera of pose ``T_world_camera`` (4, 4); they cast no shadow."""
-    p, a, R = scene.primitives, arms.primitives, T_world_camera[:3, :3]
-    first, table = len(scene.materials.pattern), material_table(arms.materials)
-    both = replace(
-        p,
-        shape=np.concatenate((p.shape, a.shape)),
-        center=np.concatenate((p.center, a.center @ R.T + T_world_camera[:3, 3])),
-        half=np.concatenate((p.half, a.half)),
-        rotation=np.concatenate((p.rotation, R @ a.rotation)),
-        label=np.concatenate((p.label, a.label)),
-        instance=np.concatenate((p.instance, (a.instance + p.instance.max()).astype(p.instance.dtype))),
-        group=np.concatenate((p.group, a.group + p.group.max() + 1)),
-        material=np.concatenate((p.material, a.material + first)),
-        casts_shadow=np.concatenate((p.casts_shadow, a.casts_shadow)),
-    )
-    return replace(scene, primitives=both, materials=joined_tables(scene.materials, table))
+    a, R = arms.primitives, T_world_camera[:3, :3]
+    held = replace(a, center=a.center @ R.T + T_world_camera[:3, 3], rotation=R @ a.rotation)
+    return add_primitives(scene, held, material_table(arms.materials))
 
 
 def _arm(rng: np.random.Generator, side: int) -> list[Part]:

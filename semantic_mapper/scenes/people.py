@@ -41,7 +41,7 @@ def add_beings(layout: Layout, rng: np.random.Generator) -> tuple[Walk, ...]:
     """Stand one or two people or animals where there is space; the walks of those that move."""
     walks: list[Walk] = []
     for _ in range(int(rng.integers(1, 3))):
-        make = _animal if rng.uniform() < _ANIMAL else _person
+        make = _animal if rng.uniform() < _ANIMAL else make_person
         moves = rng.uniform() < _MOVING
         being = make(rng, layout.palette, casts_shadow=not moves)  # shadows are those of what stands still
         if not _stand(layout, rng, being) or not moves:
@@ -61,7 +61,7 @@ def _stand(layout: Layout, rng: np.random.Generator, being: Assembly) -> bool:
     return False
 
 
-def _person(rng: np.random.Generator, palette: Palette, *, casts_shadow: bool) -> Assembly:
+def make_person(rng: np.random.Generator, palette: Palette, *, casts_shadow: bool) -> Assembly:
     """Upright, facing y; the arms hang, or are bent as at work."""
     a, h = Assembly(BEING), rng.uniform(1.5, 1.9) / 1.75
     wide, bend = rng.uniform(0.36, 0.5), rng.uniform(0.0, 1.5)

@@ -11,7 +11,7 @@ from semantic_mapper.labels import ROOMS, LabelSet
 from semantic_mapper.scenes.daylight import Daylight
 from semantic_mapper.scenes.fast_cast import cast_pixels
 from semantic_mapper.scenes.fast_shade import LightArrays, MaterialArrays, PrimitiveArrays
-from semantic_mapper.scenes.materials import MaterialTable
+from semantic_mapper.scenes.materials import MaterialTable, joined_tables
 from semantic_mapper.scenes.people import Walk
 from semantic_mapper.scenes.primitives import Primitives
 from semantic_mapper.types import Float32, Float64
@@ -87,6 +87,29 @@ def scene_at(scene: Scene, frame: int) -> Scene:
     for walk in scene.walks:
         center[scene.primitives.group == walk.group] += walk.offset(frame)
     return replace(scene, primitives=replace(scene.primitives, center=center))
+
+
+def add_primitives(scene: Scene, added: Primitives, materials: MaterialTable) -> Scene:
+    """The scene and more primitives, which cast no shadow on it.
+
+    Args:
+        scene: Keeps the numbers of its primitives, instances, groups and materials.
+        added: Come after them; their labels are ids of the scene's label set.
+        materials: Theirs.
+    """
+    p = scene.primitives
+    both = Primitives(
+        shape=np.concatenate((p.shape, added.shape)),
+        center=np.concatenate((p.center, added.center)),
+        half=np.concatenate((p.half, added.half)),
+        rotation=np.concatenate((p.rotation, added.rotation)),
+        label=np.concatenate((p.label, added.label)),
+        instance=np.concatenate((p.instance, (added.instance + p.instance.max()).astype(p.instance.dtype))),
+        group=np.concatenate((p.group, added.group + p.group.max() + 1)),
+        material=np.concatenate((p.material, added.material + len(scene.materials.pattern))),
+        casts_shadow=np.concatenate((p.casts_shadow, added.casts_shadow)),
+    )
+    return replace(scene, primitives=both, materials=joined_tables(scene.materials, materials))
 
 
 def kernel_arrays(scene: Scene) -> tuple[PrimitiveArrays, MaterialArrays, LightArrays]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from semantic_mapper.scenes.arms import draw_arms, hold_arms
@@ -57,17 +57,40 @@ def room_views(
     """
     scene = make_room(seed, room) if scene is None else scene
     poses = camera_path(scene, count, seed, path)
-    frame_poses = poses if pose_noise is None else drifting_poses(poses, seed, pose_noise)
-    shots = [None] * count if noise is None else sequence_shots(poses, seed, noise)
     arms = draw_arms(seed, room.variety)
-    for index, shot in enumerate(shots):
-        present = scene_at(scene, index)
-        noise_seed = None if noise is None else seed * 100_003 + index
+    present = (scene_at(scene, index) for index in range(count))
+    scenes = present if arms is None else (hold_arms(s, arms, poses[index]) for index, s in enumerate(present))
+    frame_poses = poses if pose_noise is None else drifting_poses(poses, seed, pose_noise)
+    yield from render_views(seed, scenes, poses, intrinsics, noise=noise, frame_poses=frame_poses)
+
+
+def render_views(
+    seed: int,
+    scenes: Iterable[Scene],
+    poses: Float64,
+    intrinsics: CameraIntrinsics,
+    *,
+    noise: NoiseConfig | None = None,
+    frame_poses: Float64 | None = None,
+) -> Iterator[RoomView]:
+    """One view of each scene, as frames of one camera.
+
+    Args:
+        seed: Of the noise.
+        scenes: What is there in each frame.
+        poses: (N, 4, 4) where the camera is.
+        intrinsics: Of the camera.
+        noise: Depth sensor and noise, another draw each frame; None for perfect sensors.
+        frame_poses: (N, 4, 4) where the robot thinks that it is; None: it knows.
+    """
+    known = poses if frame_poses is None else frame_poses
+    shots = [None] * len(poses) if noise is None else sequence_shots(poses, seed, noise)
+    for index, (scene, shot) in enumerate(zip(scenes, shots, strict=True)):
         view = render_view(
-            present if arms is None else hold_arms(present, arms, poses[index]),
+            scene,
             intrinsics,
             poses[index],
-            noise=noise_seed,
+            noise=None if noise is None else seed * 100_003 + index,
             noise_config=noise or NoiseConfig(),
             shot=shot,
         )
@@ -79,7 +102,7 @@ def room_views(
             depth_m=None if noise is not None and noise.depth == "none" else view.depth_m,
             label=view.label,
             intrinsics=intrinsics,
-            T_world_camera=frame_poses[index],
+            T_world_camera=known[index],
             pose_source="rooms",
         )
         yield RoomView(frame, view, poses[index])
