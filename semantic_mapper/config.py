@@ -375,6 +375,13 @@ QUALITIES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # of ``sampling
 }
 
 
+class MovingConfig(Config, frozen=True):
+    """What moves is left out of the map (``mapping/moving.py``): it would be a wall where it has gone by."""
+
+    motion: bool = False  # where measured depth shows something in space that was free within the last seconds
+    classes: bool = False  # where the rendered class moves by itself (``labels.MOVING_NAMES``)
+
+
 class MapperConfig(Config, frozen=True):
     """Everything ``MappingPipeline`` needs. The defaults are those of the "balanced" quality."""
 
@@ -384,6 +391,7 @@ class MapperConfig(Config, frozen=True):
     voxel_map: VoxelMapConfig = VoxelMapConfig()
     history: HistoryConfig = HistoryConfig()
     virtual: VirtualViewConfig = VirtualViewConfig()
+    moving: MovingConfig = MovingConfig()
     render: RenderConfig = RenderConfig()
     quality: Quality = "custom"  # any other sets samples and rays; see ``with_quality``
     seed: int = 0

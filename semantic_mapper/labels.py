@@ -109,6 +109,10 @@ class LabelSet:
         """Ids of the classes that come in countable pieces: all but those named in ``stuff`` (see ``STUFF_NAMES``)."""
         return tuple(i for i, name in zip(self.ids, self.names, strict=True) if name not in stuff)
 
+    def moving_ids(self) -> tuple[int, ...]:
+        """Ids of the classes of ``MOVING_NAMES``."""
+        return tuple(i for i, name in zip(self.ids, self.names, strict=True) if name in MOVING_NAMES)
+
     def renamed(self, names: Mapping[str, str]) -> tuple[LabelSet, UInt8]:
         """Give classes other names; classes that then have the same name become one, with the lowest of their ids.
 
@@ -230,6 +234,10 @@ STUFF_NAMES = frozenset(
     "wall floor ceiling floormat otherstructure sky building road roads roadline pavement sidewalk sidewalks parking "
     "terrain vegetation tree fence ground water bridge static background".split()
 )
+
+
+# Classes of things that move by themselves. Vehicles are not among them: most that a camera meets are parked.
+MOVING_NAMES = frozenset("person people human pedestrian rider bicyclist cyclist motorcyclist animal dog cat".split())
 
 
 def label_set_named(name: str) -> LabelSet:

@@ -265,6 +265,8 @@ class MapUpdate:
         blocks: Blocks in the map; ``blocks_touched``: visited by this frame.
         rays: Rendered for this frame; ``samples``: of a ray, 0 where the field draws its own.
         stage_ms: Wall time of each stage.
+        moving: (H, W) bool, what was left out of the map because it moves; None where that is off. It is not sent over
+            sockets, where ``depth_m`` is 0 in these pixels.
     """
 
     stamp_ns: int
@@ -281,3 +283,4 @@ class MapUpdate:
     rays: int = 0
     samples: int = 0
     stage_ms: dict[str, float] = field(default_factory=dict[str, float])
+    moving: Bool | None = None

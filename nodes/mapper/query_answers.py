@@ -12,6 +12,7 @@ import structlog
 
 from semantic_mapper.errors import MapError, SemanticMapperError
 from semantic_mapper.mapping.map_types import MapPoints
+from semantic_mapper.mapping.moving import MovingSpace
 from semantic_mapper.mapping.storage.changes import BlockChanges
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
 from semantic_mapper.nodes.mapper.live_weights import LiveWeights
@@ -77,6 +78,7 @@ class Answers:
         correction: Takes corrected poses; without it they are refused.
         weights: Says which weights are in use, and exchanges them; without it such questions are refused.
         refined: Mirror of the map as it was refined last; without it questions about that are refused.
+        moving: Where something moves now that is left out of the map.
     """
 
     def __init__(
@@ -85,12 +87,14 @@ class Answers:
         correction: LiveCorrection | None = None,
         weights: LiveWeights | None = None,
         refined: MapMirror | None = None,
+        moving: MovingSpace | None = None,
     ) -> None:
         self.map_id = uuid.uuid4().hex
         self._mirror = mirror
         self._correction = correction
         self._weights = weights
         self._refined = refined
+        self._moving = moving
         # By direction, and whether of the refined map; the last one asked stands last.
         self._tracked: dict[tuple[messages.Point, bool], _Tracked] = {}
 
@@ -122,7 +126,9 @@ class Answers:
                 return self._describe(snapshot)
             case messages.AtRequest():
                 _bound_points(snapshot, request)
-                return self._plain(snapshot, messages.AtAnswer, at(snapshot, request.points, request.radius_m))
+                return self._plain(
+                    snapshot, messages.AtAnswer, at(self._with_moving(snapshot), request.points, request.radius_m)
+                )
             case messages.NearestRequest():
                 return self._nearest(snapshot, request)
             case messages.RaysRequest():
@@ -135,10 +141,10 @@ class Answers:
             case messages.InstancesRequest():
                 return self._instances(snapshot, request)
             case messages.OccupancyRequest():
-                state = occupancy(snapshot, request.points)
+                state = occupancy(self._with_moving(snapshot), request.points)
                 return messages.OccupancyAnswer(**self._about(snapshot), state=state)
             case messages.DistanceRequest():
-                return self._distances(snapshot, request)
+                return self._distances(self._with_moving(snapshot), request)
             case messages.ChangesRequest():
                 return self._changes(snapshot, request)
             case messages.CorrectPosesRequest() | messages.CorrectionRequest():
@@ -147,6 +153,9 @@ class Answers:
                 return self._exchange_weights(snapshot, request)
             case _:
                 raise MapError(f"{type(request).__name__}: cannot be answered")
+
+    def _with_moving(self, snapshot: MapSnapshot) -> MapSnapshot:
+        return snapshot if self._moving is None else snapshot.with_moving(self._moving.points)
 
     def _refined_snapshot(self) -> MapSnapshot:
         if self._refined is None:

@@ -18,6 +18,7 @@ from typing import Self
 import structlog
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.mapping.moving import MovingSpace
 from semantic_mapper.mapping.storage.changes import CopiedChanges
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.live_correction import LiveCorrection
@@ -82,7 +83,7 @@ class QueryService:
         correction: Takes corrected poses; without it they are refused.
         weights: Takes other weights; without it requests about them are refused.
         keys: See ``QueryServer``.
-        refined: See ``Answers``.
+        refined, moving: See ``Answers``.
 
     Raises:
         TransportError: the endpoint is taken or cannot be bound.
@@ -96,11 +97,12 @@ class QueryService:
         keys: Keys | None = None,
         weights: LiveWeights | None = None,
         refined: MapMirror | None = None,
+        moving: MovingSpace | None = None,
     ) -> None:
         self._map = voxel_map
         config = voxel_map.config
         self._mirror = MapMirror(config.voxel_size_m, config.truncation_voxels, voxel_map.label_set)
-        self._answers = Answers(self._mirror, correction, weights, refined)
+        self._answers = Answers(self._mirror, correction, weights, refined, moving)
         self._copied_version = 0
         self._copy_again_at = 0.0
         self._last_request = -ASKED_LATELY_S  # never; monotonic seconds

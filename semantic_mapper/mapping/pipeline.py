@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -29,6 +30,7 @@ from semantic_mapper.mapping.frame_depth import FrameDepth, computed_trust
 from semantic_mapper.mapping.fusion.depth_trust import depth_trust
 from semantic_mapper.mapping.fusion.vote_fusion import add_votes
 from semantic_mapper.mapping.keyframes import EncodedSize, Keyframe, KeyframeStore
+from semantic_mapper.mapping.moving import BEYOND_M, MotionDetector, MovingSpace
 from semantic_mapper.mapping.picture_check import PictureCheck
 from semantic_mapper.mapping.pose_check import PoseCheck
 from semantic_mapper.mapping.views.own_image import add_own_image
@@ -78,6 +80,10 @@ class MappingPipeline:
         self.keyframes = KeyframeStore(config.keyframes)
         self._frame_depth = FrameDepth(config.depth, self._cast_for_hint)
         self.pose_check = PoseCheck(config.voxel_map.depth_max_m)
+        self._motion = MotionDetector(config.voxel_map.depth_max_m)
+        self._moving_ids = label_set.moving_ids() if config.moving.classes else ()
+        self.moving_pixels = 0  # left out of the map so far
+        self.moving_space = MovingSpace()
         self._viewpoints = ViewpointChooser(config.virtual, config.seed)
         self._steps = 0
         self._renderer = ViewRenderer(field, config.render, config.sampling)
@@ -151,6 +157,8 @@ class MappingPipeline:
                 changed then.
             PoseError: a pose is not a rigid transform.
         """
+        self._motion.clear()  # both are of the last seconds in the world before
+        self.moving_space.clear()
         return self.corrector.start(poses, until_ns)
 
     def advance_correction(self, max_frames: int = 1) -> bool:
@@ -267,6 +275,11 @@ class MappingPipeline:
             votes = add_own_image(view, self.field, current, self._own_image_weight)
         with self._stage("lift"):
             depth, rows, trust = self._lift(resized, votes, self.voxel_map)
+            moving = self._moving(frame, votes, rows)
+            if moving is not None and moving.any():
+                frame = self._left_out(frame, moving)
+                resized = FrameViews(frame)
+                depth, rows, trust = self._lift(resized, votes, self.voxel_map)
         with self._stage("fuse"):
             measured = is_measured(frame)
             table = votes.probabilities.reshape(-1, len(self.label_set))
@@ -303,13 +316,34 @@ class MappingPipeline:
             source_seqs=tuple(k.seq for k in sources),
             label=label,
             confidence=confidence,
-            depth_m=depth,
+            depth_m=depth if moving is None else np.where(moving, np.float32(0), depth),
             blocks=self.voxel_map.block_count,
             blocks_touched=touched,
             rays=view.rays,
             samples=view.samples,
             stage_ms=self._stage_ms,
+            moving=moving,
         )
+
+    def _moving(self, frame: PosedFrame, view: RenderedView, rows: NDArray[np.int32]) -> Bool | None:
+        """Pixels (H, W) of what moves, of a frame whose depth was measured; None where nobody asks."""
+        if not (self.config.moving.motion or self.config.moving.classes) or not is_measured(frame):
+            return None
+        moving = np.zeros(rows.shape, np.bool_)
+        if self.config.moving.motion:
+            moving |= self._motion.find(frame)
+        if self._moving_ids:
+            label, _ = self._at_rows(view.probabilities.reshape(-1, len(self.label_set)), rows)
+            moving |= np.isin(label, self._moving_ids)
+        self.moving_space.add(frame, moving)
+        return moving
+
+    def _left_out(self, frame: PosedFrame, moving: Bool) -> PosedFrame:
+        """The frame without depth where it shows what moves: neither surface nor seen through."""
+        assert frame.depth_m is not None
+        self.moving_pixels += int(moving.sum())
+        nothing = BEYOND_M if self.config.voxel_map.no_return_range_m > 0 else np.float32(0)
+        return replace(frame, depth_m=np.where(moving, nothing, frame.depth_m))
 
     @property
     def _delay_frames(self) -> int:
@@ -472,6 +506,8 @@ class MappingPipeline:
             depth = np.asarray(cv2.resize(view.depth_m, size, interpolation=cv2.INTER_LINEAR), np.float32)
         else:
             depth, trust = resized.depth(frame.intrinsics), None
+            if self.config.voxel_map.no_return_range_m > 0:  # what is left out is no free space
+                depth = np.where(frame.depth_m == BEYOND_M, BEYOND_M, depth)
             if frame.depth_sigma_m is not None:
                 trust = computed_trust(depth, frame.depth_sigma_m)
         return depth, upsample(view.probabilities, view.known, rgb_low, depth_low, frame.rgb, depth), trust

@@ -1,4 +1,4 @@
-"""Free, occupied or unknown: at points, and as distances to obstacles on the voxels of a box."""
+"""What is free, occupied, unknown or has something that moves: points, and the voxels of a box with their distances."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from semantic_mapper.kernels import kernel
 from semantic_mapper.mapping.storage.block_index import BlockIndex
 from semantic_mapper.queries.checks import check_box, check_points
 from semantic_mapper.queries.snapshot import BlockVoxels, MapSnapshot
-from semantic_mapper.types import Float32, Float64, Int64, UInt8
+from semantic_mapper.types import Bool, Float32, Float64, Int64, UInt8
 
 MAX_BOX_VOXELS = 1 << 24  # 134 m^3 at 2 cm; about 0.5 GB while the distances are computed
 
@@ -24,11 +24,13 @@ class State(IntEnum):
 
     Occupied: the surface is at most half a voxel in front of it, or it lies behind a surface, up to the truncation.
     Unknown is also the air that cameras looked through far from any surface: the map keeps no blocks there.
+    Moving: something that moves, and is left out of the map, was there within the last second: an obstacle for now.
     """
 
     UNKNOWN = 0
     FREE = 1
     OCCUPIED = 2
+    MOVING = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,8 +40,8 @@ class DistanceField:
     Args:
         origin_m: (3,) float64 centre of voxel [0, 0, 0] in the world.
         voxel_size_m: Step along each axis.
-        distance_m: (X, Y, Z) float32 from voxel centre to the centre of the nearest occupied voxel, 0 in those,
-            infinite where the box holds none.
+        distance_m: (X, Y, Z) float32 from voxel centre to the centre of the nearest occupied or moving voxel, 0 in
+            those, infinite where the box holds none.
         state: (X, Y, Z) uint8 ``State``.
     """
 
@@ -62,7 +64,7 @@ def occupancy(snapshot: MapSnapshot, points: ArrayLike) -> UInt8:
 def distance_field(
     snapshot: MapSnapshot, lower: ArrayLike, upper: ArrayLike, *, unknown_is_occupied: bool = False
 ) -> DistanceField:
-    """Euclidean distance to the nearest occupied voxel for every voxel with its centre in a box.
+    """Euclidean distance to the nearest occupied or moving voxel for every voxel with its centre in a box.
 
     Only voxels in the box count as obstacles: give the box a margin of the distance that matters.
 
@@ -85,7 +87,10 @@ def distance_field(
         )
     state = np.empty(tuple(shape), np.uint8)
     fill_box_states(first, snapshot.index, snapshot.voxels, snapshot.voxels_per_step, state)
-    obstacle = (state == State.OCCUPIED) | ((state == State.UNKNOWN) & unknown_is_occupied)
+    moving = snapshot.moving - first
+    moving = moving[((moving >= 0) & (moving < shape)).all(axis=1)]
+    state[tuple(moving.T)] = State.MOVING
+    obstacle = (state >= State.OCCUPIED) | ((state == State.UNKNOWN) & unknown_is_occupied)
     if obstacle.any():
         distance = ndimage.distance_transform_edt(~obstacle, sampling=snapshot.voxel_size_m)
     else:
@@ -98,7 +103,20 @@ def read_states(points: Float64, snapshot: MapSnapshot) -> UInt8:
     """``State`` (N,) of the voxels in which points (N, 3), units of voxels, lie."""
     places, states = np.floor(points + 0.5).astype(np.int64), np.empty(len(points), np.uint8)
     read_voxel_states(places, snapshot.index, snapshot.voxels, snapshot.voxels_per_step, states)
+    states[_is_in(places, snapshot.moving)] = State.MOVING
     return states
+
+
+def _is_in(places: Int64, voxels: Int64) -> Bool:
+    """Which of places (N, 3) are among voxels (M, 3)."""
+    found = np.zeros(len(places), np.bool_)
+    if len(voxels):
+        first = voxels.min(axis=0)
+        shape = tuple((voxels.max(axis=0) - first + 1).tolist())
+        near = np.flatnonzero(((places >= first) & (places < first + shape)).all(axis=1))
+        here, there = (np.ravel_multi_index(tuple((v - first).T), shape) for v in (places[near], voxels))
+        found[near] = np.isin(here, there)
+    return found
 
 
 @kernel

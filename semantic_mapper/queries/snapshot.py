@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from semantic_mapper.mapping.instance_layer import InstanceLayer
 from semantic_mapper.mapping.storage.block_index import BlockIndex, unpack_keys
 from semantic_mapper.mapping.storage.changes import CONFIDENCE_STEPS, TSDF_STEPS, BlockChanges, oldest_first
 from semantic_mapper.mapping.storage.cleared_blocks import NONE_CLEARED, ClearedBlocks
-from semantic_mapper.types import Bool, Float32, UInt8
+from semantic_mapper.types import Bool, Float32, Int64, UInt8
 
 COMPUTED, MEASURED = 1, 2  # ``BlockVoxels.weight``: depth was computed, or a sensor measured it
 
@@ -57,6 +57,7 @@ class MapSnapshot:
         scale_known: Whether lengths are metres.
         instances: Which voxels belong to which thing; None = not known.
         cleared: Which blocks lost surface that frames saw through, and when; the latest.
+        moving: (M, 3) int64 voxels where something moves that is left out of the map; see ``with_moving``.
     """
 
     version: int
@@ -73,6 +74,7 @@ class MapSnapshot:
     scale_known: bool = True
     instances: InstanceLayer | None = None
     cleared: ClearedBlocks = NONE_CLEARED
+    moving: Int64 = field(default_factory=lambda: np.empty((0, 3), np.int64))
 
     @property
     def block_count(self) -> int:
@@ -83,6 +85,12 @@ class MapSnapshot:
     def keys(self) -> NDArray[np.int32]:
         """(B, 3) block coordinates in lexicographic order."""
         return unpack_keys(self.packed)
+
+    def with_moving(self, points: Float32) -> MapSnapshot:
+        """This state with what moves at points (N, 3), world metres, as ``mapping.moving.MovingSpace`` has them."""
+        if not len(points):
+            return self
+        return replace(self, moving=np.unique(np.floor(points / self.voxel_size_m + 0.5).astype(np.int64), axis=0))
 
     def read(self, slot: NDArray[np.int64], voxel: NDArray[np.int64]) -> tuple[UInt8, Float32, UInt8]:
         """Label (N,), confidence (N,) and rgb (N, 3) of voxels (N,); ignore id, 0 and black where ``slot`` is -1."""

@@ -58,3 +58,15 @@ def test_states_of_random_blocks_are_those_of_their_voxels(seed: int) -> None:
 
 def test_no_points_have_no_state() -> None:
     assert occupancy(random_map(0), np.zeros((0, 3))).shape == (0,)
+
+
+def test_what_moves_is_an_obstacle_for_now() -> None:
+    points = np.array([(0.5, 0.0, 0.5), (0.505, 0.0, 0.5), (9.0, 9.0, 9.0)], np.float32)
+    now = whole().with_moving(points)
+    assert occupancy(now, points).tolist() == [State.MOVING] * 3
+    assert State.MOVING not in occupancy(whole(), points) and State.MOVING not in occupancy(now, points - 0.1)
+    field, before = (distance_field(s, LOWER, UPPER) for s in (now, whole()))
+    assert (field.state == State.MOVING).sum() == 1
+    at = tuple(np.rint((points[0] - field.origin_m) / 0.02).astype(int))
+    assert field.state[at] == State.MOVING and field.distance_m[at] == 0 < before.distance_m[at]
+    assert (field.distance_m <= before.distance_m).all()

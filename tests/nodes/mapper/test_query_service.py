@@ -17,6 +17,8 @@ from hypothesis import strategies as st
 
 from semantic_mapper.client import MapClient
 from semantic_mapper.errors import CodecError, LabelError, MapError, TransportError
+from semantic_mapper.geometry import transform
+from semantic_mapper.mapping.moving import MovingSpace
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper import query_answers
 from semantic_mapper.nodes.mapper.query_service import QueryService
@@ -25,13 +27,15 @@ from semantic_mapper.queries.instances import InstanceTracker
 from semantic_mapper.queries.lookup import at
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.nearest import nearest
-from semantic_mapper.queries.occupancy import distance_field, occupancy
+from semantic_mapper.queries.occupancy import State, distance_field, occupancy
 from semantic_mapper.queries.rays import cast_rays
 from semantic_mapper.transport import query_messages as messages
 from semantic_mapper.transport.codec import encode_request
 from semantic_mapper.transport.query_sockets import MAX_REQUEST_BYTES
 from semantic_mapper.transport.security import Keys
 from tests.mapping.rendered_views import small_map
+from tests.mapping.test_moving import THING_M as PASSES_AT_M
+from tests.mapping.test_moving import scene as passer_by
 from tests.queries.scene import BALL, LABELS, integrate, poses, whole, whole_map
 from tests.queries.test_measured import part_measured
 from tests.queries.test_mirror import assert_same
@@ -48,10 +52,12 @@ def a_folder() -> Iterator[Path]:
 
 
 @contextmanager
-def answering(endpoint: str, voxel_map: VoxelMap, keys: Keys | None = None) -> Iterator[QueryService]:
+def answering(
+    endpoint: str, voxel_map: VoxelMap, keys: Keys | None = None, moving: MovingSpace | None = None
+) -> Iterator[QueryService]:
     """A service, fed all the time as a mapper does."""
     stop = threading.Event()
-    with QueryService(endpoint, voxel_map, keys=keys) as service:
+    with QueryService(endpoint, voxel_map, keys=keys, moving=moving) as service:
 
         def feed() -> None:
             while not stop.wait(0.002):
@@ -397,3 +403,23 @@ def test_a_mapper_that_nobody_asks_is_not_looked_at(endpoint: str, monkeypatch: 
     with answering(endpoint, voxel_map), MapClient(endpoint, timeout_s=60) as client:
         assert client.info().blocks == voxel_map.block_count  # the very first answer is about the present map
     assert len(asked) == 1
+
+
+def test_what_moves_is_an_obstacle_while_it_is_there() -> None:
+    space = MovingSpace()
+    frame, thing = passer_by(3, 60)
+    with (
+        a_folder() as folder,
+        answering(f"ipc://{folder / 'query'}", whole_map(), moving=space) as service,
+        MapClient(service.endpoint) as client,
+    ):
+        place = transform(frame.T_world_camera, np.array([[0.0, 0.0, PASSES_AT_M]]))
+        before = client.occupancy(place)
+        space.add(frame, thing)
+        points = space.points
+        assert before[0] != State.MOVING and (client.occupancy(points) == State.MOVING).all()
+        assert (client.at(points).state == State.MOVING).all()
+        field = client.distance_field(place[0] - 0.1, place[0] + 0.1)
+        assert (field.state == State.MOVING).any() and not field.distance_m[field.state == State.MOVING].any()
+        space.clear()
+        assert (client.occupancy(points) != State.MOVING).all()

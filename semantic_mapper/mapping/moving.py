@@ -1,0 +1,240 @@
+"""What moves is no surface: pixels where something is now that was free space a moment ago.
+
+After Schmid et al., *Dynablox* (2023), but free space is what the camera itself saw within the last ``SETTLED_S``
+seconds, kept as small depth images, and no layer of the map: where a view of that time looked past a point, something
+has come there. So a thing that stays becomes part of the map after this time, whatever it is, and memory is bounded.
+
+A cell of ``CELLS`` across the image has the nearest depth of its pixels. It contradicts a view where all that the view
+measured around the point lies behind it by more than ``MARGIN_M + MARGIN_PER_M * z``: so thin things, depth edges and
+poses that are a little off say nothing. Fewer than ``LEAST_CELLS`` such cells side by side are noise. What moves then
+grows, cell by cell, along its own surface into cells of which no view knows anything, such as its inside, which it hid.
+
+Not found: what moves away along the line of sight (it hid the space where it is now), what had moved before it was seen
+for the first time, and what is slower than the margin in ``SETTLED_S``. Such surface is cleared when frames see through
+it (``fusion/clearing.py``).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semantic_mapper.geometry import invert_pose, transform
+from semantic_mapper.types import Bool, Float32, Float64, PosedFrame
+
+BEYOND_M = np.float32(1e4)  # depth of what is left out, where no depth would mean free space
+CELLS = 80  # across the longer side of the image
+EVERY_S, SETTLED_S = 0.2, 3.0  # between two views that are kept; how long they are
+MOST_VIEWS = 48  # of all cameras together
+MARGIN_M, MARGIN_PER_M = 0.1, 0.03
+LEAST_CELLS = 4
+MOST_MOVING = 0.5  # fraction of the measured cells: where more contradict, it is the pose that is wrong
+GROWTH = 6  # cells
+HOLES, LEAST_AROUND = 3, 5  # rounds in which cells are filled that have so many moving ones of the eight around
+STEP_M, STEP_PER_M = 0.1, 0.02  # between neighbouring cells of one surface
+KEPT_S = 1.0  # what moves is in the way of planners for so long after it was seen
+STRIDE = 3  # pixels: 2 cm at 3 m, as voxels are
+_FULL = 0.9  # fraction of the pixels of a cell that are measured, for it to say that space is free
+_SECOND = 1_000_000_000
+
+
+class MovingSpace:
+    """Where what is left out of the map was seen within the last ``KEPT_S`` seconds of frames.
+
+    Another thread may ask for ``points`` while frames are added.
+    """
+
+    def __init__(self) -> None:
+        self._parts: tuple[tuple[int, Float32], ...] = ()
+
+    def add(self, frame: PosedFrame, moving: Bool) -> None:
+        """Take over what moves in a frame, and forget what is older.
+
+        Args:
+            frame: With depth.
+            moving: (H, W) pixels of it; every ``STRIDE``-th along rows and columns is kept.
+        """
+        assert frame.depth_m is not None
+        since = frame.stamp_ns - KEPT_S * _SECOND
+        parts = [(stamp, points) for stamp, points in self._parts if since <= stamp <= frame.stamp_ns]
+        v, u = (STRIDE * i for i in np.nonzero(moving[::STRIDE, ::STRIDE]))
+        if len(v):
+            k, z = frame.intrinsics, frame.depth_m[v, u].astype(np.float64)
+            rays = np.stack(((u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones(len(u))), axis=1)
+            points = transform(frame.T_world_camera, z[:, None] * rays).astype(np.float32)
+            parts.append((frame.stamp_ns, points[np.isfinite(points).all(axis=1) & (z > 0)]))
+        self._parts = tuple(parts)
+
+    def clear(self) -> None:
+        """Forget all of it."""
+        self._parts = ()
+
+    @property
+    def points(self) -> Float32:
+        """(N, 3) in the world, metres."""
+        return np.concatenate([np.empty((0, 3), np.float32), *(points for _, points in self._parts)])
+
+
+class _Cells(NamedTuple):
+    """Nearest depth of cells (h, w), metres, 0 = none, and whether most of it is measured."""
+
+    near: Float32
+    full: Bool
+    size: int  # pixels across
+
+
+class _View(NamedTuple):
+    """What one frame saw: where it was, and its cells, the nearest depth of each cell and those around it."""
+
+    stamp_ns: int
+    T_camera_world: Float64
+    focal: tuple[float, float]  # in cells
+    centre: tuple[float, float]
+    near: Float32
+    around: Float32  # 0 where not all of it is measured
+
+
+class MotionDetector:
+    """Finds what moves by depth alone. Deterministic; the only clock is the frames' stamps."""
+
+    def __init__(self, depth_max_m: float) -> None:
+        self._depth_max_m = depth_max_m
+        self._views: deque[_View] = deque(maxlen=MOST_VIEWS)
+
+    def clear(self) -> None:
+        """Forget what was seen, where poses of frames to come are in another world."""
+        self._views.clear()
+
+    def find(self, frame: PosedFrame) -> Bool:
+        """Pixels (H, W) of what moves; what the frame sees is remembered for later ones.
+
+        Args:
+            frame: With measured depth and a rigid pose.
+        """
+        assert frame.depth_m is not None
+        cells = _cells(frame.depth_m, self._depth_max_m)
+        views = [v for v in self._views if 0 <= frame.stamp_ns - v.stamp_ns <= SETTLED_S * _SECOND]
+        self._views = deque(views, MOST_VIEWS)
+        moving = np.zeros(cells.near.shape, np.bool_)
+        if views and (cells.near > 0).any():
+            free, seen = _seen_before(frame, cells, views)
+            if free.sum() <= MOST_MOVING * (cells.near > 0).sum():
+                moving = _filled(_grown(_without_specks(free), cells.near, ~(free | seen)), cells.near)
+        last = max((v.stamp_ns for v in views if v.near.shape == cells.near.shape), default=None)
+        if last is None or frame.stamp_ns - last >= EVERY_S * _SECOND:
+            self._views.append(_view(frame, cells))
+        return _pixels(moving, cells, frame.depth_m)
+
+
+def _cells(depth: Float32, depth_max_m: float) -> _Cells:
+    size = max(1, round(max(depth.shape) / CELLS))
+    h, w = depth.shape[0] // size, depth.shape[1] // size
+    known = (depth > 0) & (depth <= depth_max_m)  # not NaN
+    values = np.where(known, depth, np.float32(np.inf))[: h * size, : w * size]
+    near = values.reshape(h, size, w * size).min(axis=1).reshape(h, w, size).min(axis=2)
+    count = known[: h * size, : w * size].reshape(h, size, w * size).sum(axis=1, dtype=np.uint16)
+    full = count.reshape(h, w, size).sum(axis=2) >= _FULL * size * size
+    return _Cells(np.where(np.isfinite(near), near, 0).astype(np.float32), full, size)
+
+
+def _intrinsics(frame: PosedFrame, size: int) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Focal lengths and principal point in cells, whose centres have whole numbers."""
+    k = frame.intrinsics
+    return (k.fx / size, k.fy / size), ((k.cx + 0.5) / size - 0.5, (k.cy + 0.5) / size - 0.5)
+
+
+def _view(frame: PosedFrame, cells: _Cells) -> _View:
+    near = np.where(cells.full, cells.near, 0).astype(np.float32)
+    around = cv2.erode(near, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0.0)
+    focal, centre = _intrinsics(frame, cells.size)
+    return _View(
+        frame.stamp_ns, invert_pose(frame.T_world_camera), focal, centre, cells.near, np.asarray(around, np.float32)
+    )
+
+
+def _seen_before(frame: PosedFrame, cells: _Cells, views: list[_View]) -> tuple[Bool, Bool]:
+    """Cells (h, w) where a view saw free space, and where one saw a surface."""
+    v, u = np.nonzero(cells.near)
+    z = cells.near[v, u]
+    focal, centre = _intrinsics(frame, cells.size)
+    rays = np.stack(((u - centre[0]) / focal[0], (v - centre[1]) / focal[1], np.ones(len(u))), axis=1)
+    points = ((z[:, None] * rays) @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3]).astype(np.float32)
+    free, seen = np.zeros(len(u), np.bool_), np.zeros(len(u), np.bool_)
+    for view in views:
+        T = view.T_camera_world.astype(np.float32)
+        p = points @ T[:3, :3].T + T[:3, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = np.rint(p[:, 0] / p[:, 2] * view.focal[0] + view.centre[0])
+            y = np.rint(p[:, 1] / p[:, 2] * view.focal[1] + view.centre[1])
+        inside = (p[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < view.near.shape[1]) & (y < view.near.shape[0])
+        at = np.flatnonzero(inside)
+        yi, xi, depth = y[at].astype(np.int64), x[at].astype(np.int64), p[at, 2]
+        margin = MARGIN_M + MARGIN_PER_M * depth
+        free[at] |= view.around[yi, xi] > depth + margin
+        seen[at] |= np.abs(view.near[yi, xi] - depth) <= margin
+    images = np.zeros((2, *cells.near.shape), np.bool_)
+    images[0, v, u], images[1, v, u] = free, seen
+    return images[0], images[1]
+
+
+def _without_specks(found: Bool) -> Bool:
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8), connectivity=8)
+    large = np.asarray(stats)[:, cv2.CC_STAT_AREA] >= LEAST_CELLS
+    large[0] = False
+    return large[np.asarray(labels, np.int64)] if count > 1 else np.zeros_like(found)
+
+
+def _grown(moving: Bool, depth: Float32, unknown: Bool) -> Bool:
+    """What moves and cells along its surface that no view knows."""
+    moving, unknown = moving.copy(), unknown & (depth > 0)
+    step = STEP_M + STEP_PER_M * depth
+    for _ in range(GROWTH if moving.any() else 0):
+        more = np.zeros_like(moving)
+        for to, of in _NEIGHBOURS:
+            more[to] |= moving[of] & (np.abs(depth[to] - depth[of]) < step[to])
+        more &= unknown & ~moving
+        if not more.any():
+            break
+        moving |= more
+    return moving
+
+
+def _filled(moving: Bool, depth: Float32) -> Bool:
+    """Without holes: cells with what moves on most sides, and in one surface with it, move, too."""
+    if not moving.any():
+        return moving
+    for _ in range(HOLES):
+        near = np.asarray(cv2.boxFilter(np.where(moving, depth, 0), -1, (3, 3), normalize=False))
+        count = np.asarray(cv2.boxFilter(moving.astype(np.float32), -1, (3, 3), normalize=False))
+        mean = near / np.maximum(count, 1)
+        moving = moving | ((count >= LEAST_AROUND) & (np.abs(depth - mean) < STEP_M + STEP_PER_M * depth) & (depth > 0))
+    return moving
+
+
+_ALL, _LOW, _HIGH = slice(None), slice(None, -1), slice(1, None)
+_NEIGHBOURS = (
+    ((_HIGH, _ALL), (_LOW, _ALL)),
+    ((_LOW, _ALL), (_HIGH, _ALL)),
+    ((_ALL, _HIGH), (_ALL, _LOW)),
+    ((_ALL, _LOW), (_ALL, _HIGH)),
+)
+
+
+def _pixels(moving: Bool, cells: _Cells, depth: Float32) -> NDArray[np.bool_]:
+    """Pixels (H, W) of moving cells and those beside them that are as near as what moves there."""
+    if not moving.any():
+        return np.zeros(depth.shape, np.bool_)
+    farthest = np.where(moving, cells.near * (1 + STEP_PER_M) + STEP_M, 0).astype(np.float32)
+    farthest = np.asarray(cv2.dilate(farthest, np.ones((3, 3), np.uint8)))
+    nearest = np.where(moving, cells.near * (1 - STEP_PER_M) - STEP_M, np.float32(np.inf)).astype(np.float32)
+    nearest = np.asarray(cv2.erode(nearest, np.ones((3, 3), np.uint8)))
+    found = np.zeros(depth.shape, np.bool_)
+    h, w = moving.shape[0] * cells.size, moving.shape[1] * cells.size
+    tiles = depth[:h, :w].reshape(moving.shape[0], cells.size, moving.shape[1], cells.size)
+    inside = (tiles < farthest[:, None, :, None]) & (tiles > nearest[:, None, :, None]) & (tiles > 0)
+    found[:h, :w] = inside.reshape(h, w)
+    return found

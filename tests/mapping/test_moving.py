@@ -1,0 +1,148 @@
+"""What moves is left out of the map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semantic_mapper.fields.sray_streaming import StreamingSRay
+from semantic_mapper.labels import CARLA, NYU40, ROOMS
+from semantic_mapper.mapping.moving import BEYOND_M, SETTLED_S, MotionDetector, MovingSpace
+from semantic_mapper.mapping.pipeline import MappingPipeline
+from semantic_mapper.types import Bool, CameraIntrinsics, PosedFrame
+from tests.small import tiny_config, tiny_field
+
+CAMERA = CameraIntrinsics(130.0, 130.0, 79.5, 59.5, 160, 120)
+WALL_M, POLE_M, THING_M = 3.0, 2.2, 1.8
+HZ = 10
+NOISE_M = 0.02
+
+
+def scene(number: int, left: int | None, *, shift_m: float = 0.0) -> tuple[PosedFrame, Bool]:
+    """A wall, a pole, and before them a thing 30 pixels wide whose left edge is at ``left`` for a camera that is not
+    shifted; and where that is."""
+    rng = np.random.default_rng(number)
+    depth = (WALL_M + rng.normal(0, NOISE_M, (120, 160))).astype(np.float32)
+    pole = 40 - round(shift_m * CAMERA.fx / POLE_M)
+    depth[:, max(pole, 0) : max(pole + 4, 0)] = POLE_M
+    thing = np.zeros((120, 160), np.bool_)
+    if left is not None:
+        left -= round(shift_m * CAMERA.fx / THING_M)
+        thing[20:100, max(left, 0) : max(left + 30, 0)] = True
+        depth[thing] = THING_M + rng.normal(0, NOISE_M, int(thing.sum()))
+    rgb = np.where(thing[..., None], np.uint8(200), np.uint8(90)) * np.ones(3, np.uint8)
+    T = np.eye(4)
+    T[0, 3] = shift_m
+    return PosedFrame(number * 10**9 // HZ, number, "front", rgb, depth, None, CAMERA, T), thing
+
+
+def test_what_passes_by_is_found_and_a_still_scene_is_not() -> None:
+    detector, inter, union = MotionDetector(6.0), 0, 0
+    for number in range(20):
+        frame, thing = scene(number, None if number < 3 else -30 + 10 * number, shift_m=0.01 * number)
+        found = detector.find(frame)
+        if number < 3:
+            assert not found.any()
+        inter, union = inter + int((found & thing).sum()), union + int((found | thing).sum())
+    assert inter / union > 0.8
+    detector = MotionDetector(6.0)
+    assert not any(detector.find(scene(n, 60, shift_m=0.02 * n)[0]).any() for n in range(20))
+
+
+def test_what_stays_settles_and_forgetting_leaves_nothing_to_compare_with() -> None:
+    detector = MotionDetector(6.0)
+    detector.find(scene(0, None)[0])
+    found = [bool(detector.find(scene(n, 60)[0]).any()) for n in range(2, int(SETTLED_S * HZ) + 5)]
+    assert found[: int(SETTLED_S * HZ) - 2] == [True] * (int(SETTLED_S * HZ) - 2) and not any(found[-3:])
+    detector.find(scene(100, None)[0])
+    detector.clear()
+    assert not detector.find(scene(103, 60)[0]).any()
+
+
+def test_a_pose_that_jumps_is_no_motion() -> None:
+    detector = MotionDetector(6.0)
+    detector.find(scene(0, None)[0])
+    frame, _ = scene(3, None)
+    assert frame.depth_m is not None
+    assert not detector.find(replace(frame, depth_m=frame.depth_m - 1)).any()
+
+
+def pipeline(**moving: bool) -> MappingPipeline:
+    config = tiny_config(moving=moving, history={"max_frames": 50}, voxel_map=VOXELS)
+    return MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS)
+
+
+VOXELS = {"voxel_size_m": 0.05, "initial_blocks": 200, "clear_free_space": False}
+
+
+def wall_of(p: MappingPipeline) -> int:
+    """Surface points of the passer-by in the map."""
+    return int((np.abs(p.voxel_map.points().xyz[:, 2] - THING_M) < 0.2).sum())
+
+
+def test_a_passer_by_is_no_wall_neither_when_the_map_is_built_again() -> None:
+    on, off = pipeline(motion=True), pipeline()
+    for number in range(12):
+        frame, _ = scene(number, None if number < 3 else -30 + 15 * number, shift_m=0.03 * number)
+        update, plain = on.step(frame), off.step(frame)
+        assert plain.moving is None and update.moving is not None and frame.depth_m is not None
+        assert not update.depth_m[update.moving].any() and update.depth_m[~update.moving].all()
+    assert abs(np.median(on.moving_space.points[:, 2]) - THING_M) < 0.1 and not len(off.moving_space.points)
+    assert wall_of(on) < 0.05 * wall_of(off) and on.moving_pixels > 10_000 and off.moving_pixels == 0
+    before = on.voxel_map.block_state()
+    on.correct_poses({11 * 10**9 // HZ: on.corrector.place(scene(11, None, shift_m=0.33)[0]).T_world_camera})
+    while not on.advance_correction(4):
+        pass
+    after = on.voxel_map.block_state()
+    assert all(np.array_equal(before[name], after[name]) for name in before)
+
+
+def test_what_is_left_out_is_no_free_space_for_a_sensor_whose_missing_depth_is() -> None:
+    cleared: list[int] = []
+    for left_out in (0.0, float(BEYOND_M)):
+        config = tiny_config(
+            moving={"motion": True}, voxel_map=VOXELS | {"no_return_range_m": 5.0, "clear_free_space": True}
+        )
+        p = MappingPipeline(config, StreamingSRay(tiny_field(), config.sampling), ROOMS)
+        for number in range(12):
+            frame, thing = scene(number, None)
+            assert frame.depth_m is not None
+            thing[30:90, 60:100] = number > 5
+            p.step(replace(frame, depth_m=np.where(thing, np.float32(left_out), frame.depth_m)))
+        cleared.append(p.voxel_map.cleared)
+    assert cleared[0] > 100 and cleared[1] == 0
+
+
+def test_where_it_moved_is_kept_for_a_second() -> None:
+    space = MovingSpace()
+    for number in range(2 * HZ):
+        frame, thing = scene(number, 60 if number < 3 else None)
+        space.add(frame, thing)
+        assert bool(len(space.points)) == (number <= 2 + HZ)
+    frame, thing = scene(50, 60)
+    space.add(frame, thing)
+    x = space.points[:, 0]
+    assert np.abs(space.points[:, 2] - THING_M).max() < 0.2 and -0.3 < x.min() < x.max() < 0.2
+    space.add(scene(1, None)[0], np.zeros_like(thing))  # stamps that go back begin anew
+    assert not len(space.points)
+
+
+def test_classes_that_move_by_themselves_have_names() -> None:
+    assert [NYU40.names[NYU40.ids.index(i)] for i in NYU40.moving_ids()] == ["person"]
+    assert [CARLA.names[CARLA.ids.index(i)] for i in CARLA.moving_ids()] == ["pedestrian"] and not ROOMS.moving_ids()
+
+
+def test_pixels_of_a_class_that_moves_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = [scene(number, 60, shift_m=0.03 * number)[0] for number in range(4)]
+    off = pipeline()
+    label = np.concatenate([off.step(f).label.ravel() for f in frames])
+    common = int(np.bincount(label[label != ROOMS.ignore_id]).argmax())
+    monkeypatch.setattr("semantic_mapper.labels.MOVING_NAMES", {ROOMS.names[ROOMS.ids.index(common)]})
+    on = pipeline(classes=True)
+    updates = [on.step(f) for f in frames]
+    moving = [u.moving for u in updates if u.moving is not None]
+    assert len(moving) == 4 and sum(int(m.sum()) for m in moving) == on.moving_pixels > 0
+    assert all(np.array_equal(m, u.depth_m == 0) for m, u in zip(moving, updates, strict=True))
+    assert len(on.voxel_map.points().xyz) < 0.8 * len(off.voxel_map.points().xyz)
