@@ -50,6 +50,7 @@ from semantic_mapper.types import (
 
 FIRST = 15  # frames before answers count: the map has to see free space first
 NEAR_M, APART_M = 0.05, 0.06  # a ghost is this near to where a thing was, and this far from all that stays
+HIDDEN = 0.1  # fraction of the pictures of a log that the one who walks hides
 CELL_M, STRIDE = 0.02, 3  # of the true surfaces: a point a cell, of every third pixel
 LEAST_DEPTH_M = 0.1
 ROOM, PATH = RoomConfig(min_side_m=4.5, max_side_m=7.0), CameraPathConfig(step_m=0.03)
@@ -304,14 +305,12 @@ def log_stretch(path: Path, start: int, count: int) -> Stretch:
     assert own is not None, "the log has no labels"
     labels = own if PERSON in own.names else own.with_names((PERSON,))
     up = camera_up(np.stack([f.T_world_camera for f in frames]))
-    person = place_thing(
-        frames[len(frames) // 2], up, (0.2, 0.2, 0.85), is_round=True
-    )  # crosses the view in the middle
+    places = [place_thing(frame, up, (0.2, 0.2, 0.85), is_round=True) for frame in frames[::10]]
+    person = min(places, key=lambda place: abs(_hidden(frames, place) - HIDDEN))
 
     def moving() -> Iterator[Seen]:
         for frame in frames:
-            seconds = (frame.stamp_ns - frames[len(frames) // 2].stamp_ns) / 1e9
-            there = with_thing(frame, _walked(person, seconds), labels.id_of(PERSON))
+            there = with_thing(frame, _walked(person, frame.stamp_ns), labels.id_of(PERSON))
             assert there.depth_m is not None
             hides = there.depth_m != frame.depth_m
             yield Seen(there, there.depth_m, hides.astype(np.uint8), hides)
@@ -326,12 +325,19 @@ def log_stretch(path: Path, start: int, count: int) -> Stretch:
     return Stretch(f"{path.stem} from {start}", labels, [PERSON], stays, moving(), still())
 
 
-def _walked(person: Thing, seconds: float, reach_m: float = 1.5) -> Thing:
+def _walked(person: Thing, stamp_ns: int, reach_m: float = 1.5) -> Thing:
     """Where a thing is that walks at 1 m/s along its own x axis, ``reach_m`` to either side."""
-    along = abs((seconds + reach_m) % (4 * reach_m) - 2 * reach_m) - reach_m
+    along = abs((stamp_ns / 1e9) % (4 * reach_m) - 2 * reach_m) - reach_m
     T = person.T_thing_world.copy()
     T[0, 3] -= along
     return person._replace(T_thing_world=T)
+
+
+def _hidden(frames: Sequence[PosedFrame], person: Thing) -> float:
+    """Fraction of the pictures that a walking thing hides."""
+    some = frames[::10]
+    there = [with_thing(frame, _walked(person, frame.stamp_ns), 0) for frame in some]
+    return float(np.mean([a.depth_m != b.depth_m for a, b in zip(there, some, strict=True)]))
 
 
 def draw(path: Path, runs: dict[str, Run], static: Surface) -> None:
