@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,12 +25,12 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from benchmarks.ghosts import Thing, place_thing, with_thing
+from benchmarks.ghosts import Thing, place_thing, sees_through, with_thing
 from semantic_mapper.config import MapperConfig, convert_config
 from semantic_mapper.evaluation.splat import draw_points, from_above
 from semantic_mapper.evaluation.upright import camera_up, upright_rotation
 from semantic_mapper.fields.base import EncodedViews
-from semantic_mapper.geometry import scale_intrinsics, transform, unproject
+from semantic_mapper.geometry import transform, unproject
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.pipeline import MappingPipeline
 from semantic_mapper.plots import write_picture
@@ -50,6 +51,7 @@ from semantic_mapper.types import (
 
 FIRST = 15  # frames before answers count: the map has to see free space first
 NEAR_M, APART_M = 0.05, 0.06  # a ghost is this near to where a thing was, and this far from all that stays
+BEFORE, EVERY = 45, 3  # "seen free" is what one of so many frames before, of every third, looked through
 HIDDEN = 0.1  # fraction of the pictures of a log that the one who walks hides
 CELL_M, STRIDE = 0.02, 3  # of the true surfaces: a point a cell, of every third pixel
 LEAST_DEPTH_M = 0.1
@@ -143,11 +145,12 @@ class Run:
         self.cpu_s: list[float] = []
         self.hit = self.false = self.missed = self.measured = 0
         self.on_still = 0  # false pixels on what never moves
+        self.seen_free = np.zeros(2, int)  # of moving pixels, every third: those seen free before, of these found
         self.found = np.zeros((len(stretch.things) + 1, 2), int)  # of each thing: moving pixels, of these found
         self.shown: tuple[int, Seen, Bool] | None = None  # the frame with most pixels that move
 
-    def step(self, seen: Seen, number: int) -> None:
-        """Map a frame and count."""
+    def step(self, seen: Seen, number: int, free_before: Bool) -> None:
+        """Map a frame and count; ``free_before`` from ``was_free``."""
         frame = seen.frame
         depth_m = frame.depth_m
         assert depth_m is not None
@@ -168,6 +171,8 @@ class Run:
         self.missed += int((truth & ~answer).sum())
         self.measured += int(measured.sum())
         self.on_still += int((answer & (seen.thing == 0)).sum())
+        free = free_before & truth[::STRIDE, ::STRIDE]
+        self.seen_free += (free.sum(), (free & answer[::STRIDE, ::STRIDE]).sum())
         for column, pixels in enumerate((truth, truth & answer)):
             self.found[:, column] += np.bincount(seen.thing[pixels], minlength=len(self.found))
         if self.shown is None or truth.sum() > self.shown[0]:
@@ -178,6 +183,27 @@ class Run:
         return self.pipeline.voxel_map.points().xyz.astype(np.float64)
 
 
+def cloud(seen: Seen) -> Float64:
+    """(h, w, 3) points in the world of every third pixel, by exact depth."""
+    k, depth = seen.frame.intrinsics, seen.depth_m[::STRIDE, ::STRIDE]
+    h, w = depth.shape
+    coarse = CameraIntrinsics(k.fx / STRIDE, k.fy / STRIDE, k.cx / STRIDE, k.cy / STRIDE, w, h)
+    return transform(seen.frame.T_world_camera, unproject(depth, coarse).reshape(-1, 3)).reshape(h, w, 3)
+
+
+def was_free(seen: Seen, before: Sequence[Seen]) -> Bool:
+    """(h, w), of every third pixel, whether it moves now and a frame before looked through where it is.
+
+    Depth alone tells no more than these from what stands.
+    """
+    free = seen.moving[::STRIDE, ::STRIDE] & False
+    now = np.nonzero(seen.moving[::STRIDE, ::STRIDE])
+    xyz = cloud(seen)[now]
+    for other in before:
+        free[now] |= sees_through(replace(other.frame, depth_m=other.depth_m), xyz)
+    return free
+
+
 class Surface:
     """Points of a surface, one a cell."""
 
@@ -186,15 +212,7 @@ class Surface:
 
     def add(self, seen: Seen, pixels: Bool) -> None:
         """The pixels (H, W) of a frame."""
-        k = seen.frame.intrinsics
-        depth = np.where(pixels, seen.depth_m, 0)[::STRIDE, ::STRIDE]
-        # Every third pixel is that of a camera whose focal length and centre are a third.
-        coarse = replace(
-            scale_intrinsics(k, depth.shape[1], depth.shape[0]),
-            fx=k.fx / STRIDE, fy=k.fy / STRIDE, cx=k.cx / STRIDE, cy=k.cy / STRIDE,
-        )  # fmt: skip
-        near = (depth > LEAST_DEPTH_M).ravel()
-        xyz = transform(seen.frame.T_world_camera, unproject(depth, coarse).reshape(-1, 3)[near])
+        xyz = cloud(seen)[(pixels & (seen.depth_m > LEAST_DEPTH_M))[::STRIDE, ::STRIDE]]
         cells = np.rint(xyz / CELL_M).astype(np.int64) + (1 << 20)
         keys = (cells[:, 0] << 42) + (cells[:, 1] << 21) + cells[:, 2]
         self._cells.update(zip(keys.tolist(), xyz, strict=True))
@@ -210,10 +228,14 @@ def map_stretch(stretch: Stretch, modes: Sequence[str]) -> tuple[dict[str, dict[
     """Figures by mode, the runs with things that move, and the surfaces that stay."""
     runs, bare = ({mode: Run(mode, stretch) for mode in modes} for _ in range(2))
     things, static = [Surface() for _ in stretch.things], Surface()
+    before: deque[Seen] = deque(maxlen=BEFORE // EVERY)
     for number, (seen, still) in enumerate(zip(stretch.moving, stretch.still, strict=True)):
+        free = was_free(seen, before)
+        if number % EVERY == 0:
+            before.append(seen)
         for mode in modes if number % 2 else reversed(modes):
-            runs[mode].step(seen, number)
-            bare[mode].step(still, number)
+            runs[mode].step(seen, number, free)
+            bare[mode].step(still, number, free & False)
         static.add(still, still.depth_m > 0)
         for index, surface in enumerate(things):
             surface.add(seen, seen.thing == index + 1)
@@ -235,6 +257,7 @@ def map_stretch(stretch: Stretch, modes: Sequence[str]) -> tuple[dict[str, dict[
             found[name] = [a + int(b) for a, b in zip(found[name], counts, strict=True)]
         figures[mode] = {
             "hit": run.hit, "false": run.false, "missed": run.missed, "false_on_what_never_moves": run.on_still,
+            "seen_free": int(run.seen_free[0]), "seen_free_found": int(run.seen_free[1]),
             "measured": run.measured, "found": found, "ghosts": ghosts, "points": len(xyz),
             "still_room_false": alone.hit + alone.false, "still_room_measured": alone.measured,
             "still_room_points": len(kept), "still_room_lost": _lost(kept, alone.xyz(), reach),
@@ -260,6 +283,8 @@ def total(stretches: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict[str,
             "iou": n["hit"] / max(n["hit"] + n["false"] + n["missed"], 1),
             "precision": n["hit"] / max(n["hit"] + n["false"], 1),
             "recall": {name: float(got / max(there, 1)) for name, (there, got) in found.items()},
+            "recall_of_seen_free": n["seen_free_found"] / max(n["seen_free"], 1),
+            "seen_free_fraction": n["seen_free"] * STRIDE**2 / max(n["hit"] + n["missed"], 1),
             "moving_fraction": (n["hit"] + n["missed"]) / max(n["measured"], 1),
             "false_on_what_never_moves": n["false_on_what_never_moves"] / max(n["measured"], 1),
             "false_in_still_room": n["still_room_false"] / max(n["still_room_measured"], 1),
