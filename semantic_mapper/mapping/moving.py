@@ -7,7 +7,8 @@ has come there. So a thing that stays becomes part of the map after this time, w
 A cell of ``CELLS`` across the image has the nearest depth of its pixels. It contradicts a view where all that the view
 measured around the point lies behind it by more than ``MARGIN_M + MARGIN_PER_M * z``: so thin things, depth edges and
 poses that are a little off say nothing. Fewer than ``LEAST_CELLS`` such cells side by side are noise. What moves then
-grows, cell by cell, along its own surface into cells of which no view knows anything, such as its inside, which it hid.
+grows, cell by cell, along its own surface into cells where no view of ``SURE_S`` ago or older saw a surface: as its inside,
+which it hid itself.
 
 Not found: what moves away along the line of sight (it hid the space where it is now), what had moved before it was seen
 for the first time, and what is slower than the margin in ``SETTLED_S``. Such surface is cleared when frames see through
@@ -29,6 +30,7 @@ from semantic_mapper.types import Bool, Float32, Float64, PosedFrame
 BEYOND_M = np.float32(1e4)  # depth of what is left out, where no depth would mean free space
 CELLS = 80  # across the longer side of the image
 EVERY_S, SETTLED_S = 0.2, 3.0  # between two views that are kept; how long they are
+SURE_S = 0.8  # a surface that a view of so long ago saw at the same place does not move
 MOST_VIEWS = 48  # of all cameras together
 MARGIN_M, MARGIN_PER_M = 0.1, 0.03
 LEAST_CELLS = 4
@@ -157,7 +159,7 @@ def _view(frame: PosedFrame, cells: _Cells) -> _View:
 
 
 def _seen_before(frame: PosedFrame, cells: _Cells, views: list[_View]) -> tuple[Bool, Bool]:
-    """Cells (h, w) where a view saw free space, and where one saw a surface."""
+    """Cells (h, w) where a view saw free space, and where one of some time ago saw a surface."""
     v, u = np.nonzero(cells.near)
     z = cells.near[v, u]
     focal, centre = _intrinsics(frame, cells.size)
@@ -175,7 +177,8 @@ def _seen_before(frame: PosedFrame, cells: _Cells, views: list[_View]) -> tuple[
         yi, xi, depth = y[at].astype(np.int64), x[at].astype(np.int64), p[at, 2]
         margin = MARGIN_M + MARGIN_PER_M * depth
         free[at] |= view.around[yi, xi] > depth + margin
-        seen[at] |= np.abs(view.near[yi, xi] - depth) <= margin
+        if frame.stamp_ns - view.stamp_ns >= SURE_S * _SECOND:
+            seen[at] |= np.abs(view.near[yi, xi] - depth) <= margin
     images = np.zeros((2, *cells.near.shape), np.bool_)
     images[0, v, u], images[1, v, u] = free, seen
     return images[0], images[1]

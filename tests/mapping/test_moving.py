@@ -83,7 +83,7 @@ def wall_of(p: MappingPipeline) -> int:
 
 
 def test_a_passer_by_is_no_wall_neither_when_the_map_is_built_again() -> None:
-    on, off = pipeline(motion=True), pipeline()
+    on, off = pipeline(motion=True), pipeline(motion=False)
     for number in range(12):
         frame, _ = scene(number, None if number < 3 else -30 + 15 * number, shift_m=0.03 * number)
         update, plain = on.step(frame), off.step(frame)
@@ -136,11 +136,11 @@ def test_classes_that_move_by_themselves_have_names() -> None:
 
 def test_pixels_of_a_class_that_moves_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [scene(number, 60, shift_m=0.03 * number)[0] for number in range(4)]
-    off = pipeline()
+    off = pipeline(motion=False)
     label = np.concatenate([off.step(f).label.ravel() for f in frames])
     common = int(np.bincount(label[label != ROOMS.ignore_id]).argmax())
     monkeypatch.setattr("semantic_mapper.labels.MOVING_NAMES", {ROOMS.names[ROOMS.ids.index(common)]})
-    on = pipeline(classes=True)
+    on = pipeline(classes=True, motion=False)
     updates = [on.step(f) for f in frames]
     moving = [u.moving for u in updates if u.moving is not None]
     assert len(moving) == 4 and sum(int(m.sum()) for m in moving) == on.moving_pixels > 0
