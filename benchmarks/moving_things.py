@@ -282,7 +282,7 @@ def total(stretches: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict[str,
         result[mode] = {
             "iou": n["hit"] / max(n["hit"] + n["false"] + n["missed"], 1),
             "precision": n["hit"] / max(n["hit"] + n["false"], 1),
-            "recall": {name: float(got / max(there, 1)) for name, (there, got) in found.items()},
+            "recall": {name: float(got / there) if there else None for name, (there, got) in found.items()},
             "recall_of_seen_free": n["seen_free_found"] / max(n["seen_free"], 1),
             "seen_free_fraction": n["seen_free"] * STRIDE**2 / max(n["hit"] + n["missed"], 1),
             "moving_fraction": (n["hit"] + n["missed"]) / max(n["measured"], 1),
