@@ -47,6 +47,7 @@ from semantic_mapper.transport.messages import StreamInfo
 from semantic_mapper.types import Float32, MapUpdate, PosedFrame, UInt8
 
 RENDERED_SPREAD = 0.05  # one sigma of depth that a field of the scene renders, as a fraction of depth; assumed
+SCENE_RAYS = 36_000  # rendered at least for a frame by a field of the scene, or all: small images have no sharper views
 DEPTH_STEPS_PER_M = 1000.0  # computed depth and its spread are rounded to millimetres, which pack to a fifth
 
 _log = get_logger(__name__)
@@ -126,7 +127,7 @@ def autolabel(
     with open_log(request.logs) as log, ExitStack() as stack:
         readers = log.logs if isinstance(log, LogSequence) else [log]
         _check_place(request, readers)
-        bundle = _load(request)
+        bundle = _load(request, log)
         label_set = log.info.label_set
         if bundle.checkpoint.model.knows_classes:
             label_set = _label_set(log, bundle.label_set, request)
@@ -190,8 +191,8 @@ def _check_place(request: AutolabelRequest, readers: list[LogReader]) -> None:
         raise LogError(f"{there[0]}: exists already; remove it or choose another name")
 
 
-def _load(request: AutolabelRequest) -> Mapper:
-    """Weights and the pipeline that renders them.
+def _load(request: AutolabelRequest, log: Log) -> Mapper:
+    """Weights and the pipeline that renders them, of a field of the scene at least ``SCENE_RAYS`` of a frame.
 
     Raises:
         WeightsError: missing, damaged, or they tell no classes apart.
@@ -214,10 +215,16 @@ def _load(request: AutolabelRequest) -> Mapper:
             f"{bundle.weights_path}: a field of kind '{model.kind}' has no boxes, so that it tells no things apart; "
             "--instances goes with weights of `finetune --kind panoptic`"
         )
-    if request.depth and model.holds_scene and request.config.depth.source == "auto":
-        depth = msgspec.structs.replace(request.config.depth, source="sensor")  # else the field renders
-        bundle = Mapper.load(request.weights, msgspec.structs.replace(request.config, depth=depth))
-    return bundle
+    if not model.holds_scene:
+        return bundle
+    config = request.config
+    if request.depth and config.depth.source == "auto":
+        depth = msgspec.structs.replace(config.depth, source="sensor")  # else the field renders
+        config = msgspec.structs.replace(config, depth=depth)
+    pixels = min(k.width * k.height for k in log.info.cameras.values())
+    scale = max(config.render.scale, min(1.0, (SCENE_RAYS / pixels) ** 0.5))
+    render = msgspec.structs.replace(config.render, scale=scale)
+    return Mapper.load(request.weights, msgspec.structs.replace(config, render=render))
 
 
 def _label_set(log: Log, weights: LabelSet, request: AutolabelRequest) -> LabelSet:

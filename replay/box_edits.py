@@ -77,10 +77,13 @@ class BoxEditor:
         self._set((*self.boxes.primitives, replace(box, id=new)))
         return new
 
-    def add_time(self, box_id: int, at_ns: int) -> None:
+    def add_time(self, box_id: int, at_ns: int) -> int:
         """Say that a box was there at another time, with the pose of the time nearest to it.
 
         One that stood still is known at that time alone from then on.
+
+        Returns:
+            Its times now.
         """
         box = self._find(box_id)
         self._refuse_frames(box)
@@ -90,6 +93,7 @@ class BoxEditor:
         pose = min(known, key=lambda entry: abs(entry[0] - at_ns))[1] if known else box.T_world_box
         stamps = tuple(sorted((*known, (at_ns, pose)), key=lambda entry: entry[0]))
         self._change(box_id, lambda box: replace(box, stamps=stamps, T_world_box=stamps[0][1]))
+        return len(stamps)
 
     def _moved(self, box: Primitive, move: Callable[[Float64], Float64], at_ns: int | None) -> Primitive:
         if at_ns is None:

@@ -127,7 +127,7 @@ def _draw(
     put_title(figure, title, f"{counted(len(boxes), 'box', 'boxes')}; each with its id")
     for column, ((at, frame), height) in enumerate(zip(shown, heights, strict=True)):
         box = (MARGIN + column * (TILE_WIDTH + GAP), HEADER + CAPTION, TILE_WIDTH, height)
-        axes = put_picture(figure, box, frame.rgb, f"frame {at.number}", smooth=True)
+        axes = put_picture(figure, box, frame.rgb, f"frame {at.number}, {frame.stamp_ns} ns", smooth=True)
         for primitive in boxes:
             if (pose := primitive.pose_at(at.stamp_ns)) is not None:
                 _put_edges(axes, replace(primitive, T_world_box=pose), at, colors[primitive.class_name])

@@ -129,8 +129,8 @@ def with_classes(boxes: BoxFile, label_set: LabelSet, path: Path) -> tuple[BoxFi
     """Boxes that a field can be fitted with, and the label set of the field.
 
     That is the one of the pseudo labels, and those classes of boxes that it lacks, but that a class of it may stand for
-    as ``merge`` says. XML of KITTI-360 has no ``merge``: there ``kitti360_boxes.MERGE`` says so, and boxes of any other
-    class that the label set lacks are left out, with a warning.
+    as ``merge`` says, or else ``kitti360_boxes.MERGE``. Boxes of XML of KITTI-360 of any other class that it lacks are
+    left out, with a warning.
 
     Args:
         boxes: Of a file.
@@ -138,12 +138,14 @@ def with_classes(boxes: BoxFile, label_set: LabelSet, path: Path) -> tuple[BoxFi
         path: Of the file, for errors.
 
     Raises:
-        ConfigError: the label set lacks a class, with the file, the id of the box, and the nearest name.
+        ConfigError: the label set lacks a class, with the file, the id of the box, and the nearest name; or, of XML,
+            the classes of most boxes.
     """
-    if boxes.is_xml:
-        boxes = _merged_kitti360(boxes, label_set, path)
-    boxed = dict.fromkeys(p.class_name for p in boxes.primitives)
+    boxes = _merged(boxes, label_set)
     merged = {name for others in boxes.merge.values() for name in others}
+    if boxes.is_xml:
+        boxes = _of_known_classes(boxes, merged.union(label_set.names), label_set, path)
+    boxed = dict.fromkeys(p.class_name for p in boxes.primitives)
     known = label_set.with_names([name for name in boxed if name in merged and name not in label_set.names])
     named = [("merge", name, label_set) for name in boxes.merge]
     named += [("merge", name, known) for others in boxes.merge.values() for name in others]
@@ -156,28 +158,36 @@ def with_classes(boxes: BoxFile, label_set: LabelSet, path: Path) -> tuple[BoxFi
     return boxes, known
 
 
-def _merged_kitti360(boxes: BoxFile, label_set: LabelSet, path: Path) -> BoxFile:
-    """Boxes of XML of classes that labels have, or take for others, and what they take them for.
+def _merged(boxes: BoxFile, label_set: LabelSet) -> BoxFile:
+    """Boxes whose ``merge`` also has what ``MERGE`` says of their classes that neither it nor the label set has."""
+    named = {*label_set.names, *(name for others in boxes.merge.values() for name in others)}
+    lacking = {p.class_name for p in boxes.primitives} - named
+    merge = dict(boxes.merge)
+    for name, others in MERGE.items():
+        if name in label_set.names and (found := tuple(o for o in others if o in lacking)):
+            merge[name] = (*merge.get(name, ()), *found)
+    return replace(boxes, merge=merge)
+
+
+def _of_known_classes(boxes: BoxFile, known: Collection[str], label_set: LabelSet, path: Path) -> BoxFile:
+    """Boxes of XML of classes that are known; the others are counted.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: these are more.
     """
-    boxed = {p.class_name for p in boxes.primitives}
-    merge = {
-        name: found
-        for name, others in MERGE.items()
-        if name in label_set.names and (found := tuple(o for o in others if o in boxed - set(label_set.names)))
-    }
-    known = {*label_set.names, *(name for others in merge.values() for name in others)}
     kept = tuple(p for p in boxes.primitives if p.class_name in known)
-    if lacking := sorted(boxed - known):
-        names = f"label set '{label_set.name}' has no class {', '.join(lacking)}"
-        if not kept:
-            raise ConfigError(f"{path}: {names}; it has {', '.join(label_set.names)}")
-        count = len(boxes.primitives) - len(kept)
-        _log.warning("boxes_left_out", file=str(path), count=count, reason=names)
-        boxes = replace(boxes, left_out=boxes.left_out + count)
-    return replace(boxes, primitives=kept, merge=merge)
+    count = len(boxes.primitives) - len(kept)
+    if not count:
+        return boxes
+    lacking = sorted({p.class_name for p in boxes.primitives} - set(known))
+    reason = f"label set '{label_set.name}' has no class {', '.join(lacking)}"
+    if count > len(kept):
+        raise ConfigError(
+            f"{path}: {reason}, of which {count} of {len(boxes.primitives)} boxes are; it has "
+            f"{', '.join(label_set.names)}"
+        )
+    _log.warning("boxes_left_out", file=str(path), count=count, reason=reason)
+    return replace(boxes, primitives=kept, left_out=boxes.left_out + count)
 
 
 def _read(path: Path) -> bytes:

@@ -40,7 +40,7 @@ MERGE = {
     "car": ("caravan", "trailer"),
 }
 _NAMES = {name.replace(" ", ""): name for name in LABELS.names}
-_NAMES |= {"driveway": "parking", "ground": "terrain", "bigpole": "pole"}
+_NAMES |= {"driveway": "parking", "ground": "terrain", "bigpole": "pole", "pedestrian": "person"}
 
 
 def read_kitti360(text: bytes, path: Path) -> BoxFile:

@@ -183,12 +183,15 @@ def _edit(editor: BoxEditor, action: Action, words: list[str], at_ns: int | None
     box_id = _whole(words[0])
     if action is Action.RECLASS:
         editor.reclass(box_id, words[1])
-        return f"box {box_id} is of class {words[1]}"
+        alone = sum(box.class_name == words[1] for box in editor.boxes.primitives) == 1
+        return f"box {box_id} is of class {words[1]}" + (", as no other box of the file" if alone else "")
     if action is Action.DUPLICATE:
         if at_ns is None:
             return f"box {editor.duplicate(box_id)} is a copy of box {box_id}"
-        editor.add_time(box_id, at_ns)
-        return f"box {box_id} is also there at {at_ns} ns"
+        times = editor.add_time(box_id, at_ns)
+        return f"box {box_id} is there at {at_ns} ns, " + (
+            f"one of {times} times" if times > 1 else "and moves from now on"
+        )
     numbers = np.array([_number(word) for word in words[1:]])
     if action is Action.MOVE:
         editor.move(box_id, numbers, at_ns)

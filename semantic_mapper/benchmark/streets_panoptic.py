@@ -46,6 +46,7 @@ _BEHIND_M, _AHEAD_M, _ASIDE_M, _LOW_M, _HIGH_M = 2.0, 60.0, 20.0, -0.6, 11.0  # 
 _AT_ONCE = 4096  # rays of a picture
 
 STILL = "panoptic-still"  # boxes that move are left out, as if nothing moved; where cars drive
+ALLOWED = "panoptic-allowed"  # the fit of "panoptic"; only classes that boxes allow are rendered
 UNIFORM = "panoptic-uniform"  # samples evenly along rays
 GRID_LABELS = "grid-labels"  # no boxes: the predicted labels alone teach, as in Semantic-NeRF
 
@@ -64,17 +65,18 @@ LEFT_OUT: dict[str, dict[str, Any]] = {
 def panoptic_arms(folder: Path, *, moving: bool = False) -> dict[str, Arm]:
     """Arms by name, some of them only where cars drive (``moving``); fits are kept in ``folder``."""
 
-    def arm(name: str, classes: str) -> Arm:
+    def arm(name: str, classes: str = "learned", *, allowed: bool = False) -> Arm:
         def run(config: StreetsConfig, seed: int) -> ViewScores:
             street = drive(config, seed)
             field = street_field(config, street, name, folder)
             field.shape = msgspec.structs.replace(field.shape, classes=classes)
-            return score_street(config, street, lambda frame: render_answer(field, frame))
+            return score_street(config, street, lambda frame: render_answer(field, frame, allowed=allowed))
 
         return run
 
     names = [name for name in LEFT_OUT if moving or name != STILL]
-    return {name: arm(name, "learned") for name in names} | {"panoptic-fixed": arm("panoptic", "fixed")}
+    rendered = {"panoptic-fixed": arm("panoptic", "fixed"), ALLOWED: arm("panoptic", allowed=True)}
+    return {name: arm(name) for name in names} | rendered
 
 
 def fit_settings(config: StreetsConfig, street: Drive, name: str) -> FinetuneConfig:
@@ -122,8 +124,12 @@ def street_field(config: StreetsConfig, street: Drive, name: str, folder: Path) 
     return _of(load_checkpoint(path))
 
 
-def render_answer(field: Panoptic, frame: PosedFrame) -> Answer:
-    """Classes, things and depth of a frame; only its camera is looked at."""
+def render_answer(field: Panoptic, frame: PosedFrame, *, allowed: bool = False) -> Answer:
+    """Classes, things and depth of a frame; only its camera is looked at.
+
+    Classes are those of the learned field, as in the paper; ``allowed``: of those that boxes allow at each point, as
+    ``Panoptic.classify`` answers where depth was not measured.
+    """
     k, pose = frame.intrinsics, torch.from_numpy(frame.T_world_camera).float()
     found: list[tuple[np.ndarray[Any, Any], ...]] = []
     with torch.inference_mode():
@@ -132,6 +138,7 @@ def render_answer(field: Panoptic, frame: PosedFrame) -> Answer:
             samples = field.march(rays)
             boxes = field.boxes_on(samples)
             points = boxes.fixed if field.shape.classes == "fixed" else field.learned(samples)
+            points = boxes.allowed_of(points) if allowed else points
             points = field.of_movers(samples, points)
             channel = field.composited(samples, points, boxes).argmax(1)
             depth = (ray_share(samples) * samples.z).sum(1) / samples.opacity.clamp_min(1e-6)

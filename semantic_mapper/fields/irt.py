@@ -150,11 +150,12 @@ def surface(samples: RaySamples) -> torch.Tensor:
 
 
 def at_measured(samples: RaySamples, box: GridConfig) -> RaySamples:
-    """Rays whose depth was measured, inside the box, end there.
+    """Rays whose depth was measured, inside the box, end there; depth that was filled in from other pixels ends none.
 
     Samples elsewhere fade, and one more at that depth takes the rest.
     """
-    prior = samples.rays.prior_depth_m
+    rays = samples.rays
+    prior = rays.prior_depth_m if rays.measured is None else rays.prior_depth_m * rays.measured
     xyz = samples.rays.origin + prior[:, None] * samples.rays.direction
     point = (xyz - xyz.new_tensor(box.origin_m)) / box.voxel_m
     measured = (prior > 0) & ((point >= 0) & (point <= point.new_tensor(box.shape) - 1)).all(1)
