@@ -156,7 +156,7 @@ class GraphTracker:
             xyz, label, level = _surface(snapshot, R_grid_world)
             heights = find_floors(xyz[level, 2], snapshot.voxel_size_m)
             floors = list[_Level]()
-            for height, above in zip(heights, (*heights[1:], np.inf), strict=True):
+            for height, above in zip(heights, [*heights, np.inf][1:], strict=True):
                 within = (xyz[:, 2] >= height + LOW_M[0]) & (xyz[:, 2] < min(above + LOW_M[0], height + HIGH_M))
                 first, seen, wall = _plan(xyz[within], label[within], height, cell_m, snapshot.label_set)
                 found = part_rooms(seen, wall, cell_m)
