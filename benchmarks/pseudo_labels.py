@@ -40,7 +40,10 @@ def main() -> None:
         confusion, known, total = ConfusionMatrix(labels), 0, 0
         drawn: list[tuple[PosedFrame, UInt8]] = []
         for frame in new:
-            given_frame = source.frame(by_frame[frame.camera_id, frame.stamp_ns])
+            number = by_frame.get((frame.camera_id, frame.stamp_ns))
+            if number is None:
+                continue
+            given_frame = source.frame(number)
             if not frame.label_is_pseudo or frame.label is None or given_frame.label is None:
                 continue
             drawn.append((frame, given_frame.label))

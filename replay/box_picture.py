@@ -44,6 +44,8 @@ DEPTH_FRAMES = 16  # that the view from above shows surface of
 NEAR_M = 0.05  # edges are cut off nearer than this
 MARGIN, GAP, HEADER, CAPTION = 24, 14, 84, 26
 TILE_WIDTH, PLAN_HEIGHT, LEGEND_WIDTH = 512, 760, 200
+BESIDE_M = 25.0  # the view from above ends this far from the camera's path
+ID_PX = (24.0, 13.0)  # around the middle of an id, without another
 POINTS_WIDTH = 160  # of the depth images that the view from above is made of
 _EDGES = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]  # of ``Primitive.corners``
 _FOOTPRINT_FILL = 0.15
@@ -124,13 +126,15 @@ def _draw(
     width = SHOWN * (TILE_WIDTH + GAP) - GAP
     top = HEADER + CAPTION + max(heights) + GAP + CAPTION
     figure = new_figure(width + 2 * MARGIN, top + PLAN_HEIGHT + MARGIN)
-    put_title(figure, title, f"{counted(len(boxes), 'box', 'boxes')}; each with its id")
+    put_title(figure, title, f"{counted(len(boxes), 'box', 'boxes')}; ids where there is room for them")
     for column, ((at, frame), height) in enumerate(zip(shown, heights, strict=True)):
         box = (MARGIN + column * (TILE_WIDTH + GAP), HEADER + CAPTION, TILE_WIDTH, height)
         axes = put_picture(figure, box, frame.rgb, f"frame {at.number}, {frame.stamp_ns} ns", smooth=True)
-        for primitive in boxes:
-            if (pose := primitive.pose_at(at.stamp_ns)) is not None:
-                _put_edges(axes, replace(primitive, T_world_box=pose), at, colors[primitive.class_name])
+        there = [replace(b, T_world_box=T) for b in boxes if (T := b.pose_at(at.stamp_ns)) is not None]
+        away = [float(np.linalg.norm(b.T_world_box[:3, 3] - at.T_world_camera[:3, 3])) for b in there]
+        taken: list[tuple[float, float]] = []
+        for n in np.argsort(away, kind="stable"):  # nearest first: ids further away give way
+            _put_edges(axes, there[n], at, colors[there[n].class_name], taken)
     plan_width = width - LEGEND_WIDTH - GAP
     _put_plan(figure, (MARGIN, top, plan_width, PLAN_HEIGHT), surface, np.stack(poses), boxes, colors)
     counts = {name: sum(box.class_name == name for box in boxes) for name in colors}
@@ -139,8 +143,8 @@ def _draw(
     return figure
 
 
-def _put_edges(axes: Axes, box: Primitive, at: _Place, color: Color) -> None:
-    """The edges of a box in the tile of a frame, and its id where its middle is in view."""
+def _put_edges(axes: Axes, box: Primitive, at: _Place, color: Color, taken: list[tuple[float, float]]) -> None:
+    """The edges of a box in the tile of a frame, and its id where its middle is in view and no other id is."""
     T_camera_world, k = invert_pose(at.T_world_camera), at.intrinsics
     scale = TILE_WIDTH / k.width
     for ends in edges_in_view(box, at.T_world_camera, k):
@@ -149,7 +153,7 @@ def _put_edges(axes: Axes, box: Primitive, at: _Place, color: Color) -> None:
     middle = transform(T_camera_world, box.T_world_box[:3, 3][None])
     if nearest_pixels(middle, k)[0][0]:
         x, y = (project(middle, k)[0] + 0.5) * scale
-        _put_id(axes, float(x), float(y), box.id)
+        _put_id(axes, float(x), float(y), box.id, taken)
 
 
 def edges_in_view(box: Primitive, T_world_camera: Float64, intrinsics: CameraIntrinsics) -> list[Float64]:
@@ -191,7 +195,8 @@ def _put_plan(
     moments = [(box, pose) for box in boxes for pose in _poses(box)]
     prints = [_footprint(replace(box, T_world_box=pose).corners() @ R.T) for box, pose in moments]
     every = np.concatenate([level[:, :2], path[:, :2], *prints])
-    low, high = every.min(axis=0), every.max(axis=0)
+    low = np.maximum(every.min(axis=0), path[:, :2].min(axis=0) - BESIDE_M)
+    high = np.minimum(every.max(axis=0), path[:, :2].max(axis=0) + BESIDE_M)
     _, _, w, h = place_at
     scale = 0.94 * min(w / max(high[0] - low[0], 1e-3), h / max(high[1] - low[1], 1e-3))
 
@@ -201,14 +206,16 @@ def _put_plan(
     axes = place(figure, place_at)
     put_text(axes, (0, -11), cut("from above: surface, the camera's path, and boxes", w, 11), color=DIM_TEXT)
     x, y = pixels(level).T
-    axes.scatter(x, y, c=rgb / 255, s=1.2, linewidths=0, rasterized=True)
+    axes.scatter(x, y, c=rgb / 255, s=1.2, linewidths=0, rasterized=True, clip_on=True)
     x, y = pixels(path).T
     axes.plot(x, y, color="white", linewidth=1, linestyle=":")
+    taken: list[tuple[float, float]] = []
     for (box, _), outline in zip(moments, prints, strict=True):
         x, y = pixels(outline).T
         color = _rgb(colors[box.class_name])
         axes.fill(x, y, facecolor=(*color, _FOOTPRINT_FILL), edgecolor=color, linestyle="-")
-        _put_id(axes, float(x.mean()), float(y.mean()), box.id)
+        if 0 < x.mean() < w and 0 < y.mean() < h:
+            _put_id(axes, float(x.mean()), float(y.mean()), box.id, taken)
     bar = 10.0 ** np.floor(np.log10(w / 3 / scale))
     axes.plot((16, 16 + bar * scale), (h - 18, h - 18), color="white", linewidth=3, solid_capstyle="butt")
     put_text(axes, (16, h - 34), f"{bar:g} m")
@@ -237,7 +244,11 @@ def _footprint(corners: Float64) -> Float64:
     return cv2.convexHull(corners[:, :2].astype(np.float32)).reshape(-1, 2).astype(np.float64)
 
 
-def _put_id(axes: Axes, x: float, y: float, box_id: int) -> None:
+def _put_id(axes: Axes, x: float, y: float, box_id: int, taken: list[tuple[float, float]]) -> None:
+    """An id, unless it would cover one that is there."""
+    if any(abs(x - a) < ID_PX[0] and abs(y - b) < ID_PX[1] for a, b in taken):
+        return
+    taken.append((x, y))
     behind = {"facecolor": "black", "alpha": 0.5, "linewidth": 0, "pad": 1}
     put_text(axes, (x, y), str(box_id), ha="center", fontsize=SMALL_PT, color=TEXT, bbox=behind, clip_on=True)
 

@@ -40,7 +40,7 @@ HOLES, LEAST_AROUND = 3, 5  # rounds in which cells are filled that have so many
 STEP_M, STEP_PER_M = 0.1, 0.02  # between neighbouring cells of one surface
 KEPT_S = 1.0  # what moves is in the way of planners for so long after it was seen
 STRIDE = 3  # pixels: 2 cm at 3 m, as voxels are
-_FULL = 0.9  # fraction of the pixels of a cell that are measured, for it to say that space is free
+_FULL = 0.5  # fraction of the pixels of a cell that are measured, for it to say that space is free
 _SECOND = 1_000_000_000
 
 

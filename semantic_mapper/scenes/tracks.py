@@ -178,10 +178,11 @@ def open_door(floor: Floor) -> tuple[Bool, Float64] | None:
     free no more. None where there is no such door, or the camera is in its way."""
     p, count = floor.scene.primitives, len(floor.poses)
     door = np.flatnonzero((p.label == ROOMS.id_of("door")) & (p.group > 1) & (p.shape == Shape.BOX))
-    inside = ((p.center > 0) & (p.center < np.array(floor.scene.size_m))).all(1)
-    for k in door[inside[door] & (p.half[door] > (0.35, 0.0, 0.9)).all(1) & (p.half[door, 1] < 0.04)]:
+    inside = np.all((p.center > 0) & (p.center < np.array(floor.scene.size_m)), axis=1)
+    for k in door[inside[door] & (p.half[door, 0] > 0.35) & (p.half[door, 1] < 0.04) & (p.half[door, 2] > 0.9)]:
         own = (p.center - p.center[k]) @ p.rotation[k]  # P 3: x along the leaf, y into the room
-        leaf = (p.group == p.group[k]) & (np.abs(own) < p.half[k] + (0.0, 0.2, 0.0)).all(1)
+        before = np.abs(own) < p.half[k] + np.array([0.0, 0.2, 0.0])
+        leaf = (p.group == p.group[k]) & before.all(axis=1)
         side = own[leaf, 0][np.abs(own[leaf, 0]).argmax()]  # of the handle
         hinge = p.center[k] - p.rotation[k] @ np.array([np.copysign(p.half[k, 0], side), 0.0, 0.0])
         wide = 2 * (p.center[k] - hinge)[:2]
