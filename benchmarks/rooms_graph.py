@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.graph import CELL_M, GraphTracker, SceneGraph
 from semantic_mapper.queries.instances import InstanceTracker
 from semantic_mapper.queries.mirror import MapMirror
+from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.scenes import NoiseConfig
 from semantic_mapper.scenes.config import TEST_SEEDS
 from semantic_mapper.scenes.storey import Storey, make_storey, survey_poses, survey_views
@@ -27,6 +29,7 @@ from semantic_mapper.types import Bool, CameraIntrinsics, PosedFrame
 
 CAMERA = CameraIntrinsics(80.0, 80.0, 79.5, 59.5, 160, 120)
 DOOR_NEAR_M = 0.5
+WRONG = 0.2  # of the blocks of 8^3 voxels
 SURE = 0.8  # probability of the true class that each pixel votes with
 
 
@@ -113,12 +116,26 @@ def compare(storey: Storey, graph: SceneGraph) -> dict[str, Counts]:
     }
 
 
+def with_classes(snapshot: MapSnapshot, which: str, seed: int) -> MapSnapshot:
+    """The map as it is, without classes, or with one wrong class throughout each of a fifth of its blocks."""
+    label = snapshot.voxels.label
+    if which == "none":
+        label = np.zeros_like(label)
+    elif which == "wrong":
+        rng = np.random.default_rng(seed)
+        wrong = rng.random(len(label)) < WRONG
+        other = np.array(ROOMS.ids, np.uint8)[rng.integers(len(ROOMS), size=len(label))]
+        label = np.where(wrong[:, None] & (label != ROOMS.ignore_id), other[:, None], label)
+    return replace(snapshot, voxels=snapshot.voxels._replace(label=label))
+
+
 def main() -> None:
     """Measure, and print a table."""
     parser = argparse.ArgumentParser(description="Rooms of maps of generated storeys.")
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(TEST_SEEDS[:10]))
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(TEST_SEEDS))
     parser.add_argument("--area", type=float, default=110.0, help="m2 of a storey")
     parser.add_argument("--voxel", type=float, default=0.05, help="metres")
+    parser.add_argument("--classes", choices=("true", "wrong", "none"), default="true", help="wrong: a fifth of blocks")
     parser.add_argument("--keep", type=Path, required=True, help="folder for the maps")
     args = parser.parse_args()
     total: dict[str, Counts] = {}
@@ -127,10 +144,11 @@ def main() -> None:
     for seed in args.seeds:
         storey = make_storey(seed, args.area)
         snapshot = MapMirror.of(VoxelMap.load(kept_map(seed, args.area, args.voxel, args.keep))).snapshot()
+        seen = with_classes(snapshot, args.classes, seed)
         start = time.process_time()
         things = InstanceTracker().update(snapshot)
         between = time.process_time()
-        graph = GraphTracker().update(snapshot, things)
+        graph = GraphTracker().update(seen, things)
         spent = between - start, time.process_time() - between
         found = compare(storey, graph)
         for name, counts in found.items():

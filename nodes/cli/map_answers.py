@@ -192,6 +192,8 @@ def _instance_table(found: dict[str, Any], width: int) -> Table:
 
 def _graph_table(found: dict[str, Any]) -> Table:
     table = Table(title=found["map"], title_justify="left")
+    if not found["floors"]:
+        table.caption = "no floor was found: too little level surface, or another way is up (--up)"
     for name in ("room", "floor", "area, m2", "doors to", "objects"):
         table.add_column(name, overflow="fold", min_width=len(name))
     class_of = {thing["id"]: thing["class"] for thing in found["objects"]}

@@ -21,7 +21,7 @@ NAMED_M = 0.7  # smaller things would cover each other's names
 
 @rendered
 def draw_graph(title: str, graph: SceneGraph) -> Figure:
-    """Rooms in colours with id and area, doors as white dots with their width, things as dark dots, with their class if large."""
+    """Rooms in colours with id and area, doors as white dots with their width, things as dots, the large with class."""
     count = max(len(graph.floors), 1)
     figure = new_figure(FLOOR_WIDTH * count, FLOOR_HEIGHT, layout="constrained")
     figure.suptitle(cut(title, FLOOR_WIDTH * count - 30, TITLE_PT, "bold"), x=0.012, ha="left")
@@ -45,7 +45,8 @@ def _draw_floor(axes: Axes, graph: SceneGraph, floor: Floor, R_grid_world: Float
             continue
         x, y = plan(room.outline).T
         axes.fill(x, y, color=CYCLE[room.id % len(CYCLE)], alpha=0.45, linewidth=0)
-        axes.text(*plan(room.center).tolist(), f"{room.id}\n{room.area_m2:.1f} m²", ha="center", va="center", weight="bold")
+        x, y = plan(room.center)
+        axes.text(x, y, f"{room.id}\n{room.area_m2:.1f} m²", ha="center", va="center", weight="bold")
     for door in graph.doors:
         if door.rooms[0] in floor.rooms:
             x, y = plan(door.center)

@@ -17,6 +17,7 @@ SEEN_M = 0.12  # of solid matter behind its surface
 AIR = "air"  # where the camera was: only what borders on it was seen
 Box = tuple[str, tuple[float, float, float], tuple[float, float, float]]  # class or ``AIR``, lower and upper corner
 STOREY_M = 2.8
+UPRIGHT = np.eye(3)
 
 
 def two_rooms(z: float = 0.0, *, door_m: float = 0.8, east: bool = True) -> list[Box]:
@@ -47,7 +48,7 @@ def two_rooms(z: float = 0.0, *, door_m: float = 0.8, east: bool = True) -> list
     return boxes
 
 
-def house_changes(boxes: Sequence[Box], since: int, R_world_house: Float64 = np.eye(3)) -> BlockChanges:
+def house_changes(boxes: Sequence[Box], since: int, R_world_house: Float64 = UPRIGHT) -> BlockChanges:
     """What a mirror needs to know of a house, in a world that is turned by whole quarter turns."""
     turned = [(name, *np.sort((R_world_house @ np.array((low, high)).T).T, axis=0)) for name, low, high in boxes]
     first = np.floor(np.min([low for _, low, _ in turned], axis=0) / VOXEL_M / 8).astype(int) - 1

@@ -11,12 +11,12 @@ from semantic_mapper.queries.graph_picture import draw_graph
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.rooms import find_walls, part_rooms
 from semantic_mapper.types import Bool, Float64
-from tests.queries.house import AIR, LABELS, STOREY_M, TRUNCATION, VOXEL_M, Box, house_changes, two_rooms
+from tests.queries.house import AIR, LABELS, STOREY_M, TRUNCATION, UPRIGHT, VOXEL_M, Box, house_changes, two_rooms
 
 CELL_M = 0.05
 
 
-def graph_of(boxes: list[Box], tracker: GraphTracker, R_world_house: Float64 = np.eye(3)) -> SceneGraph:
+def graph_of(boxes: list[Box], tracker: GraphTracker, R_world_house: Float64 = UPRIGHT) -> SceneGraph:
     mirror = MapMirror(VOXEL_M, TRUNCATION, LABELS)
     return tracker.update(mirror.apply(house_changes(boxes, 0, R_world_house)))
 
