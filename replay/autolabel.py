@@ -221,7 +221,7 @@ def _load(request: AutolabelRequest, log: Log) -> Mapper:
     if request.depth and config.depth.source == "auto":
         depth = msgspec.structs.replace(config.depth, source="sensor")  # else the field renders
         config = msgspec.structs.replace(config, depth=depth)
-    pixels = min(k.width * k.height for k in log.info.cameras.values())
+    pixels = min((k.width * k.height for k in log.info.cameras.values()), default=SCENE_RAYS)
     scale = max(config.render.scale, min(1.0, (SCENE_RAYS / pixels) ** 0.5))
     render = msgspec.structs.replace(config.render, scale=scale)
     return Mapper.load(request.weights, msgspec.structs.replace(config, render=render))
@@ -315,7 +315,7 @@ class _Labeller:
 
     Args:
         bundle: What renders.
-        label_set: Of the labels to write; None = there are none.
+        label_set: Of the labels to write; None = no labels are written.
         request: What was asked for.
     """
 

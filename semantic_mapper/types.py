@@ -119,7 +119,7 @@ class PosedFrame:
         rgb: (H, W, 3) uint8.
         depth_m: (H, W) float32 z-depth in metres, None without a depth sensor; what is not from ``MIN_DEPTH_M`` to
             ``MAX_DEPTH_M``, such as 0, is no measurement.
-        label: (H, W) uint8 class ids of the stream's label set; None where there are none.
+        label: (H, W) uint8 class ids of the stream's label set; None = unlabelled.
         intrinsics: Of the rectified image.
         T_world_camera: (4, 4) float64.
         pose_source: Where the pose comes from ("log", "odometry", ...).

@@ -38,7 +38,7 @@ class PseudoLabels:
 
     Args:
         label_set: Of them.
-        of: The frame, by number in the log, with its pseudo label; None as a label where there is none.
+        of: The frame, by number in the log, with its pseudo label, or without a label.
         source: For people.
         numbers: Frames that have one; None = all.
         train_stamps_ns: Frames whose true labels those who made them have learned from.

@@ -125,7 +125,7 @@ def test_where_it_moved_is_kept_for_a_second() -> None:
     space.add(frame, thing)
     x = space.points[:, 0]
     assert np.abs(space.points[:, 2] - THING_M).max() < 0.2 and -0.3 < x.min() < x.max() < 0.2
-    space.add(scene(1, None)[0], np.zeros_like(thing))  # stamps that go back begin anew
+    space.add(scene(1, None)[0], np.zeros_like(thing))  # stamps that go back start over
     assert not len(space.points)
 
 
