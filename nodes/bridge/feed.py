@@ -18,7 +18,7 @@ import structlog
 from numpy.typing import NDArray
 
 from semantic_mapper.client import MapClient
-from semantic_mapper.errors import SemanticMapperError
+from semantic_mapper.errors import CodecError, SemanticMapperError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.nodes.bridge.packing import describe_map, thinned
@@ -29,10 +29,10 @@ from semantic_mapper.queries.graph import GraphTracker, SceneGraph
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
-from semantic_mapper.transport.codec import encode
+from semantic_mapper.transport.codec import decode_as, encode, read_envelope
 from semantic_mapper.transport.messages import EndOfStream, NodeState, Status
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
-from semantic_mapper.types import MapUpdate, PosedFrame
+from semantic_mapper.types import Float64, MapUpdate, PosedFrame
 
 POLL_S = 0.1
 STATUS_PERIOD_S = 1.0
@@ -53,6 +53,14 @@ class Outlet(Protocol):
 
     def send_labels(self, label_set: LabelSet) -> None:
         """The classes of the map, before anything that has classes."""
+        ...
+
+    def wants(self, topic: Literal["frame", "map"], camera_id: str) -> bool:
+        """Whether anybody receives what messages of a camera on this topic hold: else they are not even decoded."""
+        ...
+
+    def note_pose(self, camera_id: str, T_world_camera: Float64) -> None:
+        """Where a camera was, of every frame."""
         ...
 
     def send_frame(self, frame: PosedFrame) -> None:
@@ -99,30 +107,46 @@ def run_bridge(context: NodeContext, options: BridgeOptions, outlet: Outlet) -> 
         context.heartbeat.ready()
         while not context.stop and not streams.ended:
             context.heartbeat.turn()
-            match message := messages.receive(POLL_S):
-                case PosedFrame():
-                    follower.stamp_ns = message.stamp_ns
-                    told.frames += 1
-                    outlet.send_frame(message)
-                case MapUpdate():
-                    outlet.send_update(message)
-                case Status():
-                    outlet.send_status(message)
-                case EndOfStream():
-                    streams.end(message)
-                case _:
-                    pass
+            if (parts := messages.receive_parts(POLL_S)) is not None:
+                try:
+                    _hand_on(parts, outlet, follower, streams)
+                except CodecError as error:  # of what its sender itself could not read
+                    _log.warning("message_left_out", reason=str(error))
             told.tell("running")
         messages.close()  # a camera that has ended waits for its listeners to leave
         context.heartbeat.ending()
         told.tell("ended", now=True)
 
 
+def _hand_on(parts: list[bytes], outlet: Outlet, follower: _MapFollower, streams: Streams) -> None:
+    """One message of a node.
+
+    Raises:
+        CodecError: it cannot be decoded.
+    """
+    envelope = read_envelope(parts)
+    match envelope.topic:
+        case "frame":
+            follower.stamp_ns = envelope.stamp_ns
+            follower.frames += 1
+            outlet.note_pose(envelope.source, np.array(envelope.T_world_camera, np.float64).reshape(4, 4))
+            if outlet.wants("frame", envelope.source):
+                outlet.send_frame(decode_as(PosedFrame, parts))
+        case "map":
+            if outlet.wants("map", envelope.source):
+                outlet.send_update(decode_as(MapUpdate, parts))
+        case "status":
+            outlet.send_status(decode_as(Status, parts))
+        case "end":
+            streams.end(decode_as(EndOfStream, parts))
+        case _:
+            pass
+
+
 class _Told:
     """Publishes how the bridge is, about once a second."""
 
     def __init__(self, node: str, publisher: Publisher, messages: NewestSubscriber, follower: _MapFollower) -> None:
-        self.frames = 0
         self._node = node
         self._publisher = publisher
         self._messages = messages
@@ -134,7 +158,11 @@ class _Told:
         if not now and time.monotonic() - self._last < STATUS_PERIOD_S:
             return
         self._last = time.monotonic()
-        counters = {"frames": self.frames, "maps": self._follower.sent["map"], "graphs": self._follower.sent["graph"]}
+        counters = {
+            "frames": self._follower.frames,
+            "maps": self._follower.sent["map"],
+            "graphs": self._follower.sent["graph"],
+        }
         counters |= {"rejected": self._messages.rejected, "overwritten": self._messages.overwritten}
         silent = self._messages.silent_s
         ages = {} if silent is None else {"frame": silent}
@@ -152,7 +180,7 @@ class _MapFollower:
     """
 
     def __init__(self, client: MapClient, outlet: Outlet, options: BridgeOptions) -> None:
-        self.stamp_ns = 0  # of the newest frame
+        self.frames, self.stamp_ns = 0, 0  # heard of, and stamp of the newest one
         self.sent: dict[Subject, int] = {"map": 0, "graph": 0}
         self.trouble = ""  # why the last look failed
         self._client = client
@@ -189,9 +217,9 @@ class _MapFollower:
                 self.trouble, pause_s = str(error), 0.0
 
     def _look(self) -> None:
-        if self._labels is None:
-            self._use_labels(self._client.info().label_set)
         asked = {subject: self._outlet.asked(subject) for subject in self.sent}
+        if self._labels is None and not self._ended.is_set():
+            self._use_labels(self._client.info().label_set)
         if not any(asked.values()):
             return
         mirror = self._client.mirror()

@@ -9,7 +9,7 @@ import threading
 import time
 from collections import Counter
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import msgspec
 import numpy as np
@@ -25,10 +25,11 @@ from semantic_mapper.plots import class_colors
 from semantic_mapper.queries.graph import SceneGraph
 from semantic_mapper.replay.exporters.camera_path import CameraPath
 from semantic_mapper.transport.messages import Status
-from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
+from semantic_mapper.types import CameraIntrinsics, Float64, MapUpdate, PosedFrame
 
 HOST = "127.0.0.1"  # the protocol has neither keys nor passwords: other machines come in by `ssh -L`
 BACKLOG = 32  # messages that may wait for a client; of a map of 400,000 points each has 8 MB
+SETTLE_S = 0.05  # after the SDK has said so, until what is sent reaches who has subscribed
 PATH_PERIOD_S = 1.0  # a long path takes milliseconds to draw
 STATUS_SCHEMA = {
     "type": "object",
@@ -116,10 +117,19 @@ class FoxgloveServer:
         """See ``Outlet``."""
         self._labels = label_set
 
+    def wants(self, topic: Literal["frame", "map"], camera_id: str) -> bool:
+        """See ``Outlet``."""
+        c = self._camera(camera_id)
+        wanted = (c.rgb, c.depth, c.calibration, self._tf) if topic == "frame" else (c.semantics, self._path)
+        return any(channel.has_sinks() for channel in wanted)
+
+    def note_pose(self, camera_id: str, T_world_camera: Float64) -> None:
+        """See ``Outlet``."""
+        self._camera(camera_id).path.add(T_world_camera)
+
     def send_frame(self, frame: PosedFrame) -> None:
         """See ``Outlet``."""
         camera, when, name = self._camera(frame.camera_id), frame.stamp_ns, camera_frame(frame.camera_id)
-        camera.path.add(frame.T_world_camera)
         if self._tf.has_sinks():
             moved = transform(frame.T_world_camera, name, when)
             self._tf.log(messages.FrameTransforms(transforms=[moved]), log_time=when)
@@ -179,11 +189,13 @@ class _Listener(foxglove.websocket.ServerListener):
         self._lock = threading.Lock()
         self._there: Counter[str] = Counter()
         self._joined: Counter[str] = Counter()
+        self._last = 0.0  # when somebody joined
 
     def asked(self, subject: Subject) -> int:
         """See ``Outlet``."""
         with self._lock:
-            return self._joined[subject] if self._there[subject] else 0
+            settled = time.monotonic() - self._last > SETTLE_S
+            return self._joined[subject] if self._there[subject] and settled else 0
 
     def on_subscribe(self, client: foxglove.websocket.Client, channel: foxglove.websocket.ChannelView) -> None:
         """One more."""
@@ -191,6 +203,7 @@ class _Listener(foxglove.websocket.ServerListener):
             with self._lock:
                 self._there[_MAPS[channel.topic]] += 1
                 self._joined[_MAPS[channel.topic]] += 1
+                self._last = time.monotonic()
 
     def on_unsubscribe(self, client: foxglove.websocket.Client, channel: foxglove.websocket.ChannelView) -> None:
         """One less; also where a client has gone."""

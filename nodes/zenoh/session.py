@@ -10,7 +10,7 @@ import json
 import threading
 import time
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import msgspec
 import numpy as np
@@ -27,7 +27,7 @@ from semantic_mapper.nodes.zenoh.addresses import zenoh_settings
 from semantic_mapper.nodes.zenoh.sdk import zenoh
 from semantic_mapper.queries.graph import SceneGraph
 from semantic_mapper.transport.messages import Status
-from semantic_mapper.types import MapUpdate, PosedFrame
+from semantic_mapper.types import Float64, MapUpdate, PosedFrame
 
 MAX_QUERIES = 64  # that wait for a map or graph ...
 QUERY_S = 10.0  # ... for so long: then Zenoh itself has given them up
@@ -89,6 +89,14 @@ class ZenohSession:
 
     def send_labels(self, label_set: LabelSet) -> None:
         """Class ids have their names in what is attached to the map."""
+
+    def wants(self, topic: Literal["frame", "map"], camera_id: str) -> bool:
+        """See ``Outlet``."""
+        kinds = ("rgb", "depth", "pose") if topic == "frame" else ("semantics",)
+        return any(self._wanted(f"{camera_id}/{kind}") is not None for kind in kinds)
+
+    def note_pose(self, camera_id: str, T_world_camera: Float64) -> None:
+        """Poses go out with the frames."""
 
     def send_frame(self, frame: PosedFrame) -> None:
         """See ``Outlet``."""
