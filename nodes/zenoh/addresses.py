@@ -36,6 +36,7 @@ def zenoh_settings(options: ZenohOptions) -> dict[str, Any]:
         "scouting/gossip/enabled": False,
         "transport/link/protocols": sorted({address.partition("/")[0] for address in used}),
         "transport/shared_memory/enabled": False,  # what is killed would leave some behind
+        "transport/link/rx/max_message_size": 1 << 20,  # clients send nothing but subscriptions and questions
     }
     if folder is not None:
         settings |= _tls(folder)

@@ -144,6 +144,17 @@ def test_a_client_that_stands_still_loses_images(address: str) -> None:
         assert len(set(came)) < count // 2
 
 
+def test_it_joins_the_network_of_a_router_that_comes_later(address: str) -> None:
+    with ZenohSession(ZenohOptions(listen="", connect=address)) as bridge:
+        settings = {"mode": "router", "connect/endpoints": [], "listen/endpoints": [address]}
+        with session(address, **settings), session(address) as client:
+            heard = Heard()
+            client.declare_subscriber("semantic_mapper/rooms/pose", heard)
+            assert eventually(lambda: bridge.wants("frame", "rooms"), 20)
+            bridge.send_frame(tiny_frames()[0])
+            assert eventually(lambda: bool(heard.samples), 20)
+
+
 @pytest.mark.parametrize(
     ("options", "error", "words"),
     [
