@@ -18,7 +18,7 @@ import structlog
 from numpy.typing import NDArray
 
 from semantic_mapper.client import MapClient
-from semantic_mapper.errors import CodecError, SemanticMapperError
+from semantic_mapper.errors import CodecError, NodeError, SemanticMapperError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.nodes.bridge.packing import describe_map, thinned
@@ -93,6 +93,7 @@ def run_bridge(context: NodeContext, options: BridgeOptions, outlet: Outlet) -> 
     """Hand on what the nodes publish until all streams have ended or somebody asks to stop.
 
     Raises:
+        NodeError: the thread that sends the map has ended, by a bug; what it has said is in the log.
         TransportError: an endpoint that is none, or that of the node is taken.
     """
     query = options.query if "://" in options.query else context.endpoint(options.query)
@@ -107,6 +108,8 @@ def run_bridge(context: NodeContext, options: BridgeOptions, outlet: Outlet) -> 
         context.heartbeat.ready()
         while not context.stop and not streams.ended:
             context.heartbeat.turn()
+            if not follower.alive:
+                raise NodeError("the map is no longer sent: the thread that does so has ended; its error is above")
             if (parts := messages.receive_parts(POLL_S)) is not None:
                 try:
                     _hand_on(parts, outlet, follower, streams)
@@ -191,6 +194,11 @@ class _MapFollower:
         self._shown: dict[Subject, tuple[int, NDArray[np.int64]]] = {}  # to how many, and contents of the blocks
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="map", daemon=True)
+
+    @property
+    def alive(self) -> bool:
+        """Whether it still sends; False before its end only by a bug."""
+        return self._thread.is_alive()
 
     def __enter__(self) -> Self:
         self._thread.start()

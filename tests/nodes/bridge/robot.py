@@ -98,4 +98,5 @@ def bridged_robot(run: Callable[[NodeContext, Any], None], options: BridgeOption
         finally:
             stop.signum = 15
             bridge.join(60)
-            assert not bridge.is_alive() and not failures
+            assert not bridge.is_alive()
+        assert not failures

@@ -21,7 +21,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from scipy.spatial.transform import Rotation
 
 from benchmarks.foxglove_client import FoxgloveClient, Received
-from semantic_mapper.errors import TransportError
+from semantic_mapper.errors import NodeError, TransportError
 from semantic_mapper.nodes.foxglove.node import run_foxglove
 from semantic_mapper.nodes.foxglove.server import BACKLOG, FoxgloveServer
 from semantic_mapper.nodes.options import FoxgloveOptions
@@ -146,6 +146,25 @@ def test_a_late_client_receives_the_map_that_does_not_change_and_so_after_a_rest
         assert all(client.receive(REFRESH_S) is None for _ in range(4)) and not robot.failures, "the mapper is away"
         with robot.mapped():
             gather(client, None, topics)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_it_fails_as_a_whole_where_its_map_fails(port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*args: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(FoxgloveServer, "send_labels", fail)
+    with pytest.raises(NodeError, match="the map is no longer sent"):
+        run_until_it_fails(port)
+
+
+def run_until_it_fails(port: int) -> None:
+    with bridged_robot(run_foxglove, FoxgloveOptions(port=port, refresh_s=REFRESH_S), "foxglove") as robot:
+        with robot.mapped():
+            robot.bridge.join(WARM_S)
+        [failure] = robot.failures
+        robot.failures.clear()
+        raise failure
 
 
 def test_it_ends_with_the_stream_and_lets_the_camera_go(port: int) -> None:
