@@ -222,6 +222,7 @@ class BridgeOptions(Config, frozen=True):
     query: Annotated[str, msgspec.Meta(pattern=ENDPOINT_NAME_PATTERN)] = "query"  # the mapper's
     refresh_s: Annotated[float, msgspec.Meta(ge=0.1)] = 1.0  # between two maps, at least; one is sent where it changed
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # in the world, for floors and rooms
+    keys: str = ""  # the mapper's
 
     def inputs(self) -> tuple[str, ...]:
         """Nodes that it listens to."""

@@ -10,6 +10,7 @@ import os
 import threading
 import time
 from contextlib import ExitStack
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Protocol, Self
 
@@ -31,6 +32,7 @@ from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
 from semantic_mapper.transport.codec import decode_as, encode, read_envelope
 from semantic_mapper.transport.messages import EndOfStream, NodeState, Status
+from semantic_mapper.transport.security import ServerIdentity, load_keys
 from semantic_mapper.transport.sockets import NewestSubscriber, Publisher
 from semantic_mapper.types import Float64, MapUpdate, PosedFrame
 
@@ -94,13 +96,14 @@ def run_bridge(context: NodeContext, options: BridgeOptions, outlet: Outlet) -> 
 
     Raises:
         NodeError: the thread that sends the map has ended, by a bug; what it has said is in the log.
-        TransportError: an endpoint that is none, or that of the node is taken.
+        TransportError: an endpoint that is none, or that of the node is taken; or there are no keys.
     """
     query = options.query if "://" in options.query else context.endpoint(options.query)
     endpoints = [context.endpoint(name) for name in options.inputs()]
+    identity = ServerIdentity(load_keys(Path(options.keys).expanduser())) if options.keys else None
     with ExitStack() as stack:
         publisher = stack.enter_context(Publisher(context.endpoint(context.name)))
-        client = stack.enter_context(MapClient(query, attempts=1))
+        client = stack.enter_context(MapClient(query, attempts=1, identity=identity))
         follower = stack.enter_context(_MapFollower(client, outlet, options))
         messages = stack.enter_context(NewestSubscriber(endpoints, ("frame", "map", "status", "end")))
         told = _Told(context.name, publisher, messages, follower)

@@ -204,14 +204,19 @@ def _check_bridges(options: Mapping[str, NodeOptions], path: Path) -> None:
         ConfigError: it would ask where none answers.
     """
     for name, own in options.items():
-        if isinstance(own, BridgeOptions) and "://" not in own.query:
+        if isinstance(own, BridgeOptions):
             mapper = options[own.mapper]
             if not isinstance(mapper, MapperOptions):
                 raise ConfigError(f"{path}: node '{name}' shows the map of '{own.mapper}', which is no mapper")
             if mapper.query != own.query:
                 raise ConfigError(
                     f"{path}: node '{name}' asks about the map at '{own.query}', but mapper '{own.mapper}' answers at "
-                    f"'{mapper.query}'; give both the same name as `query`"
+                    f"'{mapper.query}'; give both the same `query`"
+                )
+            if mapper.keys != own.keys:
+                raise ConfigError(
+                    f"{path}: node '{name}' has the keys '{own.keys}', but mapper '{own.mapper}' has '{mapper.keys}'; give "
+                    "both the same folder as `keys`"
                 )
 
 

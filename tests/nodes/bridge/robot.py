@@ -18,6 +18,7 @@ from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.supervisor.heartbeat import HeartbeatWriter
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, Status
+from semantic_mapper.transport.security import Keys
 from semantic_mapper.transport.sockets import Publisher
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 from tests.nodes.mapper.test_query_service import a_folder, answering
@@ -54,9 +55,9 @@ class Robot:
     failures: list[BaseException]
 
     @contextmanager
-    def mapped(self) -> Iterator[QueryService]:
+    def mapped(self, keys: Keys | None = None) -> Iterator[QueryService]:
         """The mapper answers questions meanwhile."""
-        with answering(self.endpoints["query"], whole_map()) as service:
+        with answering(self.endpoints["query"], whole_map(), keys) as service:
             yield service
 
     def publish(self, number: int) -> PosedFrame:

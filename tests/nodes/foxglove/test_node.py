@@ -7,6 +7,7 @@ import json
 import socket
 from collections.abc import Iterator
 from contextlib import closing
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -28,6 +29,7 @@ from semantic_mapper.nodes.options import FoxgloveOptions
 from semantic_mapper.plots import class_colors
 from semantic_mapper.queries.graph import GraphTracker
 from semantic_mapper.queries.surface import surface_points, surface_voxels
+from semantic_mapper.transport.security import allow, make_keys
 from tests.nodes.bridge.robot import REFRESH_S, WARM_S, Robot, big_frame, bridged_robot
 from tests.nodes.support import eventually, free_port
 from tests.queries.scene import LABELS, whole
@@ -146,6 +148,18 @@ def test_a_late_client_receives_the_map_that_does_not_change_and_so_after_a_rest
         assert all(client.receive(REFRESH_S) is None for _ in range(4)) and not robot.failures, "the mapper is away"
         with robot.mapped():
             gather(client, None, topics)
+
+
+def test_a_mapper_with_keys_answers_who_has_the_same(port: int, tmp_path: Path) -> None:
+    robot_keys, desk = make_keys(tmp_path / "robot"), make_keys(tmp_path / "desk")
+    allow(robot_keys.folder, "desk", desk.public.decode())
+    options = FoxgloveOptions(port=port, refresh_s=REFRESH_S, keys=str(robot_keys.folder))
+    with (
+        bridged_robot(run_foxglove, options, "foxglove") as robot,
+        robot.mapped(robot_keys),
+        FoxgloveClient(f"ws://127.0.0.1:{port}", {"/map/info"}) as client,
+    ):
+        gather(client, None, {"/map/info"})
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
