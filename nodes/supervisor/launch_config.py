@@ -215,7 +215,7 @@ def _check_bridges(options: Mapping[str, NodeOptions], path: Path) -> None:
                 )
             if mapper.keys != own.keys:
                 raise ConfigError(
-                    f"{path}: node '{name}' has the keys '{own.keys}', but mapper '{own.mapper}' has '{mapper.keys}'; give "
+                    f"{path}: node '{name}' has the keys '{own.keys}', but mapper '{own.mapper}' '{mapper.keys}'; give "
                     "both the same folder as `keys`"
                 )
 

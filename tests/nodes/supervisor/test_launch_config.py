@@ -187,7 +187,7 @@ def test_a_bridge_is_one_more_listener_and_asks_the_mapper(tmp_path: Path, kind:
     for change, says in (
         ('mapper = "camera"\n', f"node '{kind}' shows the map of 'camera', which is no mapper"),
         ('query = "ask"\n', f"node '{kind}' asks about the map at 'ask', but mapper 'mapper' answers at 'query'"),
-        ('keys = "k"\n', f"node '{kind}' has the keys 'k', but mapper 'mapper' has ''; give both the same"),
+        ('keys = "k"\n', f"node '{kind}' has the keys 'k', but mapper 'mapper' ''; give both the same"),
         ('mapper = "maper"\n', "did you mean 'mapper'?"),
         ("refresh_s = 0.0\n", "refresh_s"),
     ):
