@@ -2,8 +2,8 @@
 
 A mapper, both bridges and a client that receives all that either has run as processes of their own. In every other lap
 bridges and client are frozen, which leaves the mapper as it is without them. A frame is sent at its time, or when the
-mapper has answered the one before. What counts is a lap's frames from ``--skip`` seconds on: for five seconds after a
-question a mapper makes snapshots for the next one.
+mapper has answered the one before. What counts is a lap's frames from ``--skip`` seconds on: for a quarter of a second
+after a request for changes a mapper makes snapshots for the next one.
 
 Example: python -m benchmarks.bridges kitchen.mcap --laps 13 --frames 100 --hz 5
 """
@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("--laps", type=int, default=13, help="the first one only builds the map")
     parser.add_argument("--frames", type=int, default=100, help="of a lap")
     parser.add_argument("--hz", type=float, default=5.0)
-    parser.add_argument("--skip", type=float, default=6.0, help="seconds at the beginning of a lap that do not count")
+    parser.add_argument("--skip", type=float, default=1.0, help="seconds at the beginning of a lap that do not count")
     parser.add_argument("--voxel-size", type=float, default=0.0)
     parser.add_argument("--client", nargs=2, metavar=("PORT", "ADDRESS"), help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -89,11 +89,14 @@ def measure(folder: Path, info: StreamInfo, frames: list[PosedFrame], args: argp
         steps, cpu = _drive(camera, answers, frames, mapping.pid, beside, args)
         for process in beside:
             os.kill(process.pid, signal.SIGCONT)
+        used = {name: _cpu_s(process.pid) for name, process in zip(("foxglove", "zenoh"), beside, strict=False)}
         client.send_signal(signal.SIGINT)
         received, _ = client.communicate(timeout=PATIENCE_S)
+    working_frames = sum(map(_working, range(args.laps))) * len(frames)
     return (
         _compare(steps)
         | _compare_cpu(cpu)
+        | {f"{name}_cpu_ms_a_frame": round(1e3 * s / working_frames, 1) for name, s in used.items()}
         | {"frames": args.frames, "laps": args.laps, "hz": args.hz, "received": json.loads(received)}
     )
 
@@ -111,7 +114,7 @@ def _drive(
     cpu: dict[bool, list[float]] = {True: [], False: []}
     seq, due = 0, time.monotonic()
     for lap in range(args.laps):
-        working = lap == 0 or lap % 4 in (1, 0)  # with, without, without, with, ...
+        working = _working(lap)
         for process in beside:
             os.kill(process.pid, signal.SIGCONT if working else signal.SIGSTOP)
         used_s = 0.0
@@ -131,6 +134,11 @@ def _drive(
         if lap:
             cpu[working].append(1e3 * (_cpu_s(mapper) - used_s) / (len(frames) - round(args.skip * args.hz)))
     return steps, cpu
+
+
+def _working(lap: int) -> bool:
+    """Whether bridges work in a lap: after the first, with, without, without, with, ..."""
+    return lap % 4 in (0, 1)
 
 
 def _cpu_s(pid: int) -> float:
