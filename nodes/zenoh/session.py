@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from functools import partial
 from types import TracebackType
 from typing import Any, Literal, Self
 
@@ -30,7 +31,7 @@ from semantic_mapper.transport.messages import Status
 from semantic_mapper.types import Float64, MapUpdate, PosedFrame
 
 MAX_QUERIES = 64  # that wait for a map or graph ...
-QUERY_S = 10.0  # ... for so long: then Zenoh itself has given them up
+QUERY_S = 60.0  # ... for so long; by default Zenoh itself gives them up after 10 s
 KEYS: dict[Subject, str] = {"map": "map/points", "graph": "graph"}
 JSON, JPEG, PNG = zenoh.Encoding.APPLICATION_JSON, zenoh.Encoding.IMAGE_JPEG, zenoh.Encoding.IMAGE_PNG
 BYTES = zenoh.Encoding.APPLICATION_OCTET_STREAM
@@ -67,7 +68,7 @@ class ZenohSession:
         self._queries: dict[Subject, list[tuple[float, zenoh.Query]]] = {"map": [], "graph": []}
         for subject, key in KEYS.items():
             self._declare(key, subject)
-        self._queryable = self._session.declare_queryable(f"{self._prefix}/**", self._take_query)
+            self._session.declare_queryable(f"{self._prefix}/{key}", partial(self._take_query, subject))
 
     def __enter__(self) -> Self:
         return self
@@ -145,13 +146,11 @@ class ZenohSession:
         publisher = self._publishers.get(key) or self._declare(key)
         return publisher if _has_subscribers(publisher) else None
 
-    def _take_query(self, query: zenoh.Query) -> None:
+    def _take_query(self, subject: Subject, query: zenoh.Query) -> None:
         """Keep a ``get`` until there is an answer; called by Zenoh's threads."""
         with self._lock:
-            for subject, key in KEYS.items():
-                if query.key_expr.intersects(zenoh.KeyExpr(f"{self._prefix}/{key}")):
-                    self._joined[subject] += 1
-                    self._queries[subject] = [*self._queries[subject], (time.monotonic(), query)][-MAX_QUERIES:]
+            self._joined[subject] += 1
+            self._queries[subject] = [*self._queries[subject], (time.monotonic(), query)][-MAX_QUERIES:]
 
     def _answer(self, subject: Subject, payload: bytes, encoding: zenoh.Encoding, attachment: bytes | None) -> None:
         with self._lock:
