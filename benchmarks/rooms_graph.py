@@ -30,6 +30,7 @@ from semantic_mapper.types import Bool, CameraIntrinsics, PosedFrame
 CAMERA = CameraIntrinsics(80.0, 80.0, 79.5, 59.5, 160, 120)
 DOOR_NEAR_M = 0.5
 WRONG = 0.2  # of the blocks of 8^3 voxels
+UP = (0.0, 0.0, 1.0)
 SURE = 0.8  # probability of the true class that each pixel votes with
 
 
@@ -148,7 +149,7 @@ def main() -> None:
         start = time.process_time()
         things = InstanceTracker().update(snapshot)
         between = time.process_time()
-        graph = GraphTracker().update(seen, things)
+        graph = GraphTracker(UP).update(seen, things)
         spent = between - start, time.process_time() - between
         found = compare(storey, graph)
         for name, counts in found.items():

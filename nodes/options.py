@@ -221,7 +221,6 @@ class BridgeOptions(Config, frozen=True):
     mapper: str = "mapper"  # the node that maps them
     query: Annotated[str, msgspec.Meta(pattern=ENDPOINT_NAME_PATTERN)] = "query"  # the mapper's
     refresh_s: Annotated[float, msgspec.Meta(ge=0.1)] = 2.0  # between two maps, at least; one is sent where it changed
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # in the world, for floors and rooms
     keys: str = ""  # the mapper's
 
     def inputs(self) -> tuple[str, ...]:

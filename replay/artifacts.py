@@ -24,6 +24,7 @@ from semantic_mapper.mapping.map_scale import scale_name, voxel_size_text
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
 from semantic_mapper.mapping.picture_check import SENTENCES
 from semantic_mapper.plots import write_picture
+from semantic_mapper.queries.graph import SceneGraph, find_graph
 from semantic_mapper.types import Float64
 
 if TYPE_CHECKING:  # session imports this module
@@ -49,9 +50,10 @@ def write_artifacts(session: MapSession, out: Path, rerun: RerunLog | None) -> d
     voxel_map = session.pipeline.voxel_map
     write_ply(out / "map.ply", points, session.pipeline.label_set, scale_known=voxel_map.scale_known)
     voxel_map.save(out / "map.npz")
-    _draw_overview(session, points, out / "overview.png")
+    graph = find_graph(voxel_map)
+    _draw_overview(session, points, graph, out / "overview.png")
     if rerun is not None:
-        rerun.finish(points)
+        rerun.finish(points, graph)
     summary = build_summary(session, points)
     if summary["map"]["nearly_empty"]:
         _log.warning("map_nearly_empty", reason=summary["map"]["nearly_empty"])
@@ -59,7 +61,7 @@ def write_artifacts(session: MapSession, out: Path, rerun: RerunLog | None) -> d
     return summary
 
 
-def _draw_overview(session: MapSession, points: MapPoints, path: Path) -> None:
+def _draw_overview(session: MapSession, points: MapPoints, graph: SceneGraph | None, path: Path) -> None:
     label_set = session.pipeline.label_set
     voxel_map = session.pipeline.voxel_map
     size = f"voxels of {voxel_size_text(voxel_map.config.voxel_size_m, voxel_map.scale_known)}"
@@ -71,6 +73,7 @@ def _draw_overview(session: MapSession, points: MapPoints, path: Path) -> None:
         subtitle=_pose_line(session) + _empty_line(session, points) + _scores_line(session) + _depth_line(session),
         up=map_up(session),
         unit=picture_unit(session),
+        rooms=[(f"room {room.id}: {room.area_m2:.0f} m²", room.outline) for room in graph.rooms] if graph else (),
     )
     write_picture(path, picture)
 

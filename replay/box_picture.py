@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import LogError
-from semantic_mapper.evaluation.upright import camera_up, ceiling_height, upright_rotation
+from semantic_mapper.evaluation.upright import camera_up, ceiling_height, plan_rotation
 from semantic_mapper.fields.primitives import Primitive
 from semantic_mapper.geometry import invert_pose, nearest_pixels, project, transform, unproject
 from semantic_mapper.imaging import resize_depth, resize_rgb, working_intrinsics
@@ -184,7 +184,7 @@ def _put_plan(
 ) -> None:
     """Surface, path and boxes from above, in metres of a level frame."""
     xyz, rgb = _surface(surface)
-    R = upright_rotation(xyz, camera_up(poses))
+    R = plan_rotation(xyz, camera_up(poses))
     level = xyz @ R.T
     roof = ceiling_height(level) if len(level) else None
     kept = np.ones(len(level), np.bool_) if roof is None else level[:, 2] < roof

@@ -154,7 +154,7 @@ class MapClient:
         self._mirror: MapMirror | None = None
         self._mirrored = ""  # map_id of the mirror
         self._mirror_lock = threading.Lock()
-        self._graphs: dict[tuple[str, messages.Point], GraphTracker] = {}
+        self._graphs: dict[tuple[str, messages.Point | None], GraphTracker] = {}
         self._labels: tuple[str, LabelSet] | None = None
         self.version = 0
 
@@ -208,18 +208,20 @@ class MapClient:
         found = self._ask("instances", messages.InstancesAnswer, request)
         return _things(found, self._label_set(found.map_id))
 
-    def graph(self, up: ArrayLike = UP) -> SceneGraph:
+    def graph(self, up: ArrayLike | None = None) -> SceneGraph:
         """Floors, rooms, doors and things; see ``queries.graph.GraphTracker``.
 
         Computed here, from ``mirror``; the things are those of ``instances``. Ids of rooms stay from call to call of
         this client, for each ``up``; those of another client may differ.
+
+        Args:
+            up: (3,) direction in the world; found by the floor by default.
         """
-        things = self.instances(up)
         snapshot = self.mirror().snapshot()
         with self._mirror_lock:
-            key = (self._mirrored, _point(up, "up"))
+            key = (self._mirrored, None if up is None else _point(up, "up"))
             tracker = self._graphs.setdefault(key, GraphTracker(up))
-        return tracker.update(snapshot, things)
+        return tracker.update(snapshot, self.instances(tracker.up_in(snapshot)))
 
     def occupancy(self, points: ArrayLike) -> UInt8:
         """``State`` (N,) at points (N, 3), world metres; see ``queries.occupancy.occupancy``."""

@@ -244,3 +244,14 @@ def pixel_grid(width: int, height: int, device: torch.device | str = "cpu") -> t
         indexing="ij",
     )
     return torch.stack((u, v), dim=-1).reshape(-1, 2)
+
+
+def turn_onto(a: Float64, b: Float64) -> Float64:
+    """The least rotation (3, 3) that takes unit vector ``a`` to ``b``; half a turn about x or y for opposite ones."""
+    c = float(a @ b)
+    if c < -1 + 1e-9:
+        side = np.cross(b, (0.0, 0.0, 1.0) if abs(b[2]) < 0.9 else (0.0, 1.0, 0.0))
+        side /= np.linalg.norm(side)
+        return 2 * np.outer(side, side) - np.eye(3)
+    x, y, z = v = np.cross(a, b)
+    return np.array(((c, -z, y), (z, c, -x), (-y, x, c))) + np.outer(v, v) / (1 + c)

@@ -19,7 +19,7 @@ import structlog
 from numpy.typing import NDArray
 
 from semantic_mapper.client import MapClient
-from semantic_mapper.errors import CodecError, NodeError, SemanticMapperError
+from semantic_mapper.errors import CodecError, MapError, NodeError, SemanticMapperError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.nodes.bridge.packing import describe_map, thinned
@@ -236,13 +236,23 @@ class _MapFollower:
         mirror = self._client.mirror()
         snapshot = mirror.snapshot()
         self._use_labels(snapshot.label_set)
-        if asked["map"] and self._is_new("map", asked["map"], snapshot):
+        if self._is_new("map", asked["map"], snapshot):
             points = surface_points(snapshot, surface_voxels(snapshot))
             self._outlet.send_map(thinned(points), describe_map(snapshot, len(points.xyz), self.stamp_ns))
-        if asked["graph"] and snapshot.scale_known and self._is_new("graph", asked["graph"], snapshot):
+            self.sent["map"] += 1
+        if snapshot.scale_known and self._is_new("graph", asked["graph"], snapshot):
             if self._graphs is None or self._graphs[0] is not mirror:  # of a mapper that was restarted
-                self._graphs = mirror, GraphTracker(self._options.up)
-            self._outlet.send_graph(self._graphs[1].update(snapshot), self.stamp_ns)
+                self._graphs = mirror, GraphTracker()
+            self._send_graph(self._graphs[1], snapshot)
+
+    def _send_graph(self, tracker: GraphTracker, snapshot: MapSnapshot) -> None:
+        try:
+            graph = tracker.update(snapshot)
+        except MapError as error:  # which way is up shows once there is a floor
+            _log.debug("graph_not_sent", reason=str(error))
+            return
+        self._outlet.send_graph(graph, self.stamp_ns)
+        self.sent["graph"] += 1
 
     def _use_labels(self, label_set: LabelSet) -> None:
         if label_set != self._labels:
@@ -250,10 +260,9 @@ class _MapFollower:
             self._outlet.send_labels(label_set)
 
     def _is_new(self, subject: Subject, asked: int, snapshot: MapSnapshot) -> bool:
-        """Whether somebody new receives it, or the map is another one than was sent last; counts as sent then."""
+        """Whether somebody receives it who is new, or the map is another one than was shown last; shown it is then."""
         before = self._shown.get(subject)
-        if before is not None and before[0] == asked and np.array_equal(before[1], snapshot.serials):
+        if not asked or (before is not None and before[0] == asked and np.array_equal(before[1], snapshot.serials)):
             return False
         self._shown[subject] = asked, snapshot.serials
-        self.sent[subject] += 1
         return True

@@ -45,6 +45,10 @@ def export(
     ] = None,
     resolution: Annotated[float | None, typer.Option(help="grid: side of a cell in metres.  [default: 0.05]")] = None,
     floor: Annotated[float | None, typer.Option(help="grid: height of the floor; found when not given.")] = None,
+    costs: Annotated[
+        Path | None,
+        typer.Option(metavar="TOML", help="grid: also write costs by class, from lines such as `person = 100`."),
+    ] = None,
     camera: Annotated[str, typer.Option(help="Logs: the frames of this camera only.")] = "",
     max_frames: Annotated[int, typer.Option(min=0, help="Logs: stop after this many; 0 = all.")] = 0,
 ) -> None:
@@ -52,13 +56,14 @@ def export(
 
     Maps: .ply points (with --format ply-mesh a mesh), .obj mesh with materials, .glb mesh for viewers, .npz arrays for
     numpy, .yaml/.pgm floor plan for nav2 and map_server, .rrd for Rerun. In a floor plan a cell is free only where the
-    floor was seen.
+    floor was seen. With --costs the costs 0 to 100 of its cells are written beside it (mode raw, unknown 255).
 
     Logs: .mcap with Foxglove's schemas, .rrd for Rerun, .txt trajectory (TUM), a folder that `import` reads again
     without loss, or with --format tum a TUM RGB-D sequence.
 
     Example: semantic-mapper export runs/kitchen --out kitchen.glb --color class
     Example: semantic-mapper export runs/kitchen/map.npz --out plan.yaml --height 0.1 1.2
+    Example: semantic-mapper export runs/kitchen/map.npz --out plan.yaml --costs costs.toml
     Example: semantic-mapper export kitchen.mcap --out kitchen-foxglove.mcap
     """
     output = Output.guarded()
@@ -70,6 +75,7 @@ def export(
 
     if is_log(source):
         given = {"--color": color, "--height": height, "--resolution": resolution, "--floor": floor}
+        given |= {"--costs": costs}
         given |= {"--up": up != "auto", "--min-weight": min_weight is not None, "--min-confidence": min_confidence > 0}
         map_options = [name for name, value in given.items() if value]
         return export_recording(output, source, out, format, camera, max_frames, map_options)
@@ -77,7 +83,7 @@ def export(
         raise ConfigError("--camera and --max-frames are for logs; a map has no frames")
     kind = format_of(out, format)
     least = SURFACE_WEIGHT if min_weight is None else min_weight
-    request = ExportRequest(kind, least, min_confidence, color, parse_up(up), height, resolution, floor)
+    request = ExportRequest(kind, least, min_confidence, color, parse_up(up), height, resolution, floor, costs)
     return _export_map(output, source, out, request)
 
 

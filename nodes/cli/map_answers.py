@@ -74,6 +74,7 @@ def answer_nearest(class_name: str, point: Sequence[float], hit: NearestSurface 
     return found
 
 
+UP = (0.0, 0.0, 1.0)  # of the boxes of instances, where nothing else is given
 CONNECTED, LEARNED = "connected pieces of one class", "what `refine` has learned"
 
 

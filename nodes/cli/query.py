@@ -37,7 +37,7 @@ class Asked(NamedTuple):
     question: Question
     class_name: str = ""
     point: tuple[float, ...] = ()
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    up: tuple[float, float, float] | None = None
     min_confidence: float = 0.0
     server: str = ""
     keys: Path | None = None
@@ -60,9 +60,12 @@ def query(
         list[str] | None, typer.Argument(metavar="[CLASS] [X Y Z]", help="Class, and world coordinates in metres.")
     ] = None,
     up: Annotated[
-        tuple[float, float, float],
-        typer.Option(metavar="X Y Z", help="instances, graph: which way is up in the world."),
-    ] = (0.0, 0.0, 1.0),
+        tuple[float, float, float] | None,
+        typer.Option(
+            metavar="X Y Z",
+            help="instances, graph: which way is up in the world.  [default: 0 0 1; graph: away from the floor]",
+        ),
+    ] = None,
     min_confidence: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="nearest: places less sure of the class do not count.")
     ] = 0.0,
@@ -153,7 +156,8 @@ def ask_file(source: str, asked: Asked) -> dict[str, Any]:
             return map_answers.answer_nearest(asked.class_name, asked.point, hit)
         case Question.INSTANCES:
             by = map_answers.CONNECTED if snapshot.instances is None else map_answers.LEARNED
-            return map_answers.answer_instances(asked.up, InstanceTracker(up=asked.up).update(snapshot), by)
+            up = asked.up or map_answers.UP
+            return map_answers.answer_instances(up, InstanceTracker(up=up).update(snapshot), by)
         case Question.GRAPH:
             return _answer_graph(source, GraphTracker(asked.up).update(snapshot), asked.picture)
 
@@ -180,7 +184,8 @@ def ask_mapper(source: str, asked: Asked) -> dict[str, Any]:
             case Question.INSTANCES:
                 # A map that grows has no things of its own; of a refined one the answer does not say.
                 by = "" if asked.refined else map_answers.CONNECTED
-                return map_answers.answer_instances(asked.up, client.instances(asked.up, gone=asked.gone), by)
+                up = asked.up or map_answers.UP
+                return map_answers.answer_instances(up, client.instances(up, gone=asked.gone), by)
             case Question.GRAPH:
                 return _answer_graph(source, client.graph(asked.up), asked.picture)
 

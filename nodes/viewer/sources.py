@@ -21,6 +21,7 @@ from semantic_mapper.nodes.bridge.packing import thinned, thinning
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.streams import Streams
 from semantic_mapper.queries.ages import BlockAges
+from semantic_mapper.queries.graph import GraphTracker, find_graph
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.snapshot import MapSnapshot
 from semantic_mapper.queries.surface import surface_points, surface_voxels
@@ -34,6 +35,7 @@ from semantic_mapper.transport.sockets import NewestSubscriber
 from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
 POLL_S = 0.1
+GRAPH_S = 5.0  # between two graphs
 ASK_AGAIN_S = 1.0  # a mapper that does not answer yet
 
 Begin = Callable[[], rr.RecordingStream]  # what is to be shown is open: where does it go?
@@ -67,6 +69,8 @@ class _MapShow:
         self._log = log
         self._ages = BlockAges()
         self._shown: NDArray[np.int64] | None = None  # contents of the blocks
+        self._graph: GraphTracker | None = None
+        self._graph_at = 0.0
 
     def show(self, snapshot: MapSnapshot, stamp_ns: int) -> None:
         """Show it as of a time; a map that has not changed since is left as it is."""
@@ -78,6 +82,18 @@ class _MapShow:
         points = surface_points(snapshot, surface)
         ages = ages_s[surface.row].astype(np.float32)[:: thinning(len(points.xyz))]
         self._log.log_map(thinned(points), ages, stamp_ns)
+        self._show_graph(snapshot)
+
+    def _show_graph(self, snapshot: MapSnapshot) -> None:
+        """Rooms and things, now and then; none where lengths are not metres, or the floor is not known yet."""
+        if not snapshot.scale_known or time.monotonic() < self._graph_at:
+            return
+        self._graph = self._graph or GraphTracker()
+        try:
+            self._log.log_graph(self._graph.update(snapshot))
+        except MapError as error:
+            _log.debug("graph_not_shown", reason=str(error))
+        self._graph_at = time.monotonic() + GRAPH_S
 
 
 def show_saved(path: Path, begin: Begin) -> None:
@@ -89,7 +105,7 @@ def show_saved(path: Path, begin: Begin) -> None:
     voxel_map = VoxelMap.load(path)
     log = RerunLog(begin(), voxel_map.label_set, voxel_map.config.voxel_size_m)
     log.note_scale(voxel_map.scale_known)
-    log.finish(voxel_map.points())
+    log.finish(voxel_map.points(), find_graph(voxel_map))
 
 
 def show_log(

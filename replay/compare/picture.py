@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.evaluation.splat import draw_points, from_above
-from semantic_mapper.evaluation.upright import ceiling_height, upright_rotation
+from semantic_mapper.evaluation.upright import ceiling_height, plan_rotation
 from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.plots import (
     DIM_TEXT,
@@ -78,16 +78,16 @@ def draw_comparison(comparison: Comparison) -> Figure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Plan:
-    """How world points come onto a plan: turned upright, cut below the ceiling, moved and scaled to its pixels."""
+    """How points come onto a plan: turned as an exported floor plan, without ceiling, moved and scaled to pixels."""
 
-    R_upright_world: Float64
+    R_plan_world: Float64
     ceiling_m: float
     centre: Float64
     scale: float
 
     def upright(self, xyz: Float32 | Float64) -> tuple[Float64, NDArray[np.bool_]]:
         """Points (N, 3) with z up, and which of them lie below the ceiling."""
-        turned = xyz.astype(np.float64) @ self.R_upright_world.T
+        turned = xyz.astype(np.float64) @ self.R_plan_world.T
         return turned, turned[:, 2] < self.ceiling_m
 
     def raster(self, xyz: Float32 | Float64, values: Float32, side_m: float) -> Float32:
@@ -104,7 +104,7 @@ class _Plan:
 
 def _make_plan(comparison: Comparison) -> _Plan:
     xyz = np.concatenate([surface.points.xyz for surface in comparison.surfaces])
-    R = upright_rotation(xyz, _find_up(comparison.surfaces[0]))
+    R = plan_rotation(xyz, _find_up(comparison.surfaces[0]))
     upright = xyz.astype(np.float64) @ R.T
     ceiling = ceiling_height(upright)
     if not len(upright):

@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
+from semantic_mapper.config import read_toml
 from semantic_mapper.errors import ConfigError, MapError
 from semantic_mapper.files import atomic_path
+from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.files.export import ColorBy, colored, sure_faces, sure_points
 from semantic_mapper.mapping.files.formats.glb import write_glb
 from semantic_mapper.mapping.files.formats.map_server import write_map_server
@@ -22,6 +25,7 @@ from semantic_mapper.mapping.map_scale import require_metres
 from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, occupancy_grid
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.queries.graph import find_graph
 from semantic_mapper.types import Float64
 
 Format = Literal["ply", "ply-mesh", "obj", "glb", "npz", "grid", "rrd"]
@@ -40,7 +44,7 @@ _TAKES: dict[Format, set[str]] = {  # besides min_weight and min_confidence
     "obj": {"color"},
     "glb": {"color", "up"},
     "npz": set(),
-    "grid": {"up", "height", "resolution", "floor"},
+    "grid": {"up", "height", "resolution", "floor", "costs"},
     "rrd": set(),
 }
 HEIGHT_M = (0.1, 1.8)  # what a robot of a person's height can hit; what is lower, it rolls over
@@ -61,6 +65,7 @@ class ExportRequest:
         height: Grid: LOW and HIGH in metres above the floor.
         resolution: Grid: side of a cell in metres; 5 cm by default, or a voxel where that is larger.
         floor: Grid: height of the floor along ``up`` in metres; found by default.
+        costs: Grid: TOML file with the cost of classes; a grid of costs is written beside the plan then.
     """
 
     format: Format
@@ -71,6 +76,7 @@ class ExportRequest:
     height: tuple[float, float] | None = None
     resolution: float | None = None
     floor: float | None = None
+    costs: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +132,7 @@ def export_map(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> Expor
         MapError: nothing to write, a floor plan of a map without metres, impossible numbers, or the file cannot be
             written.
     """
-    for option in ("color", "up", "height", "resolution", "floor"):
+    for option in ("color", "up", "height", "resolution", "floor", "costs"):
         if getattr(request, option) is not None and option not in _TAKES[request.format]:
             able = ", ".join(name for name, takes in _TAKES.items() if option in takes)
             raise ConfigError(f"--{option} means nothing for format {request.format}; it is for {able}")
@@ -153,7 +159,7 @@ def _export_points(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> E
 
             log = RerunLog(recording_file(part), labels, voxel_map.config.voxel_size_m)
             log.note_scale(voxel_map.scale_known)
-            log.finish(points)
+            log.finish(points, find_graph(voxel_map))
     return ExportReport((path,), f"{len(points.xyz):,} points")
 
 
@@ -185,10 +191,11 @@ def _export_grid(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> Exp
     resolution = request.resolution if request.resolution is not None else max(RESOLUTION_M, voxel)
     if resolution < voxel:
         raise ConfigError(f"--resolution {resolution:g}: cells smaller than the map's voxels ({voxel:g} m) leave holes")
+    cost_of = None if request.costs is None else read_costs(request.costs, voxel_map.label_set)
     points = voxel_map.points(request.min_weight)
     up = request.up if request.up is not None else find_up(points, voxel_map.label_set)
     points = sure_points(points, request.min_confidence)
-    grid = occupancy_grid(points, up, resolution, request.height or HEIGHT_M, request.floor)
+    grid = occupancy_grid(points, up, resolution, request.height or HEIGHT_M, request.floor, cost_of)
     files = write_map_server(path, grid)
     area = {name: (grid.cells == value).sum() * resolution**2 for name, value in _STATES.items()}
     content = f"{grid.cells.shape[1]} x {grid.cells.shape[0]} cells of {resolution:g} m: " + ", ".join(
@@ -197,6 +204,25 @@ def _export_grid(voxel_map: VoxelMap, path: Path, request: ExportRequest) -> Exp
     level = round(-float(grid.T_grid_world[2, 3]), 2) + 0.0  # never -0
     floor = () if request.floor is not None else (f"floor at {level:.2f} m (--floor sets it)",)
     return ExportReport(files, content, _found_up(request, up) + floor)
+
+
+def read_costs(path: Path, label_set: LabelSet) -> NDArray[np.int64]:
+    """Cost (256,) of each class id, -1 where a TOML file of lines ``CLASS = COST`` has none; ``unknown`` is one, too.
+
+    Raises:
+        ConfigError: no such file, no TOML, no class of the map, or no cost.
+    """
+    ids = dict(zip((*label_set.names, "unknown"), (*label_set.ids, label_set.ignore_id), strict=True))
+    costs = np.full(256, -1, np.int64)
+    for name, value in read_toml(path).items():
+        if name not in ids:
+            raise ConfigError(f"{path}: '{name}' is no class of the map; it has {', '.join(sorted(ids))}")
+        if type(value) is not int or not 0 <= value <= OCCUPIED:
+            raise ConfigError(
+                f"{path}: {name} = {value!r}: a cost is a whole number from 0, free, to 100, no way through"
+            )
+        costs[ids[name]] = value
+    return costs
 
 
 _STATES = {"free": FREE, "occupied": OCCUPIED, "unknown": UNKNOWN}

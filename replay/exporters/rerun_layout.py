@@ -138,7 +138,7 @@ def layout(
     maps = [
         rrb.Spatial3DView(
             origin="/world",
-            contents=[*seen, f"+ /world/map/{name}"],
+            contents=[*seen, f"+ /world/map/{name}", *(["+ /world/graph/**"] if name == "class" else [])],
             name=f"map: {name}",
             eye_controls=eyes,
             line_grid=False,

@@ -10,12 +10,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from semantic_mapper.errors import LogError
 from semantic_mapper.evaluation.upright import camera_up
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
 from semantic_mapper.plots import UNKNOWN
+from semantic_mapper.queries.graph import SceneGraph
 from semantic_mapper.replay.exporters.camera_path import CameraPath
 from semantic_mapper.replay.exporters.rerun_layout import (
     AGE_SCALE,
@@ -39,6 +41,7 @@ JPEG_QUALITY = 80
 FRUSTUM_M = 0.4  # how far before the camera its image stands in the world
 REGROWN = 1.5  # a map that is so much larger is looked at again
 FLUSH_S = 10.0
+ROOM_COLOR, DOOR_RADIUS_M = (255, 255, 255), 0.06
 
 
 def recording_file(path: Path) -> rr.RecordingStream:
@@ -166,9 +169,33 @@ class RerunLog:
         legend = draw_map_legend(points.label, self._label_set, aged=age_s is not None, computed=computed)
         self._stream.log("legend", rr.Image(legend))
 
-    def finish(self, points: MapPoints) -> None:
+    def log_graph(self, graph: SceneGraph) -> None:
+        """Rooms, doors and things of the map as it is now, in the view that is coloured by class."""
+        rooms = [np.concatenate((room.outline, room.outline[:1])) for room in graph.rooms]
+        names = [f"room {room.id}, {room.area_m2:.1f} m²" for room in graph.rooms]
+        self._stream.log("world/graph/rooms", rr.LineStrips3D(rooms, colors=ROOM_COLOR, labels=names, show_labels=True))
+        doors = np.array([door.center for door in graph.doors]).reshape(-1, 3)
+        widths = [f"door, {door.width_m:.2f} m" for door in graph.doors]
+        self._stream.log("world/graph/doors", rr.Points3D(doors, radii=DOOR_RADIUS_M, colors=ROOM_COLOR, labels=widths))
+        boxes = [thing.box for thing in graph.things]
+        turns = [Rotation.from_matrix(box.R_world_box).as_quat() for box in boxes]
+        self._stream.log(
+            "world/graph/things",
+            rr.Boxes3D(
+                centers=np.array([box.center for box in boxes]).reshape(-1, 3),
+                sizes=np.array([box.size for box in boxes]).reshape(-1, 3),
+                quaternions=np.array(turns).reshape(-1, 4),
+                class_ids=[thing.class_id for thing in graph.things],
+                labels=[f"{thing.class_name} {thing.id}" for thing in graph.things],
+                show_labels=False,
+            ),
+        )
+
+    def finish(self, points: MapPoints, graph: SceneGraph | None = None) -> None:
         """The finished map; ends the recording."""
         self.log_map(points)
+        if graph is not None:
+            self.log_graph(graph)
         self.close()
 
     def close(self) -> None:

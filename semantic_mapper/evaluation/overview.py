@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import ShapeError
-from semantic_mapper.evaluation.splat import draw_points, from_above, from_angle, hides_the_room, open_side
-from semantic_mapper.evaluation.upright import ceiling_height, upright_rotation
+from semantic_mapper.evaluation.splat import draw_points, fitted, from_above, from_angle, hides_the_room, open_side
+from semantic_mapper.evaluation.upright import ceiling_height, plan_rotation, upright_rotation
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.plots import (
     DIM_TEXT,
@@ -102,6 +102,7 @@ def draw_overview(
     subtitle: str = "",
     up: Float64 | None = None,
     unit: str = "m",
+    rooms: Sequence[tuple[str, Float64]] = (),
 ) -> Figure:
     """Draw a row of tiles for each strip, under them the map and the legend, 1600 pixels wide.
 
@@ -113,6 +114,7 @@ def draw_overview(
         up: (3,) rough up direction of the world frame (``upright.camera_up`` of the poses gives one); ``None``
             estimates it from the points alone.
         unit: Of lengths.
+        rooms: Name and outline (N, 3) in the world of each room, drawn into the map from above.
 
     Raises:
         ShapeError: the arrays of ``points`` do not fit together.
@@ -125,7 +127,7 @@ def draw_overview(
     for strip in strips:
         _put_strip(figure, y, strip, label_set, unit)
         y += _strip_height(strip) + GAP
-    _put_map(figure, top + CAPTION, points, label_set, up, unit)
+    _put_map(figure, top + CAPTION, points, label_set, up, unit, rooms)
     shown = [image for strip in strips for image in (strip.rendered, strip.truth) if image is not None]
     legend = place(figure, (WIDTH - MARGIN - LEGEND_WIDTH, top + CAPTION, LEGEND_WIDTH, MAP_HEIGHT))
     put_text(legend, (0, -11), "class, fraction of the map", color=DIM_TEXT)
@@ -192,7 +194,13 @@ def _color_depth(depth_m: Float32, unit: str) -> tuple[str, UInt8]:
 
 
 def _put_map(
-    figure: Figure, y: int, points: LabelledPoints, label_set: LabelSet, up: Float64 | None, unit: str
+    figure: Figure,
+    y: int,
+    points: LabelledPoints,
+    label_set: LabelSet,
+    up: Float64 | None,
+    unit: str,
+    rooms: Sequence[tuple[str, Float64]],
 ) -> None:
     width = (WIDTH - 2 * MARGIN - 2 * GAP - LEGEND_WIDTH) // 2
     size = (width, MAP_HEIGHT)
@@ -204,12 +212,19 @@ def _put_map(
     inside = _without_ceiling(upright, points.label[::step], label_set)
     upright, colors = upright[inside], colors[inside]
 
-    above, scale = draw_points(from_above(upright), colors, size, PANEL)
+    R_plan_world = plan_rotation(xyz, up)
+    plan = from_above(xyz[inside].astype(np.float64) @ R_plan_world.T)
+    camera = fitted(plan, size) if len(plan) else (np.zeros(2), 1.0)
+    above, scale = draw_points(plan, colors, size, PANEL, camera=camera)
     azimuth = open_side(upright, ELEVATION)
     seen = ~hides_the_room(upright, azimuth)
     angled, _ = draw_points(from_angle(upright[seen], azimuth, ELEVATION), colors[seen], size, PANEL)
     cut = "" if inside.all() else ", ceiling cut away"
-    _put_scale_bar(put_picture(figure, (MARGIN, y, *size), above, f"map from above{cut}"), scale, unit)
+    axes = put_picture(figure, (MARGIN, y, *size), above, f"map from above{cut}")
+    _put_scale_bar(axes, scale, unit)
+    for name, outline in rooms:
+        corners = (from_above(outline @ R_plan_world.T)[:, :2] - camera[0]) * scale + np.array(size) / 2
+        _put_room(axes, name, corners)
     put_picture(figure, (MARGIN + width + GAP, y, *size), angled, f"map from an angle{cut}")
 
 
@@ -242,6 +257,16 @@ def _without_ceiling(upright: Float64, label: UInt8, label_set: LabelSet) -> NDA
     if "ceiling" in label_set.names:
         inside &= label != label_set.ids[label_set.names.index("ceiling")]
     return inside if inside.any() else ~inside
+
+
+def _put_room(axes: Axes, name: str, corners: Float64) -> None:
+    """The outline (N, 2) of a room, in pixels, and its name in the corner that is uppermost."""
+    x, y = np.concatenate((corners, corners[:1])).T
+    axes.plot(x, y, color="black", linewidth=3, clip_on=True)
+    axes.plot(x, y, color="white", linewidth=1.2, clip_on=True)
+    at = corners[int((corners @ (0.3, 1.0)).argmin())] + (6, 12)
+    behind = {"facecolor": "black", "alpha": 0.6, "linewidth": 0, "pad": 1.5}
+    put_text(axes, (float(at[0]), float(at[1])), name, bbox=behind, clip_on=True)
 
 
 def _put_scale_bar(axes: Axes, scale: float, unit: str) -> None:

@@ -41,12 +41,8 @@ def draw_points(
     canvas = np.full((height, width, 3), background, np.uint8)
     if not len(xyz_view):
         return cv2.resize(canvas, size, interpolation=cv2.INTER_AREA).astype(np.uint8), 1.0
-    if camera is None:
-        low, high = np.percentile(xyz_view[:, :2], (0.1, 99.9), axis=0)
-        extent = np.maximum(high - low, 0.1) * 1.04 + 0.05
-        centre, scale = (low + high) / 2, float(min(width / extent[0], height / extent[1]))
-    else:
-        centre, scale = camera[0], camera[1] * SUPERSAMPLING
+    centre, scale = fitted(xyz_view, size) if camera is None else camera
+    scale *= SUPERSAMPLING
     pixel = np.floor((xyz_view[:, :2] - centre) * scale + (width / 2, height / 2)).astype(np.int64)
     nearest, depth = _z_buffer(pixel, xyz_view[:, 2], width, height)
     side = int(np.clip(np.ceil(point_spacing(xyz_view) * scale * 1.1), 1, MAX_SPLAT))
@@ -55,6 +51,13 @@ def draw_points(
     shade = _edge_shading(depth, hit, scale)
     canvas[hit] = np.clip(colors[nearest[hit]] * shade[hit][:, None], 0, 255).astype(np.uint8)
     return cv2.resize(canvas, size, interpolation=cv2.INTER_AREA).astype(np.uint8), scale / SUPERSAMPLING
+
+
+def fitted(xyz_view: Float64, size: tuple[int, int]) -> tuple[Float64, float]:
+    """The ``camera`` of ``draw_points`` that fits points (N, 3), N > 0, into a picture (width, height)."""
+    low, high = np.percentile(xyz_view[:, :2], (0.1, 99.9), axis=0)
+    extent = np.maximum(high - low, 0.1) * 1.04 + 0.05
+    return (low + high) / 2, float(min(size[0] / extent[0], size[1] / extent[1]))
 
 
 def from_above(xyz_upright: Float64) -> Float64:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import ShapeError
+from semantic_mapper.geometry import turn_onto
 from semantic_mapper.types import Float32, Float64
 
 SAMPLE = 20_000  # points that the searches look at
@@ -14,6 +15,7 @@ TILT_DEG = 10.0  # how far the refinement may turn the first guess
 MIN_TURN = 0.05  # mean square of the level axes' second direction: a camera that turned about 13 degrees either way
 SLAB_M = 0.15  # thickness within which a ceiling lies
 CELL_M = 0.1  # of the floor plan
+SNAP_DEG = 0.5  # nearer to an axis of the world than the search can tell apart: it is that axis
 ROOF_SHARE = 0.04  # of the floor plan, from which on it is worth to cut
 
 
@@ -63,6 +65,22 @@ def upright_rotation(xyz: Float32 | Float64, up: Float64 | None = None) -> Float
     R = _align_walls(points, min(refined, key=lambda turned: _spread(points @ turned[2])))
     x, y, _ = np.ptp(points @ R.T, axis=0)
     return R if x >= y else _turn(np.pi / 2) @ R
+
+
+def find_upright(xyz: Float32 | Float64, up: Float64 | None = None) -> Float64:
+    """Unit vector up (3,) in the world, found as by ``upright_rotation``; an axis of the world where it is so near."""
+    found = upright_rotation(xyz, up)[2]
+    axis = np.eye(3)[int(np.abs(found).argmax())] * np.sign(found[np.abs(found).argmax()])
+    return axis if found @ axis > np.cos(np.deg2rad(SNAP_DEG)) else found
+
+
+def plan_rotation(xyz: Float32 | Float64, up: Float64 | None = None) -> Float64:
+    """Rotation (3, 3) from the world to the frame of an exported floor plan (``mapping.occupancy``).
+
+    z is up, and x and y are those of the world where its z is up, too. So pictures from above lie as the plan does.
+    Arguments and errors are those of ``upright_rotation``.
+    """
+    return turn_onto(find_upright(xyz, up), np.array((0.0, 0.0, 1.0)))
 
 
 def ceiling_height(xyz_upright: Float32 | Float64) -> float | None:

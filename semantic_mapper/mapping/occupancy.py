@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.mapping.files.up_axis import turn_onto
+from semantic_mapper.geometry import turn_onto
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.types import Float64
 
@@ -37,16 +37,23 @@ class OccupancyGrid:
         resolution_m: Side of a cell.
         origin_m: (x, y) of the outer corner of cell (0, 0).
         T_grid_world: (4, 4).
+        costs: (H, W) int8, 0 to 100 or ``UNKNOWN``, by class; None where no costs were given.
     """
 
     cells: NDArray[np.int8]
     resolution_m: float
     origin_m: tuple[float, float]
     T_grid_world: Float64
+    costs: NDArray[np.int8] | None = None
 
 
 def occupancy_grid(
-    points: MapPoints, up: Float64, resolution_m: float, height_m: tuple[float, float], floor_m: float | None = None
+    points: MapPoints,
+    up: Float64,
+    resolution_m: float,
+    height_m: tuple[float, float],
+    floor_m: float | None = None,
+    cost_of: NDArray[np.int64] | None = None,
 ) -> OccupancyGrid:
     """Make the plan of a map's surface points; see the head of this file for what its values mean.
 
@@ -56,6 +63,9 @@ def occupancy_grid(
         resolution_m: Side of a cell; below the map's voxel size, walls would have holes.
         height_m: LOW and HIGH above the floor, 0 < LOW < HIGH.
         floor_m: Height of the floor, along ``up`` from the origin of the world; None = found by ``floor_height``.
+        cost_of: (256,) cost of each class id, 0 to 100, -1 where a class has none of its own; None makes no ``costs``.
+            A cell costs as much as the dearest surface in it between -LOW and HIGH. Surface without a cost of its own
+            costs 100 where it is above LOW, and nothing where it is floor.
 
     Raises:
         MapError: impossible numbers, no points between -LOW and HIGH, or more than 100 million cells.
@@ -88,7 +98,12 @@ def occupancy_grid(
     stands = height[within] >= low
     cells[row[stands], column[stands]] = OCCUPIED
     x, y = (first * resolution_m).tolist()
-    return OccupancyGrid(cells, resolution_m, (x, y), T_grid_world)
+    costs = None
+    if cost_of is not None:
+        own = cost_of[points.label[within]]
+        costs = np.full(cells.shape, UNKNOWN, np.int8)
+        np.maximum.at(costs, (row, column), np.where(own >= 0, own, np.where(stands, OCCUPIED, FREE)).astype(np.int8))
+    return OccupancyGrid(cells, resolution_m, (x, y), T_grid_world, costs)
 
 
 def floor_height(height: Float64) -> float:

@@ -29,8 +29,9 @@ from semantic_mapper.fields.nesf import (
     near_cells,
     pool,
 )
+from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
-from semantic_mapper.mapping.files.up_axis import find_up, turn_onto
+from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.mapping.fusion.depth_trust import SURFACE_WEIGHT
 from semantic_mapper.mapping.fusion.evidence import PROBABILITY_FLOOR, STEPS_PER_NAT
 from semantic_mapper.mapping.instance_layer import InstanceLayer, instance_layer

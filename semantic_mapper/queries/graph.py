@@ -13,15 +13,18 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import STUFF_NAMES, LabelSet
-from semantic_mapper.mapping.files.up_axis import turn_onto
+from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.mapping.map_scale import require_metres
+from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.queries.checks import check_direction
 from semantic_mapper.queries.instances import LEAST_OVERLAP, Instance, InstanceTracker
+from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.queries.occupancy import State, read_states
 from semantic_mapper.queries.rooms import RoomPlan, find_walls, part_rooms
 from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.queries.surface import surface_voxels
+from semantic_mapper.queries.surface import SurfaceVoxels, surface_points, surface_voxels
 from semantic_mapper.types import Bool, Float64, Int64, UInt8
 
 CELL_M = 0.05  # of a plan, or a voxel where that is larger
@@ -34,6 +37,7 @@ BODY_M = (0.4, 1.6)  # above the floor: here walls are told from doors, whose li
 HIGH_M = 2.4  # above the floor: up to here a wall shows over what hides it below, and over doors
 WALL_LAYER_M = 0.2
 WALL_LAYERS = (3, 2)  # that a wall fills at least, of the 6 of the body, and of the 4 above
+ROOM_VOXELS = 2000  # of a thing are looked up to find its room, or up to twice as many
 NEAR_ROOM_M = 0.4  # what hangs at a wall, or stands in it, belongs to a room so near
 # Things that cover walls: where they hang there is no way through. Doors are no walls, open or closed.
 HUNG_NAMES = frozenset("window picture curtain blinds mirror showercurtain whiteboard".split())
@@ -123,20 +127,33 @@ class GraphTracker:
     that became one, the oldest id stays. A floor is the earlier one that is within half a metre of its height.
 
     Args:
-        up: (3,) direction in the world.
+        up: (3,) direction in the world; by default it is found by the floor of the first map that has one, and kept.
 
     Raises:
         MapError: ``up`` without a direction.
     """
 
-    def __init__(self, up: ArrayLike = (0.0, 0.0, 1.0)) -> None:
-        self._up = check_direction(up, "up")
-        if self._up.shape != (3,):
-            raise MapError(f"up: expected shape (3,), got {np.shape(up)}")
-        self._things = InstanceTracker(up=self._up)
+    def __init__(self, up: ArrayLike | None = None) -> None:
+        self._up: Float64 | None = None
+        if up is not None:
+            self._up = check_direction(up, "up")
+            if self._up.shape != (3,):
+                raise MapError(f"up: expected shape (3,), got {np.shape(up)}")
+        self._things: InstanceTracker | None = None
         self._plans: tuple[_Plan, ...] = ()
         self._next_floor = self._next_room = 1
         self._lock = threading.Lock()
+
+    def up_in(self, snapshot: MapSnapshot) -> Float64:
+        """Unit vector up (3,) in the world, found by the floor of this map where it is not known yet.
+
+        Raises:
+            MapError: it is not known, and the map does not show it.
+        """
+        with self._lock:
+            if self._up is None:
+                self._up = find_up(surface_points(snapshot, surface_voxels(snapshot)), snapshot.label_set)
+            return self._up
 
     def update(self, snapshot: MapSnapshot, things: Sequence[Instance] | None = None) -> SceneGraph:
         """The graph of the map as it is now.
@@ -146,15 +163,20 @@ class GraphTracker:
             things: Of it, found by another; by default this finds them.
 
         Raises:
-            MapError: lengths of the map are not metres.
+            MapError: lengths of the map are not metres, or which way is up is not known (``up_in``).
         """
         require_metres(snapshot.scale_known, "graph")
-        R_grid_world = turn_onto(self._up, np.array((0.0, 0.0, 1.0)))
+        up = self.up_in(snapshot)
+        R_grid_world = turn_onto(up, np.array((0.0, 0.0, 1.0)))
         cell_m = max(CELL_M, snapshot.voxel_size_m)
         with self._lock:
-            things = tuple(self._things.update(snapshot) if things is None else things)
-            xyz, label, level = _surface(snapshot, R_grid_world)
-            heights = find_floors(xyz[level, 2], snapshot.voxel_size_m)
+            if things is None:
+                self._things = self._things or InstanceTracker(up=up)
+                things = self._things.update(snapshot)
+            things = tuple(things)
+            every = max(1, 2 * int(CELL_M / snapshot.voxel_size_m) - 1)
+            xyz, label, level = _surface(snapshot, R_grid_world, every)
+            heights = find_floors(xyz[level, 2], snapshot.voxel_size_m**2 * every)
             floors = list[_Level]()
             for height, above in zip(heights, [*heights, np.inf][1:], strict=True):
                 within = (xyz[:, 2] >= height + LOW_M[0]) & (xyz[:, 2] < min(above + LOW_M[0], height + HIGH_M))
@@ -164,7 +186,7 @@ class GraphTracker:
                 floors.append(_describe_level(found, plan, ids, _ToWorld(R_grid_world, first, cell_m, height)))
             plans = self._plans = tuple(level.plan for level in floors)
         return SceneGraph(
-            self._up,
+            up,
             tuple(level.floor for level in floors),
             tuple(sorted((room for level in floors for room in level.rooms), key=lambda room: room.id)),
             tuple(sorted((door for level in floors for door in level.doors), key=lambda door: door.rooms)),
@@ -190,18 +212,28 @@ class GraphTracker:
         return _Plan(floor, height, first, np.append(ids, 0)[found.room]), ids
 
 
-def find_floors(height: Float64, voxel_size_m: float) -> list[float]:
+def find_graph(voxel_map: VoxelMap) -> SceneGraph | None:
+    """The graph of a finished map; None where its lengths are not metres, or nothing in it is known to be floor."""
+    if not voxel_map.scale_known:
+        return None
+    try:
+        return GraphTracker().update(MapMirror.of(voxel_map).snapshot())
+    except MapError:
+        return None
+
+
+def find_floors(height: Float64, area_m2: float) -> list[float]:
     """Heights of floors, ascending: where level surface is largest, and as far apart as storeys are.
 
     Args:
         height: (N,) of the voxels of surface that one could stand on, metres.
-        voxel_size_m: Each of them covers this squared.
+        area_m2: That each of them covers.
     """
     if not len(height):
         return []
     layer = np.floor(height / LAYER_M).astype(np.int64)
     counts = np.bincount(layer - layer.min())
-    area = np.convolve(counts, np.ones(3), "same") * voxel_size_m**2
+    area = np.convolve(counts, np.ones(3), "same") * area_m2
     least = max(LEAST_FLOOR_M2, FLOOR_SHARE * float(area.max()))
     found: list[float] = []
     for k in np.argsort(-area, kind="stable"):
@@ -213,9 +245,17 @@ def find_floors(height: Float64, voxel_size_m: float) -> list[float]:
     return sorted(found)
 
 
-def _surface(snapshot: MapSnapshot, R_grid_world: Float64) -> tuple[Float64, UInt8, Bool]:
-    """Surface points (N, 3) in the plan's frame, metres, z up; class ids (N,); whether one could stand there (N,)."""
+def _surface(snapshot: MapSnapshot, R_grid_world: Float64, every: int) -> tuple[Float64, UInt8, Bool]:
+    """Surface points (N, 3) in the plan's frame, metres, z up; class ids (N,); whether one could stand there (N,).
+
+    One of ``every`` voxels is kept, by the sum of its coordinates: so many that each cell of the plan has one.
+    """
     surface = surface_voxels(snapshot)
+    if every > 1:
+        x, y, z = (surface.voxel >> shift & 7 for shift in (0, 3, 6))  # in its block of 8^3
+        number = x + y + z + 8 * snapshot.keys.sum(axis=1)[surface.row]
+        kept = number % every == 0
+        surface = SurfaceVoxels(surface.row[kept], surface.voxel[kept], surface.point[kept])
     label = snapshot.voxels.label[snapshot.slots[surface.row], surface.voxel]
     up = R_grid_world[2]
     above = read_states(surface.point + 1.5 * up, snapshot)
@@ -309,7 +349,8 @@ def _room_of(
     thing: Instance, voxel_size_m: float, R_grid_world: Float64, plans: Sequence[_Plan], cell_m: float
 ) -> int | None:
     """Id of the room that holds most of a thing's voxels, or is nearest to most of them."""
-    xyz = thing.voxels @ (R_grid_world.T * voxel_size_m)
+    step = 1 + len(thing.voxels) // ROOM_VOXELS
+    xyz = thing.voxels[::step] @ (R_grid_world.T * voxel_size_m)
     below = [plan for plan in plans if plan.height_m <= float(np.median(xyz[:, 2])) + LOW_M[1]]
     if not below:
         return None

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from semantic_mapper.mapping.files.up_axis import turn_onto
+from semantic_mapper.geometry import turn_onto
 from semantic_mapper.plots import CYCLE, SMALL_PT, TITLE_PT, cut, new_figure, rendered
 from semantic_mapper.queries.graph import Floor, SceneGraph
 from semantic_mapper.types import Float64

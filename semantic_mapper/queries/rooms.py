@@ -22,6 +22,7 @@ SAME_WIDTH = 0.77  # of the smaller basin's greatest clearance: a passage so wid
 LEAST_ROOM_M2 = 1.0  # what is smaller belongs to the room that it opens to, or to none
 WALL_CLOSING_M = 0.15  # gaps of a wall up to twice this are closed, and so is its inside
 LEAST_WALL_M = 0.5  # a wall that is shorter (a column, a lamp) parts no rooms
+MOST_UNSEEN_M = 0.6  # width of a gap in what was seen of one room: no wall is known to be in it
 MOST_HIDDEN_M2 = 1.5  # of floor that is hidden, behind or under furniture
 
 
@@ -69,7 +70,7 @@ def part_rooms(seen: Bool, wall: Bool, cell_m: float) -> RoomPlan:
         wall: (H, W) where there is a wall, see ``find_walls``.
         cell_m: Side of a cell.
     """
-    inside = seen & ~wall
+    inside = _bridged(seen, round(MOST_UNSEEN_M / 2 / cell_m)) & ~wall
     inside[[0, -1]] = inside[:, [0, -1]] = False
     inside |= _small_parts(~inside & ~wall, MOST_HIDDEN_M2 / cell_m**2)
     clearance = np.asarray(ndimage.distance_transform_edt(inside, sampling=cell_m), np.float64)
@@ -88,6 +89,14 @@ def part_rooms(seen: Bool, wall: Bool, cell_m: float) -> RoomPlan:
     number[:-1] = number[group]
     room = number[basin]
     return RoomPlan(room, len(kept), clearance, _passages(room, clearance))
+
+
+def _bridged(seen: Bool, reach: int) -> Bool:
+    """With the gaps (H, W) between what was seen that are at most ``2 * reach`` cells wide."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1,) * 2)
+    padded = np.pad(seen, 2 * reach).astype(np.uint8)
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc) > 0
+    return closed[2 * reach : 2 * reach + seen.shape[0], 2 * reach : 2 * reach + seen.shape[1]]
 
 
 def _small_parts(mask: Bool, most_cells: float) -> Bool:

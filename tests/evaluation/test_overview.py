@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.lines import Line2D
 from matplotlib.text import Text
 
 from semantic_mapper.errors import ShapeError
@@ -63,6 +64,23 @@ def test_computed_surface_is_striped_and_the_legend_says_how_much() -> None:
     figure = figure_of(draw_overview, [], replace(points, measured=half & ~half), ROOMS, title="room", up=UP)
     assert not misplaced_texts(figure)
     assert "all of it computed, no sensor" in {t.get_text() for t in figure.findobj(Text)}
+
+
+def test_rooms_are_drawn_where_they_are_as_a_floor_plan_lies() -> None:
+    points = room_points()
+    turned = replace(points, xyz=points.xyz @ turn_about_up(np.deg2rad(30)).T.astype(np.float32))
+    outline = np.array(((0, 0, 0), (4, 0, 0), (4, 3, 0), (0, 3, 0))) @ turn_about_up(np.deg2rad(30)).T
+    figure = figure_of(draw_overview, [], turned, ROOMS, title="room", up=UP, rooms=[("room 7: 12 m²", outline)])
+    assert "room 7: 12 m²" in {t.get_text() for t in figure.findobj(Text)} and not misplaced_texts(figure)
+    x, y = next(line for line in figure.findobj(Line2D) if len(line.get_xdata()) == 5).get_data()
+    sides = np.diff(np.stack((x, -y), axis=1).astype(float), axis=0)
+    assert np.rad2deg(np.arctan2(*sides[0][::-1])) == pytest.approx(30, abs=0.5), "x of the world is to the right"
+    assert np.linalg.norm(sides[0]) / np.linalg.norm(sides[1]) == pytest.approx(4 / 3, rel=1e-3)
+
+
+def turn_about_up(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array(((c, -s, 0), (s, c, 0), (0, 0, 1.0)))
 
 
 def test_lengths_have_the_unit_that_they_are_in() -> None:

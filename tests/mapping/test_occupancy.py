@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.geometry import look_at, transform
+from semantic_mapper.geometry import look_at, transform, turn_onto
 from semantic_mapper.mapping.files.formats.map_server import write_map_server
-from semantic_mapper.mapping.files.up_axis import turn_onto
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, floor_height, occupancy_grid
 from semantic_mapper.types import CameraIntrinsics, Float32, Float64
@@ -134,6 +133,26 @@ def test_map_server_files_read_as_nav2_reads_them(tmp_path: Path) -> None:
     fraction = (255 - picture.astype(np.float64)) / 255
     read = np.where(fraction > values["occupied_thresh"], 100, np.where(fraction < values["free_thresh"], 0, -1))
     np.testing.assert_array_equal(read[::-1], cells)  # the first row of a picture is its top
+
+
+def test_a_cell_costs_as_much_as_the_dearest_surface_in_it(tmp_path: Path) -> None:
+    floor, rug, table, chair = 1, 2, 3, 4
+    at = [(0, 0, 0, floor), (1, 0, 0, rug), (2, 0, 0, floor), (2, 0, 0.7, table), (3, 0, 0.4, chair), (3, 0, 0, rug)]
+    at += [(4, 1, 0, floor)]  # the cells above the first four are unknown
+    xyz, label = np.array([a[:3] for a in at], np.float32) + np.float32(0.5), np.array([a[3] for a in at], np.uint8)
+    points = MapPoints(xyz, np.zeros((len(at), 3), np.uint8), label, np.ones(len(at), np.float32))
+    costs = np.full(256, -1)
+    costs[[rug, chair]] = 20, 60
+    grid = occupancy_grid(points, UP, 1.0, HEIGHT, floor_m=0.5, cost_of=costs)
+    assert grid.costs is not None
+    assert grid.costs.tolist() == [[0, 20, 100, 60, -1], [-1, -1, -1, -1, 0]]
+    written = write_map_server(tmp_path / "plan.yaml", grid)
+    assert [path.name for path in written] == ["plan.yaml", "plan.pgm", "plan_costs.yaml", "plan_costs.pgm"]
+    text = (tmp_path / "plan_costs.yaml").read_text()
+    assert "mode: raw\n" in text and 'image: "plan_costs.pgm"\n' in text
+    body = (tmp_path / "plan_costs.pgm").read_bytes().split(b"\n", 3)[3]
+    assert list(body) == [255, 255, 255, 255, 0, 0, 20, 100, 60, 255]
+    assert occupancy_grid(points, UP, 1.0, HEIGHT, floor_m=0.5).costs is None
 
 
 def test_the_floor_is_the_lowest_full_layer() -> None:

@@ -57,7 +57,9 @@ def test_storeys_are_floors_of_their_own() -> None:
 
 def test_up_may_be_any_axis() -> None:
     R_world_house = np.array(((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)))  # up is y
-    graph = graph_of(two_rooms(), GraphTracker((0.0, 1.0, 0.0)), R_world_house)
+    given = graph_of(two_rooms(), GraphTracker((0.0, 1.0, 0.0)), R_world_house)
+    graph = graph_of(two_rooms(), GraphTracker(), R_world_house)  # up is where the floor is not
+    assert graph.up.tolist() == given.up.tolist() == [0, 1, 0] and len(given.rooms) == 2
     assert len(graph.rooms) == 2 and len(graph.doors) == 1
     np.testing.assert_allclose(R_world_house.T @ graph.doors[0].center, (3.05, 1.5, 0.0), atol=0.15)
     assert list(graph.room_of.values()) == [max(graph.rooms, key=lambda room: room.center[0]).id]
@@ -78,17 +80,19 @@ def test_ids_stay_while_the_map_grows() -> None:
 
 def test_a_map_without_floor_has_no_rooms() -> None:
     walls = [box for box in two_rooms() if box[0] in ("wall", "ceiling", AIR)]
-    graph = graph_of(walls, GraphTracker())
+    graph = graph_of(walls, GraphTracker((0, 0, 1)))
     assert graph.floors == graph.rooms == graph.doors == ()
+    with pytest.raises(MapError, match="which way is up"):
+        graph_of(walls, GraphTracker())
     with pytest.raises(MapError, match="up"):
         GraphTracker((0, 0))
 
 
 def test_a_ceiling_and_a_table_are_no_floors() -> None:
     floor, table = np.zeros(4000), np.full(1500, 0.75)
-    assert find_floors(np.concatenate((table, floor)), 0.05) == [0.0]
-    assert find_floors(np.empty(0), 0.05) == []
-    assert find_floors(np.concatenate((floor, floor[:100] + 2.5)), 0.05) == [0.0]
+    assert find_floors(np.concatenate((table, floor)), 0.0025) == [0.0]
+    assert find_floors(np.empty(0), 0.0025) == []
+    assert find_floors(np.concatenate((floor, floor[:100] + 2.5)), 0.0025) == [0.0]
 
 
 def plan(wall: list[tuple[int, int, int, int]], size: tuple[int, int] = (64, 124)) -> tuple[Bool, Bool]:
@@ -124,6 +128,13 @@ def test_what_is_hidden_behind_furniture_belongs_to_the_room() -> None:
     seen[10:20, 40:60] = False  # 0.5 m2
     found = part_rooms(seen, wall, CELL_M)
     assert found.rooms == 1 and (found.room[10:20, 40:60] == 0).all()
+
+
+@pytest.mark.parametrize(("gap", "rooms"), [(10, 1), (16, 2)])
+def test_a_narrow_strip_that_was_not_seen_parts_no_room(gap: int, rooms: int) -> None:
+    seen, wall = plan([])
+    seen[:, 60 : 60 + gap] = False  # from wall to wall
+    assert part_rooms(seen, wall, CELL_M).rooms == rooms
 
 
 def test_a_column_is_no_wall_and_gaps_of_a_wall_are_closed() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from semantic_mapper.errors import MapError
-from semantic_mapper.evaluation.upright import upright_rotation
+from semantic_mapper.evaluation.upright import find_upright
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.types import Float64
@@ -13,7 +13,8 @@ from semantic_mapper.types import Float64
 FLOOR = "floor"  # the class whose points say where down is
 LEAST_SHARE = 0.01  # of a map's points that have to be floor
 FLAT_M = 0.1  # the middle half of the floor's points lies within so much of height, or it is none
-SNAP_DEG = 0.5  # nearer to an axis of the world than the search can tell apart: it is that axis
+LEVEL_SHARE = 0.8  # of the floor's points on several storeys, each within so much of height, or it is none
+STOREY_M = 1.8  # storeys are at least so far apart
 
 
 def find_up(points: MapPoints, label_set: LabelSet) -> Float64:
@@ -28,28 +29,32 @@ def find_up(points: MapPoints, label_set: LabelSet) -> Float64:
     floor = points.xyz[np.isin(points.label, named)].astype(np.float64)
     if len(floor) < max(LEAST_SHARE * len(points.xyz), 10):
         raise MapError("which way is up cannot be found: too little of the map is labelled floor; say it with --up")
+    rise = points.xyz.mean(axis=0, dtype=np.float64) - floor.mean(axis=0)
     guess = _normal(floor)
-    rises = (points.xyz.mean(axis=0, dtype=np.float64) - np.median(floor, axis=0)) @ guess
-    up = upright_rotation(points.xyz, guess if rises > 0 else -guess)[2]
+    up = find_upright(points.xyz, guess if rise @ guess > 0 else -guess)
     low, high = np.percentile(floor @ up, (25, 75))
-    if high - low > FLAT_M:
+    if high - low <= FLAT_M:
+        return up
+    axis = max(np.eye(3), key=lambda axis: _level_share(floor @ axis))  # floors of storeys lie in no one plane
+    up = find_upright(points.xyz, axis if rise @ axis > 0 else -axis)
+    if _level_share(floor @ up) < LEVEL_SHARE:
         raise MapError(
             f"which way is up cannot be found: what is labelled floor lies in no plane ({high - low:.2f} m of height); "
             "say it with --up"
         )
-    axis = np.eye(3)[int(np.abs(up).argmax())] * np.sign(up[np.abs(up).argmax()])
-    return axis if up @ axis > np.cos(np.deg2rad(SNAP_DEG)) else up
+    return up
 
 
-def turn_onto(a: Float64, b: Float64) -> Float64:
-    """The least rotation (3, 3) that takes unit vector ``a`` to ``b``; half a turn about x or y for opposite ones."""
-    c = float(a @ b)
-    if c < -1 + 1e-9:
-        side = np.cross(b, (0.0, 0.0, 1.0) if abs(b[2]) < 0.9 else (0.0, 1.0, 0.0))
-        side /= np.linalg.norm(side)
-        return 2 * np.outer(side, side) - np.eye(3)
-    x, y, z = v = np.cross(a, b)
-    return np.array(((c, -z, y), (z, c, -x), (-y, x, c))) + np.outer(v, v) / (1 + c)
+def _level_share(height: Float64) -> float:
+    """Fraction of heights (N,), metres, that lie in layers of ``FLAT_M`` which are as far apart as storeys."""
+    layer = np.floor((height - height.min()) / (FLAT_M / 2)).astype(np.int64)
+    counts = np.convolve(np.bincount(layer), (1, 1))
+    apart, found = round(2 * STOREY_M / FLAT_M), 0
+    while counts.any():
+        best = int(counts.argmax())
+        found += int(counts[best])
+        counts[max(0, best - apart) : best + apart] = 0
+    return found / len(height)
 
 
 def _normal(xyz: Float64) -> Float64:

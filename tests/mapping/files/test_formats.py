@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from semantic_mapper.errors import MapError
+from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.files.export import colored, sure_faces, sure_points
 from semantic_mapper.mapping.files.formats.glb import write_glb
 from semantic_mapper.mapping.files.formats.npz import write_npz
 from semantic_mapper.mapping.files.formats.obj import write_obj
 from semantic_mapper.mapping.files.formats.ply import write_ply, write_ply_mesh
-from semantic_mapper.mapping.files.up_axis import find_up, turn_onto
+from semantic_mapper.mapping.files.up_axis import find_up
 from semantic_mapper.mapping.map_types import MapMesh, MapPoints
 from semantic_mapper.mapping.open3d_loader import load_open3d
 from semantic_mapper.types import Float64

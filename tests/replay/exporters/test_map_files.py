@@ -116,6 +116,33 @@ def test_a_plan_says_what_was_found_out_for_it(corner: VoxelMap, tmp_path: Path)
     assert told.found == ()
 
 
+def test_a_recording_shows_rooms_and_things(corner: VoxelMap, tmp_path: Path) -> None:
+    export_map(corner, tmp_path / "a.rrd", ExportRequest("rrd"))
+    shown = {chunk.entity_path for chunk in rerun.chunk.RrdReader(tmp_path / "a.rrd").stream()}
+    assert {"/world/graph/rooms", "/world/graph/doors", "/world/graph/things"} <= shown
+
+
+def test_costs_are_read_by_class(corner: VoxelMap, tmp_path: Path) -> None:
+    (tmp_path / "costs.toml").write_text("floor = 10\nwall = 90\nunknown = 50\n")
+    request = ExportRequest("grid", height=(0.2, 1.0), costs=tmp_path / "costs.toml")
+    report = export_map(corner, tmp_path / "plan.yaml", request)
+    assert [path.name for path in report.files] == ["plan.yaml", "plan.pgm", "plan_costs.yaml", "plan_costs.pgm"]
+    plan, costs = (np.frombuffer(path.read_bytes().split(b"\n", 3)[3], np.uint8) for path in report.files[1::2])
+    assert set(costs) == {10, 50, 90, 255} and ((costs == 255) == (plan == 205)).all()
+    assert (costs[plan == 0] == 90).mean() > 0.8 and (costs[plan == 254] == 10).mean() > 0.8
+    for text, message in (
+        ("flor = 1", "'flor' is no class of the map; it has "),
+        ("floor = 101", "a cost is a whole number from 0"),
+        ("floor = true", "a cost is a whole number from 0"),
+        ("floor", "costs.toml"),
+    ):
+        (tmp_path / "costs.toml").write_text(text)
+        with pytest.raises(ConfigError, match=message):
+            export_map(corner, tmp_path / "plan.yaml", request)
+    with pytest.raises(ConfigError, match="--costs means nothing for format obj"):
+        export_map(corner, tmp_path / "a.obj", ExportRequest("obj", costs=tmp_path / "costs.toml"))
+
+
 def test_files_of_a_map_without_metres_say_so_and_a_plan_is_refused(corner: VoxelMap, tmp_path: Path) -> None:
     corner.save(tmp_path / "map.npz")
     unknown = VoxelMap.load(tmp_path / "map.npz")

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from semantic_mapper.errors import MapError
 from semantic_mapper.files import atomic_write
+from semantic_mapper.geometry import turn_onto
 from semantic_mapper.labels import LabelSet
-from semantic_mapper.mapping.files.up_axis import turn_onto
 from semantic_mapper.mapping.map_types import MapMesh
 from semantic_mapper.types import Float64, UInt8
 
