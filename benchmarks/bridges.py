@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 import psutil
+from numpy.typing import NDArray
 
 from benchmarks.foxglove_client import FoxgloveClient
 from semantic_mapper.nodes.bridge.feed import lower_priority
@@ -39,6 +40,7 @@ from semantic_mapper.transport.sockets import LosslessSubscriber, Publisher
 from semantic_mapper.types import MapUpdate, PosedFrame
 
 PATIENCE_S = 300.0
+DRAWS = 1000
 Steps = dict[tuple[bool, int, int], tuple[float, float]]  # by whether bridges work, pair of laps, place of the frame
 NODES = ("camera", "mapper", "query", "foxglove", "zenoh")
 
@@ -155,15 +157,30 @@ def _compare_cpu(cpu: dict[bool, list[float]]) -> dict[str, Any]:
 def _compare(steps: Steps) -> dict[str, Any]:
     both = [(pair, place) for working, pair, place in steps if working and (False, pair, place) in steps]
     table = {working: np.array([steps[working, pair, place] for pair, place in both]) for working in (False, True)}
+    laps = np.array([pair for pair, _ in both])
     found: dict[str, Any] = {"pairs": len(both)}
     for column, name in enumerate(("step_ms", "turnaround_ms")):
         for percent in (50, 95, 99):
             without, with_them = (float(np.percentile(table[w][:, column], percent)) for w in (False, True))
             row = {"without": round(without, 1), "with": round(with_them, 1), "ratio": round(with_them / without, 3)}
-            found[f"{name}_p{percent}"] = row
+            found[f"{name}_p{percent}"] = row | {"interval": _interval(laps, table, column, percent)}
         ratios = table[True][:, column] / table[False][:, column]
         found[f"{name}_ratio_median"] = round(float(np.median(ratios)), 3)
     return found
+
+
+def _interval(
+    laps: NDArray[np.int64], table: dict[bool, NDArray[np.float64]], column: int, percent: int
+) -> list[float]:
+    """95 % interval of a ratio of percentiles, pairs of laps drawn with replacement."""
+    rng, names = np.random.default_rng(0), np.unique(laps)
+    rows = [np.flatnonzero(laps == name) for name in names]
+    ratios: list[float] = []
+    for _ in range(DRAWS):
+        drawn = np.concatenate([rows[i] for i in rng.integers(len(rows), size=len(rows))])
+        without, with_them = (np.percentile(table[w][drawn, column], percent) for w in (False, True))
+        ratios.append(float(with_them / without))
+    return np.percentile(ratios, (2.5, 97.5)).round(3).tolist()
 
 
 def receive_all(port: int, address: str) -> None:
