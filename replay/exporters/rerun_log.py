@@ -41,6 +41,7 @@ FRUSTUM_M = 0.4  # how far before the camera its image stands in the world
 MAX_PATH = 4096  # positions kept of a camera's path; then every other one goes
 REGROWN = 1.5  # a map that is so much larger is looked at again
 FLUSH_S = 10.0
+MOVING_COLOR, MOVING_RADIUS_M, MOVING_STRIDE = (255, 80, 160), 0.015, 4
 ROOM_COLOR, DOOR_RADIUS_M = (255, 255, 255), 0.06
 
 
@@ -137,6 +138,7 @@ class RerunLog:
         self._stream.log(f"{path}/image/semantics", rr.SegmentationImage(np.asarray(label, np.uint8)))
         depth = cv2.resize(update.depth_m, size, interpolation=cv2.INTER_NEAREST_EXACT)
         self._stream.log(f"{path}/image/depth", rr.DepthImage(np.asarray(depth, np.float32), meter=1.0))
+        self._stream.log(f"{path}/moving", moving_points(update, intrinsics))
         for stage, value in update.stage_ms.items():
             self._stream.log(f"stage_ms/{stage}", rr.Scalars(value))
 
@@ -253,6 +255,16 @@ class RerunLog:
         if len(poses) > MAX_PATH:
             self._paths[camera] = poses[::2]
             self._strides[camera] *= 2
+
+
+def moving_points(update: MapUpdate, k: CameraIntrinsics) -> rr.Points3D:
+    """What moves, in the camera's axes; no points where nothing does."""
+    if update.moving is None:
+        return rr.Points3D(np.empty((0, 3), np.float32))
+    v, u = (MOVING_STRIDE * i for i in np.nonzero(update.moving[::MOVING_STRIDE, ::MOVING_STRIDE]))
+    z = update.depth_m[v, u]
+    xyz = np.stack(((u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z), axis=1)
+    return rr.Points3D(xyz[z > 0], radii=MOVING_RADIUS_M, colors=MOVING_COLOR)
 
 
 def _logged_size(intrinsics: CameraIntrinsics) -> tuple[tuple[int, int], float]:
