@@ -15,6 +15,7 @@ CAMERA_KINDS = ("v4l2", "opencv", "stereo", "oak", "realsense")
 POSE_KINDS = ("device", "fixed", "topic", "board", "rgbd", "visual")
 TRACKING_KINDS = ("oak",)  # cameras that can tell their own pose
 ENDPOINT_PATTERN = r"^([a-z]+://.+|)\Z"
+ENDPOINT_NAME_PATTERN = r"^([A-Za-z0-9_-][A-Za-z0-9_.-]{0,47}|[a-z]+://.+)\Z"  # a socket of the launch, or an endpoint
 
 Text = Annotated[str, msgspec.Meta(min_length=1)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**31 - 1)]
@@ -194,7 +195,7 @@ class FinetunerOptions(Config, frozen=True):
     config: str = ""  # TOML file with an OnlineConfig (semantic_mapper/training/online.py); empty = defaults
     # Where labelled keyframes come from: a name or an endpoint, at which a labelling tool, a teacher network or
     # `semantic-mapper label` binds a publisher (topic "keyframe"), for as long as it has something to say.
-    labels: Annotated[str, msgspec.Meta(pattern=r"^([A-Za-z0-9_-][A-Za-z0-9_.-]{0,47}|[a-z]+://.+)\Z")] = "labels"
+    labels: Annotated[str, msgspec.Meta(pattern=ENDPOINT_NAME_PATTERN)] = "labels"
     cpu_fraction: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.5  # of one core (or of the GPU) that learning may take
     threads: Annotated[int, msgspec.Meta(ge=1, le=64)] = 1  # that it computes with, all together within its fraction
     # How much others go before it, 0 to 19. With 19 (on Linux) it learns only while nobody else wants the core; where
@@ -213,12 +214,57 @@ class FinetunerOptions(Config, frozen=True):
         return (self.mapper,)
 
 
-NodeOptions = CameraOptions | MapperOptions | RecorderOptions | FinetunerOptions
-OPTIONS: dict[str, type[CameraOptions] | type[MapperOptions] | type[RecorderOptions] | type[FinetunerOptions]] = {
+class BridgeOptions(Config, frozen=True):
+    """Hands images, map and status on to other tools. It computes only while nobody else wants the processor."""
+
+    input: Text | Names = "camera"  # whose frames: a node, or several
+    mapper: str = "mapper"  # the node that maps them
+    query: Annotated[str, msgspec.Meta(pattern=ENDPOINT_NAME_PATTERN)] = "query"  # the mapper's
+    refresh_s: Annotated[float, msgspec.Meta(ge=0.1)] = 2.0  # between two maps, at least; one is sent where it changed
+    keys: str = ""  # the mapper's
+
+    def inputs(self) -> tuple[str, ...]:
+        """Nodes that it listens to."""
+        return (*self.cameras, self.mapper)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Nodes whose frames are handed on."""
+        return (self.input,) if isinstance(self.input, str) else self.input
+
+
+class FoxgloveOptions(BridgeOptions, frozen=True):
+    """Serves Foxglove. Its protocol knows neither keys nor passwords, so it listens on 127.0.0.1 alone."""
+
+    port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = 8765  # 0 = any that is free
+
+
+class ZenohOptions(BridgeOptions, frozen=True):
+    """Publishes to Zenoh. Beyond this machine both sides prove who they are by certificates (mutual TLS)."""
+
+    prefix: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*\Z")] = (
+        "semantic_mapper"  # of keys
+    )
+    listen: str = (
+        "tcp/127.0.0.1:7447"  # where clients connect; with certificates also tls/ADDRESS:PORT; empty = nowhere
+    )
+    connect: str = ""  # a router to connect to, in the same form; empty = none
+    # Folder with ca.pem (of the authority that signed all sides), own.pem and own.key (of this one); empty = none.
+    certificates: str = ""
+
+    def __post_init__(self) -> None:
+        if not (self.listen or self.connect):
+            raise ValueError("give `listen`, `connect` or both: with neither nobody could receive anything")
+
+
+NodeOptions = CameraOptions | MapperOptions | RecorderOptions | FinetunerOptions | FoxgloveOptions | ZenohOptions
+OPTIONS: dict[str, type[NodeOptions]] = {
     "camera": CameraOptions,
     "mapper": MapperOptions,
     "recorder": RecorderOptions,
     "finetuner": FinetunerOptions,
+    "foxglove": FoxgloveOptions,
+    "zenoh": ZenohOptions,
 }
 
 

@@ -10,7 +10,7 @@ import pytest
 
 HIDDEN = """
 import sys
-for name in ("rerun", "rerun_cli", "tensorboard", "pycolmap"):
+for name in ("rerun", "rerun_cli", "tensorboard", "pycolmap", "foxglove", "zenoh"):
     sys.modules[name] = None
 """
 
@@ -40,6 +40,19 @@ for name in ("rerun", "rerun_cli", "tensorboard", "pycolmap"):
                 print(error)
             """,
             "pip install 'semantic-mapper[sfm]'",
+        ),
+        *(
+            (
+                f"""
+                from semantic_mapper.errors import SemanticMapperError
+                try:
+                    import semantic_mapper.nodes.{kind}.sdk
+                except SemanticMapperError as error:
+                    print(error)
+                """,
+                f"pip install 'semantic-mapper[{kind}]'",
+            )
+            for kind in ("foxglove", "zenoh")
         ),
     ],
 )

@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 from semantic_mapper.errors import CameraError, ConfigError, SemanticMapperError
 from semantic_mapper.nodes.doctor.check import Check, failed
-from semantic_mapper.nodes.options import CameraOptions, FinetunerOptions, LiveCamera, MapperOptions
+from semantic_mapper.nodes.options import (
+    CameraOptions,
+    FinetunerOptions,
+    FoxgloveOptions,
+    LiveCamera,
+    MapperOptions,
+    ZenohOptions,
+)
 from semantic_mapper.nodes.supervisor.launch_config import Launch, NodeEntry
 
 
@@ -53,6 +61,15 @@ def _settings(entry: NodeEntry, launch: Launch) -> str:
             if options.config:
                 load_config(Path(options.config), OnlineConfig)
             return _weights(options.weights)
+        case FoxgloveOptions():
+            import_module("semantic_mapper.nodes.foxglove.sdk")
+            return "its package"
+        case ZenohOptions() as options:
+            from semantic_mapper.nodes.zenoh.addresses import zenoh_settings
+
+            import_module("semantic_mapper.nodes.zenoh.sdk")
+            zenoh_settings(options)
+            return "its package and addresses"
         case _:
             return ""
 

@@ -26,6 +26,7 @@ from semantic_mapper.nodes.mapper.live_weights import LiveWeights
 from semantic_mapper.nodes.mapper.query_answers import Answers, Question
 from semantic_mapper.queries.mirror import MapMirror
 from semantic_mapper.transport.codec import encode_error
+from semantic_mapper.transport.query_messages import ChangesRequest, Request
 from semantic_mapper.transport.query_sockets import QueryServer
 from semantic_mapper.transport.security import Keys
 
@@ -33,6 +34,7 @@ PERIOD_S = 0.1  # between two snapshots, at least
 MAX_FRACTION = 0.1  # of the mapper's time that copying may take; the pause after a costly copy is longer
 MAX_BLOCKS = 600  # in one copy (unless one frame has more): bounds what a step may cost
 ASKED_LATELY_S = 5.0  # without a request for so long, no more snapshots are made
+MIRRORED_LATELY_S = 0.25  # the same after requests for changes: who mirrors a map now and then waits for a snapshot
 CATCH_UP_S = 2.0  # how long requests after such a pause wait for a snapshot of the present map
 FIRST_CATCH_UP_S = 60.0  # how long the very first ones wait: there is no snapshot yet to answer them from
 MAX_PENDING = 64  # requests of all clients together
@@ -75,7 +77,7 @@ class QueryService:
     """Answers requests about a map that another thread changes. A context manager.
 
     Answers are about the map as it was a moment ago (see ``PERIOD_S``, ``MAX_FRACTION``), and say about which version.
-    While nobody asks, no snapshots are made.
+    While nobody asks, no snapshots are made; for who mirrors the map once a second, say, one at a time.
 
     Args:
         endpoint: Where to listen.
@@ -105,7 +107,9 @@ class QueryService:
         self._answers = Answers(self._mirror, correction, weights, refined, moving)
         self._copied_version = 0
         self._copy_again_at = 0.0
-        self._last_request = -ASKED_LATELY_S  # never; monotonic seconds
+        self.asked = False  # whether anybody has ever asked about the map
+        self._wanted_until = 0.0  # snapshots; monotonic seconds
+        self._wanted_s = 0.0  # after the last request, or its answer
         self._awaited_version = 0  # that requests after a pause wait for
         self._catch_up_until = 0.0
         self._map_is_busy = False  # a snapshot did not come in time, or cannot
@@ -132,18 +136,13 @@ class QueryService:
         made = self._snapshot
         return self._thread.is_alive() and (not made.done() or made.exception() is None)
 
-    @property
-    def asked(self) -> bool:
-        """Whether anybody has ever asked about the map."""
-        return self._last_request >= 0
-
     def follow(self) -> None:
         """Copy what has changed for the next snapshot; for the thread that changes the map, after each step.
 
         Costs nothing while nobody asks, and never waits.
         """
         now = time.monotonic()
-        wanted = bool(self._catching_up) or now - self._last_request <= ASKED_LATELY_S
+        wanted = bool(self._catching_up) or now <= self._wanted_until
         if not wanted or not self._snapshot.done() or self._copied_version == self._map.version or not self.alive:
             return
         if self._copied_version >= self._awaited_version and now < self._copy_again_at:
@@ -228,7 +227,7 @@ class QueryService:
         question = self._answers.read(parts)
         asked = question.request
         if question.about_map:
-            self._note_question()
+            self._note_question(asked)
         lags = question.about_map and self._snapshot_lags()
         client = asked.asker.encode() or address
         if not (lags or question.takes_long or client in self._pending):
@@ -269,7 +268,7 @@ class QueryService:
         """Pass on the requests that wait for a snapshot, once it is there or will not come in time."""
         if not self._catching_up or self._snapshot_lags():
             return
-        self._last_request = time.monotonic()
+        self._want_snapshots()
         while self._catching_up:
             self._long_queries.submit(self._work, self._catching_up.popleft())
 
@@ -302,13 +301,18 @@ class QueryService:
         self._server.send(address, parts)
         self.answered += 1
 
-    def _note_question(self) -> None:
+    def _want_snapshots(self) -> None:
+        self._wanted_until = max(self._wanted_until, time.monotonic() + self._wanted_s)
+
+    def _note_question(self, request: Request) -> None:
         """After a pause, requests wait until there is a snapshot of the map as it is now."""
         now = time.monotonic()
-        if now - self._last_request > ASKED_LATELY_S:
+        if now > self._wanted_until:
             self._awaited_version = self._map.version
             self._catch_up_until = now + (CATCH_UP_S if self._mirror.snapshot().version else FIRST_CATCH_UP_S)
-        self._last_request = now
+        self.asked = True
+        self._wanted_s = MIRRORED_LATELY_S if isinstance(request, ChangesRequest) else ASKED_LATELY_S
+        self._want_snapshots()
 
     def _snapshot_lags(self) -> bool:
         """Whether requests should wait for a newer snapshot."""

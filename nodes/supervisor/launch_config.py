@@ -21,6 +21,7 @@ from semantic_mapper.nodes.options import (
     CAMERA_KINDS,
     OPTIONS,
     POSE_KINDS,
+    BridgeOptions,
     CameraOptions,
     Count,
     FinetunerOptions,
@@ -45,7 +46,7 @@ class NodeEntry(Config, frozen=True):
     """One process; ``process_table.py`` says how its kind is started and stopped."""
 
     name: str  # unique; also the name of its endpoint
-    kind: Literal["camera", "mapper", "recorder", "finetuner"]  # a row of the process table
+    kind: Literal["camera", "mapper", "recorder", "finetuner", "foxglove", "zenoh"]  # a row of the process table
     options: dict[str, Any] = msgspec.field(
         default_factory=dict
     )  # see nodes/options.py; "{NAME}" stands for a value of [set]
@@ -109,7 +110,7 @@ class Launch(Limits, frozen=True, kw_only=True):
 
     def listeners(self, name: str) -> int:
         """How many nodes subscribe to the frames of a node."""
-        kinds = MapperOptions | RecorderOptions
+        kinds = MapperOptions | RecorderOptions | BridgeOptions
         return sum(name in o.inputs() for o in self.options.values() if isinstance(o, kinds))
 
 
@@ -150,6 +151,7 @@ def load_launch(path: Path, settings: Sequence[str] = (), out: Path | None = Non
         raise ConfigError(f"{path}: no node of kind 'camera': nothing would ever happen")
     _check_restarts(file, options, path)
     _check_cameras(options, path)
+    _check_bridges(options, path)
     limits = {name: getattr(file, name) for name in Limits.__struct_fields__}
     limits |= {name: str(_fill_in(limits[name], values, f"{path}: {name}")) for name in ("publish", "keys")}
     launch = Launch(name=path.name, nodes=file.node, options=options, **limits)
@@ -186,13 +188,36 @@ def _check_cameras(options: Mapping[str, NodeOptions], path: Path) -> None:
         ConfigError: two cameras of one name.
     """
     for name, own in options.items():
-        if not isinstance(own, MapperOptions | RecorderOptions):
+        if not isinstance(own, MapperOptions | RecorderOptions | BridgeOptions):
             continue
         for source in own.cameras:
             if not isinstance(options[source], CameraOptions):
                 raise ConfigError(f"{path}: node '{name}' takes the frames of '{source}', which is no camera")
         cameras = {source: options[source] for source in own.cameras}
         check_camera_ids(name, {s: c for s, c in cameras.items() if isinstance(c, CameraOptions)}, str(path))
+
+
+def _check_bridges(options: Mapping[str, NodeOptions], path: Path) -> None:
+    """A bridge to other tools asks a mapper of its launch about the map.
+
+    Raises:
+        ConfigError: it would ask where none answers.
+    """
+    for name, own in options.items():
+        if isinstance(own, BridgeOptions):
+            mapper = options[own.mapper]
+            if not isinstance(mapper, MapperOptions):
+                raise ConfigError(f"{path}: node '{name}' shows the map of '{own.mapper}', which is no mapper")
+            if mapper.query != own.query:
+                raise ConfigError(
+                    f"{path}: node '{name}' asks about the map at '{own.query}', but mapper '{own.mapper}' answers at "
+                    f"'{mapper.query}'; give both the same `query`"
+                )
+            if mapper.keys != own.keys:
+                raise ConfigError(
+                    f"{path}: node '{name}' has the keys '{own.keys}', but mapper '{own.mapper}' '{mapper.keys}'; give "
+                    "both the same folder as `keys`"
+                )
 
 
 def _convert_options(node: NodeEntry, values: Mapping[str, Value], path: Path) -> NodeOptions:

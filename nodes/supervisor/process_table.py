@@ -28,6 +28,8 @@ _NODES = "semantic_mapper.nodes"
 PROCESS_TABLE: dict[str, ProcessKind] = {
     "camera": ProcessKind(f"{_NODES}.camera.node", preloaded=False, ends_with_stream=True, stop_limit="stop_s"),
     "finetuner": ProcessKind(f"{_NODES}.finetuner.node", preloaded=True, ends_with_stream=False, stop_limit="finish_s"),
+    "foxglove": ProcessKind(f"{_NODES}.foxglove.node", preloaded=True, ends_with_stream=True, stop_limit="stop_s"),
+    "zenoh": ProcessKind(f"{_NODES}.zenoh.node", preloaded=True, ends_with_stream=True, stop_limit="stop_s"),
     "recorder": ProcessKind(f"{_NODES}.recorder.node", preloaded=False, ends_with_stream=True, stop_limit="stop_s"),
     "mapper": ProcessKind(f"{_NODES}.mapper.node", preloaded=True, ends_with_stream=True, stop_limit="finish_s"),
 }

@@ -16,8 +16,8 @@ from semantic_mapper.client import MapClient
 from semantic_mapper.config import MapperConfig
 from semantic_mapper.errors import MapError, SemanticMapperError, TransportError
 from semantic_mapper.mapper import Mapper
-from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.mapping.voxel_map import VoxelMap
+from semantic_mapper.nodes.bridge.packing import thinned, thinning
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.streams import Streams
 from semantic_mapper.queries.ages import BlockAges
@@ -32,9 +32,8 @@ from semantic_mapper.replay.session import MapSession
 from semantic_mapper.transport.messages import EndOfStream
 from semantic_mapper.transport.security import ServerIdentity
 from semantic_mapper.transport.sockets import NewestSubscriber
-from semantic_mapper.types import CameraIntrinsics, Float32, MapUpdate, PosedFrame
+from semantic_mapper.types import CameraIntrinsics, MapUpdate, PosedFrame
 
-MAX_POINTS = 400_000  # of a map that is shown again and again: of a larger one every second point, or third, ...
 POLL_S = 0.1
 GRAPH_S = 5.0  # between two graphs
 ASK_AGAIN_S = 1.0  # a mapper that does not answer yet
@@ -81,8 +80,8 @@ class _MapShow:
         ages_s = self._ages.follow(snapshot, stamp_ns / 1e9)
         surface = surface_voxels(snapshot)
         points = surface_points(snapshot, surface)
-        points, ages = thinned(points, ages_s[surface.row].astype(np.float32))
-        self._log.log_map(points, ages, stamp_ns)
+        ages = ages_s[surface.row].astype(np.float32)[:: thinning(len(points.xyz))]
+        self._log.log_map(thinned(points), ages, stamp_ns)
         self._show_graph(snapshot)
 
     def _show_graph(self, snapshot: MapSnapshot) -> None:
@@ -95,14 +94,6 @@ class _MapShow:
         except MapError as error:
             _log.debug("graph_not_shown", reason=str(error))
         self._graph_at = time.monotonic() + GRAPH_S
-
-
-def thinned(points: MapPoints, ages: Float32) -> tuple[MapPoints, Float32]:
-    """Every n-th point and its age, so that there are at most ``MAX_POINTS``."""
-    step = max(1, -(-len(points.xyz) // MAX_POINTS))
-    measured = None if points.measured is None else points.measured[::step]
-    few = MapPoints(points.xyz[::step], points.rgb[::step], points.label[::step], points.confidence[::step], measured)
-    return few, ages[::step]
 
 
 def show_saved(path: Path, begin: Begin) -> None:

@@ -18,6 +18,7 @@ from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints, computed_fraction
 from semantic_mapper.plots import UNKNOWN
 from semantic_mapper.queries.graph import SceneGraph
+from semantic_mapper.replay.exporters.camera_path import CameraPath
 from semantic_mapper.replay.exporters.rerun_layout import (
     AGE_SCALE,
     AGED_S,
@@ -32,13 +33,12 @@ from semantic_mapper.replay.exporters.rerun_layout import (
     scale_colors,
 )
 from semantic_mapper.replay.exporters.rerun_sdk import rr
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, MapUpdate, PosedFrame
+from semantic_mapper.types import CameraIntrinsics, Float32, MapUpdate, PosedFrame
 
 APPLICATION = "semantic_mapper"
 IMAGE_WIDTH = 320  # images are logged at this width: a recording of a long log stays small
 JPEG_QUALITY = 80
 FRUSTUM_M = 0.4  # how far before the camera its image stands in the world
-MAX_PATH = 4096  # positions kept of a camera's path; then every other one goes
 REGROWN = 1.5  # a map that is so much larger is looked at again
 FLUSH_S = 10.0
 MOVING_COLOR, MOVING_RADIUS_M, MOVING_STRIDE = (255, 80, 160), 0.015, 4
@@ -82,9 +82,7 @@ class RerunLog:
         self._radius = voxel_size_m / 2
         self._lock = threading.Lock()
         self._cameras: list[str] = []
-        self._paths: dict[str, list[Float64]] = {}  # poses, by camera
-        self._seen: dict[str, int] = {}
-        self._strides: dict[str, int] = {}
+        self._paths: dict[str, CameraPath] = {}
         self._eye: Eye | None = None
         self._aged = self._computed = False
         self._extent_m = -1.0  # of the map when the eye was set
@@ -128,7 +126,7 @@ class RerunLog:
         )
         rgb = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
         self._stream.log(f"{path}/image/rgb", rr.Image(np.asarray(rgb, np.uint8)).compress(jpeg_quality=JPEG_QUALITY))
-        self._note_pose(frame.camera_id, T)
+        self._paths.setdefault(frame.camera_id, CameraPath()).add(T)
 
     def log_update(self, update: MapUpdate, intrinsics: CameraIntrinsics) -> None:
         """What was rendered for a frame of a camera with these intrinsics, and how long it took."""
@@ -155,8 +153,8 @@ class RerunLog:
             self._set_time(stamp_ns, None)
         computed = computed_fraction(points)
         self._look_at(points, aged=age_s is not None, computed=computed > 0)
-        for camera, poses in list(self._paths.items()):
-            positions = np.stack([T[:3, 3] for T in list(poses)])
+        for camera, path in list(self._paths.items()):
+            positions = np.stack([T[:3, 3] for T in list(path.poses)])
             self._stream.log(rr.new_entity_path(["world", "path", camera]), rr.LineStrips3D([positions]))
         looks = {
             "class": {"class_ids": points.label.astype(np.uint16)},
@@ -232,7 +230,7 @@ class RerunLog:
         extent = float(np.linalg.norm(np.ptp(np.percentile(points.xyz, (1, 99), axis=0), axis=0)))
         if (self._aged, self._computed) == (aged, computed) and extent <= REGROWN * self._extent_m:
             return
-        poses = [T for poses in list(self._paths.values()) for T in list(poses)]
+        poses = [T for path in list(self._paths.values()) for T in list(path.poses)]
         self._eye = eye_on(points.xyz, camera_up(np.stack(poses)) if poses else None)
         self._aged, self._computed, self._extent_m = aged, computed, extent
         self._lay_out()
@@ -245,16 +243,6 @@ class RerunLog:
         self._stream.set_time("capture", duration=np.timedelta64(stamp_ns, "ns"))
         if seq is not None:
             self._stream.set_time("frame", sequence=seq)
-
-    def _note_pose(self, camera: str, T_world_camera: Float64) -> None:
-        """A bounded, evenly spread sample of a camera's way, whatever its length."""
-        poses, stride = self._paths.setdefault(camera, []), self._strides.setdefault(camera, 1)
-        self._seen[camera] = self._seen.get(camera, -1) + 1
-        if self._seen[camera] % stride == 0:
-            poses.append(T_world_camera.copy())
-        if len(poses) > MAX_PATH:
-            self._paths[camera] = poses[::2]
-            self._strides[camera] *= 2
 
 
 def moving_points(update: MapUpdate, k: CameraIntrinsics) -> rr.Points3D:

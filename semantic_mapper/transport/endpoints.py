@@ -71,7 +71,7 @@ def check_bind(endpoint: str, keys: Keys | None = None) -> None:
                 "a launch lie in TMPDIR)"
             )
     elif transport == "tcp":
-        if not _is_loopback(address):
+        if not is_loopback(address):
             _check_keys(endpoint, keys)
     elif transport != "inproc":
         raise TransportError(f"{endpoint}: use ipc://PATH or tcp://127.0.0.1:PORT")
@@ -87,7 +87,7 @@ def check_connect(endpoint: str, identity: ServerIdentity | None = None) -> None
     transport, _, address = endpoint.partition("://")
     if transport not in ("ipc", "inproc", "tcp"):
         raise TransportError(f"{endpoint}: no endpoint; endpoints read ipc://PATH or tcp://HOST:PORT")
-    if transport == "tcp" and identity is None and not _is_loopback(address):
+    if transport == "tcp" and identity is None and not is_loopback(address):
         raise TransportError(
             f"{endpoint}: is on another machine, and without keys anybody in the network could answer in its place. "
             "Make keys on both sides and tell each the other's (`semantic-mapper keys make`, `keys allow NAME KEY`), "
@@ -109,7 +109,7 @@ def _check_keys(endpoint: str, keys: Keys | None) -> None:
         )
 
 
-def _is_loopback(address: str) -> bool:
+def is_loopback(address: str) -> bool:
     """Of ``HOST:PORT``, or of what else ZeroMQ takes for one (``SOURCE;HOST:PORT``): that is never one of loopback."""
     host = address.rpartition(":")[0].strip("[]")
     if host == "localhost":

@@ -65,11 +65,11 @@ class ServerIdentity:
 
     Args:
         keys: Of this machine, which the server has to know as one of its peers.
-        server: Name of the server among the peers.
+        server: Name of the server among the peers; empty = it has the very same keys.
     """
 
     keys: Keys
-    server: str
+    server: str = ""
 
 
 def make_keys(folder: Path) -> Keys:
@@ -144,7 +144,7 @@ def forget(folder: Path, name: str) -> None:
 
 
 def secure_server(socket: zmq.Socket[bytes], keys: Keys) -> None:
-    """Let in through a socket, to be bound yet, who has the key of a peer, and nobody else."""
+    """Let in through a socket, to be bound yet, who has the key of a peer or the server's own, and nobody else."""
     domain = f"sm{id(socket):x}"  # of the allow-list; each socket has its own
     with _lock:
         authenticator = _authenticators.get(socket.context)
@@ -166,12 +166,13 @@ def secure_client(socket: zmq.Socket[bytes], identity: ServerIdentity) -> None:
         TransportError: the server is not among the peers.
     """
     peers = identity.keys.peers()
-    if identity.server not in peers:
+    known = {"": identity.keys.public, **peers}
+    if identity.server not in known:
         raise TransportError(
             f"{identity.keys.folder}: no peer '{identity.server}'; there are: {', '.join(peers) or 'none'}. Add the "
             "server's public key with `semantic-mapper keys allow NAME KEY`"
         )
-    socket.setsockopt(zmq.CURVE_SERVERKEY, peers[identity.server])
+    socket.setsockopt(zmq.CURVE_SERVERKEY, known[identity.server])
     socket.setsockopt(zmq.CURVE_PUBLICKEY, identity.keys.public)
     socket.setsockopt(zmq.CURVE_SECRETKEY, identity.keys.secret)
 
@@ -186,7 +187,7 @@ class _AllowList:
     def callback(self, domain: str, key: bytes) -> bool:
         """Whether the client with this key (Z85) may enter; the folder is read again, so that changes count at once."""
         try:
-            allowed = key in self._keys.peers().values()
+            allowed = key == self._keys.public or key in self._keys.peers().values()
         except TransportError as error:
             _log.error("peers_unreadable", reason=str(error))
             return False

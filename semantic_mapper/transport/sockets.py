@@ -518,23 +518,32 @@ class NewestSubscriber(_Subscriber):
         """
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
-            with self._changed:
-                left = None if deadline is None else max(0.0, deadline - time.monotonic())
-                self._changed.wait_for(
-                    lambda: bool(self._slots) or self._closed.is_set() or self._failure is not None, left
-                )
-                self._check_open()
-                if not self._slots:
-                    self._check_receiving()
-                    return None
-                # A message that replaced another keeps its place, so an end of stream cannot overtake a frame.
-                parts = self._slots.pop(next(iter(self._slots)))
+            parts = self.receive_parts(None if deadline is None else max(0.0, deadline - time.monotonic()))
+            if parts is None:
+                return None
             try:
                 return decode(parts)
             except CodecError as error:
                 self._reject(error)
             if _is_over(deadline):
                 return None
+
+    def receive_parts(self, timeout_s: float | None = None) -> list[bytes] | None:
+        """As ``receive``, as it came over the wire, its header checked: for who may not want what is in it.
+
+        Raises:
+            TransportError: see ``receive``.
+        """
+        with self._changed:
+            self._changed.wait_for(
+                lambda: bool(self._slots) or self._closed.is_set() or self._failure is not None, timeout_s
+            )
+            self._check_open()
+            if not self._slots:
+                self._check_receiving()
+                return None
+            # A message that replaced another keeps its place, so an end of stream cannot overtake a frame.
+            return self._slots.pop(next(iter(self._slots)))
 
     def close(self) -> None:
         """Stop the thread and free the socket. Harmless when repeated."""

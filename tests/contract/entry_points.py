@@ -40,7 +40,15 @@ from semantic_mapper.nodes.calibration.report import CalibrationSettings
 from semantic_mapper.nodes.cli import main as cli
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.finetuner.keyframe_store import LearningStore, Progress
-from semantic_mapper.nodes.options import CameraOptions, FinetunerOptions, LiveCamera, MapperOptions, RecorderOptions
+from semantic_mapper.nodes.options import (
+    CameraOptions,
+    FinetunerOptions,
+    FoxgloveOptions,
+    LiveCamera,
+    MapperOptions,
+    RecorderOptions,
+    ZenohOptions,
+)
 from semantic_mapper.nodes.supervisor.launch_config import LaunchFile, NodeEntry, load_launch
 from semantic_mapper.replay.compare.tolerances import Tolerances
 from semantic_mapper.replay.corrected_poses import read_corrections
@@ -224,6 +232,8 @@ SETTINGS: dict[str, tuple[type[msgspec.Struct], dict[str, Any]]] = {
     "launch.mapper": (MapperOptions, {"out": "a"}),
     "launch.recorder": (RecorderOptions, {"out": "a"}),
     "launch.finetuner": (FinetunerOptions, {}),
+    "launch.foxglove": (FoxgloveOptions, {}),
+    "launch.zenoh": (ZenohOptions, {}),
     "camera.v4l2": (semantic_mapper.drivers.v4l2.config.Config, {}),
     "camera.opencv": (semantic_mapper.drivers.opencv.config.Config, {"source": "a.mp4"}),
     "camera.stereo": (semantic_mapper.drivers.stereo.config.Config, {}),

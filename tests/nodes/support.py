@@ -7,6 +7,7 @@ import io
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -81,6 +82,13 @@ def write_grid(path: Path) -> Path:
 def write_config(path: Path) -> Path:
     path.write_text(CONFIG, encoding="utf-8")
     return path
+
+
+def free_port() -> int:
+    """Of loopback; nobody holds it."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
 
 
 def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:

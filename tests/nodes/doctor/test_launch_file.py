@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import sys
 from pathlib import Path
 
 import pytest
@@ -30,7 +31,8 @@ def of(path: Path, *settings: str) -> dict[str, list[Check]]:
 def test_ports_of_the_viewer_and_of_all_launch_files_are_looked_at() -> None:
     assert {9090, 9876} < set(PORTS)
     remote = ["keys=k", "kind=v4l2", "camera=webcam.toml", "poses=poses.toml"]
-    for path, settings in ((ROBOT, []), (REMOTE, remote)):
+    bridges = [(REMOTE.with_name(f"{kind}.toml"), remote[1:]) for kind in ("foxglove", "zenoh")]
+    for path, settings in ((ROBOT, []), (REMOTE, remote), *bridges):
         for endpoint, _ in doctor_launch._listening(load_launch(path, settings)):
             assert int(endpoint.rpartition(":")[2]) in PORTS
 
@@ -101,6 +103,19 @@ def test_what_a_node_would_refuse_as_it_starts_is_told_before(tmp_path: Path) ->
     assert "begin in another world" in found["camera"][0].found
     assert "voxel_size" in found["mapper"][0].found and "broken.safetensors" in found["finetuner"][0].found
     assert {found[name][0].state for name in ("camera", "mapper", "finetuner")} == {"bad"}
+
+
+def test_addresses_and_packages_of_bridges_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = ("kind=v4l2", "poses=poses.toml")
+    zenoh, foxglove = (ROBOT.with_name(f"{kind}.toml") for kind in ("zenoh", "foxglove"))
+    assert of(zenoh, *given)["zenoh"] == [Check("zenoh", "ok", "its package and addresses")]
+    (refused,) = of(zenoh, *given, "listen=tcp/0.0.0.0:7447")["zenoh"]
+    assert refused.state == "bad" and "certificates on both sides" in refused.found + refused.mend
+    monkeypatch.setitem(sys.modules, "semantic_mapper.nodes.foxglove.sdk", None)
+    monkeypatch.delitem(sys.modules, "semantic_mapper.nodes.foxglove.sdk")
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    (missing,) = of(foxglove, *given)["foxglove"]
+    assert missing.state == "bad" and "semantic-mapper[foxglove]" in missing.found + missing.mend
 
 
 def test_a_camera_that_is_not_connected_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

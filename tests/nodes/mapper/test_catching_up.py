@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 
 import msgpack
@@ -14,7 +15,7 @@ from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper import query_service
 from semantic_mapper.nodes.mapper.query_service import QueryService
 from tests.mapping.rendered_views import small_map
-from tests.nodes.mapper.test_query_service import Stranger, a_folder, good_questions
+from tests.nodes.mapper.test_query_service import Stranger, a_folder, answering, good_questions
 from tests.nodes.support import eventually
 from tests.queries.scene import LABELS, integrate, poses, whole_map
 
@@ -71,3 +72,24 @@ def test_who_waits_in_vain_for_a_mirror_is_told_so(endpoint: str, monkeypatch: p
             assert stranger.socket.poll(20_000)
             assert b"busy, or ending" in stranger.socket.recv_multipart()[2]
         stranger.socket.close()
+
+
+def test_who_mirrors_a_map_now_and_then_gets_it_as_it_is_and_costs_nothing_in_between(endpoint: str) -> None:
+    voxel_map = small_map(LABELS)
+    places = iter(poses(4))
+    integrate(voxel_map, next(places), 0)
+    with answering(endpoint, voxel_map) as service, MapClient(endpoint, timeout_s=60) as client:
+
+        def copied_without_a_question() -> bool:
+            time.sleep(2 * query_service.MIRRORED_LATELY_S)
+            integrate(voxel_map, next(places), voxel_map.version)
+            return eventually(lambda: service._copied_version == voxel_map.version, 0.5)
+
+        client.mirror()
+        client.mirror()  # the first one asks for classes, too, whose window is longer: let it pass
+        service._wanted_until = 0.0
+        assert client.mirror().version == voxel_map.version
+        assert not copied_without_a_question()
+        assert client.mirror().version == voxel_map.version, "it waits for a snapshot of the present map"
+        client.at([(0.0, 0.0, 0.0)])
+        assert copied_without_a_question(), "who asks for an answer at once goes on to get one"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 from datetime import datetime, tzinfo
 from pathlib import Path
 
@@ -175,6 +176,27 @@ def test_the_map_of_the_remote_viewer_is_answered_for_with_keys() -> None:
         check_bind(mapper.query)
 
 
+@pytest.mark.parametrize("kind", ["foxglove", "zenoh"])
+def test_a_bridge_is_one_more_listener_and_asks_the_mapper(tmp_path: Path, kind: str) -> None:
+    path = REPLAY_LAUNCH.with_name(f"{kind}.toml")
+    given = ["kind=v4l2", "camera=webcam.toml", "poses=poses.toml"]
+    launch = load_launch(path, given, Path("somewhere"))
+    assert launch.inputs(kind) == ("camera", "mapper") and launch.listeners("camera") == 2
+    text = path.read_text(encoding="utf-8")
+    bridge = f'kind = "{kind}"\nrestart = "on-failure"\n[node.options]\n'
+    for change, says in (
+        ('mapper = "camera"\n', f"node '{kind}' shows the map of 'camera', which is no mapper"),
+        ('query = "ask"\n', f"node '{kind}' asks about the map at 'ask', but mapper 'mapper' answers at 'query'"),
+        ('keys = "k"\n', f"node '{kind}' has the keys 'k', but mapper 'mapper' ''; give both the same"),
+        ('mapper = "maper"\n', "did you mean 'mapper'?"),
+        ("refresh_s = 0.0\n", "refresh_s"),
+    ):
+        assert bridge in text
+        other = text.replace(bridge, bridge + change).replace('refresh_s = "{refresh}"\n', "")
+        with pytest.raises(ConfigError, match=re.escape(says)):
+            load_launch(_file(tmp_path, other), given)
+
+
 def test_launch_files_for_cameras_are_as_the_docs_say() -> None:
     live = 0
     for path in set(REPLAY_LAUNCH.parent.glob("*.toml")) - {REPLAY_LAUNCH.with_name("video.toml")}:  # a film waits
@@ -186,7 +208,7 @@ def test_launch_files_for_cameras_are_as_the_docs_say() -> None:
         assert "{now}" in str(file.set["out"]), path.name
         for node in file.node:
             assert not node.standby, f"{path.name}: {node.name}"
-    assert live == 9
+    assert live == 11
 
 
 def test_settings_are_filled_in_with_their_own_type(tmp_path: Path) -> None:

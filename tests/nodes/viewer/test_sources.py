@@ -24,18 +24,16 @@ import pytest
 import rerun.chunk
 
 from semantic_mapper.errors import MapError, TransportError
-from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.nodes.cli.console import Output
 from semantic_mapper.nodes.cli.view import _find_live, _Page
 from semantic_mapper.nodes.process import StopRequest
 from semantic_mapper.nodes.supervisor.launch_config import STATUS_SOCKET
 from semantic_mapper.nodes.supervisor.launch_note import NOTE, LaunchNote, NodeNote
-from semantic_mapper.nodes.viewer import sources as watching
 from semantic_mapper.nodes.viewer.server import WebViewer
-from semantic_mapper.nodes.viewer.sources import Live, show_live, show_log, show_saved, thinned
+from semantic_mapper.nodes.viewer.sources import Live, show_live, show_log, show_saved
 from semantic_mapper.queries.ages import BlockAges
 from semantic_mapper.queries.mirror import MapMirror
-from semantic_mapper.replay.exporters.rerun_log import MAX_PATH, RerunLog, recording_file, recording_server
+from semantic_mapper.replay.exporters.rerun_log import RerunLog, recording_file, recording_server
 from semantic_mapper.transport.codec import encode, encode_frame
 from semantic_mapper.transport.messages import EndOfStream, NodeState, Status
 from semantic_mapper.transport.security import ServerIdentity, allow, make_keys
@@ -291,22 +289,3 @@ def test_blocks_age_until_they_change() -> None:
     assert ages.follow(snapshot, 131.0).tolist() == [31.0, 1.0, 31.0]
     other = MapMirror(0.05, 4.0, LABELS)
     assert ages.follow(other.apply(everything), 140.0).tolist() == [0.0, 0.0, 0.0], "a mapper that was restarted"
-
-
-def test_a_large_map_is_thinned_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(watching, "MAX_POINTS", 4)
-    xyz = np.arange(27, dtype=np.float32).reshape(9, 3)
-    points = MapPoints(xyz, xyz.astype(np.uint8), np.arange(9, dtype=np.uint8), np.ones(9, np.float32))
-    few, ages = thinned(points, np.arange(9, dtype=np.float32))
-    assert few.label.tolist() == ages.tolist() == [0, 3, 6] and few.xyz[1].tolist() == [9, 10, 11]
-
-
-def test_the_path_of_a_camera_stays_bounded_and_even(tmp_path: Path) -> None:
-    log = RerunLog(recording_file(tmp_path / "path.rrd"), LABELS)
-    for number in range(3 * MAX_PATH):
-        T = np.eye(4)
-        T[0, 3] = number
-        log._note_pose("camera", T)
-    kept = [T[0, 3] for T in log._paths["camera"]]
-    assert len(kept) <= MAX_PATH and set(np.diff(kept)) == {4.0} and kept[0] == 0
-    log.close()
