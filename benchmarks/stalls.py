@@ -19,11 +19,12 @@ import cv2
 import numpy as np
 
 from semantic_mapper.client import MapClient
-from semantic_mapper.config import HistoryConfig, KeyframeConfig, VoxelMapConfig
+from semantic_mapper.config import HistoryConfig, KeyframeConfig, MapperConfig, VoxelMapConfig
 from semantic_mapper.labels import ROOMS
 from semantic_mapper.mapping.correction.corrected_map import MapCorrector
 from semantic_mapper.mapping.correction.history import FusedFrame
 from semantic_mapper.mapping.keyframes import KeyframeStore
+from semantic_mapper.mapping.moving_filter import MovingFilter
 from semantic_mapper.mapping.views.upsample import upsample
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.nodes.mapper.query_service import QueryService
@@ -94,7 +95,13 @@ def main() -> None:
     given = parser.parse_args()
     rng = np.random.default_rng(0)
     voxel_map = VoxelMap(VoxelMapConfig(voxel_size_m=given.voxel_size), ROOMS)
-    corrector = MapCorrector(HistoryConfig(max_frames=given.history), voxel_map, KeyframeStore(KeyframeConfig()), fuse)
+    corrector = MapCorrector(
+        HistoryConfig(max_frames=given.history),
+        voxel_map,
+        KeyframeStore(KeyframeConfig()),
+        lambda into, item, _: fuse(into, item),
+        MovingFilter(MapperConfig(), ROOMS),
+    )
     room, record, upkeep, hand_over = Stopwatch(), Stopwatch(), Stopwatch(), Stopwatch()
     ended = threading.Event()
     with tempfile.TemporaryDirectory() as folder, QueryService(f"ipc://{Path(folder) / 'q'}", voxel_map) as service:

@@ -225,7 +225,7 @@ def build_summary(session: MapSession, points: MapPoints) -> dict[str, Any]:
             "blocks": voxel_map.block_count,
             "surface_points": len(points.xyz),
             "cleared_voxels": voxel_map.cleared,
-            "moving_pixels": pipeline.moving_pixels,
+            "moving_pixels": pipeline.moving.pixels,
             "unknown": round(float((points.label == label_set.ignore_id).mean()), 4) if len(points.xyz) else None,
             "computed": round(computed_fraction(points), 4) if len(points.xyz) else None,
             "memory_mb": round(voxel_map.memory_bytes / 1e6, 1),

@@ -261,12 +261,12 @@ class MapUpdate:
         source_seqs: Sequence numbers of the source views that were rendered from.
         label: (H, W) uint8 rendered class ids, the label set's ignore id where unknown.
         confidence: (H, W) float32 probability of ``label``.
-        depth_m: (H, W) float32 depth that was fused.
+        depth_m: (H, W) float32 depth that was fused; in ``moving`` pixels that which was left out.
         blocks: Blocks in the map; ``blocks_touched``: visited by this frame.
         rays: Rendered for this frame; ``samples``: of a ray, 0 where the field draws its own.
         stage_ms: Wall time of each stage.
-        moving: (H, W) bool, what was left out of the map because it moves; None where that is off. It is not sent over
-            sockets, where ``depth_m`` is 0 in these pixels.
+        moving: (H, W) bool, what was left out of the map because it moves; None where that is off, and over sockets
+            also where nothing moves.
     """
 
     stamp_ns: int

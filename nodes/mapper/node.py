@@ -111,7 +111,7 @@ def _answering(
     keys = load_keys(Path(options.keys).expanduser()) if options.keys else None
     refined = None if refinement is None else refinement.mirror
     pipeline = bundle.pipeline
-    return QueryService(endpoint, pipeline.voxel_map, correction, keys, weights, refined, pipeline.moving_space)
+    return QueryService(endpoint, pipeline.voxel_map, correction, keys, weights, refined, pipeline.moving.space)
 
 
 def _refining(options: MapperOptions, bundle: Mapper) -> LiveRefinement | nullcontext[None]:
@@ -340,7 +340,7 @@ class _Mapper:
         if self._session is not None:
             s = self._session
             counters |= {"published": s.published, "fused": s.fused, "refused": len(s.refusals), "dropped": s.dropped}
-            counters |= {"cleared": s.pipeline.voxel_map.cleared, "moving": s.pipeline.moving_pixels}
+            counters |= {"cleared": s.pipeline.voxel_map.cleared, "moving": s.pipeline.moving.pixels}
             counters["step_us"] = self._step_us
         silent = self._frames.silent_s
         ages = self._streams.ages_s | ({} if silent is None else {"frame": silent})

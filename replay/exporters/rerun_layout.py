@@ -130,7 +130,7 @@ def layout(
         computed: No sensor measured some of it.
         eye: From where to look first; None leaves it to the viewer.
     """
-    seen = [f"+ {camera_path(c)}/{part}" for c in cameras for part in ("", "image", "image/rgb")]
+    seen = [f"+ {camera_path(c)}/{part}" for c in cameras for part in ("", "image", "image/rgb", "moving")]
     seen = [line.rstrip("/") for line in seen] + ["+ /world/path/**"]
     eyes = None
     if eye is not None:

@@ -41,6 +41,7 @@ JPEG_QUALITY = 80
 FRUSTUM_M = 0.4  # how far before the camera its image stands in the world
 REGROWN = 1.5  # a map that is so much larger is looked at again
 FLUSH_S = 10.0
+MOVING_COLOR, MOVING_RADIUS_M, MOVING_STRIDE = (255, 80, 160), 0.015, 4
 ROOM_COLOR, DOOR_RADIUS_M = (255, 255, 255), 0.06
 
 
@@ -135,6 +136,7 @@ class RerunLog:
         self._stream.log(f"{path}/image/semantics", rr.SegmentationImage(np.asarray(label, np.uint8)))
         depth = cv2.resize(update.depth_m, size, interpolation=cv2.INTER_NEAREST_EXACT)
         self._stream.log(f"{path}/image/depth", rr.DepthImage(np.asarray(depth, np.float32), meter=1.0))
+        self._stream.log(f"{path}/moving", moving_points(update, intrinsics))
         for stage, value in update.stage_ms.items():
             self._stream.log(f"stage_ms/{stage}", rr.Scalars(value))
 
@@ -241,6 +243,16 @@ class RerunLog:
         self._stream.set_time("capture", duration=np.timedelta64(stamp_ns, "ns"))
         if seq is not None:
             self._stream.set_time("frame", sequence=seq)
+
+
+def moving_points(update: MapUpdate, k: CameraIntrinsics) -> rr.Points3D:
+    """What moves, in the camera's axes; no points where nothing does."""
+    if update.moving is None:
+        return rr.Points3D(np.empty((0, 3), np.float32))
+    v, u = (MOVING_STRIDE * i for i in np.nonzero(update.moving[::MOVING_STRIDE, ::MOVING_STRIDE]))
+    z = update.depth_m[v, u]
+    xyz = np.stack(((u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z), axis=1)
+    return rr.Points3D(xyz[z > 0], radii=MOVING_RADIUS_M, colors=MOVING_COLOR)
 
 
 def _logged_size(intrinsics: CameraIntrinsics) -> tuple[tuple[int, int], float]:

@@ -42,6 +42,7 @@ KEPT_S = 1.0  # what moves is in the way of planners for so long after it was se
 STRIDE = 3  # pixels: 2 cm at 3 m, as voxels are
 _FULL = 0.5  # fraction of the pixels of a cell that are measured, for it to say that space is free
 _SECOND = 1_000_000_000
+_EVERY_NS = round(EVERY_S * _SECOND)
 
 
 class MovingSpace:
@@ -127,7 +128,7 @@ class MotionDetector:
             if free.sum() <= MOST_MOVING * (cells.near > 0).sum():
                 moving = _filled(_grown(_without_specks(free), cells.near, ~(free | seen)), cells.near)
         last = max((v.stamp_ns for v in views if v.near.shape == cells.near.shape), default=None)
-        if last is None or frame.stamp_ns - last >= EVERY_S * _SECOND:
+        if last is None or frame.stamp_ns // _EVERY_NS > last // _EVERY_NS:  # whichever frame was the first one
             self._views.append(_view(frame, cells))
         return _pixels(moving, cells, frame.depth_m)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -30,7 +29,8 @@ from semantic_mapper.mapping.frame_depth import FrameDepth, computed_trust
 from semantic_mapper.mapping.fusion.depth_trust import depth_trust
 from semantic_mapper.mapping.fusion.vote_fusion import add_votes
 from semantic_mapper.mapping.keyframes import EncodedSize, Keyframe, KeyframeStore
-from semantic_mapper.mapping.moving import BEYOND_M, MotionDetector, MovingSpace
+from semantic_mapper.mapping.moving import BEYOND_M
+from semantic_mapper.mapping.moving_filter import MovingAgain, MovingFilter
 from semantic_mapper.mapping.picture_check import PictureCheck
 from semantic_mapper.mapping.pose_check import PoseCheck
 from semantic_mapper.mapping.views.own_image import add_own_image
@@ -80,15 +80,12 @@ class MappingPipeline:
         self.keyframes = KeyframeStore(config.keyframes)
         self._frame_depth = FrameDepth(config.depth, self._cast_for_hint)
         self.pose_check = PoseCheck(config.voxel_map.depth_max_m)
-        self._motion = MotionDetector(config.voxel_map.depth_max_m)
-        self._moving_ids = label_set.moving_ids() if config.moving.classes else ()
-        self.moving_pixels = 0  # left out of the map so far
-        self.moving_space = MovingSpace()
+        self.moving = MovingFilter(config, label_set)
         self._viewpoints = ViewpointChooser(config.virtual, config.seed)
         self._steps = 0
         self._renderer = ViewRenderer(field, config.render, config.sampling)
         self._own_image_weight = config.keyframes.own_image_weight if config.keyframes.use_current_view else 0.0
-        self.corrector = MapCorrector(config.history, self.voxel_map, self.keyframes, self._fuse_again)
+        self.corrector = MapCorrector(config.history, self.voxel_map, self.keyframes, self._fuse_again, self.moving)
         self._intrinsics: dict[str, CameraIntrinsics] = {}
         self._odd_sizes: dict[str, tuple[tuple[int, int], int]] = {}
         self._stage_ms: dict[str, float] = {}
@@ -157,8 +154,7 @@ class MappingPipeline:
                 changed then.
             PoseError: a pose is not a rigid transform.
         """
-        self._motion.clear()  # both are of the last seconds in the world before
-        self.moving_space.clear()
+        self.moving.clear()
         return self.corrector.start(poses, until_ns)
 
     def advance_correction(self, max_frames: int = 1) -> bool:
@@ -273,20 +269,33 @@ class MappingPipeline:
             own = [current] if self.config.keyframes.use_current_view else []
             view = self._render(resized, [*(k.encoded for k in sources), *own], self.config.render.scale)
             votes = add_own_image(view, self.field, current, self._own_image_weight)
+        seen, by_motion, by_class = frame, None, None
+        if self.moving.on and is_measured(frame):
+            with self._stage("motion"):
+                by_motion = self.moving.find(frame)
+                if by_motion.any():
+                    frame = self.moving.leave_out(seen, by_motion)
+                    resized = FrameViews(frame)
         with self._stage("lift"):
             depth, rows, trust = self._lift(resized, votes, self.voxel_map)
-            moving = self._moving(frame, votes, rows)
-            if moving is not None and moving.any():
-                frame = self._left_out(frame, moving)
-                resized = FrameViews(frame)
-                depth, rows, trust = self._lift(resized, votes, self.voxel_map)
+            if by_motion is not None and self.moving.uses_classes:
+                own, _ = self._at_rows(votes.probabilities.reshape(-1, len(self.label_set)), rows)
+                by_class = self.moving.of_classes(own)
+                if (by_class & ~by_motion).any():
+                    frame = self.moving.leave_out(seen, by_motion | by_class)
+                    resized = FrameViews(frame)
+                    depth, rows, trust = self._lift(resized, votes, self.voxel_map)
+        moving = by_motion if by_motion is None or by_class is None else by_motion | by_class
+        if moving is not None:
+            self.moving.note(seen, moving)
         with self._stage("fuse"):
             measured = is_measured(frame)
             table = votes.probabilities.reshape(-1, len(self.label_set))
             touched = self.voxel_map.integrate(frame, depth, table, rows=rows, trust=trust, measured=measured)
         if self.corrector.records:
             with self._stage("history"):
-                self.corrector.record(FusedFrame(frame, votes.probabilities, votes.known, votes.depth_m))
+                rendered = votes.probabilities, votes.known, votes.depth_m
+                self.corrector.record(FusedFrame(seen, *rendered, by_motion, by_class))
         with self._stage("keyframe"):
             is_keyframe = self.keyframes.wants(frame.T_world_camera, current.size)
             if is_keyframe:
@@ -316,7 +325,7 @@ class MappingPipeline:
             source_seqs=tuple(k.seq for k in sources),
             label=label,
             confidence=confidence,
-            depth_m=depth if moving is None else np.where(moving, np.float32(0), depth),
+            depth_m=depth if moving is None or seen.depth_m is None else np.where(moving, seen.depth_m, depth),
             blocks=self.voxel_map.block_count,
             blocks_touched=touched,
             rays=view.rays,
@@ -324,26 +333,6 @@ class MappingPipeline:
             stage_ms=self._stage_ms,
             moving=moving,
         )
-
-    def _moving(self, frame: PosedFrame, view: RenderedView, rows: NDArray[np.int32]) -> Bool | None:
-        """Pixels (H, W) of what moves, of a frame whose depth was measured; None where nobody asks."""
-        if not (self.config.moving.motion or self.config.moving.classes) or not is_measured(frame):
-            return None
-        moving = np.zeros(rows.shape, np.bool_)
-        if self.config.moving.motion:
-            moving |= self._motion.find(frame)
-        if self._moving_ids:
-            label, _ = self._at_rows(view.probabilities.reshape(-1, len(self.label_set)), rows)
-            moving |= np.isin(label, self._moving_ids)
-        self.moving_space.add(frame, moving)
-        return moving
-
-    def _left_out(self, frame: PosedFrame, moving: Bool) -> PosedFrame:
-        """The frame without depth where it shows what moves: neither surface nor seen through."""
-        assert frame.depth_m is not None
-        self.moving_pixels += int(moving.sum())
-        nothing = BEYOND_M if self.config.voxel_map.no_return_range_m > 0 else np.float32(0)
-        return replace(frame, depth_m=np.where(moving, nothing, frame.depth_m))
 
     @property
     def _delay_frames(self) -> int:
@@ -517,12 +506,17 @@ class MappingPipeline:
         ids = np.append(self.label_set.to_ids(table.argmax(axis=1)), np.uint8(self.label_set.ignore_id))
         return ids[rows], np.append(table.max(axis=1), np.float32(0))[rows]
 
-    def _fuse_again(self, voxel_map: VoxelMap, fused: FusedFrame) -> None:
+    def _fuse_again(self, voxel_map: VoxelMap, fused: FusedFrame, again: MovingAgain) -> None:
+        frame = fused.frame
+        if fused.moves_by_motion is not None:
+            by_class = fused.moves_by_class
+            none = np.zeros_like(fused.moves_by_motion)
+            frame = again.without_moving(frame, fused.moves_by_motion, none if by_class is None else by_class)
         view = RenderedView(fused.probabilities, fused.known, fused.rendered_depth_m, 0, 0)
-        depth, rows, trust = self._lift(FrameViews(fused.frame), view, voxel_map)
+        depth, rows, trust = self._lift(FrameViews(frame), view, voxel_map)
         table = view.probabilities.reshape(-1, len(self.label_set))
-        measured = is_measured(fused.frame)
-        voxel_map.integrate(fused.frame, depth, table, rows=rows, trust=trust, measured=measured)
+        measured = is_measured(frame)
+        voxel_map.integrate(frame, depth, table, rows=rows, trust=trust, measured=measured)
 
     def _make_keyframe(self, resized: FrameViews, encoded: EncodedViews, *, labelled: bool = False) -> Keyframe:
         frame = resized.frame

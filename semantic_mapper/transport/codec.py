@@ -110,6 +110,7 @@ _NOT_SENT_AS_0 = (
     "depth_sigma",
     "refined",
     "gone",
+    "moving",
 )  # came later: what does not need it is read by older releases, too
 _FRAME_BUFFERS = ("rgb", "depth", "label", "depth_sigma")  # fields of a frame's header, in the order of their buffers
 
@@ -180,7 +181,7 @@ class FrameHeader(Wire, frozen=True):
 
 
 class MapUpdateHeader(Wire, frozen=True, kw_only=True):
-    """``MapUpdate`` without its images; buffers: label, confidence, depth."""
+    """``MapUpdate`` without its images; buffers: label, confidence, depth and, where something moves, moving (0, 1)."""
 
     stamp_ns: Stamp
     seq: Count
@@ -198,6 +199,7 @@ class MapUpdateHeader(Wire, frozen=True, kw_only=True):
     label: LabelSpec
     confidence: ConfidenceSpec
     depth: DepthSpec
+    moving: LabelSpec | None = None
 
     def __post_init__(self) -> None:
         if self.width * self.height > MAX_PIXELS:
@@ -609,24 +611,31 @@ def _encode_map_update(update: MapUpdate, options: CodecOptions) -> list[bytes]:
     depth_spec, depth = encode_depth(np.ascontiguousarray(update.depth_m, np.float32), options)
     fields = {name: getattr(update, name) for name in MapUpdateHeader.__struct_fields__ if name in _UPDATE_SCALARS}
     specs = {"label": label_spec, "confidence": confidence_spec, "depth": depth_spec}
-    header = MapUpdateHeader(width=width, height=height, **fields, **specs)
-    packed = _pack(to_plain(header, what), MapUpdateHeader, what)
-    return [topic_bytes("map", update.camera_id), packed, label, confidence, depth]
+    buffers = [label, confidence, depth]
+    if update.moving is not None and update.moving.shape != (height, width):
+        raise CodecError(f"{what}: moving {update.moving.shape} must have the size of label, {update.label.shape}")
+    if update.moving is not None and update.moving.any():
+        specs["moving"], data = encode_label(update.moving.astype(np.uint8), options)
+        buffers.append(data)
+    header = to_plain(MapUpdateHeader(width=width, height=height, **fields, **specs), what)
+    _leave_out_zeros(header)
+    return [topic_bytes("map", update.camera_id), _pack(header, MapUpdateHeader, what), *buffers]
 
 
 def _open_map_update(parts: Parts) -> tuple[MapUpdateHeader, Parts]:
     header = _open(parts, "map", MapUpdateHeader)
-    specs = (header.label, header.confidence, header.depth)
-    return header, check_buffers(parts, [s.bytes for s in specs], header.name)
+    specs = (header.label, header.confidence, header.depth, header.moving)
+    return header, check_buffers(parts, [s.bytes for s in specs if s is not None], header.name)
 
 
 def _decode_map_update(header: MapUpdateHeader, buffers: Parts) -> MapUpdate:
     size, what = (header.height, header.width), header.name
-    label, confidence, depth = buffers
+    label, confidence, depth, *moving = buffers
     return MapUpdate(
         label=decode_label(label, size, what),
         confidence=decode_confidence(header.confidence, confidence, size, what),
         depth_m=decode_depth(header.depth, depth, size, what),
+        moving=decode_label(moving[0], size, what) > 0 if moving else None,
         **{name: getattr(header, name) for name in _UPDATE_SCALARS},
     )
 

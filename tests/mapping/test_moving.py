@@ -88,15 +88,43 @@ def test_a_passer_by_is_no_wall_neither_when_the_map_is_built_again() -> None:
         frame, _ = scene(number, None if number < 3 else -30 + 15 * number, shift_m=0.03 * number)
         update, plain = on.step(frame), off.step(frame)
         assert plain.moving is None and update.moving is not None and frame.depth_m is not None
-        assert not update.depth_m[update.moving].any() and update.depth_m[~update.moving].all()
-    assert abs(np.median(on.moving_space.points[:, 2]) - THING_M) < 0.1 and not len(off.moving_space.points)
-    assert wall_of(on) < 0.05 * wall_of(off) and on.moving_pixels > 10_000 and off.moving_pixels == 0
+        assert np.array_equal(update.depth_m[update.moving], frame.depth_m[update.moving]), "to be shown"
+    assert abs(np.median(on.moving.space.points[:, 2]) - THING_M) < 0.1 and not len(off.moving.space.points)
+    assert wall_of(on) < 0.05 * wall_of(off) and on.moving.pixels > 10_000 and off.moving.pixels == 0
     before = on.voxel_map.block_state()
     on.correct_poses({11 * 10**9 // HZ: on.corrector.place(scene(11, None, shift_m=0.33)[0]).T_world_camera})
     while not on.advance_correction(4):
         pass
     after = on.voxel_map.block_state()
     assert all(np.array_equal(before[name], after[name]) for name in before)
+
+
+def test_a_correction_of_poses_decides_again_what_moved() -> None:
+    frames = [scene(n, None if n < 3 else -30 + 15 * n, shift_m=0.03 * n)[0] for n in range(12)]
+    off_m = np.array((0.0, 0.0, 0.5))
+    wrong = [
+        replace(f, T_world_camera=shifted(f.T_world_camera, off_m if n in (5, 6) else 0 * off_m))
+        for n, f in enumerate(frames)
+    ]
+    right, corrected = pipeline(motion=True), pipeline(motion=True)
+    for true, given in zip(frames, wrong, strict=True):
+        right.step(true)
+        corrected.step(given)
+    assert corrected.moving.pixels != right.moving.pixels, "poses that are off look like motion"
+    corrected.correct_poses({f.stamp_ns: f.T_world_camera for f in frames})
+    while corrected.advance_correction(4):
+        pass
+    ours, theirs = corrected.voxel_map.block_state(), right.voxel_map.block_state()
+    assert all(np.array_equal(ours[name], theirs[name]) for name in ("keys", "tsdf", "weight"))
+    frame, _ = scene(12, 150, shift_m=0.36)
+    told, expected = corrected.step(frame).moving, right.step(frame).moving
+    assert expected is not None and expected.any() and np.array_equal(told, expected), "and goes on with what it knows"
+
+
+def shifted(T_world_camera: np.ndarray, by_m: np.ndarray) -> np.ndarray:
+    T = T_world_camera.copy()
+    T[:3, 3] += by_m
+    return T
 
 
 def test_what_is_left_out_is_no_free_space_for_a_sensor_whose_missing_depth_is() -> None:
@@ -143,6 +171,9 @@ def test_pixels_of_a_class_that_moves_are_left_out(monkeypatch: pytest.MonkeyPat
     on = pipeline(classes=True, motion=False)
     updates = [on.step(f) for f in frames]
     moving = [u.moving for u in updates if u.moving is not None]
-    assert len(moving) == 4 and sum(int(m.sum()) for m in moving) == on.moving_pixels > 0
-    assert all(np.array_equal(m, u.depth_m == 0) for m, u in zip(moving, updates, strict=True))
+    assert len(moving) == 4 and sum(int(m.sum()) for m in moving) == on.moving.pixels > 0
+    shown = [
+        (u.depth_m[m], f.depth_m[m]) for m, u, f in zip(moving, updates, frames, strict=True) if f.depth_m is not None
+    ]
+    assert len(shown) == 4 and all(np.array_equal(told, measured) for told, measured in shown)
     assert len(on.voxel_map.points().xyz) < 0.8 * len(off.voxel_map.points().xyz)

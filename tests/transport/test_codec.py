@@ -138,6 +138,18 @@ def test_a_map_update_keeps_labels_and_depth_exactly_and_confidence_to_one_255th
     assert np.array_equal(exact.confidence, update.confidence)
 
 
+def test_what_moves_is_sent_where_something_does() -> None:
+    update = samples.make_update()
+    moving = np.zeros(update.label.shape, np.bool_)
+    for nothing in (None, moving):
+        parts = encode(dataclasses.replace(update, moving=nothing))
+        assert decode_as(MapUpdate, parts).moving is None and parts == encode(update), "as older releases read it"
+    moving[2:5, 3] = True
+    assert np.array_equal(decode_as(MapUpdate, encode(dataclasses.replace(update, moving=moving))).moving, moving)
+    with pytest.raises(CodecError, match="must have the size of label"):
+        encode(dataclasses.replace(update, moving=moving[1:]))
+
+
 @pytest.mark.parametrize("label_set", [None, NYU40, CAMVID11])
 def test_stream_info_survives(label_set) -> None:
     info = msgspec.structs.replace(samples.make_info(), label_set=label_set)

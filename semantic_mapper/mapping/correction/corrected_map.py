@@ -30,6 +30,7 @@ from semantic_mapper.mapping.correction.history import FrameEntry, FrameHistory,
 from semantic_mapper.mapping.correction.pose_correction import ALWAYS, CorrectedPoses, PoseCorrection, move
 from semantic_mapper.mapping.correction.pose_matching import FrozenFrames, pair_poses
 from semantic_mapper.mapping.keyframes import KeyframeStore
+from semantic_mapper.mapping.moving_filter import MovingAgain, MovingFilter
 from semantic_mapper.mapping.storage.map_journal import MapJournal
 from semantic_mapper.mapping.voxel_map import VoxelMap
 from semantic_mapper.types import Float64, PosedFrame
@@ -81,6 +82,7 @@ class _Rebuild:
     corrections: tuple[PoseCorrection, ...]  # to be applied one after the other
     first: int  # number of the history's oldest frame
     next: int  # number of the next frame to fuse
+    moving: MovingAgain
     waiting: NDArray[np.int64] | None = None  # blocks of the frozen frames' map, with which it begins; None = all
     journal: MapJournal | None = None  # from where these are there
 
@@ -102,7 +104,8 @@ class MapCorrector:
         config: Bounds of the history; ``max_frames`` 0 = none is kept and nothing can be corrected.
         voxel_map: In use; becomes the corrected one at a swap.
         keyframes: Move with their frames at a swap.
-        fuse: Lifts a frame of the history and integrates it into the map given.
+        fuse: Lifts a frame of the history and integrates it into the map given, without what the last argument finds.
+        moving: Of the map; decides again in a rebuild.
 
     Raises:
         MapError: no file can be made in the system's folder for temporary files.
@@ -113,13 +116,15 @@ class MapCorrector:
         config: HistoryConfig,
         voxel_map: VoxelMap,
         keyframes: KeyframeStore,
-        fuse: Callable[[VoxelMap, FusedFrame], None],
+        fuse: Callable[[VoxelMap, FusedFrame, MovingAgain], None],
+        moving: MovingFilter,
     ) -> None:
         self.turn = threading.RLock()  # held by a step, and by a swap: one at a time
         self._lock = threading.RLock()  # of what is below; never taken while ``turn`` is held
         self._map = voxel_map
         self._keyframes = keyframes
         self._fuse = fuse
+        self._moving = moving
         self._history = FrameHistory(config.max_frames, config.max_disk_mb * 1_000_000) if config.max_frames else None
         self._why_none = "no frames are kept; set history.max_frames in the mapper's config"
         self._rebuild: _Rebuild | None = None
@@ -212,6 +217,7 @@ class MapCorrector:
                 corrections=(correction,) if before is None else (*before.corrections, correction),
                 first=entries[0].number,
                 next=entries[0].number,
+                moving=self._moving.again(whole=entries[0].number == 0),
             )
             self._failure = ""
             event = "correction_begins" if before is None else "correction_begins_again"
@@ -263,18 +269,18 @@ class MapCorrector:
             return False
         if history.is_segment(rebuild.journal.numbers[-1], entry.number):
             rebuild.journal.mark(entry.number)
-        self._fuse_entry(history, entry, rebuild.place(entry), rebuild.voxel_map)
+        self._fuse_entry(history, entry, rebuild)
         rebuild.next += 1
         return True
 
-    def _fuse_entry(self, history: FrameHistory, entry: FrameEntry, pose: Float64, into: VoxelMap) -> None:
+    def _fuse_entry(self, history: FrameHistory, entry: FrameEntry, rebuild: _Rebuild) -> None:
         try:
-            fused = history.read(entry, pose)
+            fused = history.read(entry, rebuild.place(entry))
         except MapError as error:
             self._lost += 1
             _log.error("history_frame_lost", seq=entry.seq, camera=entry.camera_id, reason=str(error))
             return
-        self._fuse(into, fused)
+        self._fuse(rebuild.voxel_map, fused, rebuild.moving)
 
     def _write_journal(self) -> None:
         """Put some of what the journal holds in memory on disk, unless another thread holds what that takes."""
@@ -324,6 +330,7 @@ class MapCorrector:
         for correction in rebuild.corrections:
             if correction.until_ns == ALWAYS:
                 self._motion = move(correction.last_motion, self._motion)
+        rebuild.moving.adopt()
         self._completed += len(rebuild.corrections)
         self._poses += sum(len(correction) for correction in rebuild.corrections)
         self._rebuild = None

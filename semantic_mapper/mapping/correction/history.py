@@ -26,7 +26,7 @@ from semantic_mapper.mapping.storage.packing import (
     unpack_floats,
     unpack_mask,
 )
-from semantic_mapper.types import CameraIntrinsics, Float32, Float64, PosedFrame
+from semantic_mapper.types import Bool, CameraIntrinsics, Float32, Float64, PosedFrame
 
 SEGMENTS = 8  # a full history lets its oldest frames go by about an eighth of what it has room for
 _CACHE_KIB = 4096  # of SQLite's own pages
@@ -43,12 +43,15 @@ class FusedFrame:
         probabilities: (h, w, L) float32 rendered class probabilities, before they are lifted to full size.
         known: (h, w) bool.
         rendered_depth_m: (h, w) float32; looked at only where the frame has no depth, and kept only there.
+        moves_by_motion, moves_by_class: (H, W) what was left out of its depth; None where it was not looked for.
     """
 
     frame: PosedFrame
     probabilities: Float32
     known: NDArray[np.bool_]
     rendered_depth_m: Float32
+    moves_by_motion: Bool | None = None
+    moves_by_class: Bool | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +111,7 @@ class FrameHistory:
             self._database.execute("PRAGMA journal_mode = OFF")
             self._database.execute(
                 "CREATE TABLE frames (number INTEGER PRIMARY KEY, crc INTEGER, "
-                "color BLOB, depth BLOB, probabilities BLOB, known BLOB, sigma BLOB)"
+                "color BLOB, depth BLOB, probabilities BLOB, known BLOB, sigma BLOB, motion BLOB, class BLOB)"
             )
         except sqlite3.Error as error:
             raise MapError(
@@ -164,7 +167,7 @@ class FrameHistory:
                 self._database.execute("DELETE FROM frames WHERE number >= ? AND number < ?", (self._erased, until))
                 self._erased = until
                 self._database.execute(
-                    "INSERT INTO frames VALUES (?, ?, ?, ?, ?, ?, ?)", (number, _checksum(blobs), *blobs)
+                    f"INSERT INTO frames VALUES (?, ?{', ?' * len(blobs)})", (number, _checksum(blobs), *blobs)
                 )
         except sqlite3.Error as error:
             raise MapError(
@@ -199,7 +202,7 @@ class FrameHistory:
         try:
             with self._lock:
                 row = self._database.execute(
-                    "SELECT crc, color, depth, probabilities, known, sigma FROM frames WHERE number = ?",
+                    "SELECT crc, color, depth, probabilities, known, sigma, motion, class FROM frames WHERE number = ?",
                     (entry.number,),
                 ).fetchone()
         except sqlite3.Error as error:
@@ -238,11 +241,13 @@ def _pack(fused: FusedFrame) -> tuple[bytes, ...]:
         pack_floats(fused.probabilities),
         pack_mask(fused.known),
         b"" if fused.frame.depth_sigma_m is None else pack_floats(fused.frame.depth_sigma_m),
+        b"" if fused.moves_by_motion is None else pack_mask(fused.moves_by_motion),
+        b"" if fused.moves_by_class is None else pack_mask(fused.moves_by_class),
     )
 
 
 def _unpack(entry: FrameEntry, T_world_camera: Float64, blobs: tuple[bytes, ...]) -> FusedFrame:
-    color, depth, probabilities, known, sigma = blobs
+    color, depth, probabilities, known, sigma, motion, by_class = blobs
     height, width = entry.intrinsics.height, entry.intrinsics.width
     coarse = entry.shape[:2]
     return FusedFrame(
@@ -260,6 +265,8 @@ def _unpack(entry: FrameEntry, T_world_camera: Float64, blobs: tuple[bytes, ...]
         probabilities=unpack_floats(probabilities, entry.shape),
         known=unpack_mask(known, *coarse),
         rendered_depth_m=np.zeros(coarse, np.float32) if entry.has_depth else unpack_floats(depth, coarse),
+        moves_by_motion=unpack_mask(motion, height, width) if motion else None,
+        moves_by_class=unpack_mask(by_class, height, width) if by_class else None,
     )
 
 

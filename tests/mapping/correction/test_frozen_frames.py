@@ -61,7 +61,7 @@ def test_the_last_max_frames_can_always_be_corrected_and_few_more(max_frames: in
 def test_frozen_frames_stay_where_they_are_and_a_correction_of_them_is_told_to_be_partial():
     frames = tiny_frames(13)
     late = drifted(frames)
-    pipeline = mapped(late[:7], max_frames=4)
+    pipeline = mapped(late[:7], max_frames=4, moving={"motion": False})  # decides by poses, too
     with structlog.testing.capture_logs() as logs:
         pipeline.correct_poses(true_poses(frames[:7], 1))
     partial = [e for e in logs if e["event"] == "correction_is_partial"]

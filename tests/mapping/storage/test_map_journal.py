@@ -161,14 +161,14 @@ def test_a_correction_that_begins_while_the_journal_is_written_starts_from_the_r
     frames = tiny_frames(12)
     late = drifted(frames)
     for count in (5, 7, 8, 9):  # before and after the first frames are frozen
-        pipeline = mapped(late[:count], max_frames=5)
+        pipeline = mapped(late[:count], max_frames=5, moving={"motion": False})  # which a correction lets forget
         pipeline.correct_poses({f.stamp_ns: f.T_world_camera for f in late[3:count]})
         pipeline.advance_correction(2)
         for frame in late[count:]:
             pipeline.step(frame)
         finish(pipeline)
         assert pipeline.corrector.status.completed == 1 and pipeline.corrector.status.total <= 8
-        assert same(pipeline.voxel_map, mapped(late, max_frames=0).voxel_map), count
+        assert same(pipeline.voxel_map, mapped(late, max_frames=0, moving={"motion": False}).voxel_map), count
         pipeline.correct_poses({late[-1].stamp_ns: drift(0.3) @ late[-1].T_world_camera})
         finish(pipeline)
         assert len(pipeline.voxel_map._grid.watchers) <= 1

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from semantic_mapper.evaluation.splat import seen_from
 from semantic_mapper.replay.exporters.rerun_layout import eye_on
+from semantic_mapper.replay.exporters.rerun_log import moving_points
+from semantic_mapper.types import CameraIntrinsics, MapUpdate
 
 SIZE = np.array((5.0, 4.0, 2.6))
 
@@ -46,3 +50,15 @@ def test_what_stands_behind_a_wall_is_not_seen() -> None:
     assert seen[: len(wall)].sum() > 1000 and not seen[len(wall) :].any()
     assert seen_from(behind, position, target, up).mean() > 0.9
     assert not seen_from(behind, position, -target, up).any()
+
+
+def test_what_moves_is_shown_where_it_was_seen() -> None:
+    k = CameraIntrinsics(40.0, 50.0, 15.5, 11.5, 32, 24)
+    shape, moving = (24, 32), np.zeros((24, 32), np.bool_)
+    moving[8, 16] = moving[9, 17] = True  # of every fourth pixel, the first one is among them
+    update = MapUpdate(1, 1, "c", True, False, (), np.zeros(shape, np.uint8), np.ones(shape, np.float32),
+                       np.full(shape, 2.0, np.float32), 0, 0, moving=moving)  # fmt: skip
+    positions = moving_points(update, k).positions
+    assert positions is not None
+    np.testing.assert_allclose(positions.as_arrow_array().to_pylist(), [(0.5 / 40 * 2, -3.5 / 50 * 2, 2.0)], rtol=1e-5)
+    assert not moving_points(dataclasses.replace(update, moving=None), k).positions.as_arrow_array().to_pylist()
