@@ -10,7 +10,7 @@ import numpy as np
 from semantic_mapper.errors import FrameError
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.queries.snapshot import MapSnapshot
-from semantic_mapper.types import PosedFrame, UInt8
+from semantic_mapper.types import MapUpdate, PosedFrame, UInt8
 
 MAX_POINTS = 400_000  # of a map that is shown again and again: of a larger one every second point, or third, ...
 JPEG_QUALITY = 80
@@ -84,13 +84,19 @@ def describe_pose(frame: PosedFrame) -> dict[str, Any]:
     }
 
 
+def moving_mask(update: MapUpdate) -> UInt8:
+    """255 (H, W) where something moves, which the map leaves out; else 0."""
+    none = np.zeros(update.label.shape, np.uint8)
+    return none if update.moving is None else np.where(update.moving, np.uint8(255), none)
+
+
 def to_jpeg(rgb: UInt8) -> bytes:
     """JPEG file of an image (H, W, 3)."""
     return _encoded(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
 
 
 def to_png(image: UInt8) -> bytes:
-    """PNG file of an image (H, W, 3) or of class ids (H, W); little compressed, for speed."""
+    """PNG file of an image (H, W, 3) or of one channel (H, W); little compressed, for speed."""
     turned = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
     return _encoded(".png", turned, [cv2.IMWRITE_PNG_COMPRESSION, 1])
 

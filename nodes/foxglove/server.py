@@ -18,7 +18,7 @@ from semantic_mapper.errors import TransportError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.nodes.bridge.feed import Subject
-from semantic_mapper.nodes.bridge.packing import POINT, pack_points, to_jpeg, to_png
+from semantic_mapper.nodes.bridge.packing import POINT, moving_mask, pack_points, to_jpeg, to_png
 from semantic_mapper.nodes.foxglove.scene import WORLD, camera_frame, draw_graph, draw_path, stamp, transform
 from semantic_mapper.nodes.foxglove.sdk import channels, foxglove, messages
 from semantic_mapper.plots import class_colors
@@ -54,6 +54,7 @@ class _Camera:
         self.rgb = channels.CompressedImageChannel(f"{name}/rgb", context=context)
         self.depth = channels.RawImageChannel(f"{name}/depth", context=context)
         self.semantics = channels.CompressedImageChannel(f"{name}/semantics", context=context)
+        self.moving = channels.CompressedImageChannel(f"{name}/moving", context=context)
         self.calibration = channels.CameraCalibrationChannel(f"{name}/calibration", context=context)
         self.path = CameraPath()
 
@@ -120,7 +121,7 @@ class FoxgloveServer:
     def wants(self, topic: Literal["frame", "map"], camera_id: str) -> bool:
         """See ``Outlet``."""
         c = self._camera(camera_id)
-        wanted = (c.rgb, c.depth, c.calibration, self._tf) if topic == "frame" else (c.semantics, self._path)
+        wanted = (c.rgb, c.depth, c.calibration, self._tf) if topic == "frame" else (c.semantics, c.moving, self._path)
         return any(channel.has_sinks() for channel in wanted)
 
     def note_pose(self, camera_id: str, T_world_camera: Float64) -> None:
@@ -148,9 +149,12 @@ class FoxgloveServer:
     def send_update(self, update: MapUpdate) -> None:
         """See ``Outlet``."""
         camera, labels, when = self._camera(update.camera_id), self._labels, update.stamp_ns
+        name = camera_frame(update.camera_id)
         if labels is not None and camera.semantics.has_sinks():
             picture = to_png(class_colors(update.label, labels))
-            camera.semantics.log(_picture(picture, "png", camera_frame(update.camera_id), when), log_time=when)
+            camera.semantics.log(_picture(picture, "png", name, when), log_time=when)
+        if camera.moving.has_sinks():
+            camera.moving.log(_picture(to_png(moving_mask(update)), "png", name, when), log_time=when)
         if self._path.has_sinks() and time.monotonic() - self._path_sent > PATH_PERIOD_S:
             self._path_sent = time.monotonic()
             paths = {name: camera.path.poses for name, camera in self._cameras.items()}

@@ -21,7 +21,7 @@ from semantic_mapper.errors import TransportError
 from semantic_mapper.labels import LabelSet
 from semantic_mapper.mapping.map_types import MapPoints
 from semantic_mapper.nodes.bridge.feed import Subject
-from semantic_mapper.nodes.bridge.packing import describe_pose, pack_points, to_jpeg, to_png
+from semantic_mapper.nodes.bridge.packing import describe_pose, moving_mask, pack_points, to_jpeg, to_png
 from semantic_mapper.nodes.cli.map_answers import answer_graph
 from semantic_mapper.nodes.options import ZenohOptions
 from semantic_mapper.nodes.zenoh.addresses import zenoh_settings
@@ -93,7 +93,7 @@ class ZenohSession:
 
     def wants(self, topic: Literal["frame", "map"], camera_id: str) -> bool:
         """See ``Outlet``."""
-        kinds = ("rgb", "depth", "pose") if topic == "frame" else ("semantics",)
+        kinds = ("rgb", "depth", "pose") if topic == "frame" else ("semantics", "moving")
         return any(self._wanted(f"{camera_id}/{kind}") is not None for kind in kinds)
 
     def note_pose(self, camera_id: str, T_world_camera: Float64) -> None:
@@ -113,9 +113,11 @@ class ZenohSession:
 
     def send_update(self, update: MapUpdate) -> None:
         """See ``Outlet``."""
+        about = {"stamp_ns": update.stamp_ns, "seq": update.seq, "camera": update.camera_id}
         if (semantics := self._wanted(f"{update.camera_id}/semantics")) is not None:
-            about = {"stamp_ns": update.stamp_ns, "seq": update.seq, "camera": update.camera_id}
             semantics.put(to_png(update.label), encoding=PNG, attachment=_json(about))
+        if (moving := self._wanted(f"{update.camera_id}/moving")) is not None:
+            moving.put(to_png(moving_mask(update)), encoding=PNG, attachment=_json(about))
 
     def send_status(self, status: Status) -> None:
         """See ``Outlet``."""

@@ -33,7 +33,10 @@ def update_for(frame: PosedFrame, label: int) -> MapUpdate:
     """What a mapper would have rendered."""
     size = frame.rgb.shape[:2]
     images = np.full(size, label, np.uint8), np.ones(size, np.float32), np.ones(size, np.float32)
-    return MapUpdate(frame.stamp_ns, frame.seq, frame.camera_id, True, False, (), *images, blocks=1, blocks_touched=1)
+    moving = np.zeros(size, np.bool_)
+    moving[:2] = True
+    names = frame.stamp_ns, frame.seq, frame.camera_id
+    return MapUpdate(*names, True, False, (), *images, blocks=1, blocks_touched=1, moving=moving)
 
 
 def big_frame() -> PosedFrame:

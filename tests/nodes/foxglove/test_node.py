@@ -80,7 +80,7 @@ def test_images_poses_map_graph_and_status_arrive(robot: Robot, port: int) -> No
     frame = tiny_frames()[2]
     camera = f"/{frame.camera_id}"
     wanted = {"/tf", "/path", "/map/classes", "/map/colors", "/map/info", "/graph", "/status"}
-    wanted |= {f"{camera}/{kind}" for kind in ("rgb", "depth", "semantics", "calibration")}
+    wanted |= {f"{camera}/{kind}" for kind in ("rgb", "depth", "semantics", "moving", "calibration")}
     with robot.mapped() as service, FoxgloveClient(f"ws://127.0.0.1:{port}") as client:
         found = gather(client, robot, wanted)
         assert service.alive
@@ -93,6 +93,9 @@ def test_images_poses_map_graph_and_status_arrive(robot: Robot, port: int) -> No
     picture = CompressedImage.FromString(found[f"{camera}/semantics"].data)
     shown = cv2.cvtColor(cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
     assert (shown == LABELS.colors[1]).all()
+    picture = CompressedImage.FromString(found[f"{camera}/moving"].data)
+    mask = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert (mask[:2] == 255).all() and not mask[2:].any()
     depth = RawImage.FromString(found[f"{camera}/depth"].data)
     assert depth.encoding == "32FC1" and depth.frame_id == f"camera{camera}"
     np.testing.assert_array_equal(np.frombuffer(depth.data, "<f4").reshape(depth.height, -1), frame.depth_m)

@@ -75,7 +75,7 @@ def attached(sample: zenoh.Sample) -> dict[str, Any]:
 def test_images_poses_map_graph_and_status_arrive(robot: Robot, address: str) -> None:
     frame, heard = tiny_frames()[2], Heard()
     camera = f"lab/robot/{frame.camera_id}"
-    keys = {f"{camera}/{kind}" for kind in ("rgb", "depth", "semantics", "pose")}
+    keys = {f"{camera}/{kind}" for kind in ("rgb", "depth", "semantics", "moving", "pose")}
     keys |= {"lab/robot/map/points", "lab/robot/graph", "lab/robot/status/mapper"}
     with robot.mapped(), session(address) as client:
         client.declare_subscriber("lab/robot/**", heard)
@@ -98,6 +98,9 @@ def test_images_poses_map_graph_and_status_arrive(robot: Robot, address: str) ->
     assert frame.depth_m is not None and depth.tobytes() == frame.depth_m.tobytes()
     ids = cv2.imdecode(np.frombuffer(found[f"{camera}/semantics"].payload.to_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     assert ids.shape == frame.rgb.shape[:2] and (ids == LABELS.ids[1]).all()
+
+    mask = cv2.imdecode(np.frombuffer(found[f"{camera}/moving"].payload.to_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert (mask[:2] == 255).all() and not mask[2:].any()
 
     cloud = found["lab/robot/map/points"]
     about, points = attached(cloud), np.frombuffer(cloud.payload.to_bytes(), POINT)
